@@ -13,15 +13,7 @@ from hypothesis import given
 from wearcap.cli.main import run_verb
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.datasets.egohoi import (
-    egohoi_names,
-    read_egohoi,
-    read_egohoi_contacts,
-    read_object_locations,
-    read_object_npz,
-    write_object_npz,
-)
+from wearcap.io.datasets.egohoi import egohoi_names, read_egohoi, read_egohoi_contacts, read_object_locations
 from wearcap.io.formats.contact_labels import LabelClock
 from wearcap.io.formats.environment import read_environment
 from wearcap.io.formats.ply import Ply, read_ply, write_ply
@@ -230,43 +222,6 @@ def test_damaged_locations_are_read_or_refused(tmp_path_factory, text):
     except WearcapError:
         return
     assert read.trajectory.t_world_body.isfinite().all()
-
-
-def test_the_trackers_output_is_written_in_the_scans_axes_and_read_back(tmp_path):
-    annotated = read_object_locations(_written(tmp_path))
-    path = tmp_path / "out.npz"
-    write_object_npz(annotated.trajectory, path, annotated.center)
-    with np.load(path, allow_pickle=False) as arrays:
-        assert set(arrays) == {"version", "type", "translations", "quaternions", "timestamps"}
-        np.testing.assert_allclose(arrays["translations"], [row["position"] for row in SLID["locations"]], atol=1e-5)
-        wanted = np.array([row["quaternion"] for row in SLID["locations"]])
-        sign = np.sign((arrays["quaternions"] * wanted).sum(1, keepdims=True))
-        np.testing.assert_allclose(sign * arrays["quaternions"], wanted, atol=1e-6)
-    back = read_object_npz(path, annotated.center)
-    torch.testing.assert_close(back.t_world_body, annotated.trajectory.t_world_body, atol=1e-5, rtol=0)
-    torch.testing.assert_close(back.R_world_body, annotated.trajectory.R_world_body, atol=1e-6, rtol=0)
-    assert torch.equal(back.timestamps, annotated.trajectory.timestamps)
-
-
-def _written(tmp_path):
-    write_json(SLID, tmp_path / "locations.json")
-    return tmp_path / "locations.json"
-
-
-def test_broken_tracker_outputs(tmp_path):
-    path, times = tmp_path / "a.npz", torch.arange(2, dtype=torch.float64)
-    with pytest.raises(WearcapError, match="not finite|NaN"):
-        write_object_npz(Trajectory(times, torch.eye(3).expand(2, 3, 3), torch.full((2, 3), math.nan)), path)
-    assert not path.exists()
-    np.savez(path, translations=np.zeros((2, 3)), quaternions=np.zeros((2, 4)), timestamps=np.arange(2.0))
-    with pytest.raises(WearcapError, match="norm 0"):
-        read_object_npz(path)
-    np.savez(path, translations=np.zeros((0, 3)), quaternions=np.zeros((0, 4)), timestamps=np.zeros(0))
-    with pytest.raises(WearcapError, match="without poses"):
-        read_object_npz(path)
-    np.savez(path, translations=np.zeros((2, 3)), timestamps=np.arange(2.0))
-    with pytest.raises(WearcapError, match="quaternions"):
-        read_object_npz(path)
 
 
 def test_the_command_makes_a_data_set_with_environments(tmp_path, capsys):

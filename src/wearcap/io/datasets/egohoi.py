@@ -13,11 +13,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
-from torch import Tensor
+from jaxtyping import Float64
 
 from wearcap.errors import WearcapError
-from wearcap.files import atomic_path
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
@@ -25,7 +23,6 @@ from wearcap.io.datasets.hcontact import activity_of, location_of, read_smpl_jso
 from wearcap.io.datasets.hps import read_hps_subject
 from wearcap.io.datasets.hps_sequence import subject_of
 from wearcap.io.formats.contact_labels import LabelClock, interactions_of, labels_of, parse_labels
-from wearcap.io.formats.npz import read_npz, require
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import checked_trajectory
 from wearcap.io.formats.smpl import shape_from_betas
@@ -282,43 +279,3 @@ def _joined(parts: list[Interactions]) -> Interactions:
     return Interactions(
         start[order], stop[order], hands[order], tuple(names[k] for k in index), tuple(kinds[k] for k in index)
     )
-
-
-def write_object_npz(
-    trajectory: Trajectory, path: str | Path, center: tuple[float, float, float] = (0.0, 0.0, 0.0)
-) -> None:
-    """Write an object's path as the published tracker does: `translations`, `quaternions` (wxyz), `timestamps`.
-
-    `center` is the origin of the object's axes in its model's axes (m). Raises WearcapError for poses that are not finite.
-    """
-    R, t = trajectory.R_world_body.double(), trajectory.t_world_body.double()
-    if not (R.isfinite().all() and t.isfinite().all() and trajectory.timestamps.isfinite().all()):
-        raise WearcapError("the object's path holds NaN or infinite values", where=path, expected="finite poses")
-    moved = t - R @ _double(center)
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(
-            file,
-            version=np.array(2),
-            type=np.array("sequential"),
-            translations=moved.numpy(),
-            quaternions=rotation.quat_wxyz_from_matrix(R).numpy(),
-            timestamps=trajectory.timestamps.numpy(),
-        )
-
-
-def read_object_npz(path: str | Path, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Trajectory:
-    """Read what `write_object_npz` or the published tracker wrote. Raises WearcapError for missing arrays, NaN, times that
-    do not rise, quaternions that are none."""
-    arrays = read_npz(path, ("translations", "quaternions", "timestamps"))
-    require(arrays, path, translations=("time", 3), quaternions=("time", 4), timestamps=("time",))
-    times, positions, quaternions = (
-        arrays[key].astype(np.float64) for key in ("timestamps", "translations", "quaternions")
-    )
-    if not len(times):
-        raise WearcapError("a path without poses", where=path, expected="at least one")
-    checked_trajectory(times, positions, quaternions, path)
-    return _about_center(times, positions, quaternions, _double(center).numpy())
-
-
-def _double(point: tuple[float, float, float]) -> Float[Tensor, "3"]:
-    return torch.tensor(point, dtype=torch.float64)

@@ -13,17 +13,14 @@ from torch import Tensor
 
 from wearcap.body.kinematics import local_rotations
 from wearcap.body.skeleton import FOOT_PATCHES, Skeleton, xsens23
-from wearcap.body.skeletons import smpl24
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate
-from wearcap.io.datasets.amass import PELVIS_SMPLH
 from wearcap.io.devices.aria_mps import T_HEAD_DEVICE, find_mps_file, head_stream, read_closed_loop, read_mps_points
 from wearcap.io.devices.aria_vrs import extract_video
 from wearcap.io.devices.head_alignment import align_head, clock_offset
 from wearcap.io.formats.npz import read_npz, require
-from wearcap.io.formats.smpl import rotations_from_smpl
 from wearcap.io.formats.text import read_json_object
 from wearcap.recording import ContactTrack, HeadStream, Motion, Recording
 
@@ -119,20 +116,6 @@ def _contacts(arrays: dict[str, np.ndarray], motion: Motion, path: str | Path) -
             f"foot_contacts has shape {contact.shape}", where=path, expected=f"({len(motion)}, {len(FOOT_PATCHES)})"
         )
     return ContactTrack(motion.timestamps, FOOT_PATCHES, torch.from_numpy(contact > 0.5))
-
-
-def read_smpl_neutral(path: str | Path) -> Motion:
-    """Read NymeriaPlus' `body/xdata_smpl_neutral.npz`: SMPL poses that are in the Aria world already.
-
-    The skeleton keeps its standard bone lengths. Raises WearcapError for missing or misshapen arrays or NaN.
-    """
-    arrays = read_npz(path, ("timestamps", "global_orient", "body_pose", "transl"))
-    require(arrays, path, timestamps=("time",), global_orient=("time", 3), body_pose=("time", 69), transl=("time", 3))
-    axis_angle = np.concatenate([arrays["global_orient"], arrays["body_pose"]], 1).reshape(-1, 24, 3)
-    R = rotations_from_smpl(torch.from_numpy(axis_angle.astype(np.float64)))
-    t_root = torch.from_numpy(arrays["transl"].astype(np.float64)) + torch.tensor(PELVIS_SMPLH, dtype=torch.float64)
-    timestamps = torch.from_numpy(arrays["timestamps"].astype(np.float64) * 1e-6)
-    return Motion(timestamps, smpl24(), R.float(), t_root.float(), provenance={"source": Path(path).name})
 
 
 def read_nymeria(

@@ -1,4 +1,4 @@
-"""Project Aria's VRS recordings: calibration, inertial sensors, images (needs the extra: `pip install "wearcap[aria]"`).
+"""Project Aria's VRS recordings: calibration and the head's video (needs the extra: `pip install "wearcap[aria]"`).
 
 Timestamps are the device's clock, the one that MPS trajectories carry. Frames as in io/devices/aria_mps.py.
 """
@@ -13,13 +13,12 @@ from PIL import Image
 from torch import Tensor
 
 from wearcap.errors import WearcapError
-from wearcap.files import atomic_path
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.devices.aria_mps import R_CPF_DEVICE, T_HEAD_DEVICE
 from wearcap.io.formats.bounded import file_size
 from wearcap.io.formats.video import write_frames
-from wearcap.recording import CameraStream, ImuStream
+from wearcap.recording import CameraStream
 
 try:
     from projectaria_tools.core import calibration as aria_calibration
@@ -27,8 +26,6 @@ try:
     from projectaria_tools.core.sensor_data import TimeDomain
 except ImportError:
     data_provider = None
-
-IMU_LABELS = ("imu-left", "imu-right")
 
 
 @dataclass(frozen=True)
@@ -57,58 +54,6 @@ def read_device(path: str | Path) -> AriaDevice:
     )
 
 
-def read_imus(path: str | Path, T_head_device: Rigid | None = None) -> dict[str, ImuStream]:
-    """Rectified accelerometer and gyroscope streams by label ("imu-left", "imu-right"), worn on the head joint.
-
-    `T_head_device` is the pose of the glasses on the head joint; by default the assumed one of io/devices/aria_mps.py. Samples that
-    the device marks invalid are left out. Raises WearcapError as `read_device` does.
-    """
-    provider, device = _open(path), read_device(path)
-    R_head_aria = (T_head_device or T_HEAD_DEVICE).R @ R_CPF_DEVICE.T @ device.T_aria_cpf.R.T
-    streams = {}
-    for label in IMU_LABELS:
-        stream = provider.get_stream_id_from_label(label)
-        if stream is None or not provider.get_num_data(stream):
-            continue
-        rectify = provider.get_device_calibration().get_imu_calib(label)
-        samples = [provider.get_imu_data_by_index(stream, i) for i in range(provider.get_num_data(stream))]
-        samples = [sample for sample in samples if sample.accel_valid and sample.gyro_valid]
-        acc = np.array([rectify.raw_to_rectified_accel(np.array(sample.accel_msec2)) for sample in samples])
-        gyro = np.array([rectify.raw_to_rectified_gyro(np.array(sample.gyro_radsec)) for sample in samples])
-        streams[label] = ImuStream(
-            torch.tensor([sample.capture_timestamp_ns * 1e-9 for sample in samples], dtype=torch.float64),
-            "head",
-            acc_imu=torch.tensor(acc, dtype=torch.float32).reshape(-1, 3),
-            gyro_imu=torch.tensor(gyro, dtype=torch.float32).reshape(-1, 3),
-            R_joint_imu=R_head_aria @ device.T_aria_sensor[label].R,
-        )
-    return streams
-
-
-def extract_images(
-    path: str | Path,
-    folder: str | Path,
-    *,
-    label: str = "camera-rgb",
-    size: int = 1024,
-    focal: float = 560.0,
-    T_head_device: Rigid | None = None,
-) -> CameraStream:
-    """Write a camera's images, undistorted to a pinhole of `size` × `size` px and `focal` px and turned upright, as JPEGs.
-
-    Files are named `<label>/<index>.jpg` under `folder`, and so in the stream. Raises WearcapError as `read_device`
-    does, and for a camera that the recording lacks.
-    """
-    view = _UprightView(path, label, size, focal)
-    (Path(folder) / label).mkdir(parents=True, exist_ok=True)
-    times, names = view.times(), []
-    for i in range(len(times)):
-        names.append(f"{label}/{i:06d}.jpg")
-        with atomic_path(Path(folder) / names[-1]) as temporary:
-            Image.fromarray(view.picture(i)).save(temporary, quality=92)
-    return replace(view.stream(times, T_head_device), image_files=tuple(names))
-
-
 def extract_video(
     path: str | Path,
     file: Path,
@@ -119,10 +64,11 @@ def extract_video(
     focal: float = 140.0,
     T_head_device: Rigid | None = None,
 ) -> CameraStream:
-    """As `extract_images`, but into one MP4, which the stream names by its folder's name and its own.
+    """Write a camera's pictures, undistorted to a pinhole of `size` × `size` px and `focal` px and turned upright, as an MP4.
 
-    `between` keeps the frames from one device time to another (s). Raises WearcapError as `extract_images` does, and
-    when fewer than two frames are left.
+    The stream names it by its folder's name and its own. `between` keeps the frames from one device time to another
+    (s). Raises WearcapError as `read_device` does, for a camera that the recording lacks, and when fewer than two
+    frames are left.
     """
     view = _UprightView(path, label, size, focal, finer=4)
     times = view.times()
@@ -179,18 +125,6 @@ class _UprightView:
         (fx, fy), (cx, cy) = upright.get_focal_lengths(), upright.get_principal_point()
         camera = Camera("pinhole", self.size, self.size, float(fx), float(fy), float(cx), float(cy))
         return CameraStream(times, camera, T_head_cam.R, T_head_cam.t)
-
-
-def timecode_offset_s(path: str | Path) -> float:
-    """Device clock minus time code (s) at the recording's start: what Nymeria's suit timestamps need added.
-
-    Raises WearcapError as `read_device` does, and for a recording without time code.
-    """
-    provider = _open(path)
-    device_ns = provider.get_first_time_ns_all_streams(TimeDomain.DEVICE_TIME)
-    if not provider.supports_time_domain(provider.get_all_streams()[0], TimeDomain.TIME_CODE):
-        raise WearcapError("carries no time code", where=path, expected="a recording made with one, as Nymeria's")
-    return (device_ns - provider.convert_from_device_time_to_timecode_ns(device_ns)) * 1e-9
 
 
 def _open(path: str | Path):

@@ -18,7 +18,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from wearcap.errors import WearcapError
-from wearcap.files import write_text
+from wearcap.io.formats.bounded import understood
 from wearcap.io.formats.text import read_json
 from wearcap.recording.interactions import HANDS, Interactions
 from wearcap.scene.objects import CONTACT_CLASSES
@@ -70,35 +70,27 @@ def read_contact_labels(path: str | Path, clock: LabelClock) -> Interactions:
     return interactions_of(parse_labels(read_json(path), clock, where=path))
 
 
-def write_contact_labels(path: str | Path, interactions: Interactions, clock: LabelClock) -> None:
-    """Write H-contact's JSON (hands and times alone) atomically. Raises WearcapError for overlapping labels."""
-    write_text(path, hcontact_text(labels_of(interactions, clock), clock))
-
-
 def hcontact_text(labels: Labels, clock: LabelClock) -> str:
     """H-contact's JSON: hands and times alone."""
-    return json.dumps({"contacts": hcontact_of(labels, clock)}, indent=1) + "\n"
-
-
-def hcontact_of(labels: Labels, clock: LabelClock) -> dict[str, list[list[float]]]:
-    """H-contact's `contacts`; a label that reaches the recording's end is written with end < start."""
-    return {
-        f"{hand}_hand": [
-            [label.start_s, label.stop_s if label.stop_s < clock.stop_s else min(-1.0, label.start_s - 1.0)]
-            for label in labels[hand]
-        ]
-        for hand in HANDS
-    }
+    return json.dumps({"contacts": annotation_of(labels, clock)["contacts"]}, indent=1) + "\n"
 
 
 def annotation_of(labels: Labels, clock: LabelClock) -> dict[str, Any]:
     """wearcap's own file: H-contact's content with objects, classes and the recording that the labels belong to."""
+    about = {"name": clock.name, "frames": clock.frames, "start_s": clock.start_s, "stop_s": clock.stop_s}
+    of_hands = {f"{hand}_hand": labels[hand] for hand in HANDS}
+
+    def span(label: Label) -> list[float]:
+        """A label that reaches the recording's end is written with end < start."""
+        whole = label.stop_s >= clock.stop_s
+        return [label.start_s, min(-1.0, label.start_s - 1.0) if whole else label.stop_s]
+
     return {
         "schema_version": SCHEMA,
-        "recording": {"name": clock.name, "frames": clock.frames, "start_s": clock.start_s, "stop_s": clock.stop_s},
-        "contacts": hcontact_of(labels, clock),
-        "objects": {f"{hand}_hand": [label.object for label in labels[hand]] for hand in HANDS},
-        "classes": {f"{hand}_hand": [label.contact_class for label in labels[hand]] for hand in HANDS},
+        "recording": about,
+        "contacts": {hand: [span(label) for label in found] for hand, found in of_hands.items()},
+        "objects": {hand: [label.object for label in found] for hand, found in of_hands.items()},
+        "classes": {hand: [label.contact_class for label in found] for hand, found in of_hands.items()},
     }
 
 
@@ -132,12 +124,10 @@ def parse_labels(content: Any, clock: LabelClock, *, where: str | Path) -> Label
 def _check_recording(content: dict, clock: LabelClock, where: str | Path) -> None:
     if content.get("schema_version") != SCHEMA:
         raise WearcapError(f"schema version {content.get('schema_version')}", where=where, expected=f"version {SCHEMA}")
-    about = content["recording"]
-    try:
+    with understood("does not name the recording of its labels", where):
+        about = content["recording"]
         name, frames, span = about["name"], about["frames"], (about["start_s"], about["stop_s"])
         same = all(abs(a - b) < 1e-3 for a, b in zip(span, (clock.start_s, clock.stop_s)))
-    except (KeyError, TypeError) as error:
-        raise WearcapError(f"does not name the recording of its labels ({error})", where=where) from error
     if name != clock.name or frames != clock.frames or not same:
         raise WearcapError(
             f"labels of recording {name!r} with {frames} frames from {span[0]:.3f} to {span[1]:.3f} s",
@@ -208,13 +198,13 @@ def interactions_of(labels: Labels) -> Interactions:
             if any(hands):
                 found.append((start, stop, hands, *item))
     found.sort(key=lambda row: row[0])
-    column = lambda index: [row[index] for row in found]  # noqa: E731
+    start, stop, hands, objects, classes = zip(*found) if found else ((),) * 5
     return Interactions(
-        torch.tensor(column(0), dtype=torch.float64),
-        torch.tensor(column(1), dtype=torch.float64),
-        torch.tensor(column(2), dtype=torch.bool).reshape(-1, len(HANDS)),
-        tuple(column(3)),
-        tuple(column(4)),
+        torch.tensor(start, dtype=torch.float64),
+        torch.tensor(stop, dtype=torch.float64),
+        torch.tensor(hands, dtype=torch.bool).reshape(-1, len(HANDS)),
+        tuple(objects),
+        tuple(classes),
     )
 
 
@@ -224,18 +214,11 @@ def labels_of(interactions: Interactions, clock: LabelClock) -> Labels:
     Raises WearcapError where a hand would hold two objects at once, or outside the recording.
     """
     labels: Labels = {}
-    rows = list(
-        zip(
-            interactions.start_s.tolist(),
-            interactions.stop_s.tolist(),
-            interactions.hands.tolist(),
-            interactions.objects,
-            interactions.classes,
-        )
-    )
+    times, hands_of = (interactions.start_s.tolist(), interactions.stop_s.tolist()), interactions.hands.tolist()
+    rows = sorted(zip(*times, hands_of, interactions.objects, interactions.classes), key=lambda row: row[0])
     for number, hand in enumerate(HANDS):
         joined: list[Label] = []
-        for start, stop, hands, item, kind in sorted(rows, key=lambda row: row[0]):
+        for start, stop, hands, item, kind in rows:
             if not hands[number]:
                 continue
             span = _span([start, stop], clock, f"{hand}_hand's interaction", clock.name)

@@ -14,6 +14,7 @@ from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
+from wearcap.io.formats.bounded import placed
 from wearcap.io.formats.ply import Ply, read_ply, write_ply
 from wearcap.io.formats.text import read_json
 from wearcap.scene.environment import Environment, hinge_gap_m
@@ -34,8 +35,6 @@ _FREEDOM_KEYS = {
 _OPTIONAL = ("limits_deg", "limits_m")
 _ORTHOGONAL_WITHIN = 1e-3
 _LARGEST = float(np.finfo(np.float32).max)
-_COLOR = np.array([0.7, 0.7, 0.7], np.float32)
-"""Colour of meshes without one."""
 
 
 def read_environment(path: str | Path) -> Environment:
@@ -58,10 +57,8 @@ def read_environment(path: str | Path) -> Environment:
         )
     _require_keys(content, ("schema_version", "objects"), path)
     objects = tuple(_object(row, number, path) for number, row in enumerate(content["objects"]))
-    try:
+    with placed(path):
         return Environment(objects)
-    except WearcapError as error:
-        raise WearcapError(error.what, where=path, expected=error.expected) from error
 
 
 def write_environment(environment: Environment, path: str | Path) -> None:
@@ -75,8 +72,7 @@ def write_environment(environment: Environment, path: str | Path) -> None:
     for item in environment.objects:
         where = f"{path}: object {item.name!r}"
         _check(item, where)
-        row = _row(item, f"objects/{_file_name(item.name, taken)}.ply", where)
-        rows.append(row)
+        rows.append(_row(item, f"objects/{_file_name(item.name, taken)}.ply", where))
     for item, row in zip(environment.objects, rows):
         write_ply(_ply(item.mesh), path.parent / row["mesh"])
     lines = ",\n  ".join(json.dumps(row, ensure_ascii=False, allow_nan=False) for row in rows)
@@ -98,16 +94,10 @@ def _object(row: Any, number: int, path: Path) -> SceneObject:
     _require_keys(row, _KEYS, where)
     if not isinstance(row["category"], str):
         raise WearcapError(f"category {row['category']!r}", where=where, expected="text")
-    R = _rotation(row["R_world_object"], where)
+    R = torch.from_numpy(_rotation(row["R_world_object"], where)).float()
     t = torch.from_numpy(_numbers(row["t_world_object"], (3,), "t_world_object", where)).float()
-    item = SceneObject(
-        row["name"],
-        row["category"],
-        _mesh(row["mesh"], path, where),
-        torch.from_numpy(R).float(),
-        t,
-        _freedom(row["freedom"], where),
-    )
+    mesh, freedom = _mesh(row["mesh"], path, where), _freedom(row["freedom"], where)
+    item = SceneObject(row["name"], row["category"], mesh, R, t, freedom)
     _check(item, where)
     return item
 
@@ -125,21 +115,13 @@ def _freedom(row: Any, where: str) -> Freedom:
         if limits[0] > limits[1]:
             raise WearcapError(f"{key} {limits.tolist()} are reversed", where=where, expected="[least, greatest]")
         limits = tuple((np.radians(limits) if key == "limits_deg" else limits).tolist())
-    try:
+    with placed(where):
         return Freedom(kind, pivot, axis, limits)
-    except WearcapError as error:
-        raise WearcapError(error.what, where=where, expected=error.expected) from error
 
 
 def _mesh(name: Any, path: Path, where: str) -> Mesh:
-    inside = (
-        isinstance(name, str)
-        and name
-        and "\0" not in name
-        and "\\" not in name
-        and len(name.encode(errors="replace")) < 256
-    )
-    if not inside or PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+    plain = isinstance(name, str) and name and not set(name) & {"\0", "\\"} and len(name.encode(errors="replace")) < 256
+    if not plain or PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
         raise WearcapError(
             f"mesh {name!r}",
             where=where,
@@ -154,12 +136,10 @@ def _mesh(name: Any, path: Path, where: str) -> Mesh:
             expected=str(file),
             fix="Copy the folder objects/ together with the environment.",
         )
-    ply = read_ply(file)
-    if not len(ply.points):
+    mesh = read_ply(file).mesh
+    if not len(mesh.vertices):
         raise WearcapError("an empty mesh", where=file, expected="at least one point")
-    color = _COLOR if ply.colors is None else ply.colors.astype(np.float32) / 255
-    faces = np.zeros((0, 3), np.int32) if ply.faces is None else ply.faces
-    return Mesh(ply.points, faces, color)
+    return mesh
 
 
 def _row(item: SceneObject, mesh: str, where: str) -> dict[str, Any]:
@@ -178,19 +158,12 @@ def _row(item: SceneObject, mesh: str, where: str) -> dict[str, Any]:
     if limits is not None:
         hinge = freedom.kind == "hinge"
         row["limits_deg" if hinge else "limits_m"] = [math.degrees(v) if hinge else v for v in limits]
-    return {
-        "name": item.name,
-        "category": item.category,
-        "mesh": mesh,
-        "R_world_object": [[_shortest(v) for v in line] for line in item.R_world_object.tolist()],
-        "t_world_object": [_shortest(v) for v in item.t_world_object.tolist()],
-        "freedom": row,
-    }
-
-
-def _shortest(value: float) -> float:
-    """A single-precision number with the fewest digits that identify it."""
-    return float(f"{value:.9g}")
+    # The fewest digits that identify a single-precision number.
+    *R, t = [
+        [float(f"{v:.9g}") for v in line] for line in (*item.R_world_object.tolist(), item.t_world_object.tolist())
+    ]
+    values = (item.name, item.category, mesh, R, t, row)
+    return dict(zip(_KEYS, values))
 
 
 def _file_name(name: str, taken: set[str]) -> str:

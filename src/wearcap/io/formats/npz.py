@@ -11,7 +11,6 @@ import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 from numpy.lib import format as npy
@@ -60,7 +59,7 @@ def readable(kind: str, where: str | Path, expected: str) -> Iterator[None]:
         yield
 
 
-def _read_array(file: IO[bytes], file_bytes: int, where: str, budget: Budget) -> np.ndarray:
+def _read_array(file: io.BufferedIOBase, file_bytes: int, where: str, budget: Budget) -> np.ndarray:
     """An archive's array, read chunk by chunk into its memory, so that nothing large is in memory twice."""
     head = io.BytesIO(file.read(_MAX_HEADER))
     shape, fortran, dtype = _header(head, where)

@@ -5,6 +5,7 @@ Errors name the line.
 
 import codecs
 import io
+import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -77,17 +78,17 @@ def finite_floats(tokens: Iterable[str]) -> np.ndarray:
     """All tokens as float64. Raises ValueError naming the first that is no finite number."""
     tokens = tokens if isinstance(tokens, list) else list(tokens)
     try:
-        values = np.fromiter(map(float, tokens), np.float64, len(tokens))
+        values = list(map(float, tokens))
     except ValueError:
-        values = np.full(1, np.nan)
-    if not np.isfinite(values).all():
+        values = [math.nan]
+    if not all(map(math.isfinite, values)):
         raise ValueError(f"{next(filter(_no_finite_number, tokens))[:30]!r} is no finite number")
-    return values
+    return np.array(values, np.float64)
 
 
 def _no_finite_number(token: str) -> bool:
     try:
-        return not np.isfinite(float(token))
+        return not math.isfinite(float(token))
     except ValueError:
         return True
 
