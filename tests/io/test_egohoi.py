@@ -78,8 +78,8 @@ def posed(path) -> np.ndarray:
 def test_one_object_slides(tmp_path):
     write_set(tmp_path)
     assert egohoi_names(tmp_path) == [ONE, SEVERAL]
-    read = read_egohoi(tmp_path, ONE)
-    recording, sofa = read.recording, read.environment.by_name(SOFA)
+    recording, environment = read_egohoi(tmp_path, ONE)
+    sofa = environment.by_name(SOFA)
     assert recording.motion is not None
     assert recording.interactions is not None
     assert moved(recording.motion, motion(hands=False)) < 1e-5
@@ -99,8 +99,8 @@ def test_one_object_slides(tmp_path):
 
 
 def test_several_objects_one_of_which_turns_about_its_hinge(tmp_path):
-    read = read_egohoi(write_set(tmp_path), SEVERAL)
-    recording, door = read.recording, read.environment.by_name(DOOR)
+    recording, environment = read_egohoi(write_set(tmp_path), SEVERAL)
+    door = environment.by_name(DOOR)
     assert recording.interactions is not None
     assert door.freedom.kind == "hinge"
     assert door.freedom.pivot == tuple(HINGE)
@@ -117,10 +117,10 @@ def test_several_objects_one_of_which_turns_about_its_hinge(tmp_path):
 def test_motion_types_are_given_by_patterns(tmp_path):
     write_set(tmp_path)
     types = {"*door": "absent", "*": "free"}
-    read = read_egohoi(tmp_path, SEVERAL, types)
-    assert [item.name for item in read.environment.objects] == [TABLE]
-    assert read.environment.by_name(TABLE).freedom.kind == "free"
-    assert set(read.recording.object_motion) == {TABLE}
+    recording, environment = read_egohoi(tmp_path, SEVERAL, types)
+    assert [item.name for item in environment.objects] == [TABLE]
+    assert environment.by_name(TABLE).freedom.kind == "free"
+    assert set(recording.object_motion) == {TABLE}
     with pytest.raises(WearcapError, match="motion type 'swing'.*along_floor"):
         read_egohoi(tmp_path, SEVERAL, {"*": "swing"})
     with pytest.raises(WearcapError, match=f"{TABLE} is to turn about a hinge and has none"):
@@ -131,18 +131,18 @@ def test_objects_stand_at_first_where_they_were_seen_last_before_the_start(tmp_p
     write_set(tmp_path)
     path = tmp_path / "object_locations" / f"{ONE}.json"
     write_json(locations(pose(-9.0), pose(-1.0, shift=(2, 0, 0)), pose(1.0, shift=(3, 0, 0))), path)
-    sofa = read_egohoi(tmp_path, ONE).environment.by_name(SOFA)
+    sofa = read_egohoi(tmp_path, ONE)[1].by_name(SOFA)
     np.testing.assert_allclose(sofa.t_world_object, CENTER + np.array([2, 0, 0]), atol=1e-5)
     write_json(locations(pose(1.0, shift=(3, 0, 0)), pose(1.5)), path)
-    sofa = read_egohoi(tmp_path, ONE).environment.by_name(SOFA)
+    sofa = read_egohoi(tmp_path, ONE)[1].by_name(SOFA)
     np.testing.assert_allclose(sofa.t_world_object, CENTER + np.array([3, 0, 0]), atol=1e-5)
 
 
 def test_names_of_objects(tmp_path):
     write_set(tmp_path)
     (tmp_path / "object_models" / f"{SOFA}.ply").rename(tmp_path / "object_models" / f"{SOFA}_left.ply")
-    assert read_egohoi(tmp_path, ONE).environment.objects[0].name == f"{SOFA}_left"
-    assert read_egohoi(tmp_path, ONE, object_name=TABLE).environment.objects[0].name == TABLE
+    assert read_egohoi(tmp_path, ONE)[1].objects[0].name == f"{SOFA}_left"
+    assert read_egohoi(tmp_path, ONE, object_name=TABLE)[1].objects[0].name == TABLE
     write_ply(Ply(CORNERS), tmp_path / "object_models" / f"{SOFA}_right.ply")
     with pytest.raises(WearcapError, match=f"2 models fit.*{SOFA}_left, {SOFA}_right"):
         read_egohoi(tmp_path, ONE)

@@ -126,10 +126,10 @@ def _read_mps(folder: Path) -> Loaded:
     """An MPS folder at 60 Hz, with findings about the raw file's clock, its quality score and the service's own report."""
     path = find_mps_file(folder, ("closed_loop_trajectory.csv",))
     assert path is not None, "is_mps_folder has seen it"
-    raw = read_closed_loop(path)
-    findings = check_clock("closed-loop file", raw.T_world_aria.timestamps)
-    quality = raw.quality.median().item()
-    low = (raw.quality < 0.5).float().mean().item()
+    track, scores = read_closed_loop(path)
+    findings = check_clock("closed-loop file", track.timestamps)
+    quality = scores.median().item()
+    low = (scores < 0.5).float().mean().item()
     findings.append(
         Finding(
             "warning" if low > 0.1 else "ok",
@@ -175,7 +175,7 @@ def _read_amc(path: Path) -> Motion:
 
 def _read_csv(path: Path) -> Recording | Trajectory:
     if "closed_loop" in path.name or "aria_trajectory" in path.name:
-        track = read_closed_loop(path, up="y" if "aria_trajectory" in path.name else "z").T_world_aria
+        track = read_closed_loop(path, up="y" if "aria_trajectory" in path.name else "z")[0]
         return Recording(name=path.name, head=head_stream(track, fps=None), source="Aria MPS")
     return read_euroc(path)
 

@@ -30,15 +30,12 @@ class EgoHoiSequence:
 
     def __call__(self) -> Recording:
         """Recording with the body at `fps` and the annotated object poses; the environment is written beside it."""
-        read = read_egohoi(self.root, self.name, self.motion_types, self.object_name)
-        assert read.recording.motion is not None
+        recording, environment = read_egohoi(self.root, self.name, self.motion_types, self.object_name)
+        assert recording.motion is not None
         file = Path("scenes") / self.name / FILE_NAME
-        write_environment(read.environment, self.output / file)
+        write_environment(environment, self.output / file)
         return replace(
-            read.recording,
-            motion=resampled(read.recording.motion, self.fps),
-            environment=file.as_posix(),
-            license=self.license,
+            recording, motion=resampled(recording.motion, self.fps), environment=file.as_posix(), license=self.license
         )
 
 

@@ -13,11 +13,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float64
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.hcontact import activity_of, location_of, read_smpl_json
 from wearcap.io.datasets.hps import read_hps_subject
@@ -25,7 +23,6 @@ from wearcap.io.datasets.hps_sequence import subject_of
 from wearcap.io.formats.contact_labels import LabelClock, interactions_of, labels_of, parse_labels
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import checked_trajectory
-from wearcap.io.formats.smpl import shape_from_betas
 from wearcap.io.formats.text import read_json
 from wearcap.recording.interactions import HANDS, Interactions
 from wearcap.recording.recording import Recording
@@ -35,11 +32,10 @@ from wearcap.scene.objects import Freedom, SceneObject
 MOTION_TYPES = ("hinge", "along_floor", "free", "absent")
 """Motion types of the published configurations, and "absent" for objects that were mapped but not present."""
 _CONTACTS = ("gt_contacts", "contacts")
-_COLOR = np.array([0.7, 0.7, 0.7], np.float32)
 
 
 @dataclass(frozen=True)
-class AnnotatedObject:
+class _AnnotatedObject:
     """An object's poses, annotated a few times in a sequence."""
 
     center: tuple[float, float, float]
@@ -50,14 +46,6 @@ class AnnotatedObject:
     """Sparse trajectory: one pose per annotation."""
 
 
-@dataclass(frozen=True)
-class EgoHoi:
-    """One sequence and its objects."""
-
-    recording: Recording
-    environment: Environment
-
-
 def egohoi_names(root: str | Path) -> list[str]:
     """Names of all sequences with a body, in order."""
     files = [path.name for path in Path(root).glob("smpl_motions/*.json*")]
@@ -66,7 +54,7 @@ def egohoi_names(root: str | Path) -> list[str]:
 
 def read_egohoi(
     root: str | Path, name: str, motion_types: Mapping[str, str] | None = None, object_name: str | None = None
-) -> EgoHoi:
+) -> tuple[Recording, Environment]:
     """Read a sequence: `motion` (HPS's estimate), `object_motion` (sparse ground truth), `interactions`, environment.
 
     `motion_types` maps patterns of object names to one of `MOTION_TYPES`, the first match decides; by default objects
@@ -91,7 +79,7 @@ def read_egohoi(
         kind = _motion_type(object_id, annotated, motion_types or {}, locations)
         if kind == "absent":
             continue
-        item = scene_object(object_id, annotated, root / "object_models" / f"{object_id}.ply", kind, clock.start_s)
+        item = _scene_object(object_id, annotated, root / "object_models" / f"{object_id}.ply", kind, clock.start_s)
         objects.append(item)
         paths[object_id] = annotated.trajectory
         if labels is not None:
@@ -100,7 +88,7 @@ def read_egohoi(
     if interactions is not None:
         labels_of(interactions, clock)  # raises for a hand that holds two objects at once
     shape = root / "smpl_shapes" / f"{subject_of(name)}.json"
-    betas = body.shape or (shape_from_betas(read_hps_subject(shape).betas) if shape.is_file() else {})
+    betas = body.shape or (read_hps_subject(shape)[0] if shape.is_file() else {})
     recording = Recording(
         name,
         motion=body.motion,
@@ -113,7 +101,7 @@ def read_egohoi(
         activity=activity_of(name),
         source="EgoHOI",
     )
-    return EgoHoi(recording, Environment(tuple(objects)))
+    return recording, Environment(tuple(objects))
 
 
 def _object_files(root: Path, name: str, object_name: str | None) -> dict[str, tuple[Path, Path | None]]:
@@ -127,10 +115,9 @@ def _object_files(root: Path, name: str, object_name: str | None) -> dict[str, t
         raise WearcapError(
             "no object locations of this sequence", where=single, expected=f"this file, or a folder {several}"
         )
-    places = {object_id: [root / folder / labels for folder in _CONTACTS] for object_id, (_, labels) in found.items()}
     return {
-        object_id: (path, next((place for place in places[object_id] if place.is_file()), None))
-        for object_id, (path, _) in found.items()
+        object_id: (path, next((place for folder in _CONTACTS if (place := root / folder / labels).is_file()), None))
+        for object_id, (path, labels) in found.items()
     }
 
 
@@ -149,7 +136,7 @@ def _only_object(root: Path, name: str) -> str:
     return fitting[0]
 
 
-def _motion_type(object_id: str, annotated: AnnotatedObject, motion_types: Mapping[str, str], where: Path) -> str:
+def _motion_type(object_id: str, annotated: _AnnotatedObject, motion_types: Mapping[str, str], where: Path) -> str:
     default = "along_floor" if annotated.hinge is None else "hinge"
     kind = next((kind for pattern, kind in motion_types.items() if fnmatchcase(object_id, pattern)), default)
     if kind not in MOTION_TYPES:
@@ -164,72 +151,44 @@ def _motion_type(object_id: str, annotated: AnnotatedObject, motion_types: Mappi
     return kind
 
 
-def read_object_locations(path: str | Path) -> AnnotatedObject:
+def read_object_locations(path: str | Path) -> _AnnotatedObject:
     """Read {center, hinge where it has one, locations: [{time, position, quaternion (wxyz)}]}.
 
     Raises WearcapError for missing keys, NaN, quaternions that are none, two poses at one time, or no pose at all.
     """
+    expected = '{"center": [x, y, z], "locations": [{"time", "position", "quaternion"}]}'
     content = read_json(path)
-    try:
+    with understood("no object locations", path, expected):
         rows = sorted(content["locations"], key=lambda row: row["time"])
         times, positions, quaternions = (
             np.array([row[key] for row in rows], np.float64) for key in ("time", "position", "quaternion")
         )
         center = np.array(content["center"], np.float64)
         hinge = np.array(content["hinge"], np.float64) if content.get("hinge") is not None else None
-    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
-        raise _not_locations(path, f"{type(error).__name__}: {error}") from error
-    points = [center] if hinge is None else [center, hinge]
-    if positions.shape != (len(rows), 3) or quaternions.shape != (len(rows), 4) or not rows:
-        raise _not_locations(path, f"{len(rows)} of shapes {positions.shape}, {quaternions.shape}")
-    if any(point.shape != (3,) or not (np.abs(point) < 1e6).all() for point in points):
-        raise _not_locations(path, "center or hinge is no point")
+        if positions.shape != (len(rows), 3) or quaternions.shape != (len(rows), 4) or not rows:
+            raise ValueError(f"{len(rows)} of shapes {positions.shape}, {quaternions.shape}")
+        if any(p.shape != (3,) or not (np.abs(p) < 1e6).all() for p in (center, hinge) if p is not None):
+            raise ValueError("center or hinge is no point")
     checked_trajectory(times, positions, quaternions, path)
-    trajectory = _about_center(times, positions, quaternions, center)
-    return AnnotatedObject(_triple(center), None if hinge is None else _triple(hinge), trajectory)
-
-
-def _not_locations(path: str | Path, detail: str) -> WearcapError:
-    return WearcapError(
-        f"no object locations ({detail})"[:300],
-        where=path,
-        expected='{"center": [x, y, z], "locations": [{"time", "position", "quaternion"}]}',
-    )
-
-
-def _triple(point: np.ndarray) -> tuple[float, float, float]:
-    x, y, z = point.tolist()
-    return x, y, z
-
-
-def _about_center(
-    times: Float64[np.ndarray, "time"],
-    positions: Float64[np.ndarray, "time 3"],
-    quat_wxyz: Float64[np.ndarray, "time 4"],
-    center: Float64[np.ndarray, "3"],
-) -> Trajectory:
-    """Trajectory of the centre c: a vertex v is at R·v + p = R·(v - c) + (p + R·c)."""
-    R = rotation.matrix_from_quat_wxyz(torch.from_numpy(quat_wxyz))
+    # The path of the centre c: a vertex v is at R·v + p = R·(v - c) + (p + R·c).
+    R = rotation.matrix_from_quat_wxyz(torch.from_numpy(quaternions))
     t = torch.from_numpy(positions) + R @ torch.from_numpy(center)
-    return Trajectory(torch.from_numpy(times), R.float(), t.float())
+    trajectory = Trajectory(torch.from_numpy(times), R.float(), t.float())
+    return _AnnotatedObject(tuple(center.tolist()), None if hinge is None else tuple(hinge.tolist()), trajectory)
 
 
-def scene_object(
-    name: str, annotated: AnnotatedObject, model: str | Path, motion_type: str, start_s: float
+def _scene_object(
+    name: str, annotated: _AnnotatedObject, model: str | Path, motion_type: str, start_s: float
 ) -> SceneObject:
     """SceneObject at its last annotated pose before `start_s`, else its first. Raises WearcapError without its model."""
     if not Path(model).is_file():
         raise WearcapError(f"no model of {name}", where=model, expected="object_models/OBJECT.ply")
-    ply = read_ply(model)
-    if not len(ply.points):
+    mesh = read_ply(model).mesh
+    if not len(mesh.vertices):
         raise WearcapError("an empty model", where=model, expected="at least one point")
-    vertices = (ply.points.astype(np.float64) - annotated.center).astype(np.float32)
-    color = _COLOR if ply.colors is None else ply.colors.astype(np.float32) / 255
-    mesh = Mesh(vertices, np.zeros((0, 3), np.int32) if ply.faces is None else ply.faces, color)
-    freedom = Freedom(
-        {"hinge": "hinge", "along_floor": "plane", "free": "free"}[motion_type],
-        annotated.hinge if motion_type == "hinge" else None,
-    )
+    mesh = replace(mesh, vertices=(mesh.vertices.astype(np.float64) - annotated.center).astype(np.float32))
+    kind = {"hinge": "hinge", "along_floor": "plane", "free": "free"}[motion_type]
+    freedom = Freedom(kind, annotated.hinge if motion_type == "hinge" else None)
     seen = max(int(torch.searchsorted(annotated.trajectory.timestamps, start_s, right=True)) - 1, 0)
     first = annotated.trajectory.T_world_body[seen]
     return SceneObject(name, name.rpartition("_")[2], mesh, first.R, first.t, freedom)

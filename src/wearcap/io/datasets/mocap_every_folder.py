@@ -21,6 +21,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.hps import nominal_mount
 from wearcap.io.devices.watch_log import WRISTS, read_watch_log
+from wearcap.io.formats.bounded import understood
 from wearcap.io.formats.npz import require
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import checked_trajectory
@@ -42,7 +43,7 @@ _SLAM_PIXELS = 384 * 512
 
 
 @dataclass(frozen=True)
-class BoardWalks:
+class _BoardWalks:
     """Paths of the camera over the calibration board: start and end (SLAM's units), and the measured lengths."""
 
     x_slam: Float[Tensor, "end 3"]
@@ -67,7 +68,7 @@ class MocapEveryFolder:
     points_slam: Float[Tensor, "point 3"] | None = None
     video: Path | None = None
     imu: dict[str, ImuStream] | None = None
-    board: BoardWalks | None = None
+    board: _BoardWalks | None = None
 
 
 def is_mocap_every_folder(folder: str | Path) -> bool:
@@ -89,7 +90,10 @@ def read_mocap_every_folder(folder: str | Path) -> MocapEveryFolder:
     """
     folder = Path(folder)
     config, marks = _config(folder / CONFIG), _marks(folder / MARKS)
-    track = _trajectory(folder / TRAJECTORY, _shutter(config, marks, folder))
+    noted = marks.get("shutter")
+    noted = config.get("cam_shutter_timestamp") if noted is None else noted
+    shutter_s = 0.0 if noted is None else _numbers([noted], 1, "the shutter's time", folder)[0]
+    track = _trajectory(folder / TRAJECTORY, shutter_s)
     video = folder / VIDEO if (folder / VIDEO).is_file() else None
     size = None if video is None else (video_info(video).width, video_info(video).height)
     points = read_ply(folder / POINTS).points if (folder / POINTS).is_file() else None
@@ -161,12 +165,11 @@ def _trajectory(path: Path, start_s: float) -> Trajectory:
 def _config(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
-    try:
+    damage = (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError)
+    with understood("not readable YAML", path, errors=damage):
         text = read_text(path, usual=_MAX_CONFIG_BYTES)
         _require_plain_yaml(text, path)
         content = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError) as error:
-        raise WearcapError(f"not readable YAML ({' '.join(str(error).split())})"[:300], where=path) from error
     if not isinstance(content, dict | None):
         raise WearcapError(f"it holds a {type(content).__name__}", where=path, expected="keys with values")
     return content or {}
@@ -198,13 +201,7 @@ def _marks(path: Path) -> dict[str, Any]:
     return content
 
 
-def _shutter(config: dict[str, Any], marks: dict[str, Any], folder: Path) -> float:
-    noted = marks.get("shutter")
-    noted = config.get("cam_shutter_timestamp") if noted is None else noted
-    return 0.0 if noted is None else _numbers([noted], 1, "the shutter's time", folder)[0]
-
-
-def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], folder: Path) -> BoardWalks | None:
+def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], folder: Path) -> _BoardWalks | None:
     measured = config.get("cam_scale_origin")
     if measured is None or not {"x", "y"} <= marks.keys():
         return None
@@ -226,7 +223,7 @@ def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], fol
                 expected=f"{track.timestamps[0].item():.3f} s to {track.timestamps[-1].item():.3f} s, as the camera's path",
             )
         ends.append(track.t_world_body[(track.timestamps[None] - times[:, None]).abs().argmin(1)])
-    return BoardWalks(ends[0], ends[1], (length[0], length[1]), height)
+    return _BoardWalks(ends[0], ends[1], (length[0], length[1]), height)
 
 
 def _numbers(values: Any, count: int, what: str, where: Path) -> list[float]:
@@ -240,10 +237,8 @@ def _numbers(values: Any, count: int, what: str, where: Path) -> list[float]:
 
 
 def _intrinsics(path: Path, counts: tuple[int, ...]) -> list[float]:
-    try:
+    with understood("not a list of numbers", path, "fx fy cx cy"):
         values = finite_floats(read_text(path).split()).tolist()
-    except ValueError as error:
-        raise WearcapError(f"not a list of numbers ({error})", where=path, expected="fx fy cx cy") from error
     if len(values) not in counts:
         raise WearcapError(
             f"{len(values)} numbers",

@@ -5,7 +5,6 @@ Frames: `aria` is MPS's own device frame (on Gen 1 glasses the left SLAM camera)
 (x forward, y left, z up), the frame of a `HeadStream`.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -51,21 +50,10 @@ def nominal_T_aria_cpf() -> Rigid:
     return T_cpf_aria.inverse().to(torch.float32)
 
 
-@dataclass(frozen=True)
-class MpsTrajectory:
-    """A closed-loop trajectory: poses of the `aria` frame in a world with z up."""
-
-    T_world_aria: Trajectory
-    vel_aria: Float[Tensor, "time 3"]
-    """Velocity in the device's axes (m/s)."""
-    angvel_aria: Float[Tensor, "time 3"]
-    """Angular velocity in the device's axes (rad/s)."""
-    quality: Float[Tensor, "time"]
-    """Quality score of MPS, 0 … 1."""
-
-
-def read_closed_loop(path: str | Path, *, up: str = "z") -> MpsTrajectory:
+def read_closed_loop(path: str | Path, *, up: str = "z") -> tuple[Trajectory, Float[Tensor, "time"]]:
     """Read `closed_loop_trajectory.csv` (plain, .gz, .xz), the world's axis `up` ("z"; ADT: "y") turned to z.
+
+    Gives the poses of the `aria` frame, and MPS' quality score of each, 0 … 1.
 
     Raises WearcapError for missing columns, NaN, unsorted times, quaternions far from unit norm, gravity that does
     not point against `up`, and several unconnected world frames.
@@ -91,12 +79,7 @@ def read_closed_loop(path: str | Path, *, up: str = "z") -> MpsTrajectory:
     _check_gravity(columns["gravity"], up, path)
     trajectory = checked_trajectory(table[time] * 1e-6, columns["pose"][:, :3], columns["pose"][:, 3:], path)
     T_turned = Rigid(turn_up(up), torch.zeros(3)) @ trajectory.T_world_body
-    return MpsTrajectory(
-        Trajectory(trajectory.timestamps, T_turned.R, T_turned.t),
-        torch.tensor(columns["velocity"], dtype=torch.float32),
-        torch.tensor(columns["spin"], dtype=torch.float32),
-        torch.tensor(table[quality], dtype=torch.float32),
-    )
+    return Trajectory(trajectory.timestamps, T_turned.R, T_turned.t), torch.tensor(table[quality], dtype=torch.float32)
 
 
 def turn_up(up: str) -> Float[Tensor, "3 3"]:
@@ -228,7 +211,7 @@ def read_mps(folder: str | Path, *, fps: float | None = 60.0, T_aria_cpf: Rigid 
             where=folder,
             expected="the output folder of Aria's MPS",
         )
-    head = head_stream(read_closed_loop(path).T_world_aria, fps=fps, T_aria_cpf=T_aria_cpf, where=path)
+    head = head_stream(read_closed_loop(path)[0], fps=fps, T_aria_cpf=T_aria_cpf, where=path)
     return Recording(name=Path(folder).resolve().name, head=head, points=read_mps_points(folder), source="Aria MPS")
 
 

@@ -29,7 +29,7 @@ except ImportError:
 
 
 @dataclass(frozen=True)
-class AriaDevice:
+class _AriaDevice:
     """Factory calibration stored in a recording."""
 
     T_aria_cpf: Rigid
@@ -40,14 +40,14 @@ class AriaDevice:
     """"DVT-S" or "DVT-L": the size of the glasses."""
 
 
-def read_device(path: str | Path) -> AriaDevice:
+def read_device(path: str | Path) -> _AriaDevice:
     """Calibration of a VRS recording. Raises WearcapError when the extra is missing or the file is no VRS."""
     device = _open(path).get_device_calibration()
     if device is None:
         raise WearcapError("holds no calibration", where=path, expected="a recording of Aria glasses")
     labels = [*device.get_camera_labels(), *device.get_imu_labels()]
     poses = {label: device.get_transform_device_sensor(label) for label in labels}
-    return AriaDevice(
+    return _AriaDevice(
         _rigid(device.get_transform_device_cpf()),
         {label: _rigid(pose) for label, pose in poses.items() if pose is not None},
         device.get_device_subtype(),

@@ -47,7 +47,7 @@ class _Bone:
 
 
 @dataclass(frozen=True)
-class AsfSkeleton:
+class _AsfSkeleton:
     """Content of an ASF file that reading an AMC file needs; per joint in the order of `skeleton.joint_names`."""
 
     skeleton: Skeleton
@@ -63,7 +63,7 @@ class AsfSkeleton:
     radians: bool
 
 
-def read_asf(path: str | Path, unit_m: float | int | None = None) -> AsfSkeleton:
+def read_asf(path: str | Path, unit_m: float | int | None = None) -> _AsfSkeleton:
     """Read an .asf file (plain, .gz or .xz).
 
     `unit_m` is the length of one unit in metres; by default an inch over the file's `length`. The skeleton is called
@@ -71,9 +71,9 @@ def read_asf(path: str | Path, unit_m: float | int | None = None) -> AsfSkeleton
     the ends of leaf bones are sites. Raises WearcapError naming file and line.
     """
     path = Path(path)
-    content = _parse_asf(path)
+    content = _AsfContent.read(path)
     unit_m = INCH_M / content.length if unit_m is None else unit_m
-    names, parents = _tree_order(path, content.bones, content.hierarchy)
+    names, parents = content.tree_order(path)
     table = [content.root, *(content.bones[name] for name in names[1:])]
     ends = torch.tensor([bone.direction for bone in table], dtype=torch.float64)
     lengths = torch.tensor([bone.length for bone in table], dtype=torch.float64)
@@ -91,7 +91,7 @@ def read_asf(path: str | Path, unit_m: float | int | None = None) -> AsfSkeleton
     to_rad = 1.0 if content.radians else math.pi / 180
     angles = to_rad * torch.tensor([bone.axis_deg for bone in table], dtype=torch.float64)
     order = tuple(bone.order for bone in table)
-    return AsfSkeleton(
+    return _AsfSkeleton(
         skeleton,
         tuple(bone.dof for bone in table),
         order,
@@ -102,7 +102,7 @@ def read_asf(path: str | Path, unit_m: float | int | None = None) -> AsfSkeleton
     )
 
 
-def read_amc(asf: AsfSkeleton, path: str | Path, fps: float | int = 120) -> Motion:
+def read_amc(asf: _AsfSkeleton, path: str | Path, fps: float | int = 120) -> Motion:
     """Read an .amc file (plain, .gz or .xz) of this skeleton; the format carries no frame rate, CMU's is 120.
 
     Timestamps start at 0 and follow the file's frame numbers, so that dropped frames show as gaps.
@@ -158,6 +158,52 @@ class _AsfContent:
         self.hierarchy: list[tuple[int, list[str]]] = []
         """Lines with their words: a parent, and those below it."""
         self.section, self.bone = "", None
+
+    @classmethod
+    def read(cls, path: Path) -> "_AsfContent":
+        content, number = cls(), 0
+        for number, text in numbered_lines(path):
+            words = text.split("#")[0].split()
+            try:
+                if words:
+                    content.take(number, words)
+            except (ValueError, IndexError) as error:
+                what = f"cannot read {text.strip()[:80]!r} ({error})"
+                raise WearcapError(what, where=at_line(path, number), expected="Acclaim ASF") from error
+        if content.bone is not None or not content.bones or not content.hierarchy:
+            raise WearcapError(
+                "bones or hierarchy are missing or cut short",
+                where=at_line(path, number),
+                expected="an ASF file with :bonedata and :hierarchy",
+                fix="Fetch the file again.",
+            )
+        return content
+
+    def tree_order(self, path: Path) -> tuple[list[str], list[int]]:
+        """Names with parents before children (depth first, as the file lists them), and each one's parent."""
+        children: dict[str, list[str]] = {}
+        seen = {"root"}
+        for line, (parent, *below) in self.hierarchy:
+            for name in below:
+                if name not in self.bones or name in seen:
+                    what, expected = (
+                        f"bone {name!r} is unknown or has two parents",
+                        "every bone of :bonedata once below a parent",
+                    )
+                    raise WearcapError(what, where=at_line(path, line), expected=expected)
+                seen.add(name)
+            children.setdefault(parent, []).extend(below)
+        names, parents = ["root"], [-1]
+        stack = [(name, 0) for name in reversed(children.get("root", []))]
+        while stack:
+            name, parent = stack.pop()
+            names.append(name)
+            parents.append(parent)
+            stack += [(child, len(names) - 1) for child in reversed(children.get(name, []))]
+        if missing := sorted(set(self.bones) - set(names)):
+            what = f"bones {missing[:5]} do not hang on the root"
+            raise WearcapError(what, where=path, expected="one tree below 'root' in :hierarchy")
+        return names, parents
 
     def take(self, number: int, words: list[str]) -> None:
         if words[0].startswith(":"):
@@ -215,26 +261,6 @@ class _AsfContent:
         self.bones[bone.name], self.bone = bone, None
 
 
-def _parse_asf(path: Path) -> _AsfContent:
-    content, number = _AsfContent(), 0
-    for number, text in numbered_lines(path):
-        words = text.split("#")[0].split()
-        try:
-            if words:
-                content.take(number, words)
-        except (ValueError, IndexError) as error:
-            what = f"cannot read {text.strip()[:80]!r} ({error})"
-            raise WearcapError(what, where=at_line(path, number), expected="Acclaim ASF") from error
-    if content.bone is not None or not content.bones or not content.hierarchy:
-        raise WearcapError(
-            "bones or hierarchy are missing or cut short",
-            where=at_line(path, number),
-            expected="an ASF file with :bonedata and :hierarchy",
-            fix="Fetch the file again.",
-        )
-    return content
-
-
 def _three(words: list[str]) -> list[float]:
     values = finite_floats(words)
     if len(values) != 3:
@@ -253,33 +279,6 @@ def _channels(words: list[str], known: tuple[str, ...]) -> tuple[str, ...]:
     if len(set(channels)) != len(channels) or not set(channels) <= set(known):
         raise ValueError(f"channels must be different ones of {' '.join(known)}")
     return channels
-
-
-def _tree_order(path: Path, bones: dict[str, _Bone], hierarchy: list[tuple[int, list[str]]]):
-    """Names with parents before children (depth first, as the file lists them), and each one's parent."""
-    children: dict[str, list[str]] = {}
-    seen = {"root"}
-    for line, (parent, *below) in hierarchy:
-        for name in below:
-            if name not in bones or name in seen:
-                what, expected = (
-                    f"bone {name!r} is unknown or has two parents",
-                    "every bone of :bonedata once below a parent",
-                )
-                raise WearcapError(what, where=at_line(path, line), expected=expected)
-            seen.add(name)
-        children.setdefault(parent, []).extend(below)
-    names, parents = ["root"], [-1]
-    stack = [(name, 0) for name in reversed(children.get("root", []))]
-    while stack:
-        name, parent = stack.pop()
-        names.append(name)
-        parents.append(parent)
-        stack += [(child, len(names) - 1) for child in reversed(children.get(name, []))]
-    if missing := sorted(set(bones) - set(names)):
-        what = f"bones {missing[:5]} do not hang on the root"
-        raise WearcapError(what, where=path, expected="one tree below 'root' in :hierarchy")
-    return names, parents
 
 
 _CMU_NODES = {"root", "lowerback", "upperback", "thorax", "lowerneck", "upperneck", "head"} | {
@@ -326,7 +325,7 @@ def _sites(names: list[str], ends: Tensor, leaves: dict[str, Tensor]) -> dict[st
 # --- AMC -----------------------------------------------------------------------------------------------------------
 
 
-def _parse_amc(path: Path, asf: AsfSkeleton) -> tuple[np.ndarray, list[int], Float64[Tensor, "time channel"]]:
+def _parse_amc(path: Path, asf: _AsfSkeleton) -> tuple[np.ndarray, list[int], Float64[Tensor, "time channel"]]:
     """Frame numbers, joints in the file's order, and all channel values; every frame must have the first one's layout."""
     lines = _amc_lines(path, asf)
     beginning = list(islice(lines, 1))
@@ -371,7 +370,7 @@ def _parse_amc(path: Path, asf: AsfSkeleton) -> tuple[np.ndarray, list[int], Flo
     return np.array(frames), joints, torch.from_numpy(np.array(values).reshape(len(frames), -1))
 
 
-def _amc_lines(path: Path, asf: AsfSkeleton) -> Iterator[tuple[int, list[str]]]:
+def _amc_lines(path: Path, asf: _AsfSkeleton) -> Iterator[tuple[int, list[str]]]:
     """Numbers and words of the lines from the first frame on."""
     begun = False
     for number, line in numbered_lines(path):
@@ -383,7 +382,7 @@ def _amc_lines(path: Path, asf: AsfSkeleton) -> Iterator[tuple[int, list[str]]]:
             yield number, words
 
 
-def _layout_joints(path: Path, asf: AsfSkeleton, start: int, first: list[tuple[int, list[str]]]) -> list[int]:
+def _layout_joints(path: Path, asf: _AsfSkeleton, start: int, first: list[tuple[int, list[str]]]) -> list[int]:
     """Joints of the first frame, which begins in line `start`, checked against the skeleton's channels."""
     names = [words[0] for _, words in first]
     for line, (name, *values) in first:

@@ -46,8 +46,10 @@ class Budget:
         """Count bytes before or after they are unpacked. Raises WearcapError beyond the limit."""
         self.spent += size
         if self.spent > self.max_bytes:
+            units = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))
+            unit, name = next((known for known in units if self.max_bytes >= known[0]), (1, "bytes"))
             raise WearcapError(
-                f"larger than {_size_text(self.max_bytes)} once unpacked",
+                f"larger than {self.max_bytes / unit:.4g} {name} once unpacked",
                 where=self.path,
                 expected="a smaller file",
                 fix=_lift(self.spent),
@@ -70,13 +72,6 @@ def gib_bytes(text: str, where: str) -> int:
     if not 0 < gib < 1e9:
         raise WearcapError(f"a limit of {text[:30]!r} GiB", where=where, expected="a number above 0, such as 16")
     return int(gib * (1 << 30))
-
-
-def _size_text(size: int) -> str:
-    for unit, name in ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB")):
-        if size >= unit:
-            return f"{size / unit:.4g} {name}"
-    return f"{size} bytes"
 
 
 def _lift(size: int) -> str:

@@ -83,6 +83,28 @@ class _Hierarchy:
         """Joints whose blocks are open."""
         self.words = self.split(lines)
 
+    @classmethod
+    def read(cls, path: Path, lines: Iterator[tuple[int, str]]) -> tuple[list[_Joint], int]:
+        """Joints with parents first, and the number of the MOTION line, up to which the lines are consumed."""
+        found, line = cls(lines), 1
+        try:
+            for word in found.words:
+                line = found.line
+                found.take(word)
+        except (ValueError, IndexError, StopIteration) as error:
+            what = f"the hierarchy is broken here ({str(error) or 'it ends too early'})"[:200]
+            raise WearcapError(what, where=at_line(path, line), expected="BVH") from error
+        if not found.joints or found.open or not found.motion_line:
+            raise WearcapError(
+                "no complete HIERARCHY followed by MOTION",
+                where=at_line(path, found.line),
+                expected="a whole BVH file",
+                fix="Fetch it again.",
+            )
+        if len({joint.name for joint in found.joints}) < len(found.joints):
+            raise WearcapError("two joints share a name", where=path, expected="unique joint names")
+        return found.joints, found.motion_line
+
     def split(self, lines: Iterator[tuple[int, str]]) -> Iterator[str]:
         """Words until the line MOTION."""
         for number, line in lines:
@@ -146,28 +168,6 @@ class _Hierarchy:
         self.joints[self.open[-1]].channels = [_CHANNELS[name] for name in names]
 
 
-def _parse_hierarchy(path: Path, lines: Iterator[tuple[int, str]]) -> tuple[list[_Joint], int]:
-    """Joints with parents first, and the number of the MOTION line, up to which the lines are consumed."""
-    found, line = _Hierarchy(lines), 1
-    try:
-        for word in found.words:
-            line = found.line
-            found.take(word)
-    except (ValueError, IndexError, StopIteration) as error:
-        what = f"the hierarchy is broken here ({str(error) or 'it ends too early'})"[:200]
-        raise WearcapError(what, where=at_line(path, line), expected="BVH") from error
-    if not found.joints or found.open or not found.motion_line:
-        raise WearcapError(
-            "no complete HIERARCHY followed by MOTION",
-            where=at_line(path, found.line),
-            expected="a whole BVH file",
-            fix="Fetch it again.",
-        )
-    if len({joint.name for joint in found.joints}) < len(found.joints):
-        raise WearcapError("two joints share a name", where=path, expected="unique joint names")
-    return found.joints, found.motion_line
-
-
 def _parse_motion(
     path: Path, lines: Iterator[tuple[int, str]], motion_line: int, channels: int
 ) -> tuple[float, np.ndarray]:
@@ -218,7 +218,7 @@ def read_bvh(
     path = Path(path)
     R_world_file = _axes(path, up, forward)
     lines = numbered_lines(path)
-    joints, motion_line = _parse_hierarchy(path, lines)
+    joints, motion_line = _Hierarchy.read(path, lines)
     step_s, values = _parse_motion(path, lines, motion_line, sum(len(joint.channels) for joint in joints))
     for joint in joints:
         joint.offset = list((offsets or {}).get(joint.name, joint.offset))

@@ -16,6 +16,7 @@ from wearcap.files import write_text
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.bounded import placed, understood
+from wearcap.io.formats.poses import are_rotations
 from wearcap.io.formats.text import read_json
 from wearcap.recording.photo import Photo
 
@@ -31,7 +32,7 @@ def camera_row(camera: Camera) -> dict[str, Any]:
     return {name: getattr(camera, name) for name in names} | {"distortion": list(camera.distortion)}
 
 
-def camera_from_row(row: Any, where: str | Path) -> Camera:
+def _camera_from_row(row: Any, where: str | Path) -> Camera:
     """Camera from the dict of `camera_row`. Raises WearcapError naming `where` when numbers are missing or invalid."""
     with understood("no intrinsics", where, EXAMPLE), placed(where):
         if not all(math.isfinite(float(value)) for value in (row["cx"], row["cy"], *row["distortion"])):
@@ -55,7 +56,7 @@ def read_camera(path: str | Path) -> Camera:
     """Read what `write_camera` wrote. Raises WearcapError when it is missing, no JSON, or holds no intrinsics."""
     content = read_json(path)
     row = content.get("camera", content) if isinstance(content, dict) else None
-    return camera_from_row(row, path)
+    return _camera_from_row(row, path)
 
 
 PHOTOS_FILE = "photos.json"
@@ -105,11 +106,11 @@ def _photo(row: Any, folder: Path, where: str) -> Photo:
     with understood("unreadable", where, _EXAMPLE):
         file, camera = Path(row["file"]), row["camera"]
         R, t = (np.array(row[key], np.float64) for key in ("R_world_cam", "t_world_cam"))
-    lens = camera_from_row(camera, where)
+    lens = _camera_from_row(camera, where)
     if file.is_absolute() or ".." in file.parts:
         raise WearcapError(f"file {str(file)!r} is outside the scene's folder", where=where)
     if R.shape != (3, 3) or t.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(t).all()):
         raise WearcapError(f"a pose of shapes {R.shape} and {t.shape}", where=where, expected="finite 3x3 and 3")
-    if np.abs(R @ R.T - np.eye(3)).max() > _NOT_ORTHONORMAL or np.linalg.det(R) < 0:
+    if not are_rotations(torch.from_numpy(R), _NOT_ORTHONORMAL):
         raise WearcapError("R_world_cam is no rotation", where=where, expected="an orthonormal 3x3 matrix")
     return Photo(folder / file, lens, Rigid(torch.from_numpy(R).float(), torch.from_numpy(t).float()))

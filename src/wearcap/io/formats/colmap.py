@@ -96,13 +96,12 @@ def read_colmap(folder: str | Path, images: str | Path | None = None) -> ColmapM
     places = (folder / "images", folder.parent / "images", folder.parent.parent / "images")
     images = Path(images) if images is not None else next((place for place in places if place.is_dir()), folder)
     binary = (folder / "images.bin").is_file()
-    suffix, readers = (".bin", _BINARY) if binary else (".txt", _TEXT)
-    read_cameras, read_images, read_points = readers
-    cameras = read_cameras(folder / f"cameras{suffix}")
-    found = sorted(read_images(folder / f"images{suffix}"), key=lambda image: image.name)
+    reader, suffix = (_Binary, ".bin") if binary else (_Text, ".txt")
+    cameras = reader.cameras(folder / f"cameras{suffix}")
+    found = sorted(reader.images(folder / f"images{suffix}"), key=lambda image: image.name)
     points, file = _Points(), folder / f"points3D{suffix}"
     if file.is_file():
-        points = read_points(file)
+        points = reader.points(file)
         if not np.isfinite(points.xyz).all():
             raise WearcapError("a point is NaN or infinite", where=file, expected="finite coordinates")
     return ColmapModel([_photo(image, cameras, images) for image in found], _tracks(found, points))
@@ -182,60 +181,64 @@ def _damaged(where: str | Path, error: Exception, expected: str) -> WearcapError
     return WearcapError(f"cannot be understood ({error})", where=where, expected=expected)
 
 
-def _read_cameras_txt(path: Path) -> dict[int, Camera]:
-    cameras = {}
-    for where, words in _lines(path):
-        if words:
+class _Text:
+    """A model as text."""
+
+    @staticmethod
+    def cameras(path: Path) -> dict[int, Camera]:
+        cameras = {}
+        for where, words in _lines(path):
+            if words:
+                try:
+                    number, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
+                    values = [float(word) for word in words[4:]]
+                except (ValueError, IndexError) as error:
+                    raise _damaged(where, error, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS…") from error
+                cameras[number] = _camera(model, width, height, values, where)
+        return cameras
+
+    @staticmethod
+    def images(path: Path) -> list[_Image]:
+        images = []
+        lines = _lines(path)
+        for where, words in lines:
+            if not words:
+                continue
             try:
-                number, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
-                values = [float(word) for word in words[4:]]
+                _, *pose, camera, name = [*words[:9], " ".join(words[9:])]
+                pose = [float(word) for word in pose]
+                if not name:
+                    raise ValueError("no name")
+                place, second = next(lines, (where, None))
+                if second is None:
+                    fix = "The file was cut short: copy it again."
+                    raise WearcapError(
+                        f"it ends after image {name!r}", where=where, expected="a line of its points", fix=fix
+                    )
+                if len(second) % 3:
+                    what = f"{len(second)} numbers for the points of image {name!r}"
+                    raise WearcapError(what, where=place, expected="X Y POINT3D_ID for each point")
+                table = finite_floats(second).reshape(-1, 3)
+                points = table[:, :2], table[:, 2].astype(np.int64)
+                images.append(_Image(name, int(camera), tuple(pose[:4]), tuple(pose[4:]), *points, where))
             except (ValueError, IndexError) as error:
-                raise _damaged(where, error, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS…") from error
-            cameras[number] = _camera(model, width, height, values, where)
-    return cameras
+                raise _damaged(where, error, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its points") from error
+        return images
 
-
-def _read_images_txt(path: Path) -> list[_Image]:
-    images = []
-    lines = _lines(path)
-    for where, words in lines:
-        if not words:
-            continue
-        try:
-            _, *pose, camera, name = [*words[:9], " ".join(words[9:])]
-            pose = [float(word) for word in pose]
-            if not name:
-                raise ValueError("no name")
-            place, second = next(lines, (where, None))
-            if second is None:
-                fix = "The file was cut short: copy it again."
-                raise WearcapError(
-                    f"it ends after image {name!r}", where=where, expected="a line of its points", fix=fix
-                )
-            if len(second) % 3:
-                what = f"{len(second)} numbers for the points of image {name!r}"
-                raise WearcapError(what, where=place, expected="X Y POINT3D_ID for each point")
-            table = finite_floats(second).reshape(-1, 3)
-            points = table[:, :2], table[:, 2].astype(np.int64)
-            images.append(_Image(name, int(camera), tuple(pose[:4]), tuple(pose[4:]), *points, where))
-        except (ValueError, IndexError) as error:
-            raise _damaged(where, error, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its points") from error
-    return images
-
-
-def _read_points_txt(path: Path) -> _Points:
-    points = _Points()
-    for where, words in _lines(path):
-        if words:
-            try:
-                if len(words) < 7:
-                    raise ValueError("too few numbers")
-                points.number.append(int(words[0]))
-                points.xyz.extend(map(float, words[1:4]))
-                points.rgb += bytes(map(int, words[4:7]))  # raises beyond 0…255
-            except (ValueError, IndexError, OverflowError) as error:
-                raise _damaged(where, error, "POINT3D_ID X Y Z R G B ERROR TRACK…") from error
-    return points
+    @staticmethod
+    def points(path: Path) -> _Points:
+        points = _Points()
+        for where, words in _lines(path):
+            if words:
+                try:
+                    if len(words) < 7:
+                        raise ValueError("too few numbers")
+                    points.number.append(int(words[0]))
+                    points.xyz.extend(map(float, words[1:4]))
+                    points.rgb += bytes(map(int, words[4:7]))  # raises beyond 0…255
+                except (ValueError, IndexError, OverflowError) as error:
+                    raise _damaged(where, error, "POINT3D_ID X Y Z R G B ERROR TRACK…") from error
+        return points
 
 
 # Binary (little-endian, without padding)
@@ -278,45 +281,45 @@ class _Cursor:
         )
 
 
-def _read_cameras_bin(path: Path) -> dict[int, Camera]:
-    cursor, cameras = _Cursor(path), {}
-    (count,) = cursor.take("Q", "its count")
-    for row in range(count):
-        where = f"camera {row + 1} of {count}"
-        number, model, width, height = cursor.take("iiQQ", where)
-        name = _BY_NUMBER[model] if 0 <= model < len(_BY_NUMBER) else f"number {model}"
-        parameters = cursor.take(f"{_MODELS[name][1]}d", where) if name in _MODELS else ()
-        cameras[number] = _camera(name, width, height, list(parameters), str(path))
-    return cameras
+class _Binary:
+    """A model in binary files."""
 
+    @staticmethod
+    def cameras(path: Path) -> dict[int, Camera]:
+        cursor, cameras = _Cursor(path), {}
+        (count,) = cursor.take("Q", "its count")
+        for row in range(count):
+            where = f"camera {row + 1} of {count}"
+            number, model, width, height = cursor.take("iiQQ", where)
+            name = _BY_NUMBER[model] if 0 <= model < len(_BY_NUMBER) else f"number {model}"
+            parameters = cursor.take(f"{_MODELS[name][1]}d", where) if name in _MODELS else ()
+            cameras[number] = _camera(name, width, height, list(parameters), str(path))
+        return cameras
 
-def _read_images_bin(path: Path) -> list[_Image]:
-    cursor, images = _Cursor(path), []
-    observation = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
-    (count,) = cursor.take("Q", "its count")
-    for row in range(count):
-        where = f"image {row + 1} of {count}"
-        _, *pose, camera = cursor.take("I7dI", where)
-        name = cursor.text(where)
-        (length,) = cursor.take("Q", where)
-        table = cursor.rows(length, observation, where)
-        points = table["xy"].astype(np.float64), table["point"].astype(np.int64)
-        images.append(_Image(name, camera, tuple(pose[:4]), tuple(pose[4:]), *points, str(path)))
-    return images
+    @staticmethod
+    def images(path: Path) -> list[_Image]:
+        cursor, images = _Cursor(path), []
+        observation = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+        (count,) = cursor.take("Q", "its count")
+        for row in range(count):
+            where = f"image {row + 1} of {count}"
+            _, *pose, camera = cursor.take("I7dI", where)
+            name = cursor.text(where)
+            (length,) = cursor.take("Q", where)
+            table = cursor.rows(length, observation, where)
+            points = table["xy"].astype(np.float64), table["point"].astype(np.int64)
+            images.append(_Image(name, camera, tuple(pose[:4]), tuple(pose[4:]), *points, str(path)))
+        return images
 
-
-def _read_points_bin(path: Path) -> _Points:
-    cursor, points = _Cursor(path), _Points()
-    (count,) = cursor.take("Q", "its count")
-    for row in range(count):
-        where = f"point {row + 1} of {count}"
-        number, x, y, z, red, green, blue, _, length = cursor.take("q3d3BdQ", where)
-        cursor.rows(length, np.dtype("<i4, <i4"), where)
-        points.number.append(number)
-        points.xyz.extend((x, y, z))
-        points.rgb += bytes((red, green, blue))
-    return points
-
-
-_TEXT = (_read_cameras_txt, _read_images_txt, _read_points_txt)
-_BINARY = (_read_cameras_bin, _read_images_bin, _read_points_bin)
+    @staticmethod
+    def points(path: Path) -> _Points:
+        cursor, points = _Cursor(path), _Points()
+        (count,) = cursor.take("Q", "its count")
+        for row in range(count):
+            where = f"point {row + 1} of {count}"
+            number, x, y, z, red, green, blue, _, length = cursor.take("q3d3BdQ", where)
+            cursor.rows(length, np.dtype("<i4, <i4"), where)
+            points.number.append(number)
+            points.xyz.extend((x, y, z))
+            points.rgb += bytes((red, green, blue))
+        return points

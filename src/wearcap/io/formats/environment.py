@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float64
+from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
@@ -16,6 +17,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.io.formats.bounded import placed
 from wearcap.io.formats.ply import Ply, read_ply, write_ply
+from wearcap.io.formats.poses import are_rotations
 from wearcap.io.formats.text import read_json
 from wearcap.scene.environment import Environment, hinge_gap_m
 from wearcap.scene.objects import FREEDOMS, Freedom, SceneObject
@@ -74,7 +76,7 @@ def write_environment(environment: Environment, path: str | Path) -> None:
         _check(item, where)
         rows.append(_row(item, f"objects/{_file_name(item.name, taken)}.ply", where))
     for item, row in zip(environment.objects, rows):
-        write_ply(_ply(item.mesh), path.parent / row["mesh"])
+        write_ply(Ply.of(item.mesh), path.parent / row["mesh"])
     lines = ",\n  ".join(json.dumps(row, ensure_ascii=False, allow_nan=False) for row in rows)
     write_text(path, f'{{"schema_version": {SCHEMA}, "objects": [\n  {lines}\n]}}\n')
 
@@ -94,7 +96,7 @@ def _object(row: Any, number: int, path: Path) -> SceneObject:
     _require_keys(row, _KEYS, where)
     if not isinstance(row["category"], str):
         raise WearcapError(f"category {row['category']!r}", where=where, expected="text")
-    R = torch.from_numpy(_rotation(row["R_world_object"], where)).float()
+    R = _rotation(row["R_world_object"], where).float()
     t = torch.from_numpy(_numbers(row["t_world_object"], (3,), "t_world_object", where)).float()
     mesh, freedom = _mesh(row["mesh"], path, where), _freedom(row["freedom"], where)
     item = SceneObject(row["name"], row["category"], mesh, R, t, freedom)
@@ -178,16 +180,6 @@ def _file_name(name: str, taken: set[str]) -> str:
     return free
 
 
-def _ply(mesh: Mesh) -> Ply:
-    """The mesh with a colour per vertex: faces with their own colour get their own vertices."""
-    vertices, faces, color = mesh.vertices, mesh.faces, mesh.color
-    if color.ndim == 2 and len(color) != len(vertices):
-        vertices, color = vertices[faces.ravel()], np.repeat(color, 3, axis=0)
-        faces = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
-    colors = np.broadcast_to(np.clip(np.rint(color * 255), 0, 255).astype(np.uint8), vertices.shape)
-    return Ply(np.ascontiguousarray(vertices), np.ascontiguousarray(colors), faces if len(faces) else None)
-
-
 def _check(item: SceneObject, where: str) -> None:
     """Raise WearcapError for properties that no object can have."""
     pose = [*item.R_world_object.flatten().tolist(), *item.t_world_object.tolist()]
@@ -207,16 +199,16 @@ def _check(item: SceneObject, where: str) -> None:
         )
 
 
-def _rotation(value: Any, where: str) -> Float64[np.ndarray, "3 3"]:
+def _rotation(value: Any, where: str) -> Float64[Tensor, "3 3"]:
     """The rotation nearest to a matrix that is a rotation up to rounding."""
-    R = _numbers(value, (3, 3), "R_world_object", where)
-    if np.abs(R.T @ R - np.eye(3)).max() > _ORTHOGONAL_WITHIN or np.linalg.det(R) < 0:
+    R = torch.from_numpy(_numbers(value, (3, 3), "R_world_object", where))
+    if not are_rotations(R, _ORTHOGONAL_WITHIN):
         raise WearcapError(
             "R_world_object is no rotation",
             where=where,
             expected=f"an orthogonal matrix (within {_ORTHOGONAL_WITHIN}) of determinant +1",
         )
-    return rotation.mean_rotation(torch.from_numpy(R)[None]).numpy()
+    return rotation.mean_rotation(R[None])
 
 
 def _numbers(value: Any, shape: tuple[int, ...], key: str, where: str) -> Float64[np.ndarray, "..."]:

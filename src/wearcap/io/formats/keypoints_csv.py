@@ -37,23 +37,14 @@ def read_keypoints(path: str | Path) -> dict[str, Cue]:
     ):
         if wrong.any():
             raise WearcapError(what, where=f"{path}, row {int(wrong.argmax()) + 1} after the header", expected=expected)
-    return {
-        str(joint): _cue(
-            path, str(joint), *(part[observed & (joints == joint)] for part in (times, points, confidence))
-        )
-        for joint in np.unique(joints[observed])
-    }
-
-
-def _cue(path: str | Path, joint: str, times: np.ndarray, points: np.ndarray, confidence: np.ndarray) -> Cue:
-    order = np.argsort(times, kind="stable")
-    times = times[order]
-    if (np.diff(times) == 0).any():
-        twice = times[:-1][np.diff(times) == 0][0]
-        raise WearcapError(f"{joint!r} is twice at {twice:.6f} s", where=path, expected="one row per joint and time")
-    return Cue(
-        torch.from_numpy(times),
-        joint,
-        torch.from_numpy(points[order]).float(),
-        torch.from_numpy(confidence[order]).float(),
-    )
+    cues = {}
+    for joint in map(str, np.unique(joints[observed])):
+        rows = np.flatnonzero(observed & (joints == joint))
+        rows = rows[np.argsort(times[rows], kind="stable")]
+        twice = rows[1:][np.diff(times[rows]) == 0]
+        if len(twice):
+            what = f"{joint!r} is twice at {times[twice[0]]:.6f} s"
+            raise WearcapError(what, where=path, expected="one row per joint and time")
+        place, sure = (torch.from_numpy(part[rows]).float() for part in (points, confidence))
+        cues[joint] = Cue(torch.from_numpy(times[rows]), joint, place, sure)
+    return cues

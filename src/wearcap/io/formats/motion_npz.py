@@ -1,12 +1,9 @@
-"""wearcap's motion file: one .npz that holds a Motion exactly, readable with NumPy alone.
+"""wearcap's motion file: one .npz that holds a Motion exactly, readable with NumPy alone; frames on an even time grid.
 
 Arrays by the Motion's field names (`timestamps`, `R_parent_joint`, `skeleton.t_parent_joint`, …), `wearcap` (JSON with
 everything that is no array), and for tools that know AMASS' keys `trans`, `poses` (axis-angle of each joint in its
 parent, in this skeleton's joints and axes), `mocap_framerate` and `joint_names`.
 """
-
-# MERGED DOCS
-# """Frames of a motion on an even time grid, for formats with a fixed frame rate."""
 
 from pathlib import Path
 
@@ -81,37 +78,26 @@ def _check(motion: Motion, path: str | Path) -> None:
     if not isinstance(motion, Motion):
         raise WearcapError("holds no motion", where=path)
     skeleton = motion.skeleton
-    arrays = {
-        "timestamps": motion.timestamps,
-        "R_parent_joint": motion.R_parent_joint,
-        "t_world_root": motion.t_world_root,
-        "t_parent_joint": skeleton.t_parent_joint,
+    parts: dict[str, tuple[Tensor | None, tuple[int | str, ...]]] = {
+        "timestamps": (motion.timestamps, ("time",)),
+        "R_parent_joint": (motion.R_parent_joint, ("time", len(skeleton), 3, 3)),
+        "t_world_root": (motion.t_world_root, ("time", 3)),
+        "t_parent_joint": (skeleton.t_parent_joint, (len(skeleton), 3)),
+        "contact_prob": (motion.contact_prob, ("time", "patch")),
+        "hand_contact_prob": (motion.hand_contact_prob, ("time", len(HANDS))),
+        "body_contact_prob": (motion.body_contact_prob, ("time", "point")),
     }
-    shapes: dict[str, tuple[int | str, ...]] = {
-        "timestamps": ("time",),
-        "R_parent_joint": ("time", len(skeleton), 3, 3),
-        "t_world_root": ("time", 3),
-        "t_parent_joint": (len(skeleton), 3),
-    }
-    if motion.contact_prob is not None:
-        arrays["contact_prob"], shapes["contact_prob"] = motion.contact_prob, ("time", "patch")
-    if motion.hand_contact_prob is not None:
-        arrays["hand_contact_prob"], shapes["hand_contact_prob"] = (motion.hand_contact_prob, ("time", len(HANDS)))
-    if motion.body_contact_prob is not None:
-        arrays["body_contact_prob"] = motion.body_contact_prob
-        shapes["body_contact_prob"] = ("time", "point")
     if motion.interactions is not None:
         _check_interactions(motion.interactions, path)
     for name, track in (motion.object_motion or {}).items():
         if not isinstance(track, Trajectory):
             raise TypeError(f"object {name!r} has no trajectory")
         clock = f"time of {name}"
-        arrays |= {
-            f"{name} timestamps": track.timestamps,
-            f"{name} R": track.R_world_body,
-            f"{name} t": track.t_world_body,
-        }
-        shapes |= {f"{name} timestamps": (clock,), f"{name} R": (clock, 3, 3), f"{name} t": (clock, 3)}
+        parts[f"{name} timestamps"] = (track.timestamps, (clock,))
+        parts[f"{name} R"] = (track.R_world_body, (clock, 3, 3))
+        parts[f"{name} t"] = (track.t_world_body, (clock, 3))
+    arrays = {key: tensor for key, (tensor, _) in parts.items() if tensor is not None}
+    shapes = {key: parts[key][1] for key in arrays}
     require({key: tensor.numpy() for key, tensor in arrays.items()}, path, **shapes)
     if motion.timestamps.dtype != torch.float64 or not all(a.is_floating_point() for a in arrays.values()):
         raise TypeError("arrays of another number type")
@@ -131,9 +117,8 @@ def _check_interactions(interactions: Interactions, path: str | Path) -> None:
         "stop_s": interactions.stop_s.numpy(),
         "hands": interactions.hands.numpy().astype(np.uint8),
     }
-    count = require(arrays, path, start_s=("interval",), stop_s=("interval",), hands=("interval", len(HANDS)))[
-        "interval"
-    ]
+    sizes = require(arrays, path, start_s=("interval",), stop_s=("interval",), hands=("interval", len(HANDS)))
+    count = sizes["interval"]
     if {interactions.start_s.dtype, interactions.stop_s.dtype} != {torch.float64}:
         raise TypeError("times of interactions of another number type")
     for names in (interactions.objects, interactions.classes):

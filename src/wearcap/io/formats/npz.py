@@ -62,7 +62,17 @@ def readable(kind: str, where: str | Path, expected: str) -> Iterator[None]:
 def _read_array(file: io.BufferedIOBase, file_bytes: int, where: str, budget: Budget) -> np.ndarray:
     """An archive's array, read chunk by chunk into its memory, so that nothing large is in memory twice."""
     head = io.BytesIO(file.read(_MAX_HEADER))
-    shape, fortran, dtype = _header(head, where)
+    version = npy.read_magic(head)
+    if version not in _HEADERS:
+        raise ValueError(f"array format {version}")
+    shape, fortran, dtype = _HEADERS[version](head)
+    if dtype.hasobject:
+        fix = "Such arrays can run code when they are loaded and are never read."
+        raise WearcapError("it holds Python objects", where=where, expected="plain numbers or text", fix=fix)
+    if dtype.kind not in "biufcSU":
+        raise WearcapError(f"an array of {dtype}"[:100], where=where, expected="plain numbers or text")
+    if any(length < 0 for length in shape):
+        raise ValueError(f"an array of shape {shape}")
     size = math.prod(shape) * dtype.itemsize
     if size != file_bytes - head.tell():
         raise ValueError(f"an array of shape {shape} in {file_bytes} bytes")
@@ -78,37 +88,6 @@ def _read_array(file: io.BufferedIOBase, file_bytes: int, where: str, budget: Bu
     if dtype.kind == "U" and size and (array.view(np.dtype("u4").newbyteorder(dtype.byteorder)) > sys.maxunicode).any():
         raise ValueError("text with characters that are none")
     return array.reshape(shape, order="F").copy(order="C") if fortran else array.reshape(shape)
-
-
-def _header(head: io.BytesIO, where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, order and type of an array, from the beginning of its file."""
-    version = npy.read_magic(head)
-    if version not in _HEADERS:
-        raise ValueError(f"array format {version}")
-    shape, fortran, dtype = _HEADERS[version](head)
-    if dtype.hasobject:
-        raise WearcapError(
-            "it holds Python objects",
-            where=where,
-            expected="plain numbers or text",
-            fix="Such arrays can run code when they are loaded and are never read.",
-        )
-    if dtype.kind not in "biufcSU":
-        raise WearcapError(f"an array of {dtype}"[:100], where=where, expected="plain numbers or text")
-    if any(length < 0 for length in shape):
-        raise ValueError(f"an array of shape {shape}")
-    return shape, fortran, dtype
-
-
-def _fill(view: memoryview, head: io.BytesIO, rest: io.BufferedIOBase) -> None:
-    """Fill an array's memory chunk by chunk, so that nothing large is in memory twice."""
-    place = 0
-    while place < len(view):
-        content = head.read(_CHUNK) or rest.read(min(_CHUNK, len(view) - place))
-        if not content:
-            raise ValueError("its data ends too early")
-        view[place : place + len(content)] = content
-        place += len(content)
 
 
 def require(arrays: dict[str, np.ndarray], path: str | Path, **shapes: tuple[int | str, ...]) -> dict[str, int]:

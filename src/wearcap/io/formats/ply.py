@@ -53,6 +53,16 @@ class Ply:
         color = GREY if self.colors is None else self.colors.astype(np.float32) / 255
         return Mesh(self.points, np.zeros((0, 3), np.int32) if self.faces is None else self.faces, color)
 
+    @classmethod
+    def of(cls, mesh: Mesh) -> "Ply":
+        """The mesh with a colour per vertex: faces with their own colour get their own vertices."""
+        vertices, faces, color = mesh.vertices, mesh.faces, mesh.color
+        if color.ndim == 2 and len(color) != len(vertices):
+            vertices, color = vertices[faces.ravel()], np.repeat(color, 3, axis=0)
+            faces = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
+        colors = np.broadcast_to(np.clip(np.rint(color * 255), 0, 255).astype(np.uint8), vertices.shape)
+        return cls(np.ascontiguousarray(vertices), np.ascontiguousarray(colors), faces if len(faces) else None)
+
 
 @dataclass(frozen=True)
 class _Property:

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
@@ -68,6 +70,12 @@ def check_rising(timestamps: np.ndarray, where: str | Path) -> None:
             expected="timestamps that rise",
             fix="Sort the rows by time and drop repeated ones.",
         )
+
+
+def are_rotations(R: Float[Tensor, "*batch 3 3"], within: float) -> Bool[Tensor, "*batch"]:
+    """Mask of matrices that are orthogonal, `within` an element of Rᵀ R, and no reflections."""
+    apart = (R.mT @ R - torch.eye(3, dtype=R.dtype)).abs().amax((-1, -2))
+    return (apart <= within) & (torch.linalg.det(R) > 0)
 
 
 def read_tum(path: str | Path) -> Trajectory:

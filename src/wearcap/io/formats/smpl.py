@@ -25,12 +25,6 @@ A = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torc
 """Rotation of SMPL's axes into wearcap's."""
 
 
-def rotations_from_smpl(rotvec: Float64[Tensor, "time joint 3"]) -> Float64[Tensor, "time joint 3 3"]:
-    """R_parent_joint from SMPL's rotation vectors (rad), the root first."""
-    R = rotation.exp(rotvec)
-    return torch.cat([R[:, :1] @ A.T, A @ R[:, 1:] @ A.T], 1)
-
-
 def smpl_motion(
     timestamps: Float64[Tensor, "time"],
     skeleton: Skeleton,
@@ -42,7 +36,8 @@ def smpl_motion(
 
     Empty texts are left out of the provenance.
     """
-    R = rotations_from_smpl(torch.from_numpy(rotvec.astype(np.float64)).unflatten(1, (-1, 3)))
+    R = rotation.exp(torch.from_numpy(rotvec.astype(np.float64)).unflatten(1, (-1, 3)))
+    R = torch.cat([R[:, :1] @ A.T, A @ R[:, 1:] @ A.T], 1)
     t = torch.from_numpy(t_world_pelvis.astype(np.float64))
     return Motion(
         timestamps, skeleton, R.float(), t.float(), provenance={key: text for key, text in provenance.items() if text}

@@ -29,13 +29,8 @@ MAX_LINE = 1 << 24
 """Longest line (characters): COLMAP lists all points of a picture in one line."""
 
 
-def _as_latin1(error: UnicodeError) -> tuple[str, int]:
-    """Error handler of decoding that reads bytes that are no UTF-8 as Latin-1."""
-    assert isinstance(error, UnicodeDecodeError)
-    return error.object[error.start : error.end].decode("latin-1"), error.end
-
-
-codecs.register_error("wearcap.latin1", _as_latin1)
+# Bytes that are no UTF-8 are read as Latin-1.
+codecs.register_error("wearcap.latin1", lambda e: (e.object[e.start : e.end].decode("latin-1"), e.end))  # pyright: ignore
 
 
 def read_text(path: str | Path, max_bytes: int | None = None, usual: int = MAX_BYTES) -> str:

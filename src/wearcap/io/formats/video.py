@@ -114,7 +114,7 @@ def _open_video(path: str | Path) -> Iterator[tuple[InputContainer, VideoStream]
 
 
 @dataclass(frozen=True)
-class VideoInfo:
+class _VideoInfo:
     """Content of a video's header."""
 
     width: int
@@ -124,7 +124,7 @@ class VideoInfo:
     """Number of frames; 0 if neither it nor the duration is stated."""
 
 
-def video_info(path: str | Path) -> VideoInfo:
+def video_info(path: str | Path) -> _VideoInfo:
     """Size, average rate and length of a video. Raises WearcapError as `read_frames` does."""
     with _open_video(path) as (container, stream):
         fps = float(stream.average_rate or 30)
@@ -138,7 +138,7 @@ def video_info(path: str | Path) -> VideoInfo:
                 expected="no more frames than bytes",
                 fix="The file was damaged: copy it again.",
             )
-        return VideoInfo(stream.width, stream.height, fps, frames)
+        return _VideoInfo(stream.width, stream.height, fps, frames)
 
 
 def video_encoder(crf: int) -> tuple[str, dict[str, str]]:

@@ -25,7 +25,10 @@ def read_obj(path: str | Path) -> Mesh:
         words = line.split()
         try:
             if words[:1] == ["v"]:
-                vertices.extend(_vertex(words))
+                values = [float(word) for word in words[1:4]]
+                if len(values) < 3 or not all(abs(value) < _LARGEST for value in values):
+                    raise ValueError(f"{' '.join(words[1:4])!r} are no three finite numbers")
+                vertices.extend(values)
             elif words[:1] == ["f"]:
                 faces.extend(_fan(words, len(vertices) // 3))
         except ValueError as error:
@@ -47,13 +50,6 @@ def read_obj(path: str | Path) -> Mesh:
             fix="The file was cut short: copy it again.",
         )
     return Mesh(points, corners, GREY)
-
-
-def _vertex(words: list[str]) -> list[float]:
-    values = [float(word) for word in words[1:4]]
-    if len(values) < 3 or not all(abs(value) < _LARGEST for value in values):
-        raise ValueError(f"{' '.join(words[1:4])!r} are no three finite numbers")
-    return values
 
 
 def _fan(words: list[str], known: int) -> list[int]:
