@@ -23,8 +23,8 @@ from wearcap.io.datasets.amass import write_amass
 from wearcap.io.formats.bvh import write_bvh
 from wearcap.io.formats.gltf import write_glb
 from wearcap.io.formats.motion_npz import write_motion
-from wearcap.io.formats.smpl import read_smpl
 from wearcap.io.formats.scene_folder import cloud_file, read_scan
+from wearcap.io.formats.smpl import read_smpl
 from wearcap.recording import Motion, Recording
 from wearcap.recording.locate import dataset_folder, load_recording
 from wearcap.runtime.system import CaptureInput, StageOptions, System

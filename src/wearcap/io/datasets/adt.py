@@ -91,11 +91,9 @@ def read_moving_objects(folder: str | Path) -> dict[str, Trajectory]:
         if about is None or uid not in boxes:
             continue
         if not isinstance(about, dict):
-            raise WearcapError(
-                f"object {name} is a {type(about).__name__}",
-                where=folder / "instances.json",
-                expected="its instance_name, category and motion_type",
-            )
+            what = f"object {name} is a {type(about).__name__}"
+            expected = "its instance_name, category and motion_type"
+            raise WearcapError(what, where=folder / "instances.json", expected=expected)
         with understood("a time is no number", path, "nanoseconds, or -1"):
             times = poses["timestamp[ns]"][rows].astype(np.float64) * 1e-9
         timeless = bool((times < 0).any())

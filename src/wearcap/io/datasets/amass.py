@@ -38,12 +38,9 @@ def read_amass(path: str | Path, t_template_pelvis: tuple[float, float, float] |
     path = Path(path)
     arrays = read_npz(path, _KEYS)
     if "poses" not in arrays and "pose_body" not in arrays:
-        raise WearcapError(
-            "holds no poses",
-            where=path,
-            expected="a motion file of AMASS (poses, trans, mocap_framerate)",
-            fix="shape.npz files beside the motions hold none: leave them out.",
-        )
+        what = "holds no poses"
+        fix = "shape.npz files beside the motions hold none: leave them out."
+        raise WearcapError(what, where=path, expected="a motion file of AMASS (poses, trans, mocap_framerate)", fix=fix)
     fps = _rate(arrays, path)
     model = _text(arrays.get("surface_model_type")).lower()
     stageii = "pose_body" in arrays or "mocap_frame_rate" in arrays or model.startswith("smplx")
@@ -84,12 +81,9 @@ def write_amass(
     """
     target = smplh52()
     if set(motion.skeleton.joint_names[:22]) != set(target.joint_names[:22]):
-        raise WearcapError(
-            f"a motion of skeleton {motion.skeleton.name!r}",
-            where=path,
-            expected="one of SMPL's skeletons",
-            fix='Retarget it to "smplh52" first (body.retarget).',
-        )
+        what = f"a motion of skeleton {motion.skeleton.name!r}"
+        expected = "one of SMPL's skeletons"
+        raise WearcapError(what, where=path, expected=expected, fix='Retarget it to "smplh52" first (body.retarget).')
     if not (motion.R_parent_joint.isfinite().all() and motion.t_world_root.isfinite().all()):
         raise WearcapError("the motion holds NaN or infinite values", where=path, expected="finite poses")
     frames, fps = even_frames(motion)

@@ -52,12 +52,9 @@ def behave_folder(root: str | Path) -> Path:
     """The folder of sequences. Raises WearcapError where there is none with fits at 30 frames per second."""
     found = [Path(root) / name for name in _FOLDERS if _names(Path(root) / name)]
     if not found:
-        raise WearcapError(
-            "no sequences",
-            where=root,
-            expected=f"sequences/NAME/{BODY_FILE} and {OBJECT_FILE}",
-            fix="Give BEHAVE's folder as source=DIR, with the parameters of all frames (30 fps) in it.",
-        )
+        what = "no sequences"
+        fix = "Give BEHAVE's folder as source=DIR, with the parameters of all frames (30 fps) in it."
+        raise WearcapError(what, where=root, expected=f"sequences/NAME/{BODY_FILE} and {OBJECT_FILE}", fix=fix)
     return found[0]
 
 
@@ -80,11 +77,8 @@ def read_behave(root: str | Path, name: str) -> OneObject:
         raise WearcapError(f"no sequence {name!r}", where=root, expected=f"sequences/{name}/{BODY_FILE}")
     folder, parts = behave_folder(root) / name, name.split("_")
     if len(parts) < 3:
-        raise WearcapError(
-            "not named as BEHAVE's are",
-            where=folder,
-            expected="a folder DATE_SUBJECT_OBJECT, such as Date01_Sub01_boxlarge_hand",
-        )
+        expected = "a folder DATE_SUBJECT_OBJECT, such as Date01_Sub01_boxlarge_hand"
+        raise WearcapError("not named as BEHAVE's are", where=folder, expected=expected)
     body = read_npz(folder / BODY_FILE, ("poses", "trans", "betas", "frame_times"))
     fitted = read_npz(folder / OBJECT_FILE, ("angles", "trans", "frame_times"))
     frames = require(body, folder / BODY_FILE, poses=("time", 156), trans=("time", 3))["time"]
@@ -120,12 +114,8 @@ def read_behave_mesh(root: str | Path, object_name: str) -> Mesh:
         )
     path = Path(root) / "objects" / object_name / _REGISTERED.get(object_name, f"{object_name}_f1000.ply")
     if not path.is_file():
-        raise WearcapError(
-            f"no mesh of {object_name}",
-            where=path,
-            expected="objects/OBJECT/OBJECT_f1000.ply",
-            fix="Unpack BEHAVE's objects.zip beside the sequences.",
-        )
+        fix = "Unpack BEHAVE's objects.zip beside the sequences."
+        raise WearcapError(f"no mesh of {object_name}", where=path, expected="objects/OBJECT/OBJECT_f1000.ply", fix=fix)
     mesh = read_ply(path).mesh
     if len(mesh.vertices):
         mesh, _ = centered(mesh)
@@ -140,23 +130,17 @@ def _common_times(
     if not frames:
         raise WearcapError("no frames", where=folder / BODY_FILE, expected="poses of at least one frame")
     if len(fitted["angles"]) != frames:
-        raise WearcapError(
-            f"the object has {len(fitted['angles'])} frames, the body {frames}",
-            where=folder,
-            expected=f"as many in {OBJECT_FILE} as in {BODY_FILE}",
-            fix="Fetch both files again.",
-        )
+        what = f"the object has {len(fitted['angles'])} frames, the body {frames}"
+        expected = f"as many in {OBJECT_FILE} as in {BODY_FILE}"
+        raise WearcapError(what, where=folder, expected=expected, fix="Fetch both files again.")
     times = _times(fitted, folder / OBJECT_FILE, frames)
     if "frame_times" in body:
         other = _times(body, folder / BODY_FILE, frames)
         apart = np.flatnonzero(other != times)
         if len(apart):
-            raise WearcapError(
-                f"the body's frame {apart[0]} is of {other[apart[0]]:.3f} s, the object's of {times[apart[0]]:.3f} s",
-                where=folder,
-                expected="the same frame_times in both files",
-                fix="Fetch both files again.",
-            )
+            what = f"the body's frame {apart[0]} is of {other[apart[0]]:.3f} s, the object's of {times[apart[0]]:.3f} s"
+            expected = "the same frame_times in both files"
+            raise WearcapError(what, where=folder, expected=expected, fix="Fetch both files again.")
     return torch.from_numpy(times)
 
 
@@ -164,11 +148,8 @@ def _times(arrays: dict[str, np.ndarray], path: Path, frames: int) -> Float64[np
     """Times (s) from `frame_times` ("t0003.033"), snapped to whole frames. Raises WearcapError for rates other than 30."""
     stamps = arrays.get("frame_times")
     if stamps is None or stamps.shape != (frames,) or stamps.dtype.kind not in "US":
-        raise WearcapError(
-            f"frame_times is {'missing' if stamps is None else f'{stamps.dtype} {stamps.shape}'}",
-            where=path,
-            expected=f'{frames} texts such as "t0003.033" (s)',
-        )
+        what = f"frame_times is {'missing' if stamps is None else f'{stamps.dtype} {stamps.shape}'}"
+        raise WearcapError(what, where=path, expected=f'{frames} texts such as "t0003.033" (s)')
     texts = [text.decode("latin-1") if isinstance(text, bytes) else str(text) for text in stamps]
     with understood("frame_times cannot be read", path, 'texts such as "t0003.033" (s)'):
         seconds = np.array([float(text.removeprefix("t")) for text in texts])
@@ -178,12 +159,8 @@ def _times(arrays: dict[str, np.ndarray], path: Path, frames: int) -> Float64[np
     step = float(np.median(np.diff(grid))) if frames > 1 else 1.0
     if np.abs(seconds * FPS - grid).max() > _OFF_GRID or step != 1.0:
         rate = 1 / max(float(np.median(np.abs(np.diff(seconds)))), 1e-6) if frames > 1 else 0.0
-        raise WearcapError(
-            f"frames come at {rate:.4g} per second",
-            where=path,
-            expected=f"{FPS} per second",
-            fix="Use the release of all frames (30 fps), not the one of one frame per second.",
-        )
+        fix = "Use the release of all frames (30 fps), not the one of one frame per second."
+        raise WearcapError(f"frames come at {rate:.4g} per second", where=path, expected=f"{FPS} per second", fix=fix)
     check_rising(grid / FPS, path)
     return grid / FPS
 

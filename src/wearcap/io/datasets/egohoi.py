@@ -64,15 +64,12 @@ def read_egohoi(
     """
     root = Path(root)
     if name not in egohoi_names(root):
-        raise WearcapError(
-            f"no sequence {name!r}",
-            where=root,
-            expected=f"smpl_motions/{name}.json.zip or .json",
-            fix=f"There are {len(egohoi_names(root))}, such as {egohoi_names(root)[:3]}.",
-        )
+        what = f"no sequence {name!r}"
+        fix = f"There are {len(egohoi_names(root))}, such as {egohoi_names(root)[:3]}."
+        raise WearcapError(what, where=root, expected=f"smpl_motions/{name}.json.zip or .json", fix=fix)
     packed = root / "smpl_motions" / f"{name}.json.zip"
-    body = read_smpl_json(packed if packed.is_file() else packed.with_suffix(""))
-    clock = LabelClock.of(name, body.motion.timestamps)
+    motion, betas = read_smpl_json(packed if packed.is_file() else packed.with_suffix(""))
+    clock = LabelClock.of(name, motion.timestamps)
     objects, paths, contacts = [], {}, []
     for object_id, (locations, labels) in _object_files(root, name, object_name).items():
         annotated = read_object_locations(locations)
@@ -88,13 +85,13 @@ def read_egohoi(
     if interactions is not None:
         labels_of(interactions, clock)  # raises for a hand that holds two objects at once
     shape = root / "smpl_shapes" / f"{subject_of(name)}.json"
-    betas = body.shape or (read_hps_subject(shape)[0] if shape.is_file() else {})
+    betas = betas or (read_hps_subject(shape)[0] if shape.is_file() else {})
     recording = Recording(
         name,
-        motion=body.motion,
+        motion=motion,
         object_motion=paths,
         interactions=interactions,
-        skeleton=body.motion.skeleton,
+        skeleton=motion.skeleton,
         shape=betas,
         subject=subject_of(name),
         location=location_of(name),
@@ -127,12 +124,9 @@ def _only_object(root: Path, name: str) -> str:
     models = sorted(path.stem for path in root.glob("object_models/*.ply"))
     fitting = [stem] if stem in models else [model for model in models if model.startswith(stem)]
     if len(fitting) != 1:
-        raise WearcapError(
-            f"{len(fitting)} models fit the sequence {name!r}",
-            where=root / "object_models",
-            expected=f"{stem}.ply",
-            fix=f"Give its object's name: one of {', '.join(fitting or models)}.",
-        )
+        what = f"{len(fitting)} models fit the sequence {name!r}"
+        fix = f"Give its object's name: one of {', '.join(fitting or models)}."
+        raise WearcapError(what, where=root / "object_models", expected=f"{stem}.ply", fix=fix)
     return fitting[0]
 
 
@@ -142,12 +136,8 @@ def _motion_type(object_id: str, annotated: _AnnotatedObject, motion_types: Mapp
     if kind not in MOTION_TYPES:
         raise WearcapError(f"motion type {kind!r} of {object_id}", expected=f"one of {', '.join(MOTION_TYPES)}")
     if kind == "hinge" and annotated.hinge is None:
-        raise WearcapError(
-            f"{object_id} is to turn about a hinge and has none",
-            where=where,
-            expected='"hinge": [x, y, z]',
-            fix="Give it another motion type.",
-        )
+        what = f"{object_id} is to turn about a hinge and has none"
+        raise WearcapError(what, where=where, expected='"hinge": [x, y, z]', fix="Give it another motion type.")
     return kind
 
 
@@ -212,12 +202,9 @@ def read_egohoi_contacts(path: str | Path, clock: LabelClock, object_name: str, 
             )
         start, end = row.get("start"), row.get("end")
         if isinstance(start, int | float) and isinstance(end, int | float) and end < start:
-            raise WearcapError(
-                f"interaction {number} ends before it starts: {start} to {end} s",
-                where=path,
-                expected="start < end",
-                fix="Exchange the two, if that is what was meant.",
-            )
+            what = f"interaction {number} ends before it starts: {start} to {end} s"
+            expected = "start < end"
+            raise WearcapError(what, where=path, expected=expected, fix="Exchange the two, if that is what was meant.")
         for part in row["parts"]:
             if part not in parts:
                 raise WearcapError(f"interaction {number} is with {part!r}", where=path, expected=" or ".join(parts))

@@ -37,19 +37,11 @@ _EXPECTED = (
 )
 
 
-@dataclass(frozen=True)
-class _SmplSequence:
-    """A body's motion (smpl24, or smplh52 where the file has hands) on the file's clock, and its shape."""
-
-    motion: Motion
-    shape: dict[str, float]
-    """SMPL's coefficients by name: beta_0 …"""
-    placed: bool
-    """Whether the file has the body's position; else the root stays at the origin."""
-
-
-def read_smpl_json(path: str | Path) -> _SmplSequence:
+def read_smpl_json(path: str | Path) -> tuple[Motion, dict[str, float]]:
     """Read `NAME.json.zip` {sequence, global}, or an older `NAME.json`: [{time, pose (72), translation, shape}].
+
+    Gives the body's motion (smpl24, or smplh52 where the file has hands) on the file's clock, and its shape. Where the
+    file has no position, the root stays at the origin.
 
     Raises WearcapError for what is damaged, missing or misshapen, for NaN, and for times that do not rise.
     """
@@ -77,7 +69,7 @@ def read_smpl_json(path: str | Path) -> _SmplSequence:
         betas = np.array(about.get("betas") or [], np.float64).reshape(-1)
     if not np.isfinite(betas).all() or len(betas) > 300:
         raise WearcapError(f"{len(betas)} betas, or some that are not finite", where=path, expected="10 numbers")
-    return _SmplSequence(motion, shape_from_betas(betas), "transl" in arrays)
+    return motion, shape_from_betas(betas)
 
 
 def _unzipped(path: Path) -> Any:
@@ -138,21 +130,17 @@ def read_hcontact(root: str | Path, name: str, contact_class: str = "") -> Recor
         raise WearcapError(f"no contact class {contact_class!r}", expected=f"one of {', '.join(CONTACT_CLASSES)}")
     root = Path(root)
     if name not in hcontact_names(root):
-        raise WearcapError(
-            f"no sequence {name!r}",
-            where=root,
-            expected=f"body/{name}{ENDING}",
-            fix=f"There are {len(hcontact_names(root))}, such as {hcontact_names(root)[:3]}.",
-        )
-    body = read_smpl_json(root / "body" / f"{name}{ENDING}")
-    clock = LabelClock.of(name, body.motion.timestamps)
+        fix = f"There are {len(hcontact_names(root))}, such as {hcontact_names(root)[:3]}."
+        raise WearcapError(f"no sequence {name!r}", where=root, expected=f"body/{name}{ENDING}", fix=fix)
+    motion, shape = read_smpl_json(root / "body" / f"{name}{ENDING}")
+    clock = LabelClock.of(name, motion.timestamps)
     contacts = read_contact_labels(root / "contacts" / f"{name}.json", clock)
     return Recording(
         name,
-        motion=body.motion,
+        motion=motion,
         interactions=replace(contacts, classes=tuple(named or contact_class for named in contacts.classes)),
-        skeleton=body.motion.skeleton,
-        shape=body.shape,
+        skeleton=motion.skeleton,
+        shape=shape,
         subject=subject_of(name),
         location=location_of(name),
         activity=activity_of(name),
@@ -182,9 +170,6 @@ def read_hcontact_split(path: str | Path) -> _HContactSplit:
     sound = type(radius) is int and radius > 0
     sound = sound and all(type(k) is int and 0 <= k < 1 << 40 for windows in frames for k in windows)
     if not sound:
-        raise WearcapError(
-            "not a split of windows",
-            where=path,
-            expected='{"window_radius": 30, "train": [frame, …], "valid": […], "test": […]}',
-        )
+        expected = '{"window_radius": 30, "train": [frame, …], "valid": […], "test": […]}'
+        raise WearcapError("not a split of windows", where=path, expected=expected)
     return _HContactSplit(radius, *map(tuple, lists))

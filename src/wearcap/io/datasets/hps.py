@@ -128,11 +128,8 @@ def _read_hps_pose(row: Any, where: str) -> tuple[np.ndarray, np.ndarray]:
         quat_wxyz = np.asarray(row["quaternion"], np.float64).reshape(4)
         position = np.asarray(row["position"], np.float64).reshape(3)
     if not (np.abs(position) < 1e6).all() or not abs(np.linalg.norm(quat_wxyz) - 1) < NORM_TOLERANCE:
-        raise WearcapError(
-            f"position {position.tolist()}, quaternion {quat_wxyz.tolist()}",
-            where=where,
-            expected="metres, and a quaternion of length 1",
-        )
+        what = f"position {position.tolist()}, quaternion {quat_wxyz.tolist()}"
+        raise WearcapError(what, where=where, expected="metres, and a quaternion of length 1")
     return quat_wxyz, position
 
 
@@ -265,11 +262,8 @@ def read_unity_motion(
         angles_deg = np.delete(angles_deg, [3, 4, 5], 1)
     trans = _table(trans_path, (3,))
     if abs(len(angles_deg) - len(trans)) > 1:
-        raise WearcapError(
-            f"{len(trans)} positions for {len(angles_deg)} poses",
-            where=trans_path,
-            expected=f"as many lines as in {Path(pose_path).name}",
-        )
+        what = f"{len(trans)} positions for {len(angles_deg)} poses"
+        raise WearcapError(what, where=trans_path, expected=f"as many lines as in {Path(pose_path).name}")
     count = min(len(angles_deg), len(trans))
     R_smpl = rotations_from_unity(torch.from_numpy(angles_deg[:count]).unflatten(1, (-1, 3)))
     skeleton = smpl24()

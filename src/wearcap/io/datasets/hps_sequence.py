@@ -99,12 +99,8 @@ def read_hps_sequence(root: str | Path, name: str, camera_hz: float | int = FPS)
     suit = _suit(root, name)
     starts = _one(root, f"*init*/{name}.json")
     if starts is None and (localization_path is not None or suit is not None):
-        raise WearcapError(
-            f"no starts of sequence {name!r}",
-            where=root,
-            expected=f"hps_inits/{name}.json",
-            fix="Without them its streams' clocks are unknown.",
-        )
+        fix = "Without them its streams' clocks are unknown."
+        raise WearcapError(f"no starts of sequence {name!r}", where=root, expected=f"hps_inits/{name}.json", fix=fix)
     cam_start, imu_start = (0, 0) if starts is None else read_hps_starts(starts)
     localization = None
     if localization_path is not None:
@@ -160,20 +156,14 @@ def _camera(root: Path, name: str, clap_s: float, localization: Localization | N
         return None
     cameras = read_hps_cameras(calibration)
     if name not in cameras:
-        raise WearcapError(
-            f"no intrinsics for the video of {name!r}",
-            where=calibration,
-            expected=f"its name among captured_videos (there are {len(cameras)})",
-        )
+        expected = f"its name among captured_videos (there are {len(cameras)})"
+        raise WearcapError(f"no intrinsics for the video of {name!r}", where=calibration, expected=expected)
     if path is None:
         return None if localization is None else CameraStream(localization.timestamps, cameras[name], *nominal_mount())
     video = video_info(path)
     if (video.width, video.height) != IMAGE_SIZE or not video.frames:
-        raise WearcapError(
-            f"a video of {video.frames} frames of {video.width}x{video.height} pixels",
-            where=path,
-            expected=f"{IMAGE_SIZE[0]}x{IMAGE_SIZE[1]}, as its camera was calibrated",
-        )
+        what = f"a video of {video.frames} frames of {video.width}x{video.height} pixels"
+        raise WearcapError(what, where=path, expected=f"{IMAGE_SIZE[0]}x{IMAGE_SIZE[1]}, as its camera was calibrated")
     times = torch.arange(video.frames, dtype=torch.float64) / video.fps - clap_s
     return CameraStream(times, cameras[name], *nominal_mount(), video=str(path.resolve()))
 

@@ -43,7 +43,7 @@ _SLAM_PIXELS = 384 * 512
 
 
 @dataclass(frozen=True)
-class _BoardWalks:
+class BoardWalks:
     """Paths of the camera over the calibration board: start and end (SLAM's units), and the measured lengths."""
 
     x_slam: Float[Tensor, "end 3"]
@@ -68,7 +68,7 @@ class MocapEveryFolder:
     points_slam: Float[Tensor, "point 3"] | None = None
     video: Path | None = None
     imu: dict[str, ImuStream] | None = None
-    board: _BoardWalks | None = None
+    board: BoardWalks | None = None
 
 
 def is_mocap_every_folder(folder: str | Path) -> bool:
@@ -152,12 +152,9 @@ def _trajectory(path: Path, start_s: float) -> Trajectory:
     if not len(table):
         raise WearcapError("no poses", where=path, expected="a row of 7 numbers per picture")
     if abs(table[0, 3]) > 0.9999 > abs(table[0, 6]):
-        raise WearcapError(
-            "the first quaternion is the identity with the scalar first",
-            where=path,
-            expected="x y z, then qx qy qz qw",
-            fix="Move the scalar to the end of the rows.",
-        )
+        what = "the first quaternion is the identity with the scalar first"
+        expected = "x y z, then qx qy qz qw"
+        raise WearcapError(what, where=path, expected=expected, fix="Move the scalar to the end of the rows.")
     times = start_s + np.arange(len(table)) / FPS
     return checked_trajectory(times, table[:, :3], table[:, [6, 3, 4, 5]], path)
 
@@ -180,12 +177,9 @@ def _require_plain_yaml(text: str, path: Path) -> None:
     depth = 0
     for event in yaml.parse(text, yaml.SafeLoader):
         if isinstance(event, yaml.AliasEvent):
-            raise WearcapError(
-                "it refers to its own parts (&name, *name)",
-                where=path,
-                expected="plain keys with values",
-                fix="Write them out: such references can blow up.",
-            )
+            what = "it refers to its own parts (&name, *name)"
+            expected = "plain keys with values"
+            raise WearcapError(what, where=path, expected=expected, fix="Write them out: such references can blow up.")
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_JSON_DEPTH:
             raise WearcapError(
@@ -201,7 +195,7 @@ def _marks(path: Path) -> dict[str, Any]:
     return content
 
 
-def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], folder: Path) -> _BoardWalks | None:
+def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], folder: Path) -> BoardWalks | None:
     measured = config.get("cam_scale_origin")
     if measured is None or not {"x", "y"} <= marks.keys():
         return None
@@ -223,7 +217,7 @@ def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], fol
                 expected=f"{track.timestamps[0].item():.3f} s to {track.timestamps[-1].item():.3f} s, as the camera's path",
             )
         ends.append(track.t_world_body[(track.timestamps[None] - times[:, None]).abs().argmin(1)])
-    return _BoardWalks(ends[0], ends[1], (length[0], length[1]), height)
+    return BoardWalks(ends[0], ends[1], (length[0], length[1]), height)
 
 
 def _numbers(values: Any, count: int, what: str, where: Path) -> list[float]:
@@ -240,11 +234,8 @@ def _intrinsics(path: Path, counts: tuple[int, ...]) -> list[float]:
     with understood("not a list of numbers", path, "fx fy cx cy"):
         values = finite_floats(read_text(path).split()).tolist()
     if len(values) not in counts:
-        raise WearcapError(
-            f"{len(values)} numbers",
-            where=path,
-            expected=f"{' or '.join(map(str, counts))}: fx fy cx cy and distortion",
-        )
+        what = f"{len(values)} numbers"
+        raise WearcapError(what, where=path, expected=f"{' or '.join(map(str, counts))}: fx fy cx cy and distortion")
     return values
 
 
@@ -258,11 +249,8 @@ def _undistorted(path: Path, video: tuple[int, int] | None) -> Camera | None:
         shrink = np.sqrt(_SLAM_PIXELS / (video[0] * video[1]))
         width, height = (int(side * shrink) // 8 * 8 for side in video)
     if not (0.25 * width < cx < 0.75 * width and 0.25 * height < cy < 0.75 * height):
-        raise WearcapError(
-            f"principal point {cx:.1f}, {cy:.1f}",
-            where=path,
-            expected=f"one near the middle of {width}x{height} pixels",
-        )
+        what = f"principal point {cx:.1f}, {cy:.1f}"
+        raise WearcapError(what, where=path, expected=f"one near the middle of {width}x{height} pixels")
     return Camera("pinhole", width, height, fx, fy, cx, cy)
 
 

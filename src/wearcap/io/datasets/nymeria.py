@@ -84,12 +84,9 @@ def _clean_timestamps(seconds: np.ndarray, path: str | Path) -> np.ndarray:
     steps[np.abs(steps - 1 / SUIT_HZ) > _STEP_TOLERANCE_S] = 1 / SUIT_HZ
     cleaned = seconds[0] + np.concatenate([[0.0], steps.cumsum()])
     if abs(cleaned[-1] - seconds[-1]) > _DRIFT_TOLERANCE_S:
-        raise WearcapError(
-            f"after cleaning, time ends {cleaned[-1] - seconds[-1]:+.3f} s from the file's own",
-            where=path,
-            expected=f"steady {SUIT_HZ:g} Hz",
-            fix="Frames were lost: cut the sequence there.",
-        )
+        what = f"after cleaning, time ends {cleaned[-1] - seconds[-1]:+.3f} s from the file's own"
+        expected = f"steady {SUIT_HZ:g} Hz"
+        raise WearcapError(what, where=path, expected=expected, fix="Frames were lost: cut the sequence there.")
     return cleaned
 
 
@@ -128,11 +125,8 @@ def read_nymeria(
     slam = folder / "recording_head" / "mps" / "slam"
     path = find_mps_file(slam, ("closed_loop_trajectory.csv",))
     if path is None or not is_nymeria(folder):
-        raise WearcapError(
-            "not a complete Nymeria sequence",
-            where=folder,
-            expected="body/xdata.npz and recording_head/mps/slam/closed_loop_trajectory.csv",
-        )
+        expected = "body/xdata.npz and recording_head/mps/slam/closed_loop_trajectory.csv"
+        raise WearcapError("not a complete Nymeria sequence", where=folder, expected=expected)
     suit, contacts = read_xdata(folder / "body" / "xdata.npz")
     device = head_stream(read_closed_loop(path)[0], fps=None)
     with placed(folder):
@@ -167,10 +161,8 @@ def _on_device(
     own = Trajectory(own.timestamps + offset, own.R_world_body, own.t_world_body)
     alignment = align_head(own, track, T_HEAD_DEVICE.t)
     if alignment.residual_m > MAX_RESIDUAL_M:
-        raise WearcapError(
-            f"the suit's head stays {100 * alignment.residual_m:.0f} cm from the device after alignment",
-            expected="suit and device of the same wearer on one clock",
-        )
+        what = f"the suit's head stays {100 * alignment.residual_m:.0f} cm from the device after alignment"
+        raise WearcapError(what, expected="suit and device of the same wearer on one clock")
     start = max(own.timestamps[0].item(), track.timestamps[0].item())
     stop = min(own.timestamps[-1].item(), track.timestamps[-1].item())
     times = start + torch.arange(int((stop - start) * fps) + 1, dtype=torch.float64) / fps

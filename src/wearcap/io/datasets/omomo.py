@@ -86,11 +86,8 @@ def _sequences(content: Any, path: Path) -> list[OmomoSequence]:
     for key, entry in content.items():
         name = entry.get("seq_name") if isinstance(entry, dict) else None
         if not isinstance(name, str) or len(name.split("_")) < 3 or not name.replace("_", "").isalnum():
-            raise WearcapError(
-                f"sequence {key!r} is named {name!r}"[:200],
-                where=path,
-                expected="seq_name SUBJECT_OBJECT_NUMBER, such as sub1_largebox_000",
-            )
+            what = f"sequence {key!r} is named {name!r}"[:200]
+            raise WearcapError(what, where=path, expected="seq_name SUBJECT_OBJECT_NUMBER, such as sub1_largebox_000")
         arrays = {key: entry[key] for key in _KEYS if isinstance(entry.get(key), np.ndarray)}
         gender = entry.get("gender", "")
         if isinstance(gender, np.ndarray) and gender.size == 1:
@@ -118,12 +115,8 @@ def omomo_take(sequence: OmomoSequence, root: str | Path, fps: float | int) -> O
     require(arrays, where, obj_rot=("frame", 3, 3), obj_trans=("frame", 3), obj_scale=("frame",))
     frames, others = len(arrays["trans"]), len(arrays["obj_trans"])
     if frames != others or not frames:
-        raise WearcapError(
-            f"the object has {others} frames, the body {frames}",
-            where=where,
-            expected="as many of both, and at least one",
-            fix="Fetch the file again.",
-        )
+        what = f"the object has {others} frames, the body {frames}"
+        raise WearcapError(what, where=where, expected="as many of both, and at least one", fix="Fetch the file again.")
     times = torch.arange(frames, dtype=torch.float64) / fps
     about = {"source": sequence.name, "format": "omomo", "gender": sequence.gender}
     if sequence.object_name in _TWO_PARTS:
@@ -167,19 +160,12 @@ def _mesh(root: str | Path, object_name: str, scales: np.ndarray, where: str) ->
         raise WearcapError("obj_scale is nowhere positive", where=where, expected="metres per unit of the mesh")
     scale = float(np.median(scales))
     if np.ptp(scales) > _SCALE_WITHIN * scale:
-        raise WearcapError(
-            f"obj_scale runs from {scales.min():.4g} to {scales.max():.4g}",
-            where=where,
-            expected=f"one scale within {_SCALE_WITHIN:.0%}: a rigid object",
-        )
+        what = f"obj_scale runs from {scales.min():.4g} to {scales.max():.4g}"
+        raise WearcapError(what, where=where, expected=f"one scale within {_SCALE_WITHIN:.0%}: a rigid object")
     path = omomo_mesh_path(root, object_name)
     if not path.is_file():
-        raise WearcapError(
-            f"no mesh of {object_name}",
-            where=path,
-            expected=f"{MESHES}/OBJECT{MESH_ENDING}",
-            fix="Unpack OMOMO's captured_objects beside the sequences.",
-        )
+        fix = "Unpack OMOMO's captured_objects beside the sequences."
+        raise WearcapError(f"no mesh of {object_name}", where=path, expected=f"{MESHES}/OBJECT{MESH_ENDING}", fix=fix)
     mesh, center = centered(read_obj(path))
     mesh = Mesh((mesh.vertices.astype(np.float64) * scale).astype(np.float32), mesh.faces, mesh.color)
     check_object_mesh(mesh, path)
@@ -191,11 +177,8 @@ def _path(arrays: dict[str, np.ndarray], times: Tensor, center: Tensor, posed: T
     R = torch.from_numpy(arrays["obj_rot"].astype(np.float64))
     bad = ~are_rotations(R, _ORTHOGONAL_WITHIN) & posed
     if bad.any():
-        raise WearcapError(
-            f"obj_rot of frame {int(bad.nonzero()[0])} is no rotation ({int(bad.sum())} such frames)",
-            where=where,
-            expected="orthogonal matrices of determinant +1",
-        )
+        what = f"obj_rot of frame {int(bad.nonzero()[0])} is no rotation ({int(bad.sum())} such frames)"
+        raise WearcapError(what, where=where, expected="orthogonal matrices of determinant +1")
     U, _, Vh = torch.linalg.svd(torch.where(posed[:, None, None], R, torch.eye(3, dtype=R.dtype)))
     R = U @ Vh
     scale = torch.from_numpy(arrays["obj_scale"].astype(np.float64))

@@ -48,10 +48,8 @@ def clock_offset(suit: Trajectory, device: Trajectory) -> float:
     a, b = (speed.clamp(max=10.0).numpy() for speed in speeds)
     lag, score = best_shift(*correlate_shifts(a, b, 1 / 3))
     if score < 0.5:
-        raise WearcapError(
-            f"head and device do not move alike at any shift of their clocks (correlation {score:.2f})",
-            expected="a recording of the same head",
-        )
+        what = f"head and device do not move alike at any shift of their clocks (correlation {score:.2f})"
+        raise WearcapError(what, expected="a recording of the same head")
     return grids[1][0].item() - grids[0][0].item() + lag / _RATE_HZ
 
 

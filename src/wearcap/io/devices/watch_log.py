@@ -90,12 +90,9 @@ def _columns(path: str | Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
                 iso = text.decode().strip().replace(" +", "+").replace(" -", "-")
                 seconds[row] = datetime.fromisoformat(iso).timestamp()
     else:
-        raise WearcapError(
-            "not a watch's motion log",
-            where=path,
-            expected="SensorLog's CSV (motionQuaternionW(R), …) or WristMotion.csv (quaternionW, …)",
-            fix="Switch on device motion when you record.",
-        )
+        what = "not a watch's motion log"
+        expected = "SensorLog's CSV (motionQuaternionW(R), …) or WristMotion.csv (quaternionW, …)"
+        raise WearcapError(what, where=path, expected=expected, fix="Switch on device motion when you record.")
     return seconds, {name: np.stack([table[column] for column in group], 1) for name, group in groups.items()}
 
 
@@ -105,18 +102,11 @@ def _require_times(seconds: np.ndarray, path: str | Path) -> None:
     step = np.diff(seconds)
     if (step <= 0).any():
         row = int(np.flatnonzero(step <= 0)[0]) + 1
-        raise WearcapError(
-            f"time does not grow at row {row} ({step[row - 1]:+.3f} s)",
-            where=path,
-            fix="Sort the rows by time and leave repeated ones out.",
-        )
+        what = f"time does not grow at row {row} ({step[row - 1]:+.3f} s)"
+        raise WearcapError(what, where=path, fix="Sort the rows by time and leave repeated ones out.")
     if np.median(step) > 1 / MIN_RATE_HZ:
-        raise WearcapError(
-            f"{1 / np.median(step):.1f} rows a second",
-            where=path,
-            expected=f"at least {MIN_RATE_HZ:g}",
-            fix="Log at 30 Hz or more.",
-        )
+        what = f"{1 / np.median(step):.1f} rows a second"
+        raise WearcapError(what, where=path, expected=f"at least {MIN_RATE_HZ:g}", fix="Log at 30 Hz or more.")
 
 
 def _attitude(quaternion: np.ndarray, gravity: np.ndarray, path: str | Path) -> tuple[np.ndarray, float]:
@@ -130,10 +120,7 @@ def _attitude(quaternion: np.ndarray, gravity: np.ndarray, path: str | Path) -> 
     there, back = (float((turned @ down[..., None])[:, 2, 0].mean()) for turned in (R, R.swapaxes(1, 2)))
     best = max(abs(there), abs(back))
     if best < UPRIGHT:
-        raise WearcapError(
-            f"the attitude turns gravity {best:.2f} upright",
-            where=path,
-            expected=f"at least {UPRIGHT}",
-            fix="Check the order of the quaternion's columns (W, X, Y, Z), and that z is up in its reference frame.",
-        )
+        what = f"the attitude turns gravity {best:.2f} upright"
+        fix = "Check the order of the quaternion's columns (W, X, Y, Z), and that z is up in its reference frame."
+        raise WearcapError(what, where=path, expected=f"at least {UPRIGHT}", fix=fix)
     return (R, there) if abs(there) >= abs(back) else (np.ascontiguousarray(R.swapaxes(1, 2)), back)

@@ -171,12 +171,9 @@ class _AsfContent:
                 what = f"cannot read {text.strip()[:80]!r} ({error})"
                 raise WearcapError(what, where=at_line(path, number), expected="Acclaim ASF") from error
         if content.bone is not None or not content.bones or not content.hierarchy:
-            raise WearcapError(
-                "bones or hierarchy are missing or cut short",
-                where=at_line(path, number),
-                expected="an ASF file with :bonedata and :hierarchy",
-                fix="Fetch the file again.",
-            )
+            what = "bones or hierarchy are missing or cut short"
+            expected = "an ASF file with :bonedata and :hierarchy"
+            raise WearcapError(what, where=at_line(path, number), expected=expected, fix="Fetch the file again.")
         return content
 
     def tree_order(self, path: Path) -> tuple[list[str], list[int]]:
@@ -361,12 +358,9 @@ def _parse_amc(path: Path, asf: _AsfSkeleton) -> tuple[np.ndarray, list[int], Fl
         except ValueError as error:
             raise WearcapError(str(error), where=at_line(path, number)) from error
     if place < len(first):
-        raise WearcapError(
-            "the last frame is cut short",
-            where=at_line(path, number),
-            expected=f"{len(first)} bones per frame",
-            fix="Fetch the file again.",
-        )
+        what = "the last frame is cut short"
+        expected = f"{len(first)} bones per frame"
+        raise WearcapError(what, where=at_line(path, number), expected=expected, fix="Fetch the file again.")
     return np.array(frames), joints, torch.from_numpy(np.array(values).reshape(len(frames), -1))
 
 
@@ -387,21 +381,16 @@ def _layout_joints(path: Path, asf: _AsfSkeleton, start: int, first: list[tuple[
     names = [words[0] for _, words in first]
     for line, (name, *values) in first:
         if name not in asf.skeleton.joint_names or names.count(name) > 1:
-            raise WearcapError(
-                f"bone {name!r} is not in the ASF, or comes twice",
-                where=at_line(path, line),
-                expected="bones of the skeleton, once per frame",
-                fix="Check that AMC and ASF belong together.",
-            )
+            what = f"bone {name!r} is not in the ASF, or comes twice"
+            expected = "bones of the skeleton, once per frame"
+            fix = "Check that AMC and ASF belong together."
+            raise WearcapError(what, where=at_line(path, line), expected=expected, fix=fix)
         if len(values) != (expected := len(asf.dof[asf.skeleton.index(name)])):
             raise WearcapError(
                 f"{len(values)} values for {name!r}", where=at_line(path, line), expected=f"{expected} as in the ASF"
             )
     moving = {name for name, dof in zip(asf.skeleton.joint_names, asf.dof) if dof}
     if not names or moving - set(names):
-        raise WearcapError(
-            f"the first frame lacks {sorted(moving - set(names))[:5]}",
-            where=at_line(path, start),
-            expected="every bone that has channels in the ASF",
-        )
+        what = f"the first frame lacks {sorted(moving - set(names))[:5]}"
+        raise WearcapError(what, where=at_line(path, start), expected="every bone that has channels in the ASF")
     return [asf.skeleton.index(name) for name in names]

@@ -48,19 +48,12 @@ class Budget:
         if self.spent > self.max_bytes:
             units = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))
             unit, name = next((known for known in units if self.max_bytes >= known[0]), (1, "bytes"))
-            raise WearcapError(
-                f"larger than {self.max_bytes / unit:.4g} {name} once unpacked",
-                where=self.path,
-                expected="a smaller file",
-                fix=_lift(self.spent),
-            )
+            what = f"larger than {self.max_bytes / unit:.4g} {name} once unpacked"
+            raise WearcapError(what, where=self.path, expected="a smaller file", fix=_lift(self.spent))
         if self.spent > self._by_ratio:
-            raise WearcapError(
-                f"it unpacks to more than {MAX_RATIO} times its size",
-                where=self.path,
-                expected="a capture, which packs 5 to 30 times",
-                fix=_lift(self.spent),
-            )
+            what = f"it unpacks to more than {MAX_RATIO} times its size"
+            expected = "a capture, which packs 5 to 30 times"
+            raise WearcapError(what, where=self.path, expected=expected, fix=_lift(self.spent))
 
 
 def gib_bytes(text: str, where: str) -> int:
@@ -111,11 +104,8 @@ def explained(path: str | Path, kind: str = "file") -> Iterator[None]:
     except IsADirectoryError as error:
         raise WearcapError("a folder", where=path, expected="a file") from error
     except _DAMAGE as error:
-        raise WearcapError(
-            f"not a complete {Path(path).suffix} file: its packed data is damaged or cut short ({error})",
-            where=path,
-            fix="Copy or fetch it again.",
-        ) from error
+        what = f"not a complete {Path(path).suffix} file: its packed data is damaged or cut short ({error})"
+        raise WearcapError(what, where=path, fix="Copy or fetch it again.") from error
     except OSError as error:
         raise WearcapError(f"cannot be read ({error.strerror or error})", where=path) from error
     except MemoryError as error:

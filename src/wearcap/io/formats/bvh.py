@@ -95,12 +95,9 @@ class _Hierarchy:
             what = f"the hierarchy is broken here ({str(error) or 'it ends too early'})"[:200]
             raise WearcapError(what, where=at_line(path, line), expected="BVH") from error
         if not found.joints or found.open or not found.motion_line:
-            raise WearcapError(
-                "no complete HIERARCHY followed by MOTION",
-                where=at_line(path, found.line),
-                expected="a whole BVH file",
-                fix="Fetch it again.",
-            )
+            what = "no complete HIERARCHY followed by MOTION"
+            expected = "a whole BVH file"
+            raise WearcapError(what, where=at_line(path, found.line), expected=expected, fix="Fetch it again.")
         if len({joint.name for joint in found.joints}) < len(found.joints):
             raise WearcapError("two joints share a name", where=path, expected="unique joint names")
         return found.joints, found.motion_line
@@ -270,11 +267,8 @@ def _axes(path: Path, up: str, forward: str) -> Tensor:
         row["xyz".index(name[-1])] = -1.0 if name.startswith("-") else 1.0
         rows[name] = row
     if up[-1] == forward[-1]:
-        raise WearcapError(
-            f"up {up!r} and forward {forward!r} are one axis",
-            where=path,
-            fix='For a z-up file give forward as well, mostly "-y", "x" or "y".',
-        )
+        what = f"up {up!r} and forward {forward!r} are one axis"
+        raise WearcapError(what, where=path, fix='For a z-up file give forward as well, mostly "-y", "x" or "y".')
     return torch.stack([rows[forward], torch.linalg.cross(rows[up], rows[forward]), rows[up]])
 
 
@@ -364,12 +358,9 @@ def _check_body(motion: Motion, path: Path, unit_m: float, R_world_file: Float[T
         mirrors = {axis: torch.ones(3).index_fill(0, torch.tensor(axis), -1.0) for axis in long_axes}
         axis = max(long_axes, key=lambda k: torch.cdist(rest_joints * mirrors[k], rest_joints).amin(1).mean().item())
         name = "xyz"[int(R_world_file[axis].abs().argmax())]
-        raise WearcapError(
-            f"the body lies down: {moving[2]:.2f} m high and {moving[axis]:.2f} m long",
-            where=path,
-            expected="a person upright in the bind pose or in most frames",
-            fix=f'up="{name}" (or "-{name}") would raise it; check=False takes it as it is.',
-        )
+        what = f"the body lies down: {moving[2]:.2f} m high and {moving[axis]:.2f} m long"
+        fix = f'up="{name}" (or "-{name}") would raise it; check=False takes it as it is.'
+        raise WearcapError(what, where=path, expected="a person upright in the bind pose or in most frames", fix=fix)
 
 
 def longest_path(skeleton: Skeleton) -> float:

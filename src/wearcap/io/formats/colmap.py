@@ -109,18 +109,12 @@ def read_colmap(folder: str | Path, images: str | Path | None = None) -> ColmapM
 
 def _photo(image: _Image, cameras: dict[int, Camera], images: Path) -> Photo:
     if image.camera not in cameras:
-        raise WearcapError(
-            f"image {image.name!r} names camera {image.camera}, which is not in the model",
-            where=image.where,
-            expected=f"one of {', '.join(map(str, sorted(cameras)))}",
-        )
+        what = f"image {image.name!r} names camera {image.camera}, which is not in the model"
+        raise WearcapError(what, where=image.where, expected=f"one of {', '.join(map(str, sorted(cameras)))}")
     wxyz = torch.tensor(image.quaternion_wxyz, dtype=torch.float64)
     if not (wxyz.isfinite().all() and 0.9 < wxyz.norm() < 1.1 and all(map(math.isfinite, image.translation))):
-        raise WearcapError(
-            f"image {image.name!r} has no valid pose",
-            where=image.where,
-            expected="a unit quaternion (w first) and a finite translation",
-        )
+        what = f"image {image.name!r} has no valid pose"
+        raise WearcapError(what, where=image.where, expected="a unit quaternion (w first) and a finite translation")
     wxyz = wxyz / wxyz.norm()
     R_cam_world = roma.unitquat_to_rotmat(wxyz[[1, 2, 3, 0]])
     T_cam_world = Rigid(R_cam_world, torch.tensor(image.translation, dtype=torch.float64))
@@ -149,12 +143,9 @@ def _tracks(images: list[_Image], points: _Points) -> Tracks:
 
 def _camera(model: str, width: int, height: int, values: list[float], where: str) -> Camera:
     if model not in _MODELS:
-        raise WearcapError(
-            f"camera model {model} is not supported",
-            where=where,
-            expected=f"one of {', '.join(_MODELS)}",
-            fix="COLMAP's image_undistorter turns any model into PINHOLE.",
-        )
+        what = f"camera model {model} is not supported"
+        fix = "COLMAP's image_undistorter turns any model into PINHOLE."
+        raise WearcapError(what, where=where, expected=f"one of {', '.join(_MODELS)}", fix=fix)
     ours, count = _MODELS[model]
     if len(values) != count or not all(map(math.isfinite, values)):
         raise WearcapError(

@@ -99,11 +99,8 @@ def parse_labels(content: Any, clock: LabelClock, *, where: str | Path) -> Label
     contacts = content.get("contacts") if isinstance(content, dict) else None
     names = [f"{hand}_hand" for hand in HANDS]
     if not isinstance(contacts, dict) or not all(isinstance(contacts.get(name), list) for name in names):
-        raise WearcapError(
-            "no contact labels",
-            where=where,
-            expected='{"contacts": {"left_hand": [[start, end], …], "right_hand": […]}} in seconds',
-        )
+        expected = '{"contacts": {"left_hand": [[start, end], …], "right_hand": […]}} in seconds'
+        raise WearcapError("no contact labels", where=where, expected=expected)
     if "recording" in content:
         _check_recording(content, clock, where)
     labels: Labels = {}
@@ -129,12 +126,10 @@ def _check_recording(content: dict, clock: LabelClock, where: str | Path) -> Non
         name, frames, span = about["name"], about["frames"], (about["start_s"], about["stop_s"])
         same = all(abs(a - b) < 1e-3 for a, b in zip(span, (clock.start_s, clock.stop_s)))
     if name != clock.name or frames != clock.frames or not same:
-        raise WearcapError(
-            f"labels of recording {name!r} with {frames} frames from {span[0]:.3f} to {span[1]:.3f} s",
-            where=where,
-            expected=f"{clock.name!r} with {clock.frames} frames from {clock.start_s:.3f} to {clock.stop_s:.3f} s",
-            fix="Give another output folder, or move this file away.",
-        )
+        what = f"labels of recording {name!r} with {frames} frames from {span[0]:.3f} to {span[1]:.3f} s"
+        expected = f"{clock.name!r} with {clock.frames} frames from {clock.start_s:.3f} to {clock.stop_s:.3f} s"
+        fix = "Give another output folder, or move this file away."
+        raise WearcapError(what, where=where, expected=expected, fix=fix)
 
 
 def _texts(content: dict, key: str, name: str, count: int, where: str | Path) -> list[str]:
@@ -153,20 +148,14 @@ def _span(pair: Any, clock: LabelClock, label: str, where: str | Path) -> tuple[
         raise WearcapError(f"{label} is {pair!r}"[:200], where=where, expected="[start, end] in seconds")
     start, end = pair
     if start == end:
-        raise WearcapError(
-            f"{label} is empty: {start} to {end} s",
-            where=where,
-            expected="an end after the start",
-            fix="Delete the label, or write an end before its start where it lasts to the end.",
-        )
+        what = f"{label} is empty: {start} to {end} s"
+        fix = "Delete the label, or write an end before its start where it lasts to the end."
+        raise WearcapError(what, where=where, expected="an end after the start", fix=fix)
     stop = clock.stop_s if end < start else end
     if not (clock.start_s - SLACK_S <= start < clock.stop_s - 1e-9 and clock.start_s < stop <= clock.stop_s + SLACK_S):
-        raise WearcapError(
-            f"{label} from {start} to {end} s is outside the recording",
-            where=where,
-            expected=f"times from {clock.start_s:.3f} to {clock.stop_s:.3f} s",
-            fix="Is it the file of another recording?",
-        )
+        what = f"{label} from {start} to {end} s is outside the recording"
+        expected = f"times from {clock.start_s:.3f} to {clock.stop_s:.3f} s"
+        raise WearcapError(what, where=where, expected=expected, fix="Is it the file of another recording?")
     return max(float(start), clock.start_s), min(float(stop), clock.stop_s)
 
 
@@ -174,12 +163,9 @@ def _refuse_overlap(labels: Sequence[Label], clock: LabelClock, name: str, where
     for label, following in itertools.pairwise(labels):
         if following.start_s < label.stop_s:
             until = "to the end of the recording" if label.stop_s == clock.stop_s else f"to {label.stop_s} s"
-            raise WearcapError(
-                f"labels of {name} overlap: one from {label.start_s} {until}, the next from {following.start_s} s",
-                where=where,
-                expected="one contact of a hand at a time",
-                fix="Give the first an end before the second starts (an end before its start means: until the end).",
-            )
+            what = f"labels of {name} overlap: one from {label.start_s} {until}, the next from {following.start_s} s"
+            fix = "Give the first an end before the second starts (an end before its start means: until the end)."
+            raise WearcapError(what, where=where, expected="one contact of a hand at a time", fix=fix)
 
 
 def interactions_of(labels: Labels) -> Interactions:

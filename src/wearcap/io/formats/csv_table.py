@@ -82,12 +82,8 @@ def iter_columns(
     for name in wanted:
         if name not in header:
             near = difflib.get_close_matches(name, header, n=1)
-            raise WearcapError(
-                f"no column {name!r}",
-                where=path,
-                expected=f"the columns {', '.join(wanted)}",
-                fix=f"The nearest is {near[0]!r}." if near else "",
-            )
+            fix = f"The nearest is {near[0]!r}." if near else ""
+            raise WearcapError(f"no column {name!r}", where=path, expected=f"the columns {', '.join(wanted)}", fix=fix)
     kinds = dict.fromkeys(columns, "f8") | dict.fromkeys(text, "S64") | dict.fromkeys(whole, "i8")
     done = 0
     with open_text(path, MAX_BYTES if rows is None else MAX_STREAMED_BYTES) as file:

@@ -51,12 +51,9 @@ def read_environment(path: str | Path) -> Environment:
     if not isinstance(content, dict) or not isinstance(content.get("objects"), list):
         raise WearcapError("not an environment", where=path, expected='{"schema_version": 1, "objects": […]}')
     if content.get("schema_version") != SCHEMA:
-        raise WearcapError(
-            f"schema version {content.get('schema_version')!r}",
-            where=path,
-            expected=str(SCHEMA),
-            fix="Read it with the wearcap that wrote it, or update.",
-        )
+        what = f"schema version {content.get('schema_version')!r}"
+        fix = "Read it with the wearcap that wrote it, or update."
+        raise WearcapError(what, where=path, expected=str(SCHEMA), fix=fix)
     _require_keys(content, ("schema_version", "objects"), path)
     objects = tuple(_object(row, number, path) for number, row in enumerate(content["objects"]))
     with placed(path):
@@ -87,12 +84,9 @@ def _object(row: Any, number: int, path: Path) -> SceneObject:
     if not named:
         raise WearcapError("an object without a name", where=where, expected=f"an object with {', '.join(_KEYS)}")
     if row.get("freedom") is None:
-        raise WearcapError(
-            "no degree of freedom",
-            where=where,
-            expected=f'"freedom": {{"kind": one of {", ".join(FREEDOMS)}}}',
-            fix="What cannot move belongs to the scan and not among the objects.",
-        )
+        what = "no degree of freedom"
+        fix = "What cannot move belongs to the scan and not among the objects."
+        raise WearcapError(what, where=where, expected=f'"freedom": {{"kind": one of {", ".join(FREEDOMS)}}}', fix=fix)
     _require_keys(row, _KEYS, where)
     if not isinstance(row["category"], str):
         raise WearcapError(f"category {row['category']!r}", where=where, expected="text")
@@ -124,20 +118,13 @@ def _freedom(row: Any, where: str) -> Freedom:
 def _mesh(name: Any, path: Path, where: str) -> Mesh:
     plain = isinstance(name, str) and name and not set(name) & {"\0", "\\"} and len(name.encode(errors="replace")) < 256
     if not plain or PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-        raise WearcapError(
-            f"mesh {name!r}",
-            where=where,
-            expected="a .ply file below the environment's folder",
-            fix="Copy it there and name it relatively, as objects/sofa_1.ply.",
-        )
+        what = f"mesh {name!r}"
+        fix = "Copy it there and name it relatively, as objects/sofa_1.ply."
+        raise WearcapError(what, where=where, expected="a .ply file below the environment's folder", fix=fix)
     file = path.parent / name
     if not file.is_file():
-        raise WearcapError(
-            f"its mesh {name} is missing",
-            where=where,
-            expected=str(file),
-            fix="Copy the folder objects/ together with the environment.",
-        )
+        fix = "Copy the folder objects/ together with the environment."
+        raise WearcapError(f"its mesh {name} is missing", where=where, expected=str(file), fix=fix)
     mesh = read_ply(file).mesh
     if not len(mesh.vertices):
         raise WearcapError("an empty mesh", where=file, expected="at least one point")
@@ -152,11 +139,8 @@ def _row(item: SceneObject, mesh: str, where: str) -> dict[str, Any]:
     if freedom.axis is not None:
         row["axis"] = list(freedom.axis)
     if limits is not None and freedom.kind not in ("hinge", "axis"):
-        raise WearcapError(
-            f"limits of an object that is {freedom.kind!r}",
-            where=where,
-            expected="limits of hinges and of slides along an axis alone",
-        )
+        what = f"limits of an object that is {freedom.kind!r}"
+        raise WearcapError(what, where=where, expected="limits of hinges and of slides along an axis alone")
     if limits is not None:
         hinge = freedom.kind == "hinge"
         row["limits_deg" if hinge else "limits_m"] = [math.degrees(v) if hinge else v for v in limits]
@@ -191,23 +175,17 @@ def _check(item: SceneObject, where: str) -> None:
     _rotation(item.R_world_object.tolist(), where)
     gap = hinge_gap_m(item)
     if gap > MAX_HINGE_GAP_M:
-        raise WearcapError(
-            f"its hinge is {gap:.2f} m from its mesh, seen from above",
-            where=where,
-            expected=f"at most {MAX_HINGE_GAP_M} m",
-            fix="The pivot is a point of the world, in metres.",
-        )
+        what = f"its hinge is {gap:.2f} m from its mesh, seen from above"
+        expected = f"at most {MAX_HINGE_GAP_M} m"
+        raise WearcapError(what, where=where, expected=expected, fix="The pivot is a point of the world, in metres.")
 
 
 def _rotation(value: Any, where: str) -> Float64[Tensor, "3 3"]:
     """The rotation nearest to a matrix that is a rotation up to rounding."""
     R = torch.from_numpy(_numbers(value, (3, 3), "R_world_object", where))
     if not are_rotations(R, _ORTHOGONAL_WITHIN):
-        raise WearcapError(
-            "R_world_object is no rotation",
-            where=where,
-            expected=f"an orthogonal matrix (within {_ORTHOGONAL_WITHIN}) of determinant +1",
-        )
+        expected = f"an orthogonal matrix (within {_ORTHOGONAL_WITHIN}) of determinant +1"
+        raise WearcapError("R_world_object is no rotation", where=where, expected=expected)
     return rotation.mean_rotation(R[None])
 
 

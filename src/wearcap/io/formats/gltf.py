@@ -61,11 +61,9 @@ class _SkinnedMesh:
     def of_body(cls, body: BodyModel, skeleton: Skeleton) -> "_SkinnedMesh":
         """A body model's skin. Raises WearcapError when the motion's skeleton has other joints than the body."""
         if body.skeleton.joint_names != skeleton.joint_names:
-            raise WearcapError(
-                f"the motion has skeleton {skeleton.name!r}, the body {body.skeleton.name!r}",
-                expected="the same joints",
-                fix="Make the body for the motion's skeleton, or retarget.",
-            )
+            what = f"the motion has skeleton {skeleton.name!r}, the body {body.skeleton.name!r}"
+            expected = "the same joints"
+            raise WearcapError(what, expected=expected, fix="Make the body for the motion's skeleton, or retarget.")
         mesh = Mesh(body.rest_vertices.float().numpy(), body.faces.int().numpy(), _GREY, smooth=True)
         weights = body.skin_weights.float().numpy()
         # Joints without weight must be named as joint 0.

@@ -47,12 +47,8 @@ def read_motion(path: str | Path) -> Motion:
     """Read what `write_motion` wrote. Raises WearcapError when it is missing, damaged, not finite or foreign."""
     arrays = read_npz(path)
     if "wearcap" not in arrays:
-        raise WearcapError(
-            "an .npz file, but not of ours",
-            where=path,
-            expected="one that write_motion wrote",
-            fix="AMASS files are read by io.datasets.amass.",
-        )
+        fix = "AMASS files are read by io.datasets.amass."
+        raise WearcapError("an .npz file, but not of ours", where=path, expected="one that write_motion wrote", fix=fix)
     try:
         tree = parse_json(str(arrays.pop("wearcap")), path)
         version = tree["schema"]
@@ -142,11 +138,8 @@ def even_frames(motion: Motion) -> tuple[Int64[Tensor, "time"], float]:
         return torch.zeros(1, dtype=torch.int64), STILL_FPS
     steps, fps = motion.timestamps.diff(), nominal_fps(motion.fps)
     if not (steps > 0).all() or steps.max() > 60:
-        raise WearcapError(
-            "timestamps fall, repeat or leave a gap of over a minute",
-            expected="rising timestamps in s",
-            fix="Cut the motion at the gap.",
-        )
+        what = "timestamps fall, repeat or leave a gap of over a minute"
+        raise WearcapError(what, expected="rising timestamps in s", fix="Cut the motion at the gap.")
     start, duration = motion.timestamps[0], motion.timestamps[-1] - motion.timestamps[0]
     grid = start + torch.arange(round(duration.item() * fps) + 1, dtype=torch.float64) / fps
     midpoints = (motion.timestamps[1:] + motion.timestamps[:-1]) / 2

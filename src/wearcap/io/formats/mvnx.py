@@ -261,11 +261,8 @@ def _quaternions(file: _File, name: str) -> Float[Tensor, "time segment 4"]:
     wrong = ((quat_wxyz.norm(dim=-1) - 1).abs() > 0.02).nonzero()
     if len(wrong):
         frame, element = wrong[0].tolist()
-        raise WearcapError(
-            f"{name} {element} is no unit quaternion",
-            where=f"{file.path}, frame {file.index[frame]}",
-            expected="w x y z of length 1",
-        )
+        what = f"{name} {element} is no unit quaternion"
+        raise WearcapError(what, where=f"{file.path}, frame {file.index[frame]}", expected="w x y z of length 1")
     return quat_wxyz
 
 

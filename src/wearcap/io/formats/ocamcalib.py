@@ -54,11 +54,8 @@ class OCamModel:
         c, d, e = self.affine
         determinant = c - d * e
         if not (0 < self.width <= _MAX_SIDE and 0 < self.height <= _MAX_SIDE and 0.1 < determinant < 10):
-            raise WearcapError(
-                f"an image of {self.width}x{self.height} pixels with affine parameters {self.affine}",
-                where=where,
-                expected=f"sizes of 1 to {_MAX_SIDE}, c near 1, d and e near 0",
-            )
+            what = f"an image of {self.width}x{self.height} pixels with affine parameters {self.affine}"
+            raise WearcapError(what, where=where, expected=f"sizes of 1 to {_MAX_SIDE}, c near 1, d and e near 0")
         if not (0 <= self.row < self.height and 0 <= self.column < self.width):
             raise WearcapError(
                 f"its centre, row {self.row:g} and column {self.column:g}, is outside the image of "
@@ -68,11 +65,8 @@ class OCamModel:
             )
         focal = -self.pol[0]
         if focal <= 0:
-            raise WearcapError(
-                f"its direct polynomial begins with {self.pol[0]:g}",
-                where=where,
-                expected="a negative number (the axis points backwards)",
-            )
+            what = f"its direct polynomial begins with {self.pol[0]:g}"
+            raise WearcapError(what, where=where, expected="a negative number (the axis points backwards)")
         rho, theta = self._curve(determinant, where)
         share = theta / theta[-1]  # powers of numbers up to 1 keep the system solvable
         exponents = np.arange(2, _POWERS + 2)
@@ -100,21 +94,15 @@ class OCamModel:
         last = int(falling.argmax()) if falling.any() else len(rho) - 1
         # If the polynomial turns within the image, the lens's image circle is smaller than the picture.
         if last < len(rho) // 4:
-            raise WearcapError(
-                f"its direct polynomial turns back {rho[last]:.0f} px from the centre",
-                where=where,
-                expected="angles that rise with the radius",
-            )
+            what = f"its direct polynomial turns back {rho[last]:.0f} px from the centre"
+            raise WearcapError(what, where=where, expected="angles that rise with the radius")
         rho, theta = rho[: last + 1], theta[: last + 1]
         if self.invpol:
             disagreement = np.abs(np.polynomial.polynomial.polyval(theta - np.pi / 2, self.invpol) - rho)
             central = disagreement[theta < 0.8 * theta[-1]]
             if central.max() > _MAX_DISAGREEMENT_PX:
-                raise WearcapError(
-                    f"its two polynomials differ by up to {central.max():.3g} px",
-                    where=where,
-                    expected="two fits of one lens",
-                )
+                what = f"its two polynomials differ by up to {central.max():.3g} px"
+                raise WearcapError(what, where=where, expected="two fits of one lens")
         return rho, theta
 
 

@@ -62,11 +62,8 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[dict[str, list[str]], 
         start = stop + 1
     missing = {"FIELDS", "SIZE", "TYPE", "POINTS"} - set(header)
     if missing or not (header["POINTS"][0].isdigit() and len(header["POINTS"][0]) < 15):
-        raise WearcapError(
-            f"its header lacks {', '.join(sorted(missing)) or 'a count of points'}",
-            where=path,
-            expected="a PCD 0.7 header",
-        )
+        what = f"its header lacks {', '.join(sorted(missing)) or 'a count of points'}"
+        raise WearcapError(what, where=path, expected="a PCD 0.7 header")
     return header, start
 
 

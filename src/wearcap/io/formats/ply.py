@@ -103,11 +103,8 @@ def read_ply(path: str | Path) -> Ply:
     with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite and is refused below
         points = np.stack([vertex[axis] for axis in "xyz"], 1).astype(np.float32)
     if not np.isfinite(points).all():
-        raise WearcapError(
-            f"{int((~np.isfinite(points)).any(1).sum())} points are NaN or infinite",
-            where=path,
-            expected="finite coordinates",
-        )
+        what = f"{int((~np.isfinite(points)).any(1).sum())} points are NaN or infinite"
+        raise WearcapError(what, where=path, expected="finite coordinates")
     return Ply(points, _colors(vertex), _triangles(tables.get("face", {}), len(points), path))
 
 

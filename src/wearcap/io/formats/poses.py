@@ -34,12 +34,9 @@ def checked_trajectory(
     norm = np.linalg.norm(quat_wxyz, axis=1)
     worst = int(np.abs(norm - 1).argmax())
     if abs(norm[worst] - 1) > NORM_TOLERANCE:
-        raise WearcapError(
-            f"row {worst + 1}: quaternion {quat_wxyz[worst].round(4).tolist()} has norm {norm[worst]:.4f}",
-            where=where,
-            expected="unit quaternions",
-            fix="Check that the columns are the quaternion's.",
-        )
+        what = f"row {worst + 1}: quaternion {quat_wxyz[worst].round(4).tolist()} has norm {norm[worst]:.4f}"
+        expected = "unit quaternions"
+        raise WearcapError(what, where=where, expected=expected, fix="Check that the columns are the quaternion's.")
     return Trajectory(
         torch.from_numpy(np.ascontiguousarray(timestamps, dtype=np.float64)),
         matrix_from_quat_wxyz(torch.tensor(quat_wxyz)).float(),
@@ -52,11 +49,8 @@ def check_finite(columns: dict[str, np.ndarray], where: str | Path) -> None:
     for name, values in columns.items():
         bad = ~(np.abs(values.reshape(len(values), -1)) < np.finfo(np.float32).max).all(1)
         if bad.any():
-            raise WearcapError(
-                f"row {int(bad.argmax()) + 1}: {name} is NaN or infinite ({int(bad.sum())} such rows)",
-                where=where,
-                expected="finite numbers",
-            )
+            what = f"row {int(bad.argmax()) + 1}: {name} is NaN or infinite ({int(bad.sum())} such rows)"
+            raise WearcapError(what, where=where, expected="finite numbers")
 
 
 def check_rising(timestamps: np.ndarray, where: str | Path) -> None:
@@ -64,12 +58,9 @@ def check_rising(timestamps: np.ndarray, where: str | Path) -> None:
     late = np.diff(timestamps) <= 0
     if late.any():
         row = int(late.argmax()) + 1
-        raise WearcapError(
-            f"row {row + 1}: timestamp {timestamps[row]:.6f} s follows {timestamps[row - 1]:.6f} s",
-            where=where,
-            expected="timestamps that rise",
-            fix="Sort the rows by time and drop repeated ones.",
-        )
+        what = f"row {row + 1}: timestamp {timestamps[row]:.6f} s follows {timestamps[row - 1]:.6f} s"
+        expected = "timestamps that rise"
+        raise WearcapError(what, where=where, expected=expected, fix="Sort the rows by time and drop repeated ones.")
 
 
 def are_rotations(R: Float[Tensor, "*batch 3 3"], within: float) -> Bool[Tensor, "*batch"]:

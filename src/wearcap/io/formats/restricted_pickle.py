@@ -47,19 +47,12 @@ def read_pickle(path: str | Path, max_bytes: int | None = None) -> Any:
         _require_plain(value)
         return value
     except _RefusedError as error:
-        raise WearcapError(
-            str(error),
-            where=path,
-            expected="numbers, text, lists, dicts and NumPy arrays only",
-            fix="Anything else in a pickle can run code when it is loaded, and is never read.",
-        ) from error
+        expected = "numbers, text, lists, dicts and NumPy arrays only"
+        fix = "Anything else in a pickle can run code when it is loaded, and is never read."
+        raise WearcapError(str(error), where=path, expected=expected, fix=fix) from error
     except Exception as error:  # the opcodes are the file's own program and can raise anything
-        raise WearcapError(
-            f"a damaged pickle ({type(error).__name__}: {error})"[:300],
-            where=path,
-            expected="a whole pickle file",
-            fix="Fetch it again.",
-        ) from error
+        what = f"a damaged pickle ({type(error).__name__}: {error})"[:300]
+        raise WearcapError(what, where=path, expected="a whole pickle file", fix="Fetch it again.") from error
 
 
 class _RefusedError(Exception):

@@ -43,19 +43,11 @@ def read_scan(path: str | Path, *, needs_colors: bool = False, metres_per_unit: 
     if not len(points):
         raise WearcapError("the scan has no points", where=path, expected="a cloud of the scene's surfaces")
     if metres_per_unit is None and (fault := _unit_fault(points)):
-        raise WearcapError(
-            fault,
-            where=path,
-            expected="metres",
-            fix="Give metres_per_unit=0.001 for a scan in millimetres, 1 for one that is sparse.",
-        )
+        fix = "Give metres_per_unit=0.001 for a scan in millimetres, 1 for one that is sparse."
+        raise WearcapError(fault, where=path, expected="metres", fix=fix)
     if needs_colors and content.colors is None:
-        raise WearcapError(
-            "the scan has no colour",
-            where=path,
-            expected="red, green and blue of every point",
-            fix="Export it with colours: pictures of the scene are drawn from them.",
-        )
+        fix = "Export it with colours: pictures of the scene are drawn from them."
+        raise WearcapError("the scan has no colour", where=path, expected="red, green and blue of every point", fix=fix)
     return Scan(points, content.colors)
 
 
@@ -103,11 +95,8 @@ def read_scene(
     if any((folder / f"images.{ending}").is_file() for ending in ("bin", "txt")):
         model = read_colmap(folder, images)
         return model.photos, model.tracks
-    raise WearcapError(
-        "no scene of a known kind",
-        where=folder,
-        expected=f"{PHOTOS_FILE} with {CLOUD}, a scan of the HPS data set, or a COLMAP model (cameras, images, points3D)",
-    )
+    expected = f"{PHOTOS_FILE} with {CLOUD}, a scan of the HPS data set, or a COLMAP model (cameras, images, points3D)"
+    raise WearcapError("no scene of a known kind", where=folder, expected=expected)
 
 
 def cloud_file(scene: str | Path) -> Path:

@@ -94,12 +94,9 @@ def _cleaned_pickle(path: Path) -> dict:
     try:
         table = read_pickle(path)
     except WearcapError as error:
-        raise WearcapError(
-            f"not a plain model file ({error.what})",
-            where=path,
-            expected="arrays only",
-            fix="SMPL's first releases hold chumpy objects: clean them with smplx's tools/clean_ch.py, or use the .npz.",
-        ) from error
+        what = f"not a plain model file ({error.what})"
+        fix = "SMPL's first releases hold chumpy objects: clean them with smplx's tools/clean_ch.py, or use the .npz."
+        raise WearcapError(what, where=path, expected="arrays only", fix=fix) from error
     if not isinstance(table, dict):
         raise WearcapError("not a body model", where=path, expected="a dictionary of arrays")
     return table

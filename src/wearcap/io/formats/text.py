@@ -107,12 +107,9 @@ def plain_xml(path: str | Path, kind: str) -> Iterator[None]:
     try:
         yield
     except DefusedXmlException as error:
-        raise WearcapError(
-            "it declares a document type or entities",
-            where=path,
-            expected=f"a plain {kind}",
-            fix="Such declarations can blow up or fetch other files, and are never read.",
-        ) from error
+        what = "it declares a document type or entities"
+        fix = "Such declarations can blow up or fetch other files, and are never read."
+        raise WearcapError(what, where=path, expected=f"a plain {kind}", fix=fix) from error
     except ParseError as error:
         raise WearcapError(
             f"broken XML ({error.msg})", where=path, expected=f"a whole {kind}", fix="Export or copy it again."

@@ -104,12 +104,8 @@ def _open_video(path: str | Path) -> Iterator[tuple[InputContainer, VideoStream]
             raise WearcapError(what, where=path, expected="a video in H.264, say")
         stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}  # for sizes that only the pictures have
         if stream.width * stream.height > MAX_PIXELS:
-            raise WearcapError(
-                f"pictures of {stream.width}x{stream.height} pixels",
-                where=path,
-                expected=f"at most {MAX_PIXELS} pixels",
-                fix="Scale the video down.",
-            )
+            what = f"pictures of {stream.width}x{stream.height} pixels"
+            raise WearcapError(what, where=path, expected=f"at most {MAX_PIXELS} pixels", fix="Scale the video down.")
         yield container, stream
 
 
@@ -132,12 +128,9 @@ def video_info(path: str | Path) -> _VideoInfo:
         if not (stream.width > 0 and stream.height > 0):
             raise WearcapError(f"pictures of {stream.width}x{stream.height} pixels", where=path, expected="a video")
         if not (0 < fps <= _MAX_FPS and 0 <= frames <= file_size(path)):
-            raise WearcapError(
-                f"a header that announces {frames} frames at {fps:.6g} per second",
-                where=path,
-                expected="no more frames than bytes",
-                fix="The file was damaged: copy it again.",
-            )
+            what = f"a header that announces {frames} frames at {fps:.6g} per second"
+            expected = "no more frames than bytes"
+            raise WearcapError(what, where=path, expected=expected, fix="The file was damaged: copy it again.")
         return _VideoInfo(stream.width, stream.height, fps, frames)
 
 

@@ -32,23 +32,17 @@ def read_obj(path: str | Path) -> Mesh:
             elif words[:1] == ["f"]:
                 faces.extend(_fan(words, len(vertices) // 3))
         except ValueError as error:
-            raise WearcapError(
-                f"not a readable {'vertex' if words[0] == 'v' else 'face'} ({error})"[:300],
-                where=at_line(path, number),
-                expected="v x y z, or f a b c …",
-                fix="The file was damaged: copy it again.",
-            ) from error
+            what = f"not a readable {'vertex' if words[0] == 'v' else 'face'} ({error})"[:300]
+            fix = "The file was damaged: copy it again."
+            raise WearcapError(what, where=at_line(path, number), expected="v x y z, or f a b c …", fix=fix) from error
     if not vertices:
         raise WearcapError("no vertices", where=path, expected="a Wavefront .obj with lines `v x y z`")
     points = np.array(vertices, np.float32).reshape(-1, 3)
     corners = np.array(faces, np.int32).reshape(-1, 3)
     if len(corners) and corners.max() >= len(points):
-        raise WearcapError(
-            f"a face names vertex {corners.max() + 1}, there are {len(points)}",
-            where=path,
-            expected="faces of its own vertices",
-            fix="The file was cut short: copy it again.",
-        )
+        what = f"a face names vertex {corners.max() + 1}, there are {len(points)}"
+        expected = "faces of its own vertices"
+        raise WearcapError(what, where=path, expected=expected, fix="The file was cut short: copy it again.")
     return Mesh(points, corners, GREY)
 
 
