@@ -95,8 +95,10 @@ def _with_body(motion: Motion, recording: Recording, chosen: bool | str) -> tupl
     """The .glb's motion and surface: Anny's body, none, or on its own skeleton that of the user's SMPL model file."""
     if not isinstance(chosen, str):
         return motion, anny_body(motion.skeleton, recording.shape or None) if chosen else None
+    arrays = read_smpl(chosen)
     betas = [value for name, value in recording.shape.items() if name.startswith("beta_")]
-    body = smpl_body(read_smpl(chosen), torch.tensor(betas) if betas else None)
+    betas = torch.tensor(betas[: arrays.shape_directions.shape[-1]])
+    body = smpl_body(arrays, betas if len(betas) else None)
     R, root = retarget(motion.skeleton, body.skeleton, motion.R_parent_joint, motion.t_world_root)
     return replace(motion, skeleton=body.skeleton, R_parent_joint=R, t_world_root=root), body
 
