@@ -6,7 +6,7 @@ the scan's axes; a pose turns them about the scan's origin and then moves them. 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.hcontact import activity_of, location_of, read_smpl_json
 from wearcap.io.datasets.hps import read_hps_subject
 from wearcap.io.datasets.hps_sequence import subject_of
+from wearcap.io.formats.bounded import understood
 from wearcap.io.formats.contact_labels import LabelClock, interactions_of, labels_of, parse_labels
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import checked_trajectory
