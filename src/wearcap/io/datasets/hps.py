@@ -195,7 +195,7 @@ def is_hps_scene(folder: str | Path) -> bool:
 
 
 def read_hps_scene(folder: str | Path) -> tuple[Path, list[Photo]]:
-    """(path of the cloud, photos in order of frame and camera); the cloud itself is read by `io.formats.scan.read_scan`.
+    """(path of the cloud, photos in order of frame and camera); the cloud itself is read by `io.formats.scene_folder.read_scan`.
 
     Pictures whose frame was found invalid by the scanner are left out. Raises WearcapError for a missing cloud,
     calibration or picture folder, a picture without pose or calibration, and what those readers refuse.
