@@ -13,7 +13,7 @@ from one_object_files import BEHAVE_NAME, CORNERS, behave_arrays, carried, frame
 from boxes import BOX_FACES
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.datasets.behave import R_WORLD_CAMERA, behave_names, read_behave
+from wearcap.io.datasets.behave import R_WORLD_CAMERA, behave_names, read_behave, read_behave_mesh
 from wearcap.io.formats.ply import Ply
 
 
