@@ -15,4 +15,5 @@ def write_keypoints(cues: Mapping[str, Cue], path: Path) -> None:
         rows += [(time, cue.joint, [*point, sure]) for time, point, sure in values if sure > 0]
     lines = [",".join(["timestamp", "joint", *axes, "confidence"])]
     lines += [",".join([repr(time), joint, *(f"{v:.9g}" for v in rest)]) for time, joint, rest in sorted(rows)]
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("\n".join(lines) + "\n")
