@@ -26,14 +26,13 @@ import test_adt  # noqa: E402
 import test_aria_mps  # noqa: E402
 import test_asf_amc  # noqa: E402
 import test_colmap  # noqa: E402
-import test_droid  # noqa: E402
 import test_egohoi  # noqa: E402
 import test_hcontact  # noqa: E402
 import test_mvnx  # noqa: E402
-import test_totalcapture  # noqa: E402
 import test_watch_log  # noqa: E402
 from PIL import Image  # noqa: E402
 
+import keypoint_files  # noqa: E402
 from wearcap.body.skeletons import smplh52  # noqa: E402
 from wearcap.geometry.camera import Camera  # noqa: E402
 from wearcap.geometry.rigid import Rigid  # noqa: E402
@@ -44,15 +43,12 @@ from wearcap.io.datasets import (  # noqa: E402
     egohoi,
     hcontact,
     hps,
-    hps_scene,
     hps_sequence,
-    hps_unity,
     mocap_every_folder,
     nymeria,
     omomo,
-    totalcapture,
 )
-from wearcap.io.devices import aria_mps, depth_rig, watch_calibration_json, watch_log  # noqa: E402
+from wearcap.io.devices import aria_mps, watch_log  # noqa: E402
 from wearcap.io.formats import (  # noqa: E402
     asf_amc,
     bvh,
@@ -60,26 +56,19 @@ from wearcap.io.formats import (  # noqa: E402
     colmap,
     contact_labels,
     csv_table,
-    droid,
     environment,
-    euroc,
-    json_text,
     keypoints_csv,
     motion_npz,
     mvnx,
     npz,
     ocamcalib,
     pcd,
-    photos,
-    pictures,
     ply,
+    poses,
     restricted_pickle,
-    scan,
     scene_folder,
-    smpl_files,
-    smpl_json,
+    smpl,
     text,
-    tum,
     video,
     wavefront,
 )
@@ -209,27 +198,6 @@ def _environment(folder: Path) -> None:
     (folder / "environment.json").write_text(json.dumps({"schema_version": 1, "objects": [row]}))
 
 
-def _watch_calibration(path: Path) -> None:
-    watch = {"R_world_ref_wxyz": [1, 0, 0, 0], "R_joint_imu_wxyz": [1, 0, 0, 0]}
-    watch |= dict.fromkeys(watch_calibration_json._WATCH, 0.5)
-    clock = {
-        "camera_s": [0, 9],
-        "watch_s": [1, 10],
-        "swings": 3,
-        "drift_s_per_hour": 0.1,
-        "residual_s": 0.01,
-        "std_s": 0.01,
-    }
-    camera = dict.fromkeys(watch_calibration_json._CAMERA, 0.5) | {
-        "R_world_slam_wxyz": [1, 0, 0, 0],
-        "t_world_slam": [0, 0, 1],
-    }
-    head = {"R_head_cam_wxyz": [1, 0, 0, 0], "t_head_cam": [0, 0, 0.1], "still_deg": 0.5}
-    path.write_text(
-        json.dumps({"watches": {"left_wrist": watch}, "clocks": {"left_wrist": clock}, "camera": camera, "head": head})
-    )
-
-
 def _smpl(path: Path) -> None:
     random = np.random.default_rng(0)
     np.savez(path, v_template=random.normal(size=(30, 3)), shapedirs=random.normal(size=(30, 3, 4)),
@@ -250,29 +218,14 @@ def _video(path: Path) -> None:
     video.write_frames(path, [np.full((32, 48, 3), 20 * k, np.uint8) for k in range(6)], 30.0)
 
 
-def _depth_rig(folder: Path) -> None:
-    images = np.random.default_rng(0).integers(800, 4000, (3, 12, 16)).astype(np.uint16)
-    depth_rig.write_depth_rig(folder, {"k0": (LENS, POSE)}, {"k0": images[:1]}, {"k0": images}, np.arange(3) / 30)
-
-
 def _cues(path: Path) -> None:
     times = torch.arange(5, dtype=torch.float64) / 30
-    keypoints_csv.write_keypoints({"left_wrist": Cue(times, "left_wrist", torch.rand(5, 3), torch.ones(5))}, path)
+    keypoint_files.write_keypoints({"left_wrist": Cue(times, "left_wrist", torch.rand(5, 3), torch.ones(5))}, path)
 
 
 def _mocap_every(folder: Path) -> None:
     mocap_every_files.write_capture(folder, seconds=2.0)
     (folder / "config.yaml").write_text("start: 0\nmap: {a: [1, 2], b: x}\n")
-
-
-def _nymeria(path: Path) -> None:
-    np.savez(
-        path,
-        timestamps=np.arange(9) / 30,
-        global_orient=np.zeros((9, 3)),
-        body_pose=np.zeros((9, 69)),
-        transl=np.zeros((9, 3)),
-    )
 
 
 def _amass(path: Path) -> None:
@@ -286,7 +239,7 @@ PICKLED = pickle.dumps({"a": [1, 2.5, "x", (None, True)], "b": np.arange(12.0).r
 
 READERS: dict[str, Reader] = {
     "adt_skeleton": _made("s.json", test_adt.skeleton_file, adt.read_skeleton),
-    "adt_objects": Reader(_adt_objects, adt.read_objects),
+    "adt_objects": Reader(_adt_objects, adt.read_moving_objects),
     "amass": _made("a.npz", _amass, amass.read_amass),
     "aria_closed_loop": _made(
         "a.csv", lambda path: test_aria_mps.write(path, test_aria_mps.rows(12)), aria_mps.read_closed_loop
@@ -313,26 +266,12 @@ READERS: dict[str, Reader] = {
     "csv_table": _one(
         "a.csv", "a,b,n\n1,x,3\n2.5,y,4\n", lambda path: csv_table.read_columns(path, ["a"], text=["b"], whole=["n"])
     ),
-    "depth_rig": Reader(_depth_rig, depth_rig.read_depth_rig),
-    "depth_image": _made(
-        "d.png",
-        lambda path: depth_rig.write_depth(path, np.full((12, 16), 2000, np.uint16)),
-        lambda path: depth_rig.read_depth(path, LENS),
-    ),
-    "droid": Reader(test_droid.reconstruction, lambda folder: droid.read_droid(folder, 10.0)),
     "egohoi": Reader(
         lambda folder: test_egohoi.write_set(folder, FRAMES), lambda folder: egohoi.read_egohoi(folder, test_egohoi.ONE)
     ),
     "egohoi_locations": _one("l.json", json.dumps(test_egohoi.SLID), egohoi.read_object_locations),
-    "egohoi_npz": _made(
-        "o.npz",
-        lambda path: np.savez(
-            path, translations=np.zeros((4, 3)), timestamps=np.arange(4.0), quaternions=np.tile([1.0, 0, 0, 0], (4, 1))
-        ),
-        egohoi.read_object_npz,
-    ),
     "environment": Reader(_environment, environment.read_environment),
-    "euroc": _one("e.csv", EUROC, euroc.read_euroc),
+    "euroc": _one("e.csv", EUROC, poses.read_euroc),
     "hcontact": Reader(
         lambda folder: test_hcontact.write_set(folder, frames=FRAMES),
         lambda folder: hcontact.read_hcontact(folder, test_hcontact.DOOR),
@@ -353,16 +292,16 @@ READERS: dict[str, Reader] = {
         hps.read_hps_localization,
     ),
     "hps_cameras": _one("c.json", json.dumps(hps_files.CAMERA), hps.read_hps_cameras),
-    "hps_scene": Reader(hps_files.write_scan, hps_scene.read_hps_scene),
+    "hps_scene": Reader(hps_files.write_scan, hps.read_hps_scene),
     "hps_sequence": Reader(
         lambda folder: hps_files.write_hps(folder, frames=FRAMES),
         lambda folder: hps_sequence.read_hps_sequence(folder, hps_files.NAME),
     ),
     "hps_unity": Reader(
         lambda folder: hps_files.write_unity(hps_files.motion(4), folder, "u"),
-        lambda folder: hps_unity.read_unity_motion(folder / "u_pose.txt", folder / "u_trans.txt"),
+        lambda folder: hps.read_unity_motion(folder / "u_pose.txt", folder / "u_trans.txt"),
     ),
-    "json_text": _one("a.json", '{"a": [1, 2.5, null], "b": {"c": "x"}}', json_text.read_json_object),
+    "json_text": _one("a.json", '{"a": [1, 2.5, null], "b": {"c": "x"}}', text.read_json_object),
     "keypoints_csv": _made("k.csv", _cues, keypoints_csv.read_keypoints),
     "mocap_every": Reader(_mocap_every, mocap_every_folder.read_mocap_every_folder),
     "motion_npz": _made("m.npz", lambda path: motion_npz.write_motion(swaying_motion(4), path), motion_npz.read_motion),
@@ -370,22 +309,15 @@ READERS: dict[str, Reader] = {
     "mvnx_packed": _one(
         "m.mvnx.xz", lzma.compress(test_mvnx.mvnx(test_mvnx.sample(2)).encode(), preset=0), mvnx.read_mvnx
     ),
-    "npy": _made(
-        "a.npy", lambda path: np.save(path, np.arange(12.0).reshape(3, 4)), lambda path: npz.map_npy(path).sum()
-    ),
     "npz": _made(
         "a.npz",
         lambda path: np.savez_compressed(path, a=np.arange(12.0), b=np.array("text"), c=np.asfortranarray(np.eye(3))),
         npz.read_npz,
     ),
     "nymeria_xdata": _made("x.npz", _xdata, nymeria.read_xdata),
-    "nymeria_smpl": _made("x.npz", _nymeria, nymeria.read_smpl_neutral),
     "nymeria_metadata": Reader(
         lambda folder: (folder / "metadata.json").write_text('{"fake_name": "a", "participant_height_cm": 160}'),
         nymeria.read_metadata,
-    ),
-    "ocamcalib": _one(
-        "c.txt", ocam_files.text_of(LENSES["cam0"]), lambda path: ocamcalib.read_ocamcalib(path).camera()
     ),
     "sensor_frame": _one(
         "s.xml",
@@ -397,9 +329,9 @@ READERS: dict[str, Reader] = {
     "pcd_binary": _one("a.pcd", (PCD + "binary\n").encode() + bytes(64), pcd.read_pcd),
     "pcd_compressed": _one("a.pcd", _compressed_pcd(), pcd.read_pcd),
     "photos": Reader(
-        lambda folder: photos.write_photos([Photo(Path("a.png"), LENS, POSE)], folder), photos.read_photos
+        lambda folder: camera_json.write_photos([Photo(Path("a.png"), LENS, POSE)], folder), camera_json.read_photos
     ),
-    "pictures": Reader(_pictures, lambda folder: list(pictures.read_pictures(folder, 2))),
+    "pictures": Reader(_pictures, lambda folder: list(video.read_pictures(folder, 2))),
     "ply_ascii": _one("a.ply", ASCII_PLY, ply.read_ply),
     "ply_even": _made(
         "a.ply",
@@ -411,43 +343,24 @@ READERS: dict[str, Reader] = {
     "pickle": _one("a.pkl", PICKLED, restricted_pickle.read_pickle),
     "pickle_packed": _one("a.pkl", zlib.compress(PICKLED), restricted_pickle.read_pickle),
     "pickle_joblib": Reader(_joblib, lambda folder: restricted_pickle.read_pickle(next(folder.glob("*.p")))),
-    "scan": _made("s.ply", lambda path: ply.write_ply(ply.Ply(_points(300)), path), scan.read_scan),
+    "scan": _made("s.ply", lambda path: ply.write_ply(ply.Ply(_points(300)), path), scene_folder.read_scan),
     "scene_folder": Reader(hps_files.write_scan, scene_folder.read_scene),
-    "smpl_files": _made("m.npz", _smpl, smpl_files.read_smpl),
-    "smpl_json": _one("m.json", HCONTACT_JSON, smpl_json.read_smpl_json),
+    "smpl_files": _made("m.npz", _smpl, smpl.read_smpl),
+    "smpl_json": _one("m.json", HCONTACT_JSON, hcontact.read_smpl_json),
     "smpl_json_zip": _made(
-        "m.json.zip", lambda path: hoi_files.write_zip(HCONTACT_JSON, path), smpl_json.read_smpl_json
+        "m.json.zip", lambda path: hoi_files.write_zip(HCONTACT_JSON, path), hcontact.read_smpl_json
     ),
     "text": _one(
         "a.txt.gz",
         gzip.compress(b"some words\nof text\n"),
         lambda path: (text.read_text(path), list(text.numbered_lines(path))),
     ),
-    "totalcapture_pickle": _made(
-        "t.pkl",
-        lambda path: test_totalcapture.write(path, test_totalcapture.recorded(frames=12)),
-        totalcapture.read_totalcapture,
-    ),
-    "totalcapture_npz": _made(
-        "t.npz",
-        lambda path: test_totalcapture.write(path, test_totalcapture.recorded(frames=12)),
-        totalcapture.read_totalcapture,
-    ),
-    "totalcapture_torch": _made(
-        "t.pt",
-        lambda path: test_totalcapture.write(path, test_totalcapture.recorded(frames=12)),
-        totalcapture.read_totalcapture,
-    ),
-    "dip_imu": _made(
-        "t.pkl", lambda path: test_totalcapture.write(path, test_totalcapture.dip(12)), totalcapture.read_dip_imu
-    ),
-    "tum": _one("t.txt", TUM, tum.read_tum),
-    "tum_gz": _one("t.txt.gz", gzip.compress(TUM.encode()), tum.read_tum),
-    "tum_xz": _one("t.txt.xz", lzma.compress(TUM.encode()), tum.read_tum),
+    "tum": _one("t.txt", TUM, poses.read_tum),
+    "tum_gz": _one("t.txt.gz", gzip.compress(TUM.encode()), poses.read_tum),
+    "tum_xz": _one("t.txt.xz", lzma.compress(TUM.encode()), poses.read_tum),
     "image": _made("a.png", lambda path: _pictures(path.parent), video.read_image),
     "video_frames": _made("a.mp4", _video, lambda path: list(video.read_frames(path))),
     "video_info": _made("a.mp4", _video, video.video_info),
-    "watch_calibration": _made("w.json", _watch_calibration, watch_calibration_json.read_watch_calibration),
     "watch_log_logger": _made(
         "w.csv",
         lambda path: test_watch_log.sensor_logger(test_watch_log.moved(20), path),

@@ -8,10 +8,14 @@ from wearcap.body.anny_body import anny_body
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeletons import skeleton_by_name
 from wearcap.body.smpl_body import smpl_body
+from wearcap.cli.capture import _with_body
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.io.formats.smpl_files import read_smpl
+from wearcap.io.formats.gltf import write_glb
+from wearcap.io.formats.smpl import read_smpl
+from wearcap.recording import Recording
+from wearcap_testing import swaying_motion
 
 AXES = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # model → world
 
@@ -102,3 +106,17 @@ def test_broken_files_are_named(tmp_path):
         read_smpl(tmp_path / "model.pkl")
     with pytest.raises(WearcapError, match="at most this file's 4"):
         smpl_body(read_smpl(tmp_path / "model.npz"), torch.zeros(10))
+
+
+def test_a_capture_is_shown_with_the_users_own_body(tmp_path):
+    """`wearcap capture body=MODEL.npz`: the motion moves to the model's joints, and the .glb shows its surface."""
+    model_file(tmp_path / "model.npz", "smplh52")
+    motion = swaying_motion(4)
+    recording = Recording("r", motion=motion, shape={"beta_0": 0.5, "height": 1.7})
+    shown, body = _with_body(motion, recording, str(tmp_path / "model.npz"))
+    assert shown.skeleton.name == "smplh52"
+    write_glb(shown, tmp_path / "motion.glb", body=body)
+    assert (tmp_path / "motion.glb").stat().st_size > 36 * len(body.rest_vertices)
+    before, after = (m.joint("head").t for m in (motion, shown))
+    assert (before - after).norm(dim=-1).max() < 0.3
+    assert _with_body(motion, recording, False) == (motion, None)

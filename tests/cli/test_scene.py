@@ -12,7 +12,7 @@ from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.io.formats.photos import write_photos
+from wearcap.io.formats.camera_json import write_photos
 from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.localization.visual_map import VisualMap
 from wearcap.recording.photo import Photo

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from keypoint_files import write_keypoints
 from wearcap.cli import prepare
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
-from wearcap.io.formats.keypoints_csv import write_keypoints
 from wearcap.io.formats.video import write_frames
 from wearcap.localization.keypoints import Keypoint
 from wearcap.prepare import keypoints

@@ -7,7 +7,7 @@ from hydra.utils import instantiate
 
 from wearcap.cli.conf import compose, splits_dir
 from wearcap.errors import WearcapError
-from wearcap.io.formats.photos import read_photos
+from wearcap.io.formats.camera_json import read_photos
 from wearcap.prepare.engine import prepare
 from wearcap.prepare.simulated import simulated_hps_tasks
 from wearcap.prepare.splits import read_splits

@@ -9,7 +9,7 @@ import torch
 
 from wearcap.body.skeletons import smpl24, smplh52
 from wearcap.geometry import rotation
-from wearcap.io.formats.smpl_axes import A
+from wearcap.io.formats.smpl import A
 from wearcap.recording import Motion
 from wearcap_testing import swaying_motion
 

@@ -10,10 +10,9 @@ from ocam_files import lens, xml_of
 
 from wearcap.body.skeletons import smpl24
 from wearcap.geometry import rotation
-from wearcap.io.datasets.hps import PELVIS_SMPL, nominal_mount
-from wearcap.io.datasets.hps_unity import JOINTS
+from wearcap.io.datasets.hps import PELVIS_SMPL, UNITY_JOINTS, nominal_mount
 from wearcap.io.formats.ply import Ply, write_ply
-from wearcap.io.formats.smpl_axes import A
+from wearcap.io.formats.smpl import A
 from wearcap.recording import Motion
 from wearcap_testing import swaying_motion
 
@@ -59,7 +58,7 @@ def write_unity(motion: Motion, folder: Path, name: str = NAME, inner_root: bool
     """A motion in our axes as Unity would show it: y up, x right, left-handed."""
     mirror = torch.diag(torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64))
     R_smpl = A.T @ motion.R_parent_joint.double() @ A
-    order = [motion.skeleton.index(joint) for joint in JOINTS]
+    order = [motion.skeleton.index(joint) for joint in UNITY_JOINTS]
     angles = unity_euler_deg(mirror @ R_smpl[:, order] @ mirror)
     if inner_root:
         angles = torch.cat([angles[:, :1], torch.zeros_like(angles[:, :1]), angles[:, 1:]], 1)

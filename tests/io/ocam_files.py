@@ -23,21 +23,6 @@ def lens(scale: float = 1.0) -> OCamModel:
     )
 
 
-def text_of(model: OCamModel) -> str:
-    rows = ["#polynomial coefficients for the DIRECT mapping function", ""]
-    rows += [f"{len(model.pol)} " + " ".join(f"{a:.9e}" for a in model.pol), "", "#inverse mapping function", ""]
-    rows += [f"{len(model.invpol)} " + " ".join(f"{a:.6f}" for a in model.invpol), "", '#center: "row" and "column"']
-    rows += [f"{model.row} {model.column}", "", '#affine parameters "c", "d", "e"', ""]
-    rows += [
-        " ".join(map(str, model.affine)),
-        "",
-        '#image size: "height" and "width"',
-        "",
-        f"{model.height} {model.width}",
-    ]
-    return "\n".join(rows) + "\n"
-
-
 def xml_of(models: dict[str, OCamModel]) -> str:
     def coefficients(values) -> str:
         return "".join(f"<coeff>{value!r}</coeff>" for value in values)

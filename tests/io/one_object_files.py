@@ -14,7 +14,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.amass import PELVIS_SMPLH
 from wearcap.io.formats.ply import Ply, write_ply
-from wearcap.io.formats.smpl_axes import A
+from wearcap.io.formats.smpl import A
 from wearcap.recording import Motion
 
 BEHAVE_NAME, OMOMO_NAME = "Date03_Sub04_boxlarge_hand", "sub16_largebox_007"

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wearcap.errors import WearcapError
-from wearcap.io.datasets.adt import is_adt, read_adt, read_objects, read_skeleton
+from wearcap.io.datasets.adt import is_adt, read_adt, read_moving_objects, read_skeleton
 
 
 def skeleton_file(path, joints=51, frames=3):
@@ -56,13 +56,10 @@ def test_objects_from_small_files(tmp_path):
         "77": {"instance_name": "Cup", "category": "cup", "motion_type": "dynamic"},
     }
     (tmp_path / "instances.json").write_text(json.dumps(about))
-    sofa, cup = sorted(read_objects(tmp_path), key=lambda o: o.moves)
-    assert (sofa.name, sofa.moves, cup.name, cup.moves) == ("Sofa", False, "Cup", True)
-    assert sofa.timestamps is None
-    assert sofa.T_world_obj.t[0].tolist() == [1, -3, 2]
-    assert sofa.box.tolist() == [[-1, -2, -3], [1, 2, 3]]
-    assert cup.timestamps is not None
-    assert cup.timestamps.tolist() == [1.0, 2.0]
+    found = read_moving_objects(tmp_path)
+    assert list(found) == ["Cup"], "the sofa's pose is for all time"
+    assert found["Cup"].timestamps.tolist() == [1.0, 2.0]
+    assert found["Cup"].t_world_body.tolist() == [[0, 0, 0], [1, 0, 0]]
 
 
 def test_other_folders_are_refused(tmp_path):
@@ -111,13 +108,11 @@ def test_real_sequence(real_data):
 
 @pytest.mark.real
 def test_real_objects(real_data):
-    objects = read_objects(real_data / "aria_adt_sample" / "raw")
-    assert len(objects) > 300
-    assert all((o.box[1] >= o.box[0]).all() for o in objects)
-    heights = torch.stack([o.T_world_obj.t[0, 2] for o in objects])
+    objects = read_moving_objects(real_data / "aria_adt_sample" / "raw")
+    assert len(objects) > 10
+    heights = torch.stack([track.t_world_body[0, 2] for track in objects.values()])
     assert heights.min() > -0.2
     assert heights.max() < 4
-    assert sum(o.moves for o in objects) > 10
 
 
 @pytest.mark.real

@@ -13,7 +13,7 @@ from one_object_files import BEHAVE_NAME, CORNERS, behave_arrays, carried, frame
 from boxes import BOX_FACES
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.datasets.behave import R_WORLD_CAMERA, behave_mesh_path, behave_names, read_behave
+from wearcap.io.datasets.behave import R_WORLD_CAMERA, behave_names, read_behave, read_behave_mesh
 from wearcap.io.formats.ply import Ply
 
 
@@ -57,8 +57,10 @@ def test_the_mesh_is_placed_by_the_data_sets_own_rule(tmp_path):
 
 
 def test_the_registered_meshes(tmp_path):
-    names = [behave_mesh_path(tmp_path, name).name for name in ("boxlarge", "monitor", "chairwood", "tablesquare")]
-    assert names == ["boxlarge_f1000.ply", "monitor_closed_f1000.ply", "chairwood_f2500.ply", "tablesquare_f2000.ply"]
+    of_object = {"boxlarge": "f1000", "monitor": "closed_f1000", "chairwood": "f2500", "tablesquare": "f2000"}
+    for name, ending in of_object.items():
+        with pytest.raises(WearcapError, match=rf"{name}_{ending}\.ply: no mesh"):
+            read_behave_mesh(tmp_path, name)
 
 
 def test_the_other_folder_and_betas_for_all_frames(tmp_path):

@@ -14,24 +14,21 @@ import numpy as np
 import pytest
 
 from wearcap.errors import WearcapError
+from wearcap.io.datasets.hcontact import read_smpl_json
 from wearcap.io.datasets.mocap_every_folder import _config
-from wearcap.io.datasets.totalcapture import read_totalcapture
 from wearcap.io.formats import bounded
 from wearcap.io.formats.asf_amc import read_asf
 from wearcap.io.formats.bvh import read_bvh
+from wearcap.io.formats.camera_json import read_photos
 from wearcap.io.formats.colmap import read_colmap
-from wearcap.io.formats.euroc import read_euroc
-from wearcap.io.formats.json_text import read_json
 from wearcap.io.formats.mvnx import read_mvnx
-from wearcap.io.formats.npz import map_npy, read_npz
+from wearcap.io.formats.npz import read_npz
 from wearcap.io.formats.ocamcalib import OCamModel
 from wearcap.io.formats.pcd import read_pcd
-from wearcap.io.formats.photos import read_photos
 from wearcap.io.formats.ply import read_ply
+from wearcap.io.formats.poses import read_euroc, read_tum
 from wearcap.io.formats.restricted_pickle import read_pickle
-from wearcap.io.formats.smpl_json import read_smpl_json
-from wearcap.io.formats.text import read_text
-from wearcap.io.formats.tum import read_tum
+from wearcap.io.formats.text import read_json, read_text
 from wearcap.io.formats.video import read_frames, read_image, video_info
 from wearcap.io.formats.wavefront import read_obj
 
@@ -43,14 +40,12 @@ READERS = {
     "a.asf": read_asf,
     "a.mvnx": read_mvnx,
     "a.npz": read_npz,
-    "a.npy": map_npy,
     "a.ply": read_ply,
     "a.pcd": read_pcd,
     "a.json": read_json,
     "a.pkl": read_pickle,
     "a.obj": read_obj,
     "a.json.zip": read_smpl_json,
-    "a.pt": read_totalcapture,
     "a.png": read_image,
     "a.mp4": video_info,
     "b.mp4": lambda path: list(read_frames(path)),
@@ -200,9 +195,6 @@ COUNTS = {
     "binary points.pcd": PCD.format(count="1 1 1", points=10**12, form="binary"),
     "packed points.pcd": PCD.format(count="1 1 1", points=10**12, form="binary_compressed"),
     "digits.pcd": PCD.format(count="1 1 1", points="9" * 5000, form="binary"),
-    "rows.npy": npy_of((10**12,)),
-    "product.npy": npy_of((10**9, 10**9, 10**9)),
-    "negative.npy": npy_of((-1,)),
 }
 
 
@@ -215,9 +207,10 @@ def test_impossible_counts(tmp_path, name):
     refused(read, path, name.split(".")[1], most_mib=30)
 
 
-def test_an_array_larger_than_its_archive(tmp_path):
+@pytest.mark.parametrize("shape", [(10**12,), (10**9, 10**9, 10**9), (-1,)])
+def test_an_array_larger_than_its_archive(tmp_path, shape):
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
-        archive.writestr("a.npy", npy_of((10**12,)))
+        archive.writestr("a.npy", npy_of(shape))
     refused(read_npz, tmp_path / "a.npz", "shape", most_mib=10)
 
 
@@ -305,7 +298,7 @@ def test_a_file_that_may_not_be_read(tmp_path, name, monkeypatch):
     assert "chmod" in refused(READERS[name], tmp_path / name, "no permission")
 
 
-@pytest.mark.parametrize("name", ["a.txt", "a.bvh", "a.npz", "a.npy", "a.ply", "a.pkl", "a.json", "a.json.zip"])
+@pytest.mark.parametrize("name", ["a.txt", "a.bvh", "a.npz", "a.ply", "a.pkl", "a.json", "a.json.zip"])
 def test_a_file_that_may_be_seen_but_not_opened(tmp_path, name, monkeypatch):
     (tmp_path / name).write_bytes(b"something")
 
@@ -331,7 +324,6 @@ def test_an_empty_list_is_json(tmp_path):
 
 @pytest.mark.parametrize("dtype", ["<f8,<f4", "M8[s]", "V4"])
 def test_arrays_of_neither_numbers_nor_text(tmp_path, dtype):
-    for name, save, read in (("a.npy", np.save, map_npy), ("a.npz", np.savez, read_npz)):
-        save(tmp_path / name, np.zeros(3, dtype))
-        with pytest.raises(WearcapError, match="an array of"):
-            read(tmp_path / name)
+    np.savez(tmp_path / "a.npz", np.zeros(3, dtype))
+    with pytest.raises(WearcapError, match="an array of"):
+        read_npz(tmp_path / "a.npz")

@@ -12,12 +12,11 @@ from wearcap.io.formats.contact_labels import (
     Label,
     LabelClock,
     annotation_of,
-    hcontact_of,
+    hcontact_text,
     interactions_of,
     labels_of,
     parse_labels,
     read_contact_labels,
-    write_contact_labels,
 )
 from wearcap.recording.interactions import Interactions
 
@@ -44,7 +43,7 @@ def test_hcontact_is_read(tmp_path):
     assert not contact[150:240, 0].any()
     assert contact[540:, 1].all()
     assert contact[-1, 1], "a label that is open at its end holds the last frame"
-    write_contact_labels(tmp_path / "out.json", found, CLOCK)
+    (tmp_path / "out.json").write_text(hcontact_text(labels_of(found, CLOCK), CLOCK))
     assert json.loads((tmp_path / "out.json").read_text()) == contacts([[1.0, 2.5], [4.0, 5.0]], [[9.0, -1.0]])
 
 
@@ -83,7 +82,7 @@ def test_every_frame_keeps_its_label_through_files_and_interactions(labels):
     text = json.dumps(annotation_of(labels, CLOCK))
     assert parsed(json.loads(text)) == labels
     assert labels_of(interactions_of(labels), CLOCK) == labels
-    bare = parsed({"contacts": json.loads(json.dumps(hcontact_of(labels, CLOCK)))})
+    bare = parsed(json.loads(hcontact_text(labels, CLOCK)))
     wanted, found = (interactions_of(each).hand_contact(TIMES) for each in (labels, bare))
     assert torch.equal(wanted, found)
 

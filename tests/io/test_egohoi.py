@@ -13,15 +13,7 @@ from hypothesis import given
 from wearcap.cli.main import run_verb
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.datasets.egohoi import (
-    egohoi_names,
-    read_egohoi,
-    read_egohoi_contacts,
-    read_object_locations,
-    read_object_npz,
-    write_object_npz,
-)
+from wearcap.io.datasets.egohoi import egohoi_names, read_egohoi, read_egohoi_contacts, read_object_locations
 from wearcap.io.formats.contact_labels import LabelClock
 from wearcap.io.formats.environment import read_environment
 from wearcap.io.formats.ply import Ply, read_ply, write_ply
@@ -86,8 +78,8 @@ def posed(path) -> np.ndarray:
 def test_one_object_slides(tmp_path):
     write_set(tmp_path)
     assert egohoi_names(tmp_path) == [ONE, SEVERAL]
-    read = read_egohoi(tmp_path, ONE)
-    recording, sofa = read.recording, read.environment.by_name(SOFA)
+    recording, environment = read_egohoi(tmp_path, ONE)
+    sofa = environment.by_name(SOFA)
     assert recording.motion is not None
     assert recording.interactions is not None
     assert moved(recording.motion, motion(hands=False)) < 1e-5
@@ -107,8 +99,8 @@ def test_one_object_slides(tmp_path):
 
 
 def test_several_objects_one_of_which_turns_about_its_hinge(tmp_path):
-    read = read_egohoi(write_set(tmp_path), SEVERAL)
-    recording, door = read.recording, read.environment.by_name(DOOR)
+    recording, environment = read_egohoi(write_set(tmp_path), SEVERAL)
+    door = environment.by_name(DOOR)
     assert recording.interactions is not None
     assert door.freedom.kind == "hinge"
     assert door.freedom.pivot == tuple(HINGE)
@@ -125,10 +117,10 @@ def test_several_objects_one_of_which_turns_about_its_hinge(tmp_path):
 def test_motion_types_are_given_by_patterns(tmp_path):
     write_set(tmp_path)
     types = {"*door": "absent", "*": "free"}
-    read = read_egohoi(tmp_path, SEVERAL, types)
-    assert [item.name for item in read.environment.objects] == [TABLE]
-    assert read.environment.by_name(TABLE).freedom.kind == "free"
-    assert set(read.recording.object_motion) == {TABLE}
+    recording, environment = read_egohoi(tmp_path, SEVERAL, types)
+    assert [item.name for item in environment.objects] == [TABLE]
+    assert environment.by_name(TABLE).freedom.kind == "free"
+    assert set(recording.object_motion) == {TABLE}
     with pytest.raises(WearcapError, match="motion type 'swing'.*along_floor"):
         read_egohoi(tmp_path, SEVERAL, {"*": "swing"})
     with pytest.raises(WearcapError, match=f"{TABLE} is to turn about a hinge and has none"):
@@ -139,18 +131,18 @@ def test_objects_stand_at_first_where_they_were_seen_last_before_the_start(tmp_p
     write_set(tmp_path)
     path = tmp_path / "object_locations" / f"{ONE}.json"
     write_json(locations(pose(-9.0), pose(-1.0, shift=(2, 0, 0)), pose(1.0, shift=(3, 0, 0))), path)
-    sofa = read_egohoi(tmp_path, ONE).environment.by_name(SOFA)
+    sofa = read_egohoi(tmp_path, ONE)[1].by_name(SOFA)
     np.testing.assert_allclose(sofa.t_world_object, CENTER + np.array([2, 0, 0]), atol=1e-5)
     write_json(locations(pose(1.0, shift=(3, 0, 0)), pose(1.5)), path)
-    sofa = read_egohoi(tmp_path, ONE).environment.by_name(SOFA)
+    sofa = read_egohoi(tmp_path, ONE)[1].by_name(SOFA)
     np.testing.assert_allclose(sofa.t_world_object, CENTER + np.array([3, 0, 0]), atol=1e-5)
 
 
 def test_names_of_objects(tmp_path):
     write_set(tmp_path)
     (tmp_path / "object_models" / f"{SOFA}.ply").rename(tmp_path / "object_models" / f"{SOFA}_left.ply")
-    assert read_egohoi(tmp_path, ONE).environment.objects[0].name == f"{SOFA}_left"
-    assert read_egohoi(tmp_path, ONE, object_name=TABLE).environment.objects[0].name == TABLE
+    assert read_egohoi(tmp_path, ONE)[1].objects[0].name == f"{SOFA}_left"
+    assert read_egohoi(tmp_path, ONE, object_name=TABLE)[1].objects[0].name == TABLE
     write_ply(Ply(CORNERS), tmp_path / "object_models" / f"{SOFA}_right.ply")
     with pytest.raises(WearcapError, match=f"2 models fit.*{SOFA}_left, {SOFA}_right"):
         read_egohoi(tmp_path, ONE)
@@ -230,43 +222,6 @@ def test_damaged_locations_are_read_or_refused(tmp_path_factory, text):
     except WearcapError:
         return
     assert read.trajectory.t_world_body.isfinite().all()
-
-
-def test_the_trackers_output_is_written_in_the_scans_axes_and_read_back(tmp_path):
-    annotated = read_object_locations(_written(tmp_path))
-    path = tmp_path / "out.npz"
-    write_object_npz(annotated.trajectory, path, annotated.center)
-    with np.load(path, allow_pickle=False) as arrays:
-        assert set(arrays) == {"version", "type", "translations", "quaternions", "timestamps"}
-        np.testing.assert_allclose(arrays["translations"], [row["position"] for row in SLID["locations"]], atol=1e-5)
-        wanted = np.array([row["quaternion"] for row in SLID["locations"]])
-        sign = np.sign((arrays["quaternions"] * wanted).sum(1, keepdims=True))
-        np.testing.assert_allclose(sign * arrays["quaternions"], wanted, atol=1e-6)
-    back = read_object_npz(path, annotated.center)
-    torch.testing.assert_close(back.t_world_body, annotated.trajectory.t_world_body, atol=1e-5, rtol=0)
-    torch.testing.assert_close(back.R_world_body, annotated.trajectory.R_world_body, atol=1e-6, rtol=0)
-    assert torch.equal(back.timestamps, annotated.trajectory.timestamps)
-
-
-def _written(tmp_path):
-    write_json(SLID, tmp_path / "locations.json")
-    return tmp_path / "locations.json"
-
-
-def test_broken_tracker_outputs(tmp_path):
-    path, times = tmp_path / "a.npz", torch.arange(2, dtype=torch.float64)
-    with pytest.raises(WearcapError, match="not finite|NaN"):
-        write_object_npz(Trajectory(times, torch.eye(3).expand(2, 3, 3), torch.full((2, 3), math.nan)), path)
-    assert not path.exists()
-    np.savez(path, translations=np.zeros((2, 3)), quaternions=np.zeros((2, 4)), timestamps=np.arange(2.0))
-    with pytest.raises(WearcapError, match="norm 0"):
-        read_object_npz(path)
-    np.savez(path, translations=np.zeros((0, 3)), quaternions=np.zeros((0, 4)), timestamps=np.zeros(0))
-    with pytest.raises(WearcapError, match="without poses"):
-        read_object_npz(path)
-    np.savez(path, translations=np.zeros((2, 3)), timestamps=np.arange(2.0))
-    with pytest.raises(WearcapError, match="quaternions"):
-        read_object_npz(path)
 
 
 def test_the_command_makes_a_data_set_with_environments(tmp_path, capsys):

@@ -11,8 +11,14 @@ from hypothesis import given
 
 from wearcap.cli.main import run_verb
 from wearcap.errors import WearcapError
-from wearcap.io.datasets.hcontact import activity_of, hcontact_names, location_of, read_hcontact, read_hcontact_split
-from wearcap.io.formats.smpl_json import read_smpl_json
+from wearcap.io.datasets.hcontact import (
+    activity_of,
+    hcontact_names,
+    location_of,
+    read_hcontact,
+    read_hcontact_split,
+    read_smpl_json,
+)
 from wearcap.prepare.splits import read_splits
 from wearcap.prepare.worn import hcontact_tasks
 from wearcap.recording.store import RecordingStore
@@ -50,10 +56,9 @@ def test_a_sequence_is_read(tmp_path):
 def test_bodies_of_either_width(tmp_path, hands, body):
     wanted = motion(hands=hands)
     write_zip(smpl_content(wanted, body=body), tmp_path / "a.json.zip")
-    read = read_smpl_json(tmp_path / "a.json.zip")
-    assert len(read.motion.skeleton) == (52 if hands else 24)
-    assert read.placed
-    assert moved(read.motion, wanted) < 1e-5
+    read, _ = read_smpl_json(tmp_path / "a.json.zip")
+    assert len(read.skeleton) == (52 if hands else 24)
+    assert moved(read, wanted) < 1e-5
 
 
 def test_a_body_of_63_numbers_without_hands_has_flat_ones(tmp_path):
@@ -61,7 +66,7 @@ def test_a_body_of_63_numbers_without_hands_has_flat_ones(tmp_path):
     for frame in content["sequence"]:
         frame["body_pose"] = frame["body_pose"][:63]
     write_zip(content, tmp_path / "a.json.zip")
-    read = read_smpl_json(tmp_path / "a.json.zip").motion
+    read, _ = read_smpl_json(tmp_path / "a.json.zip")
     assert read.skeleton.name == "smpl24"
     flat = read.R_parent_joint[:, read.skeleton.indices("left_hand", "right_hand")]
     torch.testing.assert_close(flat, torch.eye(3).expand_as(flat))
@@ -70,11 +75,10 @@ def test_a_body_of_63_numbers_without_hands_has_flat_ones(tmp_path):
 def test_the_older_form_and_bodies_without_a_place(tmp_path):
     wanted = motion(hands=False)
     write_json(older(wanted), tmp_path / "old.json")
-    assert moved(read_smpl_json(tmp_path / "old.json").motion, wanted) < 1e-5
+    assert moved(read_smpl_json(tmp_path / "old.json")[0], wanted) < 1e-5
     write_zip(smpl_content(wanted, placed=False), tmp_path / "a.json.zip")
-    read = read_smpl_json(tmp_path / "a.json.zip")
-    assert not read.placed
-    assert not read.motion.t_world_root.any()
+    read, _ = read_smpl_json(tmp_path / "a.json.zip")
+    assert not read.t_world_root.any()
 
 
 def changed(key, value, frame=7):
@@ -131,10 +135,10 @@ def test_damaged_bodies_are_read_or_refused(tmp_path_factory, text):
     path = tmp_path_factory.getbasetemp() / "fuzzed.json"
     path.write_text(text, encoding="utf-8")
     try:
-        read = read_smpl_json(path)
+        read, _ = read_smpl_json(path)
     except WearcapError:
         return
-    assert read.motion.R_parent_joint.isfinite().all()
+    assert read.R_parent_joint.isfinite().all()
 
 
 @pytest.mark.parametrize(

@@ -22,9 +22,10 @@ from wearcap.io.datasets.hps import (
     read_hps_motion,
     read_hps_starts,
     read_hps_subject,
+    read_unity_motion,
     resampled_localization,
+    rotations_from_unity,
 )
-from wearcap.io.datasets.hps_unity import read_unity_motion, rotations_from_unity
 from wearcap.recording import Localization
 
 # Single files ------------------------------------------------------------------------------------------------------

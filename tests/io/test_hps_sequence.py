@@ -15,8 +15,8 @@ from test_mvnx import mvnx, sample
 from wearcap.body.skeletons import smpl24
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.datasets.hps_scene import is_hps_scene, read_hps_scene
-from wearcap.io.datasets.hps_sequence import hps_names, is_hps, read_hps_sequence, scan_name, subject_of
+from wearcap.io.datasets.hps import is_hps_scene, read_hps_scene
+from wearcap.io.datasets.hps_sequence import _scan_name, hps_names, is_hps, read_hps_sequence, subject_of
 
 # Scans -------------------------------------------------------------------------------------------------------------
 
@@ -128,9 +128,9 @@ def test_an_mvnx_brings_contacts_and_sensors(tmp_path):
 
 def test_names_of_subjects_and_scans():
     assert subject_of("Double_SUB1_SUB2_talk") == "SUB1"
-    assert scan_name("Double_SUB1_SUB2_talk") == "MPI_EG"
-    assert scan_name("SUB1_MPI_BIB_AB_SEND_Exercises") == "MPI_BIB_AB_SEND"
-    assert scan_name("SUB3_MPI_KINO_lecture_multilevel") == "MPI_KINO"
+    assert _scan_name("Double_SUB1_SUB2_talk") == "MPI_EG"
+    assert _scan_name("SUB1_MPI_BIB_AB_SEND_Exercises") == "MPI_BIB_AB_SEND"
+    assert _scan_name("SUB3_MPI_KINO_lecture_multilevel") == "MPI_KINO"
     with pytest.raises(WearcapError, match="names no subject"):
         subject_of("walking")
 

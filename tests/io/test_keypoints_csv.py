@@ -5,8 +5,9 @@ import torch
 from hostile import fuzz, mutated
 from hypothesis import given
 
+from keypoint_files import write_keypoints
 from wearcap.errors import WearcapError
-from wearcap.io.formats.keypoints_csv import read_keypoints, write_keypoints
+from wearcap.io.formats.keypoints_csv import read_keypoints
 from wearcap.recording import Cue
 
 HEADER = "timestamp,joint,x,y,confidence\n"
@@ -63,18 +64,6 @@ def test_hostile_files_are_refused(tmp_path, text, message):
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(WearcapError, match=message):
         read_keypoints(tmp_path / "a.csv")
-
-
-def test_what_no_file_can_hold_is_not_written(tmp_path):
-    for cues in (
-        {"head": cue("head", 2), "neck": cue("neck", 3)},
-        {"a": cue("head", 2), "b": cue("head", 2)},
-        {"head": cue("head", 2, 0)},
-        {},
-    ):
-        with pytest.raises(WearcapError):
-            write_keypoints(cues, tmp_path / "a.csv")
-    assert not (tmp_path / "a.csv").exists()
 
 
 @fuzz

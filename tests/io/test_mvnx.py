@@ -185,8 +185,8 @@ FAULTS = {
     "no frames": (TEXT.replace('type="normal"', 'type="other"'), "no frames"),
     "missing segment": (TEXT.replace('label="LeftFoot" id', 'label="Tail" id'), "leftfoot"),
     "wrong count": (TEXT.replace("<position>", "<position>1 ", 2), "identity frame: position with 70"),
-    "nan": (re.sub(r"(<sensorFreeAcceleration>)\S+", r"\1nan", TEXT), "normal frame 0: not finite"),
-    "nan at rest": (TEXT.replace(IDENTITY, "nan 0 0 0 ", 1), "identity frame: not finite"),
+    "nan": (re.sub(r"(<sensorFreeAcceleration>)\S+", r"\1nan", TEXT), "normal frame 0: .nan. is no finite"),
+    "nan at rest": (TEXT.replace(IDENTITY, "nan 0 0 0 ", 1), "identity frame: .nan. is no finite"),
     "missing field": (re.sub(r"(?s)(.*)<footContacts>.*?</footContacts>", r"\1", TEXT), "frame 1: a frame with"),
     "no quaternion": (
         TEXT.replace("<sensorOrientation>", "<sensorOrientation>7").replace("7-", "-7"),

@@ -14,7 +14,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.datasets.nymeria import is_nymeria, read_nymeria, read_smpl_neutral, read_xdata
+from wearcap.io.datasets.nymeria import is_nymeria, read_nymeria, read_xdata
 from wearcap.io.devices.aria_mps import R_CPF_DEVICE, T_HEAD_DEVICE, nominal_T_aria_cpf
 from wearcap.io.devices.head_alignment import align_head, clock_offset
 
@@ -247,20 +247,3 @@ def test_noise_and_outliers_move_the_seat_little():
     alignment = align_head(suit, Trajectory(t[::4], (seen.R @ shake).float(), position.float()), T_HEAD_DEVICE.t)
     assert (alignment.T_head_device.t - SEAT.t).norm() < 0.012
     assert rotation.geodesic(alignment.T_head_device.R, SEAT.R) < math.radians(0.5)
-
-
-def test_smpl_poses_turn_to_our_axes(tmp_path):
-    """A person who stands upright and faces +y in the Aria world: SMPL's y axis up, its z axis along +y."""
-    upright = rotation.log(torch.tensor([[-1.0, 0, 0], [0, 0, 1.0], [0, 1.0, 0]])).numpy()
-    np.savez(
-        tmp_path / "s.npz",
-        timestamps=np.array([0, 33333]),
-        global_orient=np.tile(upright, (2, 1)),
-        body_pose=np.zeros((2, 69)),
-        transl=np.zeros((2, 3)),
-        betas=np.zeros((2, 10)),
-    )
-    motion = read_smpl_neutral(tmp_path / "s.npz")
-    joints = motion.T_world_joint.t[0]
-    assert (joints[motion.skeleton.index("head")] - joints[motion.skeleton.index("left_ankle")])[2] > 1.2
-    assert motion.R_parent_joint[0, 0, :, 0].tolist() == pytest.approx([0, 1, 0], abs=1e-5)

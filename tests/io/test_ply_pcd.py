@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wearcap.errors import WearcapError
-from wearcap.io.formats.pcd import lzf_decompress, read_pcd
+from wearcap.io.formats.pcd import _lzf_decompressed, read_pcd
 from wearcap.io.formats.ply import Ply, read_ply, write_ply
 
 CLOUD = Ply(
@@ -169,11 +169,11 @@ def test_every_pcd_truncation_is_named(tmp_path, kind):
 def test_lzf_references():
     """A literal "abc", then 6 bytes from 3 back (overlapping), then 12 from 9 back with a long length."""
     data = bytes([2]) + b"abc" + bytes([(6 - 2) << 5, 2]) + bytes([7 << 5, 12 - 9, 8])
-    assert lzf_decompress(data, 21) == b"abc" * 7
+    assert _lzf_decompressed(data, 21) == b"abc" * 7
     with pytest.raises(ValueError):
-        lzf_decompress(data, 20)
+        _lzf_decompressed(data, 20)
     with pytest.raises(ValueError):
-        lzf_decompress(bytes([(6 - 2) << 5, 2]), 6)
+        _lzf_decompressed(bytes([(6 - 2) << 5, 2]), 6)
 
 
 @pytest.mark.real

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.formats.euroc import read_euroc
-from wearcap.io.formats.tum import read_tum, write_tum
+from wearcap.io.formats.poses import read_euroc, read_tum, write_tum
 
 
 def random_track(n=30):

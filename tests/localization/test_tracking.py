@@ -18,7 +18,7 @@ from wearcap.geometry.camera import Camera
 from wearcap.io.formats.camera_json import read_camera, write_camera
 from wearcap.io.formats.colmap import read_colmap
 from wearcap.io.formats.ply import read_ply
-from wearcap.io.formats.tum import read_tum
+from wearcap.io.formats.poses import read_tum
 from wearcap.io.formats.video import write_frames
 from wearcap.localization import tracking
 from wearcap.localization.structure import MappingSettings, colmap_camera

@@ -10,7 +10,7 @@ from PIL import Image
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import about_axis
-from wearcap.io.formats.photos import write_photos
+from wearcap.io.formats.camera_json import write_photos
 from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.recording.photo import Photo
 

@@ -17,7 +17,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.formats.tum import write_tum
+from wearcap.io.formats.poses import write_tum
 from wearcap.recording import CameraStream, PointCloud, Recording, RecordingStore
 from wearcap.recording.store import save_recording
 from wearcap.sensors.imu import ImuNoise, synthesize_imu

@@ -15,7 +15,7 @@ from wearcap.doctor import Finding, examine
 from wearcap.doctor.body import check_contact_prob
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rotation import about_axis
-from wearcap.io.formats.photos import write_photos
+from wearcap.io.formats.camera_json import write_photos
 from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.localization.landmarks import Landmarks
 from wearcap.localization.visual_map import VisualMap

@@ -114,7 +114,7 @@ def test_a_real_wearer_is_left_alone(real_data):
     from wearcap.io.devices.aria_mps import read_closed_loop
 
     path = next((real_data / "aria_mps").rglob("closed_loop_trajectory.csv*"))
-    whole = read_closed_loop(path).T_world_aria
+    whole = read_closed_loop(path)[0]
     count = int((whole.timestamps[-1] - whole.timestamps[0]).item() * 30)
     track = resample(whole, whole.timestamps[0] + torch.arange(count, dtype=torch.float64) / 30)
     assert acceleration_outliers(track)[0].all()

@@ -12,8 +12,8 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.formats.photos import read_photos
-from wearcap.io.formats.scan import read_scan
+from wearcap.io.formats.camera_json import read_photos
+from wearcap.io.formats.scene_folder import read_scan
 from wearcap.recording.recording import CameraStream
 from wearcap.sensors.claps import camera_claps
 from wearcap.sensors.slam import R_DEVICE_CAM

@@ -1,4 +1,4 @@
-"""SMPL, SMPL+H and SMPL-X surfaces from the arrays of the user's own model files (see `io/formats/smpl_files.py`)."""
+"""SMPL, SMPL+H and SMPL-X surfaces from the arrays of the user's own model files (see `io/formats/smpl.py`)."""
 
 from dataclasses import dataclass, replace
 

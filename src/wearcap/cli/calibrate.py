@@ -13,7 +13,7 @@ from rich.table import Table
 
 from wearcap.cli.conf import hydra_main
 from wearcap.io.formats.camera_json import write_camera
-from wearcap.io.formats.pictures import read_pictures
+from wearcap.io.formats.video import read_pictures
 from wearcap.localization.checkerboard import Board, Calibration, calibrate_from_pictures
 
 HELP = (

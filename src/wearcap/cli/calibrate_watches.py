@@ -19,7 +19,7 @@ from wearcap.errors import WearcapError, nearest
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.devices.watch_calibration_json import write_watch_calibration
 from wearcap.io.devices.watch_log import read_watch_log
-from wearcap.io.formats.tum import read_tum
+from wearcap.io.formats.poses import read_tum
 from wearcap.locks import folder_lock
 from wearcap.recording import Recording, RecordingStore
 from wearcap.recording.locate import load_recording

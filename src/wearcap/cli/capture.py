@@ -2,15 +2,19 @@
 
 import json
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
+import torch
 from omegaconf import DictConfig
 from rich import print as show
 from rich.console import Console
 
 from wearcap.body.anny_body import anny_body
+from wearcap.body.model import BodyModel
 from wearcap.body.retarget import retarget
 from wearcap.body.skeletons import smplh52
+from wearcap.body.smpl_body import smpl_body
 from wearcap.cli.conf import hydra_main
 from wearcap.cli.load import load_pipeline
 from wearcap.errors import WearcapError
@@ -19,8 +23,8 @@ from wearcap.io.datasets.amass import write_amass
 from wearcap.io.formats.bvh import write_bvh
 from wearcap.io.formats.gltf import write_glb
 from wearcap.io.formats.motion_npz import write_motion
-from wearcap.io.formats.scan import read_scan
-from wearcap.io.formats.scene_folder import cloud_file
+from wearcap.io.formats.scene_folder import cloud_file, read_scan
+from wearcap.io.formats.smpl import read_smpl
 from wearcap.recording import Motion, Recording
 from wearcap.recording.locate import dataset_folder, load_recording
 from wearcap.runtime.system import CaptureInput, StageOptions, System
@@ -73,8 +77,8 @@ def _write(
         R_parent_joint, root = retarget(motion.skeleton, target, motion.R_parent_joint, motion.t_world_root)
         smpl = Motion(motion.timestamps, target, R_parent_joint, root)
         write_amass(smpl, folder / "motion_smplh.npz")
-    body = anny_body(motion.skeleton, recording.shape or None) if config.body else None
-    write_glb(motion, folder / "motion.glb", body=body)
+    shown, body = _with_body(motion, recording, config.body)
+    write_glb(shown, folder / "motion.glb", body=body)
     if config.video:
         truth = with_objects(recording, environment)
         shown = {"truth": truth} if truth is not None else {}
@@ -84,6 +88,18 @@ def _write(
             environment=environment,
             max_seconds=config.video_seconds,
         )
+
+
+def _with_body(motion: Motion, recording: Recording, chosen: bool | str) -> tuple[Motion, BodyModel | None]:
+    """The .glb's motion and surface: Anny's body, none, or on its own skeleton that of the user's SMPL model file."""
+    if not isinstance(chosen, str):
+        return motion, anny_body(motion.skeleton, recording.shape or None) if chosen else None
+    arrays = read_smpl(chosen)
+    betas = [value for name, value in recording.shape.items() if name.startswith("beta_")]
+    betas = torch.tensor(betas[: arrays.shape_directions.shape[-1]])
+    body = smpl_body(arrays, betas if len(betas) else None)
+    R, root = retarget(motion.skeleton, body.skeleton, motion.R_parent_joint, motion.t_world_root)
+    return replace(motion, skeleton=body.skeleton, R_parent_joint=R, t_world_root=root), body
 
 
 def _write_samples(draws: list[Motion], recording: Recording, environment: Environment | None, folder: Path) -> None:

@@ -25,8 +25,7 @@ def main(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
 
     from wearcap.io.formats.environment import FILE_NAME
-    from wearcap.io.formats.scan import read_scan
-    from wearcap.io.formats.scene_folder import cloud_file
+    from wearcap.io.formats.scene_folder import cloud_file, read_scan
     from wearcap.viewer.object_editor import ObjectEditor
 
     cloud = cloud_file(options.scene)

@@ -13,7 +13,7 @@ from wearcap.doctor.streams import check_rotations, check_speed
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory, interpolate, linear_velocity
-from wearcap.io.formats.bvh_check import HEIGHT_M, REACH_PER_HEIGHT, UNITS_M, longest_path
+from wearcap.io.formats.bvh import HEIGHT_M, REACH_PER_HEIGHT, UNITS_M, longest_path
 from wearcap.recording import FloorTrack, Motion
 
 

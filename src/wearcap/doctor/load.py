@@ -19,14 +19,13 @@ from wearcap.io.datasets.nymeria import is_nymeria, read_nymeria, read_xdata
 from wearcap.io.devices.aria_mps import find_mps_file, head_stream, is_mps_folder, read_closed_loop, read_mps
 from wearcap.io.formats.asf_amc import read_amc, read_asf
 from wearcap.io.formats.bvh import read_bvh
-from wearcap.io.formats.euroc import read_euroc
-from wearcap.io.formats.json_text import read_json_object
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.io.formats.mvnx import read_mvnx
 from wearcap.io.formats.npz import read_npz
 from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply
-from wearcap.io.formats.tum import read_tum
+from wearcap.io.formats.poses import read_euroc, read_tum
+from wearcap.io.formats.text import read_json_object
 from wearcap.recording import HeadStream, Motion, PointCloud, Recording, RecordingStore
 from wearcap.recording.store import RecordingFile
 
@@ -106,10 +105,10 @@ def _read_mps(folder: Path) -> Loaded:
     """An MPS folder at 60 Hz, with findings about the raw file's clock, its quality score and the service's own report."""
     path = find_mps_file(folder, ("closed_loop_trajectory.csv",))
     assert path is not None, "is_mps_folder has seen it"
-    raw = read_closed_loop(path)
-    findings = check_clock("closed-loop file", raw.T_world_aria.timestamps)
-    quality = raw.quality.median().item()
-    low = (raw.quality < 0.5).float().mean().item()
+    track, scores = read_closed_loop(path)
+    findings = check_clock("closed-loop file", track.timestamps)
+    quality = scores.median().item()
+    low = (scores < 0.5).float().mean().item()
     check, evidence = Check("closed-loop file: quality"), f"median score {quality:.2f}, {100 * low:.0f} % below 0.5"
     if low > 0.1:
         findings.append(check.warning("MPS trusts its poses little", evidence))
@@ -144,7 +143,7 @@ def _read_amc(path: Path) -> Motion:
 
 def _read_csv(path: Path) -> Recording | Trajectory:
     if "closed_loop" in path.name or "aria_trajectory" in path.name:
-        track = read_closed_loop(path, up="y" if "aria_trajectory" in path.name else "z").T_world_aria
+        track = read_closed_loop(path, up="y" if "aria_trajectory" in path.name else "z")[0]
         return Recording(name=path.name, head=head_stream(track, fps=None), source="Aria MPS")
     return read_euroc(path)
 

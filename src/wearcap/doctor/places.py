@@ -10,13 +10,13 @@ from jaxtyping import Float32, Float64
 
 from wearcap.doctor.report import Check, Finding, refusal
 from wearcap.errors import WearcapError
-from wearcap.io.datasets.hps_scene import CLOUD, is_hps_scene, read_hps_scene
+from wearcap.io.datasets.hps import CLOUD, is_hps_scene, read_hps_scene
+from wearcap.io.formats.camera_json import PHOTOS_FILE as PHOTOS
+from wearcap.io.formats.camera_json import read_photos
 from wearcap.io.formats.environment import FILE_NAME as ENVIRONMENT
 from wearcap.io.formats.environment import read_environment
-from wearcap.io.formats.image_file import open_image
-from wearcap.io.formats.photos import FILE_NAME as PHOTOS
-from wearcap.io.formats.photos import read_photos
-from wearcap.io.formats.scan import read_scan
+from wearcap.io.formats.scene_folder import read_scan
+from wearcap.io.formats.video import open_image
 from wearcap.localization.visual_map import VisualMap
 from wearcap.recording import PointCloud, Recording
 from wearcap.recording.photo import Photo

@@ -21,11 +21,10 @@ from wearcap.geometry.camera import Camera
 from wearcap.geometry.trajectory import Trajectory, filled
 from wearcap.io.formats.camera_json import camera_row, write_camera
 from wearcap.io.formats.colmap import ColmapModel, read_colmap
-from wearcap.io.formats.json_text import read_json
-from wearcap.io.formats.pictures import SUFFIXES
 from wearcap.io.formats.ply import Ply, write_ply
-from wearcap.io.formats.tum import write_tum
-from wearcap.io.formats.video import read_frames, read_image, video_info
+from wearcap.io.formats.poses import write_tum
+from wearcap.io.formats.text import read_json
+from wearcap.io.formats.video import SUFFIXES, read_frames, read_image, video_info
 from wearcap.localization.picture import check_size
 from wearcap.localization.structure import Advance, MappingSettings, map_pictures
 

@@ -77,12 +77,12 @@ def _egohoi(
     output: Path,
 ) -> Recording:
     """The body at `fps` and the annotated object poses; the environment is written beside the recording."""
-    read = read_egohoi(root, name, motion_types, object_name)
-    assert read.recording.motion is not None
+    recording, environment = read_egohoi(root, name, motion_types, object_name)
+    assert recording.motion is not None
     file = Path("scenes") / name / FILE_NAME
-    write_environment(read.environment, output / file)
-    motion = resampled(read.recording.motion, fps)
-    return replace(read.recording, motion=motion, environment=file.as_posix(), license=license)
+    write_environment(environment, output / file)
+    motion = resampled(recording.motion, fps)
+    return replace(recording, motion=motion, environment=file.as_posix(), license=license)
 
 
 def egohoi_tasks(

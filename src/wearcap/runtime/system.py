@@ -18,8 +18,7 @@ from rich.console import Console
 
 from wearcap.errors import WearcapError
 from wearcap.io.formats.environment import FILE_NAME, read_environment
-from wearcap.io.formats.scan import read_scan
-from wearcap.io.formats.scene_folder import cloud_file
+from wearcap.io.formats.scene_folder import cloud_file, read_scan
 from wearcap.metrics.scores import score
 from wearcap.metrics.table import Row
 from wearcap.models.checkpoint import load_trained

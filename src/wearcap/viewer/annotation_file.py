@@ -11,8 +11,8 @@ import torch
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, write_text
 from wearcap.io.formats.contact_labels import LabelClock, Labels, annotation_of, labels_of, parse_labels
-from wearcap.io.formats.json_text import read_json
 from wearcap.io.formats.motion_npz import read_motion
+from wearcap.io.formats.text import read_json
 from wearcap.recording.interactions import HANDS, Interactions
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording

@@ -3,21 +3,19 @@
 The files' world has y up (gravity along -y); here it is turned to z up, x staying x.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.devices.aria_mps import head_stream, read_closed_loop, turn_up
+from wearcap.io.formats.bounded import understood
 from wearcap.io.formats.csv_table import read_columns
-from wearcap.io.formats.json_text import read_json_object
 from wearcap.io.formats.poses import check_finite, check_rising, checked_trajectory
+from wearcap.io.formats.text import read_json_object
 from wearcap.recording import Cue, Recording
 
 _BODY = {
@@ -27,20 +25,6 @@ _BODY = {
 }  # fmt: skip
 """Row of each joint among the file's 51 joints (Skeleton, Ab, Chest, Neck, Head, LShoulder, LUArm, LFArm, LHand, 15 fingers …)."""
 _JOINTS = 51
-
-
-@dataclass(frozen=True)
-class AdtObject:
-    """A tracked object: its box in its own axes and its poses in the world (one for all time where it never moves)."""
-
-    name: str
-    category: str
-    moves: bool
-    box: Float[Tensor, "2 3"]
-    """Minimum and maximum corner of the bounding box in the object's axes (m)."""
-    T_world_obj: Rigid
-    timestamps: Tensor | None = None
-    """Times of the poses (s); None for a single, timeless pose."""
 
 
 def is_adt(folder: str | Path) -> bool:
@@ -57,31 +41,25 @@ def read_adt(folder: str | Path, *, fps: float | None = None, T_aria_cpf: Rigid 
     folder = Path(folder)
     if not is_adt(folder):
         raise WearcapError("no aria_trajectory.csv", where=folder, expected="an ADT sequence folder")
-    trajectory = read_closed_loop(folder / "aria_trajectory.csv", up="y").T_world_aria
+    trajectory = read_closed_loop(folder / "aria_trajectory.csv", up="y")[0]
     skeletons = sorted(folder.glob("Skeleton_*.json"))
-    objects = read_objects(folder) if (folder / "scene_objects.csv").is_file() else []
+    metadata = folder / "metadata.json"
     return Recording(
         name=folder.resolve().name,
         head=head_stream(trajectory, fps=fps, T_aria_cpf=T_aria_cpf, where=folder),
         cues=read_skeleton(skeletons[0]) if skeletons else {},
-        object_motion={o.name: _path(o) for o in objects if o.moves and o.timestamps is not None},
-        location=str(read_json_object(folder / "metadata.json").get("scene", ""))
-        if (folder / "metadata.json").is_file()
-        else "",
+        object_motion=read_moving_objects(folder) if (folder / "scene_objects.csv").is_file() else {},
+        location=str(read_json_object(metadata).get("scene", "")) if metadata.is_file() else "",
         source="Aria Digital Twin",
     )
 
 
 def read_skeleton(path: str | Path) -> dict[str, Cue]:
     """3D cues by joint name from `Skeleton_*.json` (120 Hz). Raises WearcapError for other joint counts or NaN."""
-    try:
+    with understood("not an ADT skeleton", path, "frames with timestamp_ns and joints"):
         frames = read_json_object(path)["frames"]
         times = np.array([frame["timestamp_ns"] for frame in frames], dtype=np.float64) * 1e-9
         joints = np.array([frame["joints"] for frame in frames], dtype=np.float64)
-    except (KeyError, TypeError, ValueError) as error:
-        raise WearcapError(
-            f"not an ADT skeleton ({error})", where=path, expected="frames with timestamp_ns and joints"
-        ) from error
     if joints.ndim != 3 or joints.shape[1:] != (_JOINTS, 3):
         raise WearcapError(f"joints of shape {joints.shape}", where=path, expected=f"(frames, {_JOINTS}, 3)")
     check_finite({"joints": joints}, path)
@@ -91,64 +69,38 @@ def read_skeleton(path: str | Path) -> dict[str, Cue]:
     return {name: Cue(timestamps, name, world[:, row], sure) for name, row in _BODY.items()}
 
 
-def read_objects(folder: str | Path) -> list[AdtObject]:
-    """Objects with boxes and poses, from instances.json, 3d_bounding_box.csv and scene_objects.csv.
+def read_moving_objects(folder: str | Path) -> dict[str, Trajectory]:
+    """Poses of the objects that move, in the z-up world, from instances.json, 3d_bounding_box.csv and scene_objects.csv.
 
-    Raises WearcapError for missing or malformed files; objects without a pose or box are left out.
+    Raises WearcapError for missing or malformed files; objects without a pose or box are left out, as are those with a
+    timestamp of -1, whose pose is for all time.
     """
     folder = Path(folder)
-    poses_path = folder / "scene_objects.csv"
-    names = [f"t_wo_{axis}[m]" for axis in "xyz"] + [f"q_wo_{axis}" for axis in "wxyz"]
-    poses = read_columns(poses_path, names, text=["object_uid", "timestamp[ns]"])
+    path = folder / "scene_objects.csv"
+    axes = [f"t_wo_{axis}[m]" for axis in "xyz"] + [f"q_wo_{axis}" for axis in "wxyz"]
+    poses = read_columns(path, axes, text=["object_uid", "timestamp[ns]"])
     extents = [f"p_local_obj_{axis}{end}[m]" for end in ("min", "max") for axis in "xyz"]
-    boxes = read_columns(folder / "3d_bounding_box.csv", extents, text=["object_uid"])
-    box_of = dict(zip(boxes["object_uid"], np.stack([boxes[name] for name in extents], 1).reshape(-1, 2, 3)))
+    boxes = set(read_columns(folder / "3d_bounding_box.csv", extents, text=["object_uid"])["object_uid"].tolist())
     instances = read_json_object(folder / "instances.json")
     order = np.argsort(poses["object_uid"], kind="stable")
-    objects = []
+    found = {}
     for rows in np.split(order, np.unique(poses["object_uid"][order], return_index=True)[1][1:]):
         uid = bytes(poses["object_uid"][rows[0]])
         name = uid.decode("latin-1")
         about = instances.get(name)
-        if about is None or uid not in box_of:
+        if about is None or uid not in boxes:
             continue
         if not isinstance(about, dict):
-            raise WearcapError(
-                f"object {name} is a {type(about).__name__}",
-                where=folder / "instances.json",
-                expected="its instance_name, category and motion_type",
-            )
-        T_world_obj, times = _object_poses({name: poses[name][rows] for name in (*names, "timestamp[ns]")}, poses_path)
-        objects.append(
-            AdtObject(
-                str(about.get("instance_name", name)),
-                str(about.get("category", "")),
-                about.get("motion_type") == "dynamic",
-                torch.tensor(box_of[uid], dtype=torch.float32),
-                T_world_obj,
-                times,
-            )
-        )
-    return objects
-
-
-def _object_poses(rows: dict[str, np.ndarray], where: Path) -> tuple[Rigid, Tensor | None]:
-    """Poses in the z-up world; a timestamp of -1 stands for all time."""
-    try:
-        times = rows["timestamp[ns]"].astype(np.float64) * 1e-9
-    except ValueError as error:
-        raise WearcapError(
-            f"a time is no number ({error})"[:200], where=where, expected="nanoseconds, or -1"
-        ) from error
-    timeless = bool((times < 0).any())
-    keep = slice(0, 1) if timeless else slice(None)
-    t = np.stack([rows[f"t_wo_{axis}[m]"] for axis in "xyz"], 1)[keep]
-    wxyz = np.stack([rows[f"q_wo_{axis}"] for axis in "wxyz"], 1)[keep]
-    track = checked_trajectory(times[keep], t, wxyz, where)
-    turned = Rigid(turn_up("y"), torch.zeros(3)) @ track.T_world_body
-    return turned, None if timeless else track.timestamps
-
-
-def _path(tracked: AdtObject) -> Trajectory:
-    assert tracked.timestamps is not None
-    return Trajectory(tracked.timestamps, tracked.T_world_obj.R, tracked.T_world_obj.t)
+            what = f"object {name} is a {type(about).__name__}"
+            expected = "its instance_name, category and motion_type"
+            raise WearcapError(what, where=folder / "instances.json", expected=expected)
+        with understood("a time is no number", path, "nanoseconds, or -1"):
+            times = poses["timestamp[ns]"][rows].astype(np.float64) * 1e-9
+        timeless = bool((times < 0).any())
+        last = 1 if timeless else len(rows)
+        table = np.stack([poses[axis][rows] for axis in axes], 1)[:last]
+        track = checked_trajectory(times[:last], table[:, :3], table[:, 3:], path)
+        T_world_obj = Rigid(turn_up("y"), torch.zeros(3)) @ track.T_world_body
+        if about.get("motion_type") == "dynamic" and not timeless:
+            found[str(about.get("instance_name", name))] = Trajectory(track.timestamps, T_world_obj.R, T_world_obj.t)
+    return found

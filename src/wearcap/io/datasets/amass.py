@@ -1,6 +1,6 @@
 """AMASS: SMPL+H `.npz` files and SMPL-X "stageii" files in; AMASS-style SMPL+H files out.
 
-AMASS' world is metric and z up; its joint frames are SMPL's (`io.formats.smpl_axes`). SMPL turns about its pelvis but places its
+AMASS' world is metric and z up; its joint frames are SMPL's (`io.formats.smpl`). SMPL turns about its pelvis but places its
 template's origin, so the pelvis stands at `trans` + J₀ with J₀ the template's pelvis in SMPL's own axes.
 """
 
@@ -15,27 +15,17 @@ from wearcap.body.skeletons import smplh52, smplx22
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 from wearcap.geometry import rotation
-from wearcap.io.formats.frame_grid import even_frames, nominal_fps
+from wearcap.io.formats.motion_npz import even_frames, nominal_fps
 from wearcap.io.formats.npz import read_npz, require
-from wearcap.io.formats.smpl_axes import A, rotations_from_smpl, shape_from_arrays
+from wearcap.io.formats.smpl import A, shape_from_arrays, smpl_motion
 from wearcap.recording import Motion, Recording
 
 PELVIS_SMPLH = (-0.0022, -0.2408, 0.0286)
 PELVIS_SMPLX = (0.0031, -0.3514, 0.0120)
 """J₀ of the mean bodies (m); a person's own differs by a few centimetres with the betas."""
 
-_KEYS = (
-    "trans",
-    "poses",
-    "root_orient",
-    "pose_body",
-    "betas",
-    "gender",
-    "mocap_framerate",
-    "mocap_frame_rate",
-    "surface_model_type",
-)
 _RATES = ("mocap_framerate", "mocap_frame_rate")
+_KEYS = ("trans", "poses", "root_orient", "pose_body", "betas", "gender", "surface_model_type", *_RATES)
 _SMPLX_BODY = 66
 
 
@@ -48,23 +38,26 @@ def read_amass(path: str | Path, t_template_pelvis: tuple[float, float, float] |
     path = Path(path)
     arrays = read_npz(path, _KEYS)
     if "poses" not in arrays and "pose_body" not in arrays:
-        raise WearcapError(
-            "holds no poses",
-            where=path,
-            expected="a motion file of AMASS (poses, trans, mocap_framerate)",
-            fix="shape.npz files beside the motions hold none: leave them out.",
-        )
+        what = "holds no poses"
+        fix = "shape.npz files beside the motions hold none: leave them out."
+        raise WearcapError(what, where=path, expected="a motion file of AMASS (poses, trans, mocap_framerate)", fix=fix)
     fps = _rate(arrays, path)
-    stageii = _is_smplx(arrays)
+    model = _text(arrays.get("surface_model_type")).lower()
+    stageii = "pose_body" in arrays or "mocap_frame_rate" in arrays or model.startswith("smplx")
+    if stageii and "pose_body" in arrays:
+        require(arrays, path, trans=("time", 3), root_orient=("time", 3), pose_body=("time", _SMPLX_BODY - 3))
+        rotvec = np.concatenate([arrays["root_orient"], arrays["pose_body"]], -1)
+    else:
+        width = 165 if stageii else 156
+        require(arrays, path, trans=("time", 3), poses=("time", width))
+        rotvec = arrays["poses"][:, : _SMPLX_BODY if stageii else width]
+    if len(rotvec) == 0:
+        raise WearcapError("no frames", where=path)
     skeleton = smplx22() if stageii else smplh52()
-    pelvis = t_template_pelvis or (PELVIS_SMPLX if stageii else PELVIS_SMPLH)
-    R = rotations_from_smpl(_axis_angles(arrays, path, stageii))
-    t_root = torch.from_numpy(arrays["trans"].astype(np.float64)) + torch.tensor(pelvis, dtype=torch.float64)
-    gender = _text(arrays.get("gender"))
-    provenance = {"source": path.name, "format": "amass", **({"gender": gender} if gender else {})}
-    motion = Motion(
-        torch.arange(len(R), dtype=torch.float64) / fps, skeleton, R.float(), t_root.float(), provenance=provenance
-    )
+    pelvis = arrays["trans"].astype(np.float64) + (t_template_pelvis or (PELVIS_SMPLX if stageii else PELVIS_SMPLH))
+    times = torch.arange(len(rotvec), dtype=torch.float64) / fps
+    about = {"source": path.name, "format": "amass", "gender": _text(arrays.get("gender"))}
+    motion = smpl_motion(times, skeleton, rotvec, pelvis, **about)
     return Recording(
         path.stem,
         motion=motion,
@@ -88,12 +81,9 @@ def write_amass(
     """
     target = smplh52()
     if set(motion.skeleton.joint_names[:22]) != set(target.joint_names[:22]):
-        raise WearcapError(
-            f"a motion of skeleton {motion.skeleton.name!r}",
-            where=path,
-            expected="one of SMPL's skeletons",
-            fix='Retarget it to "smplh52" first (body.retarget).',
-        )
+        what = f"a motion of skeleton {motion.skeleton.name!r}"
+        expected = "one of SMPL's skeletons"
+        raise WearcapError(what, where=path, expected=expected, fix='Retarget it to "smplh52" first (body.retarget).')
     if not (motion.R_parent_joint.isfinite().all() and motion.t_world_root.isfinite().all()):
         raise WearcapError("the motion holds NaN or infinite values", where=path, expected="finite poses")
     frames, fps = even_frames(motion)
@@ -126,25 +116,6 @@ def _rate(arrays: dict[str, np.ndarray], path: Path) -> float:
     if not (np.isfinite(fps) and 0 < fps < 1e5):
         raise WearcapError(f"a frame rate of {fps} Hz", where=path, expected="a positive number")
     return nominal_fps(fps)
-
-
-def _is_smplx(arrays: dict[str, np.ndarray]) -> bool:
-    model = _text(arrays.get("surface_model_type")).lower()
-    return "pose_body" in arrays or "mocap_frame_rate" in arrays or model.startswith("smplx")
-
-
-def _axis_angles(arrays: dict[str, np.ndarray], path: Path, stageii: bool) -> Float[Tensor, "time joint 3"]:
-    """Rotation vectors (rad) in SMPL's axes of the root and the joints of wearcap's skeleton."""
-    if stageii and "pose_body" in arrays:
-        require(arrays, path, trans=("time", 3), root_orient=("time", 3), pose_body=("time", _SMPLX_BODY - 3))
-        vectors = np.concatenate([arrays["root_orient"], arrays["pose_body"]], -1)
-    else:
-        width = 165 if stageii else 156
-        require(arrays, path, trans=("time", 3), poses=("time", width))
-        vectors = arrays["poses"][:, : _SMPLX_BODY if stageii else width]
-    if len(vectors) == 0:
-        raise WearcapError("no frames", where=path)
-    return torch.from_numpy(vectors.astype(np.float64)).unflatten(1, (-1, 3))
 
 
 def _text(array: np.ndarray | None) -> str:

@@ -21,12 +21,13 @@ from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.amass import PELVIS_SMPLH
-from wearcap.io.datasets.one_object import OneObject, smpl_motion
-from wearcap.io.formats.json_text import read_json
+from wearcap.io.datasets.one_object import OneObject
+from wearcap.io.formats.bounded import understood
 from wearcap.io.formats.npz import read_npz, require
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import check_rising
-from wearcap.io.formats.smpl_axes import shape_from_betas
+from wearcap.io.formats.smpl import shape_from_betas, smpl_motion
+from wearcap.io.formats.text import read_json
 from wearcap.scene.object_mesh import centered, check_object_mesh
 
 FPS = 30
@@ -45,20 +46,15 @@ _REGISTERED = {
 """Files of the registered meshes; those of all other objects are OBJECT_f1000.ply."""
 _OFF_GRID = 0.1
 """Largest distance (frames) of a time from a multiple of 1/30 s: times are rounded to milliseconds."""
-_COLOR = np.array([0.7, 0.7, 0.7], np.float32)
 
 
 def behave_folder(root: str | Path) -> Path:
     """The folder of sequences. Raises WearcapError where there is none with fits at 30 frames per second."""
-    folders = [Path(root) / name for name in _FOLDERS]
-    found = [folder for folder in folders if _names(folder)]
+    found = [Path(root) / name for name in _FOLDERS if _names(Path(root) / name)]
     if not found:
-        raise WearcapError(
-            "no sequences",
-            where=root,
-            expected=f"sequences/NAME/{BODY_FILE} and {OBJECT_FILE}",
-            fix="Give BEHAVE's folder as source=DIR, with the parameters of all frames (30 fps) in it.",
-        )
+        what = "no sequences"
+        fix = "Give BEHAVE's folder as source=DIR, with the parameters of all frames (30 fps) in it."
+        raise WearcapError(what, where=root, expected=f"sequences/NAME/{BODY_FILE} and {OBJECT_FILE}", fix=fix)
     return found[0]
 
 
@@ -79,24 +75,18 @@ def read_behave(root: str | Path, name: str) -> OneObject:
     """
     if name not in behave_names(root):
         raise WearcapError(f"no sequence {name!r}", where=root, expected=f"sequences/{name}/{BODY_FILE}")
-    parts = name.split("_")
+    folder, parts = behave_folder(root) / name, name.split("_")
     if len(parts) < 3:
-        raise WearcapError(
-            "not named as BEHAVE's are",
-            where=behave_folder(root) / name,
-            expected="a folder DATE_SUBJECT_OBJECT, such as Date01_Sub01_boxlarge_hand",
-        )
-    folder = behave_folder(root) / name
+        expected = "a folder DATE_SUBJECT_OBJECT, such as Date01_Sub01_boxlarge_hand"
+        raise WearcapError("not named as BEHAVE's are", where=folder, expected=expected)
     body = read_npz(folder / BODY_FILE, ("poses", "trans", "betas", "frame_times"))
     fitted = read_npz(folder / OBJECT_FILE, ("angles", "trans", "frame_times"))
     frames = require(body, folder / BODY_FILE, poses=("time", 156), trans=("time", 3))["time"]
     require(fitted, folder / OBJECT_FILE, angles=("time", 3), trans=("time", 3))
     times = _common_times(body, fitted, folder, frames)
     object_name, gender = _about(read_json(folder / INFO_FILE), folder / INFO_FILE)
-    provenance = {"source": name, "format": "behave", **({"gender": gender} if gender else {})}
-    pelvis = body["trans"].astype(np.float64) + PELVIS_SMPLH
-    rotvec = torch.from_numpy(body["poses"].astype(np.float64)).unflatten(1, (-1, 3))
-    motion = smpl_motion(times, smplh52(), rotvec, torch.from_numpy(pelvis), provenance)
+    pelvis, about = body["trans"].astype(np.float64) + PELVIS_SMPLH, {"source": name, "format": "behave"}
+    motion = smpl_motion(times, smplh52(), body["poses"], pelvis, **about, gender=gender)
     R = rotation.exp(torch.from_numpy(fitted["angles"].astype(np.float64)))
     path = Trajectory(times, R.float(), torch.from_numpy(fitted["trans"].astype(np.float32)))
     take = OneObject(
@@ -113,11 +103,6 @@ def read_behave(root: str | Path, name: str) -> OneObject:
     return take.turned(R_WORLD_CAMERA)
 
 
-def behave_mesh_path(root: str | Path, object_name: str) -> Path:
-    """Path of the mesh that an object's poses refer to."""
-    return Path(root) / "objects" / object_name / _REGISTERED.get(object_name, f"{object_name}_f1000.ply")
-
-
 def read_behave_mesh(root: str | Path, object_name: str) -> Mesh:
     """Registered mesh of an object, centred on the mean of its vertices as the poses expect.
 
@@ -127,17 +112,11 @@ def read_behave_mesh(root: str | Path, object_name: str) -> Mesh:
         raise WearcapError(
             f"an object named {object_name[:60]!r}", where=root, expected="one of BEHAVE's names, as boxlarge"
         )
-    path = behave_mesh_path(root, object_name)
+    path = Path(root) / "objects" / object_name / _REGISTERED.get(object_name, f"{object_name}_f1000.ply")
     if not path.is_file():
-        raise WearcapError(
-            f"no mesh of {object_name}",
-            where=path,
-            expected="objects/OBJECT/OBJECT_f1000.ply",
-            fix="Unpack BEHAVE's objects.zip beside the sequences.",
-        )
-    ply = read_ply(path)
-    faces = np.zeros((0, 3), np.int32) if ply.faces is None else ply.faces
-    mesh = Mesh(ply.points, faces, _COLOR if ply.colors is None else ply.colors.astype(np.float32) / 255)
+        fix = "Unpack BEHAVE's objects.zip beside the sequences."
+        raise WearcapError(f"no mesh of {object_name}", where=path, expected="objects/OBJECT/OBJECT_f1000.ply", fix=fix)
+    mesh = read_ply(path).mesh
     if len(mesh.vertices):
         mesh, _ = centered(mesh)
     check_object_mesh(mesh, path)
@@ -151,23 +130,17 @@ def _common_times(
     if not frames:
         raise WearcapError("no frames", where=folder / BODY_FILE, expected="poses of at least one frame")
     if len(fitted["angles"]) != frames:
-        raise WearcapError(
-            f"the object has {len(fitted['angles'])} frames, the body {frames}",
-            where=folder,
-            expected=f"as many in {OBJECT_FILE} as in {BODY_FILE}",
-            fix="Fetch both files again.",
-        )
+        what = f"the object has {len(fitted['angles'])} frames, the body {frames}"
+        expected = f"as many in {OBJECT_FILE} as in {BODY_FILE}"
+        raise WearcapError(what, where=folder, expected=expected, fix="Fetch both files again.")
     times = _times(fitted, folder / OBJECT_FILE, frames)
     if "frame_times" in body:
         other = _times(body, folder / BODY_FILE, frames)
         apart = np.flatnonzero(other != times)
         if len(apart):
-            raise WearcapError(
-                f"the body's frame {apart[0]} is of {other[apart[0]]:.3f} s, the object's of {times[apart[0]]:.3f} s",
-                where=folder,
-                expected="the same frame_times in both files",
-                fix="Fetch both files again.",
-            )
+            what = f"the body's frame {apart[0]} is of {other[apart[0]]:.3f} s, the object's of {times[apart[0]]:.3f} s"
+            expected = "the same frame_times in both files"
+            raise WearcapError(what, where=folder, expected=expected, fix="Fetch both files again.")
     return torch.from_numpy(times)
 
 
@@ -175,30 +148,19 @@ def _times(arrays: dict[str, np.ndarray], path: Path, frames: int) -> Float64[np
     """Times (s) from `frame_times` ("t0003.033"), snapped to whole frames. Raises WearcapError for rates other than 30."""
     stamps = arrays.get("frame_times")
     if stamps is None or stamps.shape != (frames,) or stamps.dtype.kind not in "US":
-        raise WearcapError(
-            f"frame_times is {'missing' if stamps is None else f'{stamps.dtype} {stamps.shape}'}",
-            where=path,
-            expected=f'{frames} texts such as "t0003.033" (s)',
-        )
+        what = f"frame_times is {'missing' if stamps is None else f'{stamps.dtype} {stamps.shape}'}"
+        raise WearcapError(what, where=path, expected=f'{frames} texts such as "t0003.033" (s)')
     texts = [text.decode("latin-1") if isinstance(text, bytes) else str(text) for text in stamps]
-    try:
+    with understood("frame_times cannot be read", path, 'texts such as "t0003.033" (s)'):
         seconds = np.array([float(text.removeprefix("t")) for text in texts])
-    except ValueError as error:
-        raise WearcapError(
-            f"frame_times cannot be read ({error})"[:200], where=path, expected='texts such as "t0003.033" (s)'
-        ) from error
     if not (np.abs(seconds) < 1e6).all():
         raise WearcapError("frame_times holds NaN or infinity", where=path, expected="seconds")
     grid = np.rint(seconds * FPS)
     step = float(np.median(np.diff(grid))) if frames > 1 else 1.0
     if np.abs(seconds * FPS - grid).max() > _OFF_GRID or step != 1.0:
         rate = 1 / max(float(np.median(np.abs(np.diff(seconds)))), 1e-6) if frames > 1 else 0.0
-        raise WearcapError(
-            f"frames come at {rate:.4g} per second",
-            where=path,
-            expected=f"{FPS} per second",
-            fix="Use the release of all frames (30 fps), not the one of one frame per second.",
-        )
+        fix = "Use the release of all frames (30 fps), not the one of one frame per second."
+        raise WearcapError(f"frames come at {rate:.4g} per second", where=path, expected=f"{FPS} per second", fix=fix)
     check_rising(grid / FPS, path)
     return grid / FPS
 
@@ -215,10 +177,6 @@ def _shape(body: dict[str, np.ndarray], path: Path, frames: int) -> dict[str, fl
     """The mean of the betas that were fitted frame by frame."""
     if "betas" not in body:
         return {}
-    if body["betas"].ndim == 2:
-        require(body, path, betas=(frames, "feature"))
-        mean = body["betas"].mean(0)
-    else:
-        require(body, path, betas=("feature",))
-        mean = body["betas"]
-    return shape_from_betas(mean)
+    by_frame = body["betas"].ndim == 2
+    require(body, path, betas=(frames, "feature") if by_frame else ("feature",))
+    return shape_from_betas(body["betas"].mean(0) if by_frame else body["betas"])

@@ -6,31 +6,25 @@ the scan's axes; a pose turns them about the scan's origin and then moves them. 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
-from torch import Tensor
 
 from wearcap.errors import WearcapError
-from wearcap.files import atomic_path
 from wearcap.geometry import rotation
-from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.datasets.hcontact import activity_of, location_of
+from wearcap.io.datasets.hcontact import activity_of, location_of, read_smpl_json
 from wearcap.io.datasets.hps import read_hps_subject
 from wearcap.io.datasets.hps_sequence import subject_of
+from wearcap.io.formats.bounded import understood
 from wearcap.io.formats.contact_labels import LabelClock, interactions_of, labels_of, parse_labels
-from wearcap.io.formats.json_text import read_json
-from wearcap.io.formats.npz import read_npz, require
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import checked_trajectory
-from wearcap.io.formats.smpl_axes import shape_from_betas
-from wearcap.io.formats.smpl_json import read_smpl_json
+from wearcap.io.formats.text import read_json
 from wearcap.recording.interactions import HANDS, Interactions
 from wearcap.recording.recording import Recording
 from wearcap.scene.environment import Environment
@@ -39,11 +33,10 @@ from wearcap.scene.objects import Freedom, SceneObject
 MOTION_TYPES = ("hinge", "along_floor", "free", "absent")
 """Motion types of the published configurations, and "absent" for objects that were mapped but not present."""
 _CONTACTS = ("gt_contacts", "contacts")
-_COLOR = np.array([0.7, 0.7, 0.7], np.float32)
 
 
 @dataclass(frozen=True)
-class AnnotatedObject:
+class _AnnotatedObject:
     """An object's poses, annotated a few times in a sequence."""
 
     center: tuple[float, float, float]
@@ -54,14 +47,6 @@ class AnnotatedObject:
     """Sparse trajectory: one pose per annotation."""
 
 
-@dataclass(frozen=True)
-class EgoHoi:
-    """One sequence and its objects."""
-
-    recording: Recording
-    environment: Environment
-
-
 def egohoi_names(root: str | Path) -> list[str]:
     """Names of all sequences with a body, in order."""
     files = [path.name for path in Path(root).glob("smpl_motions/*.json*")]
@@ -70,7 +55,7 @@ def egohoi_names(root: str | Path) -> list[str]:
 
 def read_egohoi(
     root: str | Path, name: str, motion_types: Mapping[str, str] | None = None, object_name: str | None = None
-) -> EgoHoi:
+) -> tuple[Recording, Environment]:
     """Read a sequence: `motion` (HPS's estimate), `object_motion` (sparse ground truth), `interactions`, environment.
 
     `motion_types` maps patterns of object names to one of `MOTION_TYPES`, the first match decides; by default objects
@@ -80,22 +65,19 @@ def read_egohoi(
     """
     root = Path(root)
     if name not in egohoi_names(root):
-        raise WearcapError(
-            f"no sequence {name!r}",
-            where=root,
-            expected=f"smpl_motions/{name}.json.zip or .json",
-            fix=f"There are {len(egohoi_names(root))}, such as {egohoi_names(root)[:3]}.",
-        )
+        what = f"no sequence {name!r}"
+        fix = f"There are {len(egohoi_names(root))}, such as {egohoi_names(root)[:3]}."
+        raise WearcapError(what, where=root, expected=f"smpl_motions/{name}.json.zip or .json", fix=fix)
     packed = root / "smpl_motions" / f"{name}.json.zip"
-    body = read_smpl_json(packed if packed.is_file() else packed.with_suffix(""))
-    clock = LabelClock.of(name, body.motion.timestamps)
+    motion, betas = read_smpl_json(packed if packed.is_file() else packed.with_suffix(""))
+    clock = LabelClock.of(name, motion.timestamps)
     objects, paths, contacts = [], {}, []
     for object_id, (locations, labels) in _object_files(root, name, object_name).items():
         annotated = read_object_locations(locations)
         kind = _motion_type(object_id, annotated, motion_types or {}, locations)
         if kind == "absent":
             continue
-        item = scene_object(object_id, annotated, root / "object_models" / f"{object_id}.ply", kind, clock.start_s)
+        item = _scene_object(object_id, annotated, root / "object_models" / f"{object_id}.ply", kind, clock.start_s)
         objects.append(item)
         paths[object_id] = annotated.trajectory
         if labels is not None:
@@ -104,20 +86,20 @@ def read_egohoi(
     if interactions is not None:
         labels_of(interactions, clock)  # raises for a hand that holds two objects at once
     shape = root / "smpl_shapes" / f"{subject_of(name)}.json"
-    betas = body.shape or (shape_from_betas(read_hps_subject(shape).betas) if shape.is_file() else {})
+    betas = betas or (read_hps_subject(shape)[0] if shape.is_file() else {})
     recording = Recording(
         name,
-        motion=body.motion,
+        motion=motion,
         object_motion=paths,
         interactions=interactions,
-        skeleton=body.motion.skeleton,
+        skeleton=motion.skeleton,
         shape=betas,
         subject=subject_of(name),
         location=location_of(name),
         activity=activity_of(name),
         source="EgoHOI",
     )
-    return EgoHoi(recording, Environment(tuple(objects)))
+    return recording, Environment(tuple(objects))
 
 
 def _object_files(root: Path, name: str, object_name: str | None) -> dict[str, tuple[Path, Path | None]]:
@@ -131,10 +113,9 @@ def _object_files(root: Path, name: str, object_name: str | None) -> dict[str, t
         raise WearcapError(
             "no object locations of this sequence", where=single, expected=f"this file, or a folder {several}"
         )
-    places = {object_id: [root / folder / labels for folder in _CONTACTS] for object_id, (_, labels) in found.items()}
     return {
-        object_id: (path, next((place for place in places[object_id] if place.is_file()), None))
-        for object_id, (path, _) in found.items()
+        object_id: (path, next((place for folder in _CONTACTS if (place := root / folder / labels).is_file()), None))
+        for object_id, (path, labels) in found.items()
     }
 
 
@@ -144,96 +125,61 @@ def _only_object(root: Path, name: str) -> str:
     models = sorted(path.stem for path in root.glob("object_models/*.ply"))
     fitting = [stem] if stem in models else [model for model in models if model.startswith(stem)]
     if len(fitting) != 1:
-        raise WearcapError(
-            f"{len(fitting)} models fit the sequence {name!r}",
-            where=root / "object_models",
-            expected=f"{stem}.ply",
-            fix=f"Give its object's name: one of {', '.join(fitting or models)}.",
-        )
+        what = f"{len(fitting)} models fit the sequence {name!r}"
+        fix = f"Give its object's name: one of {', '.join(fitting or models)}."
+        raise WearcapError(what, where=root / "object_models", expected=f"{stem}.ply", fix=fix)
     return fitting[0]
 
 
-def _motion_type(object_id: str, annotated: AnnotatedObject, motion_types: Mapping[str, str], where: Path) -> str:
+def _motion_type(object_id: str, annotated: _AnnotatedObject, motion_types: Mapping[str, str], where: Path) -> str:
     default = "along_floor" if annotated.hinge is None else "hinge"
     kind = next((kind for pattern, kind in motion_types.items() if fnmatchcase(object_id, pattern)), default)
     if kind not in MOTION_TYPES:
         raise WearcapError(f"motion type {kind!r} of {object_id}", expected=f"one of {', '.join(MOTION_TYPES)}")
     if kind == "hinge" and annotated.hinge is None:
-        raise WearcapError(
-            f"{object_id} is to turn about a hinge and has none",
-            where=where,
-            expected='"hinge": [x, y, z]',
-            fix="Give it another motion type.",
-        )
+        what = f"{object_id} is to turn about a hinge and has none"
+        raise WearcapError(what, where=where, expected='"hinge": [x, y, z]', fix="Give it another motion type.")
     return kind
 
 
-def read_object_locations(path: str | Path) -> AnnotatedObject:
+def read_object_locations(path: str | Path) -> _AnnotatedObject:
     """Read {center, hinge where it has one, locations: [{time, position, quaternion (wxyz)}]}.
 
     Raises WearcapError for missing keys, NaN, quaternions that are none, two poses at one time, or no pose at all.
     """
+    expected = '{"center": [x, y, z], "locations": [{"time", "position", "quaternion"}]}'
     content = read_json(path)
-    try:
+    with understood("no object locations", path, expected):
         rows = sorted(content["locations"], key=lambda row: row["time"])
         times, positions, quaternions = (
             np.array([row[key] for row in rows], np.float64) for key in ("time", "position", "quaternion")
         )
         center = np.array(content["center"], np.float64)
         hinge = np.array(content["hinge"], np.float64) if content.get("hinge") is not None else None
-    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
-        raise _not_locations(path, f"{type(error).__name__}: {error}") from error
-    points = [center] if hinge is None else [center, hinge]
-    if positions.shape != (len(rows), 3) or quaternions.shape != (len(rows), 4) or not rows:
-        raise _not_locations(path, f"{len(rows)} of shapes {positions.shape}, {quaternions.shape}")
-    if any(point.shape != (3,) or not (np.abs(point) < 1e6).all() for point in points):
-        raise _not_locations(path, "center or hinge is no point")
+        if positions.shape != (len(rows), 3) or quaternions.shape != (len(rows), 4) or not rows:
+            raise ValueError(f"{len(rows)} of shapes {positions.shape}, {quaternions.shape}")
+        if any(p.shape != (3,) or not (np.abs(p) < 1e6).all() for p in (center, hinge) if p is not None):
+            raise ValueError("center or hinge is no point")
     checked_trajectory(times, positions, quaternions, path)
-    trajectory = _about_center(times, positions, quaternions, center)
-    return AnnotatedObject(_triple(center), None if hinge is None else _triple(hinge), trajectory)
-
-
-def _not_locations(path: str | Path, detail: str) -> WearcapError:
-    return WearcapError(
-        f"no object locations ({detail})"[:300],
-        where=path,
-        expected='{"center": [x, y, z], "locations": [{"time", "position", "quaternion"}]}',
-    )
-
-
-def _triple(point: np.ndarray) -> tuple[float, float, float]:
-    x, y, z = point.tolist()
-    return x, y, z
-
-
-def _about_center(
-    times: Float64[np.ndarray, "time"],
-    positions: Float64[np.ndarray, "time 3"],
-    quat_wxyz: Float64[np.ndarray, "time 4"],
-    center: Float64[np.ndarray, "3"],
-) -> Trajectory:
-    """Trajectory of the centre c: a vertex v is at R·v + p = R·(v - c) + (p + R·c)."""
-    R = rotation.matrix_from_quat_wxyz(torch.from_numpy(quat_wxyz))
+    # The path of the centre c: a vertex v is at R·v + p = R·(v - c) + (p + R·c).
+    R = rotation.matrix_from_quat_wxyz(torch.from_numpy(quaternions))
     t = torch.from_numpy(positions) + R @ torch.from_numpy(center)
-    return Trajectory(torch.from_numpy(times), R.float(), t.float())
+    trajectory = Trajectory(torch.from_numpy(times), R.float(), t.float())
+    return _AnnotatedObject(tuple(center.tolist()), None if hinge is None else tuple(hinge.tolist()), trajectory)
 
 
-def scene_object(
-    name: str, annotated: AnnotatedObject, model: str | Path, motion_type: str, start_s: float
+def _scene_object(
+    name: str, annotated: _AnnotatedObject, model: str | Path, motion_type: str, start_s: float
 ) -> SceneObject:
     """SceneObject at its last annotated pose before `start_s`, else its first. Raises WearcapError without its model."""
     if not Path(model).is_file():
         raise WearcapError(f"no model of {name}", where=model, expected="object_models/OBJECT.ply")
-    ply = read_ply(model)
-    if not len(ply.points):
+    mesh = read_ply(model).mesh
+    if not len(mesh.vertices):
         raise WearcapError("an empty model", where=model, expected="at least one point")
-    vertices = (ply.points.astype(np.float64) - annotated.center).astype(np.float32)
-    color = _COLOR if ply.colors is None else ply.colors.astype(np.float32) / 255
-    mesh = Mesh(vertices, np.zeros((0, 3), np.int32) if ply.faces is None else ply.faces, color)
-    freedom = Freedom(
-        {"hinge": "hinge", "along_floor": "plane", "free": "free"}[motion_type],
-        annotated.hinge if motion_type == "hinge" else None,
-    )
+    mesh = replace(mesh, vertices=(mesh.vertices.astype(np.float64) - annotated.center).astype(np.float32))
+    kind = {"hinge": "hinge", "along_floor": "plane", "free": "free"}[motion_type]
+    freedom = Freedom(kind, annotated.hinge if motion_type == "hinge" else None)
     seen = max(int(torch.searchsorted(annotated.trajectory.timestamps, start_s, right=True)) - 1, 0)
     first = annotated.trajectory.T_world_body[seen]
     return SceneObject(name, name.rpartition("_")[2], mesh, first.R, first.t, freedom)
@@ -257,12 +203,9 @@ def read_egohoi_contacts(path: str | Path, clock: LabelClock, object_name: str, 
             )
         start, end = row.get("start"), row.get("end")
         if isinstance(start, int | float) and isinstance(end, int | float) and end < start:
-            raise WearcapError(
-                f"interaction {number} ends before it starts: {start} to {end} s",
-                where=path,
-                expected="start < end",
-                fix="Exchange the two, if that is what was meant.",
-            )
+            what = f"interaction {number} ends before it starts: {start} to {end} s"
+            expected = "start < end"
+            raise WearcapError(what, where=path, expected=expected, fix="Exchange the two, if that is what was meant.")
         for part in row["parts"]:
             if part not in parts:
                 raise WearcapError(f"interaction {number} is with {part!r}", where=path, expected=" or ".join(parts))
@@ -283,43 +226,3 @@ def _joined(parts: list[Interactions]) -> Interactions:
     return Interactions(
         start[order], stop[order], hands[order], tuple(names[k] for k in index), tuple(kinds[k] for k in index)
     )
-
-
-def write_object_npz(
-    trajectory: Trajectory, path: str | Path, center: tuple[float, float, float] = (0.0, 0.0, 0.0)
-) -> None:
-    """Write an object's path as the published tracker does: `translations`, `quaternions` (wxyz), `timestamps`.
-
-    `center` is the origin of the object's axes in its model's axes (m). Raises WearcapError for poses that are not finite.
-    """
-    R, t = trajectory.R_world_body.double(), trajectory.t_world_body.double()
-    if not (R.isfinite().all() and t.isfinite().all() and trajectory.timestamps.isfinite().all()):
-        raise WearcapError("the object's path holds NaN or infinite values", where=path, expected="finite poses")
-    moved = t - R @ _double(center)
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(
-            file,
-            version=np.array(2),
-            type=np.array("sequential"),
-            translations=moved.numpy(),
-            quaternions=rotation.quat_wxyz_from_matrix(R).numpy(),
-            timestamps=trajectory.timestamps.numpy(),
-        )
-
-
-def read_object_npz(path: str | Path, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Trajectory:
-    """Read what `write_object_npz` or the published tracker wrote. Raises WearcapError for missing arrays, NaN, times that
-    do not rise, quaternions that are none."""
-    arrays = read_npz(path, ("translations", "quaternions", "timestamps"))
-    require(arrays, path, translations=("time", 3), quaternions=("time", 4), timestamps=("time",))
-    times, positions, quaternions = (
-        arrays[key].astype(np.float64) for key in ("timestamps", "translations", "quaternions")
-    )
-    if not len(times):
-        raise WearcapError("a path without poses", where=path, expected="at least one")
-    checked_trajectory(times, positions, quaternions, path)
-    return _about_center(times, positions, quaternions, _double(center).numpy())
-
-
-def _double(point: tuple[float, float, float]) -> Float[Tensor, "3"]:
-    return torch.tensor(point, dtype=torch.float64)

@@ -1,25 +1,111 @@
 """The H-contact data set: bodies by sequence, contacts of each hand, and the published split of windows.
 
 Folders as it unpacks: `body/NAME.json.zip`, `contacts/NAME.json`, and, from the published code, `splits/…/NAME.json`.
+Bodies, as EgoHOI's, are SMPL or SMPL+H poses frame by frame, as `.json.zip` or older `.json`: the world is metric and z
+up, joint frames are SMPL's (x left, y up, z forward) as in AMASS, but `transl` is the place of the root joint itself.
+Fingers may be relative to SMPL+H's mean hand, which the files do not state.
 """
 
+import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import torch
+
+from wearcap.body.skeletons import smpl24, smplh52
 from wearcap.errors import WearcapError
+from wearcap.files import parse_json
 from wearcap.io.datasets.hps_sequence import subject_of
+from wearcap.io.formats.bounded import Budget, counted, file_size, understood
 from wearcap.io.formats.contact_labels import LabelClock, read_contact_labels
-from wearcap.io.formats.json_text import read_json
-from wearcap.io.formats.smpl_json import read_smpl_json
-from wearcap.recording.interactions import Interactions
+from wearcap.io.formats.npz import readable, require
+from wearcap.io.formats.poses import check_rising
+from wearcap.io.formats.smpl import shape_from_betas, smpl_motion
+from wearcap.io.formats.text import MAX_JSON_BYTES, read_json
+from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 from wearcap.scene.objects import CONTACT_CLASSES
+
+_BODY = 63
+"""Number of values of SMPL+H's 21 body joints; SMPL's two hand joints follow them."""
+_HANDS = ("left_hand_pose", "right_hand_pose")
+_SIZES = {"global_orient": 3, "body_pose": "pose", "transl": 3, **dict.fromkeys(_HANDS, 45)}
+_EXPECTED = (
+    '{"sequence": [{"time", "global_orient", "body_pose" (63 or 69), "transl", …}], "global": {"betas", "gender"}}'
+)
+
+
+def read_smpl_json(path: str | Path) -> tuple[Motion, dict[str, float]]:
+    """Read `NAME.json.zip` {sequence, global}, or an older `NAME.json`: [{time, pose (72), translation, shape}].
+
+    Gives the body's motion (smpl24, or smplh52 where the file has hands) on the file's clock, and its shape. Where the
+    file has no position, the root stays at the origin.
+
+    Raises WearcapError for what is damaged, missing or misshapen, for NaN, and for times that do not rise.
+    """
+    path = Path(path)
+    frames, about = _frames(_unzipped(path) if path.suffix == ".zip" else read_json(path), path)
+    arrays = {}
+    for name in ("time", *_SIZES):
+        if name in ("time", "global_orient", "body_pose") or name in frames[0]:
+            with understood(f"{name} is missing in a frame, or no list of numbers", path, _EXPECTED):
+                arrays[name] = np.array([frame[name] for frame in frames], np.float64).reshape(len(frames), -1)
+    require(arrays, path, time=("frame", 1), **{name: ("frame", _SIZES[name]) for name in arrays if name != "time"})
+    body, hands = arrays["body_pose"], [arrays[name] for name in _HANDS if name in arrays]
+    if body.shape[1] not in (_BODY, _BODY + 6) or len(hands) == 1:
+        what = f"poses of {body.shape[1]} numbers with {', '.join(arrays)}"
+        raise WearcapError(what, where=path, expected=_EXPECTED)
+    check_rising(arrays["time"][:, 0], path)
+    parts = [body[:, :_BODY], *hands] if hands else [body, np.zeros((len(body), _BODY + 6 - body.shape[1]))]
+    rotvec = np.concatenate([arrays["global_orient"], *parts], 1)
+    times, t = torch.from_numpy(arrays["time"][:, 0]), arrays.get("transl", np.zeros((len(frames), 3)))
+    gender = about.get("gender")
+    gender = gender if isinstance(gender, str) else ""
+    skeleton = smplh52() if hands else smpl24()
+    motion = smpl_motion(times, skeleton, rotvec, t, source=path.name, format="smpl_json", gender=gender)
+    with understood("betas are no numbers", path):
+        betas = np.array(about.get("betas") or [], np.float64).reshape(-1)
+    if not np.isfinite(betas).all() or len(betas) > 300:
+        raise WearcapError(f"{len(betas)} betas, or some that are not finite", where=path, expected="10 numbers")
+    return motion, shape_from_betas(betas)
+
+
+def _unzipped(path: Path) -> Any:
+    """Content of the one JSON file in an archive."""
+    budget = Budget(path, file_size(path), MAX_JSON_BYTES)
+    with readable(".json.zip", path, _EXPECTED), zipfile.ZipFile(path) as archive:
+        members = [
+            info for info in archive.infolist() if not info.is_dir() and not info.filename.startswith("__MACOSX")
+        ]
+        if len(members) != 1:
+            raise WearcapError(f"an archive of {len(members)} files", where=path, expected="one JSON file")
+        with archive.open(members[0]) as file, counted(file, budget) as reader:
+            return parse_json(reader.read(), path)
+
+
+def _frames(content: Any, path: Path) -> tuple[list[dict], dict]:
+    """Frames in the newer layout, and the content that applies to all of them."""
+    sequence = content.get("sequence") if isinstance(content, dict) else content
+    if not isinstance(sequence, list) or not sequence or not all(isinstance(frame, dict) for frame in sequence):
+        raise WearcapError("no poses", where=path, expected=_EXPECTED)
+    about = content.get("global", {}) if isinstance(content, dict) else {"betas": sequence[0].get("shape", [])}
+    if "pose" in sequence[0]:
+        for number, frame in enumerate(sequence):
+            pose = frame.get("pose")
+            if not isinstance(pose, list) or len(pose) != 72:
+                raise WearcapError(f"frame {number} has no pose of 72 numbers", where=path, expected=_EXPECTED)
+            newer = {"time": frame.get("time"), "global_orient": pose[:3], "body_pose": pose[3:]}
+            sequence[number] = newer | ({"transl": frame["translation"]} if "translation" in frame else {})
+    return sequence, about if isinstance(about, dict) else {}
+
 
 ENDING = ".json.zip"
 
 
 @dataclass(frozen=True)
-class HContactSplit:
+class _HContactSplit:
     """Middle frames of the training, validation and test windows, counted from the first whole window."""
 
     window_radius: int
@@ -44,31 +130,22 @@ def read_hcontact(root: str | Path, name: str, contact_class: str = "") -> Recor
         raise WearcapError(f"no contact class {contact_class!r}", expected=f"one of {', '.join(CONTACT_CLASSES)}")
     root = Path(root)
     if name not in hcontact_names(root):
-        raise WearcapError(
-            f"no sequence {name!r}",
-            where=root,
-            expected=f"body/{name}{ENDING}",
-            fix=f"There are {len(hcontact_names(root))}, such as {hcontact_names(root)[:3]}.",
-        )
-    body = read_smpl_json(root / "body" / f"{name}{ENDING}")
-    clock = LabelClock.of(name, body.motion.timestamps)
+        fix = f"There are {len(hcontact_names(root))}, such as {hcontact_names(root)[:3]}."
+        raise WearcapError(f"no sequence {name!r}", where=root, expected=f"body/{name}{ENDING}", fix=fix)
+    motion, shape = read_smpl_json(root / "body" / f"{name}{ENDING}")
+    clock = LabelClock.of(name, motion.timestamps)
     contacts = read_contact_labels(root / "contacts" / f"{name}.json", clock)
     return Recording(
         name,
-        motion=body.motion,
-        interactions=_of_class(contacts, contact_class),
-        skeleton=body.motion.skeleton,
-        shape=body.shape,
+        motion=motion,
+        interactions=replace(contacts, classes=tuple(named or contact_class for named in contacts.classes)),
+        skeleton=motion.skeleton,
+        shape=shape,
         subject=subject_of(name),
         location=location_of(name),
         activity=activity_of(name),
         source="H-contact",
     )
-
-
-def _of_class(contacts: Interactions, contact_class: str) -> Interactions:
-    """The interactions with `contact_class` filled in where they have none."""
-    return replace(contacts, classes=tuple(named or contact_class for named in contacts.classes))
 
 
 def location_of(name: str) -> str:
@@ -83,23 +160,16 @@ def activity_of(name: str) -> str:
     return rest.strip("_")
 
 
-def read_hcontact_split(path: str | Path) -> HContactSplit:
+def read_hcontact_split(path: str | Path) -> _HContactSplit:
     """Read `splits/…/NAME.json` {window_radius, train, valid, test}. Raises WearcapError for anything else."""
     content = read_json(path)
     parts = ("train", "valid", "test")
-    radius = content.get("window_radius") if isinstance(content, dict) else None
-    lists = [content.get(part) for part in parts] if isinstance(content, dict) else []
-    sound = (
-        type(radius) is int
-        and radius > 0
-        and all(
-            isinstance(windows, list) and all(type(k) is int and 0 <= k < 1 << 40 for k in windows) for windows in lists
-        )
-    )
+    content = content if isinstance(content, dict) else {}
+    radius, lists = content.get("window_radius"), [content.get(part) for part in parts]
+    frames = [windows if isinstance(windows, list) else [None] for windows in lists]
+    sound = type(radius) is int and radius > 0
+    sound = sound and all(type(k) is int and 0 <= k < 1 << 40 for windows in frames for k in windows)
     if not sound:
-        raise WearcapError(
-            "not a split of windows",
-            where=path,
-            expected='{"window_radius": 30, "train": [frame, …], "valid": […], "test": […]}',
-        )
-    return HContactSplit(radius, *map(tuple, lists))
+        expected = '{"window_radius": 30, "train": [frame, …], "valid": […], "test": […]}'
+        raise WearcapError("not a split of windows", where=path, expected=expected)
+    return _HContactSplit(radius, *map(tuple, lists))

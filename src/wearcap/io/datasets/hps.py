@@ -1,10 +1,21 @@
-"""Single files of the HPS data set: SMPL motion, betas, camera localisation, starts, head cameras.
+"""Files of the HPS data set: SMPL motion, betas, camera localisation, starts, head cameras, scans, the suit's pose.
 
 `hps_smpl/*.pkl` is in the scan's world (metres, z up) with joint frames of SMPL's (x left, y up, z forward), as AMASS
 is. Localisation is the pose of the OpenCV camera in that world. io/datasets/hps_sequence.py puts a sequence together.
+
+A scan (unzipped) has a cloud, photos of a fisheye rig and their calibration; `info/00000-info.json` gives the pose of each
+camera of the rig in the scan's world, along OpenCV's axes of the picture as stored (the trolley's cameras are mounted on
+their side: right in the picture may be down in the room).
+
+The suit's pose is text written by Unity (`*_pose.txt`, `*_trans.txt`), whose world is left-handed (x right, y up, z
+forward) and turns by Euler angles "ZXY": first about z, then x, then y, all about fixed axes, in degrees. With x flipped
+it is SMPL's (right-handed): rotations about x keep their sign, those about y and z change it, so
+R = Ry(-y) Rx(x) Rz(-z). SMPL's axes are then converted as in io/datasets/amass.py; here the world's axes are, too, for
+Unity's world is y up.
 """
 
-from dataclasses import dataclass
+import re
+from array import array
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +28,17 @@ from wearcap.body.skeletons import smpl24
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
-from wearcap.io.formats.json_text import read_json_object
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.rotation import about_axis, matrix_from_quat_wxyz
+from wearcap.io.formats.bounded import placed, understood
 from wearcap.io.formats.npz import require
+from wearcap.io.formats.ocamcalib import read_sensor_frame
 from wearcap.io.formats.poses import NORM_TOLERANCE
 from wearcap.io.formats.restricted_pickle import read_pickle
-from wearcap.io.formats.smpl_axes import rotations_from_smpl
+from wearcap.io.formats.smpl import A, shape_from_betas, smpl_motion
+from wearcap.io.formats.text import at_line, finite_floats, numbered_lines, read_json, read_json_object
 from wearcap.recording import Localization, Motion
+from wearcap.recording.photo import Photo
 
 FPS = 30.0
 """Frame rate (Hz) of the motion, the suit's exports and the localised video (resampled from 29.97)."""
@@ -32,15 +48,6 @@ PELVIS_SMPL = (-0.0018, -0.2233, 0.0282)
 """Pelvis of SMPL's mean template in SMPL's axes (m); a person's own differs by a few centimetres with the betas."""
 MAX_FRAMES = 1_000_000
 """Most frames (nine hours) that a file's frame numbers may span; frames that are not listed are filled in."""
-
-
-@dataclass(frozen=True)
-class HpsSubject:
-    """A subject's body: SMPL betas and gender, and the height of the pelvis above the heels (m; 0 when not given)."""
-
-    betas: tuple[float, ...]
-    gender: str
-    root_to_heel_m: float
 
 
 def read_hps_motion(path: str | Path, t_template_pelvis: tuple[float, float, float] = PELVIS_SMPL) -> Motion:
@@ -56,27 +63,24 @@ def read_hps_motion(path: str | Path, t_template_pelvis: tuple[float, float, flo
     sizes = require(arrays, path, poses=("time", 72), transes=("time", 3))
     if not sizes["time"]:
         raise WearcapError("no frames", where=path)
-    R = rotations_from_smpl(torch.from_numpy(arrays["poses"].astype(np.float64)).unflatten(1, (-1, 3)))
-    t = torch.from_numpy(arrays["transes"].astype(np.float64)) + torch.tensor(t_template_pelvis, dtype=torch.float64)
-    times = torch.arange(sizes["time"], dtype=torch.float64) / FPS
-    return Motion(times, smpl24(), R.float(), t.float(), provenance={"source": Path(path).name, "format": "hps"})
+    times, pelvis = torch.arange(sizes["time"], dtype=torch.float64) / FPS, arrays["transes"].astype(np.float64)
+    about = {"source": Path(path).name, "format": "hps"}
+    return smpl_motion(times, smpl24(), arrays["poses"], pelvis + t_template_pelvis, **about)
 
 
-def read_hps_subject(path: str | Path) -> HpsSubject:
-    """Read `hps_betas/SUBx.json`. Raises WearcapError for missing betas or what is no number."""
+def read_hps_subject(path: str | Path) -> tuple[dict[str, float], dict[str, str]]:
+    """A subject's shape of `hps_betas/SUBx.json`; its gender, and `root_to_heel_m`: the pelvis above the heels (0: not given).
+
+    Raises WearcapError for missing betas or what is no number.
+    """
     content = read_json_object(path)
-    try:
+    with understood("no betas that can be read", path, '{"betas": 10 numbers, "gender": …, "root_to_heel": …}'):
         betas = np.asarray(content["betas"], np.float64).reshape(-1)
         heel_m = float(content.get("root_to_heel", 0.0))
-    except (KeyError, ValueError, TypeError) as error:
-        raise WearcapError(
-            f"no betas that can be read ({error})",
-            where=path,
-            expected='{"betas": 10 numbers, "gender": …, "root_to_heel": …}',
-        ) from error
     if not (0 < len(betas) <= 300 and np.isfinite(betas).all() and np.isfinite(heel_m)):
         raise WearcapError(f"{len(betas)} betas, or some that are not finite", where=path, expected="10 numbers")
-    return HpsSubject(tuple(betas.tolist()), str(content.get("gender", "neutral")), heel_m)
+    about = {"gender": str(content.get("gender", "neutral")), "root_to_heel_m": f"{heel_m:.4f}"}
+    return shape_from_betas(betas.tolist()), about
 
 
 def read_hps_starts(path: str | Path) -> tuple[int, int]:
@@ -95,13 +99,18 @@ def read_hps_localization(path: str | Path, fps: float | int = FPS) -> Localizat
     the file has no others. Raises WearcapError naming the frame for what is no pose, and when no frame has one.
     """
     rows = read_json_object(path)
-    frames = _frame_numbers(rows, path)
+    for key in rows:
+        if not (key.isascii() and key.isdigit() and len(key) < 20 and int(key) < MAX_FRAMES):
+            raise WearcapError(f"frame {key[:30]!r}", where=path, expected="frame numbers from 0 as keys")
+    frames = {key: int(key) for key in rows}
+    if len(set(frames.values())) < len(frames):
+        raise WearcapError("a frame is there twice", where=path)
     count = max(frames.values(), default=-1) + 1
     quat_wxyz, position = np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, 3))
     confidence = torch.zeros(count)
     for key, frame in frames.items():
         if rows[key] is not None:
-            quat_wxyz[frame], position[frame] = read_hps_pose(rows[key], f"{path}, frame {key}")
+            quat_wxyz[frame], position[frame] = _read_hps_pose(rows[key], f"{path}, frame {key}")
             confidence[frame] = 1.0
     if not confidence.any():
         raise WearcapError("no frame has a pose", where=path, expected="poses of some frames, null for the others")
@@ -113,34 +122,14 @@ def read_hps_localization(path: str | Path, fps: float | int = FPS) -> Localizat
     )
 
 
-def _frame_numbers(rows: dict[str, Any], path: str | Path) -> dict[str, int]:
-    frames = {}
-    for key in rows:
-        if not (key.isascii() and key.isdigit() and len(key) < 20 and int(key) < MAX_FRAMES):
-            raise WearcapError(f"frame {key[:30]!r}", where=path, expected="frame numbers from 0 as keys")
-        frames[key] = int(key)
-    if len(set(frames.values())) < len(frames):
-        raise WearcapError("a frame is there twice", where=path)
-    return frames
-
-
-def read_hps_pose(row: Any, where: str) -> tuple[np.ndarray, np.ndarray]:
+def _read_hps_pose(row: Any, where: str) -> tuple[np.ndarray, np.ndarray]:
     """(quaternion w x y z, position) of {"position": …, "quaternion": …}; anything else raises WearcapError."""
-    try:
+    with understood("no pose", where, '{"position": [x, y, z], "quaternion": [w, x, y, z]}'):
         quat_wxyz = np.asarray(row["quaternion"], np.float64).reshape(4)
         position = np.asarray(row["position"], np.float64).reshape(3)
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise WearcapError(
-            f"no pose ({type(error).__name__}: {error})",
-            where=where,
-            expected='{"position": [x, y, z], "quaternion": [w, x, y, z]}',
-        ) from error
     if not (np.abs(position) < 1e6).all() or not abs(np.linalg.norm(quat_wxyz) - 1) < NORM_TOLERANCE:
-        raise WearcapError(
-            f"position {position.tolist()}, quaternion {quat_wxyz.tolist()}",
-            where=where,
-            expected="metres, and a quaternion of length 1",
-        )
+        what = f"position {position.tolist()}, quaternion {quat_wxyz.tolist()}"
+        raise WearcapError(what, where=where, expected="metres, and a quaternion of length 1")
     return quat_wxyz, position
 
 
@@ -152,26 +141,17 @@ def read_hps_cameras(path: str | Path) -> dict[str, Camera]:
     cameras: dict[str, Camera] = {}
     for serial, row in read_json_object(path).items():
         where = f"{path}, camera {serial!r}"
-        try:
-            lens = row["parameters"]
+        expected = "parameters {focal_dist_xy, center_xy, dist_coeffs} and captured_videos"
+        with understood("no intrinsics", where, expected), placed(where):
             focal, centre, distortion = (
-                np.asarray(lens[key], np.float64).reshape(-1).tolist()
+                np.asarray(row["parameters"][key], np.float64).reshape(-1).tolist()
                 for key in ("focal_dist_xy", "center_xy", "dist_coeffs")
             )
             videos = [Path(str(video)).stem for video in row["captured_videos"]]
             if not (len(focal) == len(centre) == 2 and np.isfinite([*focal, *centre, *distortion]).all()):
                 raise ValueError(f"focal lengths {focal}, centre {centre}, distortion {distortion}")
-        except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise WearcapError(
-                f"no intrinsics ({type(error).__name__}: {error})"[:200],
-                where=where,
-                expected="parameters {focal_dist_xy, center_xy, dist_coeffs} and captured_videos",
-            ) from error
-        distortion = tuple((distortion + [0.0] * 4)[: max(4, len(distortion))])
-        try:
+            distortion = tuple((distortion + [0.0] * 4)[: max(4, len(distortion))])
             camera = Camera("opencv", *IMAGE_SIZE, *focal, *centre, distortion)
-        except WearcapError as error:
-            raise WearcapError(error.what, where=where, expected=error.expected) from error
         cameras |= dict.fromkeys(videos, camera)
     return cameras
 
@@ -203,3 +183,129 @@ def resampled_localization(localization: Localization, fps: float | int) -> Loca
 def nominal_mount() -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
     """(R_head_cam, t_head_cam) of an upright, forward-looking camera on the forehead (assumed: it is not measured)."""
     return torch.tensor([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), torch.tensor([0.12, 0.0, 0.12])
+
+
+CLOUD, CALIBRATION = "pointcloud.ply", "sensor_frame.xml"
+_PHOTO = re.compile(r"(\d+)-(cam\d+)\.jpe?g", re.IGNORECASE)
+
+
+def is_hps_scene(folder: str | Path) -> bool:
+    """Whether a folder has the layout of a NavVis scan: a calibration and poses of pictures."""
+    return (Path(folder) / CALIBRATION).is_file() and (Path(folder) / "info").is_dir()
+
+
+def read_hps_scene(folder: str | Path) -> tuple[Path, list[Photo]]:
+    """(path of the cloud, photos in order of frame and camera); the cloud itself is read by `io.formats.scene_folder.read_scan`.
+
+    Pictures whose frame was found invalid by the scanner are left out. Raises WearcapError for a missing cloud,
+    calibration or picture folder, a picture without pose or calibration, and what those readers refuse.
+    """
+    folder = Path(folder)
+    if folder.suffix == ".zip":
+        raise WearcapError("a packed scan", where=folder, expected="its folder", fix="Unzip it first.")
+    for part in (CLOUD, CALIBRATION, "cam", "info"):
+        if not (folder / part).exists():
+            raise WearcapError(f"no {part}", where=folder, expected=f"a scan with {CLOUD}, {CALIBRATION}, cam/, info/")
+    cameras = {
+        name: model.camera(f"{folder / CALIBRATION}, camera {name!r}")
+        for name, model in read_sensor_frame(folder / CALIBRATION).items()
+    }
+    named = [(match, path) for path in sorted((folder / "cam").iterdir()) if (match := _PHOTO.fullmatch(path.name))]
+    if not named:
+        raise WearcapError("no pictures", where=folder / "cam", expected="files such as 00000-cam0.jpg")
+    photos, info, info_path = [], {}, None
+    for match, path in named:
+        frame, name = match.groups()
+        if info_path != folder / "info" / f"{frame}-info.json":
+            info_path = folder / "info" / f"{frame}-info.json"
+            info = read_json(info_path)
+        if not isinstance(info, dict) or name not in info:
+            raise WearcapError(f"no pose of {name}", where=info_path, expected=f"one for {path.name}")
+        if name not in cameras:
+            raise WearcapError(f"no intrinsics of {name}", where=folder / CALIBRATION, expected=f"one for {path.name}")
+        if str(info.get("valid", "true")).lower() == "false":
+            continue
+        quat_wxyz, position = _read_hps_pose(info[name], f"{info_path}, {name}")
+        R = matrix_from_quat_wxyz(torch.from_numpy(quat_wxyz))
+        photos.append(Photo(path, cameras[name], Rigid(R.float(), torch.from_numpy(position).float())))
+    return folder / CLOUD, photos
+
+
+_ARM = ("collar", "shoulder", "elbow", "wrist", "hand")
+_LEG = ("hip", "knee", "ankle", "foot")
+UNITY_JOINTS = (
+    "pelvis",
+    *(f"{side}_{joint}" for side in ("left", "right") for joint in _LEG),
+    "spine1",
+    "spine2",
+    "spine3",
+    *(f"left_{joint}" for joint in _ARM),
+    "neck",
+    "head",
+    *(f"right_{joint}" for joint in _ARM),
+)
+"""Order of the file's Euler angles: Unity's hierarchy of SMPL, depth first."""
+_WITH_INNER_ROOT = 3 * (len(UNITY_JOINTS) + 1)
+"""Files name the root twice: the avatar, which turns, and below it the model's own root, which does not."""
+
+
+def read_unity_motion(
+    pose_path: str | Path, trans_path: str | Path, t_template_pelvis: tuple[float, float, float] = PELVIS_SMPL
+) -> Motion:
+    """Read one sequence's `_pose.txt` and `_trans.txt` as a smpl24 motion at 30 Hz that begins at 0 s, z up.
+
+    A last line that was cut short is left out. Raises WearcapError naming the line for a wrong count or what is no
+    number, and for files whose lengths differ by more than one frame.
+    """
+    angles_deg = _table(pose_path, (_WITH_INNER_ROOT, 3 * len(UNITY_JOINTS)))
+    if angles_deg.shape[1] == _WITH_INNER_ROOT:
+        angles_deg = np.delete(angles_deg, [3, 4, 5], 1)
+    trans = _table(trans_path, (3,))
+    if abs(len(angles_deg) - len(trans)) > 1:
+        what = f"{len(trans)} positions for {len(angles_deg)} poses"
+        raise WearcapError(what, where=trans_path, expected=f"as many lines as in {Path(pose_path).name}")
+    count = min(len(angles_deg), len(trans))
+    R_smpl = rotations_from_unity(torch.from_numpy(angles_deg[:count]).unflatten(1, (-1, 3)))
+    skeleton = smpl24()
+    order = [UNITY_JOINTS.index(name) for name in skeleton.joint_names]
+    t_smpl = torch.from_numpy(trans[:count]) * torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
+    t_smpl = t_smpl + torch.tensor(t_template_pelvis, dtype=torch.float64)
+    return Motion(
+        torch.arange(count, dtype=torch.float64) / FPS,
+        skeleton,
+        (A @ R_smpl[:, order] @ A.T).float(),
+        (t_smpl @ A.T).float(),
+        provenance={"source": Path(pose_path).name, "format": "hps unity"},
+    )
+
+
+def rotations_from_unity(angles_deg: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotations in SMPL's axes from Unity's Euler angles (x, y, z in degrees)."""
+    x, y, z = torch.deg2rad(angles_deg).unbind(-1)
+    return about_axis("y", -y) @ about_axis("x", x) @ about_axis("z", -z)
+
+
+def _table(path: str | Path, widths: tuple[int, ...]) -> np.ndarray:
+    values, width = array("d"), 0
+    short: WearcapError | None = None
+    for number, line in numbered_lines(path):
+        tokens = line.split()
+        if not tokens:
+            continue
+        if short is not None:
+            raise short
+        width = width or len(tokens)
+        if width not in widths or len(tokens) != width:
+            short = WearcapError(
+                f"{len(tokens)} numbers", where=at_line(path, number), expected=" or ".join(map(str, widths))
+            )
+            if len(tokens) >= width:
+                raise short
+            continue  # the recorder stops in the middle of a line: only the last may be short
+        try:
+            values.extend(finite_floats(tokens))
+        except ValueError as error:
+            raise WearcapError(str(error), where=at_line(path, number)) from error
+    if not values:
+        raise WearcapError("no lines of numbers", where=path)
+    return np.asarray(values).reshape(-1, width)

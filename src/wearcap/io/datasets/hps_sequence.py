@@ -12,11 +12,10 @@ from glob import escape
 from pathlib import Path
 
 import torch
-from jaxtyping import Float64
-from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.io.datasets.hps import (
+    CLOUD,
     FPS,
     IMAGE_SIZE,
     nominal_mount,
@@ -25,13 +24,11 @@ from wearcap.io.datasets.hps import (
     read_hps_motion,
     read_hps_starts,
     read_hps_subject,
+    read_unity_motion,
 )
-from wearcap.io.datasets.hps_scene import CLOUD
-from wearcap.io.datasets.hps_unity import read_unity_motion
 from wearcap.io.formats.mvnx import read_mvnx
-from wearcap.io.formats.smpl_axes import shape_from_betas
 from wearcap.io.formats.video import video_info
-from wearcap.recording import CameraStream, Localization, Motion, Recording
+from wearcap.recording import CameraStream, ImuStream, Localization, Motion, Recording
 
 _SUBJECT = re.compile(r"SUB\d+")
 _SCAN_OF = {
@@ -43,7 +40,7 @@ _SCAN_OF = {
     "SUB6": "MPI_BIBLIO_UG",
     "SUB7": "MPI_BIBLIO_OG",
 }
-"""Scan of each subject's sequences, except those that `scan_name` handles individually."""
+"""Scan of each subject's sequences, except those that `_scan_name` handles individually."""
 FAR_M = 2.0
 """Median distance (m) of pelvis and localised camera beyond which clocks or places of the two disagree."""
 
@@ -66,7 +63,7 @@ def subject_of(name: str) -> str:
     return found.group()
 
 
-def scan_name(name: str) -> str:
+def _scan_name(name: str) -> str:
     """Scan that a sequence was recorded in, as assigned by the published code."""
     subject = subject_of(name)
     if "double" in name.lower():
@@ -86,40 +83,34 @@ def read_hps_sequence(root: str | Path, name: str, camera_hz: float | int = FPS)
     """
     root = Path(root)
     if not name or Path(name).name != name or escape(name) != name:
-        raise WearcapError(
-            f"no sequence {name!r}", where=root, expected="a plain name, such as SUB4_MPI_Etage6_working_standing"
-        )
+        expected = "a plain name, such as SUB4_MPI_Etage6_working_standing"
+        raise WearcapError(f"no sequence {name!r}", where=root, expected=expected)
     motion_path = _one(root, f"*hps_smpl*/{name}.pkl")
     if motion_path is None:
         known = hps_names(root)
-        raise WearcapError(
-            f"no sequence {name!r}",
-            where=root,
-            expected=f"one of {len(known)}, such as {known[:3]}" if known else "hps_smpl/NAME.pkl",
-        )
+        expected = f"one of {len(known)}, such as {known[:3]}" if known else "hps_smpl/NAME.pkl"
+        raise WearcapError(f"no sequence {name!r}", where=root, expected=expected)
     motion = read_hps_motion(motion_path)
-    shape, motion = _shaped(root, name, motion)
+    subject, shape = _one(root, f"*betas*/{subject_of(name)}.json"), {}
+    if subject is not None:
+        shape, about = read_hps_subject(subject)
+        motion = replace(motion, provenance=motion.provenance | about)
     localization_path = _one(root, f"*locali*/{name}.json")
     suit = _suit(root, name)
     starts = _one(root, f"*init*/{name}.json")
     if starts is None and (localization_path is not None or suit is not None):
-        raise WearcapError(
-            f"no starts of sequence {name!r}",
-            where=root,
-            expected=f"hps_inits/{name}.json",
-            fix="Without them its streams' clocks are unknown.",
-        )
+        fix = "Without them its streams' clocks are unknown."
+        raise WearcapError(f"no starts of sequence {name!r}", where=root, expected=f"hps_inits/{name}.json", fix=fix)
     cam_start, imu_start = (0, 0) if starts is None else read_hps_starts(starts)
     localization = None
     if localization_path is not None:
         localization = read_hps_localization(localization_path, camera_hz)
         if cam_start >= len(localization.timestamps):
-            raise WearcapError(
-                f"cam_start {cam_start} is beyond the {len(localization.timestamps)} localised frames", where=starts
-            )
+            what = f"cam_start {cam_start} is beyond the {len(localization.timestamps)} localised frames"
+            raise WearcapError(what, where=starts)
         localization = replace(localization, timestamps=localization.timestamps - cam_start / camera_hz)
         _warn_if_apart(motion, localization, motion_path)
-    scan = _one(root, *(f"{depth}{scan_name(name)}/{CLOUD}" for depth in ("", "*/", "*/*/")))
+    scan = _one(root, *(f"{depth}{_scan_name(name)}/{CLOUD}" for depth in ("", "*/", "*/*/")))
     recording = Recording(
         name,
         motion=motion,
@@ -128,89 +119,59 @@ def read_hps_sequence(root: str | Path, name: str, camera_hz: float | int = FPS)
         shape=shape,
         camera=_camera(root, name, cam_start / camera_hz, localization),
         subject=subject_of(name),
-        location=scan_name(name),
-        activity=name.removeprefix(f"{subject_of(name)}_").removeprefix(f"{scan_name(name)}_"),
+        location=_scan_name(name),
+        activity=name.removeprefix(f"{subject_of(name)}_").removeprefix(f"{_scan_name(name)}_"),
         scene=None if scan is None else str(scan.resolve()),
         source="HPS data set",
     )
-    return recording if suit is None else _with_suit(recording, suit, imu_start)
+    if suit is None:
+        return recording
+    motion, imu = suit
+    if imu_start >= len(motion):
+        raise WearcapError(f"imu_start {imu_start} is beyond the suit's {len(motion)} frames", where=name)
+    clap_s = motion.timestamps[imu_start]
+    imu = {joint: replace(stream, timestamps=stream.timestamps - clap_s) for joint, stream in imu.items()}
+    return replace(recording, suit=replace(motion, timestamps=motion.timestamps - clap_s), imu=imu)
 
 
 def _one(root: Path, *patterns: str) -> Path | None:
     return next((path for pattern in patterns for path in sorted(root.glob(pattern))), None)
 
 
-def _shaped(root: Path, name: str, motion: Motion) -> tuple[dict[str, float], Motion]:
-    path = _one(root, f"*betas*/{subject_of(name)}.json")
-    if path is None:
-        return {}, motion
-    subject = read_hps_subject(path)
-    about = {"gender": subject.gender, "root_to_heel_m": f"{subject.root_to_heel_m:.4f}"}
-    return shape_from_betas(subject.betas), replace(motion, provenance=motion.provenance | about)
-
-
-def _suit(root: Path, name: str) -> Recording | None:
-    """Suit recording on its own clock."""
+def _suit(root: Path, name: str) -> tuple[Motion, dict[str, ImuStream]] | None:
+    """The suit's motion and sensors on its own clock."""
     mvnx = _one(root, f"*/{name}.mvnx", f"*/{name}.mvnx.gz")
     if mvnx is not None:
         read = read_mvnx(mvnx)
-        return Recording(name, suit=read.motion, imu=read.imu)
+        assert read.motion is not None
+        return read.motion, read.imu
     pose, trans = _one(root, f"*/{name}_pose.txt"), _one(root, f"*/{name}_trans.txt")
-    if pose is None or trans is None:
-        return None
-    return Recording(name, suit=read_unity_motion(pose, trans))
-
-
-def _with_suit(recording: Recording, suit: Recording, imu_start: int) -> Recording:
-    assert suit.suit is not None
-    if imu_start >= len(suit.suit):
-        raise WearcapError(f"imu_start {imu_start} is beyond the suit's {len(suit.suit)} frames", where=recording.name)
-    clap_s = suit.suit.timestamps[imu_start]
-
-    imu = {name: replace(part, timestamps=part.timestamps - clap_s) for name, part in suit.imu.items()}
-    return replace(recording, suit=replace(suit.suit, timestamps=suit.suit.timestamps - clap_s), imu=imu)
+    return None if pose is None or trans is None else (read_unity_motion(pose, trans), {})
 
 
 def _camera(root: Path, name: str, clap_s: float, localization: Localization | None) -> CameraStream | None:
-    video = _one(root, f"*video*/{name}.[mM][pP]4")
+    path = _one(root, f"*video*/{name}.[mM][pP]4")
     calibration = _one(root, "*video*/cameras.json", "cameras.json")
     if calibration is None:
         return None
     cameras = read_hps_cameras(calibration)
     if name not in cameras:
-        raise WearcapError(
-            f"no intrinsics for the video of {name!r}",
-            where=calibration,
-            expected=f"its name among captured_videos (there are {len(cameras)})",
-        )
-    if video is not None:
-        times = _video_times(video) - clap_s
-    elif localization is not None:
-        times = localization.timestamps
-    else:
-        return None
-    return CameraStream(times, cameras[name], *nominal_mount(), video=None if video is None else str(video.resolve()))
-
-
-def _video_times(path: Path) -> Float64[Tensor, "time"]:
-    """Times of a video's frames (s from its first), at its own rate; the pictures must have the calibration's size."""
+        expected = f"its name among captured_videos (there are {len(cameras)})"
+        raise WearcapError(f"no intrinsics for the video of {name!r}", where=calibration, expected=expected)
+    if path is None:
+        return None if localization is None else CameraStream(localization.timestamps, cameras[name], *nominal_mount())
     video = video_info(path)
     if (video.width, video.height) != IMAGE_SIZE or not video.frames:
-        raise WearcapError(
-            f"a video of {video.frames} frames of {video.width}x{video.height} pixels",
-            where=path,
-            expected=f"{IMAGE_SIZE[0]}x{IMAGE_SIZE[1]}, as its camera was calibrated",
-        )
-    return torch.arange(video.frames, dtype=torch.float64) / video.fps
+        what = f"a video of {video.frames} frames of {video.width}x{video.height} pixels"
+        raise WearcapError(what, where=path, expected=f"{IMAGE_SIZE[0]}x{IMAGE_SIZE[1]}, as its camera was calibrated")
+    times = torch.arange(video.frames, dtype=torch.float64) / video.fps - clap_s
+    return CameraStream(times, cameras[name], *nominal_mount(), video=str(path.resolve()))
 
 
 def _warn_if_apart(motion: Motion, localization: Localization, path: Path) -> None:
     frame = torch.searchsorted(motion.timestamps, localization.timestamps).clamp(max=len(motion) - 1)
-    localized = (
-        (localization.confidence > 0)
-        & (localization.timestamps >= 0)
-        & (localization.timestamps <= motion.timestamps[-1])
-    )
+    times = localization.timestamps
+    localized = (localization.confidence > 0) & (times >= 0) & (times <= motion.timestamps[-1])
     if not localized.any():
         warnings.warn(f"{path}: no localised frame while the motion lasts", stacklevel=3)
         return

@@ -21,6 +21,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.hps import nominal_mount
 from wearcap.io.devices.watch_log import WRISTS, read_watch_log
+from wearcap.io.formats.bounded import understood
 from wearcap.io.formats.npz import require
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import checked_trajectory
@@ -89,7 +90,10 @@ def read_mocap_every_folder(folder: str | Path) -> MocapEveryFolder:
     """
     folder = Path(folder)
     config, marks = _config(folder / CONFIG), _marks(folder / MARKS)
-    track = _trajectory(folder / TRAJECTORY, _shutter(config, marks, folder))
+    noted = marks.get("shutter")
+    noted = config.get("cam_shutter_timestamp") if noted is None else noted
+    shutter_s = 0.0 if noted is None else _numbers([noted], 1, "the shutter's time", folder)[0]
+    track = _trajectory(folder / TRAJECTORY, shutter_s)
     video = folder / VIDEO if (folder / VIDEO).is_file() else None
     size = None if video is None else (video_info(video).width, video_info(video).height)
     points = read_ply(folder / POINTS).points if (folder / POINTS).is_file() else None
@@ -148,12 +152,9 @@ def _trajectory(path: Path, start_s: float) -> Trajectory:
     if not len(table):
         raise WearcapError("no poses", where=path, expected="a row of 7 numbers per picture")
     if abs(table[0, 3]) > 0.9999 > abs(table[0, 6]):
-        raise WearcapError(
-            "the first quaternion is the identity with the scalar first",
-            where=path,
-            expected="x y z, then qx qy qz qw",
-            fix="Move the scalar to the end of the rows.",
-        )
+        what = "the first quaternion is the identity with the scalar first"
+        expected = "x y z, then qx qy qz qw"
+        raise WearcapError(what, where=path, expected=expected, fix="Move the scalar to the end of the rows.")
     times = start_s + np.arange(len(table)) / FPS
     return checked_trajectory(times, table[:, :3], table[:, [6, 3, 4, 5]], path)
 
@@ -161,12 +162,11 @@ def _trajectory(path: Path, start_s: float) -> Trajectory:
 def _config(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
-    try:
+    damage = (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError)
+    with understood("not readable YAML", path, errors=damage):
         text = read_text(path, usual=_MAX_CONFIG_BYTES)
         _require_plain_yaml(text, path)
         content = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError) as error:
-        raise WearcapError(f"not readable YAML ({' '.join(str(error).split())})"[:300], where=path) from error
     if not isinstance(content, dict | None):
         raise WearcapError(f"it holds a {type(content).__name__}", where=path, expected="keys with values")
     return content or {}
@@ -177,12 +177,9 @@ def _require_plain_yaml(text: str, path: Path) -> None:
     depth = 0
     for event in yaml.parse(text, yaml.SafeLoader):
         if isinstance(event, yaml.AliasEvent):
-            raise WearcapError(
-                "it refers to its own parts (&name, *name)",
-                where=path,
-                expected="plain keys with values",
-                fix="Write them out: such references can blow up.",
-            )
+            what = "it refers to its own parts (&name, *name)"
+            expected = "plain keys with values"
+            raise WearcapError(what, where=path, expected=expected, fix="Write them out: such references can blow up.")
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_JSON_DEPTH:
             raise WearcapError(
@@ -196,12 +193,6 @@ def _marks(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise WearcapError(f"it holds a {type(content).__name__}", where=path, expected="a dict of times")
     return content
-
-
-def _shutter(config: dict[str, Any], marks: dict[str, Any], folder: Path) -> float:
-    noted = marks.get("shutter")
-    noted = config.get("cam_shutter_timestamp") if noted is None else noted
-    return 0.0 if noted is None else _numbers([noted], 1, "the shutter's time", folder)[0]
 
 
 def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], folder: Path) -> BoardWalks | None:
@@ -240,16 +231,11 @@ def _numbers(values: Any, count: int, what: str, where: Path) -> list[float]:
 
 
 def _intrinsics(path: Path, counts: tuple[int, ...]) -> list[float]:
-    try:
+    with understood("not a list of numbers", path, "fx fy cx cy"):
         values = finite_floats(read_text(path).split()).tolist()
-    except ValueError as error:
-        raise WearcapError(f"not a list of numbers ({error})", where=path, expected="fx fy cx cy") from error
     if len(values) not in counts:
-        raise WearcapError(
-            f"{len(values)} numbers",
-            where=path,
-            expected=f"{' or '.join(map(str, counts))}: fx fy cx cy and distortion",
-        )
+        what = f"{len(values)} numbers"
+        raise WearcapError(what, where=path, expected=f"{' or '.join(map(str, counts))}: fx fy cx cy and distortion")
     return values
 
 
@@ -263,11 +249,8 @@ def _undistorted(path: Path, video: tuple[int, int] | None) -> Camera | None:
         shrink = np.sqrt(_SLAM_PIXELS / (video[0] * video[1]))
         width, height = (int(side * shrink) // 8 * 8 for side in video)
     if not (0.25 * width < cx < 0.75 * width and 0.25 * height < cy < 0.75 * height):
-        raise WearcapError(
-            f"principal point {cx:.1f}, {cy:.1f}",
-            where=path,
-            expected=f"one near the middle of {width}x{height} pixels",
-        )
+        what = f"principal point {cx:.1f}, {cy:.1f}"
+        raise WearcapError(what, where=path, expected=f"one near the middle of {width}x{height} pixels")
     return Camera("pinhole", width, height, fx, fy, cx, cy)
 
 

@@ -8,23 +8,21 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.body.kinematics import local_rotations
 from wearcap.body.skeleton import FOOT_PATCHES, Skeleton, xsens23
-from wearcap.body.skeletons import smpl24
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate
-from wearcap.io.datasets.amass import PELVIS_SMPLH
 from wearcap.io.devices.aria_mps import T_HEAD_DEVICE, find_mps_file, head_stream, read_closed_loop, read_mps_points
 from wearcap.io.devices.aria_vrs import extract_video
 from wearcap.io.devices.head_alignment import align_head, clock_offset
-from wearcap.io.formats.json_text import read_json_object
+from wearcap.io.formats.bounded import placed
 from wearcap.io.formats.npz import read_npz, require
-from wearcap.io.formats.smpl_axes import rotations_from_smpl
+from wearcap.io.formats.text import read_json_object
 from wearcap.recording import ContactTrack, HeadStream, Motion, Recording
 
 SUIT_HZ = 240.0
@@ -62,7 +60,12 @@ def read_xdata(path: str | Path) -> tuple[Motion, ContactTrack | None]:
     if "frameRate" in arrays and abs(float(arrays["frameRate"].reshape(-1)[0]) - SUIT_HZ) > 1:
         raise WearcapError(f"frame rate {arrays['frameRate'].reshape(-1)[0]}", where=path, expected=f"{SUIT_HZ:g} Hz")
     timestamps = _clean_timestamps(arrays["timestamps_us"].astype(np.float64) * 1e-6, path)
-    quat = _filled_quaternions(arrays["segment_qWXYZ"].reshape(-1, count, 4).astype(np.float64))
+    quat = arrays["segment_qWXYZ"].reshape(-1, count, 4).astype(np.float64)
+    # Zeros become the same segment's previous quaternion (at the beginning: no rotation).
+    latest = np.where(np.linalg.norm(quat, axis=-1) < 0.5, -1, np.arange(len(quat))[:, None])
+    latest = np.maximum.accumulate(latest, axis=0)
+    quat = np.take_along_axis(quat, np.maximum(latest, 0)[..., None], axis=0)
+    quat[latest < 0] = (1.0, 0.0, 0.0, 0.0)
     R_world_joint = rotation.matrix_from_quat_wxyz(torch.from_numpy(quat))
     position = torch.from_numpy(arrays["segment_tXYZ"].reshape(-1, count, 3).astype(np.float64))
     skeleton = _measured_skeleton(R_world_joint, position)
@@ -81,23 +84,10 @@ def _clean_timestamps(seconds: np.ndarray, path: str | Path) -> np.ndarray:
     steps[np.abs(steps - 1 / SUIT_HZ) > _STEP_TOLERANCE_S] = 1 / SUIT_HZ
     cleaned = seconds[0] + np.concatenate([[0.0], steps.cumsum()])
     if abs(cleaned[-1] - seconds[-1]) > _DRIFT_TOLERANCE_S:
-        raise WearcapError(
-            f"after cleaning, time ends {cleaned[-1] - seconds[-1]:+.3f} s from the file's own",
-            where=path,
-            expected=f"steady {SUIT_HZ:g} Hz",
-            fix="Frames were lost: cut the sequence there.",
-        )
+        what = f"after cleaning, time ends {cleaned[-1] - seconds[-1]:+.3f} s from the file's own"
+        expected = f"steady {SUIT_HZ:g} Hz"
+        raise WearcapError(what, where=path, expected=expected, fix="Frames were lost: cut the sequence there.")
     return cleaned
-
-
-def _filled_quaternions(quat: np.ndarray) -> np.ndarray:
-    """Quaternions with zeros replaced by the same segment's previous one (at the beginning: no rotation)."""
-    bad = np.linalg.norm(quat, axis=-1) < 0.5
-    frame = np.where(bad, -1, np.arange(len(quat))[:, None])
-    latest = np.maximum.accumulate(frame, axis=0)
-    filled = np.take_along_axis(quat, np.maximum(latest, 0)[..., None], axis=0)
-    filled[latest < 0] = (1.0, 0.0, 0.0, 0.0)
-    return filled
 
 
 def _measured_skeleton(R_world_joint: Tensor, position: Tensor) -> Skeleton:
@@ -121,20 +111,6 @@ def _contacts(arrays: dict[str, np.ndarray], motion: Motion, path: str | Path) -
     return ContactTrack(motion.timestamps, FOOT_PATCHES, torch.from_numpy(contact > 0.5))
 
 
-def read_smpl_neutral(path: str | Path) -> Motion:
-    """Read NymeriaPlus' `body/xdata_smpl_neutral.npz`: SMPL poses that are in the Aria world already.
-
-    The skeleton keeps its standard bone lengths. Raises WearcapError for missing or misshapen arrays or NaN.
-    """
-    arrays = read_npz(path, ("timestamps", "global_orient", "body_pose", "transl"))
-    require(arrays, path, timestamps=("time",), global_orient=("time", 3), body_pose=("time", 69), transl=("time", 3))
-    axis_angle = np.concatenate([arrays["global_orient"], arrays["body_pose"]], 1).reshape(-1, 24, 3)
-    R = rotations_from_smpl(torch.from_numpy(axis_angle.astype(np.float64)))
-    t_root = torch.from_numpy(arrays["transl"].astype(np.float64)) + torch.tensor(PELVIS_SMPLH, dtype=torch.float64)
-    timestamps = torch.from_numpy(arrays["timestamps"].astype(np.float64) * 1e-6)
-    return Motion(timestamps, smpl24(), R.float(), t_root.float(), provenance={"source": Path(path).name})
-
-
 def read_nymeria(
     folder: str | Path, *, fps: float = 60.0, clock_offset_s: float | None = None, video: Path | None = None
 ) -> Recording:
@@ -149,28 +125,17 @@ def read_nymeria(
     slam = folder / "recording_head" / "mps" / "slam"
     path = find_mps_file(slam, ("closed_loop_trajectory.csv",))
     if path is None or not is_nymeria(folder):
-        raise WearcapError(
-            "not a complete Nymeria sequence",
-            where=folder,
-            expected="body/xdata.npz and recording_head/mps/slam/closed_loop_trajectory.csv",
-        )
+        expected = "body/xdata.npz and recording_head/mps/slam/closed_loop_trajectory.csv"
+        raise WearcapError("not a complete Nymeria sequence", where=folder, expected=expected)
     suit, contacts = read_xdata(folder / "body" / "xdata.npz")
-    device = head_stream(read_closed_loop(path).T_world_aria, fps=None)
-    try:
+    device = head_stream(read_closed_loop(path)[0], fps=None)
+    with placed(folder):
         motion, contact, head = _on_device(suit, contacts, device, fps, clock_offset_s)
-    except WearcapError as error:
-        raise WearcapError(error.what, where=folder, expected=error.expected, fix=error.fix) from error
-    about = read_metadata(folder)
-    camera = (
-        None
-        if video is None
-        else extract_video(
-            head_vrs(folder),
-            video,
-            between=(head.timestamps[0].item(), head.timestamps[-1].item()),
-            T_head_device=Rigid(head.R_head_device, head.t_head_device),
-        )
-    )
+    about, camera = read_metadata(folder), None
+    if video is not None:
+        between = (head.timestamps[0].item(), head.timestamps[-1].item())
+        T_head_device = Rigid(head.R_head_device, head.t_head_device)
+        camera = extract_video(head_vrs(folder), video, between=between, T_head_device=T_head_device)
     return Recording(
         name=folder.resolve().name,
         head=head,
@@ -196,10 +161,8 @@ def _on_device(
     own = Trajectory(own.timestamps + offset, own.R_world_body, own.t_world_body)
     alignment = align_head(own, track, T_HEAD_DEVICE.t)
     if alignment.residual_m > MAX_RESIDUAL_M:
-        raise WearcapError(
-            f"the suit's head stays {100 * alignment.residual_m:.0f} cm from the device after alignment",
-            expected="suit and device of the same wearer on one clock",
-        )
+        what = f"the suit's head stays {100 * alignment.residual_m:.0f} cm from the device after alignment"
+        raise WearcapError(what, expected="suit and device of the same wearer on one clock")
     start = max(own.timestamps[0].item(), track.timestamps[0].item())
     stop = min(own.timestamps[-1].item(), track.timestamps[-1].item())
     times = start + torch.arange(int((stop - start) * fps) + 1, dtype=torch.float64) / fps
@@ -217,17 +180,14 @@ def _on_device(
             "head_residual_deg": f"{np.degrees(alignment.residual_rad):.2f}",
         },
     )
-    contact = (
-        None
-        if contacts is None
-        else ContactTrack(times, contacts.parts, _nearest(own.timestamps, contacts.contact, times))
-    )
+    contact = None
+    if contacts is not None:
+        nearest = torch.searchsorted((own.timestamps[1:] + own.timestamps[:-1]) / 2, times)
+        contact = ContactTrack(times, contacts.parts, contacts.contact[nearest])
+    R_world_device = _resampled_rotations(track.timestamps, track.R_world_body, times)
+    t_world_device = interpolate(track.timestamps, track.t_world_body, times)
     T_head_device = alignment.T_head_device
-    pose = Rigid(
-        _resampled_rotations(track.timestamps, track.R_world_body, times),
-        interpolate(track.timestamps, track.t_world_body, times),
-    )
-    return motion, contact, HeadStream(times, pose.R, pose.t, T_head_device.R, T_head_device.t)
+    return motion, contact, HeadStream(times, R_world_device, t_world_device, T_head_device.R, T_head_device.t)
 
 
 def _resampled_rotations(
@@ -238,12 +198,6 @@ def _resampled_rotations(
     blend = ((at - timestamps[after - 1]) / (timestamps[after] - timestamps[after - 1])).clamp(0, 1).to(R.dtype)
     turn = rotation.log(R[after - 1].mT @ R[after])
     return R[after - 1] @ rotation.exp(turn * blend.reshape(-1, *[1] * (turn.ndim - 1)))
-
-
-def _nearest(
-    timestamps: Float64[Tensor, "time"], value: Bool[Tensor, "time *rest"], at: Float64[Tensor, "new_time"]
-) -> Bool[Tensor, "new_time *rest"]:
-    return value[torch.searchsorted((timestamps[1:] + timestamps[:-1]) / 2, at)]
 
 
 def read_metadata(folder: Path) -> dict:

@@ -22,16 +22,17 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.amass import PELVIS_SMPLX
-from wearcap.io.datasets.one_object import OneObject, smpl_motion
+from wearcap.io.datasets.one_object import OneObject
 from wearcap.io.formats.npz import require
+from wearcap.io.formats.poses import are_rotations
 from wearcap.io.formats.restricted_pickle import read_pickle
-from wearcap.io.formats.smpl_axes import shape_from_arrays
+from wearcap.io.formats.smpl import shape_from_arrays, smpl_motion
 from wearcap.io.formats.wavefront import read_obj
 from wearcap.scene.object_mesh import centered, check_object_mesh
 
 FILES = ("train_diffusion_manip_seq_joints24.p", "test_diffusion_manip_seq_joints24.p")
 MESHES, MESH_ENDING = "captured_objects", "_cleaned_simplified.obj"
-TWO_PARTS = ("mop", "vacuum")
+_TWO_PARTS = ("mop", "vacuum")
 
 _KEYS = ("trans", "root_orient", "pose_body", "betas", "trans2joint", "obj_rot", "obj_trans", "obj_scale")
 _LEAST_SCALE = 1e-8
@@ -85,11 +86,8 @@ def _sequences(content: Any, path: Path) -> list[OmomoSequence]:
     for key, entry in content.items():
         name = entry.get("seq_name") if isinstance(entry, dict) else None
         if not isinstance(name, str) or len(name.split("_")) < 3 or not name.replace("_", "").isalnum():
-            raise WearcapError(
-                f"sequence {key!r} is named {name!r}"[:200],
-                where=path,
-                expected="seq_name SUBJECT_OBJECT_NUMBER, such as sub1_largebox_000",
-            )
+            what = f"sequence {key!r} is named {name!r}"[:200]
+            raise WearcapError(what, where=path, expected="seq_name SUBJECT_OBJECT_NUMBER, such as sub1_largebox_000")
         arrays = {key: entry[key] for key in _KEYS if isinstance(entry.get(key), np.ndarray)}
         gender = entry.get("gender", "")
         if isinstance(gender, np.ndarray) and gender.size == 1:
@@ -117,26 +115,21 @@ def omomo_take(sequence: OmomoSequence, root: str | Path, fps: float | int) -> O
     require(arrays, where, obj_rot=("frame", 3, 3), obj_trans=("frame", 3), obj_scale=("frame",))
     frames, others = len(arrays["trans"]), len(arrays["obj_trans"])
     if frames != others or not frames:
-        raise WearcapError(
-            f"the object has {others} frames, the body {frames}",
-            where=where,
-            expected="as many of both, and at least one",
-            fix="Fetch the file again.",
-        )
+        what = f"the object has {others} frames, the body {frames}"
+        raise WearcapError(what, where=where, expected="as many of both, and at least one", fix="Fetch the file again.")
     times = torch.arange(frames, dtype=torch.float64) / fps
-    provenance = {
-        "source": sequence.name,
-        "format": "omomo",
-        **({"gender": sequence.gender} if sequence.gender else {}),
-    }
-    if sequence.object_name in TWO_PARTS:
-        provenance |= {"object": "of two parts, posed as its upper one"}
-    vectors = np.concatenate([arrays["root_orient"], arrays["pose_body"]], 1).astype(np.float64)
-    rotvec = torch.from_numpy(vectors).unflatten(1, (-1, 3))
-    motion = smpl_motion(times, smplx22(), rotvec, torch.from_numpy(_pelvis(arrays, where)), provenance)
+    about = {"source": sequence.name, "format": "omomo", "gender": sequence.gender}
+    if sequence.object_name in _TWO_PARTS:
+        about["object"] = "of two parts, posed as its upper one"
+    pelvis = arrays["trans"].astype(np.float64) + PELVIS_SMPLX
+    if "trans2joint" in arrays:
+        offset = {"trans2joint": arrays["trans2joint"].reshape(-1)}
+        require(offset, where, trans2joint=(3,))
+        pelvis = arrays["trans"].astype(np.float64) - offset["trans2joint"].astype(np.float64)
+    rotvec = np.concatenate([arrays["root_orient"], arrays["pose_body"]], 1)
+    motion = smpl_motion(times, smplx22(), rotvec, pelvis, **about)
     posed = arrays["obj_scale"] > _LEAST_SCALE
-    scale = _scale(arrays["obj_scale"][posed], where)
-    mesh, center = _mesh(root, sequence.object_name, scale)
+    mesh, center = _mesh(root, sequence.object_name, arrays["obj_scale"][posed], where)
     path = _path(arrays, times, torch.from_numpy(center), torch.from_numpy(posed), where)
     take = OneObject(
         sequence.name,
@@ -161,39 +154,18 @@ def _flat(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return flat
 
 
-def _pelvis(arrays: dict[str, np.ndarray], where: str) -> Float64[np.ndarray, "time 3"]:
-    """Position of the root joint (m): from `trans2joint`, else from the mean body."""
-    trans = arrays["trans"].astype(np.float64)
-    if "trans2joint" not in arrays:
-        return trans + PELVIS_SMPLX
-    offset = {"trans2joint": arrays["trans2joint"].reshape(-1)}
-    require(offset, where, trans2joint=(3,))
-    return trans - offset["trans2joint"].astype(np.float64)
-
-
-def _scale(scales: np.ndarray, where: str) -> float:
+def _mesh(root: str | Path, object_name: str, scales: np.ndarray, where: str) -> tuple[Mesh, Float64[np.ndarray, "3"]]:
+    """The mesh in metres about its centre, and the centre in the file's axes and unit; `scales`: metres per unit."""
     if not len(scales):
         raise WearcapError("obj_scale is nowhere positive", where=where, expected="metres per unit of the mesh")
     scale = float(np.median(scales))
     if np.ptp(scales) > _SCALE_WITHIN * scale:
-        raise WearcapError(
-            f"obj_scale runs from {scales.min():.4g} to {scales.max():.4g}",
-            where=where,
-            expected=f"one scale within {_SCALE_WITHIN:.0%}: a rigid object",
-        )
-    return scale
-
-
-def _mesh(root: str | Path, object_name: str, scale: float) -> tuple[Mesh, Float64[np.ndarray, "3"]]:
-    """The mesh in metres about its centre, and the centre in the file's axes and unit."""
+        what = f"obj_scale runs from {scales.min():.4g} to {scales.max():.4g}"
+        raise WearcapError(what, where=where, expected=f"one scale within {_SCALE_WITHIN:.0%}: a rigid object")
     path = omomo_mesh_path(root, object_name)
     if not path.is_file():
-        raise WearcapError(
-            f"no mesh of {object_name}",
-            where=path,
-            expected=f"{MESHES}/OBJECT{MESH_ENDING}",
-            fix="Unpack OMOMO's captured_objects beside the sequences.",
-        )
+        fix = "Unpack OMOMO's captured_objects beside the sequences."
+        raise WearcapError(f"no mesh of {object_name}", where=path, expected=f"{MESHES}/OBJECT{MESH_ENDING}", fix=fix)
     mesh, center = centered(read_obj(path))
     mesh = Mesh((mesh.vertices.astype(np.float64) * scale).astype(np.float32), mesh.faces, mesh.color)
     check_object_mesh(mesh, path)
@@ -203,14 +175,10 @@ def _mesh(root: str | Path, object_name: str, scale: float) -> tuple[Mesh, Float
 def _path(arrays: dict[str, np.ndarray], times: Tensor, center: Tensor, posed: Tensor, where: str) -> Trajectory:
     """Trajectory of the mesh's centre: scale · R · c + t."""
     R = torch.from_numpy(arrays["obj_rot"].astype(np.float64))
-    away = (R.mT @ R - torch.eye(3, dtype=R.dtype)).abs().amax((-1, -2))
-    bad = ((away > _ORTHOGONAL_WITHIN) | (torch.linalg.det(R) < 0)) & posed
+    bad = ~are_rotations(R, _ORTHOGONAL_WITHIN) & posed
     if bad.any():
-        raise WearcapError(
-            f"obj_rot of frame {int(bad.nonzero()[0])} is no rotation ({int(bad.sum())} such frames)",
-            where=where,
-            expected="orthogonal matrices of determinant +1",
-        )
+        what = f"obj_rot of frame {int(bad.nonzero()[0])} is no rotation ({int(bad.sum())} such frames)"
+        raise WearcapError(what, where=where, expected="orthogonal matrices of determinant +1")
     U, _, Vh = torch.linalg.svd(torch.where(posed[:, None, None], R, torch.eye(3, dtype=R.dtype)))
     R = U @ Vh
     scale = torch.from_numpy(arrays["obj_scale"].astype(np.float64))

@@ -3,13 +3,11 @@
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from wearcap.body.skeleton import Skeleton
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.formats.smpl_axes import rotations_from_smpl
 from wearcap.recording.motion import Motion
 
 
@@ -52,15 +50,3 @@ class OneObject:
             t_world_root=self.motion.t_world_root[chosen],
         )
         return replace(self, motion=motion, path=self.path[chosen])
-
-
-def smpl_motion(
-    timestamps: Float64[Tensor, "time"],
-    skeleton: Skeleton,
-    rotvec: Float64[Tensor, "time joint 3"],
-    t_world_pelvis: Float64[Tensor, "time 3"],
-    provenance: dict[str, str],
-) -> Motion:
-    """Motion of a wearcap skeleton from rotation vectors (rad) in SMPL's axes and the pelvis' position (m)."""
-    R = rotations_from_smpl(rotvec)
-    return Motion(timestamps, skeleton, R.float(), t_world_pelvis.float(), provenance=provenance)

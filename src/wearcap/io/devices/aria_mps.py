@@ -5,7 +5,6 @@ Frames: `aria` is MPS's own device frame (on Gen 1 glasses the left SLAM camera)
 (x forward, y left, z up), the frame of a `HeadStream`.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -51,21 +50,10 @@ def nominal_T_aria_cpf() -> Rigid:
     return T_cpf_aria.inverse().to(torch.float32)
 
 
-@dataclass(frozen=True)
-class MpsTrajectory:
-    """A closed-loop trajectory: poses of the `aria` frame in a world with z up."""
-
-    T_world_aria: Trajectory
-    vel_aria: Float[Tensor, "time 3"]
-    """Velocity in the device's axes (m/s)."""
-    angvel_aria: Float[Tensor, "time 3"]
-    """Angular velocity in the device's axes (rad/s)."""
-    quality: Float[Tensor, "time"]
-    """Quality score of MPS, 0 … 1."""
-
-
-def read_closed_loop(path: str | Path, *, up: str = "z") -> MpsTrajectory:
+def read_closed_loop(path: str | Path, *, up: str = "z") -> tuple[Trajectory, Float[Tensor, "time"]]:
     """Read `closed_loop_trajectory.csv` (plain, .gz, .xz), the world's axis `up` ("z"; ADT: "y") turned to z.
+
+    Gives the poses of the `aria` frame, and MPS' quality score of each, 0 … 1.
 
     Raises WearcapError for missing columns, NaN, unsorted times, quaternions far from unit norm, gravity that does
     not point against `up`, and several unconnected world frames.
@@ -82,21 +70,12 @@ def read_closed_loop(path: str | Path, *, up: str = "z") -> MpsTrajectory:
     }
     check_finite({**columns, quality: table[quality]}, path)
     if len(graphs := np.unique(table["graph_uid"])) > 1:
-        raise WearcapError(
-            f"{len(graphs)} unconnected world frames (graph_uid)",
-            where=path,
-            expected="one",
-            fix="Keep the rows of one graph_uid.",
-        )
+        what = f"{len(graphs)} unconnected world frames (graph_uid)"
+        raise WearcapError(what, where=path, expected="one", fix="Keep the rows of one graph_uid.")
     _check_gravity(columns["gravity"], up, path)
     trajectory = checked_trajectory(table[time] * 1e-6, columns["pose"][:, :3], columns["pose"][:, 3:], path)
     T_turned = Rigid(turn_up(up), torch.zeros(3)) @ trajectory.T_world_body
-    return MpsTrajectory(
-        Trajectory(trajectory.timestamps, T_turned.R, T_turned.t),
-        torch.tensor(columns["velocity"], dtype=torch.float32),
-        torch.tensor(columns["spin"], dtype=torch.float32),
-        torch.tensor(table[quality], dtype=torch.float32),
-    )
+    return Trajectory(trajectory.timestamps, T_turned.R, T_turned.t), torch.tensor(table[quality], dtype=torch.float32)
 
 
 def turn_up(up: str) -> Float[Tensor, "3 3"]:
@@ -117,12 +96,9 @@ def _check_gravity(gravity: np.ndarray, up: str, where: str | Path) -> None:
     if upward["xyz".index(up)] < 0.99:
         axis = "xyz"[int(np.abs(upward).argmax())]
         sign = "-" if upward["xyz".index(axis)] < 0 else "+"
-        raise WearcapError(
-            f"gravity {mean.round(2).tolist()} shows that {sign}{axis} is up",
-            where=where,
-            expected=f"+{up} up",
-            fix="Read it with up='y'." if (axis, sign) == ("y", "+") else "Rotate the world, or fix gravity's sign.",
-        )
+        what = f"gravity {mean.round(2).tolist()} shows that {sign}{axis} is up"
+        fix = "Read it with up='y'." if (axis, sign) == ("y", "+") else "Rotate the world, or fix gravity's sign."
+        raise WearcapError(what, where=where, expected=f"+{up} up", fix=fix)
 
 
 def head_stream(
@@ -142,12 +118,9 @@ def head_stream(
     if fps is not None:
         start, stop = trajectory.timestamps[0].item(), trajectory.timestamps[-1].item()
         if stop - start > _MAX_DURATION_S:
-            raise WearcapError(
-                f"poses over {(stop - start) / 3600:.3g} hours",
-                where=where,
-                expected="a recording of less than half a day",
-                fix="A time stamp is damaged, or two recordings stand in one file: cut it.",
-            )
+            what = f"poses over {(stop - start) / 3600:.3g} hours"
+            fix = "A time stamp is damaged, or two recordings stand in one file: cut it."
+            raise WearcapError(what, where=where, expected="a recording of less than half a day", fix=fix)
         count = int((stop - start) * fps + 1e-6) + 1
         trajectory = resample(trajectory, start + torch.arange(count, dtype=torch.float64) / fps)
     T_aria_cpf = T_aria_cpf or nominal_T_aria_cpf()
@@ -223,12 +196,9 @@ def read_mps(folder: str | Path, *, fps: float | None = 60.0, T_aria_cpf: Rigid 
     """
     path = find_mps_file(folder, _TRAJECTORY)
     if path is None:
-        raise WearcapError(
-            "no closed_loop_trajectory.csv (plain, .gz or .xz)",
-            where=folder,
-            expected="the output folder of Aria's MPS",
-        )
-    head = head_stream(read_closed_loop(path).T_world_aria, fps=fps, T_aria_cpf=T_aria_cpf, where=path)
+        what = "no closed_loop_trajectory.csv (plain, .gz or .xz)"
+        raise WearcapError(what, where=folder, expected="the output folder of Aria's MPS")
+    head = head_stream(read_closed_loop(path)[0], fps=fps, T_aria_cpf=T_aria_cpf, where=path)
     return Recording(name=Path(folder).resolve().name, head=head, points=read_mps_points(folder), source="Aria MPS")
 
 

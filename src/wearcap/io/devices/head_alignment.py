@@ -20,8 +20,8 @@ _SEAT_PRIOR_M = 0.05
 
 
 @dataclass(frozen=True)
-class Alignment:
-    """Alignment of suit and device."""
+class _Alignment:
+    """_Alignment of suit and device."""
 
     T_head_device: Rigid
     """Constant pose of the device on the suit's head joint."""
@@ -48,10 +48,8 @@ def clock_offset(suit: Trajectory, device: Trajectory) -> float:
     a, b = (speed.clamp(max=10.0).numpy() for speed in speeds)
     lag, score = best_shift(*correlate_shifts(a, b, 1 / 3))
     if score < 0.5:
-        raise WearcapError(
-            f"head and device do not move alike at any shift of their clocks (correlation {score:.2f})",
-            expected="a recording of the same head",
-        )
+        what = f"head and device do not move alike at any shift of their clocks (correlation {score:.2f})"
+        raise WearcapError(what, expected="a recording of the same head")
     return grids[1][0].item() - grids[0][0].item() + lag / _RATE_HZ
 
 
@@ -87,7 +85,7 @@ def best_shift(shifts: np.ndarray, score: np.ndarray) -> tuple[float, float]:
 
 def align_head(
     suit: Trajectory, device: Trajectory, t_head_device: Float[Tensor, "3"], window_s: float = 8.0
-) -> Alignment:
+) -> _Alignment:
     """Solve device = T_world_suit(t) · suit head · T_head_device, both streams on one clock, both worlds z up.
 
     The mounting's rotation comes from relative rotations and from both streams' up direction (Wahba's problem), its
@@ -99,7 +97,7 @@ def align_head(
         raise WearcapError("suit and device share less than 10 s", expected="overlapping recordings on one clock")
     start, stop = suit.timestamps[shared][0].item(), suit.timestamps[shared][-1].item()
     grid = start + torch.arange(int((stop - start) * _RATE_HZ), dtype=torch.float64) / _RATE_HZ
-    head, seen = (_double(resample(track, grid)) for track in (suit, device))
+    head, seen = (resample(track, grid).T_world_body.to(torch.float64) for track in (suit, device))
     R_head_device = _mounting_rotation(head.R, seen.R)
     R_apart = seen.R @ R_head_device.mT @ head.R.mT
     yaw, knots = _windowed_yaw(R_apart, grid, window_s)
@@ -114,11 +112,7 @@ def align_head(
     T_world_suit = Rigid(rotation.about_axis("z", _between(knots, yaw, at)), _between(knots, shift, at))
     turn = rotation.geodesic(R_world_suit @ head.R @ R_head_device, seen.R)
     T_head_device = Rigid(R_head_device, t_seat).to(torch.float32)
-    return Alignment(T_head_device, T_world_suit, error.norm(dim=-1).median().item(), turn.median().item())
-
-
-def _double(track: Trajectory) -> Rigid:
-    return Rigid(track.R_world_body.double(), track.t_world_body.double())
+    return _Alignment(T_head_device, T_world_suit, error.norm(dim=-1).median().item(), turn.median().item())
 
 
 def _mounting_rotation(R_head: Tensor, R_device: Tensor) -> Float64[Tensor, "3 3"]:

@@ -10,21 +10,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
-from wearcap.errors import WearcapError
 from wearcap.files import write_text
-from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
-from wearcap.io.formats.json_text import read_json
-from wearcap.sensors.arm_swings import SwingClock
-from wearcap.sensors.camera_alignment import HeadMount, SlamAlignment
-from wearcap.sensors.clock import Clock
+from wearcap.geometry.rotation import quat_wxyz_from_matrix
 from wearcap.sensors.stillness import StepCheck
-from wearcap.sensors.watch_calibration import WatchCalibration
 from wearcap.sensors.watch_session import WornCalibration
 
-EXAMPLE = '{"watches": {"left_wrist": {"R_world_ref_wxyz": […], "R_joint_imu_wxyz": […], …}, "right_wrist": {…}}, …}'
 _WATCH = ("board_still_deg", "board_tilt_deg", "pose_still_deg")
 _CAMERA = ("scale", "residual_m", "scale_spread", "corner_deg")
 
@@ -68,63 +60,5 @@ def write_watch_calibration(
     write_text(path, json.dumps(content | ({"about": about} if about else {}), indent=1) + "\n")
 
 
-def read_watch_calibration(path: str | Path) -> WornCalibration:
-    """Read what `write_watch_calibration` wrote. Raises WearcapError when it is missing, no JSON, or no calibration."""
-    content = read_json(path)
-    try:
-        return WornCalibration(
-            {joint: _watch(joint, row) for joint, row in content["watches"].items()},
-            {joint: _clock(row) for joint, row in content.get("clocks", {}).items()},
-            _camera(content["camera"]) if "camera" in content else None,
-            _head(content["head"]) if "head" in content else None,
-        )
-    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError, OverflowError) as error:
-        what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
-        raise WearcapError(
-            f"not a watches' calibration ({what})"[:300],
-            where=path,
-            expected=EXAMPLE,
-            fix="Calibrate again: wearcap calibrate steps=watches.",
-        ) from error
-
-
-def _watch(joint: str, row: Any) -> WatchCalibration:
-    rotations = (_matrix(row[key]).float() for key in ("R_world_ref_wxyz", "R_joint_imu_wxyz"))
-    return WatchCalibration(joint, *rotations, *(float(row[name]) for name in _WATCH))
-
-
-def _clock(row: Any) -> SwingClock:
-    camera_s, watch_s = (torch.tensor(row[key], dtype=torch.float64) for key in ("camera_s", "watch_s"))
-    if camera_s.ndim != 1 or not len(camera_s) or camera_s.shape != watch_s.shape:
-        raise ValueError("a clock without knots")
-    clock = Clock(camera_s, watch_s, float(row["drift_s_per_hour"]), float(row["residual_s"]), int(row["swings"]))
-    return SwingClock(clock, float(row["std_s"]))
-
-
-def _camera(row: Any) -> SlamAlignment:
-    quality = (float(row[name]) for name in _CAMERA[1:])
-    return SlamAlignment(float(row["scale"]), _matrix(row["R_world_slam_wxyz"]), _three(row["t_world_slam"]), *quality)
-
-
-def _head(row: Any) -> HeadMount:
-    return HeadMount(
-        _matrix(row["R_head_cam_wxyz"]).float(), _three(row["t_head_cam"]).float(), float(row["still_deg"])
-    )
-
-
 def _wxyz(R: Tensor) -> list[float]:
     return quat_wxyz_from_matrix(R.double()).tolist()
-
-
-def _matrix(wxyz: Any) -> Tensor:
-    quaternion = torch.tensor(wxyz, dtype=torch.float64)
-    if quaternion.shape != (4,) or not abs(quaternion.norm().item() - 1) < 0.01:
-        raise ValueError(f"{wxyz} is no unit quaternion")
-    return matrix_from_quat_wxyz(quaternion)
-
-
-def _three(value: Any) -> Tensor:
-    vector = torch.tensor(value, dtype=torch.float64)
-    if vector.shape != (3,) or not vector.isfinite().all():
-        raise ValueError(f"{value} is no position")
-    return vector

@@ -14,6 +14,7 @@ import torch
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import matrix_from_quat_wxyz
+from wearcap.io.formats.bounded import understood
 from wearcap.io.formats.csv_table import read_columns, read_header
 from wearcap.recording import ImuStream
 
@@ -53,7 +54,10 @@ def read_watch_log(path: str | Path, joint: str) -> ImuStream:
             row = int(np.flatnonzero(~np.isfinite(values).all(1))[0])
             raise WearcapError(f"{name} of row {row} is not finite", where=path, expected="numbers")
     gravity = parts["gravity"] if "gravity" in parts else parts["whole"] - parts["free"]
-    unit = _unit(gravity, path)
+    length = float(np.median(np.linalg.norm(gravity, axis=1)))
+    unit = next((unit for unit in (G_M_S2, 1.0) if abs(length * unit / G_M_S2 - 1) < 0.1), None)  # m/s² per unit
+    if unit is None:
+        raise WearcapError(f"gravity of length {length:.3g}", where=path, expected="1 (g) or 9.8 (m/s²)")
     R, upright = _attitude(parts["quaternion"], gravity, path)
     # Core Motion's gravity points down, and its accelerations have the opposite sign.
     free, felt = np.sign(upright) * unit * parts["free"], np.sign(upright) * unit * (parts["free"] + gravity)
@@ -80,24 +84,16 @@ def _columns(path: str | Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         groups = {name: group for name, group in _SENSOR_LOG.items() if name != "turn" or set(group) <= set(header)}
         time = "loggingTime(txt)"
         table = read_columns(path, [name for group in groups.values() for name in group], text=[time])
-        seconds = np.array([_seconds(text, row, path) for row, text in enumerate(table[time])])
+        seconds = np.empty(len(table[time]))
+        for row, text in enumerate(table[time]):
+            with understood(f"time {text.decode()!r} in row {row}", path, "such as 2024-05-01T12:00:00.123+02:00"):
+                iso = text.decode().strip().replace(" +", "+").replace(" -", "-")
+                seconds[row] = datetime.fromisoformat(iso).timestamp()
     else:
-        raise WearcapError(
-            "not a watch's motion log",
-            where=path,
-            expected="SensorLog's CSV (motionQuaternionW(R), …) or WristMotion.csv (quaternionW, …)",
-            fix="Switch on device motion when you record.",
-        )
+        what = "not a watch's motion log"
+        expected = "SensorLog's CSV (motionQuaternionW(R), …) or WristMotion.csv (quaternionW, …)"
+        raise WearcapError(what, where=path, expected=expected, fix="Switch on device motion when you record.")
     return seconds, {name: np.stack([table[column] for column in group], 1) for name, group in groups.items()}
-
-
-def _seconds(text: bytes, row: int, path: str | Path) -> float:
-    try:
-        return datetime.fromisoformat(text.decode().strip().replace(" +", "+").replace(" -", "-")).timestamp()
-    except ValueError as error:
-        raise WearcapError(
-            f"time {text.decode()!r} in row {row}", where=path, expected="such as 2024-05-01T12:00:00.123+02:00"
-        ) from error
 
 
 def _require_times(seconds: np.ndarray, path: str | Path) -> None:
@@ -106,27 +102,11 @@ def _require_times(seconds: np.ndarray, path: str | Path) -> None:
     step = np.diff(seconds)
     if (step <= 0).any():
         row = int(np.flatnonzero(step <= 0)[0]) + 1
-        raise WearcapError(
-            f"time does not grow at row {row} ({step[row - 1]:+.3f} s)",
-            where=path,
-            fix="Sort the rows by time and leave repeated ones out.",
-        )
+        what = f"time does not grow at row {row} ({step[row - 1]:+.3f} s)"
+        raise WearcapError(what, where=path, fix="Sort the rows by time and leave repeated ones out.")
     if np.median(step) > 1 / MIN_RATE_HZ:
-        raise WearcapError(
-            f"{1 / np.median(step):.1f} rows a second",
-            where=path,
-            expected=f"at least {MIN_RATE_HZ:g}",
-            fix="Log at 30 Hz or more.",
-        )
-
-
-def _unit(gravity: np.ndarray, path: str | Path) -> float:
-    """m/s² per unit of the file's accelerations."""
-    length = float(np.median(np.linalg.norm(gravity, axis=1)))
-    for unit in (G_M_S2, 1.0):
-        if abs(length * unit / G_M_S2 - 1) < 0.1:
-            return unit
-    raise WearcapError(f"gravity of length {length:.3g}", where=path, expected="1 (g) or 9.8 (m/s²)")
+        what = f"{1 / np.median(step):.1f} rows a second"
+        raise WearcapError(what, where=path, expected=f"at least {MIN_RATE_HZ:g}", fix="Log at 30 Hz or more.")
 
 
 def _attitude(quaternion: np.ndarray, gravity: np.ndarray, path: str | Path) -> tuple[np.ndarray, float]:
@@ -140,10 +120,7 @@ def _attitude(quaternion: np.ndarray, gravity: np.ndarray, path: str | Path) -> 
     there, back = (float((turned @ down[..., None])[:, 2, 0].mean()) for turned in (R, R.swapaxes(1, 2)))
     best = max(abs(there), abs(back))
     if best < UPRIGHT:
-        raise WearcapError(
-            f"the attitude turns gravity {best:.2f} upright",
-            where=path,
-            expected=f"at least {UPRIGHT}",
-            fix="Check the order of the quaternion's columns (W, X, Y, Z), and that z is up in its reference frame.",
-        )
+        what = f"the attitude turns gravity {best:.2f} upright"
+        fix = "Check the order of the quaternion's columns (W, X, Y, Z), and that z is up in its reference frame."
+        raise WearcapError(what, where=path, expected=f"at least {UPRIGHT}", fix=fix)
     return (R, there) if abs(there) >= abs(back) else (np.ascontiguousarray(R.swapaxes(1, 2)), back)

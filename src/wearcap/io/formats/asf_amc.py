@@ -20,7 +20,7 @@ from torch import Tensor
 from wearcap.body.skeleton import Site, Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis
-from wearcap.io.formats.text import at_line, finite_floats, is_finite_number, numbered_lines
+from wearcap.io.formats.text import at_line, finite_floats, numbered_lines
 from wearcap.recording.motion import Motion
 
 R_WORLD_FILE = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
@@ -71,11 +71,10 @@ def read_asf(path: str | Path, unit_m: float | int | None = None) -> AsfSkeleton
     the ends of leaf bones are sites. Raises WearcapError naming file and line.
     """
     path = Path(path)
-    units, root, bones, hierarchy = _parse_asf(path)
-    unit_m = INCH_M / units["length"] if unit_m is None else unit_m
-    radians = bool(units["radians"])
-    names, parents = _tree_order(path, bones, hierarchy)
-    table = [root, *(bones[name] for name in names[1:])]
+    content = _AsfContent.read(path)
+    unit_m = INCH_M / content.length if unit_m is None else unit_m
+    names, parents = content.tree_order(path)
+    table = [content.root, *(content.bones[name] for name in names[1:])]
     ends = torch.tensor([bone.direction for bone in table], dtype=torch.float64)
     lengths = torch.tensor([bone.length for bone in table], dtype=torch.float64)
     ends = ends * lengths[:, None] * unit_m @ R_WORLD_FILE.T
@@ -83,13 +82,13 @@ def read_asf(path: str | Path, unit_m: float | int | None = None) -> AsfSkeleton
     offsets[0] = 0
     leaves = {name: ends[joint] for joint, name in enumerate(names) if joint not in parents}
     skeleton = Skeleton(
-        "cmu31" if set(names) == CMU_NODES else path.name.split(".")[0],
+        "cmu31" if set(names) == _CMU_NODES else path.name.split(".")[0],
         tuple(names),
         tuple(parents),
         offsets.float(),
         _sites(names, ends, leaves),
     )
-    to_rad = 1.0 if radians else math.pi / 180
+    to_rad = 1.0 if content.radians else math.pi / 180
     angles = to_rad * torch.tensor([bone.axis_deg for bone in table], dtype=torch.float64)
     order = tuple(bone.order for bone in table)
     return AsfSkeleton(
@@ -97,9 +96,9 @@ def read_asf(path: str | Path, unit_m: float | int | None = None) -> AsfSkeleton
         tuple(bone.dof for bone in table),
         order,
         _euler(angles, order),
-        unit_m * torch.tensor(root.direction, dtype=torch.float64),
+        unit_m * torch.tensor(content.root.direction, dtype=torch.float64),
         unit_m,
-        radians,
+        content.radians,
     )
 
 
@@ -149,87 +148,114 @@ def _euler(angles: Float[Tensor, "*batch joint 3"], order: tuple[str, ...]) -> F
 # --- ASF -----------------------------------------------------------------------------------------------------------
 
 
-def _parse_asf(path: Path):
-    """Sections of an ASF file: units, root, bones by name, hierarchy as (line, words)."""
-    units, root = {"length": 1.0, "radians": 0.0}, _Bone("root", 1)
-    bones: dict[str, _Bone] = {}
-    hierarchy: list[tuple[int, list[str]]] = []
-    section, bone, number = "", None, 0
-    for number, text in numbered_lines(path):
-        words = text.split("#")[0].split()
-        if not words:
-            continue
-        try:
-            if words[0].startswith(":"):
-                section, bone = words[0].lower(), None
-            elif section == ":units":
-                _read_unit(units, words)
-            elif section == ":root":
-                _read_root(root, words)
-            elif section == ":bonedata" and words[0] == "begin":
-                bone = _Bone("", number)
-            elif section == ":bonedata" and words[0] == "end" and bone is not None:
-                _close_bone(bones, bone)
-                bone = None
-            elif section == ":bonedata" and bone is not None:
-                _read_bone(bone, words)
-            elif section == ":hierarchy" and words[0] not in ("begin", "end"):
-                hierarchy.append((number, words))
-                if max(len(hierarchy), len(words)) > MAX_BONES:
-                    raise ValueError(f"more than {MAX_BONES} bones")
-        except (ValueError, IndexError) as error:
-            raise WearcapError(
-                f"cannot read {text.strip()[:80]!r} ({error})", where=at_line(path, number), expected="Acclaim ASF"
-            ) from error
-    if bone is not None or not bones or not hierarchy:
-        raise WearcapError(
-            "bones or hierarchy are missing or cut short",
-            where=at_line(path, number),
-            expected="an ASF file with :bonedata and :hierarchy",
-            fix="Fetch the file again.",
-        )
-    return units, root, bones, hierarchy
+class _AsfContent:
+    """Sections of an ASF file; `take` reads one line's words and raises ValueError or IndexError for what it cannot."""
 
+    def __init__(self) -> None:
+        self.length, self.radians = 1.0, False
+        self.root = _Bone("root", 1)
+        self.bones: dict[str, _Bone] = {}
+        self.hierarchy: list[tuple[int, list[str]]] = []
+        """Lines with their words: a parent, and those below it."""
+        self.section, self.bone = "", None
 
-def _read_unit(units: dict[str, float], words: list[str]) -> None:
-    if words[0] == "length":
-        units["length"] = float(finite_floats(words[1:2])[0])
-        if not units["length"] > 0:
-            raise ValueError("the length unit must be positive")
-    elif words[0] == "angle":
-        units["radians"] = float(words[1].lower().startswith("rad"))
+    @classmethod
+    def read(cls, path: Path) -> "_AsfContent":
+        content, number = cls(), 0
+        for number, text in numbered_lines(path):
+            words = text.split("#")[0].split()
+            try:
+                if words:
+                    content.take(number, words)
+            except (ValueError, IndexError) as error:
+                what = f"cannot read {text.strip()[:80]!r} ({error})"
+                raise WearcapError(what, where=at_line(path, number), expected="Acclaim ASF") from error
+        if content.bone is not None or not content.bones or not content.hierarchy:
+            what = "bones or hierarchy are missing or cut short"
+            expected = "an ASF file with :bonedata and :hierarchy"
+            raise WearcapError(what, where=at_line(path, number), expected=expected, fix="Fetch the file again.")
+        return content
 
+    def tree_order(self, path: Path) -> tuple[list[str], list[int]]:
+        """Names with parents before children (depth first, as the file lists them), and each one's parent."""
+        children: dict[str, list[str]] = {}
+        seen = {"root"}
+        for line, (parent, *below) in self.hierarchy:
+            for name in below:
+                if name not in self.bones or name in seen:
+                    what, expected = (
+                        f"bone {name!r} is unknown or has two parents",
+                        "every bone of :bonedata once below a parent",
+                    )
+                    raise WearcapError(what, where=at_line(path, line), expected=expected)
+                seen.add(name)
+            children.setdefault(parent, []).extend(below)
+        names, parents = ["root"], [-1]
+        stack = [(name, 0) for name in reversed(children.get("root", []))]
+        while stack:
+            name, parent = stack.pop()
+            names.append(name)
+            parents.append(parent)
+            stack += [(child, len(names) - 1) for child in reversed(children.get(name, []))]
+        if missing := sorted(set(self.bones) - set(names)):
+            what = f"bones {missing[:5]} do not hang on the root"
+            raise WearcapError(what, where=path, expected="one tree below 'root' in :hierarchy")
+        return names, parents
 
-def _read_root(root: _Bone, words: list[str]) -> None:
-    if words[0] == "order":
-        root.dof = _channels(words[1:], ("tx", "ty", "tz", *ROTATIONS))
-    elif words[0] == "axis":
-        root.order = _order(words[1])
-    elif words[0] == "position":
-        root.direction = _three(words[1:4])
-    elif words[0] == "orientation":
-        root.axis_deg = _three(words[1:4])
+    def take(self, number: int, words: list[str]) -> None:
+        if words[0].startswith(":"):
+            self.section, self.bone = words[0].lower(), None
+        elif self.section == ":units":
+            self.take_unit(words)
+        elif self.section == ":root":
+            self.take_root(words)
+        elif self.section == ":bonedata" and words[0] == "begin":
+            self.bone = _Bone("", number)
+        elif self.section == ":bonedata" and words[0] == "end" and self.bone is not None:
+            self.close_bone(self.bone)
+        elif self.section == ":bonedata" and self.bone is not None:
+            self.take_bone(self.bone, words)
+        elif self.section == ":hierarchy" and words[0] not in ("begin", "end"):
+            self.hierarchy.append((number, words))
+            if max(len(self.hierarchy), len(words)) > MAX_BONES:
+                raise ValueError(f"more than {MAX_BONES} bones")
 
+    def take_unit(self, words: list[str]) -> None:
+        if words[0] == "length":
+            self.length = float(finite_floats(words[1:2])[0])
+            if not self.length > 0:
+                raise ValueError("the length unit must be positive")
+        elif words[0] == "angle":
+            self.radians = words[1].lower().startswith("rad")
 
-def _read_bone(bone: _Bone, words: list[str]) -> None:
-    if words[0] == "name":
-        bone.name = words[1]
-    elif words[0] == "direction":
-        bone.direction = _three(words[1:4])
-    elif words[0] == "length":
-        bone.length = float(finite_floats(words[1:2])[0])
-    elif words[0] == "axis":
-        bone.axis_deg, bone.order = _three(words[1:4]), _order(words[4])
-    elif words[0] == "dof":
-        bone.dof = _channels(words[1:], ROTATIONS)
+    def take_root(self, words: list[str]) -> None:
+        if words[0] == "order":
+            self.root.dof = _channels(words[1:], ("tx", "ty", "tz", *ROTATIONS))
+        elif words[0] == "axis":
+            self.root.order = _order(words[1])
+        elif words[0] == "position":
+            self.root.direction = _three(words[1:4])
+        elif words[0] == "orientation":
+            self.root.axis_deg = _three(words[1:4])
 
+    def take_bone(self, bone: _Bone, words: list[str]) -> None:
+        if words[0] == "name":
+            bone.name = words[1]
+        elif words[0] == "direction":
+            bone.direction = _three(words[1:4])
+        elif words[0] == "length":
+            bone.length = float(finite_floats(words[1:2])[0])
+        elif words[0] == "axis":
+            bone.axis_deg, bone.order = _three(words[1:4]), _order(words[4])
+        elif words[0] == "dof":
+            bone.dof = _channels(words[1:], ROTATIONS)
 
-def _close_bone(bones: dict[str, _Bone], bone: _Bone) -> None:
-    if not bone.name or bone.name == "root" or bone.name in bones:
-        raise ValueError(f"the bone begun in line {bone.line} has no name of its own")
-    if len(bones) >= MAX_BONES:
-        raise ValueError(f"more than {MAX_BONES} bones")
-    bones[bone.name] = bone
+    def close_bone(self, bone: _Bone) -> None:
+        if not bone.name or bone.name == "root" or bone.name in self.bones:
+            raise ValueError(f"the bone begun in line {bone.line} has no name of its own")
+        if len(self.bones) >= MAX_BONES:
+            raise ValueError(f"more than {MAX_BONES} bones")
+        self.bones[bone.name], self.bone = bone, None
 
 
 def _three(words: list[str]) -> list[float]:
@@ -252,38 +278,10 @@ def _channels(words: list[str], known: tuple[str, ...]) -> tuple[str, ...]:
     return channels
 
 
-def _tree_order(path: Path, bones: dict[str, _Bone], hierarchy: list[tuple[int, list[str]]]):
-    """Names with parents before children (depth first, as the file lists them), and each one's parent."""
-    children: dict[str, list[str]] = {}
-    seen = {"root"}
-    for line, (parent, *below) in hierarchy:
-        for name in below:
-            if name not in bones or name in seen:
-                raise WearcapError(
-                    f"bone {name!r} is unknown or has two parents",
-                    where=at_line(path, line),
-                    expected="every bone of :bonedata once below a parent",
-                )
-            seen.add(name)
-        children.setdefault(parent, []).extend(below)
-    names, parents = ["root"], [-1]
-    stack = [(name, 0) for name in reversed(children.get("root", []))]
-    while stack:
-        name, parent = stack.pop()
-        names.append(name)
-        parents.append(parent)
-        stack += [(child, len(names) - 1) for child in reversed(children.get(name, []))]
-    if missing := sorted(set(bones) - set(names)):
-        raise WearcapError(
-            f"bones {missing[:5]} do not hang on the root", where=path, expected="one tree below 'root' in :hierarchy"
-        )
-    return names, parents
-
-
-CMU_NODES = {"root", "lowerback", "upperback", "thorax", "lowerneck", "upperneck", "head"} | {
+_CMU_NODES = {"root", "lowerback", "upperback", "thorax", "lowerneck", "upperneck", "head"} | {
     side + part
     for side in SIDES
-    for part in (
+    for part in [
         "hipjoint",
         "femur",
         "tibia",
@@ -296,7 +294,7 @@ CMU_NODES = {"root", "lowerback", "upperback", "thorax", "lowerneck", "upperneck
         "hand",
         "fingers",
         "thumb",
-    )
+    ]
 }
 
 
@@ -309,20 +307,16 @@ def _sites(names: list[str], ends: Tensor, leaves: dict[str, Tensor]) -> dict[st
         sites[site] = Site(name, tuple(end.tolist()))
     for letter, side in SIDES.items():
         if {letter + "foot", letter + "tibia"} <= set(names):
-            sites[f"{side}_heel"] = Site(
-                letter + "foot", _heel(*(ends[names.index(letter + part)] for part in ("foot", "tibia")))
-            )
+            foot, shin = (ends[names.index(letter + part)] for part in ("foot", "tibia"))
+            # "Down" runs on along the shin, for bind poses stand astride.
+            down = shin / shin.norm().clamp(min=1e-9)
+            forward = foot - (foot @ down) * down
+            forward = forward / forward.norm().clamp(min=1e-9)
+            heel = foot.norm() * (HEEL_DOWN * down - HEEL_BACK * forward)
+            sites[f"{side}_heel"] = Site(letter + "foot", tuple(heel.tolist()))
         if letter + "hand" in names:
             sites[f"{side}_palm"] = Site(letter + "hand", tuple(ends[names.index(letter + "hand")].tolist()))
     return sites
-
-
-def _heel(foot: Float[Tensor, "3"], shin: Float[Tensor, "3"]) -> tuple[float, ...]:
-    """The heel from the ankle: backwards and down, where "down" runs on along the shin (bind poses stand astride)."""
-    down = shin / shin.norm().clamp(min=1e-9)
-    forward = foot - (foot @ down) * down
-    forward = forward / forward.norm().clamp(min=1e-9)
-    return tuple((foot.norm() * (HEEL_DOWN * down - HEEL_BACK * forward)).tolist())
 
 
 # --- AMC -----------------------------------------------------------------------------------------------------------
@@ -346,16 +340,27 @@ def _parse_amc(path: Path, asf: AsfSkeleton) -> tuple[np.ndarray, list[int], Flo
     for row, (number, words) in enumerate(chain(beginning, first, following, lines)):
         place = row % (len(first) + 1)
         if place == 0:
-            _take_frame_number(frames, words, path, number)
-        else:
-            _take_values(values, words, first[place - 1][1], path, number)
+            sound = len(words) == 1 and words[0].isdecimal() and len(words[0]) <= 15
+            if not sound or (frames and int(words[0]) <= frames[-1]):
+                what = f"{' '.join(words)[:60]!r} where a frame number should stand"
+                raise WearcapError(what, where=at_line(path, number), expected="rising frame numbers")
+            frames.append(int(words[0]))
+            continue
+        like = first[place - 1][1]
+        if words[0] != like[0] or len(words) != len(like):
+            what, expected = (
+                f"{' '.join(words)[:60]!r} differs from the first frame",
+                f"{like[0]!r} with {len(like) - 1} values",
+            )
+            raise WearcapError(what, where=at_line(path, number), expected=expected)
+        try:
+            values.extend(finite_floats(words[1:]))
+        except ValueError as error:
+            raise WearcapError(str(error), where=at_line(path, number)) from error
     if place < len(first):
-        raise WearcapError(
-            "the last frame is cut short",
-            where=at_line(path, number),
-            expected=f"{len(first)} bones per frame",
-            fix="Fetch the file again.",
-        )
+        what = "the last frame is cut short"
+        expected = f"{len(first)} bones per frame"
+        raise WearcapError(what, where=at_line(path, number), expected=expected, fix="Fetch the file again.")
     return np.array(frames), joints, torch.from_numpy(np.array(values).reshape(len(frames), -1))
 
 
@@ -371,55 +376,21 @@ def _amc_lines(path: Path, asf: AsfSkeleton) -> Iterator[tuple[int, list[str]]]:
             yield number, words
 
 
-def _take_frame_number(frames: "array[int]", words: list[str], path: Path, line: int) -> None:
-    sound = len(words) == 1 and words[0].isdecimal() and len(words[0]) <= 15
-    if not sound or (frames and int(words[0]) <= frames[-1]):
-        raise WearcapError(
-            f"{' '.join(words)[:60]!r} where a frame number should stand",
-            where=at_line(path, line),
-            expected="rising frame numbers",
-        )
-    frames.append(int(words[0]))
-
-
-def _take_values(values: "array[float]", words: list[str], like: list[str], path: Path, line: int) -> None:
-    """A bone's values, whose name and number must be those of the first frame."""
-    if words[0] != like[0] or len(words) != len(like):
-        raise WearcapError(
-            f"{' '.join(words)[:60]!r} differs from the first frame",
-            where=at_line(path, line),
-            expected=f"{like[0]!r} with {len(like) - 1} values",
-        )
-    try:
-        found = list(map(float, words[1:]))
-    except ValueError:
-        found = [math.nan]
-    if not all(map(math.isfinite, found)):
-        bad = next(word for word in words[1:] if not is_finite_number(word))
-        raise WearcapError(f"{bad[:30]!r} is no finite number", where=at_line(path, line))
-    values.extend(found)
-
-
 def _layout_joints(path: Path, asf: AsfSkeleton, start: int, first: list[tuple[int, list[str]]]) -> list[int]:
     """Joints of the first frame, which begins in line `start`, checked against the skeleton's channels."""
     names = [words[0] for _, words in first]
     for line, (name, *values) in first:
         if name not in asf.skeleton.joint_names or names.count(name) > 1:
-            raise WearcapError(
-                f"bone {name!r} is not in the ASF, or comes twice",
-                where=at_line(path, line),
-                expected="bones of the skeleton, once per frame",
-                fix="Check that AMC and ASF belong together.",
-            )
+            what = f"bone {name!r} is not in the ASF, or comes twice"
+            expected = "bones of the skeleton, once per frame"
+            fix = "Check that AMC and ASF belong together."
+            raise WearcapError(what, where=at_line(path, line), expected=expected, fix=fix)
         if len(values) != (expected := len(asf.dof[asf.skeleton.index(name)])):
             raise WearcapError(
                 f"{len(values)} values for {name!r}", where=at_line(path, line), expected=f"{expected} as in the ASF"
             )
     moving = {name for name, dof in zip(asf.skeleton.joint_names, asf.dof) if dof}
     if not names or moving - set(names):
-        raise WearcapError(
-            f"the first frame lacks {sorted(moving - set(names))[:5]}",
-            where=at_line(path, start),
-            expected="every bone that has channels in the ASF",
-        )
+        what = f"the first frame lacks {sorted(moving - set(names))[:5]}"
+        raise WearcapError(what, where=at_line(path, start), expected="every bone that has channels in the ASF")
     return [asf.skeleton.index(name) for name in names]

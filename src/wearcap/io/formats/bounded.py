@@ -36,7 +36,8 @@ class Budget:
 
     def __init__(self, path: str | Path, packed: int, usual: int = MAX_BYTES, max_bytes: int | None = None):
         """`packed` is the file's size in bytes, `usual` the limit of its kind, `max_bytes` the caller's own."""
-        lifted = _from_environment() if max_bytes is None else max_bytes
+        text = os.environ.get(VARIABLE, "").strip()
+        lifted = gib_bytes(text, VARIABLE) if max_bytes is None and text else max_bytes
         self.path, self.spent = path, 0
         self.max_bytes = usual if lifted is None else lifted
         self._by_ratio = math.inf if lifted is not None else max(FREE_BYTES, MAX_RATIO * packed)
@@ -45,25 +46,14 @@ class Budget:
         """Count bytes before or after they are unpacked. Raises WearcapError beyond the limit."""
         self.spent += size
         if self.spent > self.max_bytes:
-            raise WearcapError(
-                f"larger than {_size_text(self.max_bytes)} once unpacked",
-                where=self.path,
-                expected="a smaller file",
-                fix=_lift(self.spent),
-            )
+            units = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))
+            unit, name = next((known for known in units if self.max_bytes >= known[0]), (1, "bytes"))
+            what = f"larger than {self.max_bytes / unit:.4g} {name} once unpacked"
+            raise WearcapError(what, where=self.path, expected="a smaller file", fix=_lift(self.spent))
         if self.spent > self._by_ratio:
-            raise WearcapError(
-                f"it unpacks to more than {MAX_RATIO} times its size",
-                where=self.path,
-                expected="a capture, which packs 5 to 30 times",
-                fix=_lift(self.spent),
-            )
-
-
-def _from_environment() -> int | None:
-    """Limit (bytes) that the user has set for all files; None if none is set."""
-    text = os.environ.get(VARIABLE, "").strip()
-    return None if not text else gib_bytes(text, VARIABLE)
+            what = f"it unpacks to more than {MAX_RATIO} times its size"
+            expected = "a capture, which packs 5 to 30 times"
+            raise WearcapError(what, where=self.path, expected=expected, fix=_lift(self.spent))
 
 
 def gib_bytes(text: str, where: str) -> int:
@@ -75,13 +65,6 @@ def gib_bytes(text: str, where: str) -> int:
     if not 0 < gib < 1e9:
         raise WearcapError(f"a limit of {text[:30]!r} GiB", where=where, expected="a number above 0, such as 16")
     return int(gib * (1 << 30))
-
-
-def _size_text(size: int) -> str:
-    for unit, name in ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB")):
-        if size >= unit:
-            return f"{size / unit:.4g} {name}"
-    return f"{size} bytes"
 
 
 def _lift(size: int) -> str:
@@ -121,15 +104,46 @@ def explained(path: str | Path, kind: str = "file") -> Iterator[None]:
     except IsADirectoryError as error:
         raise WearcapError("a folder", where=path, expected="a file") from error
     except _DAMAGE as error:
-        raise WearcapError(
-            f"not a complete {Path(path).suffix} file: its packed data is damaged or cut short ({error})",
-            where=path,
-            fix="Copy or fetch it again.",
-        ) from error
+        what = f"not a complete {Path(path).suffix} file: its packed data is damaged or cut short ({error})"
+        raise WearcapError(what, where=path, fix="Copy or fetch it again.") from error
     except OSError as error:
         raise WearcapError(f"cannot be read ({error.strerror or error})", where=path) from error
     except MemoryError as error:
         raise WearcapError("it does not fit into this machine's memory", where=path) from error
+
+
+_MALFORMED = (LookupError, TypeError, ValueError, OverflowError, AttributeError)
+"""Exceptions of taking content apart that is not laid out as it should be."""
+
+
+@contextmanager
+def understood(
+    what: str,
+    where: str | Path,
+    expected: str = "",
+    fix: str = "",
+    errors: type[Exception] | tuple[type[Exception], ...] = _MALFORMED,
+) -> Iterator[None]:
+    """Turn the exceptions of taking foreign content apart into a WearcapError: `what`, and the exception's own words."""
+    try:
+        yield
+    except PermissionError:
+        with explained(where):
+            raise
+    except errors as error:
+        reason = f"lacks {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
+        raise WearcapError(
+            f"{what} ({reason or type(error).__name__})"[:300], where=where, expected=expected, fix=fix
+        ) from error
+
+
+@contextmanager
+def placed(where: str | Path) -> Iterator[None]:
+    """Name the place in the errors of what is built from a file's content and knows nothing of the file."""
+    try:
+        yield
+    except WearcapError as error:
+        raise WearcapError(error.what, where=where, expected=error.expected, fix=error.fix) from error
 
 
 @contextmanager

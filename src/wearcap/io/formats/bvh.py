@@ -1,11 +1,16 @@
 """BVH (Biovision hierarchy): any hierarchy and channel order in; Y-up with ZYX channels out.
 
 A joint's rotation is the product of its rotation channels in the file's order (the first one outermost), acting on the
-bind pose given by the OFFSETs. Position channels replace a joint's OFFSET, as Blender reads them.
+bind pose given by the OFFSETs. Position channels replace a joint's OFFSET, as Blender reads them. A body that is no
+person's size or lies down is refused with the setting that would mend it.
 """
 
 import math
 import warnings
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +22,17 @@ from wearcap.body.skeleton import Site, Skeleton
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry.rotation import about_axis
-from wearcap.io.formats.bvh_check import check_body
-from wearcap.io.formats.bvh_parse import BvhJoint, parse_hierarchy, parse_motion
-from wearcap.io.formats.frame_grid import even_frames, nominal_fps
-from wearcap.io.formats.text import numbered_lines
+from wearcap.io.formats.motion_npz import even_frames, nominal_fps
+from wearcap.io.formats.text import at_line, finite_floats, numbered_lines
 from wearcap.recording.motion import Motion
 
-END_SITES = {
+_CHANNELS = {f"{axis}{kind}": (kind[0], axis) for axis in "xyz" for kind in ("position", "rotation")}
+MAX_JOINTS = 2000
+_MAX_WORDS = 64
+"""Most words of a joint's name."""
+_END_SITE = -1
+"""Index that marks an End Site among the open blocks."""
+_END_SITES = {
     "toe": "toe_tip",
     "toebase": "toe_tip",
     "wrist": "fingertip",
@@ -31,13 +40,161 @@ END_SITES = {
     "thumb": "thumb_tip",
 }
 """wearcap's names of End Sites, by the joint's name without its side."""
-
 STRETCH_M = 0.005
 """Largest change of a bone's length without a warning."""
-
 CGSPEED_UNIT_M = 0.0254 / 0.45
 CGSPEED_THORAX = (0.0, 2.07, 0.0)
 """Offset (file units) that cgspeed's BVH conversion of the CMU database dropped between thorax and neck or shoulders."""
+UNITS_M = {
+    "metres": 1.0,
+    "decimetres": 0.1,
+    "centimetres": 0.01,
+    "millimetres": 0.001,
+    "inches": 0.0254,
+    "feet": 0.3048,
+    "CMU's units": 0.0254 / 0.45,
+}
+REACH_PER_HEIGHT = 1.46
+"""Longest path along the bones (fingertip to toe tip) over body height; in the tested skeletons 1.46 … 1.53."""
+HEIGHT_M = (0.6, 2.6)
+_R_FILE_WORLD = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
+"""wearcap's axes in those of the files that are written."""
+
+
+@dataclass
+class _Joint:
+    """One joint of the file; offsets in file units."""
+
+    name: str
+    parent: int
+    offset: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    channels: list[tuple[str, str]] = field(default_factory=list)
+    """("p" or "r", axis) in the file's order."""
+    end: list[float] | None = None
+
+
+class _Hierarchy:
+    """The joints of a HIERARCHY, parents first, from its words; `line` is the number of the last word's line."""
+
+    def __init__(self, lines: Iterator[tuple[int, str]]):
+        self.line, self.motion_line = 1, 0
+        self.joints: list[_Joint] = []
+        self.open: list[int] = []
+        """Joints whose blocks are open."""
+        self.words = self.split(lines)
+
+    @classmethod
+    def read(cls, path: Path, lines: Iterator[tuple[int, str]]) -> tuple[list[_Joint], int]:
+        """Joints with parents first, and the number of the MOTION line, up to which the lines are consumed."""
+        found, line = cls(lines), 1
+        try:
+            for word in found.words:
+                line = found.line
+                found.take(word)
+        except (ValueError, IndexError, StopIteration) as error:
+            what = f"the hierarchy is broken here ({str(error) or 'it ends too early'})"[:200]
+            raise WearcapError(what, where=at_line(path, line), expected="BVH") from error
+        if not found.joints or found.open or not found.motion_line:
+            what = "no complete HIERARCHY followed by MOTION"
+            expected = "a whole BVH file"
+            raise WearcapError(what, where=at_line(path, found.line), expected=expected, fix="Fetch it again.")
+        if len({joint.name for joint in found.joints}) < len(found.joints):
+            raise WearcapError("two joints share a name", where=path, expected="unique joint names")
+        return found.joints, found.motion_line
+
+    def split(self, lines: Iterator[tuple[int, str]]) -> Iterator[str]:
+        """Words until the line MOTION."""
+        for number, line in lines:
+            self.line = number
+            if line.strip().upper() == "MOTION":
+                self.motion_line = number
+                return
+            yield from line.replace("{", " { ").replace("}", " } ").split()
+
+    def take(self, word: str) -> None:
+        """Read what a word begins. Raises ValueError, IndexError or StopIteration where something else follows."""
+        key = word.upper()
+        if key in ("ROOT", "JOINT", "END"):
+            self.begin(key, self.name())
+        elif key == "OFFSET":
+            offset = finite_floats(islice(self.words, 3)).tolist()
+            if len(offset) != 3 or not self.open:
+                raise ValueError("OFFSET needs three numbers inside a joint")
+            if self.open[-1] != _END_SITE:
+                self.joints[self.open[-1]].offset = offset
+            elif self.joints[self.open[-2]].end is None:
+                self.joints[self.open[-2]].end = offset
+        elif key == "CHANNELS":
+            self.add_channels(int(next(self.words)))
+        elif key == "}":
+            self.open.pop()
+        elif key != "HIERARCHY":
+            raise ValueError(f"unknown word {word[:30]!r}")
+
+    def name(self) -> str:
+        """The words until a block opens."""
+        words: list[str] = []
+        while (word := next(self.words)) != "{":
+            if len(words) == _MAX_WORDS:
+                raise ValueError("a name without an end")
+            words.append(word)
+        return " ".join(words)
+
+    def begin(self, key: str, name: str) -> None:
+        """Open a ROOT, JOINT or End Site block."""
+        if (key == "ROOT") != (not self.open) or (key == "ROOT" and self.joints):
+            raise ValueError(f"{key} {name[:30]!r} stands in the wrong place; one ROOT holds everything")
+        if self.open and self.open[-1] == _END_SITE:
+            raise ValueError("an End Site holds another joint")
+        if key == "END":
+            self.open.append(_END_SITE)
+            return
+        if not name or len(self.joints) >= MAX_JOINTS:
+            raise ValueError("a joint without a name" if not name else f"more than {MAX_JOINTS} joints")
+        self.joints.append(_Joint(name, self.open[-1] if self.open else -1))
+        self.open.append(len(self.joints) - 1)
+
+    def add_channels(self, count: int) -> None:
+        if not 0 <= count <= len(_CHANNELS):
+            raise ValueError(f"CHANNELS {count}")
+        names = [name.lower() for name in islice(self.words, count)]
+        if not self.open or self.open[-1] == _END_SITE or self.joints[self.open[-1]].channels:
+            raise ValueError("CHANNELS belongs once into a joint")
+        if len(names) != count or not set(names) <= set(_CHANNELS) or len(set(names)) != count:
+            raise ValueError(f"CHANNELS {count} with {' '.join(names)[:80]}")
+        self.joints[self.open[-1]].channels = [_CHANNELS[name] for name in names]
+
+
+def _parse_motion(
+    path: Path, lines: Iterator[tuple[int, str]], motion_line: int, channels: int
+) -> tuple[float, np.ndarray]:
+    """Time step (s) and values "time channel"."""
+    lines = ((number, line) for number, line in lines if line.strip())
+    try:
+        (_, first), (line, second) = next(lines), next(lines)
+        count = int(first.lower().split("frames:")[1])
+        step_s = float(second.lower().split("frame time:")[1])
+    except (ValueError, IndexError, StopIteration) as error:
+        raise WearcapError("no 'Frames:' and 'Frame Time:' below MOTION", where=at_line(path, motion_line)) from error
+    if not 1e-5 <= step_s <= 10:
+        raise WearcapError(f"frame time {step_s} s", where=at_line(path, line), expected="seconds per frame, above 0")
+    values, odd, rows = array("d"), None, 0
+    for number, text in lines:
+        words = text.split()
+        rows += 1
+        try:
+            values.extend(finite_floats(words))
+        except ValueError as error:
+            raise WearcapError(str(error), where=at_line(path, number)) from error
+        if len(words) != channels and odd is None:
+            expected = f"{channels}, one per channel of the hierarchy"
+            odd = WearcapError(f"{len(words)} values", where=at_line(path, number), expected=expected)
+        if len(values) > count * channels:
+            break
+    if len(values) != count * channels or not values:
+        expected = f"{count} frames, as in the file's header (at least one)"
+        raise odd or WearcapError(f"{rows} frames", where=path, expected=expected)
+    return step_s, np.asarray(values).reshape(count, channels)
 
 
 def read_bvh(
@@ -58,8 +215,8 @@ def read_bvh(
     path = Path(path)
     R_world_file = _axes(path, up, forward)
     lines = numbered_lines(path)
-    joints, motion_line = parse_hierarchy(path, lines)
-    step_s, values = parse_motion(path, lines, motion_line, sum(len(joint.channels) for joint in joints))
+    joints, motion_line = _Hierarchy.read(path, lines)
+    step_s, values = _parse_motion(path, lines, motion_line, sum(len(joint.channels) for joint in joints))
     for joint in joints:
         joint.offset = list((offsets or {}).get(joint.name, joint.offset))
     translation, R = _channels(joints, values)
@@ -72,11 +229,9 @@ def read_bvh(
         (bones @ to_world).float(),
         _sites(joints, to_world),
     )
-    root = (
-        translation[0]
-        if translation[0] is not None
-        else torch.tensor(joints[0].offset, dtype=torch.float64).expand(len(values), 3)
-    )
+    root = translation[0]
+    if root is None:
+        root = torch.tensor(joints[0].offset, dtype=torch.float64).expand(len(values), 3)
     motion = Motion(
         torch.arange(len(values), dtype=torch.float64) / nominal_fps(1 / step_s),
         skeleton,
@@ -85,7 +240,7 @@ def read_bvh(
         provenance={"source": path.name, "format": "bvh"},
     )
     if check:
-        check_body(motion, path, float(unit_m), R_world_file)
+        _check_body(motion, path, float(unit_m), R_world_file)
     return motion
 
 
@@ -99,13 +254,7 @@ def read_cmu_bvh(path: str | Path) -> Motion:
     if len(motion) < 2:
         raise WearcapError("only the T-pose frame", where=path, expected="frames of motion after it")
     motion = motion.sliced(1, len(motion))
-    return Motion(
-        motion.timestamps - motion.timestamps[0],
-        motion.skeleton,
-        motion.R_parent_joint,
-        motion.t_world_root,
-        provenance=motion.provenance,
-    )
+    return replace(motion, timestamps=motion.timestamps - motion.timestamps[0])
 
 
 def _axes(path: Path, up: str, forward: str) -> Tensor:
@@ -118,20 +267,12 @@ def _axes(path: Path, up: str, forward: str) -> Tensor:
         row["xyz".index(name[-1])] = -1.0 if name.startswith("-") else 1.0
         rows[name] = row
     if up[-1] == forward[-1]:
-        raise WearcapError(
-            f"up {up!r} and forward {forward!r} are one axis",
-            where=path,
-            fix='For a z-up file give forward as well, mostly "-y", "x" or "y".',
-        )
+        what = f"up {up!r} and forward {forward!r} are one axis"
+        raise WearcapError(what, where=path, fix='For a z-up file give forward as well, mostly "-y", "x" or "y".')
     return torch.stack([rows[forward], torch.linalg.cross(rows[up], rows[forward]), rows[up]])
 
 
-# --- reading ---------------------------------------------------------------------------------------------------
-
-
-def _channels(
-    joints: list[BvhJoint], values: np.ndarray
-) -> tuple[list[Tensor | None], Float[Tensor, "time joint 3 3"]]:
+def _channels(joints: list[_Joint], values: np.ndarray) -> tuple[list[Tensor | None], Float[Tensor, "time joint 3 3"]]:
     """Per joint its translations "time 3" (file units; None without position channels), and all rotations."""
     columns = torch.from_numpy(values)
     starts = np.cumsum([0, *(len(joint.channels) for joint in joints)]).tolist()
@@ -153,7 +294,7 @@ def _channels(
 
 
 def _bones(
-    path: Path, joints: list[BvhJoint], translation: list[Tensor | None], unit_m: float
+    path: Path, joints: list[_Joint], translation: list[Tensor | None], unit_m: float
 ) -> Float[Tensor, "joint 3"]:
     """Constant bone offsets (file units; the root's is zero), from OFFSET or from the position channels' median."""
     bones = torch.tensor([joint.offset for joint in joints], dtype=torch.float64)
@@ -176,28 +317,65 @@ def _bones(
     return bones
 
 
-def _sites(joints: list[BvhJoint], to_world: Float[Tensor, "3 3"]) -> dict[str, Site]:
+def _sites(joints: list[_Joint], to_world: Float[Tensor, "3 3"]) -> dict[str, Site]:
+    """End Sites, under wearcap's names where their joints' names are known ("LeftToeBase", "l_wrist" …)."""
     sites = {}
     for joint in joints:
-        if joint.end is not None:
-            end = torch.tensor(joint.end, dtype=torch.float64) @ to_world
-            sites[_site_name(joint.name)] = Site(joint.name, tuple(end.tolist()))
+        if joint.end is None:
+            continue
+        plain = joint.name.lower().replace("_", "")
+        named = [
+            f"{side}_{_END_SITES[plain.removeprefix(start)]}"
+            for side, start in (("left", "left"), ("right", "right"), ("left", "l"), ("right", "r"))
+            if plain.startswith(start) and plain.removeprefix(start) in _END_SITES
+        ]
+        name = "crown" if plain == "head" else [*named, f"{joint.name}_end"][0]
+        end = torch.tensor(joint.end, dtype=torch.float64) @ to_world
+        sites[name] = Site(joint.name, tuple(end.tolist()))
     return sites
 
 
-def _site_name(joint: str) -> str:
-    plain = joint.lower().replace("_", "")
-    if plain == "head":
-        return "crown"
-    for side, start in (("left", "left"), ("right", "right"), ("left", "l"), ("right", "r")):
-        if plain.startswith(start) and plain.removeprefix(start) in END_SITES:
-            return f"{side}_{END_SITES[plain.removeprefix(start)]}"
-    return f"{joint}_end"
+def _check_body(motion: Motion, path: Path, unit_m: float, R_world_file: Float[Tensor, "3 3"]) -> None:
+    """Raise WearcapError, naming the setting that fixes it, when the body is no person's size or lies on its side."""
+    height = longest_path(motion.skeleton) / REACH_PER_HEIGHT
+    if not HEIGHT_M[0] < height < HEIGHT_M[1]:
+        name = min(UNITS_M, key=lambda name: abs(height / unit_m * UNITS_M[name] - 1.7))
+        raise WearcapError(
+            f"the body would be about {height:.3g} m tall with unit_m={unit_m:g}",
+            where=path,
+            expected="a person's size",
+            fix=f"unit_m={UNITS_M[name]:.6g} ({name}) would make it {height / unit_m * UNITS_M[name]:.2f} m; "
+            "check=False takes it as it is.",
+        )
+    rest_joints = motion.skeleton.rest_joints
+    rest = rest_joints.amax(0) - rest_joints.amin(0)
+    positions = motion.sliced(0, len(motion)).T_world_joint.t
+    moving = (positions.amax(1) - positions.amin(1)).median(0).values
+    long_axes = [axis for axis in (0, 1) if rest[2] < 0.5 * rest[axis] and moving[2] < 0.6 * moving[axis]]
+    if long_axes:
+        # Arms may span as much as the body is tall, but only across them left mirrors right: the mean distance (m)
+        # from each joint, mirrored along an axis through the root, to the nearest one tells them apart.
+        mirrors = {axis: torch.ones(3).index_fill(0, torch.tensor(axis), -1.0) for axis in long_axes}
+        axis = max(long_axes, key=lambda k: torch.cdist(rest_joints * mirrors[k], rest_joints).amin(1).mean().item())
+        name = "xyz"[int(R_world_file[axis].abs().argmax())]
+        what = f"the body lies down: {moving[2]:.2f} m high and {moving[axis]:.2f} m long"
+        fix = f'up="{name}" (or "-{name}") would raise it; check=False takes it as it is.'
+        raise WearcapError(what, where=path, expected="a person upright in the bind pose or in most frames", fix=fix)
 
 
-# --- writing ---------------------------------------------------------------------------------------------------
-
-_R_FILE_WORLD = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
+def longest_path(skeleton: Skeleton) -> float:
+    """Length (m) of the longest path along the bones from one end of the tree to another."""
+    bones = skeleton.t_parent_joint.double().norm(dim=-1).tolist()
+    down = [0.0] * len(skeleton)
+    for site in skeleton.sites.values():
+        joint = skeleton.index(site.joint)
+        down[joint] = max(down[joint], torch.tensor(site.t_joint_site).norm().item())
+    longest = 0.0
+    for joint in range(len(skeleton) - 1, 0, -1):
+        parent, length = skeleton.parents[joint], down[joint] + bones[joint]
+        longest = max(longest, down[parent] + length)
+        down[parent] = max(down[parent], length)
+    return longest
 
 
 def write_bvh(motion: Motion, path: str | Path, unit_m: float | int = 0.01) -> None:
@@ -211,7 +389,13 @@ def write_bvh(motion: Motion, path: str | Path, unit_m: float | int = 0.01) -> N
     root = motion.t_world_root[frames].double() @ _R_FILE_WORLD.T / unit_m
     if not (R.isfinite().all() and root.isfinite().all()):
         raise WearcapError("the motion holds NaN or infinite values", where=path, expected="finite poses")
-    degrees = np.unwrap(np.degrees(_zyx(R).numpy()), axis=0, period=360)
+    # R = Rz · Ry · Rx; at gimbal lock x is zero.
+    cos_y = torch.hypot(R[..., 0, 0], R[..., 1, 0])
+    locked = cos_y < 1e-7
+    x = torch.where(locked, 0.0, torch.atan2(R[..., 2, 1], R[..., 2, 2]))
+    z = torch.where(locked, torch.atan2(-R[..., 0, 1], R[..., 1, 1]), torch.atan2(R[..., 1, 0], R[..., 0, 0]))
+    zyx = torch.stack([z, torch.atan2(-R[..., 2, 0], cos_y), x], -1)
+    degrees = np.unwrap(np.degrees(zyx.numpy()), axis=0, period=360)
     order = _depth_first(motion.skeleton)
     table = np.concatenate([root.numpy(), degrees[:, order].reshape(len(frames), -1)], -1)
     row = " ".join(["%.6f"] * table.shape[1])
@@ -224,15 +408,6 @@ def write_bvh(motion: Motion, path: str | Path, unit_m: float | int = 0.01) -> N
         *(row % tuple(values) for values in table.tolist()),
     ]
     write_text(path, "\n".join(lines) + "\n")
-
-
-def _zyx(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
-    """Angles (z, y, x) in rad with R = Rz · Ry · Rx; at gimbal lock x is zero."""
-    cos_y = torch.hypot(R[..., 0, 0], R[..., 1, 0])
-    locked = cos_y < 1e-7
-    x = torch.where(locked, 0.0, torch.atan2(R[..., 2, 1], R[..., 2, 2]))
-    z = torch.where(locked, torch.atan2(-R[..., 0, 1], R[..., 1, 1]), torch.atan2(R[..., 1, 0], R[..., 0, 0]))
-    return torch.stack([z, torch.atan2(-R[..., 2, 0], cos_y), x], -1)
 
 
 def _children(skeleton: Skeleton, joint: int) -> list[int]:

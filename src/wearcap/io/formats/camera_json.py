@@ -1,14 +1,24 @@
-"""A camera's calibration as JSON: {"camera": {model, width, height, fx, fy, cx, cy, distortion}, "calibration": {…}}."""
+"""Cameras as JSON: a calibration, and a scene's database pictures, whose `photos.json` is beside the files that it names.
+
+{"camera": {model, width, height, fx, fy, cx, cy, distortion}, "calibration": {…}}
+"""
 
 import json
 import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry.camera import Camera
-from wearcap.io.formats.json_text import read_json
+from wearcap.geometry.rigid import Rigid
+from wearcap.io.formats.bounded import placed, understood
+from wearcap.io.formats.poses import are_rotations
+from wearcap.io.formats.text import read_json
+from wearcap.recording.photo import Photo
 
 _NUMBERS = ("fx", "fy", "cx", "cy")
 EXAMPLE = (
@@ -22,9 +32,9 @@ def camera_row(camera: Camera) -> dict[str, Any]:
     return {name: getattr(camera, name) for name in names} | {"distortion": list(camera.distortion)}
 
 
-def camera_from_row(row: Any, where: str | Path) -> Camera:
+def _camera_from_row(row: Any, where: str | Path) -> Camera:
     """Camera from the dict of `camera_row`. Raises WearcapError naming `where` when numbers are missing or invalid."""
-    try:
+    with understood("no intrinsics", where, EXAMPLE), placed(where):
         if not all(math.isfinite(float(value)) for value in (row["cx"], row["cy"], *row["distortion"])):
             raise ValueError("numbers that are not finite")
         return Camera(
@@ -34,11 +44,6 @@ def camera_from_row(row: Any, where: str | Path) -> Camera:
             *(float(row[key]) for key in _NUMBERS),
             tuple(map(float, row["distortion"])),
         )
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
-        raise WearcapError(f"no intrinsics ({what})", where=where, expected=EXAMPLE) from error
-    except WearcapError as error:
-        raise WearcapError(error.what, where=where, expected=error.expected) from error
 
 
 def write_camera(camera: Camera, path: str | Path, calibration: dict[str, Any] | None = None) -> None:
@@ -51,4 +56,61 @@ def read_camera(path: str | Path) -> Camera:
     """Read what `write_camera` wrote. Raises WearcapError when it is missing, no JSON, or holds no intrinsics."""
     content = read_json(path)
     row = content.get("camera", content) if isinstance(content, dict) else None
-    return camera_from_row(row, path)
+    return _camera_from_row(row, path)
+
+
+PHOTOS_FILE = "photos.json"
+_NOT_ORTHONORMAL = 1e-3
+_EXAMPLE = (
+    '{"photos": [{"file": "photos/00000-cam0.jpg", "camera": {"model": "fisheye", "width": …, "height": …, '
+    '"fx": …, "fy": …, "cx": …, "cy": …, "distortion": […]}, "R_world_cam": 3x3, "t_world_cam": [x, y, z]}]}'
+)
+
+
+def read_photos(folder: str | Path) -> list[Photo]:
+    """Photos of a scene's folder, with files as paths; whether these exist is checked when they are opened.
+
+    Raises WearcapError when `photos.json` is missing or not as `write_photos` writes it, naming the photo.
+    """
+    folder = Path(folder)
+    path = folder / PHOTOS_FILE
+    with understood("not a readable list of photos", path, _EXAMPLE, errors=(KeyError, TypeError)):
+        rows = read_json(path)["photos"]
+        if not isinstance(rows, list):
+            raise TypeError("its 'photos' are no list")
+    return [_photo(row, folder, f"{path}, photo {number}") for number, row in enumerate(rows)]
+
+
+def write_photos(photos: list[Photo], folder: str | Path) -> None:
+    """Write `photos.json`. Raises WearcapError for an image file outside the folder."""
+    folder = Path(folder)
+    rows = []
+    for photo in photos:
+        file = Path(photo.file)
+        if file.is_absolute() or file.is_relative_to(folder):
+            if not file.is_relative_to(folder):
+                raise WearcapError("this photo is outside its scene", where=file, expected=f"in {folder}")
+            file = file.relative_to(folder)
+        rows.append(
+            {
+                "file": file.as_posix(),
+                "camera": camera_row(photo.camera),
+                "R_world_cam": photo.T_world_cam.R.double().tolist(),
+                "t_world_cam": photo.T_world_cam.t.double().tolist(),
+            }
+        )
+    write_text(folder / PHOTOS_FILE, json.dumps({"photos": rows}, indent=1) + "\n")
+
+
+def _photo(row: Any, folder: Path, where: str) -> Photo:
+    with understood("unreadable", where, _EXAMPLE):
+        file, camera = Path(row["file"]), row["camera"]
+        R, t = (np.array(row[key], np.float64) for key in ("R_world_cam", "t_world_cam"))
+    lens = _camera_from_row(camera, where)
+    if file.is_absolute() or ".." in file.parts:
+        raise WearcapError(f"file {str(file)!r} is outside the scene's folder", where=where)
+    if R.shape != (3, 3) or t.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(t).all()):
+        raise WearcapError(f"a pose of shapes {R.shape} and {t.shape}", where=where, expected="finite 3x3 and 3")
+    if not are_rotations(torch.from_numpy(R), _NOT_ORTHONORMAL):
+        raise WearcapError("R_world_cam is no rotation", where=where, expected="an orthonormal 3x3 matrix")
+    return Photo(folder / file, lens, Rigid(torch.from_numpy(R).float(), torch.from_numpy(t).float()))

@@ -8,7 +8,7 @@ import math
 import struct
 from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -34,19 +34,8 @@ _MODELS = {
     "OPENCV_FISHEYE": ("fisheye", 8),
 }
 """wearcap's camera model, and the number of parameters of COLMAP's."""
-_BY_NUMBER = (
-    "SIMPLE_PINHOLE",
-    "PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "OPENCV",
-    "OPENCV_FISHEYE",
-    "FULL_OPENCV",
-    "FOV",
-    "SIMPLE_RADIAL_FISHEYE",
-    "RADIAL_FISHEYE",
-    "THIN_PRISM_FISHEYE",
-)
+_BY_NUMBER = (*_MODELS, "FULL_OPENCV", "FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE")
+"""COLMAP's models by their number in binary files."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,11 +76,13 @@ class _Image:
     where: str
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class _Points:
-    number: np.ndarray
-    xyz: np.ndarray
-    rgb: np.ndarray
+    """3D points one after another: their numbers, coordinates and colours."""
+
+    number: "array[int]" = field(default_factory=lambda: array("q"))
+    xyz: "array[float]" = field(default_factory=lambda: array("d"))
+    rgb: bytearray = field(default_factory=bytearray)
 
 
 def read_colmap(folder: str | Path, images: str | Path | None = None) -> ColmapModel:
@@ -102,42 +93,28 @@ def read_colmap(folder: str | Path, images: str | Path | None = None) -> ColmapM
     Raises WearcapError for missing or truncated files, unknown camera models, and numbers that name nothing.
     """
     folder = Path(folder)
-    images = Path(images) if images is not None else _images_folder(folder)
-    binary = (folder / "images.bin").is_file()
-    if binary:
-        cameras = _read_cameras_bin(folder / "cameras.bin")
-        found = _read_images_bin(folder / "images.bin")
-    else:
-        cameras = _read_cameras_txt(folder / "cameras.txt")
-        found = _read_images_txt(folder / "images.txt")
-    found.sort(key=lambda image: image.name)
-    points = _Points(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    file = folder / ("points3D.bin" if binary else "points3D.txt")
-    if file.is_file():
-        points = (_read_points_bin if binary else _read_points_txt)(file)
-    photos = [_photo(image, cameras, images) for image in found]
-    return ColmapModel(photos, _tracks(found, points))
-
-
-def _images_folder(folder: Path) -> Path:
     places = (folder / "images", folder.parent / "images", folder.parent.parent / "images")
-    return next((place for place in places if place.is_dir()), folder)
+    images = Path(images) if images is not None else next((place for place in places if place.is_dir()), folder)
+    binary = (folder / "images.bin").is_file()
+    reader, suffix = (_Binary, ".bin") if binary else (_Text, ".txt")
+    cameras = reader.cameras(folder / f"cameras{suffix}")
+    found = sorted(reader.images(folder / f"images{suffix}"), key=lambda image: image.name)
+    points, file = _Points(), folder / f"points3D{suffix}"
+    if file.is_file():
+        points = reader.points(file)
+        if not np.isfinite(points.xyz).all():
+            raise WearcapError("a point is NaN or infinite", where=file, expected="finite coordinates")
+    return ColmapModel([_photo(image, cameras, images) for image in found], _tracks(found, points))
 
 
 def _photo(image: _Image, cameras: dict[int, Camera], images: Path) -> Photo:
     if image.camera not in cameras:
-        raise WearcapError(
-            f"image {image.name!r} names camera {image.camera}, which is not in the model",
-            where=image.where,
-            expected=f"one of {', '.join(map(str, sorted(cameras)))}",
-        )
+        what = f"image {image.name!r} names camera {image.camera}, which is not in the model"
+        raise WearcapError(what, where=image.where, expected=f"one of {', '.join(map(str, sorted(cameras)))}")
     wxyz = torch.tensor(image.quaternion_wxyz, dtype=torch.float64)
     if not (wxyz.isfinite().all() and 0.9 < wxyz.norm() < 1.1 and all(map(math.isfinite, image.translation))):
-        raise WearcapError(
-            f"image {image.name!r} has no valid pose",
-            where=image.where,
-            expected="a unit quaternion (w first) and a finite translation",
-        )
+        what = f"image {image.name!r} has no valid pose"
+        raise WearcapError(what, where=image.where, expected="a unit quaternion (w first) and a finite translation")
     wxyz = wxyz / wxyz.norm()
     R_cam_world = roma.unitquat_to_rotmat(wxyz[[1, 2, 3, 0]])
     T_cam_world = Rigid(R_cam_world, torch.tensor(image.translation, dtype=torch.float64))
@@ -146,8 +123,9 @@ def _photo(image: _Image, cameras: dict[int, Camera], images: Path) -> Photo:
 
 def _tracks(images: list[_Image], points: _Points) -> Tracks:
     """Observations of points that exist; their numbers become rows."""
-    order = np.argsort(points.number)
-    number = points.number[order]
+    number = np.array(points.number, np.int64)
+    order = np.argsort(number)
+    number = number[order]
     photo = np.repeat(np.arange(len(images)), [len(image.point) for image in images])
     pixels = np.concatenate([np.zeros((0, 2)), *(image.pixels for image in images)])
     seen = np.concatenate([np.zeros(0, np.int64), *(image.point for image in images)])
@@ -155,8 +133,8 @@ def _tracks(images: list[_Image], points: _Points) -> Tracks:
     known = (seen >= 0) & (len(number) > 0) & (np.abs(pixels) < 1e6).all(1)
     known[known] = number[place[known]] == seen[known]
     return Tracks(
-        points.xyz,
-        points.rgb,
+        np.array(points.xyz, np.float64).reshape(-1, 3),
+        np.array(points.rgb, np.uint8).reshape(-1, 3),
         photo[known].astype(np.int64),
         order[place[known]].astype(np.int64),
         (pixels[known] - 0.5).astype(np.float32),
@@ -165,12 +143,9 @@ def _tracks(images: list[_Image], points: _Points) -> Tracks:
 
 def _camera(model: str, width: int, height: int, values: list[float], where: str) -> Camera:
     if model not in _MODELS:
-        raise WearcapError(
-            f"camera model {model} is not supported",
-            where=where,
-            expected=f"one of {', '.join(_MODELS)}",
-            fix="COLMAP's image_undistorter turns any model into PINHOLE.",
-        )
+        what = f"camera model {model} is not supported"
+        fix = "COLMAP's image_undistorter turns any model into PINHOLE."
+        raise WearcapError(what, where=where, expected=f"one of {', '.join(_MODELS)}", fix=fix)
     ours, count = _MODELS[model]
     if len(values) != count or not all(map(math.isfinite, values)):
         raise WearcapError(
@@ -197,83 +172,64 @@ def _damaged(where: str | Path, error: Exception, expected: str) -> WearcapError
     return WearcapError(f"cannot be understood ({error})", where=where, expected=expected)
 
 
-def _read_cameras_txt(path: Path) -> dict[int, Camera]:
-    cameras = {}
-    for where, words in _lines(path):
-        if words:
+class _Text:
+    """A model as text."""
+
+    @staticmethod
+    def cameras(path: Path) -> dict[int, Camera]:
+        cameras = {}
+        for where, words in _lines(path):
+            if words:
+                try:
+                    number, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
+                    values = [float(word) for word in words[4:]]
+                except (ValueError, IndexError) as error:
+                    raise _damaged(where, error, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS…") from error
+                cameras[number] = _camera(model, width, height, values, where)
+        return cameras
+
+    @staticmethod
+    def images(path: Path) -> list[_Image]:
+        images = []
+        lines = _lines(path)
+        for where, words in lines:
+            if not words:
+                continue
             try:
-                number, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
-                values = [float(word) for word in words[4:]]
+                _, *pose, camera, name = [*words[:9], " ".join(words[9:])]
+                pose = [float(word) for word in pose]
+                if not name:
+                    raise ValueError("no name")
+                place, second = next(lines, (where, None))
+                if second is None:
+                    fix = "The file was cut short: copy it again."
+                    raise WearcapError(
+                        f"it ends after image {name!r}", where=where, expected="a line of its points", fix=fix
+                    )
+                if len(second) % 3:
+                    what = f"{len(second)} numbers for the points of image {name!r}"
+                    raise WearcapError(what, where=place, expected="X Y POINT3D_ID for each point")
+                table = finite_floats(second).reshape(-1, 3)
+                points = table[:, :2], table[:, 2].astype(np.int64)
+                images.append(_Image(name, int(camera), tuple(pose[:4]), tuple(pose[4:]), *points, where))
             except (ValueError, IndexError) as error:
-                raise _damaged(where, error, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS…") from error
-            cameras[number] = _camera(model, width, height, values, where)
-    return cameras
+                raise _damaged(where, error, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its points") from error
+        return images
 
-
-def _read_images_txt(path: Path) -> list[_Image]:
-    images = []
-    lines = _lines(path)
-    for where, words in lines:
-        if not words:
-            continue
-        try:
-            _, *pose, camera, name = [*words[:9], " ".join(words[9:])]
-            pose = [float(word) for word in pose]
-            if not name:
-                raise ValueError("no name")
-            place, second = next(lines, (where, None))
-            if second is None:
-                raise WearcapError(
-                    f"it ends after image {name!r}",
-                    where=where,
-                    expected="a line of its points",
-                    fix="The file was cut short: copy it again.",
-                )
-            if len(second) % 3:
-                raise WearcapError(
-                    f"{len(second)} numbers for the points of image {name!r}",
-                    where=place,
-                    expected="X Y POINT3D_ID for each point",
-                )
-            table = finite_floats(second).reshape(-1, 3)
-            images.append(
-                _Image(
-                    name,
-                    int(camera),
-                    tuple(pose[:4]),
-                    tuple(pose[4:]),
-                    table[:, :2],
-                    table[:, 2].astype(np.int64),
-                    where,
-                )
-            )
-        except (ValueError, IndexError) as error:
-            raise _damaged(where, error, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its points") from error
-    return images
-
-
-def _read_points_txt(path: Path) -> _Points:
-    numbers, xyz, rgb = array("q"), array("d"), bytearray()
-    for where, words in _lines(path):
-        if words:
-            try:
-                if len(words) < 7:
-                    raise ValueError("too few numbers")
-                numbers.append(int(words[0]))
-                xyz.extend(map(float, words[1:4]))
-                rgb += bytes(map(int, words[4:7]))  # raises beyond 0…255
-            except (ValueError, IndexError, OverflowError) as error:
-                raise _damaged(where, error, "POINT3D_ID X Y Z R G B ERROR TRACK…") from error
-    return _checked_points(numbers, xyz, rgb, path)
-
-
-def _checked_points(numbers: "array[int]", xyz: "array[float]", rgb: bytearray, path: Path) -> _Points:
-    points = _Points(
-        np.array(numbers, np.int64), np.array(xyz, np.float64).reshape(-1, 3), np.array(rgb, np.uint8).reshape(-1, 3)
-    )
-    if not np.isfinite(points.xyz).all():
-        raise WearcapError("a point is NaN or infinite", where=path, expected="finite coordinates")
-    return points
+    @staticmethod
+    def points(path: Path) -> _Points:
+        points = _Points()
+        for where, words in _lines(path):
+            if words:
+                try:
+                    if len(words) < 7:
+                        raise ValueError("too few numbers")
+                    points.number.append(int(words[0]))
+                    points.xyz.extend(map(float, words[1:4]))
+                    points.rgb += bytes(map(int, words[4:7]))  # raises beyond 0…255
+                except (ValueError, IndexError, OverflowError) as error:
+                    raise _damaged(where, error, "POINT3D_ID X Y Z R G B ERROR TRACK…") from error
+        return points
 
 
 # Binary (little-endian, without padding)
@@ -316,51 +272,45 @@ class _Cursor:
         )
 
 
-def _read_cameras_bin(path: Path) -> dict[int, Camera]:
-    cursor, cameras = _Cursor(path), {}
-    (count,) = cursor.take("Q", "its count")
-    for row in range(count):
-        where = f"camera {row + 1} of {count}"
-        number, model, width, height = cursor.take("iiQQ", where)
-        name = _BY_NUMBER[model] if 0 <= model < len(_BY_NUMBER) else f"number {model}"
-        parameters = cursor.take(f"{_MODELS[name][1]}d", where) if name in _MODELS else ()
-        cameras[number] = _camera(name, width, height, list(parameters), str(path))
-    return cameras
+class _Binary:
+    """A model in binary files."""
 
+    @staticmethod
+    def cameras(path: Path) -> dict[int, Camera]:
+        cursor, cameras = _Cursor(path), {}
+        (count,) = cursor.take("Q", "its count")
+        for row in range(count):
+            where = f"camera {row + 1} of {count}"
+            number, model, width, height = cursor.take("iiQQ", where)
+            name = _BY_NUMBER[model] if 0 <= model < len(_BY_NUMBER) else f"number {model}"
+            parameters = cursor.take(f"{_MODELS[name][1]}d", where) if name in _MODELS else ()
+            cameras[number] = _camera(name, width, height, list(parameters), str(path))
+        return cameras
 
-def _read_images_bin(path: Path) -> list[_Image]:
-    cursor, images = _Cursor(path), []
-    observation = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
-    (count,) = cursor.take("Q", "its count")
-    for row in range(count):
-        where = f"image {row + 1} of {count}"
-        _, *pose, camera = cursor.take("I7dI", where)
-        name = cursor.text(where)
-        (length,) = cursor.take("Q", where)
-        table = cursor.rows(length, observation, where)
-        images.append(
-            _Image(
-                name,
-                camera,
-                tuple(pose[:4]),
-                tuple(pose[4:]),
-                table["xy"].astype(np.float64),
-                table["point"].astype(np.int64),
-                str(path),
-            )
-        )
-    return images
+    @staticmethod
+    def images(path: Path) -> list[_Image]:
+        cursor, images = _Cursor(path), []
+        observation = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+        (count,) = cursor.take("Q", "its count")
+        for row in range(count):
+            where = f"image {row + 1} of {count}"
+            _, *pose, camera = cursor.take("I7dI", where)
+            name = cursor.text(where)
+            (length,) = cursor.take("Q", where)
+            table = cursor.rows(length, observation, where)
+            points = table["xy"].astype(np.float64), table["point"].astype(np.int64)
+            images.append(_Image(name, camera, tuple(pose[:4]), tuple(pose[4:]), *points, str(path)))
+        return images
 
-
-def _read_points_bin(path: Path) -> _Points:
-    cursor = _Cursor(path)
-    numbers, xyz, rgb = array("q"), array("d"), bytearray()
-    (count,) = cursor.take("Q", "its count")
-    for row in range(count):
-        where = f"point {row + 1} of {count}"
-        number, x, y, z, red, green, blue, _, length = cursor.take("q3d3BdQ", where)
-        cursor.rows(length, np.dtype("<i4, <i4"), where)
-        numbers.append(number)
-        xyz.extend((x, y, z))
-        rgb += bytes((red, green, blue))
-    return _checked_points(numbers, xyz, rgb, path)
+    @staticmethod
+    def points(path: Path) -> _Points:
+        cursor, points = _Cursor(path), _Points()
+        (count,) = cursor.take("Q", "its count")
+        for row in range(count):
+            where = f"point {row + 1} of {count}"
+            number, x, y, z, red, green, blue, _, length = cursor.take("q3d3BdQ", where)
+            cursor.rows(length, np.dtype("<i4, <i4"), where)
+            points.number.append(number)
+            points.xyz.extend((x, y, z))
+            points.rgb += bytes((red, green, blue))
+        return points

@@ -18,8 +18,8 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from wearcap.errors import WearcapError
-from wearcap.files import write_text
-from wearcap.io.formats.json_text import read_json
+from wearcap.io.formats.bounded import understood
+from wearcap.io.formats.text import read_json
 from wearcap.recording.interactions import HANDS, Interactions
 from wearcap.scene.objects import CONTACT_CLASSES
 
@@ -70,35 +70,27 @@ def read_contact_labels(path: str | Path, clock: LabelClock) -> Interactions:
     return interactions_of(parse_labels(read_json(path), clock, where=path))
 
 
-def write_contact_labels(path: str | Path, interactions: Interactions, clock: LabelClock) -> None:
-    """Write H-contact's JSON (hands and times alone) atomically. Raises WearcapError for overlapping labels."""
-    write_text(path, hcontact_text(labels_of(interactions, clock), clock))
-
-
 def hcontact_text(labels: Labels, clock: LabelClock) -> str:
     """H-contact's JSON: hands and times alone."""
-    return json.dumps({"contacts": hcontact_of(labels, clock)}, indent=1) + "\n"
-
-
-def hcontact_of(labels: Labels, clock: LabelClock) -> dict[str, list[list[float]]]:
-    """H-contact's `contacts`; a label that reaches the recording's end is written with end < start."""
-    return {
-        f"{hand}_hand": [
-            [label.start_s, label.stop_s if label.stop_s < clock.stop_s else min(-1.0, label.start_s - 1.0)]
-            for label in labels[hand]
-        ]
-        for hand in HANDS
-    }
+    return json.dumps({"contacts": annotation_of(labels, clock)["contacts"]}, indent=1) + "\n"
 
 
 def annotation_of(labels: Labels, clock: LabelClock) -> dict[str, Any]:
     """wearcap's own file: H-contact's content with objects, classes and the recording that the labels belong to."""
+    about = {"name": clock.name, "frames": clock.frames, "start_s": clock.start_s, "stop_s": clock.stop_s}
+    of_hands = {f"{hand}_hand": labels[hand] for hand in HANDS}
+
+    def span(label: Label) -> list[float]:
+        """A label that reaches the recording's end is written with end < start."""
+        whole = label.stop_s >= clock.stop_s
+        return [label.start_s, min(-1.0, label.start_s - 1.0) if whole else label.stop_s]
+
     return {
         "schema_version": SCHEMA,
-        "recording": {"name": clock.name, "frames": clock.frames, "start_s": clock.start_s, "stop_s": clock.stop_s},
-        "contacts": hcontact_of(labels, clock),
-        "objects": {f"{hand}_hand": [label.object for label in labels[hand]] for hand in HANDS},
-        "classes": {f"{hand}_hand": [label.contact_class for label in labels[hand]] for hand in HANDS},
+        "recording": about,
+        "contacts": {hand: [span(label) for label in found] for hand, found in of_hands.items()},
+        "objects": {hand: [label.object for label in found] for hand, found in of_hands.items()},
+        "classes": {hand: [label.contact_class for label in found] for hand, found in of_hands.items()},
     }
 
 
@@ -107,11 +99,8 @@ def parse_labels(content: Any, clock: LabelClock, *, where: str | Path) -> Label
     contacts = content.get("contacts") if isinstance(content, dict) else None
     names = [f"{hand}_hand" for hand in HANDS]
     if not isinstance(contacts, dict) or not all(isinstance(contacts.get(name), list) for name in names):
-        raise WearcapError(
-            "no contact labels",
-            where=where,
-            expected='{"contacts": {"left_hand": [[start, end], …], "right_hand": […]}} in seconds',
-        )
+        expected = '{"contacts": {"left_hand": [[start, end], …], "right_hand": […]}} in seconds'
+        raise WearcapError("no contact labels", where=where, expected=expected)
     if "recording" in content:
         _check_recording(content, clock, where)
     labels: Labels = {}
@@ -132,19 +121,15 @@ def parse_labels(content: Any, clock: LabelClock, *, where: str | Path) -> Label
 def _check_recording(content: dict, clock: LabelClock, where: str | Path) -> None:
     if content.get("schema_version") != SCHEMA:
         raise WearcapError(f"schema version {content.get('schema_version')}", where=where, expected=f"version {SCHEMA}")
-    about = content["recording"]
-    try:
+    with understood("does not name the recording of its labels", where):
+        about = content["recording"]
         name, frames, span = about["name"], about["frames"], (about["start_s"], about["stop_s"])
         same = all(abs(a - b) < 1e-3 for a, b in zip(span, (clock.start_s, clock.stop_s)))
-    except (KeyError, TypeError) as error:
-        raise WearcapError(f"does not name the recording of its labels ({error})", where=where) from error
     if name != clock.name or frames != clock.frames or not same:
-        raise WearcapError(
-            f"labels of recording {name!r} with {frames} frames from {span[0]:.3f} to {span[1]:.3f} s",
-            where=where,
-            expected=f"{clock.name!r} with {clock.frames} frames from {clock.start_s:.3f} to {clock.stop_s:.3f} s",
-            fix="Give another output folder, or move this file away.",
-        )
+        what = f"labels of recording {name!r} with {frames} frames from {span[0]:.3f} to {span[1]:.3f} s"
+        expected = f"{clock.name!r} with {clock.frames} frames from {clock.start_s:.3f} to {clock.stop_s:.3f} s"
+        fix = "Give another output folder, or move this file away."
+        raise WearcapError(what, where=where, expected=expected, fix=fix)
 
 
 def _texts(content: dict, key: str, name: str, count: int, where: str | Path) -> list[str]:
@@ -163,20 +148,14 @@ def _span(pair: Any, clock: LabelClock, label: str, where: str | Path) -> tuple[
         raise WearcapError(f"{label} is {pair!r}"[:200], where=where, expected="[start, end] in seconds")
     start, end = pair
     if start == end:
-        raise WearcapError(
-            f"{label} is empty: {start} to {end} s",
-            where=where,
-            expected="an end after the start",
-            fix="Delete the label, or write an end before its start where it lasts to the end.",
-        )
+        what = f"{label} is empty: {start} to {end} s"
+        fix = "Delete the label, or write an end before its start where it lasts to the end."
+        raise WearcapError(what, where=where, expected="an end after the start", fix=fix)
     stop = clock.stop_s if end < start else end
     if not (clock.start_s - SLACK_S <= start < clock.stop_s - 1e-9 and clock.start_s < stop <= clock.stop_s + SLACK_S):
-        raise WearcapError(
-            f"{label} from {start} to {end} s is outside the recording",
-            where=where,
-            expected=f"times from {clock.start_s:.3f} to {clock.stop_s:.3f} s",
-            fix="Is it the file of another recording?",
-        )
+        what = f"{label} from {start} to {end} s is outside the recording"
+        expected = f"times from {clock.start_s:.3f} to {clock.stop_s:.3f} s"
+        raise WearcapError(what, where=where, expected=expected, fix="Is it the file of another recording?")
     return max(float(start), clock.start_s), min(float(stop), clock.stop_s)
 
 
@@ -184,12 +163,9 @@ def _refuse_overlap(labels: Sequence[Label], clock: LabelClock, name: str, where
     for label, following in itertools.pairwise(labels):
         if following.start_s < label.stop_s:
             until = "to the end of the recording" if label.stop_s == clock.stop_s else f"to {label.stop_s} s"
-            raise WearcapError(
-                f"labels of {name} overlap: one from {label.start_s} {until}, the next from {following.start_s} s",
-                where=where,
-                expected="one contact of a hand at a time",
-                fix="Give the first an end before the second starts (an end before its start means: until the end).",
-            )
+            what = f"labels of {name} overlap: one from {label.start_s} {until}, the next from {following.start_s} s"
+            fix = "Give the first an end before the second starts (an end before its start means: until the end)."
+            raise WearcapError(what, where=where, expected="one contact of a hand at a time", fix=fix)
 
 
 def interactions_of(labels: Labels) -> Interactions:
@@ -208,13 +184,13 @@ def interactions_of(labels: Labels) -> Interactions:
             if any(hands):
                 found.append((start, stop, hands, *item))
     found.sort(key=lambda row: row[0])
-    column = lambda index: [row[index] for row in found]  # noqa: E731
+    start, stop, hands, objects, classes = zip(*found) if found else ((),) * 5
     return Interactions(
-        torch.tensor(column(0), dtype=torch.float64),
-        torch.tensor(column(1), dtype=torch.float64),
-        torch.tensor(column(2), dtype=torch.bool).reshape(-1, len(HANDS)),
-        tuple(column(3)),
-        tuple(column(4)),
+        torch.tensor(start, dtype=torch.float64),
+        torch.tensor(stop, dtype=torch.float64),
+        torch.tensor(hands, dtype=torch.bool).reshape(-1, len(HANDS)),
+        tuple(objects),
+        tuple(classes),
     )
 
 
@@ -224,18 +200,11 @@ def labels_of(interactions: Interactions, clock: LabelClock) -> Labels:
     Raises WearcapError where a hand would hold two objects at once, or outside the recording.
     """
     labels: Labels = {}
-    rows = list(
-        zip(
-            interactions.start_s.tolist(),
-            interactions.stop_s.tolist(),
-            interactions.hands.tolist(),
-            interactions.objects,
-            interactions.classes,
-        )
-    )
+    times, hands_of = (interactions.start_s.tolist(), interactions.stop_s.tolist()), interactions.hands.tolist()
+    rows = sorted(zip(*times, hands_of, interactions.objects, interactions.classes), key=lambda row: row[0])
     for number, hand in enumerate(HANDS):
         joined: list[Label] = []
-        for start, stop, hands, item, kind in sorted(rows, key=lambda row: row[0]):
+        for start, stop, hands, item, kind in rows:
             if not hands[number]:
                 continue
             span = _span([start, stop], clock, f"{hand}_hand's interaction", clock.name)

@@ -7,11 +7,12 @@ import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from wearcap.errors import WearcapError
-from wearcap.io.formats.bounded import open_bytes
+from wearcap.io.formats.bounded import open_bytes, understood
 
 MAX_BYTES = 1 << 31
 """Largest table that is taken into memory as a whole (2 GiB: two hours of poses at 1 kHz)."""
@@ -27,18 +28,24 @@ def open_text(path: str | Path, usual: int = MAX_BYTES) -> Iterator[Iterator[str
     Raises WearcapError as `open_bytes` does, for what is no text and for lines longer than `MAX_LINE`; errors that show
     only while reading inside the `with` block are named too.
     """
-    try:
+
+    def lines(file: io.TextIOWrapper) -> Iterator[str]:
+        while line := file.readline(MAX_LINE):
+            if len(line) == MAX_LINE:
+                what = f"a line longer than {MAX_LINE} characters"
+                raise WearcapError(what, where=path, expected="a table as text")
+            yield line
+
+    with understood("not a text file", path, "UTF-8 text", errors=UnicodeDecodeError):  # noqa: SIM117
         with open_bytes(path, usual=usual) as file:
-            yield _lines(io.TextIOWrapper(file, "utf-8", newline=""), path)
-    except UnicodeDecodeError as error:
-        raise WearcapError("not a text file", where=path, expected="UTF-8 text") from error
+            yield lines(io.TextIOWrapper(file, "utf-8", newline=""))
 
 
-def _lines(file: io.TextIOWrapper, path: str | Path) -> Iterator[str]:
-    while line := file.readline(MAX_LINE):
-        if len(line) == MAX_LINE:
-            raise WearcapError(f"a line longer than {MAX_LINE} characters", where=path, expected="a table as text")
-        yield line
+def load_rows(lines: Iterable[str], what: str, where: str | Path, expected: str, **options: Any) -> np.ndarray:
+    """`numpy.loadtxt` of comma-separated lines, of which there may be none; its errors become WearcapError."""
+    with warnings.catch_warnings(), understood(what, where, expected, errors=(ValueError, OverflowError)):
+        warnings.simplefilter("ignore", UserWarning)  # numpy warns about an empty file
+        return np.loadtxt(lines, delimiter=",", **options)
 
 
 def read_header(path: str | Path) -> list[str]:
@@ -75,18 +82,24 @@ def iter_columns(
     for name in wanted:
         if name not in header:
             near = difflib.get_close_matches(name, header, n=1)
-            raise WearcapError(
-                f"no column {name!r}",
-                where=path,
-                expected=f"the columns {', '.join(wanted)}",
-                fix=f"The nearest is {near[0]!r}." if near else "",
-            )
+            fix = f"The nearest is {near[0]!r}." if near else ""
+            raise WearcapError(f"no column {name!r}", where=path, expected=f"the columns {', '.join(wanted)}", fix=fix)
     kinds = dict.fromkeys(columns, "f8") | dict.fromkeys(text, "S64") | dict.fromkeys(whole, "i8")
     done = 0
     with open_text(path, MAX_BYTES if rows is None else MAX_STREAMED_BYTES) as file:
         next(file)
         while True:
-            table = _read_rows(file, path, header, kinds, rows, done)
+            table = load_rows(
+                file,
+                f"not a table of numbers; rows count from {f'row {done}' if done else 'after the header'}",
+                path,
+                f"{len(header)} comma-separated fields in every line",
+                dtype=np.dtype(list(kinds.items())),
+                usecols=[header.index(name) for name in kinds],
+                comments=None,
+                ndmin=1,
+                max_rows=rows,
+            )
             if not len(table) and not done:
                 raise WearcapError("a header line, but no rows", where=path)
             if len(table):
@@ -94,27 +107,3 @@ def iter_columns(
             done += len(table)
             if rows is None or len(table) < rows:
                 return
-
-
-def _read_rows(
-    file: Iterable[str], path: str | Path, header: list[str], kinds: dict[str, str], rows: int | None, done: int
-) -> np.ndarray:
-    """The next rows of an open file as a structured array; `done` were read before."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # numpy warns about an empty file; the WearcapError follows
-        try:
-            return np.loadtxt(
-                file,
-                dtype=np.dtype(list(kinds.items())),
-                delimiter=",",
-                usecols=[header.index(name) for name in kinds],
-                comments=None,
-                ndmin=1,
-                max_rows=rows,
-            )
-        except (ValueError, OverflowError) as error:
-            raise WearcapError(
-                f"not a table of numbers ({error}; rows count from {f'row {done}' if done else 'after the header'})",
-                where=path,
-                expected=f"{len(header)} comma-separated fields in every line",
-            ) from error

@@ -9,13 +9,16 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float64
+from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
-from wearcap.io.formats.json_text import read_json
+from wearcap.io.formats.bounded import placed
 from wearcap.io.formats.ply import Ply, read_ply, write_ply
+from wearcap.io.formats.poses import are_rotations
+from wearcap.io.formats.text import read_json
 from wearcap.scene.environment import Environment, hinge_gap_m
 from wearcap.scene.objects import FREEDOMS, Freedom, SceneObject
 
@@ -34,8 +37,6 @@ _FREEDOM_KEYS = {
 _OPTIONAL = ("limits_deg", "limits_m")
 _ORTHOGONAL_WITHIN = 1e-3
 _LARGEST = float(np.finfo(np.float32).max)
-_COLOR = np.array([0.7, 0.7, 0.7], np.float32)
-"""Colour of meshes without one."""
 
 
 def read_environment(path: str | Path) -> Environment:
@@ -50,18 +51,13 @@ def read_environment(path: str | Path) -> Environment:
     if not isinstance(content, dict) or not isinstance(content.get("objects"), list):
         raise WearcapError("not an environment", where=path, expected='{"schema_version": 1, "objects": […]}')
     if content.get("schema_version") != SCHEMA:
-        raise WearcapError(
-            f"schema version {content.get('schema_version')!r}",
-            where=path,
-            expected=str(SCHEMA),
-            fix="Read it with the wearcap that wrote it, or update.",
-        )
+        what = f"schema version {content.get('schema_version')!r}"
+        fix = "Read it with the wearcap that wrote it, or update."
+        raise WearcapError(what, where=path, expected=str(SCHEMA), fix=fix)
     _require_keys(content, ("schema_version", "objects"), path)
     objects = tuple(_object(row, number, path) for number, row in enumerate(content["objects"]))
-    try:
+    with placed(path):
         return Environment(objects)
-    except WearcapError as error:
-        raise WearcapError(error.what, where=path, expected=error.expected) from error
 
 
 def write_environment(environment: Environment, path: str | Path) -> None:
@@ -75,10 +71,9 @@ def write_environment(environment: Environment, path: str | Path) -> None:
     for item in environment.objects:
         where = f"{path}: object {item.name!r}"
         _check(item, where)
-        row = _row(item, f"objects/{_file_name(item.name, taken)}.ply", where)
-        rows.append(row)
+        rows.append(_row(item, f"objects/{_file_name(item.name, taken)}.ply", where))
     for item, row in zip(environment.objects, rows):
-        write_ply(_ply(item.mesh), path.parent / row["mesh"])
+        write_ply(Ply.of(item.mesh), path.parent / row["mesh"])
     lines = ",\n  ".join(json.dumps(row, ensure_ascii=False, allow_nan=False) for row in rows)
     write_text(path, f'{{"schema_version": {SCHEMA}, "objects": [\n  {lines}\n]}}\n')
 
@@ -89,25 +84,16 @@ def _object(row: Any, number: int, path: Path) -> SceneObject:
     if not named:
         raise WearcapError("an object without a name", where=where, expected=f"an object with {', '.join(_KEYS)}")
     if row.get("freedom") is None:
-        raise WearcapError(
-            "no degree of freedom",
-            where=where,
-            expected=f'"freedom": {{"kind": one of {", ".join(FREEDOMS)}}}',
-            fix="What cannot move belongs to the scan and not among the objects.",
-        )
+        what = "no degree of freedom"
+        fix = "What cannot move belongs to the scan and not among the objects."
+        raise WearcapError(what, where=where, expected=f'"freedom": {{"kind": one of {", ".join(FREEDOMS)}}}', fix=fix)
     _require_keys(row, _KEYS, where)
     if not isinstance(row["category"], str):
         raise WearcapError(f"category {row['category']!r}", where=where, expected="text")
-    R = _rotation(row["R_world_object"], where)
+    R = _rotation(row["R_world_object"], where).float()
     t = torch.from_numpy(_numbers(row["t_world_object"], (3,), "t_world_object", where)).float()
-    item = SceneObject(
-        row["name"],
-        row["category"],
-        _mesh(row["mesh"], path, where),
-        torch.from_numpy(R).float(),
-        t,
-        _freedom(row["freedom"], where),
-    )
+    mesh, freedom = _mesh(row["mesh"], path, where), _freedom(row["freedom"], where)
+    item = SceneObject(row["name"], row["category"], mesh, R, t, freedom)
     _check(item, where)
     return item
 
@@ -125,41 +111,24 @@ def _freedom(row: Any, where: str) -> Freedom:
         if limits[0] > limits[1]:
             raise WearcapError(f"{key} {limits.tolist()} are reversed", where=where, expected="[least, greatest]")
         limits = tuple((np.radians(limits) if key == "limits_deg" else limits).tolist())
-    try:
+    with placed(where):
         return Freedom(kind, pivot, axis, limits)
-    except WearcapError as error:
-        raise WearcapError(error.what, where=where, expected=error.expected) from error
 
 
 def _mesh(name: Any, path: Path, where: str) -> Mesh:
-    inside = (
-        isinstance(name, str)
-        and name
-        and "\0" not in name
-        and "\\" not in name
-        and len(name.encode(errors="replace")) < 256
-    )
-    if not inside or PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-        raise WearcapError(
-            f"mesh {name!r}",
-            where=where,
-            expected="a .ply file below the environment's folder",
-            fix="Copy it there and name it relatively, as objects/sofa_1.ply.",
-        )
+    plain = isinstance(name, str) and name and not set(name) & {"\0", "\\"} and len(name.encode(errors="replace")) < 256
+    if not plain or PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+        what = f"mesh {name!r}"
+        fix = "Copy it there and name it relatively, as objects/sofa_1.ply."
+        raise WearcapError(what, where=where, expected="a .ply file below the environment's folder", fix=fix)
     file = path.parent / name
     if not file.is_file():
-        raise WearcapError(
-            f"its mesh {name} is missing",
-            where=where,
-            expected=str(file),
-            fix="Copy the folder objects/ together with the environment.",
-        )
-    ply = read_ply(file)
-    if not len(ply.points):
+        fix = "Copy the folder objects/ together with the environment."
+        raise WearcapError(f"its mesh {name} is missing", where=where, expected=str(file), fix=fix)
+    mesh = read_ply(file).mesh
+    if not len(mesh.vertices):
         raise WearcapError("an empty mesh", where=file, expected="at least one point")
-    color = _COLOR if ply.colors is None else ply.colors.astype(np.float32) / 255
-    faces = np.zeros((0, 3), np.int32) if ply.faces is None else ply.faces
-    return Mesh(ply.points, faces, color)
+    return mesh
 
 
 def _row(item: SceneObject, mesh: str, where: str) -> dict[str, Any]:
@@ -170,27 +139,17 @@ def _row(item: SceneObject, mesh: str, where: str) -> dict[str, Any]:
     if freedom.axis is not None:
         row["axis"] = list(freedom.axis)
     if limits is not None and freedom.kind not in ("hinge", "axis"):
-        raise WearcapError(
-            f"limits of an object that is {freedom.kind!r}",
-            where=where,
-            expected="limits of hinges and of slides along an axis alone",
-        )
+        what = f"limits of an object that is {freedom.kind!r}"
+        raise WearcapError(what, where=where, expected="limits of hinges and of slides along an axis alone")
     if limits is not None:
         hinge = freedom.kind == "hinge"
         row["limits_deg" if hinge else "limits_m"] = [math.degrees(v) if hinge else v for v in limits]
-    return {
-        "name": item.name,
-        "category": item.category,
-        "mesh": mesh,
-        "R_world_object": [[_shortest(v) for v in line] for line in item.R_world_object.tolist()],
-        "t_world_object": [_shortest(v) for v in item.t_world_object.tolist()],
-        "freedom": row,
-    }
-
-
-def _shortest(value: float) -> float:
-    """A single-precision number with the fewest digits that identify it."""
-    return float(f"{value:.9g}")
+    # The fewest digits that identify a single-precision number.
+    *R, t = [
+        [float(f"{v:.9g}") for v in line] for line in (*item.R_world_object.tolist(), item.t_world_object.tolist())
+    ]
+    values = (item.name, item.category, mesh, R, t, row)
+    return dict(zip(_KEYS, values))
 
 
 def _file_name(name: str, taken: set[str]) -> str:
@@ -205,16 +164,6 @@ def _file_name(name: str, taken: set[str]) -> str:
     return free
 
 
-def _ply(mesh: Mesh) -> Ply:
-    """The mesh with a colour per vertex: faces with their own colour get their own vertices."""
-    vertices, faces, color = mesh.vertices, mesh.faces, mesh.color
-    if color.ndim == 2 and len(color) != len(vertices):
-        vertices, color = vertices[faces.ravel()], np.repeat(color, 3, axis=0)
-        faces = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
-    colors = np.broadcast_to(np.clip(np.rint(color * 255), 0, 255).astype(np.uint8), vertices.shape)
-    return Ply(np.ascontiguousarray(vertices), np.ascontiguousarray(colors), faces if len(faces) else None)
-
-
 def _check(item: SceneObject, where: str) -> None:
     """Raise WearcapError for properties that no object can have."""
     pose = [*item.R_world_object.flatten().tolist(), *item.t_world_object.tolist()]
@@ -226,24 +175,18 @@ def _check(item: SceneObject, where: str) -> None:
     _rotation(item.R_world_object.tolist(), where)
     gap = hinge_gap_m(item)
     if gap > MAX_HINGE_GAP_M:
-        raise WearcapError(
-            f"its hinge is {gap:.2f} m from its mesh, seen from above",
-            where=where,
-            expected=f"at most {MAX_HINGE_GAP_M} m",
-            fix="The pivot is a point of the world, in metres.",
-        )
+        what = f"its hinge is {gap:.2f} m from its mesh, seen from above"
+        expected = f"at most {MAX_HINGE_GAP_M} m"
+        raise WearcapError(what, where=where, expected=expected, fix="The pivot is a point of the world, in metres.")
 
 
-def _rotation(value: Any, where: str) -> Float64[np.ndarray, "3 3"]:
+def _rotation(value: Any, where: str) -> Float64[Tensor, "3 3"]:
     """The rotation nearest to a matrix that is a rotation up to rounding."""
-    R = _numbers(value, (3, 3), "R_world_object", where)
-    if np.abs(R.T @ R - np.eye(3)).max() > _ORTHOGONAL_WITHIN or np.linalg.det(R) < 0:
-        raise WearcapError(
-            "R_world_object is no rotation",
-            where=where,
-            expected=f"an orthogonal matrix (within {_ORTHOGONAL_WITHIN}) of determinant +1",
-        )
-    return rotation.mean_rotation(torch.from_numpy(R)[None]).numpy()
+    R = torch.from_numpy(_numbers(value, (3, 3), "R_world_object", where))
+    if not are_rotations(R, _ORTHOGONAL_WITHIN):
+        expected = f"an orthogonal matrix (within {_ORTHOGONAL_WITHIN}) of determinant +1"
+        raise WearcapError("R_world_object is no rotation", where=where, expected=expected)
+    return rotation.mean_rotation(R[None])
 
 
 def _numbers(value: Any, shape: tuple[int, ...], key: str, where: str) -> Float64[np.ndarray, "..."]:

@@ -1,23 +1,27 @@
 """Motion as glTF 2.0 binary (.glb): an animated, skinned figure that Blender and web viewers open.
 
 One node per joint, with wearcap's axes and offsets, below a node that turns z up into glTF's y up. The inverse bind
-matrices undo the rest pose with the root at the origin, the pose of a body's vertices.
+matrices undo the rest pose with the root at the origin, the pose of a body's vertices. Without a body model, sticks stand
+for its bones.
 """
 
 import json
 import struct
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+import torch
+from jaxtyping import Float, Float32, Float64, Int
 from torch import Tensor
 
 from wearcap.body.model import BodyModel
+from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 from wearcap.geometry import rotation
-from wearcap.io.formats.gltf_mesh import SkinnedMesh, skin_of, sticks
+from wearcap.geometry.mesh import Mesh, capsules
 from wearcap.recording.motion import Motion
 
 _Z_UP_XYZW = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
@@ -31,6 +35,58 @@ _MATERIAL = {
     "doubleSided": True,
     "pbrMetallicRoughness": {"baseColorFactor": [0.62, 0.68, 0.76, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.7},
 }
+_THICK_M, _THIN_M = 0.022, 0.012
+"""Radii (m) of a stick at its start and its end."""
+
+_GREY = np.full(3, 0.7, np.float32)
+
+
+@dataclass(frozen=True)
+class _SkinnedMesh:
+    """A mesh in the rest pose (m, wearcap's axes, root at the origin), with up to four weighted joints per vertex."""
+
+    mesh: Mesh
+    joints: Int[np.ndarray, "vertex 4"]
+    weights: Float32[np.ndarray, "vertex 4"]
+    rest_joints: Float[Tensor, "joint 3"]
+
+    @property
+    def normals(self) -> Float32[np.ndarray, "vertex 3"]:
+        """Unit normals; upwards at vertices without a face, for glTF wants every one of unit length."""
+        normals = self.mesh.vertex_normals
+        loose = np.linalg.norm(normals, axis=-1, keepdims=True) < 0.5
+        return np.where(loose, np.float32([0, 0, 1]), normals).astype(np.float32)
+
+    @classmethod
+    def of_body(cls, body: BodyModel, skeleton: Skeleton) -> "_SkinnedMesh":
+        """A body model's skin. Raises WearcapError when the motion's skeleton has other joints than the body."""
+        if body.skeleton.joint_names != skeleton.joint_names:
+            what = f"the motion has skeleton {skeleton.name!r}, the body {body.skeleton.name!r}"
+            expected = "the same joints"
+            raise WearcapError(what, expected=expected, fix="Make the body for the motion's skeleton, or retarget.")
+        mesh = Mesh(body.rest_vertices.float().numpy(), body.faces.int().numpy(), _GREY, smooth=True)
+        weights = body.skin_weights.float().numpy()
+        # Joints without weight must be named as joint 0.
+        joints = np.where(weights > 0, body.skin_joints.numpy(), 0)
+        return cls(mesh, joints, weights / weights.sum(-1, keepdims=True), body.skeleton.rest_joints)
+
+    @classmethod
+    def sticks(cls, skeleton: Skeleton) -> "_SkinnedMesh":
+        """A rounded stick along every bone and out to every site; each moves with the joint it starts from."""
+        bones = [(parent, skeleton.t_parent_joint[joint]) for joint, parent in enumerate(skeleton.parents) if joint]
+        bones += [(skeleton.index(site.joint), torch.tensor(site.t_joint_site)) for site in skeleton.sites.values()]
+        bones.append((0, torch.zeros(3)))
+        owners = np.array([joint for joint, _ in bones])
+        start = skeleton.rest_joints.double().numpy()[owners]
+        end = start + torch.stack([offset for _, offset in bones]).double().numpy()
+        mesh = capsules(
+            start, end, np.full(len(bones), _THICK_M), np.full(len(bones), _THIN_M), np.tile(_GREY, (len(bones), 1)), 8
+        )
+        joints = np.zeros((len(mesh.vertices), 4), dtype=np.int64)
+        joints[:, 0] = np.repeat(owners, len(mesh.vertices) // len(bones))
+        weights = np.zeros((len(mesh.vertices), 4), dtype=np.float32)
+        weights[:, 0] = 1
+        return cls(mesh, joints, weights, skeleton.rest_joints)
 
 
 def write_glb(motion: Motion, path: str | Path, body: BodyModel | None = None) -> None:
@@ -48,9 +104,9 @@ def write_glb(motion: Motion, path: str | Path, body: BodyModel | None = None) -
     if not all((clock.diff() > 0).all() for clock in clocks):
         raise WearcapError("timestamps repeat or fall", where=path, expected="rising timestamps")
     joints = len(motion.skeleton)
-    shown = sticks(motion.skeleton) if body is None else skin_of(body, motion.skeleton)
+    shown = _SkinnedMesh.sticks(motion.skeleton) if body is None else _SkinnedMesh.of_body(body, motion.skeleton)
     figure = _Figure(start_s=min(clock[0].item() for clock in clocks))
-    figure.nodes = _joint_nodes(motion)
+    figure.add_joints(motion)
     figure.animate(motion.timestamps, dict(enumerate(motion.R_parent_joint.unbind(1), 1)), {1: motion.t_world_root})
     for name, track in tracks.items():
         if len(track):
@@ -70,21 +126,7 @@ def write_glb(motion: Motion, path: str | Path, body: BodyModel | None = None) -
         "skins": [skin],
         "animations": [{"name": "motion", "samplers": figure.samplers, "channels": figure.channels}],
     }
-    _write(path, document, figure)
-
-
-def _joint_nodes(motion: Motion) -> list[dict[str, Any]]:
-    """Node 0 turns the axes; joint k of the skeleton is node k + 1, posed as in the first frame."""
-    skeleton, quat_xyzw = motion.skeleton, _quat_xyzw(motion.R_parent_joint[0]).tolist()
-    offsets = skeleton.t_parent_joint.tolist()
-    offsets[0] = motion.t_world_root[0].tolist()
-    nodes: list[dict[str, Any]] = [{"name": "z_up", "rotation": _Z_UP_XYZW, "children": [1]}]
-    for joint, name in enumerate(skeleton.joint_names):
-        nodes.append({"name": name, "translation": offsets[joint], "rotation": quat_xyzw[joint]})
-        children = [1 + child for child, parent in enumerate(skeleton.parents) if parent == joint]
-        if children:
-            nodes[-1]["children"] = children
-    return nodes
+    figure.write(path, document)
 
 
 def _quat_xyzw(R: Float[Tensor, "element 3 3"]) -> Float32[np.ndarray, "element 4"]:
@@ -106,6 +148,18 @@ class _Figure:
         self.nodes: list[dict[str, Any]] = []
         self.samplers: list[dict[str, Any]] = []
         self.channels: list[dict[str, Any]] = []
+
+    def add_joints(self, motion: Motion) -> None:
+        """Node 0 turns the axes; joint k of the skeleton is node k + 1, posed as in the first frame."""
+        skeleton, quat_xyzw = motion.skeleton, _quat_xyzw(motion.R_parent_joint[0]).tolist()
+        offsets = skeleton.t_parent_joint.tolist()
+        offsets[0] = motion.t_world_root[0].tolist()
+        self.nodes.append({"name": "z_up", "rotation": _Z_UP_XYZW, "children": [1]})
+        for joint, name in enumerate(skeleton.joint_names):
+            self.nodes.append({"name": name, "translation": offsets[joint], "rotation": quat_xyzw[joint]})
+            children = [1 + child for child, parent in enumerate(skeleton.parents) if parent == joint]
+            if children:
+                self.nodes[-1]["children"] = children
 
     def add(self, array: np.ndarray, target: int | None = None, bounds: bool = False) -> int:
         """Append one array, a row per element, with its bounds where the format wants them; returns its accessor."""
@@ -140,13 +194,13 @@ class _Figure:
             self.channels.append({"sampler": len(self.samplers), "target": {"node": node, "path": path}})
             self.samplers.append({"input": time, "output": self.add(values), "interpolation": "LINEAR"})
 
-    def inverse_bind(self, skin: SkinnedMesh) -> int:
+    def inverse_bind(self, skin: _SkinnedMesh) -> int:
         """Accessor of the matrices that bring rest vertices into each joint's frame (column-major)."""
         matrices = np.tile(np.eye(4, dtype=np.float32), (len(skin.rest_joints), 1, 1))
         matrices[:, 3, :3] = -skin.rest_joints.float().numpy()
         return self.add(matrices)
 
-    def primitive(self, skin: SkinnedMesh) -> dict[str, Any]:
+    def primitive(self, skin: _SkinnedMesh) -> dict[str, Any]:
         attributes = {
             "POSITION": self.add(skin.mesh.vertices, _VERTICES, bounds=True),
             "NORMAL": self.add(skin.normals, _VERTICES),
@@ -156,18 +210,17 @@ class _Figure:
         indices = self.add(skin.mesh.faces.astype(np.uint32).reshape(-1), _INDICES)
         return {"attributes": attributes, "indices": indices, "material": 0}
 
-
-def _write(path: str | Path, document: dict[str, Any], figure: _Figure) -> None:
-    """GLB: a header and two chunks, each padded to four bytes (glTF 2.0 §4.4)."""
-    document |= {
-        "buffers": [{"byteLength": len(figure.binary)}],
-        "bufferViews": figure.views,
-        "accessors": figure.accessors,
-    }
-    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-    text += b" " * (-len(text) % 4)
-    binary = bytes(figure.binary) + b"\0" * (-len(figure.binary) % 4)
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(binary)))
-        file.write(struct.pack("<I4s", len(text), b"JSON") + text)
-        file.write(struct.pack("<I4s", len(binary), b"BIN\0") + binary)
+    def write(self, path: str | Path, document: dict[str, Any]) -> None:
+        """GLB: a header and two chunks, each padded to four bytes (glTF 2.0 §4.4)."""
+        document |= {
+            "buffers": [{"byteLength": len(self.binary)}],
+            "bufferViews": self.views,
+            "accessors": self.accessors,
+        }
+        text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+        text += b" " * (-len(text) % 4)
+        binary = bytes(self.binary) + b"\0" * (-len(self.binary) % 4)
+        with atomic_path(path) as temporary, open(temporary, "wb") as file:
+            file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(binary)))
+            file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+            file.write(struct.pack("<I4s", len(binary), b"BIN\0") + binary)

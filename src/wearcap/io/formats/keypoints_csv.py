@@ -3,19 +3,17 @@
 A row is one joint at one time, in any order. A file holds pixels or 3D positions, not both.
 """
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from wearcap.errors import WearcapError
-from wearcap.files import write_text
 from wearcap.io.formats.csv_table import read_columns, read_header
 from wearcap.recording.recording import Cue
 
-AXES = "xyz"
-MAX_PLACE = 1e9
+_AXES = "xyz"
+_MAX_PLACE = 1e9
 """Largest coordinate (m or pixels); larger numbers need not be finite as float32."""
 
 
@@ -25,7 +23,7 @@ def read_keypoints(path: str | Path) -> dict[str, Cue]:
     Raises WearcapError for a missing column, a field that is no number, a time, place or confidence that cannot be one,
     and a joint that occurs twice at one time. Whether a skeleton has the joints is not checked here.
     """
-    axes = list(AXES if "z" in read_header(path) else AXES[:2])
+    axes = list(_AXES if "z" in read_header(path) else _AXES[:2])
     table = read_columns(path, ["timestamp", *axes, "confidence"], text=["joint"])
     times, confidence = table["timestamp"], table["confidence"]
     points = np.stack([table[axis] for axis in axes], -1)
@@ -34,54 +32,19 @@ def read_keypoints(path: str | Path) -> dict[str, Cue]:
     for wrong, what, expected in (
         (~np.isfinite(times), "a timestamp that is no time", "seconds"),
         (~((confidence >= 0) & (confidence <= 1)), "a confidence that is none", "0 to 1"),
-        (observed & ~(np.abs(points) <= MAX_PLACE).all(-1), "a place that is none", "numbers, or a confidence of 0"),
+        (observed & ~(np.abs(points) <= _MAX_PLACE).all(-1), "a place that is none", "numbers, or a confidence of 0"),
         (joints == "", "no joint", "a joint's name"),
     ):
         if wrong.any():
             raise WearcapError(what, where=f"{path}, row {int(wrong.argmax()) + 1} after the header", expected=expected)
-    return {
-        str(joint): _cue(
-            path, str(joint), *(part[observed & (joints == joint)] for part in (times, points, confidence))
-        )
-        for joint in np.unique(joints[observed])
-    }
-
-
-def write_keypoints(cues: Mapping[str, Cue], path: str | Path) -> None:
-    """Write cues atomically, rows sorted by time; cues without confidence are left out.
-
-    Raises WearcapError when nothing is left, for two cues of one joint, and for pixels beside places.
-    """
-    axes = {cue.points.shape[-1] for cue in cues.values()}
-    if len(axes) > 1 or len({cue.joint for cue in cues.values()}) < len(cues):
-        raise WearcapError(
-            "keypoints of several kinds, or twice of one joint",
-            where=path,
-            expected="pixels or places, one cue per joint",
-        )
-    rows = []
-    for cue in cues.values():
-        observed = (cue.confidence > 0) & cue.points.isfinite().all(-1)
-        for time, point, confidence in zip(
-            cue.timestamps[observed].tolist(), cue.points[observed].tolist(), cue.confidence[observed].tolist()
-        ):
-            rows.append((time, cue.joint, [*point, confidence]))
-    if not rows:
-        raise WearcapError("no keypoints to write", where=path, expected="one at least")
-    lines = [",".join(["timestamp", "joint", *AXES[: axes.pop()], "confidence"])]
-    lines += [",".join([repr(time), joint, *(f"{v:.9g}" for v in rest)]) for time, joint, rest in sorted(rows)]
-    write_text(path, "\n".join(lines) + "\n")
-
-
-def _cue(path: str | Path, joint: str, times: np.ndarray, points: np.ndarray, confidence: np.ndarray) -> Cue:
-    order = np.argsort(times, kind="stable")
-    times = times[order]
-    if (np.diff(times) == 0).any():
-        twice = times[:-1][np.diff(times) == 0][0]
-        raise WearcapError(f"{joint!r} is twice at {twice:.6f} s", where=path, expected="one row per joint and time")
-    return Cue(
-        torch.from_numpy(times),
-        joint,
-        torch.from_numpy(points[order]).float(),
-        torch.from_numpy(confidence[order]).float(),
-    )
+    cues = {}
+    for joint in map(str, np.unique(joints[observed])):
+        rows = np.flatnonzero(observed & (joints == joint))
+        rows = rows[np.argsort(times[rows], kind="stable")]
+        twice = rows[1:][np.diff(times[rows]) == 0]
+        if len(twice):
+            what = f"{joint!r} is twice at {times[twice[0]]:.6f} s"
+            raise WearcapError(what, where=path, expected="one row per joint and time")
+        place, sure = (torch.from_numpy(part[rows]).float() for part in (points, confidence))
+        cues[joint] = Cue(torch.from_numpy(times[rows]), joint, place, sure)
+    return cues

@@ -1,4 +1,4 @@
-"""wearcap's motion file: one .npz that holds a Motion exactly, readable with NumPy alone.
+"""wearcap's motion file: one .npz that holds a Motion exactly, readable with NumPy alone; frames on an even time grid.
 
 Arrays by the Motion's field names (`timestamps`, `R_parent_joint`, `skeleton.t_parent_joint`, …), `wearcap` (JSON with
 everything that is no array), and for tools that know AMASS' keys `trans`, `poses` (axis-angle of each joint in its
@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Int64
+from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, parse_json
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.formats.frame_grid import nominal_fps
 from wearcap.io.formats.npz import read_npz, require
 from wearcap.recording.interactions import HANDS, Interactions
 from wearcap.recording.motion import Motion
@@ -46,12 +47,8 @@ def read_motion(path: str | Path) -> Motion:
     """Read what `write_motion` wrote. Raises WearcapError when it is missing, damaged, not finite or foreign."""
     arrays = read_npz(path)
     if "wearcap" not in arrays:
-        raise WearcapError(
-            "an .npz file, but not of ours",
-            where=path,
-            expected="one that write_motion wrote",
-            fix="AMASS files are read by io.datasets.amass.",
-        )
+        fix = "AMASS files are read by io.datasets.amass."
+        raise WearcapError("an .npz file, but not of ours", where=path, expected="one that write_motion wrote", fix=fix)
     try:
         tree = parse_json(str(arrays.pop("wearcap")), path)
         version = tree["schema"]
@@ -77,37 +74,26 @@ def _check(motion: Motion, path: str | Path) -> None:
     if not isinstance(motion, Motion):
         raise WearcapError("holds no motion", where=path)
     skeleton = motion.skeleton
-    arrays = {
-        "timestamps": motion.timestamps,
-        "R_parent_joint": motion.R_parent_joint,
-        "t_world_root": motion.t_world_root,
-        "t_parent_joint": skeleton.t_parent_joint,
+    parts: dict[str, tuple[Tensor | None, tuple[int | str, ...]]] = {
+        "timestamps": (motion.timestamps, ("time",)),
+        "R_parent_joint": (motion.R_parent_joint, ("time", len(skeleton), 3, 3)),
+        "t_world_root": (motion.t_world_root, ("time", 3)),
+        "t_parent_joint": (skeleton.t_parent_joint, (len(skeleton), 3)),
+        "contact_prob": (motion.contact_prob, ("time", "patch")),
+        "hand_contact_prob": (motion.hand_contact_prob, ("time", len(HANDS))),
+        "body_contact_prob": (motion.body_contact_prob, ("time", "point")),
     }
-    shapes: dict[str, tuple[int | str, ...]] = {
-        "timestamps": ("time",),
-        "R_parent_joint": ("time", len(skeleton), 3, 3),
-        "t_world_root": ("time", 3),
-        "t_parent_joint": (len(skeleton), 3),
-    }
-    if motion.contact_prob is not None:
-        arrays["contact_prob"], shapes["contact_prob"] = motion.contact_prob, ("time", "patch")
-    if motion.hand_contact_prob is not None:
-        arrays["hand_contact_prob"], shapes["hand_contact_prob"] = (motion.hand_contact_prob, ("time", len(HANDS)))
-    if motion.body_contact_prob is not None:
-        arrays["body_contact_prob"] = motion.body_contact_prob
-        shapes["body_contact_prob"] = ("time", "point")
     if motion.interactions is not None:
         _check_interactions(motion.interactions, path)
     for name, track in (motion.object_motion or {}).items():
         if not isinstance(track, Trajectory):
             raise TypeError(f"object {name!r} has no trajectory")
         clock = f"time of {name}"
-        arrays |= {
-            f"{name} timestamps": track.timestamps,
-            f"{name} R": track.R_world_body,
-            f"{name} t": track.t_world_body,
-        }
-        shapes |= {f"{name} timestamps": (clock,), f"{name} R": (clock, 3, 3), f"{name} t": (clock, 3)}
+        parts[f"{name} timestamps"] = (track.timestamps, (clock,))
+        parts[f"{name} R"] = (track.R_world_body, (clock, 3, 3))
+        parts[f"{name} t"] = (track.t_world_body, (clock, 3))
+    arrays = {key: tensor for key, (tensor, _) in parts.items() if tensor is not None}
+    shapes = {key: parts[key][1] for key in arrays}
     require({key: tensor.numpy() for key, tensor in arrays.items()}, path, **shapes)
     if motion.timestamps.dtype != torch.float64 or not all(a.is_floating_point() for a in arrays.values()):
         raise TypeError("arrays of another number type")
@@ -127,11 +113,39 @@ def _check_interactions(interactions: Interactions, path: str | Path) -> None:
         "stop_s": interactions.stop_s.numpy(),
         "hands": interactions.hands.numpy().astype(np.uint8),
     }
-    count = require(arrays, path, start_s=("interval",), stop_s=("interval",), hands=("interval", len(HANDS)))[
-        "interval"
-    ]
+    sizes = require(arrays, path, start_s=("interval",), stop_s=("interval",), hands=("interval", len(HANDS)))
+    count = sizes["interval"]
     if {interactions.start_s.dtype, interactions.stop_s.dtype} != {torch.float64}:
         raise TypeError("times of interactions of another number type")
     for names in (interactions.objects, interactions.classes):
         if not isinstance(names, tuple) or len(names) != count or not all(isinstance(name, str) for name in names):
             raise ValueError(f"names that do not match {count} interactions")
+
+
+STILL_FPS = 30.0
+"""Rate (Hz) written for a motion of a single frame, which has none."""
+
+
+def even_frames(motion: Motion) -> tuple[Int64[Tensor, "time"], float]:
+    """Index of the nearest frame at each step of the motion's nominal rate, and that rate (Hz).
+
+    An even motion keeps every frame once; over a gap the nearest frame is repeated, so that nothing shifts in time.
+    Raises WearcapError for a motion without frames or with a gap of more than a minute.
+    """
+    if len(motion) == 0:
+        raise WearcapError("the motion has no frames", expected="at least one frame to write")
+    if len(motion) == 1:
+        return torch.zeros(1, dtype=torch.int64), STILL_FPS
+    steps, fps = motion.timestamps.diff(), nominal_fps(motion.fps)
+    if not (steps > 0).all() or steps.max() > 60:
+        what = "timestamps fall, repeat or leave a gap of over a minute"
+        raise WearcapError(what, expected="rising timestamps in s", fix="Cut the motion at the gap.")
+    start, duration = motion.timestamps[0], motion.timestamps[-1] - motion.timestamps[0]
+    grid = start + torch.arange(round(duration.item() * fps) + 1, dtype=torch.float64) / fps
+    midpoints = (motion.timestamps[1:] + motion.timestamps[:-1]) / 2
+    return torch.searchsorted(midpoints, grid), fps
+
+
+def nominal_fps(fps: float) -> float:
+    """Nearest integer rate if the rate was only rounded (120.0005 Hz from a step of .0083333 s), else the rate itself."""
+    return float(round(fps)) if round(fps) and abs(fps - round(fps)) < 1e-4 * fps else fps

@@ -10,11 +10,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import Element, ParseError
+from xml.etree.ElementTree import Element
 
 import numpy as np
 import torch
-from defusedxml.common import DefusedXmlException
 from defusedxml.ElementTree import iterparse
 from jaxtyping import Float
 from torch import Tensor
@@ -23,8 +22,8 @@ from wearcap.body.kinematics import local_rotations
 from wearcap.body.skeleton import FOOT_PATCHES, Site, Skeleton, xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import matrix_from_quat_wxyz
-from wearcap.io.formats.bounded import open_bytes
-from wearcap.io.formats.text import finite_floats
+from wearcap.io.formats.bounded import open_bytes, understood
+from wearcap.io.formats.text import finite_floats, plain_xml, tag_of
 from wearcap.recording import ImuStream, Motion, Recording
 
 MAX_BYTES = 1 << 34
@@ -48,6 +47,7 @@ _JOINT_OF = {name: name for name in ("pelvis", "l5", "l3", "t12", "t8", "neck", 
     side + segment: f"{side}_{joint}" for side in ("left", "right") for segment, joint in _SIDED.items()
 }
 """Segment or sensor label (lower case, no spaces) to joint."""
+_LABEL_OF = {joint: label for label, joint in _JOINT_OF.items()}
 
 _SITE_OF = {"ptopofhead": "crown"} | {
     f"p{side}{point}": f"{side}_{site}"
@@ -86,6 +86,68 @@ class _File:
     time_ms: list[float] = field(default_factory=list)
     frames: dict[str, list[np.ndarray]] = field(default_factory=lambda: {name: [] for name in _FIELDS})
 
+    def take(self, element: Element) -> None:
+        """Add one element. Raises ValueError or LookupError for what cannot be understood."""
+        name = tag_of(element)
+        if name == "subject":
+            self.fps = float(finite_floats([element.get("frameRate", "")])[0])
+            if not 0 < self.fps < 1e5:
+                raise ValueError(f"a frame rate of {self.fps} Hz")
+        elif name == "segment":
+            label = _plain(element.attrib["label"])
+            self.segments.append(label)
+            for point in (child for child in element.iter() if tag_of(child) == "point"):
+                text = next((child.text or "" for child in point if tag_of(child) == "pos_b"), "")
+                self.points[_plain(point.attrib["label"])] = (label, finite_floats(text.split()).tolist())
+        elif name == "frame":
+            try:
+                self.take_frame(element)
+            except ValueError as error:
+                label = f"{element.get('type', 'normal')} frame {element.get('index', '')}".strip()
+                raise ValueError(f"{label}: {error}") from error
+        else:
+            items = self.sensors if name == "sensor" else self.contacts
+            items.append(_plain(element.attrib["label"]))
+
+    def take_frame(self, element: Element) -> None:
+        kind = element.get("type", "normal")
+        if kind not in (*_REST_TYPES, "normal"):
+            return
+        self.require_segments()
+        texts = {name: child.text or "" for child in element if (name := tag_of(child)) in _FIELDS}
+        values = {name: self.numbers(name, text) for name, text in texts.items()}
+        if kind in _REST_TYPES:
+            self.rest[kind] = values
+            return
+        present = {name for name, column in self.frames.items() if column} if self.index else set(values)
+        if set(values) != present or not {"orientation", "position"} <= present:
+            needed = sorted(present | {"orientation", "position"})
+            raise ValueError(f"a frame with {sorted(values)} where {needed} belong")
+        self.index.append(int(element.get("index") or len(self.index)))
+        self.time_ms.append(float(element.get("time") or "nan"))
+        for name, found in values.items():
+            self.frames[name].append(found.astype(np.float32) if name != "position" else found)
+
+    def require_segments(self) -> None:
+        if missing := sorted(set(_JOINT_OF) - set(self.segments)):
+            what = f"segments {missing[:5]} are missing"
+            raise WearcapError(what, where=self.path, expected="the 23 segments of a full-body suit")
+
+    def numbers(self, name: str, text: str) -> np.ndarray:
+        """The numbers of one of a frame's fields."""
+        listing, width = _FIELDS[name]
+        count = width * (len(getattr(self, listing)) or len(FOOT_PATCHES) * (listing == "contacts"))
+        if len(text) > 1000 + _MAX_NUMBER * count:
+            raise ValueError(f"{name} with {len(text)} characters where {count} numbers belong")
+        found = finite_floats(text.split())
+        if len(found) != count:
+            raise ValueError(f"{name} with {len(found)} values where {count} belong")
+        return found
+
+    def column(self, name: str, width: int) -> Tensor:
+        """All frames of a field, "time item feature"."""
+        return torch.from_numpy(np.stack(self.frames[name])).unflatten(1, (-1, width))
+
 
 def read_mvnx(path: str | Path, max_bytes: int | None = None) -> Recording:
     """Read an .mvnx file (plain, .gz or .xz): `motion` (xsens23 with the wearer's bones, contacts in FOOT_PATCHES order)
@@ -95,24 +157,14 @@ def read_mvnx(path: str | Path, max_bytes: int | None = None) -> Recording:
     wrong counts, NaN, and quaternions that are not of unit length. Warns when bones change length or times disagree.
     """
     file = _File(Path(path))
-    try:
-        with open_bytes(path, max_bytes, MAX_BYTES) as source:
-            chunks = _Chunks(source)
-            for element in _elements(iterparse(chunks, events=("start", "end"), forbid_dtd=True), chunks):
-                _take(file, element)
-    except DefusedXmlException as error:
-        raise WearcapError(
-            "it declares a document type or entities",
-            where=path,
-            expected="plain MVNX as MVN exports it",
-            fix="Such declarations can blow up or fetch other files, and are never read.",
-        ) from error
-    except ParseError as error:
-        raise WearcapError(
-            f"broken XML ({error.msg})", where=path, expected="a whole MVNX file", fix="Export or copy it again."
-        ) from error
-    except (ValueError, LookupError) as error:
-        raise WearcapError(f"cannot be understood ({error})", where=file.path, expected="MVNX") from error
+    with (
+        understood("cannot be understood", path, "MVNX", errors=(ValueError, LookupError)),
+        plain_xml(path, "MVNX file as MVN exports it"),
+        open_bytes(path, max_bytes, MAX_BYTES) as source,
+    ):
+        chunks = _Chunks(source)
+        for element in _elements(iterparse(chunks, events=("start", "end"), forbid_dtd=True), chunks):
+            file.take(element)
     return _recording(file)
 
 
@@ -142,7 +194,7 @@ def _elements(events: Iterator[tuple[str, Element]], chunks: _Chunks) -> Iterato
     kept = 0
     for event, element in events:
         chunks.restart()
-        name = _name(element)
+        name = tag_of(element)
         kept += event == "start"
         if kept > _MAX_ELEMENTS:
             raise ValueError(f"more than {_MAX_ELEMENTS} elements beside its frames")
@@ -157,91 +209,23 @@ def _elements(events: Iterator[tuple[str, Element]], chunks: _Chunks) -> Iterato
                 kept = 0
 
 
-def _name(element: Element) -> str:
-    return element.tag.rsplit("}", 1)[-1] if isinstance(element.tag, str) else ""
-
-
 def _plain(label: str) -> str:
     return label.replace(" ", "").replace("_", "").lower()
-
-
-def _take(file: _File, element: Element) -> None:
-    """Add one element to the content."""
-    name = _name(element)
-    if name == "subject":
-        file.fps = float(finite_floats([element.get("frameRate", "")])[0])
-        if not 0 < file.fps < 1e5:
-            raise ValueError(f"a frame rate of {file.fps} Hz")
-    elif name == "segment":
-        label = _plain(element.attrib["label"])
-        file.segments.append(label)
-        for point in (child for child in element.iter() if _name(child) == "point"):
-            text = next((child.text or "" for child in point if _name(child) == "pos_b"), "")
-            file.points[_plain(point.attrib["label"])] = (label, finite_floats(text.split()).tolist())
-    elif name == "sensor":
-        file.sensors.append(_plain(element.attrib["label"]))
-    elif name == "contactDefinition":
-        file.contacts.append(_plain(element.attrib["label"]))
-    else:
-        try:
-            _take_frame(file, element)
-        except ValueError as error:
-            label = f"{element.get('type', 'normal')} frame {element.get('index', '')}".strip()
-            raise ValueError(f"{label}: {error}") from error
-
-
-def _take_frame(file: _File, element: Element) -> None:
-    kind = element.get("type", "normal")
-    if kind not in (*_REST_TYPES, "normal"):
-        return
-    _require_segments(file)
-    values = {name: _field(file, name, child.text or "") for child in element if (name := _name(child)) in _FIELDS}
-    if kind in _REST_TYPES:
-        file.rest[kind] = values
-    else:
-        present = {name for name, column in file.frames.items() if column} if file.index else set(values)
-        if set(values) != present or not {"orientation", "position"} <= present:
-            raise ValueError(
-                f"a frame with {sorted(values)} where {sorted(present | {'orientation', 'position'})} belong"
-            )
-        file.index.append(int(element.get("index") or len(file.index)))
-        file.time_ms.append(float(element.get("time") or "nan"))
-        for name, found in values.items():
-            file.frames[name].append(found.astype(np.float32) if name != "position" else found)
-
-
-def _require_segments(file: _File) -> None:
-    if missing := sorted(set(_JOINT_OF) - set(file.segments)):
-        raise WearcapError(
-            f"segments {missing[:5]} are missing", where=file.path, expected="the 23 segments of a full-body suit"
-        )
-
-
-def _field(file: _File, name: str, text: str) -> np.ndarray:
-    """The numbers of one of a frame's fields."""
-    listing, width = _FIELDS[name]
-    count = width * (len(getattr(file, listing)) or len(FOOT_PATCHES) * (listing == "contacts"))
-    if len(text) > 1000 + _MAX_NUMBER * count:
-        raise ValueError(f"{name} with {len(text)} characters where {count} numbers belong")
-    found = finite_floats(text.split())
-    if len(found) != count:
-        raise ValueError(f"{name} with {len(found)} values where {count} belong")
-    return found
 
 
 # --- from lists to a Recording ---------------------------------------------------------------------------------
 
 
 def _recording(file: _File) -> Recording:
-    _require_segments(file)
+    file.require_segments()
     if not file.fps:
         raise WearcapError("no subject with a frame rate", where=file.path, expected='<subject frameRate="60">')
     if not file.index:
         raise WearcapError("no frames of motion", where=file.path, expected='frames of type "normal"')
     timestamps = _timestamps(file)
-    skeleton, rows = xsens23(), [file.segments.index(_label_of(name)) for name in xsens23().joint_names]
+    skeleton, rows = xsens23(), [file.segments.index(_LABEL_OF[name]) for name in xsens23().joint_names]
     R_world = matrix_from_quat_wxyz(_quaternions(file, "orientation"))[:, rows].double()
-    t_world = torch.from_numpy(np.stack(file.frames["position"])).unflatten(1, (-1, 3))[:, rows]
+    t_world = file.column("position", 3)[:, rows]
     skeleton = _fitted(file, skeleton, rows, R_world, t_world)
     motion = Motion(
         timestamps,
@@ -254,10 +238,6 @@ def _recording(file: _File) -> Recording:
     return Recording(
         file.path.name.split(".")[0], motion=motion, skeleton=skeleton, imu=_imu(file, timestamps), source="Xsens MVNX"
     )
-
-
-def _label_of(joint: str) -> str:
-    return next(label for label, name in _JOINT_OF.items() if name == joint)
 
 
 def _timestamps(file: _File) -> Tensor:
@@ -277,15 +257,12 @@ def _timestamps(file: _File) -> Tensor:
 
 
 def _quaternions(file: _File, name: str) -> Float[Tensor, "time segment 4"]:
-    quat_wxyz = torch.from_numpy(np.stack(file.frames[name])).unflatten(1, (-1, 4))
+    quat_wxyz = file.column(name, 4)
     wrong = ((quat_wxyz.norm(dim=-1) - 1).abs() > 0.02).nonzero()
     if len(wrong):
         frame, element = wrong[0].tolist()
-        raise WearcapError(
-            f"{name} {element} is no unit quaternion",
-            where=f"{file.path}, frame {file.index[frame]}",
-            expected="w x y z of length 1",
-        )
+        what = f"{name} {element} is no unit quaternion"
+        raise WearcapError(what, where=f"{file.path}, frame {file.index[frame]}", expected="w x y z of length 1")
     return quat_wxyz
 
 
@@ -328,7 +305,7 @@ def _contacts(file: _File) -> Float[Tensor, "time patch"] | None:
     """Foot contacts in FOOT_PATCHES order; files without definitions list them in that order already."""
     if not file.frames["footContacts"]:
         return None
-    contacts = torch.from_numpy(np.stack(file.frames["footContacts"]))
+    contacts = file.column("footContacts", 1)[..., 0]
     if not file.contacts:
         return contacts
     columns = []
@@ -337,22 +314,19 @@ def _contacts(file: _File) -> Float[Tensor, "time patch"] | None:
         found = [k for k, label in enumerate(file.contacts) if side in label and part in label]
         if len(found) != 1:
             raise WearcapError(f"foot contacts {file.contacts}", where=file.path, expected="heel and toe of both feet")
-        columns.append(found[0])
+        columns += found
     return contacts[:, columns]
 
 
 def _imu(file: _File, timestamps: Tensor) -> dict[str, ImuStream]:
     """One stream per sensor on a known segment, with free acceleration (m/s², world) and orientation."""
-    streams: dict[str, ImuStream] = {}
     parts: dict[str, Any] = {}
     if file.frames["sensorFreeAcceleration"]:
-        parts["acc_world"] = torch.from_numpy(np.stack(file.frames["sensorFreeAcceleration"])).unflatten(1, (-1, 3))
+        parts["acc_world"] = file.column("sensorFreeAcceleration", 3)
     if file.frames["sensorOrientation"]:
         parts["R_world_imu"] = matrix_from_quat_wxyz(_quaternions(file, "sensorOrientation"))
-    for k, label in enumerate(file.sensors if parts else []):
-        if label in _JOINT_OF:
-            joint = _JOINT_OF[label]
-            streams[joint] = ImuStream(
-                timestamps, joint, **{name: part[:, k].contiguous() for name, part in parts.items()}
-            )
-    return streams
+    known = [(k, _JOINT_OF[label]) for k, label in enumerate(file.sensors if parts else []) if label in _JOINT_OF]
+    return {
+        joint: ImuStream(timestamps, joint, **{name: part[:, k].contiguous() for name, part in parts.items()})
+        for k, joint in known
+    }

@@ -1,4 +1,4 @@
-"""Arrays from untrusted .npz and .npy files: no pickles, no sizes that the file cannot hold."""
+"""Arrays from untrusted .npz files: no pickles, no sizes that the file cannot hold."""
 
 import io
 import lzma
@@ -8,14 +8,15 @@ import sys
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from numpy.lib import format as npy
 
 from wearcap.errors import WearcapError
-from wearcap.io.formats.bounded import Budget, explained, file_size
+from wearcap.io.formats.bounded import Budget, file_size, understood
 
 MAX_BYTES = 1 << 32
 """Largest total size of the arrays that are read from one file (4 GiB)."""
@@ -23,23 +24,10 @@ MAX_BYTES = 1 << 32
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 _MAX_HEADER = 1 << 14
 _CHUNK = 1 << 20
-DAMAGE = (
-    zipfile.BadZipFile,
-    zlib.error,
-    lzma.LZMAError,
-    struct.error,
-    EOFError,
-    ValueError,
-    OSError,
-    NotImplementedError,
-    RuntimeError,
-    SyntaxError,
-    tokenize.TokenError,
-    LookupError,
-    TypeError,
-    OverflowError,
-    MemoryError,
-    AttributeError,
+_DAMAGE = (
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, OSError, MemoryError),
+    *(ValueError, TypeError, LookupError, AttributeError, OverflowError),
+    *(NotImplementedError, RuntimeError, SyntaxError, tokenize.TokenError),
 )
 """Exceptions that zipfile and numpy raise on truncated or damaged files."""
 
@@ -54,96 +42,52 @@ def read_npz(
     """
     path = Path(path)
     budget = Budget(path, file_size(path), MAX_BYTES, max_bytes)
-    name = ""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            arrays = {}
-            for name in members if keys is None else [key for key in keys if key in members]:
-                arrays[name] = _read_member(archive, members[name], path, name, budget)
-            return arrays
-    except PermissionError:
-        with explained(path):
-            raise
-    except DAMAGE as error:
-        where = f"{path}, array {name!r}" if name else path
-        raise WearcapError(
-            f"not a readable .npz file ({error})"[:300],
-            where=where,
-            expected="arrays saved by NumPy",
-            fix="Fetch the file again.",
-        ) from error
+    with readable(".npz", path, "arrays saved by NumPy"), zipfile.ZipFile(path) as archive:
+        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+        arrays = {}
+        for name in members if keys is None else [key for key in keys if key in members]:
+            where = f"{path}, array {name!r}"
+            with readable(".npz", where, "arrays saved by NumPy"), archive.open(members[name]) as file:
+                arrays[name] = _read_array(file, members[name].file_size, where, budget)
+        return arrays
 
 
-def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, path: Path, name: str, budget: Budget) -> np.ndarray:
-    with archive.open(info) as file:
-        head = io.BytesIO(file.read(_MAX_HEADER))
-        shape, fortran, dtype = _header(head, f"{path}, array {name!r}")
-        size = math.prod(shape) * dtype.itemsize
-        if size != info.file_size - head.tell():
-            raise ValueError(f"an array of shape {shape} in {info.file_size} bytes")
-        budget.spend(size)
-        array = np.empty(math.prod(shape), dtype)
-        _fill(memoryview(array.view(np.uint8)) if size else memoryview(bytearray()), head, file)
-    if dtype.kind == "U" and size and (array.view(np.dtype("u4").newbyteorder(dtype.byteorder)) > sys.maxunicode).any():
-        raise ValueError("text with characters that are none")
-    return array.reshape(shape, order="F").copy(order="C") if fortran else array.reshape(shape)
+@contextmanager
+def readable(kind: str, where: str | Path, expected: str) -> Iterator[None]:
+    """Turn what zipfile and NumPy raise on damaged files into WearcapError."""
+    with understood(f"not a readable {kind} file", where, expected, "Fetch the file again.", errors=_DAMAGE):
+        yield
 
 
-def _header(head: io.BytesIO, where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, order and type of an array, from the beginning of its file."""
+def _read_array(file: io.BufferedIOBase, file_bytes: int, where: str, budget: Budget) -> np.ndarray:
+    """An archive's array, read chunk by chunk into its memory, so that nothing large is in memory twice."""
+    head = io.BytesIO(file.read(_MAX_HEADER))
     version = npy.read_magic(head)
     if version not in _HEADERS:
         raise ValueError(f"array format {version}")
     shape, fortran, dtype = _HEADERS[version](head)
     if dtype.hasobject:
-        raise WearcapError(
-            "it holds Python objects",
-            where=where,
-            expected="plain numbers or text",
-            fix="Such arrays can run code when they are loaded and are never read.",
-        )
+        fix = "Such arrays can run code when they are loaded and are never read."
+        raise WearcapError("it holds Python objects", where=where, expected="plain numbers or text", fix=fix)
     if dtype.kind not in "biufcSU":
         raise WearcapError(f"an array of {dtype}"[:100], where=where, expected="plain numbers or text")
     if any(length < 0 for length in shape):
         raise ValueError(f"an array of shape {shape}")
-    return shape, fortran, dtype
-
-
-def _fill(view: memoryview, head: io.BytesIO, rest: io.BufferedIOBase) -> None:
-    """Fill an array's memory chunk by chunk, so that nothing large is in memory twice."""
-    place = 0
-    while place < len(view):
-        content = head.read(_CHUNK) or rest.read(min(_CHUNK, len(view) - place))
+    size = math.prod(shape) * dtype.itemsize
+    if size != file_bytes - head.tell():
+        raise ValueError(f"an array of shape {shape} in {file_bytes} bytes")
+    budget.spend(size)
+    array = np.empty(math.prod(shape), dtype)
+    view, place = memoryview(array.view(np.uint8)) if size else memoryview(b""), 0
+    while place < size:
+        content = head.read(_CHUNK) or file.read(min(_CHUNK, size - place))
         if not content:
             raise ValueError("its data ends too early")
         view[place : place + len(content)] = content
         place += len(content)
-
-
-def map_npy(path: str | Path) -> np.ndarray:
-    """The memory-mapped array of an .npy file: no memory is allocated for data that the file does not hold.
-
-    Raises WearcapError for a missing or damaged file, and for an array of Python objects.
-    """
-    file_size(path)
-    try:
-        with open(path, "rb") as file:
-            head = io.BytesIO(file.read(_MAX_HEADER))
-        shape, fortran, dtype = _header(head, str(path))
-        if not math.prod(shape) * dtype.itemsize:
-            return np.zeros(shape, dtype)
-        return np.memmap(path, dtype, "r", head.tell(), shape, "F" if fortran else "C")
-    except PermissionError:
-        with explained(path):
-            raise
-    except DAMAGE as error:
-        raise WearcapError(
-            f"not a readable .npy file ({error})"[:300],
-            where=path,
-            expected="an array of numbers",
-            fix="Fetch the file again.",
-        ) from error
+    if dtype.kind == "U" and size and (array.view(np.dtype("u4").newbyteorder(dtype.byteorder)) > sys.maxunicode).any():
+        raise ValueError("text with characters that are none")
+    return array.reshape(shape, order="F").copy(order="C") if fortran else array.reshape(shape)
 
 
 def require(arrays: dict[str, np.ndarray], path: str | Path, **shapes: tuple[int | str, ...]) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""OCamCalib's fisheye calibrations: `calib_results.txt`, and NavVis' `sensor_frame.xml` (HPS and iReplica scans).
+"""OCamCalib's fisheye calibrations in NavVis' `sensor_frame.xml` (HPS and iReplica scans).
 
 Scaramuzza's model maps a pixel at (row, column) to the direction (u, v, f(ρ)), f(ρ) = a₀ + a₁ρ + a₂ρ² + …, where
 ρ² = u² + v² and [row; column] = [c d; e 1] [u; v] + [xc; yc], counted from 0. Its axes are u down the image, v along
@@ -8,33 +8,26 @@ atan(w / √(u² + v²)), is a fit to the inverse of the first.
 
 from dataclasses import dataclass
 from pathlib import Path
-from xml.etree.ElementTree import Element, ParseError
+from xml.etree.ElementTree import Element
 
 import numpy as np
-from defusedxml.common import DefusedXmlException
 from defusedxml.ElementTree import fromstring
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
-from wearcap.io.formats.text import at_line, finite_floats, numbered_lines, read_text
+from wearcap.io.formats.bounded import understood
+from wearcap.io.formats.text import finite_floats, plain_xml, read_text, tag_of
 
-POWERS = 10
+_POWERS = 10
 """Number of coefficients (k1…k10): NavVis' lenses are fitted within 0.002 px at 4592 px width."""
 _MAX_BYTES = 1 << 24
 """Largest calibration that is read (16 MiB; they take kilobytes)."""
 _MAX_SIDE = 1 << 20
 """Largest width and height of an image (pixels)."""
-MAX_MISFIT_PX = 0.5
-MAX_DISAGREEMENT_PX = 3.0
+_MAX_MISFIT_PX = 0.5
+_MAX_DISAGREEMENT_PX = 3.0
 """Largest disagreement of a file's two polynomials, which are fits to each other."""
 _COUNTS = {"world2cam": (2, 64), "cam2world": (3, 64)}
-_TEXT_LINES = (
-    "the direct polynomial",
-    "the inverse polynomial",
-    "the centre",
-    "the affine parameters",
-    "the image size",
-)
 
 
 @dataclass(frozen=True)
@@ -54,18 +47,15 @@ class OCamModel:
     height: int
 
     def camera(self, where: str | Path = "OCamCalib model") -> Camera:
-        """The camera of model "ocam" that sees as this one does, within `MAX_MISFIT_PX`.
+        """The camera of model "ocam" that sees as this one does, within `_MAX_MISFIT_PX`.
 
         Raises WearcapError when the polynomials are none of a lens, or contradict each other.
         """
         c, d, e = self.affine
         determinant = c - d * e
         if not (0 < self.width <= _MAX_SIDE and 0 < self.height <= _MAX_SIDE and 0.1 < determinant < 10):
-            raise WearcapError(
-                f"an image of {self.width}x{self.height} pixels with affine parameters {self.affine}",
-                where=where,
-                expected=f"sizes of 1 to {_MAX_SIDE}, c near 1, d and e near 0",
-            )
+            what = f"an image of {self.width}x{self.height} pixels with affine parameters {self.affine}"
+            raise WearcapError(what, where=where, expected=f"sizes of 1 to {_MAX_SIDE}, c near 1, d and e near 0")
         if not (0 <= self.row < self.height and 0 <= self.column < self.width):
             raise WearcapError(
                 f"its centre, row {self.row:g} and column {self.column:g}, is outside the image of "
@@ -75,17 +65,18 @@ class OCamModel:
             )
         focal = -self.pol[0]
         if focal <= 0:
-            raise WearcapError(
-                f"its direct polynomial begins with {self.pol[0]:g}",
-                where=where,
-                expected="a negative number (the axis points backwards)",
-            )
+            what = f"its direct polynomial begins with {self.pol[0]:g}"
+            raise WearcapError(what, where=where, expected="a negative number (the axis points backwards)")
         rho, theta = self._curve(determinant, where)
-        powers, misfit = _fitted(rho / focal, theta)
-        if misfit * focal > MAX_MISFIT_PX:
-            raise WearcapError(
-                f"its polynomial is met only within {misfit * focal:.2f} px", where=where, expected="a fisheye lens"
-            )
+        share = theta / theta[-1]  # powers of numbers up to 1 keep the system solvable
+        exponents = np.arange(2, _POWERS + 2)
+        basis = np.stack([share**power for power in exponents.tolist()], 1)
+        solution = np.linalg.lstsq(basis, rho / focal - theta, rcond=None)[0]
+        misfit_px = float(np.abs(basis @ solution + theta - rho / focal).max()) * focal
+        if misfit_px > _MAX_MISFIT_PX:
+            what = f"its polynomial is met only within {misfit_px:.2f} px"
+            raise WearcapError(what, where=where, expected="a fisheye lens")
+        powers = (solution / theta[-1] ** exponents).tolist()
         return Camera("ocam", self.width, self.height, focal, focal, self.column, self.row, (c, d, e, *powers))
 
     def _curve(self, determinant: float, where: str | Path) -> tuple[np.ndarray, np.ndarray]:
@@ -103,63 +94,16 @@ class OCamModel:
         last = int(falling.argmax()) if falling.any() else len(rho) - 1
         # If the polynomial turns within the image, the lens's image circle is smaller than the picture.
         if last < len(rho) // 4:
-            raise WearcapError(
-                f"its direct polynomial turns back {rho[last]:.0f} px from the centre",
-                where=where,
-                expected="angles that rise with the radius",
-            )
+            what = f"its direct polynomial turns back {rho[last]:.0f} px from the centre"
+            raise WearcapError(what, where=where, expected="angles that rise with the radius")
         rho, theta = rho[: last + 1], theta[: last + 1]
         if self.invpol:
             disagreement = np.abs(np.polynomial.polynomial.polyval(theta - np.pi / 2, self.invpol) - rho)
             central = disagreement[theta < 0.8 * theta[-1]]
-            if central.max() > MAX_DISAGREEMENT_PX:
-                raise WearcapError(
-                    f"its two polynomials differ by up to {central.max():.3g} px",
-                    where=where,
-                    expected="two fits of one lens",
-                )
+            if central.max() > _MAX_DISAGREEMENT_PX:
+                what = f"its two polynomials differ by up to {central.max():.3g} px"
+                raise WearcapError(what, where=where, expected="two fits of one lens")
         return rho, theta
-
-
-def _fitted(radius: np.ndarray, theta: np.ndarray) -> tuple[tuple[float, ...], float]:
-    """Coefficients k1…k10 of radius = θ + k1 θ² + …, and the largest residual."""
-    share = theta / theta[-1]  # powers of numbers up to 1 keep the system solvable
-    basis = np.stack([share**power for power in range(2, POWERS + 2)], 1)
-    solution = np.linalg.lstsq(basis, radius - theta, rcond=None)[0]
-    misfit = float(np.abs(basis @ solution + theta - radius).max())
-    return tuple((solution / theta[-1] ** np.arange(2, POWERS + 2)).tolist()), misfit
-
-
-def read_ocamcalib(path: str | Path) -> OCamModel:
-    """Read `calib_results.txt` as OCamCalib exports it.
-
-    Raises WearcapError naming the line for missing lines, wrong counts and what is no number.
-    """
-    rows = [
-        (number, line.split())
-        for number, line in numbered_lines(path, usual=_MAX_BYTES)
-        if line.strip() and not line.lstrip().startswith(("#", "%"))
-    ]
-    if len(rows) < len(_TEXT_LINES):
-        raise WearcapError(
-            f"it lacks {_TEXT_LINES[len(rows)]}",
-            where=path,
-            expected=f"calib_results.txt of OCamCalib: lines of numbers for {', '.join(_TEXT_LINES)}",
-        )
-    values = []
-    for what, counted, (number, tokens) in zip(_TEXT_LINES, (True, True, False, False, False), rows):
-        try:
-            line = finite_floats(tokens)
-            if counted and (len(line) < 3 or line[0] != len(line) - 1):
-                raise ValueError(f"{len(line) - 1} coefficients where {line[0]:g} are announced")
-        except (ValueError, IndexError) as error:
-            raise WearcapError(f"{what} cannot be read ({error})", where=at_line(path, number)) from error
-        values.append(line[1:] if counted else line)
-    for what, count, line, (number, _) in zip(_TEXT_LINES[2:], (2, 3, 2), values[2:], rows[2:]):
-        if len(line) != count:
-            raise WearcapError(f"{what} with {len(line)} numbers", where=at_line(path, number), expected=f"{count}")
-    pol, invpol, centre, affine, size = (tuple(line.tolist()) for line in values)
-    return OCamModel(pol, invpol, *centre, affine, width=int(size[1]), height=int(size[0]))  # pyright: ignore[reportArgumentType]
 
 
 def read_sensor_frame(path: str | Path) -> dict[str, OCamModel]:
@@ -169,18 +113,13 @@ def read_sensor_frame(path: str | Path) -> dict[str, OCamModel]:
     or wrong numbers.
     """
     text = read_text(path, usual=_MAX_BYTES)
-    try:
+    with (
+        understood("cannot be understood", path, "a sensor_frame.xml", errors=ValueError),
+        plain_xml(path, "sensor_frame.xml"),
+    ):
         root = fromstring(text, forbid_dtd=True)
-    except DefusedXmlException as error:
-        raise WearcapError(
-            "it declares a document type or entities", where=path, expected="a plain sensor_frame.xml"
-        ) from error
-    except (ParseError, ValueError) as error:
-        raise WearcapError(
-            f"broken XML ({error})", where=path, expected="a whole sensor_frame.xml", fix="Copy it again."
-        ) from error
     found: dict[str, OCamModel] = {}
-    for element in (item for item in root.iter() if _tag(item) == "CameraModel"):
+    for element in (item for item in root.iter() if tag_of(item) == "CameraModel"):
         name = _text(element, "SensorName", path)
         where = f"{path}, camera {name!r}"
         if _child(element, "OCamModel") is None:
@@ -200,23 +139,18 @@ def _from_xml(element: Element, where: str) -> OCamModel:
     polynomials = {}
     for name, (least, most) in _COUNTS.items():
         holder = _child(lens, name)
-        coefficients = [] if holder is None else [item.text or "" for item in holder if _tag(item) == "coeff"]
+        coefficients = [] if holder is None else [item.text or "" for item in holder if tag_of(item) == "coeff"]
         if not least <= len(coefficients) <= most and (name == "cam2world" or coefficients):
-            raise WearcapError(
-                f"{name} with {len(coefficients)} coefficients", where=where, expected=f"at least {least}"
-            )
+            what = f"{name} with {len(coefficients)} coefficients"
+            raise WearcapError(what, where=where, expected=f"at least {least}")
         polynomials[name] = tuple(_number(item, name, where) for item in coefficients)
     c, d, e, cx, cy = (_number(_text(lens, name, where), name, where) for name in ("c", "d", "e", "cx", "cy"))
     width, height = (_number(_text(size, name, where), name, where) for name in ("Width", "Height"))
     return OCamModel(polynomials["cam2world"], polynomials["world2cam"], cx, cy, (c, d, e), int(width), int(height))
 
 
-def _tag(element: Element) -> str:
-    return element.tag.rsplit("}", 1)[-1] if isinstance(element.tag, str) else ""
-
-
 def _child(element: Element, name: str) -> Element | None:
-    return next((item for item in element if _tag(item) == name), None)
+    return next((item for item in element if tag_of(item) == name), None)
 
 
 def _text(element: Element, name: str, where: str | Path) -> str:
@@ -227,7 +161,5 @@ def _text(element: Element, name: str, where: str | Path) -> str:
 
 
 def _number(text: str, name: str, where: str) -> float:
-    try:
+    with understood(name, where, "a number", errors=ValueError):
         return float(finite_floats([text])[0])
-    except ValueError as error:
-        raise WearcapError(f"{name} is {text[:30]!r}", where=where, expected="a number") from error

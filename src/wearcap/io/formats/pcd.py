@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from wearcap.errors import WearcapError
-from wearcap.io.formats.bounded import read_bytes
+from wearcap.io.formats.bounded import read_bytes, understood
 from wearcap.io.formats.ply import Ply
 
 _MAX_HEADER_BYTES = 1 << 16
@@ -41,10 +41,11 @@ def read_pcd(path: str | Path) -> Ply:
     with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite and is dropped
         points = np.stack([rows[axis] for axis in "xyz"], 1).astype(np.float32)
     valid = np.isfinite(points).all(1)
-    packed = next(
-        (rows[name] for name in ("rgb", "rgba") if name in (dtype.names or ()) and dtype[name].itemsize == 4), None
-    )
-    colors = None if packed is None else _unpacked_colors(packed)[valid]
+    colors = None
+    for name in ("rgba", "rgb"):
+        if name in (dtype.names or ()) and dtype[name].itemsize == 4:
+            bits = np.ascontiguousarray(rows[name]).view("<u4")  # PCL packs 0x00RRGGBB into a float or whole number
+            colors = (np.stack([bits >> 16, bits >> 8, bits], 1) & 255).astype(np.uint8)[valid]
     return Ply(points[valid], colors)
 
 
@@ -61,20 +62,19 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[dict[str, list[str]], 
         start = stop + 1
     missing = {"FIELDS", "SIZE", "TYPE", "POINTS"} - set(header)
     if missing or not (header["POINTS"][0].isdigit() and len(header["POINTS"][0]) < 15):
-        raise WearcapError(
-            f"its header lacks {', '.join(sorted(missing)) or 'a count of points'}",
-            where=path,
-            expected="a PCD 0.7 header",
-        )
+        what = f"its header lacks {', '.join(sorted(missing)) or 'a count of points'}"
+        raise WearcapError(what, where=path, expected="a PCD 0.7 header")
     return header, start
 
 
 def _row_type(header: dict[str, list[str]], path: str | Path) -> np.dtype:
     counts = header.get("COUNT", ["1"] * len(header["FIELDS"]))
     fields = []
-    try:
+    with understood("its header cannot be understood", path, "a SIZE, TYPE and COUNT for every field"):
         for i, name in enumerate(header["FIELDS"]):
-            letter = _TYPES[header["TYPE"][i], int(header["SIZE"][i])]
+            letter = _TYPES.get((header["TYPE"][i], int(header["SIZE"][i])))
+            if letter is None:
+                raise ValueError(f"TYPE {header['TYPE'][i]} of SIZE {header['SIZE'][i]}"[:60])
             if not 0 < int(counts[i]) <= _MAX_COUNT or (name in ("x", "y", "z") and int(counts[i]) != 1):
                 raise ValueError(f"COUNT {counts[i]} of {name}"[:60])
             shape = (int(counts[i]),) if int(counts[i]) != 1 else ()
@@ -82,12 +82,6 @@ def _row_type(header: dict[str, list[str]], path: str | Path) -> np.dtype:
         if not {"x", "y", "z"} <= {name for name, _, _ in fields}:
             raise WearcapError("no fields x, y, z", where=path, expected="a point cloud")
         return np.dtype(fields)
-    except (LookupError, ValueError, TypeError) as error:
-        raise WearcapError(
-            f"its header cannot be understood ({error})"[:200],
-            where=path,
-            expected="a SIZE, TYPE and COUNT for every field",
-        ) from error
 
 
 def _require(complete: bool, path: str | Path) -> None:
@@ -100,12 +94,13 @@ def _require(complete: bool, path: str | Path) -> None:
 def _ascii_rows(body: memoryview, dtype: np.dtype, count: int, path: str | Path) -> np.ndarray:
     text = io.TextIOWrapper(io.BytesIO(body), "ascii", errors="replace", newline="\n")
     lines = islice((line for line in text if line.strip()), count)
-    try:
-        with warnings.catch_warnings(), np.errstate(over="ignore", invalid="ignore"):
-            warnings.simplefilter("ignore", UserWarning)  # numpy warns about a file that ends here
-            rows = np.loadtxt(lines, dtype=dtype, ndmin=1, comments=None)
-    except (ValueError, OverflowError) as error:
-        raise WearcapError(f"a row does not match the header ({error})"[:200], where=path) from error
+    with (
+        warnings.catch_warnings(),
+        np.errstate(over="ignore", invalid="ignore"),
+        understood("a row does not match the header", path, errors=(ValueError, OverflowError)),
+    ):
+        warnings.simplefilter("ignore", UserWarning)  # numpy warns about a file that ends here
+        rows = np.loadtxt(lines, dtype=dtype, ndmin=1, comments=None)
     _require(len(rows) == count, path)
     return rows
 
@@ -115,12 +110,8 @@ def _compressed_rows(body: memoryview, dtype: np.dtype, count: int, path: str | 
     _require(len(body) >= 8, path)
     compressed, size = (int(v) for v in np.frombuffer(body, "<u4", 2))
     _require(len(body) >= 8 + compressed and size == count * dtype.itemsize, path)
-    try:
-        plain = lzf_decompress(body[8 : 8 + compressed], size)
-    except ValueError as error:
-        raise WearcapError(
-            f"its compressed data is damaged ({error})", where=path, fix="Copy the file again."
-        ) from error
+    with understood("its compressed data is damaged", path, fix="Copy the file again.", errors=ValueError):
+        plain = _lzf_decompressed(body[8 : 8 + compressed], size)
     rows, start = np.empty(count, dtype), 0
     for name in dtype.names or ():
         width = dtype[name].itemsize
@@ -129,7 +120,7 @@ def _compressed_rows(body: memoryview, dtype: np.dtype, count: int, path: str | 
     return rows
 
 
-def lzf_decompress(data: bytes | memoryview, size: int) -> bytes:
+def _lzf_decompressed(data: bytes | memoryview, size: int) -> bytes:
     """Undo LZF: literal runs and back references. Raises ValueError when the data does not give `size` bytes."""
     out = bytearray()
     i = 0
@@ -157,9 +148,3 @@ def lzf_decompress(data: bytes | memoryview, size: int) -> bytes:
     if len(out) != size:
         raise ValueError(f"{len(out)} bytes instead of {size}")
     return bytes(out)
-
-
-def _unpacked_colors(packed: np.ndarray) -> np.ndarray:
-    """PCL packs 0x00RRGGBB into the bits of a float or an unsigned integer."""
-    bits = np.ascontiguousarray(packed).view("<u4")
-    return (np.stack([bits >> 16, bits >> 8, bits], 1) & 255).astype(np.uint8)

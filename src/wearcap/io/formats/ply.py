@@ -13,27 +13,26 @@ from jaxtyping import Float32, Int32, UInt8
 
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
-from wearcap.io.formats.bounded import read_bytes
+from wearcap.geometry.mesh import Mesh
+from wearcap.io.formats.bounded import read_bytes, understood
 
 _TYPES = {
-    "char": "i1",
-    "int8": "i1",
-    "uchar": "u1",
-    "uint8": "u1",
-    "short": "i2",
-    "int16": "i2",
-    "ushort": "u2",
-    "uint16": "u2",
-    "int": "i4",
-    "int32": "i4",
-    "uint": "u4",
-    "uint32": "u4",
-    "float": "f4",
-    "float32": "f4",
-    "double": "f8",
-    "float64": "f8",
+    name: code
+    for code, names in {
+        "i1": ("char", "int8"),
+        "u1": ("uchar", "uint8"),
+        "i2": ("short", "int16"),
+        "u2": ("ushort", "uint16"),
+        "i4": ("int", "int32"),
+        "u4": ("uint", "uint32"),
+        "f4": ("float", "float32"),
+        "f8": ("double", "float64"),
+    }.items()
+    for name in names
 }
 _BYTE_ORDER = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+GREY = np.array([0.7, 0.7, 0.7], np.float32)
+"""Colour of meshes without one."""
 _MAX_HEADER_BYTES = 1 << 16
 _MAX_EVEN_BYTES = 1 << 28
 """Largest row (bytes) that is read as one NumPy field, whose sizes are 32 bits."""
@@ -47,6 +46,22 @@ class Ply:
     colors: UInt8[np.ndarray, "point 3"] | None = None
     faces: Int32[np.ndarray, "face 3"] | None = None
     """Triangles; polygons with more corners are split into fans."""
+
+    @property
+    def mesh(self) -> Mesh:
+        """The surface, or points without faces; grey where the file has no colours."""
+        color = GREY if self.colors is None else self.colors.astype(np.float32) / 255
+        return Mesh(self.points, np.zeros((0, 3), np.int32) if self.faces is None else self.faces, color)
+
+    @classmethod
+    def of(cls, mesh: Mesh) -> "Ply":
+        """The mesh with a colour per vertex: faces with their own colour get their own vertices."""
+        vertices, faces, color = mesh.vertices, mesh.faces, mesh.color
+        if color.ndim == 2 and len(color) != len(vertices):
+            vertices, color = vertices[faces.ravel()], np.repeat(color, 3, axis=0)
+            faces = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
+        colors = np.broadcast_to(np.clip(np.rint(color * 255), 0, 255).astype(np.uint8), vertices.shape)
+        return cls(np.ascontiguousarray(vertices), np.ascontiguousarray(colors), faces if len(faces) else None)
 
 
 @dataclass(frozen=True)
@@ -79,34 +94,30 @@ def read_ply(path: str | Path) -> Ply:
     if byte_order == "=":
         tables = _read_ascii(elements, memoryview(data)[body:], path)
     else:
-        tables = _read_binary(elements, data, body, byte_order, path)
+        tables = {}
+        for element in elements:
+            tables[element.name], body = _read_binary(element, data, body, byte_order, path)
     vertex = {name: column for name, column in tables.get("vertex", {}).items() if isinstance(column, np.ndarray)}
     if not {"x", "y", "z"} <= set(vertex):
         raise WearcapError("no vertices with x, y, z", where=path, expected="a PLY with `element vertex`")
     with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite and is refused below
         points = np.stack([vertex[axis] for axis in "xyz"], 1).astype(np.float32)
     if not np.isfinite(points).all():
-        raise WearcapError(
-            f"{int((~np.isfinite(points)).any(1).sum())} points are NaN or infinite",
-            where=path,
-            expected="finite coordinates",
-        )
+        what = f"{int((~np.isfinite(points)).any(1).sum())} points are NaN or infinite"
+        raise WearcapError(what, where=path, expected="finite coordinates")
     return Ply(points, _colors(vertex), _triangles(tables.get("face", {}), len(points), path))
 
 
 def write_ply(ply: Ply, path: str | Path) -> None:
     """Write a binary little-endian PLY atomically."""
-    fields = [(axis, "<f4") for axis in "xyz"]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(ply.points)}"]
-    lines += [f"property float {axis}" for axis in "xyz"]
+    columns = [(axis, "float", "<f4", values) for axis, values in zip("xyz", ply.points.T)]
     if ply.colors is not None:
-        fields += [(name, "u1") for name in ("red", "green", "blue")]
-        lines += [f"property uchar {name}" for name in ("red", "green", "blue")]
-    vertices = np.empty(len(ply.points), dtype=fields)
-    for column, axis in enumerate("xyz"):
-        vertices[axis] = ply.points[:, column]
-        if ply.colors is not None:
-            vertices[("red", "green", "blue")[column]] = ply.colors[:, column]
+        columns += [(name, "uchar", "u1", values) for name, values in zip(("red", "green", "blue"), ply.colors.T)]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(ply.points)}"]
+    lines += [f"property {kind} {name}" for name, kind, _, _ in columns]
+    vertices = np.empty(len(ply.points), dtype=[(name, dtype) for name, _, dtype, _ in columns])
+    for name, _, _, values in columns:
+        vertices[name] = values
     faces = np.empty(0 if ply.faces is None else len(ply.faces), dtype=[("n", "u1"), ("corner", "<i4", 3)])
     if ply.faces is not None:
         lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
@@ -127,23 +138,20 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[str, list[_Element], i
             "its header has no end", where=path, expected="`end_header`", fix="The file was cut short: copy it again."
         )
     byte_order, elements = "", []
-    try:
+    with understood("its header cannot be understood", path, "a PLY 1.0 header"):
         for line in data[:stop].decode("ascii").splitlines()[1:]:
             words = line.split()
             if words[:1] == ["format"]:
-                byte_order = _BYTE_ORDER[words[1]]
+                byte_order = _known(_BYTE_ORDER, words[1])
             elif words[:1] == ["element"]:
                 elements.append(_Element(words[1], int(words[2]), []))
             elif words[:2] == ["property", "list"]:
-                if _TYPES[words[2]][0] == "f":
+                count_dtype = _known(_TYPES, words[2])
+                if count_dtype[0] == "f":
                     raise ValueError(f"a list whose length is a {words[2]}")
-                elements[-1].properties.append(_Property(words[4], _TYPES[words[3]], _TYPES[words[2]]))
+                elements[-1].properties.append(_Property(words[4], _known(_TYPES, words[3]), count_dtype))
             elif words[:1] == ["property"]:
-                elements[-1].properties.append(_Property(words[2], _TYPES[words[1]]))
-    except (KeyError, IndexError, ValueError) as error:
-        raise WearcapError(
-            f"its header cannot be understood ({error})"[:200], where=path, expected="a PLY 1.0 header"
-        ) from error
+                elements[-1].properties.append(_Property(words[2], _known(_TYPES, words[1])))
     names = [[element.name for element in elements], *([p.name for p in element.properties] for element in elements)]
     if any(len(set(group)) < len(group) or any(name.startswith("#") for name in group) for group in names):
         raise WearcapError("its header names a part twice", where=path, expected="a PLY 1.0 header")
@@ -152,6 +160,12 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[str, list[_Element], i
             "its header names no format, or an impossible or negative count", where=path, expected="a PLY 1.0 header"
         )
     return byte_order, elements, newline + 1
+
+
+def _known(table: dict[str, str], word: str) -> str:
+    if word not in table:
+        raise ValueError(f"unknown word {word!r}")
+    return table[word]
 
 
 def _cut_short(path: str | Path, element: _Element) -> WearcapError:
@@ -163,29 +177,9 @@ def _cut_short(path: str | Path, element: _Element) -> WearcapError:
     )
 
 
-def _read_binary(elements: list[_Element], data: bytes, start: int, order: str, path) -> dict[str, dict]:
-    tables = {}
-    for element in elements:
-        lists = [p for p in element.properties if p.count_dtype]
-        read = _read_list_rows if lists else _read_fixed_rows
-        tables[element.name], start = read(element, data, start, order, path)
-    return tables
-
-
-def _read_fixed_rows(element: _Element, data: bytes, start: int, order: str, path) -> tuple[dict, int]:
-    dtype = np.dtype([(p.name, order + p.dtype) for p in element.properties])
-    if not dtype.itemsize:
-        return {}, start
-    stop = start + element.count * dtype.itemsize
-    if stop > len(data):
-        raise _cut_short(path, element)
-    rows = np.frombuffer(data, dtype, element.count, start)
-    return {p.name: rows[p.name] for p in element.properties}, stop
-
-
-def _read_list_rows(element: _Element, data: bytes, start: int, order: str, path) -> tuple[dict, int]:
-    """Rows with lists: read at once if all lists are as long as the first row's, else row by row."""
-    table, stop = _read_even_lists(element, data, start, order)
+def _read_binary(element: _Element, data: bytes, start: int, order: str, path) -> tuple[dict, int]:
+    """Columns of an element's rows: read at once if all lists are as long as the first row's, else row by row."""
+    table, stop = _read_even_rows(element, data, start, order)
     if table is not None:
         return table, stop
     columns = {p.name: (bytearray(), array("q")) for p in element.properties}
@@ -193,7 +187,7 @@ def _read_list_rows(element: _Element, data: bytes, start: int, order: str, path
         (*columns[p.name], np.dtype(order + p.count_dtype) if p.count_dtype else None, np.dtype(p.dtype).itemsize)
         for p in element.properties
     ]
-    for _ in range(element.count):
+    for _ in range(element.count if any(p.count_dtype for p in element.properties) else 0):
         for values, lengths, count_dtype, width in plan:
             length = 1
             if count_dtype:
@@ -205,12 +199,18 @@ def _read_list_rows(element: _Element, data: bytes, start: int, order: str, path
                 raise _cut_short(path, element)
             values += data[start:stop]
             start = stop
-    table = {}
-    for p in element.properties:
-        values, lengths = columns[p.name]
-        found = np.frombuffer(values, order + p.dtype)
-        table[p.name] = _Lists(found, np.array(lengths, np.int64)) if p.count_dtype else found
-    return table, start
+    if not any(p.count_dtype for p in element.properties):
+        raise _cut_short(path, element)
+    found = {p.name: np.frombuffer(columns[p.name][0], order + p.dtype) for p in element.properties}
+    return _with_lists(element, found, {name: lengths for name, (_, lengths) in columns.items()}), start
+
+
+def _with_lists(element: _Element, values: dict[str, np.ndarray], lengths: "dict[str, array[int]]") -> dict:
+    """Columns, of which those of list properties are `_Lists`."""
+    return {
+        p.name: _Lists(values[p.name], np.array(lengths[p.name], np.int64)) if p.count_dtype else values[p.name]
+        for p in element.properties
+    }
 
 
 def _length(data: bytes, place: int, dtype: np.dtype) -> int:
@@ -220,7 +220,8 @@ def _length(data: bytes, place: int, dtype: np.dtype) -> int:
     return int(np.frombuffer(data, dtype, 1, place)[0])
 
 
-def _read_even_lists(element: _Element, data: bytes, start: int, order: str) -> tuple[dict | None, int]:
+def _read_even_rows(element: _Element, data: bytes, start: int, order: str) -> tuple[dict | None, int]:
+    """Rows as one NumPy array and where they end; None where lists differ in length or the data is too short."""
     fields, position = [], start
     for p in element.properties:
         if p.count_dtype:
@@ -235,6 +236,8 @@ def _read_even_lists(element: _Element, data: bytes, start: int, order: str) -> 
             fields.append((p.name, order + p.dtype))
     dtype = np.dtype(fields)
     stop = start + element.count * dtype.itemsize
+    if not dtype.itemsize:
+        return {}, start
     if stop > len(data):
         return None, start
     rows = np.frombuffer(data, dtype, element.count, start)
@@ -256,11 +259,9 @@ def _read_ascii(elements: list[_Element], body: memoryview, path) -> dict[str, d
         if element.count == 0:
             tables[element.name] = {}
             continue
-        listed = any(p.count_dtype for p in element.properties)
-        try:
-            table, rows = (_ascii_lists if listed else _ascii_table)(element, lines)
-        except (ValueError, IndexError, OverflowError) as error:
-            raise WearcapError(f"a {element.name} row does not match the header ({error})"[:200], where=path) from error
+        read = _ascii_lists if any(p.count_dtype for p in element.properties) else _ascii_table
+        with understood(f"a {element.name} row does not match the header", path):
+            table, rows = read(element, lines)
         if rows < element.count:
             raise _cut_short(path, element)
         tables[element.name] = table
@@ -271,9 +272,8 @@ def _ascii_table(element: _Element, lines: Iterator[str]) -> tuple[dict, int]:
     with warnings.catch_warnings(), np.errstate(invalid="ignore", over="ignore"):
         warnings.simplefilter("ignore", UserWarning)  # numpy warns about a file that ends here
         values = np.loadtxt(islice(lines, element.count), ndmin=2, comments=None)
-        return {p.name: values[:, i].astype(p.dtype) for i, p in enumerate(element.properties) if len(values)}, len(
-            values
-        )
+        table = {p.name: values[:, i].astype(p.dtype) for i, p in enumerate(element.properties) if len(values)}
+        return table, len(values)
 
 
 def _ascii_lists(element: _Element, lines: Iterator[str]) -> tuple[dict, int]:
@@ -292,12 +292,8 @@ def _ascii_lists(element: _Element, lines: Iterator[str]) -> tuple[dict, int]:
             values.extend(map(float, words[place : place + length]))
             place += length
         rows += 1
-    table = {}
-    for p in element.properties:
-        values, lengths = columns[p.name]
-        found = np.array(values, np.float64)
-        table[p.name] = _Lists(found, np.array(lengths, np.int64)) if p.count_dtype else found
-    return table, rows
+    found = {name: np.array(values, np.float64) for name, (values, _) in columns.items()}
+    return _with_lists(element, found, {name: lengths for name, (_, lengths) in columns.items()}), rows
 
 
 def _colors(vertex: dict) -> np.ndarray | None:

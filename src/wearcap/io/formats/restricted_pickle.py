@@ -1,4 +1,4 @@
-"""Public pickles (HPS, DIP-IMU, OMOMO, cam_traj.pkl) without running what is in them.
+"""Public pickles (HPS, OMOMO, cam_traj.pkl) without running what is in them.
 
 A pickle names classes and functions to call. Here a handful of names stand for functions of this file that build
 numeric arrays, scalars and bytes; every other name is refused before anything is called. joblib's files, where arrays'
@@ -47,19 +47,12 @@ def read_pickle(path: str | Path, max_bytes: int | None = None) -> Any:
         _require_plain(value)
         return value
     except _RefusedError as error:
-        raise WearcapError(
-            str(error),
-            where=path,
-            expected="numbers, text, lists, dicts and NumPy arrays only",
-            fix="Anything else in a pickle can run code when it is loaded, and is never read.",
-        ) from error
+        expected = "numbers, text, lists, dicts and NumPy arrays only"
+        fix = "Anything else in a pickle can run code when it is loaded, and is never read."
+        raise WearcapError(str(error), where=path, expected=expected, fix=fix) from error
     except Exception as error:  # the opcodes are the file's own program and can raise anything
-        raise WearcapError(
-            f"a damaged pickle ({type(error).__name__}: {error})"[:300],
-            where=path,
-            expected="a whole pickle file",
-            fix="Fetch it again.",
-        ) from error
+        what = f"a damaged pickle ({type(error).__name__}: {error})"[:300]
+        raise WearcapError(what, where=path, expected="a whole pickle file", fix="Fetch it again.") from error
 
 
 class _RefusedError(Exception):
@@ -163,10 +156,6 @@ def _array(buffer: Any, dtype: Any, shape: Any, order: str = "C") -> np.ndarray:
     return array.reshape(shape, order="F" if order == "F" else "C").copy(order="C")
 
 
-def _scalar(dtype: Any, data: Any) -> np.generic:
-    return _array(data, dtype, (1,))[0]
-
-
 def _empty_array(subtype: Any, shape: Any, code: Any) -> np.ndarray:
     """numpy's _reconstruct: an empty array that a BUILD opcode fills."""
     if subtype is not _NdarrayName:
@@ -181,7 +170,7 @@ def _no_bytes(*arguments: Any) -> bytes:
 
 
 _NUMPY = {"dtype": _dtype, "ndarray": _NdarrayName}
-_MULTIARRAY = {"_reconstruct": _empty_array, "scalar": _scalar}
+_MULTIARRAY = {"_reconstruct": _empty_array, "scalar": lambda dtype, data: _array(data, dtype, (1,))[0]}
 _NAMES: dict[str, dict[str, Any]] = {
     "numpy": _NUMPY,
     "numpy.core.multiarray": _MULTIARRAY,
@@ -236,13 +225,13 @@ class _Unpickler(_PythonUnpickler):
             data, shape = _checked(data, dtype, shape)
             target.__setstate__((1, shape, dtype, bool(fortran), data))
         elif isinstance(target, np.dtype):
-            self._set_byte_order(target, state)
+            self.set_byte_order(target, state)
         elif isinstance(target, _JoblibArray):
-            self.stack[-1] = self._joblib_array(state)
+            self.stack[-1] = self.joblib_array(state)
         else:
             raise _RefusedError(f"it gives a state to a {type(target).__name__}")
 
-    def _set_byte_order(self, dtype: np.dtype, state: tuple) -> None:
+    def set_byte_order(self, dtype: np.dtype, state: tuple) -> None:
         order, parts = state[1], state[2:5]
         if order not in ("<", ">", "|", "=") or any(part is not None for part in parts) or dtype.isbuiltin == 1:
             raise _RefusedError("it holds an array of structures")
@@ -250,7 +239,7 @@ class _Unpickler(_PythonUnpickler):
         sizes = (dtype.itemsize, dtype.alignment) if dtype.kind in "SU" else (-1, -1)
         dtype.__setstate__((3, order, None, None, None, *sizes, 0))  # pyright: ignore[reportAttributeAccessIssue]
 
-    def _joblib_array(self, state: dict[str, Any]) -> np.ndarray:
+    def joblib_array(self, state: dict[str, Any]) -> np.ndarray:
         dtype, shape = state["dtype"], tuple(state["shape"])
         if not isinstance(dtype, np.dtype) or state["subclass"] is not _NdarrayName:
             raise _RefusedError("it holds a subclass of numpy.ndarray")

@@ -1,14 +1,77 @@
-"""Scenes on disk in any supported layout: database photos, and the geometry that lifts their keypoints to 3D."""
+"""Scenes on disk in any supported layout: database photos, the geometry that lifts their keypoints to 3D, and scans.
+
+Scans are PLY and PCD files, whose unit, extent and density are checked.
+"""
 
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float32
+
 from wearcap.errors import WearcapError
-from wearcap.io.datasets.hps_scene import is_hps_scene, read_hps_scene
+from wearcap.io.datasets.hps import is_hps_scene, read_hps_scene
+from wearcap.io.formats.camera_json import PHOTOS_FILE, read_photos
 from wearcap.io.formats.colmap import Tracks, read_colmap
-from wearcap.io.formats.photos import FILE_NAME, read_photos
-from wearcap.io.formats.scan import read_scan
+from wearcap.io.formats.pcd import read_pcd
+from wearcap.io.formats.ply import read_ply
 from wearcap.recording.photo import Photo
 from wearcap.scene.scan import Scan
+
+MAX_EXTENT_M = 5000.0
+"""Largest extent (m) of a scene that a person walks through in one recording."""
+MAX_HEIGHT_M = 500.0
+DENSE_FROM = 1000
+"""Number of points below which a cloud may be sparse without being in another unit."""
+_CELL_M = 0.5
+_MIN_PER_CELL = 1.5
+"""Points per occupied half-metre cell below which a cloud is no dense scan (at 5 mm spacing a wall puts 10 000 there)."""
+
+
+def read_scan(path: str | Path, *, needs_colors: bool = False, metres_per_unit: float | None = None) -> Scan:
+    """Read a scene's cloud (world axes, z up) from a .ply or .pcd file.
+
+    Its unit times `metres_per_unit` is m; None: it should be m, and is refused where it does not look so. Raises
+    WearcapError for another kind of file, what `read_ply` and `read_pcd` refuse, no points, extent or density of a
+    cloud that is not in metres, and, with `needs_colors`, a cloud without colour.
+    """
+    path = Path(path)
+    reader = {".ply": read_ply, ".pcd": read_pcd}.get(path.suffix.lower())
+    if reader is None:
+        raise WearcapError("no scan of a kind that can be read", where=path, expected="a .ply or .pcd file")
+    content = reader(path)
+    points = content.points if metres_per_unit is None else content.points * np.float32(metres_per_unit)
+    if not len(points):
+        raise WearcapError("the scan has no points", where=path, expected="a cloud of the scene's surfaces")
+    if metres_per_unit is None and (fault := _unit_fault(points)):
+        fix = "Give metres_per_unit=0.001 for a scan in millimetres, 1 for one that is sparse."
+        raise WearcapError(fault, where=path, expected="metres", fix=fix)
+    if needs_colors and content.colors is None:
+        fix = "Export it with colours: pictures of the scene are drawn from them."
+        raise WearcapError("the scan has no colour", where=path, expected="red, green and blue of every point", fix=fix)
+    return Scan(points, content.colors)
+
+
+def _unit_fault(points: Float32[np.ndarray, "point 3"]) -> str | None:
+    """Reason why these points cannot be a scene in metres; None if they can.
+
+    Millimetres show in the extent of whole scenes, and in the density of small ones: every point alone in its
+    half-metre cell.
+    """
+    low, high = points.min(0).astype(np.float64), points.max(0).astype(np.float64)
+    extent = high - low
+    size = " x ".join(f"{side:.4g}" for side in extent)
+    if extent.max() > MAX_EXTENT_M or extent[2] > MAX_HEIGHT_M:
+        return f"the scan measures {size} of its units: it looks like millimetres"
+    if len(points) < DENSE_FROM:
+        return None
+    cells = np.floor((points - low) / _CELL_M).astype(np.int64)
+    sides = cells.max(0) + 1
+    per_cell = len(points) / len(np.unique((cells[:, 0] * sides[1] + cells[:, 1]) * sides[2] + cells[:, 2]))
+    if per_cell < _MIN_PER_CELL:
+        apart = f"{len(points)} points lie over {_CELL_M} of its units apart ({size} in all)"
+        return f"the scan's {apart}: it looks like millimetres"
+    return None
+
 
 CLOUD = "pointcloud.ply"
 
@@ -24,7 +87,7 @@ def read_scene(
     folder = Path(folder)
     if not folder.is_dir():
         raise WearcapError("no such folder", where=folder, expected="a scene's folder")
-    if (folder / FILE_NAME).is_file():
+    if (folder / PHOTOS_FILE).is_file():
         return read_photos(folder), read_scan(folder / CLOUD, metres_per_unit=metres_per_unit)
     if is_hps_scene(folder):
         cloud, photos = read_hps_scene(folder)
@@ -32,18 +95,14 @@ def read_scene(
     if any((folder / f"images.{ending}").is_file() for ending in ("bin", "txt")):
         model = read_colmap(folder, images)
         return model.photos, model.tracks
-    raise WearcapError(
-        "no scene of a known kind",
-        where=folder,
-        expected=f"{FILE_NAME} with {CLOUD}, a scan of the HPS data set, or a COLMAP model (cameras, images, points3D)",
-    )
+    expected = f"{PHOTOS_FILE} with {CLOUD}, a scan of the HPS data set, or a COLMAP model (cameras, images, points3D)"
+    raise WearcapError("no scene of a known kind", where=folder, expected=expected)
 
 
 def cloud_file(scene: str | Path) -> Path:
     """The cloud of a scene: the file that was named, or the one in the folder. Raises WearcapError without one."""
     path = Path(scene) / CLOUD if Path(scene).is_dir() else Path(scene)
     if not path.is_file():
-        raise WearcapError(
-            "no scan of a scene here", where=scene, expected=f"a folder with {CLOUD}, or a .ply or .pcd file"
-        )
+        expected = f"a folder with {CLOUD}, or a .ply or .pcd file"
+        raise WearcapError("no scan of a scene here", where=scene, expected=expected)
     return path

@@ -1,31 +1,36 @@
-"""Reading untrusted text files: plain, .gz or .xz, of bounded size, with errors that name the line."""
+"""Reading untrusted text files, plain, .gz or .xz and of bounded size: whole, line by line, JSON, XML.
+
+Errors name the line.
+"""
 
 import codecs
 import io
+import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element, ParseError
 
 import numpy as np
+from defusedxml.common import DefusedXmlException
 
 from wearcap.errors import WearcapError
+from wearcap.files import parse_json
 from wearcap.io.formats.bounded import open_bytes, read_bytes
 
 MAX_BYTES = 1 << 29
 """Largest text that is taken into memory as a whole (512 MiB: over an hour of 120 Hz motion)."""
+MAX_JSON_BYTES = 1 << 28
+"""Largest JSON file that is read (256 MiB): as Python objects it takes up to twenty times as much."""
 MAX_STREAMED_BYTES = 1 << 32
 """Largest text that is read line by line (4 GiB)."""
 MAX_LINE = 1 << 24
 """Longest line (characters): COLMAP lists all points of a picture in one line."""
 
 
-def _as_latin1(error: UnicodeError) -> tuple[str, int]:
-    """Error handler of decoding that reads bytes that are no UTF-8 as Latin-1."""
-    assert isinstance(error, UnicodeDecodeError)
-    return error.object[error.start : error.end].decode("latin-1"), error.end
-
-
-codecs.register_error("wearcap.latin1", _as_latin1)
+# Bytes that are no UTF-8 are read as Latin-1.
+codecs.register_error("wearcap.latin1", lambda e: (e.object[e.start : e.end].decode("latin-1"), e.end))  # pyright: ignore
 
 
 def read_text(path: str | Path, max_bytes: int | None = None, usual: int = MAX_BYTES) -> str:
@@ -39,36 +44,24 @@ def read_text(path: str | Path, max_bytes: int | None = None, usual: int = MAX_B
         return content.decode("latin-1")
 
 
-@contextmanager
-def open_lines(path: str | Path, usual: int = MAX_STREAMED_BYTES) -> Iterator[Iterator[str]]:
-    """A text's lines one after another (UTF-8; other bytes are taken as Latin-1).
+def numbered_lines(path: str | Path, usual: int = MAX_STREAMED_BYTES) -> Iterator[tuple[int, str]]:
+    """Lines of a text with their numbers, counted from 1 (UTF-8; other bytes are taken as Latin-1).
 
-    Raises WearcapError as `open_bytes` does, while opening or inside the `with` block, for binary content and for
-    lines longer than `MAX_LINE`.
+    Raises WearcapError as `open_bytes` does, for an empty file, binary content and lines longer than `MAX_LINE`.
     """
-    with open_bytes(path, usual=usual) as file:
-        yield _lines(io.TextIOWrapper(file, "utf-8-sig", errors="wearcap.latin1"), path)
-
-
-def _lines(file: io.TextIOWrapper, path: str | Path) -> Iterator[str]:
     number = 0
-    while line := file.readline(MAX_LINE):
-        number += 1
-        if "\0" in line:
-            raise WearcapError("binary content", where=at_line(path, number), expected="a text file")
-        if len(line) == MAX_LINE and not line.endswith("\n"):
-            raise WearcapError(
-                f"a line longer than {MAX_LINE} characters", where=at_line(path, number), expected="a text file"
-            )
-        yield line
+    with open_bytes(path, usual=usual) as source:
+        file = io.TextIOWrapper(source, "utf-8-sig", errors="wearcap.latin1")
+        while line := file.readline(MAX_LINE):
+            number += 1
+            if "\0" in line:
+                raise WearcapError("binary content", where=at_line(path, number), expected="a text file")
+            if len(line) == MAX_LINE and not line.endswith("\n"):
+                what = f"a line longer than {MAX_LINE} characters"
+                raise WearcapError(what, where=at_line(path, number), expected="a text file")
+            yield number, line
     if not number:
         raise WearcapError("the file is empty", where=path)
-
-
-def numbered_lines(path: str | Path, usual: int = MAX_STREAMED_BYTES) -> Iterator[tuple[int, str]]:
-    """Lines of a text with their numbers, counted from 1. Raises WearcapError as `open_lines` does."""
-    with open_lines(path, usual) as lines:
-        yield from enumerate(lines, 1)
 
 
 def at_line(path: str | Path, line: int) -> str:
@@ -77,15 +70,52 @@ def at_line(path: str | Path, line: int) -> str:
 
 
 def finite_floats(tokens: Iterable[str]) -> np.ndarray:
-    """All tokens as float64. Raises ValueError when one is no finite number."""
-    values = np.fromiter(map(float, tokens), np.float64)
-    if not np.isfinite(values).all():
-        raise ValueError("not finite")
-    return values
-
-
-def is_finite_number(token: str) -> bool:
+    """All tokens as float64. Raises ValueError naming the first that is no finite number."""
+    tokens = tokens if isinstance(tokens, list) else list(tokens)
     try:
-        return bool(np.isfinite(float(token)))
+        values = list(map(float, tokens))
     except ValueError:
-        return False
+        values = [math.nan]
+    if not all(map(math.isfinite, values)):
+        raise ValueError(f"{next(filter(_no_finite_number, tokens))[:30]!r} is no finite number")
+    return np.array(values, np.float64)
+
+
+def _no_finite_number(token: str) -> bool:
+    try:
+        return not math.isfinite(float(token))
+    except ValueError:
+        return True
+
+
+def read_json(path: str | Path, max_bytes: int | None = None) -> Any:
+    """Content of a JSON file. Raises WearcapError as `read_text` does, and when it is no JSON or nested too deeply."""
+    return parse_json(read_text(path, max_bytes, MAX_JSON_BYTES), path)
+
+
+def read_json_object(path: str | Path) -> dict[str, Any]:
+    """A JSON file's object. Raises WearcapError as `read_json` does, and for a file that holds something else."""
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise WearcapError(f"it holds a {type(content).__name__}", where=path, expected="a JSON object")
+    return content
+
+
+@contextmanager
+def plain_xml(path: str | Path, kind: str) -> Iterator[None]:
+    """Turn the errors of parsing XML into WearcapError, also for document types and entities; `kind` names the file."""
+    try:
+        yield
+    except DefusedXmlException as error:
+        what = "it declares a document type or entities"
+        fix = "Such declarations can blow up or fetch other files, and are never read."
+        raise WearcapError(what, where=path, expected=f"a plain {kind}", fix=fix) from error
+    except ParseError as error:
+        raise WearcapError(
+            f"broken XML ({error.msg})", where=path, expected=f"a whole {kind}", fix="Export or copy it again."
+        ) from error
+
+
+def tag_of(element: Element) -> str:
+    """An element's tag without its namespace; "" for comments."""
+    return element.tag.rsplit("}", 1)[-1] if isinstance(element.tag, str) else ""

@@ -1,6 +1,15 @@
-"""Pictures as RGB arrays: single image files, and the frames of a video with their times; writing a small video."""
+"""Pictures as RGB arrays: image files, folders of them, and the frames of a video with their times; small videos written.
 
+Only a few plain image formats are read, with a limited number of pixels: Pillow guesses the format from the content,
+whatever the name says, and for some formats starts other programs (Ghostscript for EPS); half a megabyte of PNG may
+unpack to gigabytes.
+"""
+
+import io
+import struct
+import zlib
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -10,11 +19,35 @@ import numpy as np
 from av.container import InputContainer
 from av.video.stream import VideoStream
 from jaxtyping import UInt8
+from PIL import Image
 
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
-from wearcap.io.formats.bounded import file_size
-from wearcap.io.formats.image_file import open_image
+from wearcap.io.formats.bounded import Budget, file_size, read_bytes, understood
+
+FORMATS = ("BMP", "JPEG", "PNG", "PPM", "TIFF", "WEBP")
+_PIXEL_BYTES = 4
+_DAMAGE = (
+    *(OSError, SyntaxError, ValueError, LookupError, TypeError, ArithmeticError, AttributeError),
+    *(struct.error, zlib.error, EOFError, RuntimeError, MemoryError, Image.DecompressionBombError),
+)
+"""Exceptions that Pillow raises on truncated or damaged files."""
+
+
+@contextmanager
+def open_image(path: str | Path, max_bytes: int | None = None) -> Iterator[Image.Image]:
+    """An image whose header has been read, its pixels not yet.
+
+    Raises WearcapError, while opening or inside the `with` block, when the file is missing, none of `FORMATS`, damaged,
+    or unpacks to more than `max_bytes`, by default as far as `Budget` goes.
+    """
+    budget = Budget(path, file_size(path, "picture"), max_bytes=max_bytes)
+    content = io.BytesIO(read_bytes(path, max_bytes))  # no chunk of it can be longer than what is there
+    with understood("not a readable picture", path, "a JPEG or PNG file", "Copy it again.", errors=_DAMAGE):  # noqa: SIM117
+        with Image.open(content, formats=FORMATS) as image:
+            budget.spend(_PIXEL_BYTES * image.width * image.height)
+            yield image
+
 
 MAX_PIXELS = 1 << 26
 """Most pixels of a video's picture (8192 x 8192)."""
@@ -38,52 +71,46 @@ def read_frames(
     Times are those written in the file; where it has none, frames follow its average rate.
     Raises WearcapError when the file is missing, damaged or without pictures.
     """
+    with _open_video(path) as (container, stream):
+        stream.thread_type = "AUTO"
+        rate = float(stream.average_rate or 30)
+        begin: float | None = None
+        number = -1
+        for number, frame in enumerate(container.decode(stream)):
+            time = frame.time if frame.time is not None else number / rate
+            begin = time if begin is None else begin
+            if stop is not None and number >= stop:
+                return
+            if number >= start and (number - start) % step == 0:
+                yield time - begin, frame.to_ndarray(format="rgb24")
+        if number < 0:
+            raise WearcapError("a video without frames", where=path)
+
+
+@contextmanager
+def _open_video(path: str | Path) -> Iterator[tuple[InputContainer, VideoStream]]:
+    """An open video and the stream of its pictures; what FFmpeg raises, also later, becomes a WearcapError."""
     file_size(path, "video")
-    try:
-        with av.open(str(path), metadata_errors="replace") as container:
-            stream = _pictures_of(container, path)
-            stream.thread_type = "AUTO"
-            rate = float(stream.average_rate or 30)
-            begin: float | None = None
-            number = -1
-            for number, frame in enumerate(container.decode(stream)):
-                time = frame.time if frame.time is not None else number / rate
-                begin = time if begin is None else begin
-                if stop is not None and number >= stop:
-                    return
-                if number >= start and (number - start) % step == 0:
-                    yield time - begin, frame.to_ndarray(format="rgb24")
-            if number < 0:
-                raise WearcapError("a video without frames", where=path)
-    except (av.FFmpegError, OSError) as error:
-        raise WearcapError(
-            f"not a readable video ({error})",
-            where=path,
-            expected="a complete MP4, MKV or AVI file",
-            fix="Play it in a video player, or copy it again.",
-        ) from error
-
-
-def _pictures_of(container: InputContainer, path: str | Path) -> VideoStream:
-    """The stream of a video's pictures."""
-    if not container.streams.video:
-        raise WearcapError("a file without pictures", where=path, expected="a video")
-    stream = container.streams.video[0]
-    if stream.codec_context is None:
-        raise WearcapError("pictures packed in a way that is not known", where=path, expected="a video in H.264, say")
-    stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}  # for sizes that only the pictures have
-    if stream.width * stream.height > MAX_PIXELS:
-        raise WearcapError(
-            f"pictures of {stream.width}x{stream.height} pixels",
-            where=path,
-            expected=f"at most {MAX_PIXELS} pixels",
-            fix="Scale the video down.",
-        )
-    return stream
+    expected, fix = "a complete MP4, MKV or AVI file", "Play it in a video player, or copy it again."
+    with (
+        understood("not a readable video", path, expected, fix, errors=(av.FFmpegError, OSError)),
+        av.open(str(path), metadata_errors="replace") as container,
+    ):
+        if not container.streams.video:
+            raise WearcapError("a file without pictures", where=path, expected="a video")
+        stream = container.streams.video[0]
+        if stream.codec_context is None:
+            what = "pictures packed in a way that is not known"
+            raise WearcapError(what, where=path, expected="a video in H.264, say")
+        stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}  # for sizes that only the pictures have
+        if stream.width * stream.height > MAX_PIXELS:
+            what = f"pictures of {stream.width}x{stream.height} pixels"
+            raise WearcapError(what, where=path, expected=f"at most {MAX_PIXELS} pixels", fix="Scale the video down.")
+        yield container, stream
 
 
 @dataclass(frozen=True)
-class VideoInfo:
+class _VideoInfo:
     """Content of a video's header."""
 
     width: int
@@ -93,26 +120,18 @@ class VideoInfo:
     """Number of frames; 0 if neither it nor the duration is stated."""
 
 
-def video_info(path: str | Path) -> VideoInfo:
+def video_info(path: str | Path) -> _VideoInfo:
     """Size, average rate and length of a video. Raises WearcapError as `read_frames` does."""
-    size = file_size(path, "video")
-    try:
-        with av.open(str(path), metadata_errors="replace") as container:
-            stream = _pictures_of(container, path)
-            fps = float(stream.average_rate or 30)
-            frames = stream.frames or round((container.duration or 0) / av.time_base * fps)
-            if not (stream.width > 0 and stream.height > 0):
-                raise WearcapError(f"pictures of {stream.width}x{stream.height} pixels", where=path, expected="a video")
-            if not (0 < fps <= _MAX_FPS and 0 <= frames <= size):
-                raise WearcapError(
-                    f"a header that announces {frames} frames at {fps:.6g} per second",
-                    where=path,
-                    expected="no more frames than bytes",
-                    fix="The file was damaged: copy it again.",
-                )
-            return VideoInfo(stream.width, stream.height, fps, frames)
-    except (av.FFmpegError, OSError) as error:
-        raise WearcapError(f"not a readable video ({error})", where=path, expected="a video file") from error
+    with _open_video(path) as (container, stream):
+        fps = float(stream.average_rate or 30)
+        frames = stream.frames or round((container.duration or 0) / av.time_base * fps)
+        if not (stream.width > 0 and stream.height > 0):
+            raise WearcapError(f"pictures of {stream.width}x{stream.height} pixels", where=path, expected="a video")
+        if not (0 < fps <= _MAX_FPS and 0 <= frames <= file_size(path)):
+            what = f"a header that announces {frames} frames at {fps:.6g} per second"
+            expected = "no more frames than bytes"
+            raise WearcapError(what, where=path, expected=expected, fix="The file was damaged: copy it again.")
+        return _VideoInfo(stream.width, stream.height, fps, frames)
 
 
 def video_encoder(crf: int) -> tuple[str, dict[str, str]]:
@@ -141,13 +160,34 @@ def write_frames(
                 size = (frame.shape[1], frame.shape[0])
                 stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
             if (frame.shape[1], frame.shape[0]) != size or size[0] % 2 or size[1] % 2:
-                raise WearcapError(
-                    f"a picture of {frame.shape[1]}x{frame.shape[0]} pixels",
-                    where=path,
-                    expected="even sizes, all alike",
-                )
+                what = f"a picture of {frame.shape[1]}x{frame.shape[0]} pixels"
+                raise WearcapError(what, where=path, expected="even sizes, all alike")
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
         if not count:
             raise WearcapError("no pictures to write", where=path)
         container.mux(stream.encode(None))
     return count
+
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
+
+
+def read_pictures(source: str | Path, max_count: int) -> Iterator[tuple[str, UInt8[np.ndarray, "height width 3"]]]:
+    """Yield (name, RGB picture) of up to `max_count` files of a folder, by name, or evenly spaced frames of a video.
+
+    Raises WearcapError when there is no picture, and for one that cannot be decoded, naming it.
+    """
+    source = Path(source)
+    if source.is_dir():
+        files = sorted(path for path in source.iterdir() if path.suffix.lower() in SUFFIXES)
+        if not files:
+            raise WearcapError("no pictures in this folder", where=source, expected=", ".join(SUFFIXES))
+        wanted = np.unique(np.linspace(0, len(files) - 1, max_count).round().astype(int))
+        for path in (files[k] for k in wanted):
+            yield path.name, read_image(path)
+    elif source.is_file():
+        step = max(1, -(-video_info(source).frames // max_count))
+        for count, (_, picture) in enumerate(read_frames(source, step=step)):
+            yield f"frame {count * step}", picture
+    else:
+        raise WearcapError("no such file or folder", where=source, expected="a video, or a folder of pictures")

@@ -7,9 +7,9 @@ import numpy as np
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
+from wearcap.io.formats.ply import GREY
 from wearcap.io.formats.text import at_line, numbered_lines
 
-_COLOR = np.array([0.7, 0.7, 0.7], np.float32)
 _LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -25,35 +25,25 @@ def read_obj(path: str | Path) -> Mesh:
         words = line.split()
         try:
             if words[:1] == ["v"]:
-                vertices.extend(_vertex(words))
+                values = [float(word) for word in words[1:4]]
+                if len(values) < 3 or not all(abs(value) < _LARGEST for value in values):
+                    raise ValueError(f"{' '.join(words[1:4])!r} are no three finite numbers")
+                vertices.extend(values)
             elif words[:1] == ["f"]:
                 faces.extend(_fan(words, len(vertices) // 3))
         except ValueError as error:
-            raise WearcapError(
-                f"not a readable {'vertex' if words[0] == 'v' else 'face'} ({error})"[:300],
-                where=at_line(path, number),
-                expected="v x y z, or f a b c …",
-                fix="The file was damaged: copy it again.",
-            ) from error
+            what = f"not a readable {'vertex' if words[0] == 'v' else 'face'} ({error})"[:300]
+            fix = "The file was damaged: copy it again."
+            raise WearcapError(what, where=at_line(path, number), expected="v x y z, or f a b c …", fix=fix) from error
     if not vertices:
         raise WearcapError("no vertices", where=path, expected="a Wavefront .obj with lines `v x y z`")
     points = np.array(vertices, np.float32).reshape(-1, 3)
     corners = np.array(faces, np.int32).reshape(-1, 3)
     if len(corners) and corners.max() >= len(points):
-        raise WearcapError(
-            f"a face names vertex {corners.max() + 1}, there are {len(points)}",
-            where=path,
-            expected="faces of its own vertices",
-            fix="The file was cut short: copy it again.",
-        )
-    return Mesh(points, corners, _COLOR)
-
-
-def _vertex(words: list[str]) -> list[float]:
-    values = [float(word) for word in words[1:4]]
-    if len(values) < 3 or not all(abs(value) < _LARGEST for value in values):
-        raise ValueError(f"{' '.join(words[1:4])!r} are no three finite numbers")
-    return values
+        what = f"a face names vertex {corners.max() + 1}, there are {len(points)}"
+        expected = "faces of its own vertices"
+        raise WearcapError(what, where=path, expected=expected, fix="The file was cut short: copy it again.")
+    return Mesh(points, corners, GREY)
 
 
 def _fan(words: list[str], known: int) -> list[int]:

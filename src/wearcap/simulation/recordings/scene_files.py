@@ -16,7 +16,7 @@ from wearcap.files import atomic_path, write_text
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.io.formats.photos import FILE_NAME, write_photos
+from wearcap.io.formats.camera_json import PHOTOS_FILE, write_photos
 from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.io.formats.scene_folder import CLOUD
 from wearcap.recording.photo import Photo
@@ -78,7 +78,7 @@ def write_scene(scenery: Scenery, folder: str | Path, settings: SceneSettings, s
     plan = plan_photos(scenery, settings)
     note = folder / MADE
     if not note.is_file() or note.read_text(encoding="utf-8") != wanted:
-        for path in (folder / CLOUD, folder / FILE_NAME, *(folder / "photos").glob("*.jpg")):
+        for path in (folder / CLOUD, folder / PHOTOS_FILE, *(folder / "photos").glob("*.jpg")):
             path.unlink(missing_ok=True)
         write_text(note, wanted)
     if not (folder / CLOUD).is_file():
@@ -92,5 +92,5 @@ def write_scene(scenery: Scenery, folder: str | Path, settings: SceneSettings, s
             picture = Image.fromarray(render_view(scenery, photo.camera, photo.T_world_cam, light, rng))
             with atomic_path(folder / photo.file) as temporary:
                 picture.save(temporary, "JPEG", quality=92, subsampling=0)
-    if not (folder / FILE_NAME).is_file():
+    if not (folder / PHOTOS_FILE).is_file():
         write_photos(plan, folder)
