@@ -22,7 +22,7 @@ from wearcap.recording import Recording
 from wearcap.recording.store import RecordingFile, save_recording
 from wearcap.scene.scan import Scan
 from wearcap.sensors.clock import Clock
-from wearcap.sensors.depth_rig import DepthView, empty_scene, person_cloud, register_view
+from wearcap.sensors.depth_rig import Background, DepthView, person_cloud
 from wearcap.simulation.places.world import World
 from wearcap.simulation.recordings.hps import HpsConfig, simulate_hps
 from wearcap.simulation.rendering.depth_rig import approximate, place_rig, simulate_rig
@@ -115,7 +115,7 @@ def _rig_clouds(
     near = scan.points[np.linalg.norm(scan.points - spot, axis=1) < RIG_SCENE_M]
     rough = approximate(true, rng)
     views = [
-        register_view(DepthView(rig.camera, rough[number], empty_scene(rig.empty_mm[number])), near)[0]
+        DepthView(rig.camera, rough[number], Background.of(rig.empty_mm[number])).registered(near)[0]
         for number in range(len(true.t))
     ]
     clouds = [person_cloud(list(rig.depth_mm[:, number]), views) for number in range(len(frames))]

@@ -20,7 +20,7 @@ from wearcap.recording.timing import resampled
 from wearcap.runtime.system import CaptureInput
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import CONTACT_CLASSES
-from wearcap.sensors.noise import smooth_noise
+from wearcap.sensors.simulated import smooth_noise
 from wearcap.systems.ireplica.contact_intervals import ContactSettings
 from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 from wearcap.systems.ireplica.object_tracker import ObjectTracker

@@ -7,10 +7,10 @@ import torch
 
 from wearcap.geometry import rotation
 from wearcap.metrics.table import Scores, Summary
-from wearcap.sensors.arm_swings import fit_swing_clock, swing_peaks
 from wearcap.sensors.camera_alignment import align_by_marks, mark_positions, mount_by_standing
-from wearcap.sensors.gravity_scale import GravityScale, by_floor, by_head_imu
-from wearcap.sensors.watch_calibration import calibrate_watches
+from wearcap.sensors.clock import fit_swing_clock, swing_peaks
+from wearcap.sensors.monocular_slam import GravityScale, by_floor, by_head_imu
+from wearcap.sensors.watch_calibration import measure_watches, require_watches
 from wearcap.simulation.recordings.calibration_session import (
     MARKS,
     STANDING,
@@ -58,7 +58,8 @@ def calibration_scores(sessions: int, step: Callable[[], None]) -> Scores:
 
 
 def _errors(made: CalibrationSession, fps: float) -> dict[str, list[float]]:
-    watches = calibrate_watches(made.watches, made.board["left_wrist"], made.t_pose["left_wrist"])
+    watches = measure_watches(made.watches, made.board["left_wrist"], made.t_pose["left_wrist"])
+    require_watches(made.watches, watches, made.t_pose["left_wrist"])
     marks, _, _ = mark_positions(made.slam, MARKS)
     aligned = align_by_marks(marks, made.measured.distances_m, made.measured.mark_height_m)
     mount = mount_by_standing(aligned.apply(made.slam), STANDING)

@@ -19,7 +19,7 @@ from wearcap.metrics.scores import score_in_world, truth_at
 from wearcap.metrics.table import Row, evaluate_motion
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.sensors.keypoints import action_camera, camera_path, seen_joints
-from wearcap.sensors.noise import smooth_noise
+from wearcap.sensors.simulated import smooth_noise
 from wearcap.systems.mocap_every.energy import LatentSolver
 from wearcap.systems.mocap_every.pipeline import CapturedWithFloor, MocapEvery
 from wearcap.systems.mocap_every.visual_cues import at_frames, load_visual_cues

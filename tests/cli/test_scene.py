@@ -58,7 +58,7 @@ def test_a_scanned_scene_becomes_a_map(tmp_path, capsys):
     painted_wall(tmp_path)
     made = run(tmp_path, "check=2")
     assert len(made) == 9
-    assert np.abs(made.positions[:, 0] - 3).max() < 0.01
+    assert np.abs(made.observations.positions[:, 0] - 3).max() < 0.01
     said = capsys.readouterr().out
     assert "2 of 2 photos are found in the map of the others" in said
     assert "rootsift" in said
@@ -94,7 +94,7 @@ def test_a_colmap_model_becomes_a_map(tmp_path, capsys):
     )
     made = run(tmp_path, f"images={tmp_path / 'photos'}", "check=2", "settings.track_distance_px=1")
     assert len(made) == 9
-    assert np.abs(made.positions[:, 0] - 3).max() < 1e-4
+    assert np.abs(made.observations.positions[:, 0] - 3).max() < 1e-4
     assert "of 2 photos are found" in capsys.readouterr().out
 
 

@@ -14,7 +14,7 @@ from wearcap.cli import main as cli
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.io.formats.camera_json import read_camera, write_camera
-from wearcap.localization.checkerboard import Board, View, calibrate_from_pictures, coverage, find_board, varied
+from wearcap.localization.checkerboard import Board, View, calibrate_from_pictures, varied
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +33,10 @@ def test_planted_intrinsics_are_recovered(shown):
     found = calibrate_from_pictures(shown, BOARD)
     near(found.camera, 0.005)
     assert found.rms_px < 0.2
+    corners = np.concatenate([view.corners for view in found.views])
+    size = (CAMERA.width, CAMERA.height)
+    seen, _, _ = np.histogram2d(*corners.T, bins=(8, 6), range=[(0, side) for side in size])
+    assert found.coverage == pytest.approx((seen > 0).mean())
     assert found.coverage > 0.6
     assert found.examined == 24
     assert found.seen >= len(found.views) >= 15
@@ -55,7 +59,7 @@ def test_corners_lie_where_the_camera_projects_them():
     random = np.random.default_rng(5)
     R, t = pose(random, BOARD, tilt_deg=25)
     gray = cv2.cvtColor(picture(rays_of(CAMERA), BOARD, R, t), cv2.COLOR_RGB2GRAY)
-    view = find_board(gray, BOARD)
+    view = BOARD.find(gray)
     assert view is not None
     expected = cv2.projectPoints(
         BOARD.points,
@@ -72,7 +76,7 @@ def test_blurred_pictures_stand_back_for_sharp_ones(shown):
     blurred = [(f"b{name}", cv2.GaussianBlur(image, None, 2.5)) for name, image in shown[:6]]
     found = calibrate_from_pictures([*blurred, *shown], BOARD)
     assert not any(view.name.startswith("b") for view in found.views)
-    assert min(find_board(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), BOARD).blur_px for _, image in blurred[3:4]) > 4
+    assert min(BOARD.find(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)).blur_px for _, image in blurred[3:4]) > 4
 
 
 def test_varied_views_are_chosen():
@@ -83,11 +87,6 @@ def test_varied_views_are_chosen():
     ]
     far = [View("left", BOARD.points[:, :2] * 800, 2.0), View("small", BOARD.points[:, :2] * 300 + 100, 2.0)]
     assert {"left", "small"} <= {view.name for view in varied([*near_one, *far], (640, 480), 4)}
-
-
-def test_coverage():
-    corners = np.array([[5.0, 5.0], [635.0, 475.0]], np.float32)
-    assert coverage([View("a", corners, 1.0)], (640, 480)) == pytest.approx(2 / 48)
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 3.0])

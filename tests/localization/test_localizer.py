@@ -11,12 +11,12 @@ from textured_room import CAMERA, looking, photo_poses, photograph, take_photos,
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
-from wearcap.localization.features import Features, RootSift
-from wearcap.localization.localizer import Localizer, LocalizerSettings, localize_video, nearest_pictures
+from wearcap.geometry.rigid import Rigid
+from wearcap.localization.features import Features, RootSift, most_similar
+from wearcap.localization.localizer import Localizer, LocalizerSettings, localize_video
 from wearcap.localization.map_builder import MapSettings, build_map, extended
 from wearcap.localization.point_map import PointMapper
-from wearcap.localization.retrieval import most_similar
-from wearcap.localization.visual_map import VisualMap
+from wearcap.localization.visual_map import Observations, VisualMap
 from wearcap.recording.photo import Photo
 from wearcap.scene.scan import Scan
 
@@ -82,10 +82,10 @@ def test_the_covariance_speaks_of_the_error(mapper, room_map):
 
 def test_positions_lie_on_the_walls(mapper, room_map):
     size = np.array([5.0, 4.0, 2.6])
-    off = np.minimum(np.abs(room_map.positions), np.abs(room_map.positions - size)).min(1)
+    off = np.minimum(np.abs(room_map.observations.positions), np.abs(room_map.observations.positions - size)).min(1)
     assert np.median(off) < 0.002
     assert np.quantile(off, 0.99) < 0.02
-    assert len(room_map.landmarks.points_world) < 0.9 * len(room_map.positions)
+    assert len(room_map.landmarks.points_world) < 0.9 * len(room_map.observations.positions)
 
 
 def test_a_map_survives_its_file(mapper, room_map, tmp_path):
@@ -94,8 +94,10 @@ def test_a_map_survives_its_file(mapper, room_map, tmp_path):
     loaded = VisualMap.load(path)
     assert loaded.cameras == room_map.cameras
     assert loaded.names == room_map.names
-    for name in ("R_world_cam", "keypoints", "descriptors", "positions", "landmark", "vocabulary"):
-        np.testing.assert_array_equal(getattr(loaded, name), getattr(room_map, name))
+    for name, array in vars(room_map.observations).items():
+        np.testing.assert_array_equal(getattr(loaded.observations, name), array)
+    np.testing.assert_array_equal(loaded.T_world_cam.R, room_map.T_world_cam.R)
+    np.testing.assert_array_equal(loaded.vocabulary, room_map.vocabulary)
     truth = planted(1)[0]
     image = photograph(mapper, QUERY, truth)
     one, other = (Localizer(m, EXTRACTOR)(image, QUERY) for m in (room_map, loaded))
@@ -109,8 +111,8 @@ def test_an_extended_map_knows_both_parts(mapper, photos, room_map):
     both = extended(half, photos[12:], scan, EXTRACTOR, settings=SETTINGS)
     both.check()
     assert both.names == room_map.names
-    np.testing.assert_array_equal(both.positions, room_map.positions)
-    np.testing.assert_array_equal(both.landmark, room_map.landmark)
+    np.testing.assert_array_equal(both.observations.positions, room_map.observations.positions)
+    np.testing.assert_array_equal(both.observations.landmark, room_map.observations.landmark)
     np.testing.assert_array_equal(both.vocabulary, half.vocabulary)
     truth = photos[20].T_world_cam
     pose = Localizer(both, EXTRACTOR)(photograph(mapper, QUERY, truth), QUERY)
@@ -124,7 +126,7 @@ def test_retrieval_finds_what_shows_the_same_wall(mapper, room_map):
         image = photograph(mapper, QUERY, truth)
         summary = localizer.descriptor(image, EXTRACTOR(image))
         best = most_similar(summary, room_map.global_descriptors, 3)
-        angle = np.arccos(np.clip(room_map.R_world_cam[:, :, 2] @ truth.R[:, 2].numpy(), -1, 1))
+        angle = np.arccos(np.clip(room_map.T_world_cam.R.numpy()[:, :, 2] @ truth.R[:, 2].numpy(), -1, 1))
         ranks.append(angle[best].min() < np.radians(40))
     assert np.mean(ranks) > 0.8
 
@@ -186,23 +188,16 @@ def test_a_matcher_of_picture_pairs(mapper, room_map):
     localizer = Localizer(room_map, EXTRACTOR, mutual, settings)
     image = photograph(mapper, QUERY, truth)
     assert errors(localizer(image, QUERY), truth)[1] < 0.03
+    T, seen = room_map.T_world_cam, room_map.observations
+    first = np.concatenate([seen.first, seen.first[-1] + seen.first[1:]])
+    doubled = {name: np.concatenate([array] * 2) for name, array in vars(seen).items()} | {"first": first}
     twice = replace(
         room_map,
         names=room_map.names * 2,
         cameras=room_map.cameras * 2,
-        first=np.concatenate([room_map.first, room_map.first[-1] + room_map.first[1:]]),
-        **{
-            name: np.concatenate([getattr(room_map, name)] * 2)
-            for name in (
-                "R_world_cam",
-                "t_world_cam",
-                "keypoints",
-                "descriptors",
-                "positions",
-                "landmark",
-                "global_descriptors",
-            )
-        },
+        T_world_cam=Rigid(torch.cat([T.R] * 2), torch.cat([T.t] * 2)),
+        global_descriptors=np.concatenate([room_map.global_descriptors] * 2),
+        observations=Observations(**doubled),
     )
     again = Localizer(twice, EXTRACTOR, mutual, replace(settings, retrieved=20))
     # the same pictures once more tell no more
@@ -211,7 +206,7 @@ def test_a_matcher_of_picture_pairs(mapper, room_map):
 
 def test_the_nearest_pictures_look_the_same_way(room_map):
     prior = room_map.T_world_cam[7]
-    chosen = nearest_pictures(room_map, prior, 4)
+    chosen = room_map.nearest(prior, 4)
     assert chosen[0] == 7
     assert len(chosen) == 4
 
@@ -284,7 +279,8 @@ def test_files_that_are_no_maps(room_map, tmp_path):
     path.write_bytes(content[:-100])
     with pytest.raises(WearcapError, match="not a readable map"):
         VisualMap.load(path)
-    replace(room_map, first=room_map.first + 1).save(path)
+    shifted = replace(room_map.observations, first=room_map.observations.first + 1)
+    replace(room_map, observations=shifted).save(path)
     with pytest.raises(WearcapError, match="damaged map .*share out the observations"):
         VisualMap.load(path)
 

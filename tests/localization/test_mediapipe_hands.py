@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from wearcap.errors import WearcapError
-from wearcap.localization.keypoints import Detector
-from wearcap.localization.mediapipe_hands import MODEL_VARIABLE, Hand, MediaPipeHands, wearers_hands
+from wearcap.localization.keypoints import MODEL_VARIABLE, Detector, Hand, MediaPipeHands, wearers_hands
 
 
 def mark(x: float, y: float) -> SimpleNamespace:

@@ -13,14 +13,13 @@ from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.colmap import Tracks
-from wearcap.localization.absolute_pose import Fit, lens_of, pose_covariance, ransac_pose, refined_pose
-from wearcap.localization.features import Features, RootSift, root
-from wearcap.localization.landmarks import from_bytes, merge, to_bytes
+from wearcap.localization.absolute_pose import Fit, Matches
+from wearcap.localization.features import Features, RootSift, Vlad, most_similar, root
 from wearcap.localization.localizer import confidence
-from wearcap.localization.map_builder import MapSettings, _lift_by_tracks
+from wearcap.localization.map_builder import MapSettings, _lift
 from wearcap.localization.matching import match_landmarks, match_nearby
 from wearcap.localization.point_map import PointMap, PointMapper, undistortion
-from wearcap.localization.retrieval import Vlad, most_similar, train_vocabulary
+from wearcap.localization.visual_map import from_bytes, merge, to_bytes
 from wearcap.recording.photo import Photo
 from wearcap.scene.scan import Scan
 
@@ -153,7 +152,7 @@ def test_tracks_behind_the_perspective_view_lift_nothing():
     mirrored = [flat.fx * direction[0].item() + flat.cx, flat.fy * direction[1].item() + flat.cy]
     keypoints = np.array([ahead, mirrored], np.float32)
     features = Features(keypoints, unit_rows(2, 8), np.ones(2, np.float32), (400, 400))
-    lift = _lift_by_tracks(tracks, MapSettings())
+    lift = _lift(tracks, MapSettings())
     positions, valid = lift(0, Photo(Path("a.png"), wide, Rigid.identity()), flat, features)
     assert valid.tolist() == [True, False]
     np.testing.assert_allclose(positions[0], points[0], atol=1e-6)
@@ -183,13 +182,13 @@ def test_vlad_is_the_sum_of_residuals():
 def test_the_vocabulary_finds_planted_clusters():
     centers = 5 * unit_rows(6, 8)
     samples = np.repeat(centers, 50, 0) + 0.05 * unit_rows(300, 8, 1)
-    found = train_vocabulary(samples, 6)
+    found = Vlad.trained(samples, 6).vocabulary
     distance = np.linalg.norm(found[:, None] - centers, axis=-1)
     assert sorted(distance.argmin(1)) == list(range(6))
     assert distance.min(1).max() < 0.05
-    np.testing.assert_array_equal(found, train_vocabulary(samples, 6))
+    np.testing.assert_array_equal(found, Vlad.trained(samples, 6).vocabulary)
     with pytest.raises(WearcapError, match="3 descriptors for a vocabulary of 6 words"):
-        train_vocabulary(samples[:3], 6)
+        Vlad.trained(samples[:3], 6)
 
 
 def test_most_similar_sorts_by_cosine():
@@ -295,9 +294,10 @@ LENSES = [
 def test_planted_poses(camera, outliers):
     for seed in range(3):
         pose, pixels, points, wrong = planted(camera, 0.0, outliers, seed)
-        start = ransac_pose(pixels, points, camera, 4.0)
+        matches = Matches(pixels, points, camera)
+        start = matches.ransac(4.0)
         assert start is not None
-        fit = refined_pose(pixels, points, camera, start, 4.0)
+        fit = matches.refined(start, 4.0)
         assert np.abs(pose_error(fit, pose)).max() < 1e-5
         assert fit.inlier[~wrong].all()
         assert fit.inlier[wrong].mean() < 0.05 if outliers else True
@@ -307,19 +307,21 @@ def test_the_covariance_is_that_of_many_draws():
     errors, covariances = [], []
     for seed in range(60):
         pose, pixels, points, _ = planted(LENSES[1], 1.0, 0.0, seed, 60)
-        start = ransac_pose(pixels, points, LENSES[1], 6.0)
+        matches = Matches(pixels, points, LENSES[1])
+        start = matches.ransac(6.0)
         assert start is not None
-        fit = refined_pose(pixels, points, LENSES[1], start, 20.0)
+        fit = matches.refined(start, 20.0)
         errors.append(pose_error(fit, pose))
-        covariances.append(pose_covariance(pixels, points, LENSES[1], fit))
+        covariances.append(matches.covariance(fit))
     square = [error @ np.linalg.solve(cov, error) for error, cov in zip(errors, covariances)]
     assert np.mean(square) / 6 == pytest.approx(1.0, abs=0.35)  # 60 draws: standard deviation 0.075, robust loss more
 
 
 def test_few_matches_and_other_lenses():
-    assert ransac_pose(np.zeros((3, 2), np.float32), np.zeros((3, 3), np.float32), PINHOLE, 4.0) is None
+    none = np.zeros((4, 2), np.float32), np.zeros((4, 3), np.float32)
+    assert Matches(none[0][:3], none[1][:3], PINHOLE).ransac(4.0) is None
     with pytest.raises(WearcapError, match="camera model 'fisheye'"):
-        lens_of(FISHEYE)
+        Matches(*none, FISHEYE).ransac(4.0)
 
 
 def test_confidence_rises_with_spread_matches_only():

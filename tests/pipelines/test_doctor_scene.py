@@ -14,11 +14,11 @@ from walking_person import sound_recording
 from wearcap.doctor import Finding, examine
 from wearcap.doctor.body import check_contact_prob
 from wearcap.geometry.camera import Camera
+from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import about_axis
 from wearcap.io.formats.camera_json import write_photos
 from wearcap.io.formats.ply import Ply, write_ply
-from wearcap.localization.landmarks import Landmarks
-from wearcap.localization.visual_map import VisualMap
+from wearcap.localization.visual_map import Landmarks, Observations, VisualMap
 from wearcap.recording import CameraStream, Localization, Recording, RecordingStore
 
 CAMERA = Camera("opencv", 64, 48, 40.0, 40.0, 31.5, 23.5, (0.0, 0.0, 0.0, 0.0))
@@ -276,15 +276,16 @@ def small_map(pictures: int, each: int) -> VisualMap:
         "vlad",
         tuple(f"{k}.jpg" for k in range(pictures)),
         (CAMERA,) * pictures,
-        np.tile(np.eye(3), (pictures, 1, 1)),
-        np.zeros((pictures, 3)),
-        np.zeros((count, 2), np.float32),
-        descriptors,
-        positions,
-        np.arange(pictures + 1, dtype=np.int64) * each,
-        np.arange(count, dtype=np.int32),
-        landmarks,
+        Rigid.identity(pictures, dtype=torch.float64),
         np.zeros((pictures, 8), np.float32),
+        Observations(
+            np.zeros((count, 2), np.float32),
+            descriptors,
+            positions,
+            np.arange(pictures + 1, dtype=np.int64) * each,
+            np.arange(count, dtype=np.int32),
+        ),
+        landmarks,
         np.zeros((2, 128), np.float32),
         0.02,
     )

@@ -10,7 +10,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Localization
-from wearcap.sensors.alignment import align_suit, estimate_head_camera, robust_angle, yaw_between
+from wearcap.sensors.initialization import align_suit, estimate_head_camera, robust_angle, yaw_between
 
 NOISY = LocalizationNoise(outages_s=((0.0, 1.5),))
 

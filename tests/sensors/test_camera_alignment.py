@@ -10,15 +10,8 @@ from planted_session import SEEDS, apart_deg, session
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.sensors.camera_alignment import (
-    HeadMount,
-    align_by_marks,
-    mark_checks,
-    mark_positions,
-    mount_by_standing,
-    mount_checks,
-    scale_by_walks,
-)
+from wearcap.sensors.camera_alignment import HeadMount, align_by_marks, mark_positions, mount_by_standing
+from wearcap.sensors.monocular_slam import scale_by_walks
 from wearcap.sensors.stillness import require
 from wearcap.simulation.recordings.calibration_session import MARKS, STANDING
 
@@ -38,7 +31,7 @@ def test_a_planted_session_is_recovered(seed):
     aligned = found.apply(made.slam)
     mount = mount_by_standing(aligned, STANDING)
     assert apart_deg(mount.R_head_cam, made.planted.R_head_cam) < 0.5
-    require([*mark_checks(found, found.scale * moved, turned), *mount_checks(mount)])
+    require([*found.checks(found.scale * moved, turned), *mount.checks()])
     head = mount.apply(aligned)
     upright = (head.timestamps > STANDING[0]) & (head.timestamps < STANDING[1])
     yaw = rotation.yaw_of(rotation.mean_rotation(head.R_world_device[upright]))
@@ -69,17 +62,17 @@ def test_what_is_measured_wrongly_shows_in_the_checks():
     spread = align_by_marks(marks, (0.5, 0.44), 0.8)
     assert spread.scale_spread == pytest.approx(0.095, abs=0.002)
     with pytest.raises(WearcapError, match=r"scales by the two distances differ: 9.5. %. Expected at most 3 %"):
-        require(mark_checks(spread, *still))
+        require(spread.checks(*still))
     askew = marks.clone()
     askew[3] += (marks[1] - marks[0]) * 0.1
     with pytest.raises(WearcapError, match="axes miss a right angle: 7"):
-        require(mark_checks(align_by_marks(askew, DISTANCES, 0.8), *still))
+        require(align_by_marks(askew, DISTANCES, 0.8).checks(*still))
     with pytest.raises(WearcapError, match="camera on C2: moves: 0.02 m.*Let go of the camera"):
-        require(mark_checks(align_by_marks(marks, DISTANCES), torch.tensor([0.0, 0.02, 0, 0]), [0.0] * 4))
+        require(align_by_marks(marks, DISTANCES).checks(torch.tensor([0.0, 0.02, 0, 0]), [0.0] * 4))
     lifted = marks.clone()
     lifted[0] += torch.linalg.cross(marks[1] - marks[0], marks[3] - marks[2]) * scale * 0.5  # by 10 cm
     with pytest.raises(WearcapError, match="camera on the board: residual: 0.0[0-9]+ m. Expected at most 0.01"):
-        require(mark_checks(align_by_marks(lifted, DISTANCES, 0.8), *still)[-1:])
+        require(align_by_marks(lifted, DISTANCES, 0.8).checks(*still)[-1:])
 
 
 @pytest.mark.parametrize(
@@ -124,8 +117,8 @@ def test_standing_must_be_still_and_face_ahead():
     made = session(0)
     aligned = align_by_marks(mark_positions(made.slam, MARKS)[0], made.measured.distances_m).apply(made.slam)
     with pytest.raises(WearcapError, match="optical axis away from straight ahead: 1[5-8].*facing_deg"):
-        require(mount_checks(mount_by_standing(aligned, STANDING, facing_deg=-90.0)))
+        require(mount_by_standing(aligned, STANDING, facing_deg=-90.0).checks())
     with pytest.raises(WearcapError, match="standing: not still"):
-        require(mount_checks(HeadMount(torch.eye(3), torch.zeros(3), 9.0)))
+        require(HeadMount(torch.eye(3), torch.zeros(3), 9.0).checks())
     with pytest.raises(WearcapError, match="standing.*at least 3 s"):
         mount_by_standing(aligned, (52.0, 53.0))

@@ -11,7 +11,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.recording import CameraStream, ImuStream
-from wearcap.sensors.claps import camera_claps, detect_claps, detect_claps_audio, read_audio
+from wearcap.sensors.claps import camera_claps, detect_claps, detect_claps_audio
 
 ACROSS = np.array([0.0, 1.0, 0.2])
 
@@ -173,9 +173,6 @@ def worn_camera(video):
 
 def test_claps_of_a_video(tmp_path):
     write_clip(tmp_path / "head.mkv", sound([1.5, 2.1], seconds=3.0))
-    waveform, rate, delay = read_audio(tmp_path / "head.mkv")
-    assert (rate, len(waveform)) == (48_000, 3 * 48_000)
-    assert abs(delay) < 0.05
     found = camera_claps(worn_camera("head.mkv"), tmp_path)
     np.testing.assert_allclose(found.numpy(), [101.5, 102.1], atol=0.003)
 
@@ -187,8 +184,8 @@ def test_a_silent_video_takes_times_by_hand(tmp_path):
     assert camera_claps(worn_camera("head.mkv"), tmp_path, [2.0, 1.0]).tolist() == [101.0, 102.0]
     (tmp_path / "bad.mkv").write_bytes(b"nothing")
     with pytest.raises(WearcapError, match=r"bad.mkv: cannot be read"):
-        read_audio(tmp_path / "bad.mkv")
+        camera_claps(worn_camera("bad.mkv"), tmp_path)
     with pytest.raises(WearcapError, match="cannot be read"):
-        read_audio(tmp_path / "none.mkv")
+        camera_claps(worn_camera("none.mkv"), tmp_path)
     with pytest.raises(WearcapError, match="without a video"):
         camera_claps(worn_camera(None), tmp_path)

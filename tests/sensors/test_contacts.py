@@ -12,7 +12,7 @@ from wearcap.geometry import rotation
 from wearcap.recording import ImuStream, Motion
 from wearcap.sensors.contacts import contacts_from_imu, contacts_from_motion
 from wearcap.sensors.imu import ImuNoise, synthesize_imu
-from wearcap.sensors.suit import SuitNoise, suit_motion
+from wearcap.sensors.simulated import SuitNoise, suit_motion
 from wearcap.simulation.people.wearer import simulate_motion
 from wearcap.simulation.recordings.simulate import person_of, world_of
 

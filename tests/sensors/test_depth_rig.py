@@ -18,11 +18,8 @@ from wearcap.metrics.chamfer import chamfer, seen_vertices
 from wearcap.sensors.depth_rig import (
     Background,
     DepthView,
-    empty_scene,
-    foreground,
     largest_cluster,
     person_cloud,
-    register_view,
     unproject_depth,
     visible_points,
 )
@@ -36,12 +33,12 @@ def test_the_background_is_the_mean_of_what_was_measured():
     frames = np.full((4, 3, 3), 2000, np.uint16)
     frames[:, 0, 0] = [1990, 2010, 0, 2000]
     frames[:, 1, 1] = [0, 0, 0, 1500]
-    background = empty_scene(frames)
+    background = Background.of(frames)
     assert background.depth_m[0, 0] == pytest.approx(2.0)
     assert background.deviation_m[0, 0] == pytest.approx(0.01)
     assert np.isinf(background.depth_m[1, 1]), "seen in one frame of four"
     with pytest.raises(WearcapError, match="no frames of the empty scene"):
-        empty_scene(frames[:0])
+        Background.of(frames[:0])
 
 
 def test_pixels_that_flicker_are_not_steady():
@@ -49,11 +46,11 @@ def test_pixels_that_flicker_are_not_steady():
     frames += np.random.default_rng(0).integers(0, 10, frames.shape).astype(np.uint16)
     frames[::2, 4, 4] = 2045
     frames[:, 8] = 0
-    steady = empty_scene(frames).steady
+    steady = Background.of(frames).steady
     assert not steady[4, 4], "now and then 4 cm further: its mean is neither place"
     assert not steady[8].any()
     assert steady.mean() > 0.85
-    assert empty_scene(frames[:1]).steady.mean() > 0.85, "a single frame says nothing about flicker"
+    assert Background.of(frames[:1]).steady.mean() > 0.85, "a single frame says nothing about flicker"
 
 
 def test_what_stands_before_the_background_is_kept_and_flying_pixels_are_not():
@@ -65,12 +62,12 @@ def test_what_stands_before_the_background_is_kept_and_flying_pixels_are_not():
     image[0, 0] = 0
     expected = np.zeros((30, 40), bool)
     expected[2:20, 10:20] = True
-    mask = foreground(image, background)
+    mask = background.foreground(image)
     assert np.array_equal(mask[5:], expected[5:])
     assert mask[3, 12], "before an unmeasured background"
     assert not mask[0, 0]
     with pytest.raises(WearcapError, match="images of one camera"):
-        foreground(image[:10], background)
+        background.foreground(image[:10])
 
 
 def test_unprojection_puts_points_where_they_project_from():
@@ -152,8 +149,8 @@ def views(scene: Scene) -> list[DepthView]:
     """The cameras as ICP brings them back from 10 cm and 3° off."""
     found = []
     for number in range(3):
-        rough = DepthView(scene.rig.camera, scene.rough[number], empty_scene(scene.rig.empty_mm[number]))
-        view, report = register_view(rough, scene.scan)
+        rough = DepthView(scene.rig.camera, scene.rough[number], Background.of(scene.rig.empty_mm[number]))
+        view, report = rough.registered(scene.scan)
         true = scene.rig.T_world_cam[number]
         assert (rough.T_world_cam.t - true.t).norm() == pytest.approx(0.1, rel=1e-4)
         assert (view.T_world_cam.t - true.t).norm() < 0.01
@@ -184,9 +181,9 @@ def test_a_hand_made_correction_saves_a_pose_that_icp_cannot_reach(scene: Scene,
     away = Rigid(rotation.about_axis("z", torch.tensor(0.9).double()), torch.zeros(3).double())
     start = DepthView(scene.rig.camera, Rigid(away.R @ true.R, true.t), views[0].background)
     with pytest.raises(WearcapError, match="Check the camera's pose"):
-        register_view(start, scene.scan)
+        start.registered(scene.scan)
     by_hand = turned_about(away.inverse().R, true.t)
-    mended, report = register_view(start, scene.scan, Rigid(by_hand.R, by_hand.t + 0.05))
+    mended, report = start.registered(scene.scan, Rigid(by_hand.R, by_hand.t + 0.05))
     assert (mended.T_world_cam.t - true.t).norm() < 0.01
     assert report.fitness > 0.95
 

@@ -11,7 +11,7 @@ import torch
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import ImuStream
-from wearcap.sensors.gravity_scale import GravityScale, by_floor, by_head_imu
+from wearcap.sensors.monocular_slam import GravityScale, by_floor, by_head_imu
 from wearcap.simulation.recordings.calibration_session import (
     STANDING,
     CalibrationSession,

@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from wearcap.geometry import rotation
-from wearcap.sensors.head import SlamNoise, head_stream
-from wearcap.sensors.noise import random_walk, smooth_noise
+from wearcap.sensors.simulated import SlamNoise, head_stream, heading_walk, smooth_noise
 from wearcap_testing import swaying_motion
 
 SEAT = torch.tensor([0.09, 0.0, 0.08])
@@ -66,8 +65,9 @@ def test_smooth_noise_has_unit_deviation_and_the_asked_pace(period_s):
         assert (noise[:-1] * noise[1:]).mean() > 0.95
 
 
-def test_a_random_walk_starts_at_zero_and_spreads_with_the_root_of_time():
-    walk = random_walk(np.random.default_rng(2), 601, 2000, 0.3, 60.0)
-    assert (walk[0] == 0).all()
-    assert walk[600].std() == pytest.approx(0.3 * 10**0.5, rel=0.06)
-    assert walk[150].std() == pytest.approx(0.3 * 2.5**0.5, rel=0.06)
+def test_a_heading_walk_starts_at_zero_and_spreads_with_the_root_of_time():
+    walks = [heading_walk(np.random.default_rng(seed), 601, 2.0, 60.0) for seed in range(400)]
+    yaw_deg = rotation.yaw_of(torch.stack(walks, 1)).rad2deg()
+    assert (yaw_deg[0] == 0).all()
+    assert yaw_deg[600].std() == pytest.approx(2.0 * (10 / 60) ** 0.5, rel=0.1)
+    assert yaw_deg[150].std() == pytest.approx(2.0 * (2.5 / 60) ** 0.5, rel=0.1)

@@ -13,9 +13,15 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording.recording import Localization
-from wearcap.sensors.alignment import align_suit, body_camera, inliers, yaw_between
-from wearcap.sensors.initialization import InitializationSettings, initialize
-from wearcap.sensors.suit import SuitNoise, suit_motion
+from wearcap.sensors.initialization import (
+    InitializationSettings,
+    align_suit,
+    body_camera,
+    initialize,
+    inliers,
+    yaw_between,
+)
+from wearcap.sensors.simulated import SuitNoise, suit_motion
 
 DOCUMENT = InitializationSettings("tangent", "line", path_smoothing_s=0.0)
 SEEN = InitializationSettings(path_smoothing_s=0.0)

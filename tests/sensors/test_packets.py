@@ -17,7 +17,7 @@ from wearcap.sensors.packets import AGREEING, Clock, HeadInput
 
 @pytest.mark.parametrize("name", VECTORS)
 def test_bad_vectors_are_told(name):
-    assert packets.vector_fault(VECTORS[name], 1000.0)
+    assert packets.values_fault(VECTORS[name], (3,), 1000.0)
 
 
 @pytest.mark.parametrize("name", ROTATIONS)
@@ -30,10 +30,8 @@ def test_rotations_of_little_precision_are_fine(rotvec):
     R = rotation.exp(torch.tensor(rotvec))
     for each in (R, R.double(), R.half(), (100 * R).round() / 100):
         assert packets.rotation_fault(each) is None
-    assert packets.rotations_fault(R[None], (1, 3, 3)) is None
-    assert (
-        packets.rotation_fault(1.1 * R) == packets.rotations_fault(1.1 * R[None], (1, 3, 3)) == packets.NOT_A_ROTATION
-    )
+    assert packets.rotation_fault(R[None], (1, 3, 3)) is None
+    assert packets.rotation_fault(1.1 * R) == packets.rotation_fault(1.1 * R[None], (1, 3, 3)) == packets.NOT_A_ROTATION
 
 
 @pytest.mark.parametrize(
@@ -59,11 +57,14 @@ def test_times(value, fault):
 
 def test_points_that_can_be_used_are_kept():
     points = torch.tensor([[1.0, 2.0, 3.0], [math.nan, 0.0, 0.0], [0.0, 1e30, 0.0]])
-    kept, fault = packets.usable_points(points)
+    head_input = HeadInput()
+    kept = head_input.points(points)
+    assert kept is not None
     assert kept.tolist() == [[1.0, 2.0, 3.0]]
-    assert fault == "not finite"
+    assert head_input.refused == {"points: not finite": 1}
     for bad in (torch.zeros(3), torch.zeros(2, 4), torch.zeros(2, 3, dtype=torch.int32), np.zeros((2, 3)), [1]):
-        assert packets.usable_points(bad) == (None, "wrong type or shape")
+        assert head_input.points(bad) is None
+    assert head_input.refused["points: wrong type or shape"] == 5
 
 
 @pytest.mark.parametrize("name", bad_poses(Rigid.identity()))

@@ -8,7 +8,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.pcd import read_pcd
-from wearcap.sensors.registration import register
+from wearcap.sensors.depth_rig import register
 
 
 def room(points: int, seed: int) -> np.ndarray:

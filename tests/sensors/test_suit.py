@@ -9,7 +9,7 @@ import torch
 from wearcap.body.skeleton import Skeleton
 from wearcap.geometry import rotation
 from wearcap.recording import Motion
-from wearcap.sensors.suit import SuitNoise, suit_motion
+from wearcap.sensors.simulated import SuitNoise, suit_motion
 
 NONE = SuitNoise(0.0, 0.0, 6.0, 0.0, 0.0, 0.0, 2.0, 0.0, (0.0, 0.0), (0.0, 0.0))
 FPS = 10.0

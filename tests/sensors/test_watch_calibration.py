@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from planted_session import SEEDS, apart_deg, session
+from planted_session import SEEDS, apart_deg, calibrated, session
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import ImuStream
 from wearcap.sensors.stillness import StepCheck, require, still_intervals
-from wearcap.sensors.watch_calibration import calibrate_watches, measure_watch, propose_steps
+from wearcap.sensors.watch_calibration import measure_watches, propose_steps
 from wearcap.sensors.watches import watches_at
 
 JOINTS = ("left_wrist", "right_wrist")
@@ -21,7 +21,7 @@ BOARD, T_POSE = (1.0, 4.0), (6.0, 9.0)
 @pytest.mark.parametrize("seed", SEEDS)
 def test_planted_frames_and_mountings_are_recovered(seed):
     made = session(seed)
-    found = calibrate_watches(made.watches, made.board["left_wrist"], made.t_pose["left_wrist"])
+    found = calibrated(made.watches, made.board["left_wrist"], made.t_pose["left_wrist"])
     for joint, one in found.items():
         assert apart_deg(one.R_world_ref, made.planted.R_world_ref[joint]) < 0.5
         assert apart_deg(one.R_joint_imu, made.planted.R_joint_imu[joint]) < 0.5
@@ -59,7 +59,7 @@ def both(**wrong) -> dict[str, ImuStream]:
 
 
 def test_exact_logs_are_calibrated_exactly_and_reach_the_estimator_as_wrists():
-    found = calibrate_watches(both(), BOARD, T_POSE)
+    found = calibrated(both(), BOARD, T_POSE)
     streams = {joint: found[joint].apply(stream) for joint, stream in both().items()}
     R, _ = watches_at(streams, torch.tensor([7.0, 20.0], dtype=torch.float64), "test")
     torch.testing.assert_close(R[0], axis("z", 90.0).expand(2, 3, 3), atol=1e-5, rtol=0)
@@ -70,14 +70,14 @@ def test_exact_logs_are_calibrated_exactly_and_reach_the_estimator_as_wrists():
 def test_accelerations_turn_with_the_reference_frame():
     stream = exact("left_wrist")
     north = replace(stream, acc_world=torch.tensor([1.0, 0.0, 0.5]).expand(len(stream.timestamps), 3))
-    made = measure_watch(north, BOARD, T_POSE).apply(north)
+    made = measure_watches({**both(), "left_wrist": north}, BOARD, T_POSE)["left_wrist"].apply(north)
     expected = torch.tensor([math.cos(math.radians(40)), math.sin(math.radians(40)), 0.5])
     torch.testing.assert_close(made.acc_world[0], expected, atol=1e-5, rtol=0)
 
 
 def test_crowns_may_point_to_the_hand_or_to_the_elbow():
     flipped = {**both(), "right_wrist": exact("right_wrist", posed=axis("z", 180.0))}
-    assert calibrate_watches(flipped, BOARD, T_POSE)["right_wrist"].arm_facing_deg < 0.1
+    assert calibrated(flipped, BOARD, T_POSE)["right_wrist"].arm_facing_deg < 0.1
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_crowns_may_point_to_the_hand_or_to_the_elbow():
 )
 def test_a_step_done_wrongly_is_named(wrong, step, match):
     with pytest.raises(WearcapError, match=match) as caught:
-        calibrate_watches(both(**wrong), BOARD, T_POSE)
+        calibrated(both(**wrong), BOARD, T_POSE)
     assert caught.value.where == step
 
 
@@ -106,7 +106,7 @@ def test_swapped_watches_are_noticed_once_the_arms_hang():
     streams = both()
     swapped = {a: replace(streams[b], joint=a) for a, b in (JOINTS, JOINTS[::-1])}
     with pytest.raises(WearcapError, match="swapped"):
-        calibrate_watches(swapped, BOARD, T_POSE)
+        calibrated(swapped, BOARD, T_POSE)
 
 
 @pytest.mark.parametrize(
@@ -120,15 +120,15 @@ def test_swapped_watches_are_noticed_once_the_arms_hang():
 )
 def test_a_wrong_stretch_is_named(board, t_pose, match):
     with pytest.raises(WearcapError, match=match):
-        calibrate_watches(both(), board, t_pose)
+        calibrated(both(), board, t_pose)
 
 
 def test_missing_parts_are_named():
     with pytest.raises(WearcapError, match="no watch on right_wrist"):
-        calibrate_watches({"left_wrist": exact("left_wrist")}, BOARD, T_POSE)
+        calibrated({"left_wrist": exact("left_wrist")}, BOARD, T_POSE)
     blind = replace(exact("left_wrist"), R_world_imu=None)
     with pytest.raises(WearcapError, match="without orientation"):
-        measure_watch(blind, BOARD, T_POSE)
+        measure_watches({**both(), "left_wrist": blind}, BOARD, T_POSE)
 
 
 def test_still_stretches_are_found_and_proposed():

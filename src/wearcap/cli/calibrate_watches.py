@@ -24,16 +24,7 @@ from wearcap.locks import folder_lock
 from wearcap.recording import Recording, RecordingStore
 from wearcap.recording.locate import load_recording
 from wearcap.recording.store import save_recording
-from wearcap.sensors.arm_swings import swing_checks
-from wearcap.sensors.camera_alignment import (
-    HeadMount,
-    SlamAlignment,
-    align_by_marks,
-    mark_checks,
-    mark_positions,
-    mount_by_standing,
-    mount_checks,
-)
+from wearcap.sensors.camera_alignment import HeadMount, SlamAlignment, align_by_marks, mark_positions, mount_by_standing
 from wearcap.sensors.stillness import StepCheck, Stretch, require
 from wearcap.sensors.watch_calibration import measure_watches, require_watches, watch_checks
 from wearcap.sensors.watch_session import WatchSession, WornCalibration
@@ -118,7 +109,7 @@ def _measured(config: DictConfig, session: WatchSession) -> tuple[WornCalibratio
                     stretch = _stretch("swings_in", config.swings_in, session.watch_zero)
                 watch = watches[joint].apply(stream)
                 clocks[joint] = session.swing_clock(watch, seen_s, stretch, config.camera_fps)
-            checks += [check for joint, clock in clocks.items() for check in swing_checks(clock, joint)]
+            checks += [check for joint, clock in clocks.items() for check in clock.checks(joint)]
     return WornCalibration(watches, clocks, camera, head), checks
 
 
@@ -130,7 +121,7 @@ def _camera(config: DictConfig, slam: Trajectory, zero: float) -> tuple[SlamAlig
     x, y, z = _numbers(config, "t_head_cam", 3)
     standing = _stretch("standing", config.standing, zero)
     head = mount_by_standing(camera.apply(slam), standing, config.facing_deg, (x, y, z))
-    return camera, head, mark_checks(camera, camera.scale * moved, turned, limits) + mount_checks(head, limits)
+    return camera, head, camera.checks(camera.scale * moved, turned, limits) + head.checks(limits)
 
 
 def _stretch(key: str, value: Any, zero: float) -> Stretch:

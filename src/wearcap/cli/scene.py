@@ -64,12 +64,12 @@ def _part(photos: list[Photo], source: Scan | Tracks, chosen: np.ndarray) -> tup
 
 
 def _show_report(made: VisualMap) -> None:
-    counts = np.diff(made.first)
-    low, high = (reduce(made.t_world_cam, 0) for reduce in (np.min, np.max))
+    counts = np.diff(made.observations.first)
+    low, high = (reduce(made.T_world_cam.t.numpy(), 0) for reduce in (np.min, np.max))
     table = Table(show_header=False)
     table.add_row("pictures", f"{len(made)}")
     table.add_row(
-        "keypoints with a 3D position", f"{len(made.keypoints)} ({np.median(counts):.0f} in the median picture)"
+        "keypoints with a 3D position", f"{len(made.observations)} ({np.median(counts):.0f} in the median picture)"
     )
     table.add_row("landmarks", f"{len(made.landmarks.points_world)}")
     table.add_row("features", f"{made.extractor}, {made.descriptor}")

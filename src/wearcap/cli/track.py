@@ -15,15 +15,7 @@ from wearcap.errors import WearcapError
 from wearcap.io.formats.camera_json import read_camera
 from wearcap.io.formats.colmap import read_colmap
 from wearcap.localization.structure import Advance
-from wearcap.localization.tracking import (
-    Track,
-    TrackSettings,
-    model_row,
-    picture_row,
-    track_of_model,
-    track_pictures,
-    write_track,
-)
+from wearcap.localization.tracking import Pictures, Track, TrackSettings, track_pictures
 
 HELP = "a camera's path and points from its video: wearcap track VIDEO, or wearcap track --from-model COLMAP_MODEL"
 _WITH_VALUE = ("--cfg", "-c", "--info", "-i", "--package", "-p", "--config-name", "-cn", "--config-dir", "-cd")
@@ -45,15 +37,19 @@ def run(config: DictConfig) -> Track:
         camera = None if config.camera is None else read_camera(config.camera)
         with _progress() as advance:
             found = track_pictures(config.source, output, settings, camera, advance)
-    write_track(found, output, Path(named).name)
+    found.write(output, Path(named).name)
     _show_report(found, output)
     return found
 
 
 def _from_model(config: DictConfig, settings: TrackSettings) -> Track:
     model = read_colmap(config.from_model, config.source)
-    pictures = model_row(model, settings.fps) if config.source is None else picture_row(config.source, settings.fps)
-    return track_of_model(model, pictures, settings.max_gap_s, where=config.from_model)
+    pictures = (
+        Pictures.of_model(model, settings.fps)
+        if config.source is None
+        else Pictures.of_folder(config.source, settings.fps)
+    )
+    return Track.of_model(model, pictures, settings.max_gap_s, where=config.from_model)
 
 
 @contextmanager

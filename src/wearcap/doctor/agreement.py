@@ -16,8 +16,8 @@ from wearcap.geometry.trajectory import Trajectory, angular_velocity, outlier_ma
 from wearcap.io.formats.video import video_info
 from wearcap.recording import CameraStream, Cue, FloorTrack, HeadStream, Localization, Motion, PointCloud, Recording
 from wearcap.scene.floor import estimate_floor
-from wearcap.sensors.alignment import MAX_SPEED
 from wearcap.sensors.claps import detect_claps
+from wearcap.sensors.initialization import MAX_SPEED
 
 LONG_OUTAGE_S = 30.0
 

@@ -98,7 +98,7 @@ def read_map(path: Path) -> tuple[Recording, list[Finding]]:
         evidence = f"{pictures} pictures, {len(points)} landmarks"
         fix = "Build it from photos that show the scene: wearcap scene."
         return Recording(path.name), [check.error("the map is empty", evidence, fix)]
-    seen = np.diff(visual_map.first)
+    seen = np.diff(visual_map.observations.first)
     evidence = (
         f"{pictures} pictures, {len(points)} landmarks, {np.median(seen):.0f} keypoints in half of the pictures or more"
     )

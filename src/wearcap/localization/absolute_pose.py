@@ -33,122 +33,97 @@ class Fit:
     t_world_cam: Float64[np.ndarray, "3"]
     inlier: Bool[np.ndarray, "match"]
 
-
-def lens_of(camera: Camera) -> dict:
-    """The camera in PoseLib's format. Raises WearcapError for fisheyes: undistort their images first."""
-    size = {"width": camera.width, "height": camera.height}
-    principal = [camera.fx, camera.fy, camera.cx, camera.cy]
-    if camera.model == "pinhole":
-        return {"model": "PINHOLE", **size, "params": principal}
-    if camera.model == "opencv" and len(camera.distortion) == 4:
-        return {"model": "OPENCV", **size, "params": [*principal, *camera.distortion]}
-    if camera.model == "opencv":
-        return {"model": "FULL_OPENCV", **size, "params": [*principal, *camera.distortion, 0.0, 0.0, 0.0]}
-    raise WearcapError(f"absolute pose with the camera model {camera.model!r}", expected="pinhole or opencv")
+    def project(self, points_world: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Project world points into the camera at this pose: pixels, and where they are valid."""
+        points_cam = (points_world.astype(np.float64) - self.t_world_cam) @ self.R_world_cam
+        pixels, valid = camera.project(torch.from_numpy(points_cam))
+        return pixels.numpy(), valid.numpy()
 
 
-def ransac_pose(
-    pixels: Float32[np.ndarray, "match 2"],
-    points_world: Float32[np.ndarray, "match 3"],
-    camera: Camera,
-    max_error_px: float,
-    max_iterations: int = 20_000,
-    seed: int = 0,
-) -> Fit | None:
-    """P3P in LO-RANSAC over matches with outliers; None where no pose is found."""
-    if len(pixels) < 4:
-        return None
-    options = {
-        "max_reproj_error": max_error_px,
-        "max_iterations": max_iterations,
-        "min_iterations": 50,
-        "success_prob": 0.9999,
-        "seed": seed,
-    }
-    pose, report = poselib.estimate_absolute_pose(
-        pixels.astype(np.float64), points_world.astype(np.float64), lens_of(camera), options, {}
-    )
-    inlier = np.asarray(report["inliers"], bool)
-    if inlier.sum() < 4 or not np.isfinite(pose.Rt).all():
-        return None
-    return _fit(pose, inlier)
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Keypoints of a picture and the points of the world (m) that they are taken for, some of them wrongly."""
 
+    pixels: Float32[np.ndarray, "match 2"]
+    points_world: Float32[np.ndarray, "match 3"]
+    camera: Camera
 
-def refined_pose(
-    pixels: Float32[np.ndarray, "match 2"],
-    points_world: Float32[np.ndarray, "match 3"],
-    camera: Camera,
-    start: Fit,
-    max_error_px: float,
-) -> Fit:
-    """Robust least squares of the reprojection error from an initial pose (`start.inlier` is not used)."""
-    initial = poselib.CameraPose()
-    initial.R = start.R_world_cam.T
-    initial.t = -start.R_world_cam.T @ start.t_world_cam
-    inlier = np.ones(len(pixels), bool)
-    fit = start
-    for _ in range(2):
+    def ransac(self, max_error_px: float) -> Fit | None:
+        """P3P in LO-RANSAC over matches with outliers; None where no pose is found.
+
+        Raises WearcapError for cameras that PoseLib has not.
+        """
+        if len(self.pixels) < 4:
+            return None
+        options = {
+            "max_reproj_error": max_error_px,
+            "max_iterations": 20_000,
+            "min_iterations": 50,
+            "success_prob": 0.9999,
+            "seed": 0,
+        }
+        pixels, points = self.pixels.astype(np.float64), self.points_world.astype(np.float64)
+        pose, report = poselib.estimate_absolute_pose(pixels, points, self._lens(), options, {})
+        inlier = np.asarray(report["inliers"], bool)
+        if inlier.sum() < 4 or not np.isfinite(pose.Rt).all():
+            return None
+        return _fit(pose, inlier)
+
+    def refined(self, start: Fit, max_error_px: float) -> Fit:
+        """Robust least squares of the reprojection error from an initial pose (`start.inlier` is not used)."""
+        initial = poselib.CameraPose()
+        initial.R = start.R_world_cam.T
+        initial.t = -start.R_world_cam.T @ start.t_world_cam
         options = {"loss_type": "CAUCHY", "loss_scale": 0.5 * max_error_px, "max_iterations": 50}
-        pose, _ = poselib.refine_absolute_pose(
-            pixels[inlier].astype(np.float64),
-            points_world[inlier].astype(np.float64),
-            initial,
-            lens_of(camera),
-            options,
-        )
-        fit = _fit(pose, inlier)
-        inlier = reprojection_errors(pixels, points_world, camera, fit) < max_error_px
-        if inlier.sum() < 4:
-            return Fit(fit.R_world_cam, fit.t_world_cam, inlier)
-        initial = pose
-    return Fit(fit.R_world_cam, fit.t_world_cam, inlier)
+        inlier, fit = np.ones(len(self.pixels), bool), start
+        for _ in range(2):
+            pixels, points = (part[inlier].astype(np.float64) for part in (self.pixels, self.points_world))
+            initial, _ = poselib.refine_absolute_pose(pixels, points, initial, self._lens(), options)
+            fit = _fit(initial, inlier)
+            inlier = self.errors(fit) < max_error_px
+            if inlier.sum() < 4:
+                break
+        return Fit(fit.R_world_cam, fit.t_world_cam, inlier)
+
+    def errors(self, fit: Fit) -> Float64[np.ndarray, "match"]:
+        """Distance (px) between each keypoint and its point's projection; infinite where that is not in view."""
+        seen, valid = fit.project(self.points_world, self.camera)
+        return np.where(valid, np.linalg.norm(seen - self.pixels, axis=1), np.inf)
+
+    def covariance(self, fit: Fit) -> Float64[np.ndarray, "6 6"]:
+        """Covariance of rotation (rad) and position (m) in the world: σ² (JᵀJ)⁻¹ of the inliers, σ² from residuals.
+
+        σ is at least half a pixel, so that few matches that fit by chance do not look certain.
+        """
+        pixels = self.pixels[fit.inlier]
+        offset = self.points_world[fit.inlier].astype(np.float64) - fit.t_world_cam
+        points_cam = offset @ fit.R_world_cam
+        step = 1e-5 * np.maximum(np.linalg.norm(points_cam, axis=1), 1e-6)
+        shifts = step[:, None, None] * np.concatenate([np.eye(3), -np.eye(3)])
+        seen, _ = self.camera.project(torch.from_numpy(points_cam[:, None] + shifts))
+        d_pixel_d_cam = ((seen[:, :3] - seen[:, 3:]) / (2 * torch.from_numpy(step)[:, None, None])).mT.numpy()
+        # p_cam = Rᵀ exp(-ω) (X - t - δ): its derivative is Rᵀ [X - t]× in ω and -Rᵀ in δ
+        cross = np.cross(offset[:, None], np.eye(3)).swapaxes(1, 2)
+        d_pixel_d_world = d_pixel_d_cam @ fit.R_world_cam.T
+        jacobian = np.concatenate([d_pixel_d_world @ cross, -d_pixel_d_world], 2).reshape(-1, 6)
+        centre, _ = self.camera.project(torch.from_numpy(points_cam))
+        residual = pixels - centre.numpy()
+        variance = max((residual**2).sum() / max(2 * len(pixels) - 6, 1), 0.5**2)
+        scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
+        covariance = variance * np.linalg.pinv((jacobian / scale).T @ (jacobian / scale), hermitian=True)
+        return covariance / scale[:, None] / scale
+
+    def _lens(self) -> dict:
+        """The camera in PoseLib's format. Raises WearcapError for fisheyes: undistort their images first."""
+        camera, count = self.camera, len(self.camera.distortion)
+        if camera.model not in ("pinhole", "opencv"):
+            raise WearcapError(f"absolute pose with the camera model {camera.model!r}", expected="pinhole or opencv")
+        model = "PINHOLE" if camera.model == "pinhole" else "OPENCV" if count == 4 else "FULL_OPENCV"
+        bent = () if model == "PINHOLE" else (*camera.distortion, *[0.0] * (0 if count == 4 else 3))
+        params = [camera.fx, camera.fy, camera.cx, camera.cy, *bent]
+        return {"model": model, "width": camera.width, "height": camera.height, "params": params}
 
 
 def _fit(pose: poselib.CameraPose, inlier: np.ndarray) -> Fit:
     R_cam_world = np.asarray(pose.R)
     return Fit(R_cam_world.T.copy(), -R_cam_world.T @ np.asarray(pose.t), inlier)
-
-
-def project(points_world: np.ndarray, camera: Camera, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Project world points into the camera at a pose: pixels, and where they are valid."""
-    points_cam = (points_world.astype(np.float64) - fit.t_world_cam) @ fit.R_world_cam
-    pixels, valid = camera.project(torch.from_numpy(points_cam))
-    return pixels.numpy(), valid.numpy()
-
-
-def reprojection_errors(
-    pixels: Float32[np.ndarray, "match 2"], points_world: Float32[np.ndarray, "match 3"], camera: Camera, fit: Fit
-) -> Float64[np.ndarray, "match"]:
-    """Distance (px) between each keypoint and its point's projection; infinite where that is not in view."""
-    seen, valid = project(points_world, camera, fit)
-    return np.where(valid, np.linalg.norm(seen - pixels, axis=1), np.inf)
-
-
-def pose_covariance(
-    pixels: Float32[np.ndarray, "match 2"],
-    points_world: Float32[np.ndarray, "match 3"],
-    camera: Camera,
-    fit: Fit,
-    min_sigma_px: float = 0.5,
-) -> Float64[np.ndarray, "6 6"]:
-    """Covariance of rotation (rad) and position (m) in the world: σ² (JᵀJ)⁻¹ of the inliers, σ² from residuals.
-
-    σ is at least `min_sigma_px`, so that few matches that fit by chance do not look certain.
-    """
-    pixels, offset = pixels[fit.inlier], points_world[fit.inlier].astype(np.float64) - fit.t_world_cam
-    points_cam = offset @ fit.R_world_cam
-    step = 1e-5 * np.maximum(np.linalg.norm(points_cam, axis=1), 1e-6)
-    shifts = step[:, None, None] * np.concatenate([np.eye(3), -np.eye(3)])
-    seen, _ = camera.project(torch.from_numpy(points_cam[:, None] + shifts))
-    d_pixel_d_cam = ((seen[:, :3] - seen[:, 3:]) / (2 * torch.from_numpy(step)[:, None, None])).mT.numpy()
-    # p_cam = Rᵀ exp(-ω) (X - t - δ): its derivative is Rᵀ [X - t]× in ω and -Rᵀ in δ
-    cross = np.cross(offset[:, None], np.eye(3)).swapaxes(1, 2)
-    d_pixel_d_world = d_pixel_d_cam @ fit.R_world_cam.T
-    jacobian = np.concatenate([d_pixel_d_world @ cross, -d_pixel_d_world], 2).reshape(-1, 6)
-    centre, _ = camera.project(torch.from_numpy(points_cam))
-    residual = pixels - centre.numpy()
-    freedom = max(2 * len(pixels) - 6, 1)
-    variance = max((residual**2).sum() / freedom, min_sigma_px**2)
-    scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
-    covariance = variance * np.linalg.pinv((jacobian / scale).T @ (jacobian / scale), hermitian=True)
-    return covariance / scale[:, None] / scale

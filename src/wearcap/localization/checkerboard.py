@@ -21,6 +21,19 @@ _HINT_FRAMES = 12
 
 
 @dataclass(frozen=True)
+class View:
+    """Detection of the board in one image."""
+
+    name: str
+    corners: Float32[np.ndarray, "point 2"]
+    """Pixels, row by row (from either end: a checkerboard may be turned by half a turn)."""
+    blur_px: float
+    """Mean length over which the squares' edges rise."""
+    rms_px: float = np.nan
+    """Residual after calibration; NaN before."""
+
+
+@dataclass(frozen=True)
 class Board:
     """A checkerboard by its inner corners, where four squares meet: one fewer than squares each way."""
 
@@ -44,6 +57,25 @@ class Board:
     def __str__(self) -> str:
         return f"{self.columns}x{self.rows}"
 
+    def find(self, gray: UInt8[np.ndarray, "height width"], name: str = "") -> View | None:
+        """Corners of the whole board in a grey picture, refined to a fraction of a pixel; None where it is not seen."""
+        shrink = max(1.0, gray.shape[1] / _SEARCH_WIDTH)
+        small = (
+            gray if shrink == 1 else cv2.resize(gray, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
+        )
+        pattern = (self.columns, self.rows)
+        found, corners = cv2.findChessboardCornersSB(small, pattern, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+        if not found:
+            return None
+        corners = (corners.reshape(-1, 2) + 0.5) * shrink - 0.5
+        grid = corners.reshape(self.rows, self.columns, 2)
+        step = min(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1))
+        reach = int(np.clip(step / 3, 2, 11))  # the window must not reach into the next corner
+        stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
+        corners = cv2.cornerSubPix(gray, corners.astype(np.float32).reshape(-1, 1, 2), (reach, reach), (-1, -1), stop)
+        blur = cv2.estimateChessboardSharpness(gray, pattern, corners)[0][0]
+        return View(name, corners.reshape(-1, 2), float(blur))
+
 
 @dataclass(frozen=True)
 class CalibrationSettings:
@@ -65,19 +97,6 @@ class CalibrationSettings:
 
 
 SETTINGS = CalibrationSettings()
-
-
-@dataclass(frozen=True)
-class View:
-    """Detection of the board in one image."""
-
-    name: str
-    corners: Float32[np.ndarray, "point 2"]
-    """Pixels, row by row (from either end: a checkerboard may be turned by half a turn)."""
-    blur_px: float
-    """Mean length over which the squares' edges rise."""
-    rms_px: float = np.nan
-    """Residual after calibration; NaN before."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +141,7 @@ def calibrate_from_pictures(
                 fix="Calibrate each resolution by itself.",
             )
         gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
-        view = find_board(gray, board, name)
+        view = board.find(gray, name)
         if view is not None:
             views.append(view)
         elif not views and len(missed) < _HINT_FRAMES:
@@ -131,31 +150,9 @@ def calibrate_from_pictures(
         raise WearcapError("no pictures to calibrate from", expected="a video, or a folder of pictures")
     if not views:
         raise _not_found(board, size, examined, missed)
-    chosen = varied(_sharp(views, settings), size, settings.max_views)
-    return replace(_calibrated(chosen, board, size, settings), seen=len(views), examined=examined)
-
-
-def find_board(gray: UInt8[np.ndarray, "height width"], board: Board, name: str = "") -> View | None:
-    """Corners of the whole board in a grey picture, refined to a fraction of a pixel; None where it is not seen."""
-    shrink = max(1.0, gray.shape[1] / _SEARCH_WIDTH)
-    small = gray if shrink == 1 else cv2.resize(gray, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
-    pattern = (board.columns, board.rows)
-    found, corners = cv2.findChessboardCornersSB(small, pattern, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
-    if not found:
-        return None
-    corners = (corners.reshape(-1, 2) + 0.5) * shrink - 0.5
-    grid = corners.reshape(board.rows, board.columns, 2)
-    step = min(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1))
-    reach = int(np.clip(step / 3, 2, 11))  # the window must not reach into the next corner
-    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
-    corners = cv2.cornerSubPix(gray, corners.astype(np.float32).reshape(-1, 1, 2), (reach, reach), (-1, -1), stop)
-    blur = cv2.estimateChessboardSharpness(gray, pattern, corners)[0][0]
-    return View(name, corners.reshape(-1, 2), float(blur))
-
-
-def _sharp(views: list[View], settings: CalibrationSettings) -> list[View]:
     sharp = [view for view in views if view.blur_px <= settings.max_blur_px]
-    return sharp if len(sharp) >= settings.min_views else views
+    chosen = varied(sharp if len(sharp) >= settings.min_views else views, size, settings.max_views)
+    return replace(_calibrated(chosen, board, size, settings), seen=len(views), examined=examined)
 
 
 def varied(views: Sequence[View], size: tuple[int, int], count: int) -> list[View]:
@@ -200,7 +197,12 @@ def _calibrated(views: list[View], board: Board, size: tuple[int, int], settings
             break
         rejected += bad
         views = [view for view in views if view.rms_px <= limit]
-    focal_std, tilt_deg = float(max(spread[0, 0], spread[1, 0])), _tilt_deg(turns)
+    # How far the boards' normals lie from their mean: the 90th percentile of the angles.
+    normals = np.stack([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
+    normals *= np.sign(normals[:, 2:])  # a board has no up
+    mean = normals.mean(0) / np.linalg.norm(normals.mean(0))
+    tilt_deg = float(np.degrees(np.quantile(np.arccos((normals @ mean).clip(-1, 1)), 0.9)))
+    focal_std = float(max(spread[0, 0], spread[1, 0]))
     open_focal = focal_std > settings.max_focal_spread * K[0, 0] or tilt_deg < settings.min_tilt_deg
     if not np.isfinite(K).all() or open_focal:
         raise WearcapError(
@@ -210,37 +212,21 @@ def _calibrated(views: list[View], board: Board, size: tuple[int, int], settings
         )
     lens = map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
     camera = Camera("opencv", *size, *lens, tuple(map(float, bent.ravel()[:4])))
-    return Calibration(camera, float(rms), focal_std, coverage(views, size), tuple(views), tuple(rejected))
-
-
-def _tilt_deg(turns: Sequence[np.ndarray]) -> float:
-    """How far the boards' normals lie from their mean: the 90th percentile of the angles."""
-    normals = np.stack([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
-    normals *= np.sign(normals[:, 2:])  # a board has no up
-    mean = normals.mean(0) / np.linalg.norm(normals.mean(0))
-    return float(np.degrees(np.quantile(np.arccos((normals @ mean).clip(-1, 1)), 0.9)))
-
-
-def coverage(views: Sequence[View], size: tuple[int, int]) -> float:
-    """Share of the picture's cells in which a corner of some view lies."""
     corners = np.concatenate([view.corners for view in views])
     cells = np.floor(corners / size * _CELLS).astype(int).clip(0, np.array(_CELLS) - 1)
-    return len(np.unique(cells[:, 1] * _CELLS[0] + cells[:, 0])) / (_CELLS[0] * _CELLS[1])
+    coverage = len(np.unique(cells, axis=0)) / (_CELLS[0] * _CELLS[1])
+    return Calibration(camera, float(rms), focal_std, coverage, tuple(views), tuple(rejected))
 
 
 def _not_found(board: Board, size: tuple[int, int], examined: int, missed: list[np.ndarray]) -> WearcapError:
     """Error for a missing board; its fix suggests another count of corners if that one is found."""
-    others = [
-        (board.columns - 1, board.rows - 1),
-        (board.columns + 1, board.rows + 1),
-        (board.columns - 1, board.rows),
-        (board.columns, board.rows - 1),
-    ]
     fix = "Count inner corners, not squares; show the whole board with a white margin, evenly lit and in focus."
-    for columns, rows in others:
-        if min(columns, rows) >= 3 and any(
-            find_board(gray, replace(board, columns=columns, rows=rows)) for gray in missed
-        ):
+    for wider, higher in ((-1, -1), (1, 1), (-1, 0), (0, -1)):
+        columns, rows = board.columns + wider, board.rows + higher
+        if min(columns, rows) < 3:
+            continue
+        other = replace(board, columns=columns, rows=rows)
+        if any(other.find(gray) for gray in missed):
             fix = f"A board of {columns}x{rows} inner corners was found: give columns={columns} rows={rows}."
             break
     return WearcapError(

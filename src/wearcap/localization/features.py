@@ -1,10 +1,13 @@
-"""Local features of an image: keypoints and descriptors; interfaces of extractors, matchers and global descriptors."""
+"""Local and global features of an image: keypoints with descriptors, VLAD over a vocabulary trained on the map (thesis
+eq. 2.1), and the interfaces of extractors, matchers and global descriptors.
+"""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool, Float32, Int64, UInt8
 
 from wearcap.errors import WearcapError
@@ -73,7 +76,7 @@ class RootSift:
                 f"SIFT with {max_keypoints} keypoints, contrast threshold {contrast_threshold}, side {max_side}",
                 expected="at least one keypoint, a threshold of 0 or more, at least 32 pixels",
             )
-        self.max_keypoints, self.contrast_threshold, self.max_side = (max_keypoints, contrast_threshold, max_side)
+        self.max_keypoints, self.contrast_threshold, self.max_side = max_keypoints, contrast_threshold, max_side
 
     def __call__(self, image: UInt8[np.ndarray, "height width 3"]) -> Features:
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
@@ -87,12 +90,14 @@ class RootSift:
         )
         found, descriptors = sift.detectAndCompute(gray, None)
         if not found:
-            return Features(*_nothing(), (width, height))
+            empty = np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), np.zeros(0, np.float32)
+            return Features(*empty, (width, height))
         pixels = np.array([keypoint.pt for keypoint in found], np.float32)
         scale = np.array([width / gray.shape[1], height / gray.shape[0]], np.float32)
         scores = np.array([keypoint.response for keypoint in found], np.float32)
         features = Features((pixels + 0.5) * scale - 0.5, root(descriptors), scores, (width, height))
-        return features.subset(_strongest(scores, self.max_keypoints))
+        # SIFT returns more than requested where a keypoint has two orientations.
+        return features.subset(np.argsort(-scores, kind="stable")[: self.max_keypoints].astype(np.int64))
 
 
 def root(descriptors: Float32[np.ndarray, "keypoint feature"]) -> Float32[np.ndarray, "keypoint feature"]:
@@ -101,10 +106,73 @@ def root(descriptors: Float32[np.ndarray, "keypoint feature"]) -> Float32[np.nda
     return np.sqrt(descriptors / total)
 
 
-def _strongest(scores: np.ndarray, count: int) -> np.ndarray:
-    """Indices of the strongest keypoints (SIFT returns more than requested where one has two orientations)."""
-    return np.argsort(-scores, kind="stable")[:count].astype(np.int64)
+def _nearest_word(descriptors: torch.Tensor, centers: torch.Tensor) -> torch.Tensor:
+    return ((centers**2).sum(1) - 2 * descriptors @ centers.T).argmin(1)
 
 
-def _nothing() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32), np.zeros(0, np.float32)
+class Vlad:
+    """Vector of locally aggregated descriptors (thesis eq. 2.1).
+
+    Sum of the residuals of local descriptors to their nearest word, of unit length over all words. `intra`: each
+    word's residuals are made of unit length first, so that a repeated pattern does not drown the others (Arandjelović
+    and Zisserman 2013); `signed_root`: each number is replaced by its signed square root. Both are ours to choose.
+    """
+
+    def __init__(self, vocabulary: Float32[np.ndarray, "word feature"], intra: bool = True, signed_root: bool = False):
+        self.vocabulary, self.intra, self.signed_root = vocabulary, intra, signed_root
+        self.name = f"vlad{len(vocabulary)}{'-intra' if intra else ''}{'-root' if signed_root else ''}"
+
+    @classmethod
+    def trained(cls, descriptors: Float32[np.ndarray, "sample feature"], words: int = 64) -> "Vlad":
+        """VLAD over the centres of `words` clusters of local descriptors: k-means from a k-means++ start, always the same.
+
+        Raises WearcapError for fewer descriptors than words.
+        """
+        if len(descriptors) < words:
+            raise WearcapError(
+                f"{len(descriptors)} descriptors for a vocabulary of {words} words",
+                expected="many more than words",
+                fix="Give more photos, photos with more texture, or fewer words.",
+            )
+        random = torch.Generator().manual_seed(0)
+        samples = torch.from_numpy(descriptors)
+        norms = (samples**2).sum(1)
+        centers = torch.empty(words, samples.shape[1])
+        distance = torch.full((len(samples),), torch.inf)
+        chosen = int(torch.randint(len(samples), (1,), generator=random))
+        for word in range(words):
+            centers[word] = samples[chosen]
+            distance = torch.minimum(distance, (norms - 2 * samples @ centers[word] + norms[chosen]).clamp(min=0))
+            chosen = int(torch.multinomial(distance + 1e-12, 1, generator=random))
+        for _ in range(15):
+            nearest = _nearest_word(samples, centers)
+            total = torch.zeros_like(centers).index_add_(0, nearest, samples)
+            count = torch.bincount(nearest, minlength=words)[:, None]
+            centers = torch.where(count > 0, total / count.clamp(min=1), centers)
+        return cls(centers.numpy())
+
+    def __call__(
+        self, image: UInt8[np.ndarray, "height width 3"], features: Features
+    ) -> Float32[np.ndarray, "feature"]:
+        """Global descriptor; `image` is not used. Zeros for an image without features."""
+        return self.aggregate(features.descriptors)
+
+    def aggregate(self, descriptors: Float32[np.ndarray, "keypoint feature"]) -> Float32[np.ndarray, "global"]:
+        centers, local = torch.from_numpy(self.vocabulary), torch.from_numpy(descriptors)
+        word = _nearest_word(local, centers)
+        total = torch.zeros_like(centers).index_add_(0, word, local - centers[word])
+        if self.intra:
+            total = torch.nn.functional.normalize(total, dim=1)
+        if self.signed_root:
+            total = total.sign() * total.abs().sqrt()
+        return torch.nn.functional.normalize(total.flatten(), dim=0).numpy()
+
+
+def most_similar(
+    query: Float32[np.ndarray, "feature"], database: Float32[np.ndarray, "image feature"], count: int = 40
+) -> Int64[np.ndarray, "image_rank"]:
+    """Indices of the `count` images with the largest cosine to the query, best first (descriptors of unit length)."""
+    similarity = database @ query
+    count = min(count, len(database))
+    best = np.argpartition(-similarity, count - 1)[:count] if count else np.zeros(0, np.int64)
+    return best[np.argsort(-similarity[best], kind="stable")].astype(np.int64)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 from torch import Tensor
 
 from wearcap.errors import WearcapError
@@ -48,7 +48,7 @@ class FlowSettings:
             )
 
 
-class Spotted(NamedTuple):
+class _Spotted(NamedTuple):
     """All keypoints of one frame (pixels); a confidence of 0 where there is none."""
 
     pixels: Float32[np.ndarray, "keypoint 2"]
@@ -73,12 +73,8 @@ class _Track:
 
     def where(self, chosen: Bool[np.ndarray, "keypoint"], other: "_Track") -> "_Track":
         """The chosen keypoints of this track, the rest of another."""
-        return _Track(
-            *(
-                np.where(chosen.reshape(-1, *[1] * (mine.ndim - 1)), mine, theirs)
-                for mine, theirs in zip(vars(self).values(), vars(other).values())
-            )
-        )
+        pairs = zip(vars(self).values(), vars(other).values())
+        return _Track(*(np.where(chosen.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs))
 
 
 @dataclass(eq=False)
@@ -99,7 +95,7 @@ class KeypointFlow:
         none = np.full(count, np.nan, np.float32)
         self._nowhere = _Track(np.stack([none, none], -1), none, none, np.zeros((count, side, side), np.float32))
 
-    def advance(self, picture: UInt8[np.ndarray, "height width 3"], found: Mapping[str, Keypoint]) -> list[Spotted]:
+    def advance(self, picture: UInt8[np.ndarray, "height width 3"], found: Mapping[str, Keypoint]) -> list[_Spotted]:
         """Frames that are final now, none to one."""
         grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
         detected = self._detected(grey, found)
@@ -115,11 +111,18 @@ class KeypointFlow:
             forward = _followed(_without(last.forward, detected.there), last.grey, grey, self.settings)
         forward = detected.where(detected.there, forward)
         self._frames.append(_Frame(grey, detected.there, forward, self._nowhere))
-        self._look_back(detected)
+        # Detections are tracked backwards through the frames that lack them.
+        track = detected
+        for later, earlier in pairwise(reversed(self._frames)):
+            track = _without(track, earlier.found)
+            if not track.there.any():
+                break
+            track = _followed(track, later.grey, earlier.grey, self.settings)
+            earlier.backward = track.where(track.there, earlier.backward)
         ready = len(self._frames) > self.settings.reach
         return [_blended(self._frames.popleft(), self.settings)] if ready else []
 
-    def finish(self) -> list[Spotted]:
+    def finish(self) -> list[_Spotted]:
         """Return the remaining frames."""
         remaining = [_blended(frame, self.settings) for frame in self._frames]
         self._frames.clear()
@@ -135,16 +138,6 @@ class KeypointFlow:
         look[there] = _patches(grey, pixels[there], self.settings.window_px)
         return _Track(pixels, np.where(there, 0, np.nan).astype(np.float32), trust, look)
 
-    def _look_back(self, detected: _Track) -> None:
-        """Track detections backwards through the frames that lack them."""
-        track = detected
-        for later, earlier in pairwise(reversed(self._frames)):
-            track = _without(track, earlier.found)
-            if not track.there.any():
-                return
-            track = _followed(track, later.grey, earlier.grey, self.settings)
-            earlier.backward = track.where(track.there, earlier.backward)
-
 
 def tracked_cues(
     pictures: Iterable[UInt8[np.ndarray, "height width 3"]],
@@ -158,7 +151,7 @@ def tracked_cues(
     Raises WearcapError when there are not as many pictures as timestamps.
     """
     flow, times = KeypointFlow(detector.joints, settings), timestamps.tolist()
-    spotted, count = list[Spotted](), 0
+    spotted, count = list[_Spotted](), 0
     for count, picture in enumerate(pictures, 1):
         if count > len(times):
             break
@@ -192,7 +185,11 @@ def _followed(track: _Track, before: np.ndarray, after: np.ndarray, settings: Fl
         end, moved = _flow(before, after, start, settings)
         back, returned = _flow(after, before, end, settings)
         inside = ((end >= -0.5) & (end < np.array(after.shape[::-1]) - 0.5)).all(-1)
-        same = _likeness(_patches(after, end, settings.window_px), track.look[rows]) >= settings.likeness
+        # Correlation coefficient of the patches; 0 for flat ones
+        looks = (_patches(after, end, settings.window_px), track.look[rows])
+        a, b = (look - look.mean((1, 2), keepdims=True) for look in looks)
+        scale = np.sqrt((a**2).sum((1, 2)) * (b**2).sum((1, 2)))
+        same = (a * b).sum((1, 2)) / np.maximum(scale, 1e-6) >= settings.likeness
         near = np.linalg.norm(back - start, axis=-1) <= settings.return_px
         good = moved & returned & inside & near & same
         pixels[rows[good]] = end[good]
@@ -229,16 +226,7 @@ def _patches(
     return found.reshape(-1, side, side).astype(np.float32)
 
 
-def _likeness(
-    a: Float32[np.ndarray, "keypoint row column"], b: Float32[np.ndarray, "keypoint row column"]
-) -> Float[np.ndarray, "keypoint"]:
-    """Correlation coefficient of patches; 0 for flat ones."""
-    a, b = (part - part.mean((1, 2), keepdims=True) for part in (a, b))
-    scale = np.sqrt((a**2).sum((1, 2)) * (b**2).sum((1, 2)))
-    return (a * b).sum((1, 2)) / np.maximum(scale, 1e-6)
-
-
-def _blended(frame: _Frame, settings: FlowSettings) -> Spotted:
+def _blended(frame: _Frame, settings: FlowSettings) -> _Spotted:
     """Blend both directions, weighted towards the nearer detection; confidence decreases with the distance (frames) to
     the detections and with the distance (px) between the tracks."""
     tracks = (frame.forward, frame.backward)
@@ -251,4 +239,4 @@ def _blended(frame: _Frame, settings: FlowSettings) -> Spotted:
     apart = np.where(there.all(0), np.linalg.norm(where[0] - where[1], axis=-1), 0.0)
     confidence = (share * sure).sum(0) / (1 + (apart / settings.apart_px) ** 2)
     confidence[apart > APART_AT_MOST * settings.apart_px] = 0.0
-    return Spotted((share[..., None] * where).sum(0).astype(np.float32), confidence.clip(0, 1).astype(np.float32))
+    return _Spotted((share[..., None] * where).sum(0).astype(np.float32), confidence.clip(0, 1).astype(np.float32))

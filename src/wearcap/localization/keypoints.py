@@ -1,13 +1,26 @@
-"""Interface of detectors of body joints in videos, and a detector that replays recorded detections."""
+"""Detectors of body joints in videos: their interface, one that replays recorded detections, and one of the wearer's
+wrists in head camera images by MediaPipe's hand landmarker, an optional package whose model is a file that the user has.
+"""
 
-from collections.abc import Mapping
-from typing import NamedTuple, Protocol, runtime_checkable
+import importlib
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
 
 from wearcap.errors import WearcapError
 from wearcap.recording.recording import Cue
+
+MODEL_VARIABLE = "WEARCAP_HANDS_MODEL"
+"""Environment variable with the path of `hand_landmarker.task`."""
+WRIST = 0
+"""Index of the wrist among MediaPipe's 21 landmarks."""
+SIDE_PULL = 2.0
+"""Prior from the image side: logit of being the left hand at the image's left border."""
 
 
 class Keypoint(NamedTuple):
@@ -63,3 +76,98 @@ class RecordedDetections:
             if abs(times[row] - time_s) <= self._within_s:
                 found[joint] = Keypoint(*points[row].tolist(), confidence[row].item())
         return found
+
+
+class Hand(NamedTuple):
+    """One detected hand."""
+
+    x: float
+    """Horizontal wrist position, as a share of the image's width."""
+    y: float
+    """Vertical wrist position, as a share of the image's height."""
+    left: float
+    """Probability that it is a left hand."""
+
+
+class MediaPipeHands:
+    """Wrists of up to two hands, tracked by MediaPipe from image to image: one object per video."""
+
+    joints = ("left_wrist", "right_wrist")
+
+    def __init__(self, model: str | Path | None = None, min_confidence: float = 0.5):
+        """`model`: `hand_landmarker.task`; None: the file that $WEARCAP_HANDS_MODEL names.
+
+        Raises WearcapError when the package or the model is missing, or the model is no such file.
+        """
+        try:
+            self._mediapipe = importlib.import_module("mediapipe")
+        except ModuleNotFoundError as error:
+            raise WearcapError(
+                f"MediaPipe's hands need the package {error.name!r}",
+                fix='pip install "wearcap[hands]", or take detector=recorded, which needs none.',
+            ) from error
+        vision, path = self._mediapipe.tasks.vision, find_model(model)
+        options = vision.HandLandmarkerOptions(
+            base_options=self._mediapipe.tasks.BaseOptions(model_asset_path=str(path)),
+            running_mode=vision.RunningMode.VIDEO,
+            num_hands=2,
+            min_hand_detection_confidence=min_confidence,
+            min_hand_presence_confidence=min_confidence,
+            min_tracking_confidence=min_confidence,
+        )
+        try:
+            self._landmarker: Any = vision.HandLandmarker.create_from_options(options)
+        except (ValueError, RuntimeError, OSError) as error:
+            raise WearcapError(
+                f"not a model that MediaPipe can run ({' '.join(str(error).split())[:200]})",
+                where=path,
+                expected="hand_landmarker.task",
+                fix="Download it again.",
+            ) from error
+
+    def __call__(self, picture: UInt8[np.ndarray, "height width 3"], time_s: float) -> dict[str, Keypoint]:
+        image = self._mediapipe.Image(image_format=self._mediapipe.ImageFormat.SRGB, data=np.ascontiguousarray(picture))
+        result = self._landmarker.detect_for_video(image, round(1000 * time_s))
+        hands = []
+        for marks, side in zip(result.hand_landmarks, result.handedness):
+            # MediaPipe names the person's own side in a picture that is not mirrored, as a head camera's is.
+            left = side[0].score if side[0].category_name == "Left" else 1.0 - side[0].score
+            hands.append(Hand(marks[WRIST].x, marks[WRIST].y, left))
+        height, width = picture.shape[:2]
+        return {
+            joint: Keypoint(hand.x * width - 0.5, hand.y * height - 0.5, sure)
+            for joint, (hand, sure) in wearers_hands(hands).items()
+        }
+
+
+def wearers_hands(hands: Sequence[Hand]) -> dict[str, tuple[Hand, float]]:
+    """Which of up to two hands is the wearer's left wrist and which the right, and how sure that is (0…1).
+
+    A wearer sees their left hand rather on the left: that adds to what the hand looks like. Two hands are never one side's.
+    """
+    votes = []
+    for hand in hands:
+        left = min(max(hand.left, 1e-3), 1 - 1e-3)
+        votes.append(math.log(left / (1 - left)) + SIDE_PULL * (1 - 2 * min(max(hand.x, 0.0), 1.0)))
+    if len(hands) == 1:
+        votes.append(-votes[0])
+    if not hands:
+        return {}
+    first = "left_wrist" if votes[0] >= votes[1] else "right_wrist"
+    second = "right_wrist" if first == "left_wrist" else "left_wrist"
+    sure = 1 / (1 + math.exp(-abs(votes[0] - votes[1]) / 2))
+    return {joint: (hand, sure) for joint, hand in zip((first, second), hands)}
+
+
+def find_model(given: str | Path | None) -> Path:
+    """The file given, else the one that `MODEL_VARIABLE` names. Raises WearcapError when there is none."""
+    named = given or os.environ.get(MODEL_VARIABLE)
+    if not named or not Path(named).expanduser().is_file():
+        raise WearcapError(
+            "there is no model of MediaPipe's hands",
+            where=named or f"${MODEL_VARIABLE}",
+            expected="hand_landmarker.task",
+            fix="Download it from https://ai.google.dev/edge/mediapipe/solutions/vision/hand_landmarker and give "
+            f"model=PATH or set {MODEL_VARIABLE}, or take detector=recorded.",
+        )
+    return Path(named).expanduser()

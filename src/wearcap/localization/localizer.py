@@ -19,23 +19,15 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.localization.absolute_pose import (
-    CameraPose,
-    Fit,
-    pose_covariance,
-    project,
-    ransac_pose,
-    refined_pose,
-    reprojection_errors,
-)
-from wearcap.localization.features import Extractor, Features, GlobalDescriptor, Matcher
-from wearcap.localization.landmarks import from_bytes
-from wearcap.localization.map_builder import require_same_features
+from wearcap.localization.absolute_pose import CameraPose, Fit, Matches
+from wearcap.localization.features import Extractor, Features, GlobalDescriptor, Matcher, Vlad, most_similar
 from wearcap.localization.matching import match_landmarks, match_nearby
-from wearcap.localization.picture import check_size, features_within, flat_picture
-from wearcap.localization.retrieval import Vlad, most_similar
-from wearcap.localization.visual_map import VisualMap
+from wearcap.localization.point_map import described
+from wearcap.localization.visual_map import VisualMap, from_bytes
 from wearcap.recording.recording import Localization
+
+_UNKNOWN = 1e4
+"""Variance (rad², m²) of a pose that was not found."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +56,7 @@ class LocalizerSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Described:
+class _Described:
     """An image described for queries to the map."""
 
     camera: Camera
@@ -97,7 +89,7 @@ class Localizer:
                 expected="pictures with landmarks",
                 fix="Build it from photos that show the scene: wearcap scene.",
             )
-        require_same_features(visual_map, extractor, descriptor)
+        visual_map.require_features(extractor, descriptor)
         self.map, self.extractor, self.matcher, self.settings = visual_map, extractor, matcher, settings
         self.descriptor: GlobalDescriptor = descriptor or Vlad(visual_map.vocabulary)
         extent = np.linalg.norm(np.ptp(visual_map.landmarks.points_world, axis=0))
@@ -113,7 +105,7 @@ class Localizer:
         """
         return self.locate(self.describe(image, camera), prior)
 
-    def describe(self, image: UInt8[np.ndarray, "height width 3"], camera: Camera | None) -> Described:
+    def describe(self, image: UInt8[np.ndarray, "height width 3"], camera: Camera | None) -> _Described:
         """Features of a picture, undistorted where its camera is a fisheye: the half of the work without the map.
 
         Raises WearcapError without intrinsics or for a picture of another size than they are for.
@@ -124,71 +116,59 @@ class Localizer:
                 expected="a calibrated camera",
                 fix="Calibrate it from a checkerboard video: wearcap calibrate.",
             )
-        check_size(image, camera, "localization")
-        image, camera, valid = flat_picture(image, camera, self.settings.horizontal_fov_deg)
-        features = features_within(self.extractor(image), valid)
-        return Described(camera, features, self.descriptor(image, features))
+        fov_deg = self.settings.horizontal_fov_deg
+        image, camera, features = described(image, camera, self.extractor, fov_deg, "localization")
+        return _Described(camera, features, self.descriptor(image, features))
 
-    def locate(self, picture: Described, prior: Rigid | None = None) -> CameraPose | None:
+    def locate(self, picture: _Described, prior: Rigid | None = None) -> CameraPose | None:
         """Pose of a described picture's camera; `prior` as in a call."""
         if len(picture.features) < self.settings.min_inliers:
             return None
         if prior is not None:
             few = self.settings.retrieved_with_prior
             similar = most_similar(picture.summary, self.map.global_descriptors, few)
-            images = np.union1d(similar, nearest_pictures(self.map, prior, few))
+            images = np.union1d(similar, self.map.nearest(prior, few))
             pose = self._pose(picture, images, self.settings.max_landmarks_with_prior)
             if pose is not None and pose.confidence > 0.5:
                 return pose
         images = most_similar(picture.summary, self.map.global_descriptors, self.settings.retrieved)
         return self._pose(picture, images, self.settings.max_landmarks)
 
-    def _pose(self, picture: Described, images: Int64[np.ndarray, "chosen"], max_landmarks: int) -> CameraPose | None:
+    def _pose(self, picture: _Described, images: Int64[np.ndarray, "chosen"], max_landmarks: int) -> CameraPose | None:
         """Pose from the landmarks of chosen database pictures."""
         camera, features = picture.camera, picture.features
         scale = camera.width / 1000
-        chosen = self._landmarks_of(images, max_landmarks)
+        chosen = self.map.landmarks_of(images, max_landmarks)
         points = self.map.landmarks.points_world[chosen]
         descriptors = from_bytes(self.map.landmarks.descriptors[chosen])
         if self.matcher is None:
             settings = {"max_ratio": self.settings.max_ratio, "same_m": self._same_m}
             pairs = match_landmarks(features.descriptors, descriptors, points, **settings)
-            pixels, matched = features.keypoints[pairs[:, 0]], points[pairs[:, 1]]
+            matches = Matches(features.keypoints[pairs[:, 0]], points[pairs[:, 1]], camera)
         else:
-            pixels, matched = self._matched_by_pairs(features, images)
+            matches = Matches(*self._matched_by_pairs(features, images), camera)
         limit = self.settings.max_error_px * scale
-        fit = ransac_pose(pixels, matched, camera, limit)
+        fit, evidence = matches.ransac(limit), matches
         if fit is None:
             return None
-        evidence = pixels, matched
         if self.matcher is None:
             for reach in (self.settings.second_look_px * scale, limit):
                 near = _near_pairs(features.keypoints, points, camera, fit, reach)
                 pairs = match_nearby(features.descriptors, descriptors, near, self.settings.min_cosine)
                 if len(pairs) < self.settings.min_inliers:
                     return None
-                pixels, matched = features.keypoints[pairs[:, 0]], points[pairs[:, 1]]
-                fit = refined_pose(pixels, matched, camera, fit, limit)
-        agreeing = evidence[0][reprojection_errors(*evidence, camera, fit) < limit]
+                matches = Matches(features.keypoints[pairs[:, 0]], points[pairs[:, 1]], camera)
+                fit = matches.refined(fit, limit)
+        agreeing = evidence.pixels[evidence.errors(fit) < limit]
         if len(agreeing) < self.settings.min_inliers:
             return None
-        covariance = pose_covariance(pixels, matched, camera, fit)
         return CameraPose(
             torch.from_numpy(fit.R_world_cam).float(),
             torch.from_numpy(fit.t_world_cam).float(),
             int(fit.inlier.sum()),
             confidence(agreeing, camera),
-            torch.from_numpy(covariance).float(),
+            torch.from_numpy(matches.covariance(fit)).float(),
         )
-
-    def _landmarks_of(self, images: Int64[np.ndarray, "chosen"], count: int) -> Int64[np.ndarray, "landmark"]:
-        """Landmarks that the pictures observe; of too many, those observed most."""
-        views = self.map.landmark_views(images)
-        seen = np.flatnonzero(views)
-        if len(seen) > count:
-            most = np.argsort(-views[seen], kind="stable")[:count]
-            seen = np.sort(seen[most])
-        return seen
 
     def _matched_by_pairs(
         self, features: Features, images: Int64[np.ndarray, "chosen"]
@@ -198,19 +178,13 @@ class Localizer:
         A keypoint and a landmark paired by several images are one match: repeated, it would count as many.
         """
         assert self.matcher is not None
-        found = [np.zeros((0, 2), np.int64)]
+        found, seen = [np.zeros((0, 2), np.int64)], self.map.observations
         for image in images.tolist():
-            part = self.map.observations(image)
-            camera = self.map.cameras[image]
-            count = part.stop - part.start
-            other = Features(
-                self.map.keypoints[part],
-                from_bytes(self.map.descriptors[part]),
-                np.ones(count, np.float32),
-                (camera.width, camera.height),
-            )
+            part, camera = seen.of(image), self.map.cameras[image]
+            descriptors, size = from_bytes(seen.descriptors[part]), (camera.width, camera.height)
+            other = Features(seen.keypoints[part], descriptors, np.ones(len(descriptors), np.float32), size)
             pairs = self.matcher(features, other)
-            found.append(np.stack([pairs[:, 0], self.map.landmark[part][pairs[:, 1]].astype(np.int64)], 1))
+            found.append(np.stack([pairs[:, 0], seen.landmark[part][pairs[:, 1]].astype(np.int64)], 1))
         keypoint, landmark = np.unique(np.concatenate(found), axis=0).T
         return features.keypoints[keypoint], self.map.landmarks.points_world[landmark]
 
@@ -225,15 +199,6 @@ def confidence(agreeing: Float32[np.ndarray, "match 2"], camera: Camera) -> floa
     return float(1 - 2.0 ** (-max(int(np.minimum(counts, 6).sum()) - 6, 0) / 8))
 
 
-def nearest_pictures(visual_map: VisualMap, prior: Rigid, count: int) -> Int64[np.ndarray, "chosen"]:
-    """Database pictures taken near a pose and in its direction: 1 m counts as much as 30°."""
-    t, forward = prior.t.double().cpu().numpy(), prior.R[:, 2].double().cpu().numpy()
-    distance = np.linalg.norm(visual_map.t_world_cam - t, axis=1)
-    angle = np.arccos(np.clip(visual_map.R_world_cam[:, :, 2] @ forward, -1, 1))
-    cost = distance + angle / np.radians(30)
-    return np.argsort(cost, kind="stable")[:count].astype(np.int64)
-
-
 def _near_pairs(
     keypoints: Float32[np.ndarray, "keypoint 2"],
     points: Float32[np.ndarray, "landmark 3"],
@@ -242,7 +207,7 @@ def _near_pairs(
     reach_px: float,
 ) -> Int64[np.ndarray, "pair 2"]:
     """(keypoint, landmark) pairs within `reach_px` in the picture, at most the 8 nearest landmarks per keypoint."""
-    seen, valid = project(points, camera, fit)
+    seen, valid = fit.project(points, camera)
     number = np.flatnonzero(valid)
     if not len(number):
         return np.zeros((0, 2), np.int64)
@@ -270,9 +235,9 @@ def localize_video(
     poses: list[CameraPose | None] = []
     last: tuple[float, CameraPose] | None = None
     times: Sequence[float] = timestamps.tolist()
-    described = _one_ahead(lambda image: localizer.describe(image, camera), frames)
+    pictures = _one_ahead(lambda image: localizer.describe(image, camera), frames)
     for picture in track(
-        described, "localization", total=len(times), console=Console(stderr=True), disable=not progress
+        pictures, "localization", total=len(times), console=Console(stderr=True), disable=not progress
     ):
         if len(poses) == len(times):
             raise WearcapError(f"more frames than the {len(times)} timestamps", expected="one timestamp per frame")
@@ -285,13 +250,22 @@ def localize_video(
         poses.append(pose)
     if len(poses) != len(times):
         raise WearcapError(f"{len(poses)} frames with {len(times)} timestamps", expected="one timestamp per frame")
-    return _as_localization(timestamps, poses)
+    count = len(times)
+    R, t, sure = torch.eye(3).repeat(count, 1, 1), torch.zeros(count, 3), torch.zeros(count)
+    covariance = torch.eye(6).repeat(count, 1, 1) * _UNKNOWN
+    repeated = next((pose for pose in poses if pose is not None), None)
+    for number, pose in enumerate(poses):
+        if pose is not None:
+            repeated, sure[number], covariance[number] = pose, pose.confidence, pose.covariance
+        if repeated is not None:
+            R[number], t[number] = repeated.R_world_cam, repeated.t_world_cam
+    return Localization(timestamps, R, t, sure, covariance)
 
 
-def _one_ahead(describe: Callable[[np.ndarray], Described], frames: Iterable[np.ndarray]) -> Iterator[Described]:
+def _one_ahead(describe: Callable[[np.ndarray], _Described], frames: Iterable[np.ndarray]) -> Iterator[_Described]:
     """Describe frames in a second thread, one frame ahead of the consumer."""
     with ThreadPoolExecutor(1) as pool:
-        pending: Future[Described] | None = None
+        pending: Future[_Described] | None = None
         for frame in frames:
             following = pool.submit(describe, frame)
             if pending is not None:
@@ -299,33 +273,3 @@ def _one_ahead(describe: Callable[[np.ndarray], Described], frames: Iterable[np.
             pending = following
         if pending is not None:
             yield pending.result()
-
-
-def _as_localization(timestamps: Float64[Tensor, "time"], poses: list[CameraPose | None]) -> Localization:
-    found = [pose for pose in poses if pose is not None]
-    if not found:
-        count = len(poses)
-        return Localization(
-            timestamps,
-            torch.eye(3).repeat(count, 1, 1),
-            torch.zeros(count, 3),
-            torch.zeros(count),
-            torch.eye(6).repeat(count, 1, 1) * _UNKNOWN,
-        )
-    last, filled = found[0], []
-    for pose in poses:
-        last = pose or last
-        filled.append(last)
-    sure = torch.tensor([0.0 if pose is None else pose.confidence for pose in poses])
-    covariance = torch.stack([torch.eye(6) * _UNKNOWN if pose is None else pose.covariance for pose in poses])
-    return Localization(
-        timestamps,
-        torch.stack([pose.R_world_cam for pose in filled]),
-        torch.stack([pose.t_world_cam for pose in filled]),
-        sure,
-        covariance,
-    )
-
-
-_UNKNOWN = 1e4
-"""Variance (rad², m²) of a pose that was not found."""

@@ -13,14 +13,12 @@ from scipy.spatial import KDTree
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
+from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.colmap import Tracks
 from wearcap.io.formats.video import read_image
-from wearcap.localization.features import Extractor, Features, GlobalDescriptor
-from wearcap.localization.landmarks import from_bytes, merge, to_bytes
-from wearcap.localization.picture import check_size, features_within, flat_picture
-from wearcap.localization.point_map import PointMapper, undistortion
-from wearcap.localization.retrieval import Vlad, train_vocabulary
-from wearcap.localization.visual_map import VisualMap
+from wearcap.localization.features import Extractor, Features, GlobalDescriptor, Vlad
+from wearcap.localization.point_map import PointMapper, described, undistortion
+from wearcap.localization.visual_map import Observations, VisualMap, from_bytes, merge, to_bytes
 from wearcap.recording.photo import Photo
 from wearcap.scene.scan import Scan
 
@@ -55,10 +53,6 @@ class _Picture:
     global_descriptor: np.ndarray | None
 
 
-Lift = Callable[[int, Photo, Camera, Features], tuple[np.ndarray, np.ndarray]]
-"""World positions of a photo's keypoints (in the perspective camera's pixels), and where they are valid."""
-
-
 def build_map(
     photos: Sequence[Photo],
     source: Scan | Tracks,
@@ -76,7 +70,10 @@ def build_map(
     pictures = _pictures(photos, source, extractor, descriptor, settings, progress)
     vlad = None
     if descriptor is None:
-        vlad = Vlad(_vocabulary(pictures, settings.words))
+        # The vocabulary is trained on 60,000 descriptors, drawn alike from all pictures.
+        random, share = np.random.default_rng(0), max(1, 60_000 // len(pictures))
+        chosen = [p.descriptors[random.permutation(len(p.descriptors))[:share]] for p in pictures]
+        vlad = Vlad.trained(from_bytes(np.concatenate(chosen)), settings.words)
     cell_m = settings.cell_m if isinstance(source, Scan) else 0.0
     return _assemble(photos, pictures, extractor.name, vlad or descriptor, vlad, cell_m)
 
@@ -92,58 +89,41 @@ def extended(
     progress: bool = False,
 ) -> VisualMap:
     """The map with more photos; its vocabulary stays. Raises WearcapError as `build_map`, and for other features."""
-    require_same_features(visual_map, extractor, descriptor)
+    visual_map.require_features(extractor, descriptor)
     pictures = _pictures(photos, source, extractor, descriptor, settings, progress)
     vlad = Vlad(visual_map.vocabulary) if descriptor is None else None
     more = _assemble(photos, pictures, extractor.name, vlad or descriptor, vlad, 0.0)
+    old, new = visual_map.observations, more.observations
     joined = {
-        name: np.concatenate([getattr(visual_map, name), getattr(more, name)])
-        for name in ("R_world_cam", "t_world_cam", "keypoints", "descriptors", "positions", "global_descriptors")
+        name: np.concatenate([getattr(old, name), getattr(new, name)])
+        for name in ("keypoints", "descriptors", "positions")
     }
     landmarks, landmark = merge(joined["positions"], joined["descriptors"], visual_map.cell_m)
+    poses = [(part.T_world_cam.R, part.T_world_cam.t) for part in (visual_map, more)]
     return replace(
         visual_map,
         names=visual_map.names + more.names,
         cameras=visual_map.cameras + more.cameras,
-        first=np.concatenate([visual_map.first, visual_map.first[-1] + more.first[1:]]),
-        landmark=landmark,
+        T_world_cam=Rigid(*(torch.cat(part) for part in zip(*poses))),
+        global_descriptors=np.concatenate([visual_map.global_descriptors, more.global_descriptors]),
+        observations=Observations(
+            **joined, first=np.concatenate([old.first, old.first[-1] + new.first[1:]]), landmark=landmark
+        ),
         landmarks=landmarks,
-        **joined,
     )
-
-
-def require_same_features(visual_map: VisualMap, extractor: Extractor, descriptor: GlobalDescriptor | None) -> None:
-    """Raises WearcapError when a map was made with another extractor or another global descriptor."""
-    if extractor.name != visual_map.extractor:
-        raise WearcapError(
-            f"the map was made with {visual_map.extractor!r} features, not {extractor.name!r}",
-            expected="the same features in map and picture",
-            fix="Build the map again, or choose its extractor.",
-        )
-    name = descriptor.name if descriptor is not None else Vlad(visual_map.vocabulary).name
-    if name != visual_map.descriptor:
-        raise WearcapError(
-            f"the map was made with the global descriptor {visual_map.descriptor!r}, not {name!r}",
-            expected="the same descriptor in map and picture",
-            fix="Build the map again, or choose its descriptor.",
-        )
 
 
 def _pictures(photos, source, extractor, descriptor, settings: MapSettings, progress: bool) -> list[_Picture]:
     """Features of each photo. Raises WearcapError without photos, and when none of them shows the scene."""
     if not photos:
         raise WearcapError("no photos to build a map from", expected="database photos with cameras and poses")
-    if isinstance(source, Scan):
-        lift = _lift_by_scan(source, settings)
-    else:
-        lift = _lift_by_tracks(source, settings)
+    lift = _lift(source, settings)
 
     def one(number: int) -> _Picture:
         photo = photos[number]
         image = read_image(photo.file)
-        check_size(image, photo.camera, str(photo.file))
-        image, camera, valid_pixels = flat_picture(image, photo.camera, settings.horizontal_fov_deg)
-        features = features_within(extractor(image), valid_pixels)
+        where = str(photo.file)
+        image, camera, features = described(image, photo.camera, extractor, settings.horizontal_fov_deg, where)
         positions, valid = lift(number, photo, camera, features)
         summary = None if descriptor is None else descriptor(image, features)
         return _Picture(camera, to_bytes(features.descriptors), features.keypoints, positions, valid, summary)
@@ -161,25 +141,24 @@ def _pictures(photos, source, extractor, descriptor, settings: MapSettings, prog
     return pictures
 
 
-def _lift_by_scan(scan: Scan, settings: MapSettings) -> Lift:
-    mapper = PointMapper(scan, settings.splat_m)
+def _lift(source: Scan | Tracks, settings: MapSettings) -> Callable[[int, Photo, Camera, Features], tuple]:
+    """World positions of a photo's keypoints (in the perspective camera's pixels), and where they are valid."""
+    if isinstance(source, Scan):
+        mapper = PointMapper(source, settings.splat_m)
 
-    def lift(number: int, photo: Photo, camera: Camera, features: Features):
-        point_map = mapper(photo.camera, photo.T_world_cam)
-        if photo.camera.is_fisheye:
-            point_map = undistortion(photo.camera, settings.horizontal_fov_deg).point_map(point_map)
-        return point_map.lift(scan.points, features.keypoints)
+        def by_scan(number: int, photo: Photo, camera: Camera, features: Features):
+            point_map = mapper(photo.camera, photo.T_world_cam)
+            if photo.camera.is_fisheye:
+                point_map = undistortion(photo.camera, settings.horizontal_fov_deg).point_map(point_map)
+            return point_map.lift(source.points, features.keypoints)
 
-    return lift
+        return by_scan
+    order = np.argsort(source.photo, kind="stable")
 
-
-def _lift_by_tracks(tracks: Tracks, settings: MapSettings) -> Lift:
-    order = np.argsort(tracks.photo, kind="stable")
-
-    def lift(number: int, photo: Photo, camera: Camera, features: Features):
-        start, stop = np.searchsorted(tracks.photo[order], [number, number + 1])
+    def by_tracks(number: int, photo: Photo, camera: Camera, features: Features):
+        start, stop = np.searchsorted(source.photo[order], [number, number + 1])
         mine = order[start:stop]
-        pixels = tracks.pixels[mine]
+        pixels = source.pixels[mine]
         if photo.camera.is_fisheye:
             rays = photo.camera.unproject(torch.from_numpy(pixels).double())
             flat, valid = camera.project(rays.nan_to_num(0.0))
@@ -187,18 +166,10 @@ def _lift_by_tracks(tracks: Tracks, settings: MapSettings) -> Lift:
         if not len(mine) or not len(features):
             return np.zeros((len(features), 3), np.float32), np.zeros(len(features), bool)
         distance, nearest = KDTree(pixels).query(features.keypoints)
-        positions = tracks.points_world[tracks.point[mine[nearest]]].astype(np.float32)
+        positions = source.points_world[source.point[mine[nearest]]].astype(np.float32)
         return positions, distance <= settings.track_distance_px
 
-    return lift
-
-
-def _vocabulary(pictures: list[_Picture], words: int, sample: int = 60_000) -> np.ndarray:
-    """VLAD vocabulary trained on descriptors from all images."""
-    share = max(1, sample // len(pictures))
-    random = np.random.default_rng(0)
-    chosen = [p.descriptors[random.permutation(len(p.descriptors))[:share]] for p in pictures]
-    return train_vocabulary(from_bytes(np.concatenate(chosen)), words)
+    return by_tracks
 
 
 def _assemble(
@@ -208,21 +179,18 @@ def _assemble(
     descriptors = np.concatenate([p.descriptors[p.valid] for p in pictures])
     landmarks, landmark = merge(positions, descriptors, cell_m)
     counts = [int(p.valid.sum()) for p in pictures]
+    first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    keypoints = np.concatenate([p.keypoints[p.valid] for p in pictures])
     summaries = [vlad.aggregate(from_bytes(p.descriptors)) if vlad else p.global_descriptor for p in pictures]
     return VisualMap(
         extractor,
         descriptor.name,
         tuple(photo.file.name for photo in photos),
         tuple(picture.camera for picture in pictures),
-        np.stack([photo.T_world_cam.R.double().numpy() for photo in photos]),
-        np.stack([photo.T_world_cam.t.double().numpy() for photo in photos]),
-        np.concatenate([p.keypoints[p.valid] for p in pictures]),
-        descriptors,
-        positions,
-        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        landmark,
-        landmarks,
+        Rigid(*(torch.stack([getattr(photo.T_world_cam, part).double() for photo in photos]) for part in "Rt")),
         np.stack(summaries),
+        Observations(keypoints, descriptors, positions, first, landmark),
+        landmarks,
         vlad.vocabulary if vlad else np.zeros((0, descriptors.shape[1]), np.float32),
         cell_m,
     )

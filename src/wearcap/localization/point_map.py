@@ -1,4 +1,6 @@
-"""Point maps: the visible scan point of each pixel of a photo (thesis 4.2.1), for lifting keypoints to 3D."""
+"""Point maps, the visible scan point of each pixel of a photo (thesis 4.2.1), for lifting keypoints to 3D; and pictures
+before features are sought in them: of the calibrated size, and undistorted where the camera is a fisheye.
+"""
 
 import math
 from dataclasses import dataclass
@@ -13,6 +15,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.splats import SplatCloud
+from wearcap.localization.features import Extractor, Features
 from wearcap.scene.scan import Scan
 
 
@@ -101,7 +104,7 @@ class PointMapper:
 
 
 @dataclass(frozen=True, eq=False)
-class Undistortion:
+class _Undistortion:
     """A remap of pictures and point maps of one camera onto a fixed pinhole camera with the same optical axis."""
 
     camera: Camera
@@ -129,7 +132,7 @@ class Undistortion:
 
 
 @lru_cache(maxsize=16)
-def undistortion(camera: Camera, horizontal_fov_deg: float = 100.0) -> Undistortion:
+def undistortion(camera: Camera, horizontal_fov_deg: float = 100.0) -> _Undistortion:
     """The remap of a camera's pictures onto a pinhole one of the same size, centred, with square pixels.
 
     Raises WearcapError for a field of view that no pinhole camera has.
@@ -144,7 +147,7 @@ def undistortion(camera: Camera, horizontal_fov_deg: float = 100.0) -> Undistort
     # Half a pixel around the picture counts as seen: the outermost pixels' centres are taken for it.
     pixels = torch.minimum(pixels.clamp(min=0), pixels.new_tensor([width - 1, height - 1]))
     x, y = torch.where(seen[..., None], pixels, -1.0).float().unbind(-1)
-    return Undistortion(flat, x.contiguous().numpy(), y.contiguous().numpy())
+    return _Undistortion(flat, x.contiguous().numpy(), y.contiguous().numpy())
 
 
 @lru_cache(maxsize=16)
@@ -154,3 +157,39 @@ def _axis_share(camera: Camera) -> Float64[np.ndarray, "height width"]:
         torch.meshgrid(*(torch.arange(n).double() for n in (camera.width, camera.height)), indexing="xy"), -1
     )
     return camera.unproject(grid)[..., 2].numpy()
+
+
+def described(
+    image: UInt8[np.ndarray, "height width 3"],
+    camera: Camera,
+    extractor: Extractor,
+    horizontal_fov_deg: float,
+    where: str,
+) -> tuple[np.ndarray, Camera, Features]:
+    """Picture, camera and features; all of the undistorted picture where the camera is a fisheye.
+
+    Keypoints beyond the border of what a fisheye saw are left out. Raises WearcapError as `check_size`.
+    """
+    check_size(image, camera, where)
+    if not camera.is_fisheye:
+        return image, camera, extractor(image)
+    remap = undistortion(camera, horizontal_fov_deg)
+    image = remap.image(image)
+    features = extractor(image)
+    # Six pixels from the border
+    inside = cv2.erode(remap.valid.astype(np.uint8), np.ones((13, 13), np.uint8), borderValue=0) > 0
+    column, row = np.rint(features.keypoints).astype(np.int64).T
+    kept = inside[row.clip(0, inside.shape[0] - 1), column.clip(0, inside.shape[1] - 1)]
+    return image, remap.camera, features.subset(kept)
+
+
+def check_size(image: UInt8[np.ndarray, "height width 3"], camera: Camera, where: str) -> None:
+    """Raises WearcapError when a picture has not the size that its camera was calibrated for."""
+    if image.shape[:2] != (camera.height, camera.width):
+        raise WearcapError(
+            f"a picture of {image.shape[1]}x{image.shape[0]} pixels with a calibration for "
+            f"{camera.width}x{camera.height}",
+            where=where,
+            expected="the size that the camera was calibrated at",
+            fix="Resize the calibration with it (Camera.scaled), or take the original pictures.",
+        )

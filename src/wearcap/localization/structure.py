@@ -49,11 +49,21 @@ def map_pictures(
     if (folder / MODEL / "images.bin").is_file():
         return folder / MODEL
     lens = None if camera is None else colmap_camera(camera)
-    colmap = _pycolmap()
+    try:
+        colmap = importlib.import_module("pycolmap")
+    except ImportError as error:
+        raise WearcapError(
+            "structure from motion needs the package pycolmap",
+            fix='Run: pip install "wearcap[track]", or give a finished COLMAP model: from_model=DIR.',
+        ) from error
+    colmap.logging.minloglevel = 2  # its errors come as exceptions, we report its progress
     folder.mkdir(parents=True, exist_ok=True)
     _extract(colmap, names, images, folder / "database.db", lens, settings, advance)
     advance("matching", 0, 1)
-    _match(colmap, folder / "database.db", settings)
+    # Each picture is matched with those that follow; pairs that are in the database are not matched again.
+    pairing, matching = colmap.SequentialPairingOptions(), colmap.FeatureMatchingOptions()
+    pairing.overlap, pairing.num_threads, matching.num_threads = settings.overlap, settings.threads, settings.threads
+    _run_step(colmap.match_sequential, folder / "database.db", matching_options=matching, pairing_options=pairing)
     advance("matching", 1, 1)
     return _map(colmap, len(names), images, folder, lens is not None, settings, advance)
 
@@ -69,18 +79,6 @@ def colmap_camera(camera: Camera) -> tuple[str, str]:
         )
     values = (camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5, *camera.distortion)
     return name, ",".join(f"{value:.12g}" for value in values)
-
-
-def _pycolmap() -> Any:
-    try:
-        colmap = importlib.import_module("pycolmap")
-    except ImportError as error:
-        raise WearcapError(
-            "structure from motion needs the package pycolmap",
-            fix='Run: pip install "wearcap[track]", or give a finished COLMAP model: from_model=DIR.',
-        ) from error
-    colmap.logging.minloglevel = 2  # its errors come as exceptions, we report its progress
-    return colmap
 
 
 def _extract(
@@ -119,13 +117,6 @@ def _extract(
                 with colmap.Database.open(database) as opened:
                     reader.existing_camera_id = opened.read_all_cameras()[0].camera_id
     advance("features", len(names), len(names))
-
-
-def _match(colmap: Any, database: Path, settings: MappingSettings) -> None:
-    """Match each picture with those that follow; pairs that are in the database are not matched again."""
-    pairing, matching = colmap.SequentialPairingOptions(), colmap.FeatureMatchingOptions()
-    pairing.overlap, pairing.num_threads, matching.num_threads = settings.overlap, settings.threads, settings.threads
-    _run_step(colmap.match_sequential, database, matching_options=matching, pairing_options=pairing)
 
 
 def _map(

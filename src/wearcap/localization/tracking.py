@@ -5,7 +5,6 @@ A single camera knows no metres and no gravity: scale and axes of the result are
 
 import itertools
 import json
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -25,7 +24,7 @@ from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.io.formats.poses import write_tum
 from wearcap.io.formats.text import read_json
 from wearcap.io.formats.video import SUFFIXES, read_frames, read_image, video_info
-from wearcap.localization.picture import check_size
+from wearcap.localization.point_map import check_size
 from wearcap.localization.structure import Advance, MappingSettings, map_pictures
 
 FRAMES, STATE = "frames", "settings.json"
@@ -50,6 +49,22 @@ class Pictures:
     names: tuple[str, ...]
     timestamps: Float64[Tensor, "picture"]
 
+    @classmethod
+    def of_folder(cls, folder: str | Path, fps: float) -> "Pictures":
+        """A folder's images sorted by name, at `fps` per second."""
+        folder = Path(folder)
+        names = tuple(sorted(_pictures_in(folder)))
+        if not names:
+            raise WearcapError("no pictures in this folder", where=folder, expected=", ".join(SUFFIXES))
+        return cls(folder, names, torch.arange(len(names), dtype=torch.float64) / fps)
+
+    @classmethod
+    def of_model(cls, model: ColmapModel, fps: float) -> "Pictures":
+        """The images of a model sorted by name, assuming that none is missing."""
+        names = tuple(photo.file.name for photo in model.photos)
+        folder = model.photos[0].file.parent if model.photos else Path()
+        return cls(folder, names, torch.arange(len(names), dtype=torch.float64) / fps)
+
 
 @dataclass(frozen=True)
 class Track:
@@ -67,6 +82,76 @@ class Track:
     reprojection_px: float
     """Mean reprojection error of the points; NaN without tracks."""
 
+    @classmethod
+    def of_model(cls, model: ColmapModel, pictures: Pictures, max_gap_s: float, where: str | Path) -> "Track":
+        """The path of a model's camera over a row of pictures; gaps up to `max_gap_s` are interpolated.
+
+        Raises WearcapError when the model holds none of the pictures, or several cameras.
+        """
+        number = {name: index for index, name in enumerate(pictures.names)}
+        photos = {number[photo.file.name]: photo for photo in model.photos if photo.file.name in number}
+        if not photos:
+            raise WearcapError(
+                f"the model places none of {len(pictures.names)} pictures",
+                where=where,
+                expected=f"names such as {pictures.names[0]}" if pictures.names else "photos",
+            )
+        cameras = {photo.camera for photo in photos.values()}
+        if len(cameras) > 1:
+            raise WearcapError(
+                f"{len(cameras)} cameras",
+                where=where,
+                expected="pictures of one camera",
+                fix="Map the video as taken with a single camera.",
+            )
+        placed = torch.zeros(len(pictures.names), dtype=torch.bool)
+        placed[list(photos)] = True
+        R, t = torch.eye(3).repeat(len(placed), 1, 1), torch.zeros(len(placed), 3)
+        for index, photo in photos.items():
+            R[index], t[index] = photo.T_world_cam.R.float(), photo.T_world_cam.t.float()
+        whole = filled(Trajectory(pictures.timestamps, R, t), placed)
+        gaps, kept = _gaps(placed, pictures.timestamps, max_gap_s)
+        tracks, distances = model.tracks, [np.zeros(0)]
+        for index, photo in enumerate(model.photos):
+            mine = tracks.photo == index
+            points = torch.from_numpy(tracks.points_world[tracks.point[mine]])
+            pixels, valid = photo.camera.project(photo.T_world_cam.inverse() @ points)  # pyright: ignore[reportArgumentType]
+            distances.append(np.linalg.norm(pixels.numpy() - tracks.pixels[mine], axis=1)[valid.numpy()])
+        joined = np.concatenate(distances)
+        return cls(
+            whole[kept],
+            next(iter(cameras)),
+            tracks.points_world,
+            tracks.colors,
+            len(placed),
+            int(placed.sum()),
+            gaps,
+            float(joined.mean()) if len(joined) else float("nan"),
+        )
+
+    def write(self, output: str | Path, source: str) -> None:
+        """Write trajectory.txt (TUM), points.ply, camera.json and report.json into a folder."""
+        output = Path(output)
+        write_tum(self.T_world_cam, output / "trajectory.txt")
+        points = self.points_world.astype(np.float32)
+        write_ply(Ply(points, self.colors), output / "points.ply")
+        error = None if np.isnan(self.reprojection_px) else round(self.reprojection_px, 4)
+        write_camera(self.camera, output / "camera.json", {"source": source, "reprojection_px": error})
+        report = {
+            "source": source,
+            "scale": "arbitrary: no metres, no gravity",
+            "pictures": self.pictures,
+            "placed": self.placed,
+            "placed_share": round(self.placed / self.pictures, 4),
+            "interpolated": len(self.T_world_cam) - self.placed,
+            "points": len(self.points_world),
+            "reprojection_px": error,
+            "gaps": [
+                {"start_s": start, "stop_s": stop, "interpolated": bridged} for start, stop, bridged in self.gaps_s
+            ],
+        }
+        write_text(output / "report.json", json.dumps(report, indent=1) + "\n")
+
 
 def track_pictures(
     source: str | Path, output: str | Path, settings: TrackSettings, camera: Camera | None, advance: Advance
@@ -80,7 +165,9 @@ def track_pictures(
     if not source.exists():
         raise WearcapError("no such file or folder", where=source, expected="a video, or a folder of pictures")
     _claim(source, output, settings, camera)
-    pictures = picture_row(source, settings.fps) if source.is_dir() else _frames(source, output, settings.fps, advance)
+    pictures = (
+        Pictures.of_folder(source, settings.fps) if source.is_dir() else _frames(source, output, settings.fps, advance)
+    )
     if len(pictures.names) < 3:
         raise WearcapError(
             f"{len(pictures.names)} pictures", where=source, expected="at least 3", fix="Take more a second: fps=…"
@@ -88,98 +175,7 @@ def track_pictures(
     if camera is not None:
         check_size(read_image(pictures.folder / pictures.names[0]), camera, pictures.names[0])
     model = map_pictures(pictures.names, pictures.folder, output, camera, settings.mapping, advance)
-    return track_of_model(read_colmap(model, pictures.folder), pictures, settings.max_gap_s, where=output)
-
-
-def picture_row(folder: str | Path, fps: float) -> Pictures:
-    """A folder's images sorted by name, at `fps` per second."""
-    folder = Path(folder)
-    names = tuple(sorted(path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES))
-    if not names:
-        raise WearcapError("no pictures in this folder", where=folder, expected=", ".join(SUFFIXES))
-    return Pictures(folder, names, torch.arange(len(names), dtype=torch.float64) / fps)
-
-
-def model_row(model: ColmapModel, fps: float) -> Pictures:
-    """The images of a model sorted by name, assuming that none is missing."""
-    names = tuple(photo.file.name for photo in model.photos)
-    folder = model.photos[0].file.parent if model.photos else Path()
-    return Pictures(folder, names, torch.arange(len(names), dtype=torch.float64) / fps)
-
-
-def track_of_model(model: ColmapModel, pictures: Pictures, max_gap_s: float, where: str | Path) -> Track:
-    """The path of a model's camera over a row of pictures; gaps up to `max_gap_s` are interpolated.
-
-    Raises WearcapError when the model holds none of the pictures, or several cameras.
-    """
-    number = {name: index for index, name in enumerate(pictures.names)}
-    photos = {number[photo.file.name]: photo for photo in model.photos if photo.file.name in number}
-    if not photos:
-        raise WearcapError(
-            f"the model places none of {len(pictures.names)} pictures",
-            where=where,
-            expected=f"names such as {pictures.names[0]}" if pictures.names else "photos",
-        )
-    cameras = {photo.camera for photo in photos.values()}
-    if len(cameras) > 1:
-        raise WearcapError(
-            f"{len(cameras)} cameras",
-            where=where,
-            expected="pictures of one camera",
-            fix="Map the video as taken with a single camera.",
-        )
-    placed = torch.zeros(len(pictures.names), dtype=torch.bool)
-    placed[list(photos)] = True
-    R, t = torch.eye(3).repeat(len(placed), 1, 1), torch.zeros(len(placed), 3)
-    for index, photo in photos.items():
-        R[index], t[index] = photo.T_world_cam.R.float(), photo.T_world_cam.t.float()
-    whole = filled(Trajectory(pictures.timestamps, R, t), placed)
-    gaps, kept = _gaps(placed, pictures.timestamps, max_gap_s)
-    return Track(
-        whole[kept],
-        next(iter(cameras)),
-        model.tracks.points_world,
-        model.tracks.colors,
-        len(placed),
-        int(placed.sum()),
-        gaps,
-        reprojection_error(model),
-    )
-
-
-def reprojection_error(model: ColmapModel) -> float:
-    """Mean reprojection error (px) of a model's points; NaN without observations."""
-    tracks, distances = model.tracks, [np.zeros(0)]
-    for index, photo in enumerate(model.photos):
-        mine = tracks.photo == index
-        points = torch.from_numpy(tracks.points_world[tracks.point[mine]])
-        pixels, valid = photo.camera.project(photo.T_world_cam.inverse() @ points)  # pyright: ignore[reportArgumentType]
-        off = np.linalg.norm(pixels.numpy() - tracks.pixels[mine], axis=1)
-        distances.append(off[valid.numpy()])
-    joined = np.concatenate(distances)
-    return float(joined.mean()) if len(joined) else float("nan")
-
-
-def write_track(track: Track, output: str | Path, source: str) -> None:
-    """Write trajectory.txt (TUM), points.ply, camera.json and report.json into a folder."""
-    output = Path(output)
-    write_tum(track.T_world_cam, output / "trajectory.txt")
-    points = track.points_world.astype(np.float32)
-    write_ply(Ply(points, track.colors), output / "points.ply")
-    error = None if np.isnan(track.reprojection_px) else round(track.reprojection_px, 4)
-    write_camera(track.camera, output / "camera.json", {"source": source, "reprojection_px": error})
-    report = {
-        "source": source,
-        "scale": "arbitrary: no metres, no gravity",
-        "pictures": track.pictures,
-        "placed": track.placed,
-        "placed_share": round(track.placed / track.pictures, 4),
-        "interpolated": len(track.T_world_cam) - track.placed,
-        "points": len(track.points_world),
-        "reprojection_px": error,
-        "gaps": [{"start_s": start, "stop_s": stop, "interpolated": bridged} for start, stop, bridged in track.gaps_s],
-    }
-    write_text(output / "report.json", json.dumps(report, indent=1) + "\n")
+    return Track.of_model(read_colmap(model, pictures.folder), pictures, settings.max_gap_s, where=output)
 
 
 def _gaps(
@@ -204,7 +200,7 @@ def _claim(source: Path, output: Path, settings: TrackSettings, camera: Camera |
     about = source.stat()
     mine = {
         "source": str(source.resolve()),
-        "bytes": about.st_size if source.is_file() else len(_listed(source)),
+        "bytes": about.st_size if source.is_file() else len(_pictures_in(source)),
         "fps": float(settings.fps),
         "mapping": asdict(settings.mapping),
         "camera": None if camera is None else camera_row(camera),
@@ -222,8 +218,8 @@ def _claim(source: Path, output: Path, settings: TrackSettings, camera: Camera |
     write_text(output / STATE, json.dumps(mine, indent=1) + "\n")
 
 
-def _listed(folder: Path) -> Sequence[Path]:
-    return [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
+def _pictures_in(folder: Path) -> list[str]:
+    return [path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
 
 
 def _frames(video: Path, output: Path, fps: float, advance: Advance) -> Pictures:

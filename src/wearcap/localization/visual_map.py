@@ -1,4 +1,6 @@
-"""The visual map of a scene: images with known poses, keypoints lifted to 3D, and global descriptors for retrieval."""
+"""The visual map of a scene: pictures with known poses, keypoints lifted to 3D and merged to landmarks, and global
+descriptors for retrieval.
+"""
 
 import dataclasses
 import json
@@ -8,56 +10,69 @@ from pathlib import Path
 import numpy as np
 import safetensors
 import torch
-from jaxtyping import Float32, Float64, Int8, Int32, Int64
+from jaxtyping import Float32, Int8, Int32, Int64
 from safetensors.numpy import save
 
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, parse_json
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.localization.landmarks import Landmarks
+from wearcap.localization.features import Extractor, GlobalDescriptor, Vlad
 
 SCHEMA_VERSION = 1
-_ARRAYS = (
-    "R_world_cam",
-    "t_world_cam",
-    "keypoints",
-    "descriptors",
-    "positions",
-    "first",
-    "landmark",
-    "global_descriptors",
-    "vocabulary",
-)
+STEPS = 254.0
+"""Quantisation of unit-length descriptors to bytes: round(254 d), so components beyond ±0.5 are clipped."""
+_CHUNK = 1 << 18
+_AGAIN = "Build it again: wearcap scene."
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """Scene points at which keypoints were detected."""
+
+    points_world: Float32[np.ndarray, "landmark 3"]
+    descriptors: Int8[np.ndarray, "landmark feature"]
+    """Mean of the keypoints' descriptors, of unit length."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Keypoints with a 3D position, in the order of their pictures."""
+
+    keypoints: Float32[np.ndarray, "observation 2"]
+    descriptors: Int8[np.ndarray, "observation feature"]
+    positions: Float32[np.ndarray, "observation 3"]
+    """World position (m), lifted in the observation's own picture."""
+    first: Int64[np.ndarray, "edge"]
+    """Picture i has the observations first[i] … first[i + 1] - 1."""
+    landmark: Int32[np.ndarray, "observation"]
+    """Index of the observed landmark."""
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+    def of(self, picture: int) -> slice:
+        """The observations of one picture."""
+        return slice(int(self.first[picture]), int(self.first[picture + 1]))
 
 
 @dataclass(frozen=True, eq=False)
 class VisualMap:
-    """A map that cameras are localised against; `map_builder.build_map` makes one.
-
-    Observations (keypoints with a 3D position) stand in the order of their pictures.
-    """
+    """A map that cameras are localised against; `map_builder.build_map` makes one."""
 
     extractor: str
     """Name of the extractor that found the keypoints."""
     descriptor: str
     """Name of the global descriptor."""
     names: tuple[str, ...]
-    """File name of each image."""
+    """File name of each picture."""
     cameras: tuple[Camera, ...]
-    """Camera of each image; the perspective camera where a fisheye was undistorted."""
-    R_world_cam: Float64[np.ndarray, "image 3 3"]
-    t_world_cam: Float64[np.ndarray, "image 3"]
-    keypoints: Float32[np.ndarray, "observation 2"]
-    descriptors: Int8[np.ndarray, "observation feature"]
-    positions: Float32[np.ndarray, "observation 3"]
-    """World position (m), lifted in the observation's own image."""
-    first: Int64[np.ndarray, "edge"]
-    """Image i has the observations first[i] … first[i + 1] - 1."""
-    landmark: Int32[np.ndarray, "observation"]
-    """Index of the observed landmark."""
-    landmarks: Landmarks
+    """Camera of each picture; the perspective camera where a fisheye was undistorted."""
+    T_world_cam: Rigid
+    """Pose of each picture (float64)."""
     global_descriptors: Float32[np.ndarray, "image global"]
+    observations: Observations
+    landmarks: Landmarks
     vocabulary: Float32[np.ndarray, "word feature"]
     """VLAD's vocabulary; empty where another global descriptor is used."""
     cell_m: float
@@ -66,18 +81,35 @@ class VisualMap:
     def __len__(self) -> int:
         return len(self.names)
 
-    @property
-    def T_world_cam(self) -> Rigid:
-        return Rigid(torch.from_numpy(self.R_world_cam), torch.from_numpy(self.t_world_cam))
+    def landmarks_of(self, pictures: Int64[np.ndarray, "chosen"], count: int) -> Int64[np.ndarray, "landmark"]:
+        """Landmarks that the pictures observe; of more than `count`, those observed most."""
+        seen = [self.observations.landmark[self.observations.of(picture)] for picture in pictures.tolist()]
+        views = np.bincount(np.concatenate([np.zeros(0, np.int32), *seen]))
+        landmark = np.flatnonzero(views)
+        if len(landmark) > count:
+            landmark = np.sort(landmark[np.argsort(-views[landmark], kind="stable")[:count]])
+        return landmark
 
-    def observations(self, image: int) -> slice:
-        """The observations of one picture."""
-        return slice(int(self.first[image]), int(self.first[image + 1]))
+    def nearest(self, prior: Rigid, count: int) -> Int64[np.ndarray, "chosen"]:
+        """Pictures taken near a pose and in its direction: 1 m counts as much as 30°."""
+        t, forward = prior.t.double().cpu().numpy(), prior.R[:, 2].double().cpu().numpy()
+        distance = np.linalg.norm(self.T_world_cam.t.numpy() - t, axis=1)
+        angle = np.arccos(np.clip(self.T_world_cam.R.numpy()[:, :, 2] @ forward, -1, 1))
+        return np.argsort(distance + angle / np.radians(30), kind="stable")[:count].astype(np.int64)
 
-    def landmark_views(self, images: Int64[np.ndarray, "chosen"]) -> Int64[np.ndarray, "landmark"]:
-        """How often each landmark is observed by the given pictures."""
-        seen = [self.landmark[self.observations(image)] for image in images.tolist()]
-        return np.bincount(np.concatenate([np.zeros(0, np.int32), *seen]), minlength=len(self.landmarks.points_world))
+    def require_features(self, extractor: Extractor, descriptor: GlobalDescriptor | None) -> None:
+        """Raises WearcapError when the map was made with another extractor or another global descriptor (None: VLAD)."""
+        described = descriptor.name if descriptor is not None else Vlad(self.vocabulary).name
+        for mine, name, made, part, what in (
+            (self.extractor, extractor.name, f"{self.extractor!r} features", "features", "extractor"),
+            (self.descriptor, described, f"the global descriptor {self.descriptor!r}", "descriptor", "descriptor"),
+        ):
+            if name != mine:
+                raise WearcapError(
+                    f"the map was made with {made}, not {name!r}",
+                    expected=f"the same {part} in map and picture",
+                    fix=f"Build the map again, or choose its {what}.",
+                )
 
     def save(self, path: str | Path) -> None:
         """Write one .safetensors file, atomically."""
@@ -89,8 +121,15 @@ class VisualMap:
             "cameras": [dataclasses.asdict(camera) for camera in self.cameras],
             "cell_m": self.cell_m,
         }
-        tensors = {name: np.ascontiguousarray(getattr(self, name)) for name in _ARRAYS}
-        tensors |= {f"landmarks.{f.name}": getattr(self.landmarks, f.name) for f in dataclasses.fields(Landmarks)}
+        arrays = {
+            "R_world_cam": self.T_world_cam.R.numpy(),
+            "t_world_cam": self.T_world_cam.t.numpy(),
+            "global_descriptors": self.global_descriptors,
+            "vocabulary": self.vocabulary,
+            **vars(self.observations),
+            **{f"landmarks.{name}": array for name, array in vars(self.landmarks).items()},
+        }
+        tensors = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
         with atomic_path(path) as temporary:
             temporary.write_bytes(save(tensors, {"wearcap_map": json.dumps(header, sort_keys=True)}))
 
@@ -105,10 +144,7 @@ class VisualMap:
             raise WearcapError("no such map", where=path, fix="Build it: wearcap scene.") from error
         except (safetensors.SafetensorError, OSError, RuntimeError) as error:
             raise WearcapError(
-                "not a readable map",
-                where=path,
-                expected="a complete .safetensors file",
-                fix="Build it again: wearcap scene.",
+                "not a readable map", where=path, expected="a complete .safetensors file", fix=_AGAIN
             ) from error
         if "wearcap_map" not in metadata:
             raise WearcapError(
@@ -121,44 +157,102 @@ class VisualMap:
                     f"a map of version {header['schema_version']}",
                     where=path,
                     expected=f"version {SCHEMA_VERSION}",
-                    fix="Build it again: wearcap scene.",
+                    fix=_AGAIN,
                 )
-            landmarks = Landmarks(**{f.name: tensors[f"landmarks.{f.name}"] for f in dataclasses.fields(Landmarks)})
-            cameras = tuple(
-                Camera(**camera | {"distortion": tuple(camera["distortion"])}) for camera in header["cameras"]
-            )
+            cameras = [camera | {"distortion": tuple(camera["distortion"])} for camera in header["cameras"]]
             loaded = cls(
                 header["extractor"],
                 header["descriptor"],
                 tuple(header["names"]),
-                cameras,
-                landmarks=landmarks,
-                cell_m=float(header["cell_m"]),
-                **{name: tensors[name] for name in _ARRAYS},
+                tuple(Camera(**camera) for camera in cameras),
+                Rigid(*(torch.from_numpy(tensors[name]) for name in ("R_world_cam", "t_world_cam"))),
+                tensors["global_descriptors"],
+                Observations(**{field.name: tensors[field.name] for field in dataclasses.fields(Observations)}),
+                Landmarks(tensors["landmarks.points_world"], tensors["landmarks.descriptors"]),
+                tensors["vocabulary"],
+                float(header["cell_m"]),
             )
             loaded.check()
         except (KeyError, TypeError, ValueError) as error:
-            raise WearcapError(f"a damaged map ({error})", where=path, fix="Build it again: wearcap scene.") from error
+            raise WearcapError(f"a damaged map ({error})", where=path, fix=_AGAIN) from error
         return loaded
 
     def check(self) -> None:
         """Raises ValueError when the parts do not fit together."""
-        images, observations, landmarks = (len(self.names), len(self.keypoints), len(self.landmarks.points_world))
-        sizes = {
-            "cameras": (len(self.cameras), images),
-            "poses": (len(self.R_world_cam), images),
-            "positions of pictures": (len(self.t_world_cam), images),
-            "global descriptors": (len(self.global_descriptors), images),
-            "edges": (len(self.first), images + 1),
-            "descriptors": (len(self.descriptors), observations),
-            "positions": (len(self.positions), observations),
-            "numbers of landmarks": (len(self.landmark), observations),
-            "descriptors of landmarks": (len(self.landmarks.descriptors), landmarks),
-        }
-        for name, (count, expected) in sizes.items():
-            if count != expected:
-                raise ValueError(f"{count} {name} instead of {expected}")
-        if self.first[0] != 0 or self.first[-1] != observations or (np.diff(self.first) < 0).any():
+        seen = self.observations
+        images, observations, landmarks = len(self.names), len(seen), len(self.landmarks.points_world)
+        for name, part, expected in (
+            ("cameras", self.cameras, images),
+            ("poses", self.T_world_cam.R, images),
+            ("positions of pictures", self.T_world_cam.t, images),
+            ("global descriptors", self.global_descriptors, images),
+            ("edges", seen.first, images + 1),
+            ("descriptors", seen.descriptors, observations),
+            ("positions", seen.positions, observations),
+            ("numbers of landmarks", seen.landmark, observations),
+            ("descriptors of landmarks", self.landmarks.descriptors, landmarks),
+        ):
+            if len(part) != expected:
+                raise ValueError(f"{len(part)} {name} instead of {expected}")
+        if seen.first[0] != 0 or seen.first[-1] != observations or (np.diff(seen.first) < 0).any():
             raise ValueError("its pictures do not share out the observations")
-        if observations and not 0 <= self.landmark.min() <= self.landmark.max() < landmarks:
+        if observations and not 0 <= seen.landmark.min() <= seen.landmark.max() < landmarks:
             raise ValueError("observations of landmarks that are not there")
+
+
+def to_bytes(descriptors: Float32[np.ndarray, "keypoint feature"]) -> Int8[np.ndarray, "keypoint feature"]:
+    """Descriptors of unit length in a quarter of the memory."""
+    return np.clip(np.rint(descriptors * STEPS), -127, 127).astype(np.int8)
+
+
+def from_bytes(descriptors: Int8[np.ndarray, "keypoint feature"]) -> Float32[np.ndarray, "keypoint feature"]:
+    """Descriptors of unit length again."""
+    values = descriptors.astype(np.float32)
+    return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-6)
+
+
+def merge(
+    positions: Float32[np.ndarray, "observation 3"],
+    descriptors: Int8[np.ndarray, "observation feature"],
+    cell_m: float,
+    min_cosine: float = 0.85,
+) -> tuple[Landmarks, Int32[np.ndarray, "observation"]]:
+    """Landmarks, and the one that each observation belongs to.
+
+    Observations within one cell of `cell_m` are one landmark where their descriptors are alike. With `cell_m` 0 those
+    at exactly the same position are, whatever their descriptors (tracks of structure from motion).
+    """
+    if not len(positions):
+        return Landmarks(positions, descriptors), np.zeros(0, np.int32)
+    place = positions if cell_m == 0 else np.floor(positions / cell_m).astype(np.int64)
+    _, cell = np.unique(place, axis=0, return_inverse=True)
+    group = cell.ravel() if cell_m == 0 else _leaders(cell.ravel(), descriptors, min_cosine)
+    _, landmark, count = np.unique(group, return_inverse=True, return_counts=True)
+    order = np.argsort(landmark, kind="stable")
+    start = np.cumsum(count) - count
+    mean = np.add.reduceat(positions[order].astype(np.float64), start) / count[:, None]
+    total = np.add.reduceat(descriptors[order].astype(np.float32), start)
+    total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-6)
+    return Landmarks(mean.astype(np.float32), to_bytes(total)), landmark.astype(np.int32)
+
+
+def _leaders(cell: np.ndarray, descriptors: np.ndarray, min_cosine: float) -> np.ndarray:
+    """For each observation the leader of its group: repeatedly, the first remaining one of each cell collects the
+    similar ones of that cell."""
+    leader = np.full(len(cell), -1)
+    left = np.arange(len(cell))
+    for _ in range(12):
+        _, first = np.unique(cell[left], return_index=True)
+        lead_of_cell = np.full(cell.max() + 1, -1)
+        lead_of_cell[cell[left[first]]] = left[first]
+        lead = lead_of_cell[cell[left]]
+        chunks = [slice(k, k + _CHUNK) for k in range(0, len(left), _CHUNK)]
+        pairs = ((from_bytes(descriptors[left[part]]), from_bytes(descriptors[lead[part]])) for part in chunks)
+        alike = np.concatenate([np.einsum("nd,nd->n", *pair) for pair in pairs]) >= min_cosine
+        alike[first] = True
+        leader[left[alike]] = lead[alike]
+        left = left[~alike]
+        if not len(left):
+            return leader
+    leader[left] = left
+    return leader

@@ -31,7 +31,7 @@ from wearcap.prepare.splits import Splits
 from wearcap.recording.recording import Recording
 from wearcap.recording.timing import resampled
 from wearcap.sensors.camera_alignment import align_by_walks
-from wearcap.sensors.slam_track import clean_track
+from wearcap.sensors.monocular_slam import clean_track
 
 VERSION = {"hps": 1, "egohoi": 1, "hcontact": 1, "nymeria": 2, "aria": 2, "mocap_every_folder": 1}
 """Versions of the conversions, increased when the same source and settings yield another recording."""
@@ -239,8 +239,8 @@ def _mocap_every(folder: Path, name: str, subject: str, settings: MocapEverySett
     """A recording without outlier poses, which are detected in metres before the world is changed."""
     read = read_mocap_every_folder(folder)
     scale, T_world_slam = settings.alignment(read, folder)
-    clean = clean_track(read.T_slam_cam, settings.max_acceleration / scale, settings.max_burst_s)
-    recording = mocap_every_recording(replace(read, T_slam_cam=clean.trajectory), scale, T_world_slam)
+    clean, _, _ = clean_track(read.T_slam_cam, settings.max_acceleration / scale, settings.max_burst_s)
+    recording = mocap_every_recording(replace(read, T_slam_cam=clean), scale, T_world_slam)
     return replace(recording, name=name, subject=subject, license=license)
 
 

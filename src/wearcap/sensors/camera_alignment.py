@@ -20,7 +20,7 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.trajectory import Trajectory, interpolate
+from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording.recording import HeadStream
 from wearcap.sensors.stillness import StepCheck, Stretch, during, unstillness_deg
 
@@ -67,6 +67,25 @@ class SlamAlignment:
         R = self.R_world_slam.to(trajectory.R_world_body) @ trajectory.R_world_body
         return Trajectory(trajectory.timestamps, R, self.points(trajectory.t_world_body))
 
+    def checks(
+        self, moved_m: Float[Tensor, "mark"], turned_deg: Sequence[float], limits: AlignmentLimits = AlignmentLimits()
+    ) -> list[StepCheck]:
+        """Quality checks of the camera's four positions; `moved_m` and `turned_deg` as from `mark_positions`."""
+        still = "Let go of the camera, or give a stretch in which it rests."
+        ruler = "Measure |C1 C2| and |C3 C4| again, and check which position is which."
+        rows = []
+        for name, moved, turned in zip(MARKS, moved_m.tolist(), turned_deg):
+            rows.append(StepCheck(f"camera on {name}", "moves", moved, limits.mark_still_m, "m", still))
+            rows.append(StepCheck(f"camera on {name}", "turns", turned, limits.mark_still_deg, "°", still))
+        axes = "Put C1 and C2 on the y axis, C3 and C4 on the x axis."
+        for check in (
+            ("scales by the two distances differ", 100 * self.scale_spread, 100 * limits.scale_spread, "%", ruler),
+            ("axes miss a right angle", self.corner_deg, limits.corner_deg, "°", axes),
+            ("residual", self.residual_m, limits.residual_m, "m", ruler),
+        ):
+            rows.append(StepCheck("camera on the board", *check))
+        return rows
+
 
 @dataclass(frozen=True)
 class HeadMount:
@@ -92,6 +111,16 @@ class HeadMount:
             torch.eye(3),
             self.t_head_cam,
         )
+
+    def checks(self, limits: AlignmentLimits = AlignmentLimits()) -> list[StepCheck]:
+        """Quality checks of standing."""
+        calm = "Stand upright and look ahead for 10 s, or give a calmer stretch."
+        face = "Face the board's y while standing, or give the direction that you faced (facing_deg)."
+        ahead = "optical axis away from straight ahead"
+        return [
+            StepCheck("standing", "not still", self.still_deg, limits.stand_still_deg, "°", calm),
+            StepCheck("standing", ahead, self.view_deg, limits.view_deg, "°", face),
+        ]
 
 
 def mark_positions(
@@ -138,9 +167,23 @@ def align_by_marks(
             expected="90°",
             fix="Put C1 and C2 on the y axis, C3 and C4 on the x axis.",
         )
-    scales = np.array(distances_m) / lengths
-    start = _closed_form(C, np.array(distances_m), height_m)
-    found = least_squares(_residuals, start, args=(C, distances_m, height_m), x_scale="jac")
+    distances = np.array(distances_m)
+    scales = distances / lengths
+    # Closed form: scale by least squares, rotation by Procrustes, each coordinate of the origin a mean of what should be 0.
+    normal = np.cross(lines[1], lines[0])
+    there = np.stack([*(lines / lengths[:, None]), normal / np.linalg.norm(normal)])
+    R = Rotation.align_vectors(np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]]), there)[0]
+    scale = distances @ lengths / (lengths @ lengths)
+    placed = scale * R.apply(C)
+    t = -np.array([placed[:2, 0].mean(), placed[2:, 1].mean(), placed[:, 2].mean() - height_m])
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        """Residuals (m) of positions under a rotation vector, log scale and translation."""
+        P = np.exp(x[3]) * Rotation.from_rotvec(x[:3]).apply(C) + x[4:]
+        apart = [P[1, 1] - P[0, 1] - distances[0], P[3, 0] - P[2, 0] - distances[1]]
+        return np.concatenate([P[:2, 0], P[2:, 1], P[:, 2] - height_m, apart])
+
+    found = least_squares(residuals, np.concatenate([R.as_rotvec(), [np.log(scale)], t]), x_scale="jac")
     return SlamAlignment(
         float(np.exp(found.x[3])),
         torch.from_numpy(Rotation.from_rotvec(found.x[:3]).as_matrix()),
@@ -149,27 +192,6 @@ def align_by_marks(
         float(abs(scales[0] - scales[1]) / scales.mean()),
         abs(90 - math.degrees(math.acos(np.clip(lines[0] @ lines[1] / lengths.prod(), -1, 1)))),
     )
-
-
-def _closed_form(C: np.ndarray, distances: np.ndarray, height: float) -> np.ndarray:
-    """Rotation vector, log scale and translation: scale by least squares, rotation by Procrustes, then each
-    coordinate of the origin as the mean of what should be zero."""
-    lines = np.stack([C[1] - C[0], C[3] - C[2]])
-    lengths = np.linalg.norm(lines, axis=1)
-    scale = distances @ lengths / (lengths @ lengths)
-    normal = np.cross(lines[1], lines[0])
-    there = np.stack([*(lines / lengths[:, None]), normal / np.linalg.norm(normal)])
-    R = Rotation.align_vectors(np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]]), there)[0]
-    placed = scale * R.apply(C)
-    t = -np.array([placed[:2, 0].mean(), placed[2:, 1].mean(), placed[:, 2].mean() - height])
-    return np.concatenate([R.as_rotvec(), [np.log(scale)], t])
-
-
-def _residuals(x: np.ndarray, C: np.ndarray, distances: tuple[float, float], height: float) -> np.ndarray:
-    """Residuals (m) of the transformed positions against the axes, the height and the distances."""
-    P = np.exp(x[3]) * Rotation.from_rotvec(x[:3]).apply(C) + x[4:]
-    apart = [P[1, 1] - P[0, 1] - distances[0], P[3, 0] - P[2, 0] - distances[1]]
-    return np.concatenate([P[:2, 0], P[2:, 1], P[:, 2] - height, apart])
 
 
 def align_by_walks(
@@ -200,28 +222,6 @@ def align_by_walks(
     return scale, Rigid(R, start - R @ (scale * y_slam[0].double())).to(torch.float32)
 
 
-def scale_by_walks(slam: Trajectory, walks: Sequence[tuple[float, float, float]]) -> tuple[float, float]:
-    """Metres per SLAM unit from walked distances, and the relative spread of their individual scales.
-
-    A walk is (start s, stop s, metres between the two places). Raises WearcapError for walks that lead nowhere.
-    """
-    if not walks:
-        raise WearcapError("no walked distance", expected="(start s, stop s, metres), once or more")
-    at = torch.tensor([walk[:2] for walk in walks], dtype=torch.float64).reshape(-1)
-    ends = interpolate(slam.timestamps, slam.t_world_body.double(), at).reshape(-1, 2, 3)
-    lengths = (ends[:, 1] - ends[:, 0]).norm(dim=-1).numpy()
-    metres = np.array([walk[2] for walk in walks])
-    if lengths.min() < 1e-9 or metres.min() <= 0:
-        raise WearcapError(
-            f"walks of {metres.tolist()} m, and {lengths.round(4).tolist()} in the SLAM",
-            where="walked distances",
-            expected="two different places and a distance above 0",
-            fix="Check the times of the walks.",
-        )
-    scales = metres / lengths
-    return float(metres @ lengths / (lengths @ lengths)), float(np.ptp(scales) / scales.mean())
-
-
 def mount_by_standing(
     T_world_cam: Trajectory,
     standing: Stretch,
@@ -236,60 +236,3 @@ def mount_by_standing(
     R_world_head = rotation.about_axis("z", torch.tensor(math.radians(facing_deg), dtype=torch.float64))
     R_head_cam = R_world_head.mT @ rotation.mean_rotation(R.double())
     return HeadMount(R_head_cam.float(), torch.tensor(t_head_cam), unstillness_deg(R))
-
-
-def mark_checks(
-    found: SlamAlignment,
-    moved_m: Float[Tensor, "mark"],
-    turned_deg: Sequence[float],
-    limits: AlignmentLimits = AlignmentLimits(),
-) -> list[StepCheck]:
-    """Quality checks of the camera's four positions; `moved_m` and `turned_deg` as from `mark_positions`."""
-    still = "Let go of the camera, or give a stretch in which it rests."
-    ruler = "Measure |C1 C2| and |C3 C4| again, and check which position is which."
-    rows = []
-    for name, moved, turned in zip(MARKS, moved_m.tolist(), turned_deg):
-        rows.append(StepCheck(f"camera on {name}", "moves", moved, limits.mark_still_m, "m", still))
-        rows.append(StepCheck(f"camera on {name}", "turns", turned, limits.mark_still_deg, "°", still))
-    return [
-        *rows,
-        StepCheck(
-            "camera on the board",
-            "scales by the two distances differ",
-            100 * found.scale_spread,
-            100 * limits.scale_spread,
-            "%",
-            ruler,
-        ),
-        StepCheck(
-            "camera on the board",
-            "axes miss a right angle",
-            found.corner_deg,
-            limits.corner_deg,
-            "°",
-            "Put C1 and C2 on the y axis, C3 and C4 on the x axis.",
-        ),
-        StepCheck("camera on the board", "residual", found.residual_m, limits.residual_m, "m", ruler),
-    ]
-
-
-def mount_checks(found: HeadMount, limits: AlignmentLimits = AlignmentLimits()) -> list[StepCheck]:
-    """Quality checks of standing."""
-    return [
-        StepCheck(
-            "standing",
-            "not still",
-            found.still_deg,
-            limits.stand_still_deg,
-            "°",
-            "Stand upright and look ahead for 10 s, or give a calmer stretch.",
-        ),
-        StepCheck(
-            "standing",
-            "optical axis away from straight ahead",
-            found.view_deg,
-            limits.view_deg,
-            "°",
-            "Face the board's y while standing, or give the direction that you faced (facing_deg).",
-        ),
-    ]

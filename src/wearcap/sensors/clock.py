@@ -1,14 +1,21 @@
-"""Clock synchronisation by common claps (thesis §4.3.4: one clap; clock drift of about 87 ms per hour)."""
+"""Clock synchronisation by common events: claps (thesis §4.3.4: one clap; clock drift of about 87 ms per hour), or arm
+swings, the times of the highest forearm against those of the hands nearest to the camera (MocapEvery, appendix C.2:
+more reliable than claps, whose impact may disturb a wrist sensor).
+"""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.ndimage
+import scipy.signal
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
+from scipy.special import ndtr
 from torch import Tensor
 
 from wearcap.errors import WearcapError
-from wearcap.recording.recording import Recording
+from wearcap.recording.recording import ImuStream, Recording
+from wearcap.sensors.stillness import StepCheck, Stretch
 
 TOLERANCE_S = 0.03
 """Largest error of a clap under the fitted clock."""
@@ -18,9 +25,18 @@ GROUP_S = 5.0
 """Claps closer together than this share one knot."""
 PRIOR_SPREAD_S = 110.0
 """Prior on the drift, as an equivalent spread of claps: 3 ms of clap noise against a usual drift of 100 ms/h."""
-
 TOGETHER_S = 60.0
 """Among equally good offsets, one smaller than all others by this is chosen: recorders start at about the same time."""
+_MIN_RISE_DEG, _MIN_HEIGHT_DEG, _MIN_APART_S = 50.0, -10.0, 0.5
+"""Smallest prominence and height of a peak of the forearm's elevation that is a swing, and time between two."""
+_STEP_S = 0.01
+"""Time step of the resampled elevations (100 Hz)."""
+_TREMOR_S = 0.03
+"""Standard deviation of the Gaussian that smooths the elevations."""
+_TOP_S = 0.1
+"""Half width of the parabola fit around a peak."""
+_PEAK_S = 0.002
+"""Standard deviation of a watch's peak time (simulated watches: below 1 ms), with a margin for uneven swings."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +120,18 @@ def _drift(suit: np.ndarray, camera: np.ndarray) -> float:
     return float((time * gained).sum() / ((time**2).sum() + PRIOR_SPREAD_S**2))
 
 
+def mutual_pairs(
+    a: Float64[np.ndarray, "a"], b: Float64[np.ndarray, "b"], reach: float | Float64[np.ndarray, "a"]
+) -> tuple[Int64[np.ndarray, "pair"], Int64[np.ndarray, "pair"]]:
+    """Indices (of a, of b) of times that are each other's nearest and at most `reach` (s) apart."""
+    if not len(a) or not len(b):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    gap = np.abs(a[:, None] - b)
+    to_b, to_a = gap.argmin(1), gap.argmin(0)
+    of_a = np.flatnonzero((to_a[to_b] == np.arange(len(a))) & (gap.min(1) <= reach))
+    return of_a, to_b[of_a]
+
+
 def _matched(camera: np.ndarray, suit: np.ndarray, max_offset_s: float) -> tuple[np.ndarray, np.ndarray]:
     """Indices of common claps, (of suit, of camera)."""
     start, offset = (array.ravel() for array in np.broadcast_arrays(suit[:, None], camera - suit[:, None]))
@@ -115,59 +143,144 @@ def _matched(camera: np.ndarray, suit: np.ndarray, max_offset_s: float) -> tuple
             expected="clocks that are nearer to each other",
             fix="Raise max_offset_s.",
         )
-    best = np.argsort(-_agreement(camera, suit, start, offset), kind="stable")[:200]
-    found: dict[bytes, tuple[float, float, tuple]] = {}
-    for candidate in best:
-        score, at, pairs = _refined(camera, suit, start[candidate], offset[candidate])
-        found.setdefault(pairs[0].tobytes() + pairs[1].tobytes(), (score, at, pairs))
-    ranked = sorted(found.values(), key=lambda entry: -entry[0])
-    score, at, pairs = ranked[0]
-    rivals = [other for other in ranked[1:] if abs(other[1] - at) > TOLERANCE_S and other[0] > score - 0.3]
-    if rivals:
-        nearest, *others = sorted([ranked[0], *rivals], key=lambda entry: abs(entry[1]))
-        if abs(nearest[1]) + TOGETHER_S < abs(others[0][1]):
-            return nearest[2]
-        raise WearcapError(
-            f"the {len(camera)} claps of the camera and {len(suit)} of the suit fit together in several ways, with "
-            f"offsets of {at:.3f} s and {rivals[0][1]:.3f} s",
-            expected="claps at uneven intervals, or one in each",
-            fix="Give the times of the claps by hand.",
-        )
-    return pairs
-
-
-def _agreement(camera: np.ndarray, suit: np.ndarray, start: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """How many claps coincide, nearer ones counting more, if those at `start` are `offset` apart."""
+    # How many claps coincide, nearer ones counting more, if those at `start` are `offset` apart.
     score = np.empty(len(start))
     for first in range(0, len(start), 2000):
         part = slice(first, first + 2000)
-        gap = _gap(camera, suit + offset[part, None])
+        at = suit + offset[part, None]
+        after = np.searchsorted(camera, at).clip(0, len(camera) - 1)
+        gap = np.minimum(np.abs(camera[after] - at), np.abs(camera[(after - 1).clip(0)] - at))
         reach = TOLERANCE_S + MAX_DRIFT * np.abs(suit - start[part, None])
         score[part] = np.maximum(1 - (gap / reach) ** 2, 0).sum(1)
-    return score
-
-
-def _gap(times: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Distance from each of `at` to the nearest of the sorted `times`."""
-    after = np.searchsorted(times, at).clip(0, len(times) - 1)
-    return np.minimum(np.abs(times[after] - at), np.abs(times[(after - 1).clip(0)] - at))
+    found: dict[bytes, tuple[float, float, tuple]] = {}
+    for candidate in np.argsort(-score, kind="stable")[:200]:
+        refined = _refined(camera, suit, start[candidate], offset[candidate])
+        found.setdefault(refined[2][0].tobytes() + refined[2][1].tobytes(), refined)
+    best, *others = sorted(found.values(), key=lambda entry: -entry[0])
+    rivals = [other for other in others if abs(other[1] - best[1]) > TOLERANCE_S and other[0] > best[0] - 0.3]
+    if not rivals:
+        return best[2]
+    nearest, *others = sorted([best, *rivals], key=lambda entry: abs(entry[1]))
+    if abs(nearest[1]) + TOGETHER_S < abs(others[0][1]):
+        return nearest[2]
+    raise WearcapError(
+        f"the {len(camera)} claps of the camera and {len(suit)} of the suit fit together in several ways, with "
+        f"offsets of {best[1]:.3f} s and {rivals[0][1]:.3f} s",
+        expected="claps at uneven intervals, or one in each",
+        fix="Give the times of the claps by hand.",
+    )
 
 
 def _refined(camera: np.ndarray, suit: np.ndarray, start: float, offset: float) -> tuple[float, float, tuple]:
     """Refit offset and drift to the coinciding claps iteratively: score, offset at the middle, pairs."""
     predicted, reach = suit + offset, TOLERANCE_S + MAX_DRIFT * np.abs(suit - start)
     for _ in range(8):
-        gap = np.abs(predicted[:, None] - camera)
-        nearest, back = gap.argmin(1), gap.argmin(0)
-        of_suit = np.nonzero((back[nearest] == np.arange(len(suit))) & (gap.min(1) <= reach))[0]
-        if not len(of_suit):
+        found = mutual_pairs(predicted, camera, reach)
+        if not len(found[0]):
             break
-        pairs = (of_suit, nearest[of_suit])
-        score = np.maximum(1 - (gap[pairs] / reach[of_suit]) ** 2, 0).sum()
-        gained = camera[pairs[1]] - suit[of_suit]
-        rate = np.clip(_drift(suit[of_suit], camera[pairs[1]]), -MAX_DRIFT, MAX_DRIFT)
+        pairs = of_suit, of_camera = found
+        score = np.maximum(1 - (np.abs(predicted[of_suit] - camera[of_camera]) / reach[of_suit]) ** 2, 0).sum()
+        rate = np.clip(_drift(suit[of_suit], camera[of_camera]), -MAX_DRIFT, MAX_DRIFT)
         middle = suit.mean()
-        at = float(np.median(gained - rate * (suit[of_suit] - middle)))
+        at = float(np.median(camera[of_camera] - suit[of_suit] - rate * (suit[of_suit] - middle)))
         predicted = suit + at + rate * (suit - middle)
         reach = np.full(len(suit), TOLERANCE_S)
     return float(score), at, pairs
+
+
+@dataclass(frozen=True)
+class SwingClock:
+    """Clock estimated from swings, and the standard deviation (s) of its offset at the swings."""
+
+    clock: Clock
+    std_s: float
+
+    def checks(self, joint: str, min_swings: int = 5, max_std_s: float = 0.005) -> list[StepCheck]:
+        """Quality checks of the swings."""
+        more, step = (
+            "Swing ten times, and give the frames in which the hands are nearest to the camera.",
+            f"arm swings, {joint}",
+        )
+        return [
+            StepCheck(step, "seen by both clocks", self.clock.claps, min_swings, "", more, at_least=True),
+            StepCheck(step, "deviation of the offset", 1000 * self.std_s, 1000 * max_std_s, "ms", more),
+        ]
+
+
+def swing_peaks(stream: ImuStream, stretch: Stretch | None = None) -> Float64[Tensor, "swing"]:
+    """Times (s, the stream's clock) at which the forearm is highest, finer than samples: the top of a parabola.
+
+    Where the mounting is unknown the forearm is the watch's x axis, with the sign that lets the hand hang most of the
+    time. Only the direction of gravity counts, so that any reference frame with z up will do.
+    Raises WearcapError when there is no swing in the stretch (whole log by default), and without orientation.
+    """
+    times = stream.timestamps.numpy()
+    start, stop = stretch or (times[0], times[-1])
+    grid = np.arange(max(start, times[0]), min(stop, times[-1]), _STEP_S)
+    none = WearcapError(
+        f"no arm swing from {start:.1f} s to {stop:.1f} s",
+        where=stream.joint,
+        expected=f"a forearm that rises by {_MIN_RISE_DEG:g}° and falls again",
+        fix="Swing the stretched arms from hanging to above the shoulders, ten times.",
+    )
+    if len(grid) < 2 * _TOP_S / _STEP_S + 3:
+        raise none
+    if stream.R_world_imu is None:
+        raise WearcapError("a stream without orientation", where=stream.joint, expected="a watch's attitude")
+    up_imu = stream.R_world_imu[:, 2]
+    if stream.R_joint_imu is not None:
+        side = -1.0 if stream.joint.startswith("right") else 1.0
+        sine = side * up_imu @ stream.R_joint_imu[1].to(up_imu)
+    else:
+        sine = up_imu[:, 0]
+        sine = sine if sine.median() <= 0 else -sine
+    elevation = np.rad2deg(np.interp(grid, times, sine.clamp(-1, 1).asin().double().numpy()))
+    smooth = scipy.ndimage.gaussian_filter1d(elevation, _TREMOR_S / _STEP_S)
+    apart = max(round(_MIN_APART_S / _STEP_S), 1)
+    tops, _ = scipy.signal.find_peaks(smooth, height=_MIN_HEIGHT_DEG, prominence=_MIN_RISE_DEG, distance=apart)
+    reach = round(_TOP_S / _STEP_S)
+    tops = tops[(tops >= reach) & (tops < len(smooth) - reach)]
+    if not len(tops):
+        raise none
+    shift = np.arange(-reach, reach + 1)
+    quadratic, linear, _ = np.polyfit(shift, smooth[tops[:, None] + shift].T, 2)
+    finer = np.clip(-linear / (2 * np.minimum(quadratic, -1e-9)), -reach, reach)
+    return torch.from_numpy(grid[0] + (tops + finer) * _STEP_S)
+
+
+def fit_swing_clock(
+    camera_s: Float64[Tensor, "swing_camera"],
+    watch_s: Float64[Tensor, "swing_watch"],
+    frame_s: float,
+    max_offset_s: float = 600.0,
+) -> SwingClock:
+    """Fit the clock that maps the watch's swings to the camera's, whose times are accurate to half a frame.
+
+    `fit_clock` finds the correspondences and the drift. The offset is then its posterior mean: camera times have a
+    uniform error of up to half a frame, watch times a normal one of some milliseconds, so that many swings bound the
+    offset more tightly than their mean does (for 10 at 30 Hz 2 ms, not 3 ms). Raises WearcapError as `fit_clock` does.
+    """
+    try:
+        clock = fit_clock(camera_s, watch_s, max_offset_s)
+    except WearcapError as error:
+        raise WearcapError(
+            error.what.replace("clap", "swing").replace("suit", "watch"),
+            where="arm swings",
+            expected=error.expected.replace("clap", "swing"),
+            fix="Give the times of the frames in which the hands are highest, at uneven intervals.",
+        ) from error
+    ours = clock.to_camera(watch_s)
+    gap = (camera_s[:, None] - ours).abs()
+    nearest = gap.argmin(1)
+    late = (camera_s - ours[nearest])[gap.min(1).values <= TOLERANCE_S + frame_s].numpy()
+    half = frame_s / 2
+    spread = max(_PEAK_S, float(np.sqrt(max(np.mean(late**2) - half**2 / 3, 0.0))))
+    offset = np.linspace(-frame_s, frame_s, 801) + np.median(late)
+    off = late[:, None] - offset
+    # A likelihood floor of 0.001 for wrongly picked frames.
+    likelihood = ndtr((off + half) / spread) - ndtr((off - half) / spread) + 1e-3
+    posterior = np.exp(np.log(likelihood).sum(0) - np.log(likelihood).sum(0).max())
+    posterior /= posterior.sum()
+    mean = float(posterior @ offset)
+    std = float(np.sqrt(posterior @ (offset - mean) ** 2))
+    return SwingClock(replace(clock, camera_s=clock.camera_s + mean), std)

@@ -1,4 +1,4 @@
-"""Point cloud of the person from several depth cameras, in the scene (thesis §4.5.1).
+"""Depth cameras around a person (thesis §4.5.1): registered to the scene's scan, and the person's point cloud in it.
 
 Depth images are uint16 millimetres along the optical axis, 0 for missing measurements, as Kinects give them.
 """
@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+import small_gicp
 import torch
 from jaxtyping import Bool, Float, Float32, Int64, UInt16
+from scipy.spatial import KDTree
 from sklearn.cluster import DBSCAN
 
 from wearcap.errors import WearcapError
@@ -18,7 +20,6 @@ from wearcap.geometry.pointcloud import voxel_downsample
 from wearcap.geometry.render import Splats, render
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.surface import SurfaceIndex
-from wearcap.sensors.registration import STAGES, Registration, register
 
 CLUSTER_EPS_M = 0.12
 """DBSCAN's distance (thesis §4.5.1)."""
@@ -30,10 +31,26 @@ _SEEN_SHARE = 0.5
 """Smallest share of empty frames with a measurement for a background pixel to be valid."""
 _FLICKER = 2.5
 """Largest relative deviation of a steady pixel, as a multiple of the camera's median one."""
+_MARGIN_M, _DEVIATIONS = 0.01, 4.0
+"""The person is at least this far before the background, and as many standard deviations of its pixel (ours)."""
+_EDGE_M = 0.06
+"""Pixels without two neighbours in this depth are flying pixels, between two surfaces, dropped before unprojection."""
 _SPLAT_M = 0.02
 """Radius at which a scan's points hide what is behind them: its spacing, and some more."""
 _BESIDE_M = 0.04
 """Points so near to a visible one are of the same surface."""
+_FEWEST = 100
+"""Fewest points for a registration."""
+_SHARE = 0.05
+"""Share of the cloud that must lie near the scene in every stage."""
+_INSIDE_M = 0.05
+"""A registration's fitness counts points of the cloud within this of the scene's."""
+_ROOM_M = 1.5
+"""Margin around the cloud within which the scene is used."""
+_NORMAL_NEIGHBORS = 12
+STAGES = ((0.1, 0.6), (0.06, 0.25), (0.03, 0.06))
+"""Passes of ICP: both clouds are thinned to voxels of the first size (m), pairs are no further apart than the second.
+From a pose some 30 cm and 8° off, as visual localisation at worst gives, to the scan's own noise (ours)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,65 +65,64 @@ class Background:
     @property
     def steady(self) -> Bool[np.ndarray, "height width"]:
         """Measured pixels that flicker no more than others at their depth: means along edges lie in mid-air."""
-        valid = np.isfinite(self.depth_m) & ~_flying(self.depth_m, Subtraction().edge_m)
+        valid = np.isfinite(self.depth_m) & ~_flying(self.depth_m)
         relative = np.where(valid, self.deviation_m / self.depth_m, np.inf)
         return valid & (relative <= _FLICKER * np.median(relative[valid])) if valid.any() else valid
 
+    @classmethod
+    def of(cls, frames_mm: UInt16[np.ndarray, "time height width"]) -> "Background":
+        """Mean depth of an empty scene, of the frames that saw each pixel. Raises WearcapError without frames."""
+        if not len(frames_mm):
+            raise WearcapError(
+                "no frames of the empty scene",
+                expected="at least one depth image without the person",
+                fix="Record a few seconds of the scene before the person enters.",
+            )
+        seen = frames_mm > 0
+        count = seen.sum(0)
+        depth = frames_mm.astype(np.float32) / 1000
+        mean = depth.sum(0) / np.maximum(count, 1)
+        variance = (seen * (depth - mean) ** 2).sum(0) / np.maximum(count - 1, 1)
+        valid = count >= _SEEN_SHARE * len(frames_mm)
+        return cls(np.where(valid, mean, np.inf).astype(np.float32), np.sqrt(variance, dtype=np.float32))
 
-@dataclass(frozen=True, eq=False)
-class DepthView:
-    """A depth camera of the rig: lens, pose in the scene and its background."""
+    def foreground(self, depth_mm: UInt16[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+        """Pixels clearly before the empty scene's depth; all measured ones where the background gave none.
 
-    camera: Camera
-    T_world_cam: Rigid
-    background: Background
+        Raises WearcapError when the sizes differ.
+        """
+        if depth_mm.shape != self.depth_m.shape:
+            raise WearcapError(
+                f"a depth image of shape {depth_mm.shape} and a background of {self.depth_m.shape}",
+                expected="images of one camera",
+            )
+        depth = depth_mm / np.float32(1000)
+        before = depth < self.depth_m - (_MARGIN_M + _DEVIATIONS * self.deviation_m)
+        return (depth_mm > 0) & before & ~_flying(depth)
 
 
 @dataclass(frozen=True)
-class Subtraction:
-    """Margins of the background subtraction (ours: the thesis has no margin)."""
+class Registration:
+    """Pose of a cloud found by ICP, with its quality."""
 
-    margin_m: float = 0.01
-    """Smallest distance in front of the background."""
-    deviations: float = 4.0
-    """Additional margin in standard deviations of the background pixel: more at edges, less on a near floor."""
-    edge_m: float = 0.06
-    """Pixels without two neighbours in this depth are flying pixels, dropped before unprojection."""
+    T_scene_cloud: Rigid
+    """Pose of the cloud in the scene (float64)."""
+    fitness: float
+    """Share of the cloud (in voxels of the last stage) within 5 cm of a scene point."""
+    rmse_m: float
+    """Root mean square distance of those to the scene's local plane."""
+    least_seen: float
+    """Share of surface (0 … 1/3) that faces the direction least faced: near 0 the cloud can slide that way."""
+    converged: bool
 
-
-def empty_scene(frames_mm: UInt16[np.ndarray, "time height width"]) -> Background:
-    """Mean depth of an empty scene, of the frames that saw each pixel. Raises WearcapError without frames."""
-    if not len(frames_mm):
-        raise WearcapError(
-            "no frames of the empty scene",
-            expected="at least one depth image without the person",
-            fix="Record a few seconds of the scene before the person enters.",
+    @property
+    def summary(self) -> str:
+        """One line for the log."""
+        doubt = "" if self.least_seen > 0.01 else ", may slide: hardly any surface faces one direction"
+        return (
+            f"fitness {100 * self.fitness:.1f} %, RMSE {1000 * self.rmse_m:.1f} mm"
+            f"{'' if self.converged else ', not converged'}{doubt}"
         )
-    seen = frames_mm > 0
-    count = seen.sum(0)
-    depth = frames_mm.astype(np.float32) / 1000
-    mean = depth.sum(0) / np.maximum(count, 1)
-    variance = (seen * (depth - mean) ** 2).sum(0) / np.maximum(count - 1, 1)
-    valid = count >= _SEEN_SHARE * len(frames_mm)
-    return Background(np.where(valid, mean, np.inf).astype(np.float32), np.sqrt(variance, dtype=np.float32))
-
-
-def foreground(
-    depth_mm: UInt16[np.ndarray, "height width"], background: Background, subtraction: Subtraction = Subtraction()
-) -> Bool[np.ndarray, "height width"]:
-    """Pixels clearly before the empty scene's depth; all measured ones where the background gave none.
-
-    Raises WearcapError when the sizes differ.
-    """
-    if depth_mm.shape != background.depth_m.shape:
-        raise WearcapError(
-            f"a depth image of shape {depth_mm.shape} and a background of {background.depth_m.shape}",
-            expected="images of one camera",
-        )
-    depth = depth_mm / np.float32(1000)
-    margin = subtraction.margin_m + subtraction.deviations * background.deviation_m
-    before = (depth_mm > 0) & (depth < background.depth_m - margin)
-    return before & ~_flying(depth, subtraction.edge_m)
 
 
 def unproject_depth(
@@ -118,37 +134,96 @@ def unproject_depth(
     return points[np.isfinite(points).all(1)].astype(np.float64)
 
 
-def largest_cluster(points: Float[np.ndarray, "point 3"], eps_m: float = CLUSTER_EPS_M) -> Bool[np.ndarray, "point"]:
+def largest_cluster(points: Float[np.ndarray, "point 3"]) -> Bool[np.ndarray, "point"]:
     """Points of the DBSCAN cluster that holds most of them; none where all are noise."""
     if not len(points):
         return np.zeros(0, bool)
     centers, voxel = voxel_downsample(torch.from_numpy(points), _CLUSTER_VOXEL_M)
     rows: Int64[np.ndarray, "point"] = voxel.numpy()
     weight = np.bincount(rows)
-    label = DBSCAN(eps=eps_m, min_samples=_CLUSTER_POINTS).fit_predict(centers.numpy(), sample_weight=weight)
+    label = DBSCAN(eps=CLUSTER_EPS_M, min_samples=_CLUSTER_POINTS).fit_predict(centers.numpy(), sample_weight=weight)
     size = np.bincount(label + 1, weight)[1:]
     return (label == size.argmax())[rows] if len(size) else np.zeros(len(points), bool)
 
 
-def register_view(
-    view: DepthView, scene: Float32[np.ndarray, "scene_point 3"], correction: Rigid | None = None
-) -> tuple[DepthView, Registration]:
-    """The camera at the pose that ICP of its empty depth image to the scene's scan (m) finds, and ICP's report.
+@dataclass(frozen=True, eq=False)
+class DepthView:
+    """A depth camera of the rig: lens, pose in the scene and its background."""
 
-    `view.T_world_cam` is the approximate pose, as visual localisation gives it. Where the result is wrong, a person
-    gives it back with a `correction` in scene axes (new = correction @ old), and ICP starts from there: the
-    thesis's localisation, ICP, manual correction, ICP. ICP runs twice, each time to the points that the camera
-    would see from where it is thought to be: scans show walls from both sides, 10 cm apart.
-    Raises WearcapError as `register` does.
+    camera: Camera
+    T_world_cam: Rigid
+    background: Background
+
+    def registered(
+        self, scene: Float32[np.ndarray, "scene_point 3"], correction: Rigid | None = None
+    ) -> tuple["DepthView", Registration]:
+        """The camera at the pose that ICP of its empty depth image to the scene's scan (m) finds, and ICP's report.
+
+        `T_world_cam` is the approximate pose, as visual localisation gives it. Where the result is wrong, a person
+        gives it back with a `correction` in scene axes (new = correction @ old), and ICP starts from there: the
+        thesis's localisation, ICP, manual correction, ICP. ICP runs twice, each time to the points that the camera
+        would see from where it is thought to be: scans show walls from both sides, 10 cm apart.
+        Raises WearcapError as `register` does.
+        """
+        empty = self.background
+        cloud = unproject_depth(empty.depth_m, empty.steady, self.camera)
+        pose = self.T_world_cam.to(torch.float64)
+        if correction is not None:
+            pose = correction.to(torch.float64) @ pose
+        pose = register(cloud, visible_points(scene, pose), pose).T_scene_cloud
+        result = register(cloud, visible_points(scene, pose), pose, STAGES[1:])
+        return replace(self, T_world_cam=result.T_scene_cloud), result
+
+
+def register(
+    cloud: Float[np.ndarray, "point 3"],
+    scene: Float[np.ndarray, "scene_point 3"],
+    T_scene_cloud: Rigid,
+    stages: Sequence[tuple[float, float]] = STAGES,
+) -> Registration:
+    """Point-to-plane ICP of a cloud (m, its own axes) to the scene (m) from an approximate pose.
+
+    Raises WearcapError when cloud and scene hardly overlap, or either is empty or has NaN.
     """
-    empty = view.background
-    cloud = unproject_depth(empty.depth_m, empty.steady, view.camera)
-    pose = view.T_world_cam.to(torch.float64)
-    if correction is not None:
-        pose = correction.to(torch.float64) @ pose
-    pose = register(cloud, visible_points(scene, pose), pose).T_scene_cloud
-    result = register(cloud, visible_points(scene, pose), pose, STAGES[1:])
-    return replace(view, T_world_cam=result.T_scene_cloud), result
+    for points, name in ((cloud, "the cloud to register"), (scene, "the scene")):
+        if len(points) < _FEWEST or not np.isfinite(points).all():
+            raise WearcapError(
+                f"{name} has {len(points)} points, or some are NaN", expected=f"at least {_FEWEST} finite points (m)"
+            )
+    points, scene = cloud.astype(np.float64), scene.astype(np.float64)
+    pose, converged = T_scene_cloud.to(torch.float64).matrix().numpy(), False
+    placed, finest_m = _moved(points, pose), stages[-1][0]
+    inside = ((scene > placed.min(0) - _ROOM_M) & (scene < placed.max(0) + _ROOM_M)).all(1)
+    if inside.sum() < _FEWEST:
+        raise _no_overlap(_ROOM_M)
+    near = small_gicp.voxelgrid_sampling(scene[inside], finest_m).points()[:, :3]
+    for voxel_m, reach_m in stages:
+        target, tree = small_gicp.preprocess_points(near, voxel_m, _NORMAL_NEIGHBORS)
+        source = small_gicp.voxelgrid_sampling(points, voxel_m)
+        result = small_gicp.align(
+            target,
+            source,
+            tree,
+            pose,
+            "PLANE_ICP",
+            max_correspondence_distance=reach_m,
+            max_iterations=40,
+            rotation_epsilon=1e-4,
+            translation_epsilon=1e-4,
+        )
+        if result.num_inliers < _SHARE * source.size():
+            raise _no_overlap(reach_m)
+        pose, converged = np.array(result.T_target_source), result.converged
+    target, _ = small_gicp.preprocess_points(near, finest_m, _NORMAL_NEIGHBORS)
+    placed = _moved(small_gicp.voxelgrid_sampling(points, finest_m).points()[:, :3], pose)
+    distance, index = KDTree(target.points()[:, :3]).query(placed)
+    inside = distance < _INSIDE_M
+    normals = target.normals()[index[inside], :3]
+    to_plane = ((placed[inside] - target.points()[index[inside], :3]) * normals).sum(1)
+    facing = np.linalg.eigvalsh(normals.T @ normals / max(len(normals), 1))
+    rmse_m = float(np.sqrt(np.mean(to_plane**2))) if inside.any() else float("nan")
+    T_scene_cloud = Rigid.from_matrix(torch.from_numpy(pose))
+    return Registration(T_scene_cloud, float(inside.mean()), rmse_m, float(facing[0]), converged)
 
 
 def visible_points(scene: Float32[np.ndarray, "scene_point 3"], T_world_cam: Rigid) -> Float32[np.ndarray, "point 3"]:
@@ -166,9 +241,7 @@ def visible_points(scene: Float32[np.ndarray, "scene_point 3"], T_world_cam: Rig
 
 
 def person_cloud(
-    depth_mm: Sequence[UInt16[np.ndarray, "height width"]],
-    views: Sequence[DepthView],
-    subtraction: Subtraction = Subtraction(),
+    depth_mm: Sequence[UInt16[np.ndarray, "height width"]], views: Sequence[DepthView]
 ) -> Float[np.ndarray, "point 3"]:
     """The person in the scene (m) at one instant: foreground of all cameras, merged, its largest cluster.
 
@@ -178,7 +251,7 @@ def person_cloud(
         raise WearcapError(f"{len(depth_mm)} depth images for {len(views)} cameras", expected="one for each")
     parts = []
     for image, view in zip(depth_mm, views):
-        mask = foreground(image, view.background, subtraction)
+        mask = view.background.foreground(image)
         points = torch.from_numpy(unproject_depth(image / np.float32(1000), mask, view.camera))
         pose = view.T_world_cam.to(torch.float64)
         parts.append((points @ pose.R.T + pose.t).numpy())
@@ -186,7 +259,7 @@ def person_cloud(
     return merged[largest_cluster(merged)]
 
 
-def _flying(depth_m: np.ndarray, edge_m: float) -> np.ndarray:
+def _flying(depth_m: np.ndarray) -> np.ndarray:
     """Pixels with fewer than two of their eight neighbours in the same depth: between two surfaces (ours)."""
     height, width = depth_m.shape
     padded = np.pad(depth_m, 1, constant_values=np.nan)
@@ -195,7 +268,7 @@ def _flying(depth_m: np.ndarray, edge_m: float) -> np.ndarray:
         for dx in range(3):
             neighbor = padded[dy : dy + height, dx : dx + width]
             with np.errstate(invalid="ignore"):
-                near += np.abs(neighbor - depth_m) < edge_m
+                near += np.abs(neighbor - depth_m) < _EDGE_M
     return near < 3  # the pixel itself is among them
 
 
@@ -205,3 +278,15 @@ def _rays(camera: Camera) -> Float[np.ndarray, "height width 3"]:
     y, x = torch.meshgrid(torch.arange(camera.height).double(), torch.arange(camera.width).double(), indexing="ij")
     rays = camera.unproject(torch.stack([x, y], -1))
     return (rays / rays[..., 2:]).numpy().astype(np.float32)
+
+
+def _moved(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def _no_overlap(reach_m: float) -> WearcapError:
+    return WearcapError(
+        f"hardly any of the cloud lies within {100 * reach_m:.0f} cm of the scene",
+        expected="an approximate pose, within some 30 cm and 8°",
+        fix="Check the camera's pose, and that cloud and scene are both in metres.",
+    )

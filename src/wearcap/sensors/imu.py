@@ -11,7 +11,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory, resample
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import ImuStream
-from wearcap.sensors.noise import random_walk, smooth_noise
+from wearcap.sensors.simulated import heading_walk, smooth_noise
 
 GRAVITY = 9.81
 """m/s², downwards along the world's z."""
@@ -77,47 +77,35 @@ def synthesize_imu(
     """
     T_world_joint = motion.joint(joint)
     R_joint_imu = torch.eye(3) if R_joint_imu is None else R_joint_imu
+    position = T_world_joint.t if t_joint_imu is None else T_world_joint @ t_joint_imu
+    gravity = torch.tensor([0.0, 0.0, GRAVITY])
     worn = R_joint_imu
     if noise is not None:
         assert rng is not None, "noise needs a generator"
         strap = np.deg2rad(noise.strap_deg) * rng.standard_normal(3) / np.sqrt(3)
         worn = R_joint_imu @ rotation.exp(torch.from_numpy(strap).float())
-    position = T_world_joint.t if t_joint_imu is None else T_world_joint @ t_joint_imu
-    path = Trajectory(motion.timestamps, T_world_joint.R @ worn, position)
     fps, times = motion.fps, motion.timestamps
+    path = Trajectory(times, T_world_joint.R @ worn, position)
     if noise is not None and (noise.clock_offset_s or noise.clock_ppm):
-        path, times = _off_clock(path, noise, rng)
+        # The path is sampled when the sensor's clock shows the recording's timestamps.
+        offset = float(rng.uniform(-1, 1)) * noise.clock_offset_s
+        rate = 1 + 1e-6 * noise.clock_ppm * float(rng.standard_normal())
+        true = times[0] + (times - times[0]) * rate - offset
+        path = resample(path, true.clamp(times[0].item(), times[-1].item()))
     R, acc_world = path.R_world_body, acceleration(path.t_world_body, fps, n)
     gyro = angular_rate(R, fps)
-    gravity = torch.tensor([0.0, 0.0, GRAVITY])
-    if noise is None:
-        acc_imu = (R.transpose(-1, -2) @ (acc_world + gravity)[..., None])[..., 0]
-        return ImuStream(times, joint, R, acc_world, acc_imu, gyro, R_joint_imu)
     acc_imu = (R.transpose(-1, -2) @ (acc_world + gravity)[..., None])[..., 0]
-    acc_imu = acc_imu + _normal(rng, 1, 3) * noise.acc_bias + _normal(rng, len(R), 3) * noise.acc_noise
-    gyro = gyro + _normal(rng, len(R), 3) * np.deg2rad(noise.gyro_noise_deg_s)
-    R = _estimated(R, noise, rng, fps)
-    acc_world = (R @ acc_imu[..., None])[..., 0] - gravity
+    if noise is not None:
+        acc_imu = acc_imu + _normal(rng, 1, 3) * noise.acc_bias + _normal(rng, len(R), 3) * noise.acc_noise
+        gyro = gyro + _normal(rng, len(R), 3) * np.deg2rad(noise.gyro_noise_deg_s)
+        # The sensor estimates its orientation with a slowly varying attitude error and a drifting heading.
+        attitude = smooth_noise(rng, len(R), 3, noise.attitude_period_s, fps)
+        attitude = np.deg2rad(noise.attitude_deg) * attitude / np.sqrt(3)
+        heading = heading_walk(rng, len(R), noise.heading_walk_deg_per_sqrt_min, fps)
+        R = heading @ R @ rotation.exp(attitude)
+        acc_world = (R @ acc_imu[..., None])[..., 0] - gravity
     return ImuStream(times, joint, R, acc_world, acc_imu, gyro, R_joint_imu)
 
 
 def _normal(rng: np.random.Generator, *shape: int) -> Tensor:
     return torch.from_numpy(rng.standard_normal(shape)).float()
-
-
-def _off_clock(path: Trajectory, noise: ImuNoise, rng: np.random.Generator) -> tuple[Trajectory, Tensor]:
-    """The path sampled when the sensor's clock shows the recording's timestamps."""
-    offset = float(rng.uniform(-1, 1)) * noise.clock_offset_s
-    rate = 1 + 1e-6 * noise.clock_ppm * float(rng.standard_normal())
-    start = path.timestamps[0]
-    true = (start + (path.timestamps - start) * rate - offset).clamp(start.item(), path.timestamps[-1].item())
-    sampled = resample(path, true)
-    return sampled, path.timestamps
-
-
-def _estimated(R: Tensor, noise: ImuNoise, rng: np.random.Generator, fps: float) -> Tensor:
-    """The sensor's estimated orientation: a slowly varying attitude error and a drifting heading."""
-    attitude = np.deg2rad(noise.attitude_deg) * smooth_noise(rng, len(R), 3, noise.attitude_period_s, fps) / np.sqrt(3)
-    per_sqrt_s = np.deg2rad(noise.heading_walk_deg_per_sqrt_min) / np.sqrt(60)
-    heading = rotation.about_axis("z", random_walk(rng, len(R), 1, per_sqrt_s, fps)[:, 0])
-    return heading @ R @ rotation.exp(attitude)

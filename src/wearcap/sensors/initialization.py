@@ -1,8 +1,11 @@
-"""Initialisation of HPS's optimisation: the suit's pose moved to the camera's path (thesis §4.2.5, eq. 4.13)."""
+"""The suit in the scene: alignment of its world (thesis eq. 4.14, 4.15), the camera's mount (eq. 4.3), and HPS's
+initialisation, the suit's pose moved to the camera's path (§4.2.5, eq. 4.13).
+"""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+import roma
 import scipy.signal
 import torch
 from jaxtyping import Bool, Float, Float64
@@ -10,16 +13,122 @@ from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.geometry.trajectory import Trajectory, resample
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory, nearest_frames, outlier_mask, resample
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Localization
-from wearcap.sensors.alignment import body_camera, inliers, robust_angle, yaw_between
 
+MAX_SPEED = 3.0
+"""m/s between localised positions beyond which one of them is wrong (thesis §4.2.5)."""
 YAWS, BRIDGES = ("tangent", "orientation"), ("line", "suit")
 ANGLE_SCALE, DISTANCE_SCALE = 0.1, 0.15
 """Robust scales (rad, m) of the smoothing residuals."""
 PATH_SPAN_S = 1.0
 """Duration (s) of the displacements, a metre or more: 5 cm of noise turn one by 4°, a hundred by 0.4°."""
+
+
+def align_suit(
+    suit: Motion, localization: Localization, mount: Rigid, first_s: float = 10.0
+) -> tuple[Motion, Float[Tensor, ""]]:
+    """Move a suit's motion into the scene by a rotation about gravity and a translation: (motion, angle in rad).
+
+    The angle is that of eq. 4.14, estimated robustly over the first `first_s` seconds of localised frames instead of
+    frame 0, which may be an outlier; it turns root orientation and path of all frames (eq. 4.15). The translation moves
+    the worn camera to its localised positions. `mount` is the camera's nominal pose in head axes, T_head_cam. Clocks
+    must agree already. Raises WearcapError when no localised frame lies within the suit's time.
+    """
+    seen = inliers(localization)
+    inside = localization.timestamps >= suit.timestamps[0]
+    inside &= seen & (localization.timestamps <= suit.timestamps[-1])
+    step = localization.timestamps.diff().median().item() if len(seen) > 1 else first_s
+    early = inside & (inside.cumsum(0) <= max(round(first_s / step), 1))
+    if not early.any():
+        raise WearcapError(
+            f"none of {len(seen)} frames is localised between {suit.timestamps[0]:.1f} s and "
+            f"{suit.timestamps[-1]:.1f} s",
+            where="localization",
+            expected="camera poses on the suit's clock",
+            fix="Synchronise the clocks, or check the map.",
+        )
+    times, weight = localization.timestamps[early], localization.confidence[early]
+    head = suit.joint("head")
+    head = resample(Trajectory(suit.timestamps, head.R, head.t), times).T_world_body
+    T_world_cam = Rigid(localization.R_world_cam[early], localization.t_world_cam[early]).to(head.t.dtype)
+    angle, certainty = yaw_between(head.R, T_world_cam.R @ mount.R.mT)
+    turn = robust_angle(angle, weight * certainty)
+    R_scene_suit = rotation.about_axis("z", turn)
+    worn: Tensor = head @ mount.t  # pyright: ignore[reportAssignmentType]
+    move = _weighted_median(T_world_cam.t - worn @ R_scene_suit.mT, weight)
+    return suit.moved(Rigid(R_scene_suit, move)), turn
+
+
+def inliers(localization: Localization) -> Bool[Tensor, "time"]:
+    """Localised frames (confidence above 0) within 3 m/s of their inlier neighbours."""
+    found = (localization.confidence > 0) & localization.R_world_cam.isfinite().all(-1).all(-1)
+    position = torch.where(found[:, None], localization.t_world_cam, torch.nan)
+    return outlier_mask(Trajectory(localization.timestamps, localization.R_world_cam, position), MAX_SPEED)
+
+
+def yaw_between(
+    R_a: Float[Tensor, "*batch 3 3"], R_b: Float[Tensor, "*batch 3 3"]
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """Angle (rad) about gravity that brings R_a nearest to R_b, and how well it is determined (0…1).
+
+    The geodesic distance of Rz(x) R_a and R_b (eq. 4.14) is smallest where trace(Rz(x) R_a R_b^T) is largest; with
+    Q = R_b R_a^T that is (Q00 + Q11) cos x + (Q10 - Q01) sin x + Q22.
+    """
+    Q = R_b @ R_a.mT
+    cos, sin = Q[..., 0, 0] + Q[..., 1, 1], Q[..., 1, 0] - Q[..., 0, 1]
+    return torch.atan2(sin, cos), torch.hypot(sin, cos) / 2
+
+
+def robust_angle(
+    angle: Float[Tensor, "sample"], weight: Float[Tensor, "sample"], scale_rad: float = 0.05
+) -> Float[Tensor, ""]:
+    """Centre (rad) of angles on the circle: the sample with the least weighted sum of distances to all others, then
+    reweighted means in which an angle `scale_rad` away counts a quarter, and far ones hardly."""
+    # A subset of candidates suffices for the initial estimate.
+    candidates = angle[:: max(len(angle) // 300, 1)]
+    distance = rotation.wrap_angle(candidates[:, None] - angle).abs()
+    centre = candidates[(distance @ weight).argmin()]
+    for _ in range(30):
+        off = rotation.wrap_angle(angle - centre)
+        w = weight / (1 + (off / scale_rad) ** 2) ** 2
+        centre = rotation.wrap_angle(centre + (w * off).sum() / w.sum())
+    return centre
+
+
+def _weighted_median(value: Float[Tensor, "sample 3"], weight: Float[Tensor, "sample"]) -> Float[Tensor, "3"]:
+    ordered, order = value.sort(dim=0)
+    share = weight[order].cumsum(0)
+    return ordered.gather(0, (share < share[-1:] / 2).sum(0, keepdim=True))[0]
+
+
+def estimate_head_camera(
+    R_world_head: Float[Tensor, "time 3 3"], R_world_cam: Float[Tensor, "time 3 3"], confidence: Float[Tensor, "time"]
+) -> Float[Tensor, "3 3"]:
+    """R_head_cam from the aligned suit's head and the localised camera (HPS paper eq. 4, thesis eq. 4.3).
+
+    Over all frames with confidence instead of frame 0: the rotation with the least weighted sum of geodesic
+    distances (Weiszfeld steps on the chordal mean). A heading that drifts meanwhile enters as a turn of the mount:
+    give frames from before the drift or with the heading corrected. Raises WearcapError without a frame.
+    """
+    good = (confidence > 0) & R_world_cam.isfinite().all(-1).all(-1)
+    if not good.any():
+        raise WearcapError("no localised frame", expected="at least one, to estimate the camera's mount on the head")
+    R, weight = R_world_head[good].mT @ R_world_cam[good], confidence[good]
+    median = torch.stack([_weighted_median(R[:, :, column], weight) for column in range(3)], -1)
+    centre: Tensor = roma.special_procrustes(median)  # pyright: ignore[reportAssignmentType]
+    for _ in range(20):
+        w = weight / rotation.geodesic(R, centre.expand_as(R)).clamp(min=0.005)
+        mean = (w[:, None, None] * R).sum(0) / w.sum()
+        centre = roma.special_procrustes(mean)  # pyright: ignore[reportAssignmentType]
+    return centre
+
+
+def body_camera(motion: Motion, t_head_cam: Float[Tensor, "3"]) -> Float[Tensor, "time 3"]:
+    """Positions (m, world) of a camera mounted on a motion's head."""
+    return motion.joint("head") @ t_head_cam  # pyright: ignore[reportReturnType]
 
 
 @dataclass(frozen=True)
@@ -85,17 +194,25 @@ def initialize(
             expected="camera poses on the suit's clock",
             fix="Synchronise the clocks, or check the map.",
         )
-    valid = _covered(suit, localization, seen)
+    times = localization.timestamps[seen]
+    step = (localization.timestamps if len(seen) > 1 else suit.timestamps).diff().median().item()
+    valid = (times[nearest_frames(times, suit.timestamps)] - suit.timestamps).abs() <= 1.5 * step
     body = body_camera(suit, t_head_cam)
-    camera = _interpolated(suit.timestamps, localization.timestamps[seen], localization.t_world_cam[seen])
-    moved = _Paths(suit.timestamps, body.double(), camera, valid)
+    camera = _interpolated(suit.timestamps, times, localization.t_world_cam[seen])
+    paths = _Paths(suit.timestamps, body.double(), camera, valid)
     if settings.yaw == "tangent":
-        yaw = _tangent_yaw(moved, settings)
+        yaw = _tangent_yaw(paths, settings)
     else:
         yaw = _orientation_yaw(suit, localization, seen, R_head_cam, settings)
-        yaw = yaw + _path_turn(moved, yaw, settings)
+        # Alignment with a nominal mount inherits the mount's yaw error; walking reveals it: the constant angle by which
+        # the suit's path, turned by `yaw`, still differs from the camera's.
+        body_step, camera_step, moving = paths.steps(PATH_SPAN_S, settings.min_speed)
+        turned = body_step * torch.polar(torch.ones_like(yaw), yaw)
+        product = (camera_step * turned.conj())[moving]
+        if len(product):
+            yaw = yaw + robust_angle(product.angle(), product.abs(), scale_rad=ANGLE_SCALE).double()
     if settings.bridge == "suit":
-        camera = _bridged(moved, yaw, settings)
+        camera = _bridged(paths, yaw, settings)
     turn = rotation.about_axis("z", yaw).to(body.dtype)
     R = suit.R_parent_joint.clone()
     R[:, 0] = turn @ R[:, 0]
@@ -112,23 +229,22 @@ class _Paths:
     camera: Float64[Tensor, "time 3"]
     valid: Bool[Tensor, "time"]
 
-    def steps(self, span_s: float) -> tuple[Tensor, Tensor, Tensor]:
+    def steps(self, span_s: float, min_speed: float) -> tuple[Tensor, Tensor, Tensor]:
         """Horizontal displacements during the next `span_s` by suit and camera (complex, m), and where they are valid
-        from start to end."""
+        from start to end and faster than `min_speed` (m/s)."""
         ahead = torch.searchsorted(self.timestamps, self.timestamps + span_s - 1e-6).clamp(max=len(self.timestamps) - 1)
         body, camera = (torch.view_as_complex((p[ahead] - p)[:, :2].contiguous()) for p in (self.body, self.camera))
         lost = torch.cat([self.valid.new_zeros(1), ~self.valid]).cumsum(0)
         whole = (lost[ahead + 1] == lost[:-1]) & (self.timestamps[ahead] - self.timestamps > 0.9 * span_s)
-        return body, camera, whole
+        least = min_speed * span_s
+        return body, camera, whole & (body.abs() > least) & (camera.abs() > least)
 
 
 def _tangent_yaw(paths: _Paths, settings: InitializationSettings) -> Float64[Tensor, "time"]:
     """Angle from the suit's to the camera's direction of travel (thesis eq. 4.13; the angle itself, where the printed
     exp(v × v) turns by its sine). Frames that stand or are lost take the last moving one's, the first ones the first's.
     """
-    body, camera, whole = paths.steps(settings.tangent_s)
-    least = settings.min_speed * settings.tangent_s
-    moving = whole & (body.abs() > least) & (camera.abs() > least)
+    body, camera, moving = paths.steps(settings.tangent_s, settings.min_speed)
     if not moving.any():
         return torch.zeros(len(body), dtype=torch.float64)
     frame = torch.where(moving, torch.arange(len(body)), -1).cummax(0).values
@@ -150,21 +266,6 @@ def _orientation_yaw(
     return _interpolated(suit.timestamps, times, frames[:, None])[:, 0]
 
 
-def _path_turn(paths: _Paths, yaw: Tensor, settings: InitializationSettings) -> Float64[Tensor, ""]:
-    """The constant angle by which the suit's path, turned by `yaw`, still differs from the camera's.
-
-    Alignment with a nominal mount inherits the mount's yaw error; walking reveals it.
-    """
-    body, camera, whole = paths.steps(PATH_SPAN_S)
-    turned = body * torch.polar(torch.ones_like(yaw), yaw)
-    least = settings.min_speed * PATH_SPAN_S
-    moving = whole & (body.abs() > least) & (camera.abs() > least)
-    product = (camera * turned.conj())[moving]
-    if not len(product):
-        return torch.zeros((), dtype=torch.float64)
-    return robust_angle(product.angle(), product.abs(), scale_rad=ANGLE_SCALE).double()
-
-
 def _bridged(paths: _Paths, yaw: Tensor, settings: InitializationSettings) -> Float64[Tensor, "time 3"]:
     """The suit's path, turned step by step, plus the camera's difference from it, interpolated over gaps."""
     turn = rotation.about_axis("z", (yaw[1:] + yaw[:-1]) / 2)
@@ -175,16 +276,6 @@ def _bridged(paths: _Paths, yaw: Tensor, settings: InitializationSettings) -> Fl
         ones = torch.ones(len(times), dtype=torch.float64)
         apart = _robust_smooth(times, apart, ones, settings.path_smoothing_s, DISTANCE_SCALE)
     return suit_path + _interpolated(paths.timestamps, times, apart)
-
-
-def _covered(suit: Motion, localization: Localization, seen: Tensor) -> Bool[Tensor, "time"]:
-    """Frames of the suit that have an inlier within one and a half steps of the localisation."""
-    clock = localization.timestamps if len(seen) > 1 else suit.timestamps
-    step = clock.diff().median().item()
-    times = localization.timestamps[seen]
-    after = torch.searchsorted(times, suit.timestamps.contiguous()).clamp(max=len(times) - 1)
-    gap = torch.stack([times[after], times[(after - 1).clamp(min=0)]]) - suit.timestamps
-    return gap.abs().amin(0) <= 1.5 * step
 
 
 def _interpolated(

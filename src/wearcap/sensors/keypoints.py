@@ -19,7 +19,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate, nearest_frames, resample
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import CameraStream, Cue
-from wearcap.sensors.noise import smooth_noise
+from wearcap.sensors.simulated import smooth_noise
 from wearcap.sensors.slam import R_DEVICE_CAM
 
 ACTION_CAMERA = Camera("pinhole", 1920, 1080, 895.2, 785.7, 959.5, 539.5)

@@ -65,20 +65,30 @@ def time_fault(timestamp: object) -> str | None:
     return number_fault(timestamp, MAX_TIME_S)
 
 
-def vector_fault(value: object, limit: float) -> str | None:
-    """Why a vector "3" with components up to `limit` is invalid, or None."""
-    if not _is_float(value, (3,)):
+def values_fault(values: object, shape: Sequence[int], limit: float) -> str | None:
+    """Why an array of values with magnitudes up to `limit` is invalid, or None."""
+    if not _is_float(values, tuple(shape)):
         return WRONG_TYPE
-    return _values_fault(value.tolist(), limit)
+    if values.numel() > 16:
+        # Comparisons with NaN are false, whereas min and max may ignore it.
+        valid, finite = bool((values.detach().abs() <= limit).all()), bool(values.isfinite().all())
+    else:  # of a few numbers Python is faster
+        few = values.flatten().tolist()
+        valid, finite = all(-limit <= value <= limit for value in few), all(map(math.isfinite, few))
+    return None if valid else OUT_OF_RANGE if finite else NOT_FINITE
 
 
-def rotation_fault(R: object) -> str | None:
-    """Why a rotation matrix "3 3" is invalid, or None."""
-    if not _is_float(R, (3, 3)):
-        return WRONG_TYPE
-    rows = (ax, ay, az), (bx, by, bz), (cx, cy, cz) = R.tolist()
-    if fault := _values_fault([*rows[0], *rows[1], *rows[2]], 2.0):
+def rotation_fault(R: object, shape: Sequence[int] = (3, 3)) -> str | None:
+    """Why a rotation matrix, or an array of them of this shape, is invalid, or None."""
+    if fault := values_fault(R, shape, 2.0):
         return NOT_A_ROTATION if fault is OUT_OF_RANGE else fault
+    assert isinstance(R, Tensor)
+    if R.ndim > 2:
+        R = R.detach().double()
+        skew = (R @ R.mT - torch.eye(3, dtype=R.dtype, device=R.device)).abs()
+        fine = bool((skew <= ROTATION_TOLERANCE).all() and (torch.linalg.det(R) > 0).all())
+        return None if fine else NOT_A_ROTATION
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = R.tolist()
     products = (
         ax * ax + ay * ay + az * az - 1,
         bx * bx + by * by + bz * bz - 1,
@@ -96,47 +106,7 @@ def pose_fault(pose: object) -> str | None:
     """Why a pose in the world (R "3 3", t "3" in m) is invalid, or None."""
     if not isinstance(pose, Rigid):
         return WRONG_TYPE
-    return rotation_fault(pose.R) or vector_fault(pose.t, MAX_POSITION_M)
-
-
-def embedding_fault(embedding: object, size: int) -> str | None:
-    """Why an embedding of `size` features is invalid, or None."""
-    if not _is_float(embedding, (size,)):
-        return WRONG_TYPE
-    largest = embedding.detach().abs().max().item() if size else 0.0
-    return None if largest <= MAX_FEATURE else OUT_OF_RANGE if largest < math.inf else NOT_FINITE
-
-
-def rotations_fault(R: object, shape: Sequence[int]) -> str | None:
-    """Why a batch of rotation matrices "*batch 3 3" is invalid, or None."""
-    if not _is_float(R, tuple(shape)):
-        return WRONG_TYPE
-    R = R.detach().double()
-    if not R.isfinite().all():
-        return NOT_FINITE
-    skew = (R @ R.mT - torch.eye(3, dtype=R.dtype, device=R.device)).abs()
-    fine = bool((skew <= ROTATION_TOLERANCE).all() and (torch.linalg.det(R) > 0).all())
-    return None if fine else NOT_A_ROTATION
-
-
-def values_fault(values: object, shape: Sequence[int], limit: float) -> str | None:
-    """Why an array of values with magnitudes up to `limit` is invalid, or None."""
-    if not _is_float(values, tuple(shape)):
-        return WRONG_TYPE
-    if (values.detach().abs() <= limit).all():
-        return None
-    return OUT_OF_RANGE if values.isfinite().all() else NOT_FINITE
-
-
-def usable_points(points: object) -> tuple[Float[Tensor, "point 3"] | None, str | None]:
-    """A copy of the world points (m) that are finite and within range, and why the others are invalid."""
-    if not isinstance(points, Tensor) or points.ndim != 2 or not _is_float(points, (len(points), 3)):
-        return None, WRONG_TYPE
-    points = owned(points)
-    inside = (points.abs() <= MAX_POSITION_M).all(-1)
-    if inside.all():
-        return points, None
-    return points[inside], OUT_OF_RANGE if points.isfinite().all() else NOT_FINITE
+    return rotation_fault(pose.R) or values_fault(pose.t, (3,), MAX_POSITION_M)
 
 
 def owned(value: Tensor) -> Tensor:
@@ -205,10 +175,7 @@ class Clock:
         if time < newest and not self.leads and abs(time - leader) > CONNECTED_S:
             self.waiting = []
             return Admitted([], AGREEING)
-        return self._moved()
-
-    def _moved(self) -> Admitted:
-        """Accept a confirmed jump of the clock."""
+        # A confirmed jump of the clock.
         packets, self.waiting = self.waiting, []
         again = self.taken >= AGREEING
         begins, refused = packets[0][0] < self.newest or not again, 0 if again else self.taken
@@ -261,13 +228,19 @@ class HeadInput:
         return None
 
     def points(self, points_world: object) -> Float[Tensor, "point 3"] | None:
-        """A copy of the valid points (m); None where there are none."""
+        """A copy of the world points (m) that are finite and within range; None where there are none."""
         if points_world is None:
             return None
-        points, fault = usable_points(points_world)
-        if fault:
-            self.refuse("points", fault)
-        return points
+        shaped = isinstance(points_world, Tensor) and points_world.ndim == 2
+        if not shaped or not _is_float(points_world, (len(points_world), 3)):
+            self.refuse("points", WRONG_TYPE)
+            return None
+        points = owned(points_world)
+        inside = (points.abs() <= MAX_POSITION_M).all(-1)
+        if inside.all():
+            return points
+        self.refuse("points", OUT_OF_RANGE if points.isfinite().all() else NOT_FINITE)
+        return points[inside]
 
     def timely(self, timestamp: object) -> bool:
         """Whether a packet has a valid time."""
@@ -307,10 +280,3 @@ def _is_float(value: object, shape: tuple[int, ...]) -> TypeGuard[Tensor]:
         and value.layout is torch.strided
         and not value.is_meta
     )
-
-
-def _values_fault(values: list[float], limit: float) -> str | None:
-    # Comparisons with NaN are false, whereas min and max may ignore it.
-    if all(-limit <= value <= limit for value in values):
-        return None
-    return OUT_OF_RANGE if all(map(math.isfinite, values)) else NOT_FINITE

@@ -100,9 +100,3 @@ def still_intervals(
         if stop - start >= min_s:
             found.append((start, stop))
     return found
-
-
-def common(a: Sequence[Stretch], b: Sequence[Stretch], min_s: float = 2.0) -> list[Stretch]:
-    """Overlaps of the stretches of two lists."""
-    both = [(max(x[0], y[0]), min(x[1], y[1])) for x in a for y in b]
-    return sorted(stretch for stretch in both if stretch[1] - stretch[0] >= min_s)

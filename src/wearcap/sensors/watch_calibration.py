@@ -18,7 +18,7 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording.recording import ImuStream
-from wearcap.sensors.stillness import StepCheck, Stretch, common, during, require, still_intervals, unstillness_deg
+from wearcap.sensors.stillness import StepCheck, Stretch, during, require, still_intervals, unstillness_deg
 from wearcap.sensors.watches import WRISTS, require_sides
 
 FACING_DEG = 90.0
@@ -79,29 +79,12 @@ class WatchCalibration:
         )
 
 
-def measure_watch(stream: ImuStream, board: Stretch, t_pose: Stretch) -> WatchCalibration:
-    """Calibrate one watch (log in its own reference frame, z up) without quality checks.
-
-    Raises WearcapError for a stretch that is shorter than 2 s or not in the log.
-    """
-    R_ref_imu = _orientation(stream)
-    on_board = R_ref_imu[during(stream.timestamps, board, f"board, {stream.joint}")]
-    worn = R_ref_imu[during(stream.timestamps, t_pose, f"T-pose, {stream.joint}")]
-    R_ref_world = rotation.mean_rotation(on_board.double())
-    R_world_imu = R_ref_world.mT @ rotation.mean_rotation(worn.double())
-    R_world_joint = rotation.about_axis("z", torch.tensor(math.radians(FACING_DEG), dtype=torch.float64))
-    return WatchCalibration(
-        stream.joint,
-        R_ref_world.mT.float().contiguous(),
-        (R_world_joint.mT @ R_world_imu).float(),
-        unstillness_deg(on_board),
-        _angle_deg(R_ref_world[2, 2]),
-        unstillness_deg(worn),
-    )
-
-
 def measure_watches(streams: Mapping[str, ImuStream], board: Stretch, t_pose: Stretch) -> dict[str, WatchCalibration]:
-    """`measure_watch` for both wrists. Raises WearcapError when one is missing or the stretches overlap."""
+    """Calibrate both watches (logs by joint, in their own reference frames, z up) without quality checks.
+
+    Board and T-pose are stretches (s) on the watches' clocks. Raises WearcapError when a watch is missing, when the
+    stretches overlap, and for a stretch that is shorter than 2 s or not in the log.
+    """
     if missing := [joint for joint in WRISTS if joint not in streams]:
         raise WearcapError(f"no watch on {' and '.join(missing)}", expected=" and ".join(WRISTS))
     if board[0] < t_pose[1] and t_pose[0] < board[1]:
@@ -110,7 +93,24 @@ def measure_watches(streams: Mapping[str, ImuStream], board: Stretch, t_pose: St
             where="board and T-pose",
             expected="two stretches, one after the other",
         )
-    return {joint: measure_watch(streams[joint], board, t_pose) for joint in WRISTS}
+    R_world_joint = rotation.about_axis("z", torch.tensor(math.radians(FACING_DEG), dtype=torch.float64))
+    found = {}
+    for joint in WRISTS:
+        stream = streams[joint]
+        R_ref_imu = _orientation(stream)
+        on_board = R_ref_imu[during(stream.timestamps, board, f"board, {stream.joint}")]
+        worn = R_ref_imu[during(stream.timestamps, t_pose, f"T-pose, {stream.joint}")]
+        R_ref_world = rotation.mean_rotation(on_board.double())
+        R_world_imu = R_ref_world.mT @ rotation.mean_rotation(worn.double())
+        found[joint] = WatchCalibration(
+            stream.joint,
+            R_ref_world.mT.float().contiguous(),
+            (R_world_joint.mT @ R_world_imu).float(),
+            unstillness_deg(on_board),
+            _angle_deg(R_ref_world[2, 2]),
+            unstillness_deg(worn),
+        )
+    return found
 
 
 def watch_checks(
@@ -134,17 +134,11 @@ def watch_checks(
             ("T-pose", "forearm away from the wearer's side", one.arm_facing_deg, limits.arm_facing_deg, facing),
         ):
             rows.append(StepCheck(f"{step}, {joint}", what, measured, limit, "°", fix))
-    rows.append(
-        StepCheck(
-            "T-pose, both",
-            "the forearms' lines disagree",
-            _apart_deg(found),
-            limits.arms_apart_deg,
-            "°",
-            "Stretch both arms out to one line; both watches lie on the board in the same direction.",
-        )
-    )
-    return rows
+    # The lines of the watches' x axes in the T-pose; crowns may point to the hand or to the elbow.
+    left, right = (found[joint].R_joint_imu[:, 0] for joint in WRISTS)
+    apart_deg, line = _angle_deg((left @ right).abs()), "the forearms' lines disagree"
+    fix = "Stretch both arms out to one line; both watches lie on the board in the same direction."
+    return [*rows, StepCheck("T-pose, both", line, apart_deg, limits.arms_apart_deg, "°", fix)]
 
 
 def require_watches(
@@ -169,19 +163,6 @@ def require_watches(
     require_sides(torch.stack(after, 1), "after the T-pose")
 
 
-def calibrate_watches(
-    streams: Mapping[str, ImuStream], board: Stretch, t_pose: Stretch, limits: CalibrationLimits = CalibrationLimits()
-) -> dict[str, WatchCalibration]:
-    """Both watches' calibrations from logs (by joint) and the stretches (s, on their clocks) of board and T-pose.
-
-    Raises WearcapError that says which step went wrong: too short, not still, board not level, T-pose implausible,
-    watches that disagree or are swapped.
-    """
-    found = measure_watches(streams, board, t_pose)
-    require_watches(streams, found, t_pose, limits)
-    return found
-
-
 def propose_steps(streams: Mapping[str, ImuStream]) -> tuple[Stretch | None, Stretch | None]:
     """Propose the board and T-pose stretches (s) of two uncalibrated logs; None where not found.
 
@@ -190,7 +171,8 @@ def propose_steps(streams: Mapping[str, ImuStream]) -> tuple[Stretch | None, Str
     """
     still = [still_intervals(stream.timestamps, _orientation(stream)) for stream in streams.values()]
     board, t_pose = None, None
-    for stretch in common(*still):
+    overlaps = [(max(a[0], b[0]), min(a[1], b[1])) for a in still[0] for b in still[1]]
+    for stretch in sorted(both for both in overlaps if both[1] - both[0] >= 2.0):
         parts = [_orientation(s)[during(s.timestamps, stretch, "")].double() for s in streams.values()]
         means = [rotation.mean_rotation(R) for R in parts]
         tilt = max(_angle_deg(R[2, 2]) for R in means)
@@ -218,9 +200,3 @@ def _orientation(stream: ImuStream) -> Float[Tensor, "time 3 3"]:
 
 def _angle_deg(cos: Tensor) -> float:
     return math.degrees(math.acos(min(max(cos.item(), -1.0), 1.0)))
-
-
-def _apart_deg(found: Mapping[str, WatchCalibration]) -> float:
-    """Angle between the lines of the watches' x axes in the T-pose; crowns may point to the hand or to the elbow."""
-    left, right = (found[joint].R_joint_imu[:, 0] for joint in WRISTS)
-    return _angle_deg((left @ right).abs())

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording.recording import FloorTrack, ImuStream, Recording
-from wearcap.sensors.arm_swings import SwingClock, fit_swing_clock, swing_peaks
 from wearcap.sensors.camera_alignment import HeadMount, SlamAlignment
+from wearcap.sensors.clock import SwingClock, fit_swing_clock, swing_peaks
 from wearcap.sensors.stillness import Stretch, still_intervals
 from wearcap.sensors.watch_calibration import WatchCalibration, propose_steps
 

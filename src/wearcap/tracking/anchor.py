@@ -1,4 +1,4 @@
-"""Anchor a body to a joint whose pose is measured, and move a hand to a measured position."""
+"""Anchor a body to its measured head, and move a hand to a measured position."""
 
 from dataclasses import replace
 
@@ -14,29 +14,21 @@ from wearcap.recording import Motion
 
 
 def anchor(
-    skeleton: Skeleton,
-    R_parent_joint: Float[Tensor, "*batch joint 3 3"],
-    T_world_measured: Rigid,
-    t_parent_joint: Float[Tensor, "*#batch joint 3"] | None = None,
-    joint: str = "head",
+    skeleton: Skeleton, R_parent_joint: Float[Tensor, "*batch joint 3 3"], T_world_measured: Rigid
 ) -> tuple[Float[Tensor, "*batch joint 3 3"], Rigid]:
-    """Match position and orientation of `joint` to `T_world_measured` (thesis §6.2).
+    """Match position and orientation of the head joint to `T_world_measured` (thesis §6.2).
 
-    The root keeps its orientation; the joint's local rotation is set so that its world orientation is the measured
+    The root keeps its orientation; the head's local rotation is set so that its world orientation is the measured
     one, and the whole body is translated. Returns (R_parent_joint, world poses of all joints).
     """
-    at, parent = skeleton.index(joint), skeleton.parents[skeleton.index(joint)]
-    origin = torch.zeros_like(R_parent_joint[..., 0, :, 0])
-    T_root_joint = forward_kinematics(skeleton, R_parent_joint, origin, t_parent_joint)
+    at = skeleton.index("head")
+    parent = skeleton.parents[at]
+    T_root_joint = forward_kinematics(skeleton, R_parent_joint, torch.zeros_like(R_parent_joint[..., 0, :, 0]))
     R_parent_measured = T_root_joint.R[..., parent, :, :].transpose(-1, -2) @ T_world_measured.R
     shift = T_world_measured.t - T_root_joint.t[..., at, :]
-    R_anchored = torch.cat(
-        [R_parent_joint[..., :at, :, :], R_parent_measured[..., None, :, :], R_parent_joint[..., at + 1 :, :, :]],
-        dim=-3,
-    )
-    R_world = torch.cat(
-        [T_root_joint.R[..., :at, :, :], T_world_measured.R[..., None, :, :], T_root_joint.R[..., at + 1 :, :, :]],
-        dim=-3,
+    R_anchored, R_world = (
+        torch.cat([R[..., :at, :, :], R_head[..., None, :, :], R[..., at + 1 :, :, :]], dim=-3)
+        for R, R_head in ((R_parent_joint, R_parent_measured), (T_root_joint.R, T_world_measured.R))
     )
     return R_anchored, Rigid(R_world, T_root_joint.t + shift[..., None, :])
 

@@ -1,6 +1,11 @@
-"""The head's path at a constant frame rate, the input of every head-driven system."""
+"""The head's path at a constant frame rate, the input of every head-driven system: of a whole recording (`head_path`), or
+streamed (`HeadTrack`), with equal frame times, stretches between gaps and jumps, and interpolated poses.
+"""
 
+import math
+from bisect import bisect_right
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Float64, Int64
@@ -17,14 +22,14 @@ from wearcap.tracking.floor import floor_from_path
 
 MAX_GAP_S = 0.5
 """Longest interval (s) between head poses that is interpolated; a longer one is a gap, after which capture restarts."""
-
-
 MAX_FILL = 600
 """Largest ratio of frames at the model's rate to head poses; above it the timestamps are not in seconds."""
-
-
 MAX_SPEED_M_S = 12.0
 """Highest plausible speed of a head (faster than sprinters); a faster step is a jump of the tracking."""
+
+
+_SAME_S = 1e-4
+"""Largest difference (s) of timestamps that count as equal."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,7 @@ def head_path(recording: Recording, fallback: Skeleton, fps: float) -> HeadPath:
     _require_plausible(head.R_world_device[finite], times, fps, recording.name)
     skeleton = recording.skeleton or (recording.motion.skeleton if recording.motion else fallback)
     trajectory = Trajectory(times, head.R_world_device[finite], head.t_world_device[finite])
-    broken = breaks(trajectory)
+    broken = _breaks(trajectory)
     count = int((times[-1] - times[0]).item() * fps + 1e-3) + 1
     timestamps = times[0] + torch.arange(count, dtype=torch.float64) / fps
     if count != len(times) or (timestamps - times).abs().max() > 1e-4:
@@ -124,7 +129,7 @@ def _require_plausible(
         )
 
 
-def breaks(trajectory: Trajectory) -> list[tuple[float, float]]:
+def _breaks(trajectory: Trajectory) -> list[tuple[float, float]]:
     """Gaps and jumps of a trajectory, each as the times of the last pose before and the first pose after it."""
     step = trajectory.timestamps.diff()
     speed = trajectory.t_world_body.diff(dim=0).norm(dim=-1) / step
@@ -133,3 +138,109 @@ def breaks(trajectory: Trajectory) -> list[tuple[float, float]]:
     return [
         (trajectory.timestamps[i].item(), trajectory.timestamps[i + 1].item()) for i in broken.nonzero()[:, 0].tolist()
     ]
+
+
+class Chunk(NamedTuple):
+    """The next frames of one stretch."""
+
+    timestamps: Float64[Tensor, "time"]
+    T_world_device: Rigid
+    corrected: Rigid
+    """Poses of the last frames of the previous chunk, which had only repeated the newest pose."""
+    first: int
+    """Number of the chunk's first frame, counted from the first pose at the model's rate."""
+    begins: bool
+    """Whether a stretch begins with this chunk."""
+
+
+class HeadTrack:
+    """Turns poses into chunks of `stride` frames, or fewer at the end of a stretch."""
+
+    def __init__(self, fps: float, stride: int):
+        self.fps, self.stride = fps, stride
+        self.dropped = 0
+        """Number of poses that were late or duplicated."""
+        self._start: float | None = None
+        """Time of frame 0, which is that of the first pose (s)."""
+        self._next = 0
+        """Number of the next frame to go out."""
+        self.inside = False
+        """Whether the next frame continues a stretch, according to the poses so far."""
+        self._provisional = 0
+        """Number of the last frames whose pose only repeats the newest one."""
+        self.newest = -math.inf
+        self._poses: list[tuple[float, Tensor, Tensor]] = []
+
+    def take(self, timestamp: float, T_world_device: Rigid | None) -> None:
+        """Add a timestamp with the device's pose, if there is one; older than the newest until their chunk is out.
+
+        Both must be finite, which `sensors.packets` ensures.
+        """
+        self.newest = max(self.newest, timestamp)
+        if T_world_device is None:
+            return
+        place = bisect_right(self._poses, timestamp, key=lambda pose: pose[0])
+        late = self._next > 0 and timestamp <= self._time(self._next - 1) + _SAME_S
+        twice = place > 0 and self._poses[place - 1][0] == timestamp
+        if late or twice:
+            self.dropped += 1
+        else:
+            self._poses.insert(place, (timestamp, T_world_device.R, T_world_device.t))
+
+    def next(self, ended: bool = False) -> Chunk | None:
+        """The next chunk once all its frames' times have passed; with `ended`, no more poses will arrive."""
+        while self._poses:
+            start = self._poses[0][0] if self._start is None else self._start
+            first = self._next
+            if not self.inside:
+                first = max(first, math.ceil((self._poses[0][0] - 1e-6 - start) * self.fps))
+            if not ended and start + (first + self.stride - 1) / self.fps > self.newest + _SAME_S:
+                return None
+            measured = self._measured()
+            # Number of the frame after the stretch's last one, if the stretch has certainly ended
+            last, stop = measured.timestamps[-1].item(), None
+            if len(measured) < len(self._poses) or self.newest - last > MAX_GAP_S:
+                stop = math.ceil((last + 1e-6 - start) * self.fps)
+            elif ended:
+                stop = int((last - start) * self.fps + 1e-3) + 1
+            count = self.stride if stop is None else min(stop - first, self.stride)
+            chunk = None
+            if count > 0:
+                chunk = self._chunk(measured, start, first, count)
+                self._start, self._next, self.inside = start, first + count, True
+            if stop is not None and first + count >= stop:
+                self.inside, self._provisional = False, 0
+                self._poses = self._poses[len(measured) :]
+            else:
+                self._forget(measured)
+            if chunk is not None:
+                return chunk
+        return None
+
+    def _time(self, frame: int) -> float:
+        assert self._start is not None
+        return self._start + frame / self.fps
+
+    def _measured(self) -> Trajectory:
+        """Measured poses up to the first gap or jump."""
+        times, R, t = zip(*self._poses)
+        every = Trajectory(torch.tensor(times, dtype=torch.float64), torch.stack(R), torch.stack(t))
+        cut = _breaks(every)
+        return every[: int(torch.searchsorted(every.timestamps, cut[0][0], right=True))] if cut else every
+
+    def _chunk(self, measured: Trajectory, start: float, first: int, count: int) -> Chunk:
+        frames = torch.arange(first - self._provisional, first + count, dtype=torch.float64)
+        times = start + frames / self.fps
+        at = times.clamp(measured.timestamps[0].item(), measured.timestamps[-1].item())
+        place = torch.searchsorted(measured.timestamps, at - _SAME_S).clamp_max(len(measured) - 1)
+        exact = (measured.timestamps[place] - at).abs() <= _SAME_S
+        at = torch.where(exact, measured.timestamps[place], at)
+        poses = (measured[place] if exact.all() else resample(measured, at)).T_world_body
+        old, self._provisional = self._provisional, int((times > measured.timestamps[-1] + _SAME_S).sum())
+        return Chunk(times[old:], poses[old:], poses[:old], first, not self.inside)
+
+    def _forget(self, measured: Trajectory) -> None:
+        """Drop the poses that later frames are not interpolated from."""
+        decided = self._time(self._next - 1 - self._provisional)
+        keep = int(torch.searchsorted(measured.timestamps, decided + _SAME_S, right=True)) - 1
+        self._poses = self._poses[max(keep, 0) :]

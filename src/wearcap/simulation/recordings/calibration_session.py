@@ -25,7 +25,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, finite_difference
 from wearcap.recording.recording import ImuStream
 from wearcap.sensors.imu import GRAVITY, angular_rate
-from wearcap.sensors.noise import smooth_noise
+from wearcap.sensors.simulated import smooth_noise
 from wearcap.sensors.slam import R_DEVICE_CAM
 from wearcap.sensors.stillness import Stretch
 

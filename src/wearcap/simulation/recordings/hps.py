@@ -14,7 +14,7 @@ from wearcap.errors import WearcapError
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import ImuStream, Intervals, Recording
 from wearcap.sensors.imu import ImuNoise, synthesize_imu
-from wearcap.sensors.suit import SuitNoise, suit_motion
+from wearcap.sensors.simulated import SuitNoise, suit_motion
 from wearcap.simulation.people.actions import ACTIVITIES, FREE_M, follow, on_stairs, path_length
 from wearcap.simulation.people.person import Person
 from wearcap.simulation.people.plan import LEFT_SIGN, SIDES, Plan

@@ -11,8 +11,7 @@ import numpy as np
 
 from wearcap.errors import WearcapError
 from wearcap.recording.recording import Recording
-from wearcap.sensors.head import SlamNoise, head_stream
-from wearcap.sensors.suit import SuitNoise, suit_motion
+from wearcap.sensors.simulated import SlamNoise, SuitNoise, head_stream, suit_motion
 from wearcap.simulation.handling.house import House
 from wearcap.simulation.handling.household import USUAL, VARIED, Habits, Household
 from wearcap.simulation.handling.rearranging import APART_M, apart, outlines

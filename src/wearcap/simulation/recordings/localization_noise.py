@@ -15,7 +15,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording.recording import Localization
-from wearcap.sensors.noise import smooth_noise
+from wearcap.sensors.simulated import smooth_noise
 
 VIEW_M, VIEW_DEG, VIEW_S = 0.8, 35.0, 12.0
 """Translation, rotation and time that change a view, and with it the lasting part of the error."""

@@ -23,7 +23,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.video import write_frames
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import CameraStream
-from wearcap.sensors.noise import smooth_noise
+from wearcap.sensors.simulated import smooth_noise
 from wearcap.sensors.slam import R_DEVICE_CAM
 from wearcap.simulation.places.builder import hue
 from wearcap.simulation.places.world import World

@@ -20,7 +20,7 @@ from wearcap.geometry.trajectory import Trajectory, resample
 from wearcap.io.formats.video import video_encoder
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import CameraStream
-from wearcap.sensors.noise import smooth_noise
+from wearcap.sensors.simulated import smooth_noise
 from wearcap.sensors.slam import R_DEVICE_CAM
 from wearcap.simulation.places.world import World
 from wearcap.simulation.rendering.views import NEAR_M, Development, Scenery, render_view

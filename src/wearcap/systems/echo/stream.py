@@ -55,10 +55,9 @@ from wearcap.systems.echo.observations import MAX_GAP_S, BatchItem, wrist_poses
 from wearcap.systems.echo.pipeline import Echo, motion_of, pulled_by, stretch_seed
 from wearcap.systems.echo.queue import Conditioning, EchoQueue, Outputs
 from wearcap.systems.echo.static_objects import StaticObjects
-from wearcap.tracking import floor, head_track
+from wearcap.tracking import floor, head_path
 from wearcap.tracking.floor import FloorTracker
-from wearcap.tracking.head_path import HeadPath
-from wearcap.tracking.head_track import Chunk, HeadTrack
+from wearcap.tracking.head_path import Chunk, HeadPath, HeadTrack
 
 WRISTS = POINTS[1:]
 MAX_SEEN = 1000
@@ -456,7 +455,7 @@ class EchoSession(Session):
         motion_types,
         trajectory,
         rigid,
-        head_track,
+        head_path,
         packets,
         samples,
         floor,

@@ -28,8 +28,8 @@ from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.places import Memory
 from wearcap.systems.hmd2.wearer import Wearer, WearerState
 from wearcap.systems.hmd2.windows import advance
-from wearcap.tracking import floor, head_track
-from wearcap.tracking.head_track import Chunk
+from wearcap.tracking import floor, head_path
+from wearcap.tracking.head_path import Chunk
 
 
 class HMD2Session(Session):
@@ -45,7 +45,7 @@ class HMD2Session(Session):
 
     stream_class = WearerState
     classes = classes_of(
-        skeleton, motion_types, rigid, head_track, packets, samples, floor, voxels, places, windows, wearer
+        skeleton, motion_types, rigid, head_path, packets, samples, floor, voxels, places, windows, wearer
     )
 
     def __init__(self, pipeline: HMD2, wearers: Sequence[Wearer], seeds: Sequence[int], memory: Memory | None = None):

@@ -15,19 +15,20 @@ from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.recording import Motion
 from wearcap.scene.voxels import VoxelGrid
 from wearcap.sensors.packets import (
+    MAX_FEATURE,
     MAX_POSITION_M,
     WRONG_TYPE,
     Admitted,
     HeadInput,
-    embedding_fault,
     number_fault,
     owned,
+    values_fault,
 )
 from wearcap.sensors.samples import HeadSample
 from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.places import Memory, Places
 from wearcap.systems.hmd2.windows import Frames, Poses, WindowSampler
-from wearcap.tracking.head_track import Chunk, HeadTrack
+from wearcap.tracking.head_path import Chunk, HeadTrack
 
 MAX_WAITING = 1000
 """Most image embeddings, and most floor heights, that are buffered for coming head poses; the oldest are dropped."""
@@ -103,7 +104,7 @@ class WearerState:
         size = self.pipeline.net.image_size
         if embedding is None or not self.shows_pictures:
             return None
-        fault = embedding_fault(embedding, size)
+        fault = values_fault(embedding, (size,), MAX_FEATURE)
         if fault is None:
             assert isinstance(embedding, Tensor)
             return owned(embedding)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from wearcap.recording import Motion
 from wearcap.recording.recording import Localization
-from wearcap.sensors.packets import MAX_POSITION_M, MAX_TIME_S, OFF_THE_CLOCK, WRONG_TYPE, rotations_fault, values_fault
+from wearcap.sensors.packets import MAX_POSITION_M, MAX_TIME_S, OFF_THE_CLOCK, WRONG_TYPE, rotation_fault, values_fault
 
 MAX_PAUSE_S = 10.0
 """Longest gap (s) within a stretch. A piece after a longer one is kept aside until the next piece continues it; then a
@@ -22,7 +22,7 @@ def suit_fault(suit: object, like: Motion | None) -> str | None:
     contact, before = suit.contact_prob, None if like is None else like.contact_prob
     fault = (
         _times_fault(times, MAX_PAUSE_S)
-        or rotations_fault(suit.R_parent_joint, (count, joints, 3, 3))
+        or rotation_fault(suit.R_parent_joint, (count, joints, 3, 3))
         or values_fault(suit.t_world_root, (count, 3), MAX_POSITION_M)
         or (None if contact is None else _contact_fault(contact, count))
     )
@@ -55,7 +55,7 @@ def localization_fault(seen: object, suit: Motion) -> str | None:
     R, t = seen.R_world_cam[found], seen.t_world_cam[found]
     if seen.timestamps[-1] > suit.timestamps[-1] + MAX_PAUSE_S:
         return OFF_THE_CLOCK
-    return rotations_fault(R, (len(R), 3, 3)) or values_fault(t, (len(R), 3), MAX_POSITION_M)
+    return rotation_fault(R, (len(R), 3, 3)) or values_fault(t, (len(R), 3), MAX_POSITION_M)
 
 
 def _times_fault(times: Tensor, max_pause_s: float) -> str | None:

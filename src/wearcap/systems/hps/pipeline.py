@@ -31,9 +31,16 @@ from wearcap.recording.timing import resampled
 from wearcap.runtime.stages import Stage
 from wearcap.runtime.system import CaptureInput, StagedSystem
 from wearcap.scene.scan import Scan
-from wearcap.sensors.alignment import align_suit, estimate_head_camera, inliers, yaw_between
 from wearcap.sensors.clock import Clock
-from wearcap.sensors.initialization import Initialization, InitializationSettings, initialize
+from wearcap.sensors.initialization import (
+    Initialization,
+    InitializationSettings,
+    align_suit,
+    estimate_head_camera,
+    initialize,
+    inliers,
+    yaw_between,
+)
 from wearcap.systems.hps.camera import (
     Localize,
     MapLocalization,

@@ -10,7 +10,7 @@ from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import resampled
 from wearcap.runtime.stages import Stage
 from wearcap.runtime.system import CaptureInput, StagedSystem
-from wearcap.sensors.alignment import align_suit, body_camera, inliers
+from wearcap.sensors.initialization import align_suit, body_camera, inliers
 from wearcap.systems.hps.camera import (
     Localize,
     MapLocalization,

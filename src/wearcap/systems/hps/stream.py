@@ -29,8 +29,7 @@ from wearcap.runtime.digest import digest
 from wearcap.runtime.session import Session
 from wearcap.runtime.snapshot import classes_of
 from wearcap.scene.scan import Scan
-from wearcap.sensors.alignment import align_suit, estimate_head_camera, inliers
-from wearcap.sensors.initialization import Initialization, initialize
+from wearcap.sensors.initialization import Initialization, align_suit, estimate_head_camera, initialize, inliers
 from wearcap.sensors.packets import OFF_THE_CLOCK, WRONG_TYPE
 from wearcap.sensors.samples import SuitPiece
 from wearcap.systems.hps.pieces import cut, follows, localization_fault, more, suit_fault

@@ -10,7 +10,7 @@ from wearcap.geometry.trajectory import interpolate
 from wearcap.optimize.trajectory import BentPath
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import resampled
-from wearcap.sensors.alignment import align_suit, body_camera, inliers
+from wearcap.sensors.initialization import align_suit, body_camera, inliers
 from wearcap.systems.hps.camera import Localize, MapLocalization, Synchronization
 from wearcap.systems.hps.pipeline import required
 from wearcap.systems.hps.published import PlacedSuit

@@ -40,7 +40,7 @@ from wearcap.sensors.packets import (
     owned,
     rotation_fault,
     time_fault,
-    vector_fault,
+    values_fault,
 )
 from wearcap.sensors.samples import HeadSample, WatchSample
 from wearcap.sensors.watches import FILTER, MAX_GAP_S, WRISTS, filtered
@@ -48,9 +48,9 @@ from wearcap.systems.mocap_every import features, windows
 from wearcap.systems.mocap_every.features import Sensed
 from wearcap.systems.mocap_every.pipeline import MocapEvery
 from wearcap.systems.mocap_every.windows import EstimatorWindows, FinalPoses
-from wearcap.tracking import head_track
+from wearcap.tracking import head_path
 from wearcap.tracking.anchor import anchored_to_head
-from wearcap.tracking.head_track import Chunk, HeadTrack
+from wearcap.tracking.head_path import Chunk, HeadTrack
 
 MAX_POINTS = 1_000_000
 """Capacity of the buffer of points that wait for a head pose; the oldest are dropped."""
@@ -301,7 +301,7 @@ class MocapEverySession(Session):
         skeleton,
         motion_types,
         rigid,
-        head_track,
+        head_path,
         packets,
         sample_types,
         floor_update,
@@ -334,7 +334,7 @@ def _fault(sample: object) -> str | None:
     return (
         time_fault(sample.timestamp)
         or rotation_fault(sample.R_world_imu)
-        or vector_fault(sample.acc_world, MAX_ACC_M_S2)
+        or values_fault(sample.acc_world, (3,), MAX_ACC_M_S2)
     )
 
 

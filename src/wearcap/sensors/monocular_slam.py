@@ -1,28 +1,35 @@
-"""Scale and vertical of a monocular SLAM without a board: from an inertial sensor on the head, or from the floor.
+"""A monocular SLAM's path without a board: outliers removed (MocapEvery §3.2), scale and vertical by other means.
 
-Inertial: with s metres per unit, s a_slam - g_slam = R_slam_imu f for the specific force f (m/s²), so that gravity and scale
-are linear unknowns. Nearly all error lies in a_slam, a second difference of jittery positions; solved for s, that
-error would stand beside the unknown and pull s down by as much as its share of a_slam's variance. So the equation is
-solved as a_slam = (1/s) R f + g/s, the error on the left.
+Scale and vertical come from an inertial sensor on the head (`by_head_imu`) or from the floor (`by_floor`), the scale
+alone from walked distances (`scale_by_walks`). Inertial: with s metres per unit, s a_slam - g_slam = R_slam_imu f for
+the specific force f (m/s²), so that gravity and scale are linear unknowns. Nearly all error lies in a_slam, a second
+difference of jittery positions; solved for s, that error would stand beside the unknown and pull s down by as much as
+its share of a_slam's variance. So the equation is solved as a_slam = (1/s) R f + g/s, the error on the left.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.ndimage
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from scipy.spatial import KDTree
 from torch import Tensor
 
 from wearcap.body.limb_ik import swing_between
 from wearcap.errors import WearcapError
-from wearcap.geometry.trajectory import Trajectory, find_gaps, interpolate, resample
+from wearcap.geometry.trajectory import Trajectory, filled, find_gaps, interpolate, require_rising, resample
 from wearcap.recording.recording import ImuStream
 from wearcap.sensors.imu import GRAVITY, acceleration
 from wearcap.sensors.stillness import Stretch, during
 
+MAX_ACCELERATION = 40.0
+"""m/s² at the usual 30 Hz: a jump of 4.5 cm between two frames. A running head stays below 30 (ours: the paper gives
+no number)."""
+MAX_BURST_S = 1.0
+"""Longest burst of outliers; longer deviating segments are jumps of the SLAM system to another place."""
 _HALF_S = 0.25
 """Half span of the second differences: longer ones reduce jitter, shorter ones keep more of the gait."""
 _BLOCK_S = 1.0
@@ -32,6 +39,76 @@ _BIAS = 0.05
 _GRAVITY_SHARE = 0.05
 """Largest relative difference of the estimated gravity's magnitude from 9.81 m/s²."""
 _ROUNDS = 20
+
+
+def clean_track(
+    trajectory: Trajectory, max_acceleration: float = MAX_ACCELERATION, max_burst_s: float = MAX_BURST_S
+) -> tuple[Trajectory, Bool[Tensor, "time"], Float64[Tensor, "jump"]]:
+    """Drop outliers of position (m) by their acceleration, and fill them by linear interpolation and slerp: trajectory
+    on the same timestamps, the frames that were kept, and the times before jumps that are not short bursts.
+
+    A jump between two frames accelerates both of them, there and back; a hard step or a turn only one. Where both
+    exceed `max_acceleration` (m/s²) the track is cut, a piece not longer than those beside it nor than `max_burst_s` is
+    dropped, its neighbours are joined, and so on. A burst of any shape is thus dropped as a whole, and longer good
+    pieces beside it stay. Frames that are not finite are never valid. Raises WearcapError for timestamps that do not
+    rise, and when no pose is finite.
+    """
+    require_rising(trajectory.timestamps)
+    position, time = trajectory.t_world_body.double(), trajectory.timestamps
+    valid = position.isfinite().all(-1) & trajectory.R_world_body.isfinite().all(-1).all(-1)
+    if not valid.any():
+        raise WearcapError("no pose of the trajectory is finite", expected="camera positions in metres")
+    kept = valid.nonzero()[:, 0]
+    while (cut := _jump_acceleration(position[kept], time[kept]) > max_acceleration).any():
+        piece = torch.cat([cut.new_zeros(1), cut]).cumsum(0)
+        length = torch.bincount(piece)
+        end = length.cumsum(0)
+        span = time[kept][end - 1] - time[kept][end - length]
+        wall = length.new_full((1,), len(kept) + 1)
+        left, right = torch.cat([wall, length[:-1]]), torch.cat([length[1:], wall])
+        short = (length <= left) & (length <= right) & (span <= max_burst_s)
+        dropped = short.index_fill(0, length.argmax(), False)[piece]
+        if not dropped.any():
+            break
+        kept = kept[~dropped]
+    valid = torch.zeros_like(valid).index_fill(0, kept, True)
+    return filled(trajectory, valid), valid, time[kept][:-1][cut]
+
+
+def _jump_acceleration(position: Float64[Tensor, "time 3"], time: Float64[Tensor, "time"]) -> Float64[Tensor, "step"]:
+    """For each step from frame to frame, the smaller of the accelerations (m/s²) at its two ends.
+
+    Second differences on uneven times; the first and the last frame have none of their own.
+    """
+    if len(time) < 3:
+        return time.new_zeros(max(len(time) - 1, 0))
+    step = time.diff()
+    velocity = position.diff(dim=0) / step[:, None]
+    inner = 2 * velocity.diff(dim=0).norm(dim=-1) / (step[1:] + step[:-1])
+    beyond = inner.new_full((1,), torch.inf)
+    return torch.minimum(torch.cat([beyond, inner]), torch.cat([inner, beyond]))
+
+
+def scale_by_walks(slam: Trajectory, walks: Sequence[tuple[float, float, float]]) -> tuple[float, float]:
+    """Metres per SLAM unit from walked distances, and the relative spread of their individual scales.
+
+    A walk is (start s, stop s, metres between the two places). Raises WearcapError for walks that lead nowhere.
+    """
+    if not walks:
+        raise WearcapError("no walked distance", expected="(start s, stop s, metres), once or more")
+    at = torch.tensor([walk[:2] for walk in walks], dtype=torch.float64).reshape(-1)
+    ends = interpolate(slam.timestamps, slam.t_world_body.double(), at).reshape(-1, 2, 3)
+    lengths = (ends[:, 1] - ends[:, 0]).norm(dim=-1).numpy()
+    metres = np.array([walk[2] for walk in walks])
+    if lengths.min() < 1e-9 or metres.min() <= 0:
+        raise WearcapError(
+            f"walks of {metres.tolist()} m, and {lengths.round(4).tolist()} in the SLAM",
+            where="walked distances",
+            expected="two different places and a distance above 0",
+            fix="Check the times of the walks.",
+        )
+    scales = metres / lengths
+    return float(metres @ lengths / (lengths @ lengths)), float(np.ptp(scales) / scales.mean())
 
 
 @dataclass(frozen=True)
@@ -181,8 +258,16 @@ def by_floor(
     random = np.random.default_rng(seed)
     eyes = slam.t_world_body[during(slam.timestamps, standing, "standing", 1.0)].double().mean(0).numpy()
     rough = -slam.R_world_body[:, :, 1].double().mean(0).numpy()
-    points = _below(points_slam.double().numpy(), slam.t_world_body.double().numpy(), rough / np.linalg.norm(rough))
-    floor = _floor_points(points, eyes, rough / np.linalg.norm(rough), random)
+    rough /= np.linalg.norm(rough)
+    points, path, across = (
+        points_slam.double().numpy(),
+        slam.t_world_body.double().numpy(),
+        np.eye(3) - np.outer(rough, rough),
+    )
+    distance, nearest = KDTree(path @ across).query(points @ across)
+    drop = (path[nearest] - points) @ rough
+    below = (drop > 0) & (distance < 1.2 * drop)  # within 50° of vertically below the path
+    floor = _floor_points(points[below], eyes, rough, random)
     up, height = _plane(floor, eyes)
     patch = np.unique(np.floor(floor / (height / 4)).astype(np.int64), axis=0, return_inverse=True)[1].ravel()
     members = np.split(np.argsort(patch, kind="stable"), np.cumsum(np.bincount(patch))[:-1])
@@ -194,15 +279,6 @@ def by_floor(
         scales.append((height_m + height_std_m * random.standard_normal()) / height_k)
     deviation = math.degrees(math.sqrt(np.mean(np.square(turns))))
     return GravityScale(_upright(up), height_m / height, float(np.std(scales)), deviation)
-
-
-def _below(points: np.ndarray, path: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Points within 50° of vertically below the path."""
-    across = np.eye(3) - np.outer(up, up)
-    distance, nearest = KDTree(path @ across).query(points @ across)
-    drop = (path[nearest] - points) @ up
-    below = (drop > 0) & (distance < 1.2 * drop)
-    return points[below]
 
 
 def _floor_points(points: np.ndarray, eyes: np.ndarray, rough: np.ndarray, random: np.random.Generator) -> np.ndarray:
