@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from wearcap.geometry.camera import Camera
+from wearcap.geometry.render import SplatCloud, camera_from_world
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.splats import SplatCloud, camera_from_world
 
 CAMERA = Camera("opencv", 960, 540, 520.0, 520.0, 479.5, 269.5, (-0.05, 0.01, 0.0005, -0.0003))
 FORWARD = Rigid(torch.tensor([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), torch.zeros(3))

@@ -13,7 +13,7 @@ from wearcap.geometry import rotation
 from wearcap.io.devices.watch_calibration_json import read_watch_calibration
 from wearcap.io.formats.tum import write_tum
 from wearcap.recording import ImuStream, RecordingStore
-from wearcap.recording.locate import load_recording
+from wearcap.recording.store import load_recording
 from wearcap.sensors.watches import WRISTS, watches_at
 from wearcap.simulation.recordings.calibration_session import (
     MARKS,

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from wearcap.body.anny_assets import AnnyAssets
 from wearcap.body.kinematics import forward_kinematics, local_rotations
-from wearcap.body.limb_ik import swing_between
+from wearcap.body.landmarks import TPose, t_pose
 from wearcap.body.skeleton import Skeleton
-from wearcap.body.t_pose import TPose, t_pose
 from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.rotation import swing_between
 
 _JOINTS = {"leg": ("upper-leg", "knee", "ankle"), "arm": ("shoulder", "elbow", "hand")}
 _SIDES = (("left", "l", 1.0), ("right", "r", -1.0))
@@ -136,8 +136,25 @@ def fit_to(fit: Fit, assets: AnnyAssets, vertices: Float[np.ndarray, "vertex 3"]
     neck_z, head_z = fit.person["neck"][2], fit.person["head"][2]
     blend = np.clip((surface[:, 2:] - neck_z) / (head_z - neck_z), 0, 1)
     parts = {"trunk": trunk, "neck": (1 - blend) * trunk + blend * head, "head": head}
+    marks, t = fit.target_t_pose.marks, fit.T_rest_to_standing[1].numpy()
     for side, _, _ in _SIDES:
-        parts |= _limbs(fit, assets, surface, side)
+        hip_p, knee_p, ankle_p = fit.limb(side, "leg")
+        hip, knee, ankle = (t[joint] for joint in marks.limb[f"{side}_leg"])
+        foot = _foot(fit, assets, surface, side, ankle)
+        shoulder_p, elbow_p, wrist_p = fit.limb(side, "arm")
+        shoulder, elbow, wrist = (t[joint] for joint in marks.limb[f"{side}_arm"])
+        tip = fit.skeleton.sites.get(f"{side}_fingertip")
+        reach_p = np.linalg.norm(fit.person[f"{side[0]}-finger-3-4"] - wrist_p)
+        reach = np.linalg.norm(tip.t_joint_site) if tip else fit.girth * reach_p
+        hand = np.clip(reach / reach_p, 0.85 * fit.girth, 1.15 * fit.girth)
+        parts |= {
+            f"{side}_upperleg": _stretched(surface, (hip_p, knee_p), (hip, knee), fit.girth),
+            f"{side}_lowerleg": _stretched(surface, (knee_p, ankle_p), (knee, foot(ankle_p[None])[0]), fit.girth),
+            f"{side}_foot": foot(surface),
+            f"{side}_upperarm": _stretched(surface, (shoulder_p, elbow_p), (shoulder, elbow), fit.girth),
+            f"{side}_lowerarm": _stretched(surface, (elbow_p, wrist_p), (elbow, wrist), fit.girth),
+            f"{side}_hand": wrist + hand * (surface - wrist_p),
+        }
     group = [_group(bone) for bone in assets.bones]
     total = np.zeros_like(surface)
     for name, moved in parts.items():
@@ -186,28 +203,6 @@ def _head(fit: Fit, points: Float[np.ndarray, "vertex 3"], crown_p: float) -> Fl
     height = site.t_joint_site[2] if site else fit.girth * (crown_p - head_p[2])
     scale = np.clip(height / (crown_p - head_p[2]), 0.9 * fit.girth, 1.15 * fit.girth)
     return head + scale * (points - head_p)
-
-
-def _limbs(fit: Fit, assets: AnnyAssets, points: np.ndarray, side: str) -> dict[str, np.ndarray]:
-    """Thigh, shin, foot, upper arm, forearm and hand of one side."""
-    marks, t = fit.target_t_pose.marks, fit.T_rest_to_standing[1].numpy()
-    hip_p, knee_p, ankle_p = fit.limb(side, "leg")
-    hip, knee, ankle = (t[joint] for joint in marks.limb[f"{side}_leg"])
-    foot = _foot(fit, assets, points, side, ankle)
-    shoulder_p, elbow_p, wrist_p = fit.limb(side, "arm")
-    shoulder, elbow, wrist = (t[joint] for joint in marks.limb[f"{side}_arm"])
-    tip = fit.skeleton.sites.get(f"{side}_fingertip")
-    reach_p = np.linalg.norm(fit.person[f"{side[0]}-finger-3-4"] - wrist_p)
-    reach = np.linalg.norm(tip.t_joint_site) if tip else fit.girth * reach_p
-    hand = np.clip(reach / reach_p, 0.85 * fit.girth, 1.15 * fit.girth)
-    return {
-        f"{side}_upperleg": _stretched(points, (hip_p, knee_p), (hip, knee), fit.girth),
-        f"{side}_lowerleg": _stretched(points, (knee_p, ankle_p), (knee, foot(ankle_p[None])[0]), fit.girth),
-        f"{side}_foot": foot(points),
-        f"{side}_upperarm": _stretched(points, (shoulder_p, elbow_p), (shoulder, elbow), fit.girth),
-        f"{side}_lowerarm": _stretched(points, (elbow_p, wrist_p), (elbow, wrist), fit.girth),
-        f"{side}_hand": wrist + hand * (points - wrist_p),
-    }
 
 
 def _stretched(points, bone_p, bone, girth: float) -> Float[np.ndarray, "vertex 3"]:

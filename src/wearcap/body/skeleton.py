@@ -193,3 +193,18 @@ def xsens23() -> Skeleton:
         ("left_palm", "left_wrist", (0.0, 0.080, -0.015)),
     ]
     return build_skeleton("xsens23", [*spine, *mirrored(arm), *arm, *mirrored(leg), *leg], sites)
+
+
+def stature(skeleton: Skeleton) -> float:
+    """Height (m) of a person with this skeleton, from soles to crown."""
+    points = skeleton.rest_sites.values()
+    top = max([skeleton.rest_joints[:, 2].max().item(), *(point[2].item() for point in points)])
+    return top + skeleton.root_height
+
+
+def skeleton_of_height(height_m: float, skeleton: Skeleton | None = None) -> Skeleton:
+    """A skeleton (xsens23 by default) scaled to a person's height. Raises WearcapError outside 0.5…2.6 m."""
+    if not 0.5 <= height_m <= 2.6:
+        raise WearcapError(f"a height of {height_m} m", expected="0.5 to 2.6 m")
+    skeleton = skeleton or xsens23()
+    return skeleton.scaled(height_m / stature(skeleton))

@@ -6,8 +6,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from wearcap.body.model import BodyModel, four_weights
-from wearcap.body.regions import contact_regions
+from wearcap.body.model import BodyModel, contact_regions, four_weights
 from wearcap.body.skeleton import Site, Skeleton
 from wearcap.body.skeletons import skeleton_by_name
 from wearcap.errors import WearcapError

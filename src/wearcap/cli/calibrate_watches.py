@@ -23,8 +23,7 @@ from wearcap.io.devices.watch_calibration_json import WornCalibration, write_wat
 from wearcap.io.devices.watch_log import read_watch_log
 from wearcap.io.formats.tum import read_tum
 from wearcap.recording import FloorTrack, ImuStream, Recording, RecordingStore
-from wearcap.recording.locate import load_recording
-from wearcap.recording.store import save_recording
+from wearcap.recording.store import load_recording, save_recording
 from wearcap.sensors.arm_swings import SwingClock, fit_swing_clock, swing_checks, swing_peaks
 from wearcap.sensors.camera_alignment import (
     HeadMount,

@@ -9,7 +9,7 @@ from rich import print as show
 from wearcap.body.anny_body import anny_body
 from wearcap.cli.motions import read_motions
 from wearcap.errors import WearcapError
-from wearcap.recording.locate import dataset_folder, load_recording
+from wearcap.recording.store import dataset_folder, load_recording
 from wearcap.recording.motion import Motion
 from wearcap.runtime.system import CaptureInput
 from wearcap.viewer.head_path import draw_head_path

@@ -27,7 +27,7 @@ def main(arguments: list[str]) -> None:
         raise WearcapError(f"port {options.port}", expected="1 to 65535")
 
     from wearcap.cli.motions import read_motions
-    from wearcap.recording.locate import dataset_folder, load_recording
+    from wearcap.recording.store import dataset_folder, load_recording
     from wearcap.runtime.system import CaptureInput
     from wearcap.viewer.page import Page
 

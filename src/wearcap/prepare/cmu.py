@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body.head_level import head_level, with_head_face
+from wearcap.body.landmarks import head_level, with_head_face
 from wearcap.errors import WearcapError
 from wearcap.io.formats.asf_amc import read_amc, read_asf
 from wearcap.io.formats.bvh import read_bvh, read_cmu_bvh

@@ -64,7 +64,9 @@ class RecordingFile:
         try:
             self._file = safetensors.safe_open(str(self.path), framework="pt")
         except FileNotFoundError as error:
-            raise self._missing(error) from error
+            if self.path.exists():  # safetensors reports unreadable files as missing
+                raise WearcapError(f"cannot be read ({error.strerror or 'no permission'})", where=path) from error
+            raise WearcapError("no such recording", where=self.path) from error
         except (safetensors.SafetensorError, OSError, RuntimeError) as error:
             raise WearcapError(
                 "not a readable recording",
@@ -125,12 +127,6 @@ class RecordingFile:
             return unflatten(tree, self.tensor)
         except (WearcapError, TypeError, ValueError, KeyError, AttributeError) as error:
             raise self._unreadable(error) from error
-
-    def _missing(self, error: OSError) -> WearcapError:
-        """Error for a missing file; safetensors also reports unreadable files as missing."""
-        if self.path.exists():
-            return WearcapError(f"cannot be read ({error.strerror or 'no permission'})", where=self.path)
-        return WearcapError("no such recording", where=self.path)
 
     def _unreadable(self, error: Exception) -> WearcapError:
         return WearcapError(
@@ -333,3 +329,36 @@ def entry_for(recording: Recording, root: Path, split: str, config_hash: str) ->
         license=recording.license,
         config_hash=config_hash,
     )
+
+
+def load_recording(where: str | Path) -> Recording:
+    """Load "DATASET/NAME", a recording's .safetensors file, or a data set that holds just one recording.
+
+    Raises WearcapError that names the choices when there is no such recording.
+    """
+    path = Path(where)
+    if path.is_file():
+        return RecordingFile(path).load()
+    if (path / "manifest.json").is_file():
+        names = RecordingStore.open(path).names()
+        if len(names) == 1:
+            return RecordingStore.open(path).load(names[0])
+        raise WearcapError(
+            f"a data set of {len(names)} recordings",
+            where=path,
+            expected=f"one of them, such as {path / names[0] if names else path / 'NAME'}",
+        )
+    if (path.parent / "manifest.json").is_file():
+        return RecordingStore.open(path.parent).load(path.name)
+    raise WearcapError(
+        "no recording here", where=path, expected="DATASET/NAME or a .safetensors file that `wearcap prepare` wrote"
+    )
+
+
+def dataset_folder(where: str | Path) -> Path:
+    """Folder of the data set of a recording given by the user; file names in the recording are relative to it."""
+    path = Path(where)
+    for folder in (path, *path.parents):
+        if (folder / "manifest.json").is_file():
+            return folder
+    return path.parent

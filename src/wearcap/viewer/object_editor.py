@@ -17,10 +17,9 @@ from jaxtyping import Float
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.environment import MAX_HINGE_GAP_M, read_environment, write_environment
-from wearcap.scene.editing import ObjectEditing, points_world
+from wearcap.scene.editing import ObjectEditing, hinge_places, points_world, snapped
 from wearcap.scene.environment import hinge_gap_m
 from wearcap.scene.objects import Freedom, SceneObject
-from wearcap.scene.placing import hinge_places, snapped
 from wearcap.scene.scan import Scan
 from wearcap.viewer.guard import Guard
 from wearcap.viewer.object_editor_panels import HINTS, TOOLS, ObjectPanel, SelectPanel

@@ -12,8 +12,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
 from wearcap.scene.editing import points_world
 from wearcap.scene.objects import SceneObject
-from wearcap.scene.scan import Scan
-from wearcap.scene.selection import Box, first_hit
+from wearcap.scene.scan import Box, Scan, first_hit
 
 SHOWN_POINTS, SHOWN_SELECTED, SHOWN_OF_OBJECT = 250_000, 80_000, 40_000
 SELECTED_COLOR, BOX_COLOR, BRUSH_COLOR, HINGE_COLOR = ((255, 120, 20), (30, 120, 240), (255, 120, 20), (220, 30, 120))

@@ -27,7 +27,7 @@ from wearcap.io.formats.npz import read_npz, require
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import check_rising
 from wearcap.io.formats.smpl_axes import shape_from_betas
-from wearcap.scene.object_mesh import centered, check_object_mesh
+from wearcap.scene.objects import centered, check_object_mesh
 
 FPS = 30
 """Frame rate (Hz) of the release that has `smpl_fit_all.npz`; the older release has one frame per second in folders."""

@@ -198,33 +198,10 @@ def _lit_body(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Image of the body alone, each face with its own normal, by the renderer's shading."""
     rays = (_RAYS * _REACH[:, None]).reshape(EGO_CAMERA.height, EGO_CAMERA.width, 3)
-    none, no_map = np.zeros(len(body.faces), bool), np.zeros((0, 0), np.float32)
+    none = np.zeros(len(body.faces), bool)
+    triangles = raster.Triangles(in_cam, body.faces, body.color, none, none, 255 * body.color, body.faces)
     out = np.empty((EGO_CAMERA.height, EGO_CAMERA.width, 3), np.uint8)
-    raster.resolve(
-        nearness,
-        own,
-        rays,
-        1,
-        pose,
-        in_cam,
-        body.faces,
-        body.color,
-        none,
-        none,
-        255 * body.color,
-        body.faces,
-        body.color,
-        light,
-        np.zeros((6, 4)),
-        1.0,
-        no_map,
-        no_map,
-        no_map,
-        no_map,
-        1.0,
-        np.zeros((EGO_CAMERA.height, 3), np.float32),
-        out,
-        np.empty(own.shape, np.float32),
-        np.empty_like(own),
-    )
+    background = np.zeros((EGO_CAMERA.height, 3), np.float32)
+    picture = out, np.empty(own.shape, np.float32), np.empty_like(own)
+    raster.resolve(nearness, own, rays, 1, pose, triangles, body.color, light, raster.Shadows(), background, *picture)
     return out

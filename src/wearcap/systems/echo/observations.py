@@ -18,7 +18,7 @@ from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 from wearcap.recording.timing import at_times
 from wearcap.scene.environment import Environment
-from wearcap.scene.object_mesh import check_object
+from wearcap.scene.objects import check_object
 from wearcap.systems.echo.features import CONTACTS, POINTS
 from wearcap.systems.echo.model import MODALITIES
 from wearcap.systems.echo.objects import ObjectReader, ObjectShape

@@ -23,7 +23,7 @@ from wearcap.recording.acts import SAME_S
 from wearcap.recording.timing import joined
 from wearcap.runtime.graphs import undisturbed
 from wearcap.scene.environment import Environment
-from wearcap.scene.object_mesh import check_object
+from wearcap.scene.objects import check_object
 from wearcap.sensors.packets import (
     CONNECTED_S,
     MAX_WAITING,
