@@ -19,7 +19,19 @@ def decimate(
     """
     vertices, faces = vertices.astype(np.float64), faces.astype(np.int64)
     importance = np.ones(len(vertices)) if importance is None else importance
-    quadric, rim = _quadrics(vertices, faces), _rim(len(vertices), faces)
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    normal = np.cross(b - a, c - a)
+    area = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = normal / np.maximum(area, 1e-20)
+    plane = np.concatenate([normal, -(normal * a).sum(1, keepdims=True)], 1)
+    outer = plane[:, :, None] * plane[:, None, :] * area[:, :, None]
+    quadric = np.zeros((len(vertices), 4, 4))  # of the planes of each vertex's faces, weighted by area
+    for corner in range(3):
+        np.add.at(quadric, faces[:, corner], outer)
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    edges, uses = np.unique(edges, axis=0, return_counts=True)
+    rim = np.zeros(len(vertices), dtype=bool)  # vertices on an edge that has not exactly two faces
+    rim[edges[uses != 2].ravel()] = True
     alive = len(np.unique(faces))
     while alive > keep:
         target, cost = _cheapest(vertices, faces, quadric, importance, rim)
@@ -38,17 +50,12 @@ def decimate(
     return kept, np.searchsorted(kept, faces)
 
 
-def _half_edges(faces: np.ndarray) -> Int[np.ndarray, "edge 2"]:
-    start, end = faces.ravel(), faces[:, [1, 2, 0]].ravel()
-    count = faces.max() + 1
-    keys = np.unique(np.concatenate([start * count + end, end * count + start]))
-    return np.stack([keys // count, keys % count], -1)
-
-
 def _cheapest(vertices, faces, quadric, importance, rim) -> tuple[np.ndarray, np.ndarray]:
     """The cheapest neighbour that each vertex may collapse onto, and the cost (infinite if there is none)."""
     count = len(vertices)
-    edges = _half_edges(faces)
+    start, end = faces.ravel(), faces[:, [1, 2, 0]].ravel()
+    keys = np.unique(np.concatenate([start * count + end, end * count + start]))
+    edges = np.stack([keys // count, keys % count], -1)
     adjacent = sparse.csr_array((np.ones(len(edges), dtype=np.int32), edges.T), shape=(count, count))
     common = sparse.coo_array(adjacent @ adjacent * adjacent)  # neighbours shared by an edge's two ends
     fit = (common.data == 2) & ~rim[common.row]
@@ -90,25 +97,3 @@ def _independent(cost: np.ndarray, faces: np.ndarray) -> Bool[np.ndarray, "verte
             np.minimum.at(wider, faces[:, corner], around)
         lowest = wider
     return np.isfinite(own) & (own <= lowest)
-
-
-def _quadrics(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "vertex 4 4"]:
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    normal = np.cross(b - a, c - a)
-    area = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal = normal / np.maximum(area, 1e-20)
-    plane = np.concatenate([normal, -(normal * a).sum(1, keepdims=True)], 1)
-    outer = plane[:, :, None] * plane[:, None, :] * area[:, :, None]
-    total = np.zeros((len(vertices), 4, 4))
-    for corner in range(3):
-        np.add.at(total, faces[:, corner], outer)
-    return total
-
-
-def _rim(count: int, faces: np.ndarray) -> Bool[np.ndarray, "vertex"]:
-    """Vertices on an edge that has not exactly two faces."""
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    edges, uses = np.unique(edges, axis=0, return_counts=True)
-    rim = np.zeros(count, dtype=bool)
-    rim[edges[uses != 2].ravel()] = True
-    return rim

@@ -6,6 +6,7 @@ their bind pose as rest, in the same axes; `retarget` reconciles the two. Offset
 """
 
 import difflib
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -147,52 +148,46 @@ class Skeleton:
         return self.with_offsets(self.t_parent_joint * scale)
 
 
-def mirrored(rows: list[tuple[str, str, tuple[float, float, float]]]) -> list:
+def mirrored(rows: Sequence) -> list[tuple[str, str, tuple[float, float, float]]]:
     """The right side's rows (y negated, left→right in names) for rows that describe the left side."""
-    swap = lambda name: name.replace("left", "right")  # noqa: E731
-    return [(swap(name), swap(parent), (x, -y, z)) for name, parent, (x, y, z) in rows]
+    return [(n.replace("left", "right"), p.replace("left", "right"), (x, -y, z)) for n, p, (x, y, z) in rows]
 
 
-def build_skeleton(name: str, rows: list, sites: list) -> Skeleton:
+def build_skeleton(name: str, rows: Sequence, left_sites: Sequence) -> Skeleton:
     """A skeleton from rows (joint, parent, offset); left-hand sites (name, joint, offset) get right-hand twins."""
     names = tuple(row[0] for row in rows)
     parents = tuple(names.index(row[1]) if row[1] else -1 for row in rows)
     offsets = torch.tensor([row[2] for row in rows])
-    table = {site: Site(joint, offset) for site, joint, offset in [*sites, *mirrored(sites)]}
+    table = {site: Site(joint, offset) for site, joint, offset in [*left_sites, *mirrored(left_sites)]}
     table["crown"] = Site("head", (0.02, 0.0, 0.185))
     return Skeleton(name, names, parents, offsets, table)
+
+
+def foot_and_hand_sites(toe_joint: str) -> list[tuple[str, str, tuple[float, float, float]]]:
+    """The left side's sites; `toe_joint` is the skeleton's name of the joint at the left toes."""
+    return [
+        ("left_heel", "left_ankle", (-0.050, 0.0, -0.080)), ("left_toe_tip", toe_joint, (0.070, 0.0, -0.018)),
+        ("left_fingertip", "left_wrist", (0.0, 0.185, 0.0)), ("left_palm", "left_wrist", (0.0, 0.080, -0.015)),
+    ]  # fmt: skip
 
 
 def xsens23() -> Skeleton:
     """Xsens MVN's 23 segments, named by the joint at each segment's origin, at the size of a 1.75 m adult."""
     arm = [
-        ("left_collar", "t8", (0.0, 0.035, 0.085)),
-        ("left_shoulder", "left_collar", (0.0, 0.145, 0.0)),
-        ("left_elbow", "left_shoulder", (0.0, 0.290, 0.0)),
-        ("left_wrist", "left_elbow", (0.0, 0.250, 0.0)),
-    ]
+        ("left_collar", "t8", (0.0, 0.035, 0.085)), ("left_shoulder", "left_collar", (0.0, 0.145, 0.0)),
+        ("left_elbow", "left_shoulder", (0.0, 0.290, 0.0)), ("left_wrist", "left_elbow", (0.0, 0.250, 0.0)),
+    ]  # fmt: skip
     leg = [
-        ("left_hip", "pelvis", (0.0, 0.085, 0.0)),
-        ("left_knee", "left_hip", (0.0, 0.0, -0.430)),
-        ("left_ankle", "left_knee", (0.0, 0.0, -0.420)),
-        ("left_toe", "left_ankle", (0.155, 0.0, -0.062)),
-    ]
+        ("left_hip", "pelvis", (0.0, 0.085, 0.0)), ("left_knee", "left_hip", (0.0, 0.0, -0.430)),
+        ("left_ankle", "left_knee", (0.0, 0.0, -0.420)), ("left_toe", "left_ankle", (0.155, 0.0, -0.062)),
+    ]  # fmt: skip
     spine = [
-        ("pelvis", "", (0.0, 0.0, 0.0)),
-        ("l5", "pelvis", (0.0, 0.0, 0.095)),
-        ("l3", "l5", (0.0, 0.0, 0.105)),
-        ("t12", "l3", (0.0, 0.0, 0.095)),
-        ("t8", "t12", (0.0, 0.0, 0.095)),
-        ("neck", "t8", (0.0, 0.0, 0.135)),
+        ("pelvis", "", (0.0, 0.0, 0.0)), ("l5", "pelvis", (0.0, 0.0, 0.095)), ("l3", "l5", (0.0, 0.0, 0.105)),
+        ("t12", "l3", (0.0, 0.0, 0.095)), ("t8", "t12", (0.0, 0.0, 0.095)), ("neck", "t8", (0.0, 0.0, 0.135)),
         ("head", "neck", (0.0, 0.0, 0.090)),
-    ]
-    sites = [
-        ("left_heel", "left_ankle", (-0.050, 0.0, -0.080)),
-        ("left_toe_tip", "left_toe", (0.070, 0.0, -0.018)),
-        ("left_fingertip", "left_wrist", (0.0, 0.185, 0.0)),
-        ("left_palm", "left_wrist", (0.0, 0.080, -0.015)),
-    ]
-    return build_skeleton("xsens23", [*spine, *mirrored(arm), *arm, *mirrored(leg), *leg], sites)
+    ]  # fmt: skip
+    rows = [*spine, *mirrored(arm), *arm, *mirrored(leg), *leg]
+    return build_skeleton("xsens23", rows, foot_and_hand_sites("left_toe"))
 
 
 def stature(skeleton: Skeleton) -> float:

@@ -96,13 +96,12 @@ class BodiesIndex:
         R_world_body: Float64[np.ndarray, "chosen 3 3"],
         t_world_body: Float64[np.ndarray, "chosen 3"],
         reach_m: float,
-    ) -> tuple[Int64[np.ndarray, "query"], Float64[np.ndarray, "query"], Float64[np.ndarray, "query 3"]]:
-        """For each point the nearest of the chosen bodies (its number among all), the distance (m) and the closest
-        point in the world; -1, infinity and NaN where none is nearer than `reach_m`."""
-        count, roots = len(queries), self.roots[bodies]
-        body, distance, point = np.empty(count, np.int64), np.empty(count), np.empty((count, 3))
-        _nearest_bodies(queries, R_world_body, t_world_body, roots, reach_m, self.tree, body, distance, point)
-        return np.append(bodies, -1)[body], distance, point
+    ) -> tuple[Int64[np.ndarray, "query"], Float64[np.ndarray, "query"]]:
+        """For each point the nearest of the chosen bodies (its number among all) and the distance (m); -1 and infinity
+        where none is nearer than `reach_m`."""
+        body, distance = np.empty(len(queries), np.int64), np.empty(len(queries))
+        _nearest_bodies(queries, R_world_body, t_world_body, self.roots[bodies], reach_m, self.tree, body, distance)
+        return np.append(bodies, -1)[body], distance
 
 
 @compiled
@@ -237,13 +236,12 @@ def _nearest_all(queries, tree, distance, face, point):
 
 
 @compiled
-def _nearest_bodies(queries, R, t, roots, reach_m, tree, body, distance, point):
+def _nearest_bodies(queries, R, t, roots, reach_m, tree, body, distance):
     """Every body's box bounds its distance; the nearest box is searched first, the others only while they can win."""
-    corners = tree.corners
     stack, reach = np.empty(128, np.int64), np.empty(128)
     bound, local = np.empty(len(roots)), np.empty((len(roots), 3))
     for q in range(len(queries)):
-        body[q], distance[q], point[q] = -1, np.inf, np.nan
+        body[q], distance[q] = -1, np.inf
         first = -1
         for k in range(len(roots)):
             dx, dy, dz = queries[q, 0] - t[k, 0], queries[q, 1] - t[k, 1], queries[q, 2] - t[k, 2]
@@ -254,22 +252,11 @@ def _nearest_bodies(queries, R, t, roots, reach_m, tree, body, distance, point):
                 first = k
         if first < 0 or not np.isfinite(queries[q, 0] + queries[q, 1] + queries[q, 2]):
             continue
-        best, row, owner = reach_m * reach_m, -1, -1
+        best = reach_m * reach_m
         for turn in range(-1, len(roots)):
             k = first if turn < 0 else turn
             if bound[k] >= best or turn == first:
                 continue
             square, found = _nearest_face(local[k], roots[k], best, tree, stack, reach)
             if found >= 0:
-                best, row, owner = square, found, k
-        if row < 0:
-            continue
-        body[q], distance[q] = owner, np.sqrt(best)
-        _, s, along = _triangle_nearest(local[owner], corners[row])
-        for axis in range(3):
-            local[owner, axis] = corners[row, 0, axis] + s * (corners[row, 1, axis] - corners[row, 0, axis])
-            local[owner, axis] += along * (corners[row, 2, axis] - corners[row, 0, axis])
-        for axis in range(3):
-            point[q, axis] = t[owner, axis]
-            for b in range(3):
-                point[q, axis] += R[owner, axis, b] * local[owner, b]
+                best, body[q], distance[q] = square, k, np.sqrt(square)

@@ -24,8 +24,6 @@ class Nearest:
     """Index in `Environment.objects`; -1 where none is within reach."""
     distance: Float[Tensor, "query"]
     """Distance (m) from the point to the object's surface; infinity where none is within reach."""
-    point_world: Float[Tensor, "query 3"]
-    """The object's closest point (m), NaN where none is within reach."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,21 +88,16 @@ class Environment:
         moved = {self.index(name): pose for name, pose in (T_world_object or {}).items()}
         chosen = np.flatnonzero([contact_class in (None, item.freedom.contact_class) for item in self.objects])
         if not len(chosen):
-            count = len(points_world)
-            far, nowhere = (
-                points_world.new_full((count,), float("inf")),
-                points_world.new_full((count, 3), float("nan")),
-            )
-            return Nearest(torch.full((count,), -1), far, nowhere)
+            nothing = torch.full((len(points_world),), -1)
+            return Nearest(nothing, torch.full_like(nothing, torch.inf, dtype=points_world.dtype))
         bodies, R, t = self._at_rest
         R, t = R.copy(), t.copy()
         for k, pose in moved.items():
             R[k], t[k] = pose.R.numpy(), pose.t.numpy()
-        index, distance, point = bodies.nearest(
+        index, distance = bodies.nearest(
             points_world.double().contiguous().numpy(), chosen, R[chosen], t[chosen], float(reach_m)
         )
-        dtype = points_world.dtype
-        return Nearest(torch.from_numpy(index), torch.from_numpy(distance).to(dtype), torch.from_numpy(point).to(dtype))
+        return Nearest(torch.from_numpy(index), torch.from_numpy(distance).to(points_world.dtype))
 
     def distance(
         self, name: str, points_world: Float[Tensor, "time 3"], T_world_object: Rigid

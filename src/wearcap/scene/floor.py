@@ -1,4 +1,4 @@
-"""Height of the floor below the wearer, from points of the surroundings or from the head path alone."""
+"""Height of the floor below the wearer, from points of the surroundings."""
 
 from dataclasses import dataclass
 
@@ -10,9 +10,6 @@ from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from wearcap.errors import WearcapError
-
-_EYE_HEIGHT_OF_STATURE = 0.936
-"""Eyes above the floor as a share of stature, standing (Drillis and Contini 1966)."""
 
 _BIN_M = 0.02
 
@@ -78,7 +75,7 @@ def estimate_floor(
         raise WearcapError(
             "no points below the head's path",
             expected="a cloud in the head's world, z up",
-            fix="Give the wearer's stature instead: floor_from_head.",
+            fix="Check that the cloud and the head path share one world, and that the cloud shows the floor.",
         )
     heights = bottom + (np.arange(bins) + 0.5) * _BIN_M
     clearance = keys[:, 2:] - heights
@@ -100,19 +97,6 @@ def estimate_floor(
         torch.tensor(refined[key_of_frame], dtype=torch.float32),
         torch.tensor((support / (support + 10))[key_of_frame], dtype=torch.float32),
     )
-
-
-def floor_from_head(t_world_eyes: Float[Tensor, "time 3"], stature_m: float) -> FloorEstimate:
-    """One floor height for the whole path, from the eye height while upright (its 90th percentile).
-
-    Valid if the wearer stands or walks for a tenth of the time and stays on one storey; confidence 0.2.
-    Raises WearcapError for an implausible stature.
-    """
-    if not 0.5 < stature_m < 2.6:
-        raise WearcapError(f"stature {stature_m} m", expected="metres, between 0.5 and 2.6")
-    upright = torch.quantile(t_world_eyes[:, 2].double(), 0.9).item()
-    height = upright - _EYE_HEIGHT_OF_STATURE * stature_m
-    return FloorEstimate(torch.full((len(t_world_eyes),), height), torch.full((len(t_world_eyes),), 0.2))
 
 
 def _votes(points: np.ndarray, keys: np.ndarray, bottom: float, bins: int, reach: _Reach) -> np.ndarray:
