@@ -152,7 +152,7 @@ def test_joints_are_means_of_their_corners():
 def test_cache_gives_the_same_and_survives_damage(tmp_path, monkeypatch):
     reads = []
     kept = load_assets(4000)
-    monkeypatch.setattr(anny_assets, "read_assets", lambda keep: reads.append(keep) or kept)
+    monkeypatch.setattr(anny_assets, "_read_assets", lambda keep: reads.append(keep) or kept)
     monkeypatch.setenv("WEARCAP_CACHE", str(tmp_path))
     load = load_assets.__wrapped__
     first, second = load(4000), load(4000)

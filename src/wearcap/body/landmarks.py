@@ -17,27 +17,10 @@ from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import swing_between
 
-_LEGS = (
-    ("hip", "knee", "ankle"),
-    ("femur", "tibia", "foot"),
-    ("upleg", "leg", "foot"),
-    ("thigh", "shin", "foot"),
-    ("thigh", "calf", "foot"),
-    ("upperleg", "lowerleg", "foot"),
-    ("hip", "knee", "foot"),
-    ("upleg", "lowleg", "foot"),
-)
-_ARMS = (
-    ("humerus", "radius", "hand"),
-    ("shoulder", "elbow", "wrist"),
-    ("arm", "forearm", "fingerbase"),
-    ("arm", "forearm", "hand"),
-    ("upperarm", "forearm", "hand"),
-    ("upperarm", "lowerarm", "hand"),
-    ("shldr", "forearm", "hand"),
-    ("uparm", "loarm", "hand"),
-    ("shoulder", "elbow", "hand"),
-)
+_LEGS = """hip knee ankle, femur tibia foot, upleg leg foot, thigh shin foot, thigh calf foot, upperleg lowerleg foot,
+    hip knee foot, upleg lowleg foot"""
+_ARMS = """humerus radius hand, shoulder elbow wrist, arm forearm fingerbase, arm forearm hand, upperarm forearm hand,
+    upperarm lowerarm hand, shldr forearm hand, uparm loarm hand, shoulder elbow hand"""
 """Names of (hip, knee, ankle) and (shoulder, elbow, wrist) in use: xsens and SMPL, CMU, Mixamo, Poser, Unreal …
 
 CMU's `lwrist` is the middle of the forearm (its only freedom is the forearm's twist); `lhand` is the wrist.
@@ -85,14 +68,15 @@ def _ancestors(skeleton: Skeleton, joint: int) -> list[int]:
     return chain
 
 
-def _limb(by_name: dict[str, int], side: str, alternatives, skeleton: Skeleton) -> tuple[int, int, int]:
+def _limb(by_name: dict[str, int], side: str, limb: str, skeleton: Skeleton) -> tuple[int, int, int]:
+    alternatives = [names.split() for names in (_LEGS if limb == "leg" else _ARMS).split(",")]
     for names in alternatives:
         for prefix in (side, side[0]):
             first, second, third = (by_name.get(prefix + name, -1) for name in names)
             if min(first, second, third) >= 0:
                 return first, second, third
     raise WearcapError(
-        f"the {side} {'leg' if alternatives is _LEGS else 'arm'} of skeleton {skeleton.name!r} is not recognised",
+        f"the {side} {limb} of skeleton {skeleton.name!r} is not recognised",
         expected="joints named like " + " or ".join("/".join(n) for n in alternatives[:3]),
         fix=f"It has {', '.join(skeleton.joint_names)}; rename them.",
     )
@@ -111,8 +95,8 @@ def landmarks(skeleton: Skeleton) -> Landmarks:
     head = by_name["head"]
     limb, collar, toe, forearm = {}, {}, {}, {}
     for side in ("left", "right"):
-        limb[f"{side}_leg"] = _limb(by_name, side, _LEGS, skeleton)
-        limb[f"{side}_arm"] = _limb(by_name, side, _ARMS, skeleton)
+        limb[f"{side}_leg"] = _limb(by_name, side, "leg", skeleton)
+        limb[f"{side}_arm"] = _limb(by_name, side, "arm", skeleton)
         below = [joint for joint, parent in enumerate(skeleton.parents) if parent == limb[f"{side}_leg"][2]]
         toe[side] = max(below, key=lambda joint: skeleton.t_parent_joint[joint, 0].item(), default=None)
         forearm[side] = skeleton.parents[limb[f"{side}_arm"][2]]

@@ -19,6 +19,12 @@ from wearcap.errors import WearcapError
 FOOT_PATCHES = ("left_heel", "left_toe_tip", "right_heel", "right_toe_tip")
 """Sites with floor contact labels and predictions, always in this order."""
 
+FEET = 2
+"""Number of feet: contacts by foot come in the order left, right."""
+FOOT_JOINTS = ("left_toe", "right_toe")
+"""Joint of each foot whose position and contact stand for the foot's."""
+WRISTS = ("left_wrist", "right_wrist")
+
 MIRROR = (1.0, -1.0, 1.0)
 """Factors that mirror a position left to right: y changes its sign."""
 
@@ -153,22 +159,19 @@ def mirrored(rows: Sequence) -> list[tuple[str, str, tuple[float, float, float]]
     return [(n.replace("left", "right"), p.replace("left", "right"), (x, -y, z)) for n, p, (x, y, z) in rows]
 
 
-def build_skeleton(name: str, rows: Sequence, left_sites: Sequence) -> Skeleton:
-    """A skeleton from rows (joint, parent, offset); left-hand sites (name, joint, offset) get right-hand twins."""
+def build_skeleton(name: str, rows: Sequence, left_toe: str | None = None) -> Skeleton:
+    """A skeleton from rows (joint, parent, offset), with sites where `left_toe` names the joint of the left toes."""
     names = tuple(row[0] for row in rows)
     parents = tuple(names.index(row[1]) if row[1] else -1 for row in rows)
-    offsets = torch.tensor([row[2] for row in rows])
-    table = {site: Site(joint, offset) for site, joint, offset in [*left_sites, *mirrored(left_sites)]}
-    table["crown"] = Site("head", (0.02, 0.0, 0.185))
-    return Skeleton(name, names, parents, offsets, table)
-
-
-def foot_and_hand_sites(toe_joint: str) -> list[tuple[str, str, tuple[float, float, float]]]:
-    """The left side's sites; `toe_joint` is the skeleton's name of the joint at the left toes."""
-    return [
-        ("left_heel", "left_ankle", (-0.050, 0.0, -0.080)), ("left_toe_tip", toe_joint, (0.070, 0.0, -0.018)),
+    skeleton = Skeleton(name, names, parents, torch.tensor([row[2] for row in rows]))
+    if left_toe is None:
+        return skeleton
+    left = [
+        ("left_heel", "left_ankle", (-0.050, 0.0, -0.080)), ("left_toe_tip", left_toe, (0.070, 0.0, -0.018)),
         ("left_fingertip", "left_wrist", (0.0, 0.185, 0.0)), ("left_palm", "left_wrist", (0.0, 0.080, -0.015)),
     ]  # fmt: skip
+    sites = {site: Site(joint, offset) for site, joint, offset in [*left, *mirrored(left)]}
+    return replace(skeleton, sites=sites | {"crown": Site("head", (0.02, 0.0, 0.185))})
 
 
 def xsens23() -> Skeleton:
@@ -187,7 +190,7 @@ def xsens23() -> Skeleton:
         ("head", "neck", (0.0, 0.0, 0.090)),
     ]  # fmt: skip
     rows = [*spine, *mirrored(arm), *arm, *mirrored(leg), *leg]
-    return build_skeleton("xsens23", rows, foot_and_hand_sites("left_toe"))
+    return build_skeleton("xsens23", rows, "left_toe")
 
 
 def stature(skeleton: Skeleton) -> float:

@@ -10,7 +10,7 @@ from dataclasses import replace
 import torch
 
 from wearcap.body.kinematics import forward_kinematics
-from wearcap.body.skeleton import Skeleton, build_skeleton, foot_and_hand_sites, xsens23
+from wearcap.body.skeleton import Skeleton, build_skeleton, xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis
 
@@ -54,18 +54,18 @@ def _hand(side: str) -> list[tuple[str, str, tuple[float, float, float]]]:
 
 def smplx22() -> Skeleton:
     """SMPL-X's (and SMPL+H's) root and 21 body joints."""
-    return build_skeleton("smplx22", _SMPL_BODY, foot_and_hand_sites("left_foot"))
+    return build_skeleton("smplx22", _SMPL_BODY, "left_foot")
 
 
 def smpl24() -> Skeleton:
     """SMPL's 24 joints."""
     hands = [("left_hand", "left_wrist", (0.0, 0.080, 0.0)), ("right_hand", "right_wrist", (0.0, -0.080, 0.0))]
-    return build_skeleton("smpl24", [*_SMPL_BODY, *hands], foot_and_hand_sites("left_foot"))
+    return build_skeleton("smpl24", [*_SMPL_BODY, *hands], "left_foot")
 
 
 def smplh52() -> Skeleton:
     """SMPL+H's 52 joints: the body and fifteen finger joints of each hand."""
-    return build_skeleton("smplh52", [*_SMPL_BODY, *_hand("left"), *_hand("right")], foot_and_hand_sites("left_foot"))
+    return build_skeleton("smplh52", [*_SMPL_BODY, *_hand("left"), *_hand("right")], "left_foot")
 
 
 def _cmu_side(letter: str) -> list[tuple[str, str, tuple[float, float, float]]]:
@@ -93,7 +93,7 @@ def cmu31() -> Skeleton:
     ]  # fmt: skip
     left, right = _cmu_side("l"), _cmu_side("r")
     rows = [spine[0], *left[:5], *right[:5], *spine[1:], *left[5:], *right[5:]]
-    upright = replace(build_skeleton("cmu31", rows, []), sites={})
+    upright = build_skeleton("cmu31", rows)
     R = torch.eye(3).repeat(len(upright), 1, 1)
     splay = torch.tensor(20.0).deg2rad()
     R[upright.index("lfemur")], R[upright.index("rfemur")] = about_axis("x", splay), about_axis("x", -splay)

@@ -15,6 +15,7 @@ from rich import print as show
 from rich.markup import escape
 from rich.table import Table
 
+from wearcap.body.skeleton import WRISTS
 from wearcap.cli.conf import hydra_main
 from wearcap.errors import WearcapError, nearest
 from wearcap.files import folder_lock
@@ -36,7 +37,6 @@ from wearcap.sensors.camera_alignment import (
 )
 from wearcap.sensors.stillness import StepCheck, Stretch, require, still_intervals
 from wearcap.sensors.watch_calibration import measure_watches, propose_steps, require_watches, watch_checks
-from wearcap.sensors.watches import WRISTS
 
 STEPS = {
     "board": "Lay both watches on the board for 3 s: backs down, 12 o'clock along the board's y axis. Touch nothing.",

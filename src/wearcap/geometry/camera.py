@@ -91,7 +91,19 @@ class Camera:
 
         Differentiable in the points. Invalid pixels are finite but meaningless.
         """
-        plane, seen = self._to_plane(points_cam)
+        xy, z = points_cam[..., :2], points_cam[..., 2]
+        if self.is_fisheye:
+            square = (xy**2).sum(-1)
+            on_axis = square < 1e-18
+            radius = torch.where(on_axis, 1.0, square).sqrt()
+            theta = torch.atan2(radius, z)
+            scale = torch.where(on_axis, 1 / torch.where(z.abs() < 1e-9, 1.0, z), theta / radius)
+            plane, behind = xy * scale[..., None], on_axis & (z <= 0)
+            seen = ~behind & (torch.where(on_axis, 0.0, theta) ** 2 < self.lens_terms.fold)
+        else:
+            ahead = z > 1e-6
+            plane = xy / torch.where(ahead, z, 1.0)[..., None]
+            seen = ahead & ((plane**2).sum(-1) < self.lens_terms.fold)
         distorted, _ = self._lens(plane)
         pixels = distorted * plane.new_tensor([self.fx, self.fy]) + plane.new_tensor([self.cx, self.cy])
         x, y = pixels.unbind(-1)
@@ -112,24 +124,6 @@ class Camera:
                 rest = self._lens(root)[0]
             plane = root + (step @ (target - rest)[..., None])[..., 0]
             plane = torch.where(found[..., None], plane, torch.nan)
-        return self._from_plane(plane)
-
-    def _to_plane(self, points: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor]:
-        """Plane coordinates of points, and a mask of those within the lens's field of view."""
-        xy, z = points[..., :2], points[..., 2]
-        if not self.is_fisheye:
-            ahead = z > 1e-6
-            plane = xy / torch.where(ahead, z, 1.0)[..., None]
-            return plane, ahead & ((plane**2).sum(-1) < self.lens_terms.fold)
-        square = (xy**2).sum(-1)
-        on_axis = square < 1e-18
-        radius = torch.where(on_axis, 1.0, square).sqrt()
-        theta = torch.atan2(radius, z)
-        scale = torch.where(on_axis, 1 / torch.where(z.abs() < 1e-9, 1.0, z), theta / radius)
-        behind = on_axis & (z <= 0)
-        return xy * scale[..., None], ~behind & (torch.where(on_axis, 0.0, theta) ** 2 < self.lens_terms.fold)
-
-    def _from_plane(self, plane: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
         if not self.is_fisheye:
             ray = torch.cat([plane, torch.ones_like(plane[..., :1])], -1)
             return torch.nn.functional.normalize(ray, dim=-1)

@@ -180,46 +180,43 @@ def _nearest_all(queries, reach, grid, distance, row):
 
 @compiled
 def _plane_all(queries, radius, reach, grid, plane_origin, normal):
-    for q in range(len(queries)):
-        _, row = _nearest_point(queries[q], reach, grid)
-        plane_origin[q], normal[q] = np.nan, np.nan
-        if row >= 0:
-            _fit_plane(grid[0][row], radius, grid, plane_origin[q], normal[q])
-
-
-@compiled
-def _fit_plane(center, radius, grid, plane_origin, normal):
-    """Write the plane through the points around `center`; nothing is written where fewer than six are there."""
+    """Write the planes through the points around the nearest one; NaN where fewer than six are there."""
     points, cell_m, origin, keys, first, count = grid
-    low = np.floor((center - origin - radius) / cell_m)
-    high = np.floor((center - origin + radius) / cell_m)
-    total, number = 0.0, 0
-    mean, moment = np.zeros(3), np.zeros((3, 3))
-    for x in range(int(low[0]), int(high[0]) + 1):
-        for y in range(int(low[1]), int(high[1]) + 1):
-            for z in range(int(low[2]), int(high[2]) + 1):
-                slot = _find(x, y, z, keys)
-                if slot < 0:
-                    continue
-                for i in range(first[slot], first[slot] + count[slot]):
-                    d = points[i] - center
-                    square = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) / (radius * radius)
-                    if square < 1.0:
-                        weight = 1.0 - square
-                        total += weight
-                        number += 1
-                        for a in range(3):
-                            mean[a] += weight * d[a]
-                            for b in range(3):
-                                moment[a, b] += weight * d[a] * d[b]
-    if number < 6:
-        return
-    mean /= total
-    for a in range(3):
-        for b in range(3):
-            moment[a, b] = moment[a, b] / total - mean[a] * mean[b]
-    _, vectors = np.linalg.eigh(moment)
-    sign = 1.0 if vectors[2, 0] >= 0 else -1.0
-    for a in range(3):
-        plane_origin[a] = center[a] + mean[a]
-        normal[a] = sign * vectors[a, 0]
+    for q in range(len(queries)):
+        plane_origin[q], normal[q] = np.nan, np.nan
+        _, row = _nearest_point(queries[q], reach, grid)
+        if row < 0:
+            continue
+        center = points[row]
+        low = np.floor((center - origin - radius) / cell_m)
+        high = np.floor((center - origin + radius) / cell_m)
+        total, number = 0.0, 0
+        mean, moment = np.zeros(3), np.zeros((3, 3))
+        for x in range(int(low[0]), int(high[0]) + 1):
+            for y in range(int(low[1]), int(high[1]) + 1):
+                for z in range(int(low[2]), int(high[2]) + 1):
+                    slot = _find(x, y, z, keys)
+                    if slot < 0:
+                        continue
+                    for i in range(first[slot], first[slot] + count[slot]):
+                        d = points[i] - center
+                        square = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) / (radius * radius)
+                        if square < 1.0:
+                            weight = 1.0 - square
+                            total += weight
+                            number += 1
+                            for a in range(3):
+                                mean[a] += weight * d[a]
+                                for b in range(3):
+                                    moment[a, b] += weight * d[a] * d[b]
+        if number < 6:
+            continue
+        mean /= total
+        for a in range(3):
+            for b in range(3):
+                moment[a, b] = moment[a, b] / total - mean[a] * mean[b]
+        _, vectors = np.linalg.eigh(moment)
+        sign = 1.0 if vectors[2, 0] >= 0 else -1.0
+        for a in range(3):
+            plane_origin[q, a] = center[a] + mean[a]
+            normal[q, a] = sign * vectors[a, 0]

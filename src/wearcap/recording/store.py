@@ -65,7 +65,7 @@ class RecordingFile:
             self._file = safetensors.safe_open(str(self.path), framework="pt")
         except FileNotFoundError as error:
             if self.path.exists():  # safetensors reports unreadable files as missing
-                raise WearcapError(f"cannot be read ({error.strerror or 'no permission'})", where=path) from error
+                raise WearcapError(f"cannot be read ({error.strerror or 'no permission'})", where=self.path) from error
             raise WearcapError("no such recording", where=self.path) from error
         except (safetensors.SafetensorError, OSError, RuntimeError) as error:
             raise WearcapError(
@@ -187,8 +187,31 @@ class RecordingStore:
     """A data set on disk. One process may write; any number may read."""
 
     def __init__(self, root: str | Path):
-        self.root = Path(root)
-        self.entries: dict[str, Entry] = self._read_manifest() if self.manifest_path.exists() else {}
+        """Read the manifest, if there is one. Raises WearcapError when it is not readable."""
+        self.root, path = Path(root), Path(root) / MANIFEST
+        self.entries: dict[str, Entry] = {}
+        if not path.exists():
+            return
+        try:
+            manifest = parse_json(path.read_bytes(), path)
+        except OSError as error:
+            raise WearcapError(f"cannot be read ({error.strerror or error})", where=path) from error
+        version = manifest.get("schema_version") if isinstance(manifest, dict) else None
+        if version != SCHEMA_VERSION:
+            raise WearcapError(
+                f"schema version {str(version)[:40]}",
+                where=path,
+                expected=f"version {SCHEMA_VERSION}",
+                fix="Prepare the data set again.",
+            )
+        try:
+            self.entries |= {name: self._entry(name, entry) for name, entry in manifest["recordings"].items()}
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise WearcapError(
+                f"not a readable manifest ({str(error)[:200]})",
+                where=path,
+                fix="Delete it and prepare the data set again.",
+            ) from error
 
     @classmethod
     def open(cls, root: str | Path) -> "RecordingStore":
@@ -205,29 +228,6 @@ class RecordingStore:
     @property
     def manifest_path(self) -> Path:
         return self.root / MANIFEST
-
-    def _read_manifest(self) -> dict[str, Entry]:
-        path = self.manifest_path
-        try:
-            manifest = parse_json(path.read_bytes(), path)
-        except OSError as error:
-            raise WearcapError(f"cannot be read ({error.strerror or error})", where=path) from error
-        version = manifest.get("schema_version") if isinstance(manifest, dict) else None
-        if version != SCHEMA_VERSION:
-            raise WearcapError(
-                f"schema version {str(version)[:40]}",
-                where=path,
-                expected=f"version {SCHEMA_VERSION}",
-                fix="Prepare the data set again.",
-            )
-        try:
-            return {name: self._entry(name, entry) for name, entry in manifest["recordings"].items()}
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise WearcapError(
-                f"not a readable manifest ({str(error)[:200]})",
-                where=path,
-                fix="Delete it and prepare the data set again.",
-            ) from error
 
     def _entry(self, name: str, row: dict[str, Any]) -> Entry:
         """Parse one row of the manifest. Raises ValueError or TypeError for invalid values."""

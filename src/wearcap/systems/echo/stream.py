@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeleton import WRISTS, Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
@@ -36,7 +36,7 @@ from wearcap.sensors.packets import (
     pose_fault,
     time_fault,
 )
-from wearcap.systems.echo.features import CONTACTS, POINTS
+from wearcap.systems.echo.features import CONTACTS
 from wearcap.systems.echo.model import MODALITIES
 from wearcap.systems.echo.objects import ObjectShape
 from wearcap.systems.echo.observations import MAX_GAP_S, BatchItem, wrist_poses
@@ -47,7 +47,6 @@ from wearcap.tracking.floor import FloorTracker
 from wearcap.tracking.head_path import HeadPath
 from wearcap.tracking.head_track import Chunk, HeadTrack
 
-WRISTS = POINTS[1:]
 MAX_SEEN = 1000
 """Most object observations that are buffered; the oldest are dropped."""
 ASIDE_M, BELOW = 0.25, 0.47

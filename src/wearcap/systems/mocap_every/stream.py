@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeleton import WRISTS, Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import ImuStream, Motion
@@ -33,7 +33,7 @@ from wearcap.sensors.packets import (
     time_fault,
     vector_fault,
 )
-from wearcap.sensors.watches import FILTER, MAX_GAP_S, WRISTS, filtered
+from wearcap.sensors.watches import FILTER, MAX_GAP_S, filtered
 from wearcap.systems.mocap_every.features import Sensed
 from wearcap.systems.mocap_every.pipeline import MocapEvery
 from wearcap.systems.mocap_every.windows import EstimatorWindows, FinalPoses
