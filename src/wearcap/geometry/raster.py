@@ -230,35 +230,50 @@ def draw_splats(blocks, pose, planes, lens, radius, metric, offset, nearness, in
 
 
 @compiled
-def _key_visibility(x, y, z, shadows):
+def _hit(rx, ry, rz, vertices, a, b, c):
+    """Barycentric weights of corners b and c where the ray through the camera's centre meets the triangle."""
+    ax, ay, az = vertices[a, 0], vertices[a, 1], vertices[a, 2]
+    ux, uy, uz = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
+    vx, vy, vz = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
+    px, py, pz = ry * vz - rz * vy, rz * vx - rx * vz, rx * vy - ry * vx
+    det = ux * px + uy * py + uz * pz
+    if abs(det) < 1e-20:
+        return 0.0, 0.0
+    qx, qy, qz = -ay * uz + az * uy, -az * ux + ax * uz, -ax * uy + ay * ux
+    second = min(1.0, max(0.0, -(ax * px + ay * py + az * pz) / det))
+    third = min(1.0 - second, max(0.0, (rx * qx + ry * qy + rz * qz) / det))
+    return second, third
+
+
+@compiled
+def _key_visibility(x, y, z, axes, scale, shadow, high, low):
     """Part (0…1) of the key light that reaches a point: percentage-closer filtering over 4 x 4 texels."""
-    axes, size = shadows.axes, len(shadows.nearest)
-    u = (axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z + axes[0, 3]) * shadows.scale
-    v = (axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z + axes[1, 3]) * shadows.scale
+    size = len(shadow)
+    u = (axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z + axes[0, 3]) * scale
+    v = (axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z + axes[1, 3]) * scale
     d = axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z + axes[2, 3] + 0.004
     column, row = math.floor(u), math.floor(v)
     if column < 2 or row < 2 or column > size - 4 or row > size - 4:
         return 1.0
-    if shadows.high[row, column] <= d:
+    if high[row, column] <= d:
         return 1.0
-    if shadows.low[row, column] > d:
+    if low[row, column] > d:
         return 0.0
     du, dv, lit = u - column, v - row, 0.0
     for i in range(-1, 3):
         wi = (1 - dv) if i == -1 else (dv if i == 2 else 1.0)
         for j in range(-1, 3):
             wj = (1 - du) if j == -1 else (du if j == 2 else 1.0)
-            if shadows.nearest[row + i, column + j] <= d:
+            if shadow[row + i, column + j] <= d:
                 lit += wi * wj
     return lit / 9.0
 
 
 @compiled
-def _contact_shade(x, y, z, shadows):
+def _contact_shade(x, y, z, axes, scale, contact, fade):
     """Fraction (0…1) of the sky occluded by geometry close above an upward surface: largest where they touch."""
-    axes, contact = shadows.axes, shadows.contact
-    u = (axes[3, 0] * x + axes[3, 1] * y + axes[3, 2] * z + axes[3, 3]) * shadows.scale
-    v = (axes[4, 0] * x + axes[4, 1] * y + axes[4, 2] * z + axes[4, 3]) * shadows.scale
+    u = (axes[3, 0] * x + axes[3, 1] * y + axes[3, 2] * z + axes[3, 3]) * scale
+    v = (axes[4, 0] * x + axes[4, 1] * y + axes[4, 2] * z + axes[4, 3]) * scale
     height = axes[5, 0] * x + axes[5, 1] * y + axes[5, 2] * z + axes[5, 3]
     column, row = math.floor(u), math.floor(v)
     if column < 0 or row < 0 or column > len(contact) - 2 or row > len(contact) - 2:
@@ -266,58 +281,26 @@ def _contact_shade(x, y, z, shadows):
     du, dv = u - column, v - row
     value = (1 - dv) * ((1 - du) * contact[row, column] + du * contact[row, column + 1])
     value += dv * ((1 - du) * contact[row + 1, column] + du * contact[row + 1, column + 1])
-    return min(1.0, value * math.exp(min(80.0, -height / shadows.fade)))
+    return min(1.0, value * math.exp(min(80.0, -height / fade)))
 
 
 @compiled
-def _shade(face, w, ray, pose, scene, light, shadows):
-    """RGB 0…255 of a face where a ray meets it at nearness w."""
-    rx, ry, rz = ray[0], ray[1], ray[2]
-    vertices, normals, colors = scene.vertices, scene.normals, scene.colors
-    a, b, c = scene.faces[face, 0], scene.faces[face, 1], scene.faces[face, 2]
-    ax, ay, az = vertices[a, 0], vertices[a, 1], vertices[a, 2]
-    ux, uy, uz = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
-    vx, vy, vz = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
-    # Barycentric weights of the corners b and c where the ray meets the triangle.
-    second = third = 0.0
-    px, py, pz = ry * vz - rz * vy, rz * vx - rx * vz, rx * vy - ry * vx
-    det = ux * px + uy * py + uz * pz
-    if not abs(det) < 1e-20:
-        qx, qy, qz = -ay * uz + az * uy, -az * ux + ax * uz, -ax * uy + ay * ux
-        second = min(1.0, max(0.0, -(ax * px + ay * py + az * pz) / det))
-        third = min(1.0 - second, max(0.0, (rx * qx + ry * qy + rz * qz) / det))
-    first = 1.0 - second - third
-    if scene.smooth[face]:
+def _seen_normal(face, a, b, c, second, third, rx, ry, rz, vertices, normals, smooth):
+    """Unit normal of a face, or between its corners' normals, on the side that the ray meets: that side is lit."""
+    if smooth[face]:
+        first = 1.0 - second - third
         nx = first * normals[a, 0] + second * normals[b, 0] + third * normals[c, 0]
         ny = first * normals[a, 1] + second * normals[b, 1] + third * normals[c, 1]
         nz = first * normals[a, 2] + second * normals[b, 2] + third * normals[c, 2]
     else:
+        ax, ay, az = vertices[a, 0], vertices[a, 1], vertices[a, 2]
+        ux, uy, uz = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
+        vx, vy, vz = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
         nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
     length = math.sqrt(nx * nx + ny * ny + nz * nz) + 1e-30
-    if nx * rx + ny * ry + nz * rz > 0:  # the side that the ray meets is lit
+    if nx * rx + ny * ry + nz * rz > 0:
         length = -length
-    nx, ny, nz = nx / length, ny / length, nz / length
-    wx = pose[0, 0] * nx + pose[0, 1] * ny + pose[0, 2] * nz
-    wy = pose[1, 0] * nx + pose[1, 1] * ny + pose[1, 2] * nz
-    wz = pose[2, 0] * nx + pose[2, 1] * ny + pose[2, 2] * nz
-    key = light[3] * max(0.0, wx * light[0] + wy * light[1] + wz * light[2])
-    ambient = light[4] + (light[5] - light[4]) * (0.5 + 0.5 * wz)
-    if len(shadows.nearest) > 0:
-        z = 1.0 / w
-        x = pose[0, 0] * rx * z + pose[0, 1] * ry * z + pose[0, 2] * rz * z + pose[0, 3]
-        y = pose[1, 0] * rx * z + pose[1, 1] * ry * z + pose[1, 2] * rz * z + pose[1, 3]
-        z = pose[2, 0] * rx * z + pose[2, 1] * ry * z + pose[2, 2] * rz * z + pose[2, 3]
-        if key > 0:
-            key *= _key_visibility(x + 0.015 * wx, y + 0.015 * wy, z + 0.015 * wz, shadows)
-        if wz > 0.3 and not scene.casts[face]:
-            hidden = _contact_shade(x, y, z, shadows)
-            ambient *= 1.0 - 0.75 * hidden
-            key *= 1.0 - 0.5 * hidden
-    ra, rb, rc = scene.color_rows[face, 0], scene.color_rows[face, 1], scene.color_rows[face, 2]
-    shade = ambient + key
-    red = shade * (first * colors[ra, 0] + second * colors[rb, 0] + third * colors[rc, 0])
-    green = shade * (first * colors[ra, 1] + second * colors[rb, 1] + third * colors[rc, 1])
-    return red, green, shade * (first * colors[ra, 2] + second * colors[rb, 2] + third * colors[rc, 2])
+    return nx / length, ny / length, nz / length
 
 
 @compiled
@@ -329,28 +312,49 @@ def resolve(
     `scene`: `Triangles`; `shadows`: `Shadows`; `light`: direction to the key light (3), its strength, the ambient light
     from below and from above. A pixel's depth and number are those of its nearest sample.
     """
+    vertices, faces, normals, smooth, casts, colors, color_rows = scene
+    axes, scale, shadow, high, low, contact, fade = shadows
+    total, rgb = samples * samples, np.empty(3)
     for row in range(color.shape[0]):
         for column in range(color.shape[1]):
-            red, green, blue, best, best_number = 0.0, 0.0, 0.0, 0.0, -1
-            for sample in range(samples * samples):
+            rgb[:] = 0.0
+            best, best_number = 0.0, -1
+            for sample in range(total):
                 v, u = row * samples + sample // samples, column * samples + sample % samples
                 face, w = index[v, u], nearness[v, u]
                 if face >= 0 and w > best:
                     best, best_number = w, face
-                if face < 0:
-                    red += background[row, 0]
-                    green += background[row, 1]
-                    blue += background[row, 2]
-                elif face >= len(scene.faces):
-                    red += point_colors[face - len(scene.faces), 0]
-                    green += point_colors[face - len(scene.faces), 1]
-                    blue += point_colors[face - len(scene.faces), 2]
-                else:
-                    shaded = _shade(face, w, rays[v, u], pose, scene, light, shadows)
-                    red, green, blue = red + shaded[0], green + shaded[1], blue + shaded[2]
-            total = samples * samples
-            color[row, column, 0] = min(255.0, red / total + 0.5)
-            color[row, column, 1] = min(255.0, green / total + 0.5)
-            color[row, column, 2] = min(255.0, blue / total + 0.5)
+                if face < 0 or face >= len(faces):
+                    for k in range(3):
+                        rgb[k] += background[row, k] if face < 0 else point_colors[face - len(faces), k]
+                    continue
+                rx, ry, rz = rays[v, u, 0], rays[v, u, 1], rays[v, u, 2]
+                a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+                second, third = _hit(rx, ry, rz, vertices, a, b, c)
+                first = 1.0 - second - third
+                nx, ny, nz = _seen_normal(face, a, b, c, second, third, rx, ry, rz, vertices, normals, smooth)
+                wx = pose[0, 0] * nx + pose[0, 1] * ny + pose[0, 2] * nz
+                wy = pose[1, 0] * nx + pose[1, 1] * ny + pose[1, 2] * nz
+                wz = pose[2, 0] * nx + pose[2, 1] * ny + pose[2, 2] * nz
+                key = light[3] * max(0.0, wx * light[0] + wy * light[1] + wz * light[2])
+                ambient = light[4] + (light[5] - light[4]) * (0.5 + 0.5 * wz)
+                if len(shadow) > 0:
+                    z = 1.0 / w
+                    x = pose[0, 0] * rx * z + pose[0, 1] * ry * z + pose[0, 2] * rz * z + pose[0, 3]
+                    y = pose[1, 0] * rx * z + pose[1, 1] * ry * z + pose[1, 2] * rz * z + pose[1, 3]
+                    z = pose[2, 0] * rx * z + pose[2, 1] * ry * z + pose[2, 2] * rz * z + pose[2, 3]
+                    if key > 0:
+                        out_x, out_y, out_z = x + 0.015 * wx, y + 0.015 * wy, z + 0.015 * wz
+                        key *= _key_visibility(out_x, out_y, out_z, axes, scale, shadow, high, low)
+                    if wz > 0.3 and not casts[face]:
+                        hidden = _contact_shade(x, y, z, axes, scale, contact, fade)
+                        ambient *= 1.0 - 0.75 * hidden
+                        key *= 1.0 - 0.5 * hidden
+                ra, rb, rc = color_rows[face, 0], color_rows[face, 1], color_rows[face, 2]
+                shade = ambient + key
+                for k in range(3):
+                    rgb[k] += shade * (first * colors[ra, k] + second * colors[rb, k] + third * colors[rc, k])
+            for k in range(3):
+                color[row, column, k] = min(255.0, rgb[k] / total + 0.5)
             depth[row, column] = 1.0 / best if best_number >= 0 else math.inf
             number[row, column] = best_number

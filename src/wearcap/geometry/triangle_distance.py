@@ -238,6 +238,7 @@ def _nearest_all(queries, tree, distance, face, point):
 @compiled
 def _nearest_bodies(queries, R, t, roots, reach_m, tree, body, distance):
     """Every body's box bounds its distance; the nearest box is searched first, the others only while they can win."""
+    _, low, high, _ = tree
     stack, reach = np.empty(128, np.int64), np.empty(128)
     bound, local = np.empty(len(roots)), np.empty((len(roots), 3))
     for q in range(len(queries)):
@@ -247,7 +248,7 @@ def _nearest_bodies(queries, R, t, roots, reach_m, tree, body, distance):
             dx, dy, dz = queries[q, 0] - t[k, 0], queries[q, 1] - t[k, 1], queries[q, 2] - t[k, 2]
             for axis in range(3):
                 local[k, axis] = R[k, 0, axis] * dx + R[k, 1, axis] * dy + R[k, 2, axis] * dz
-            bound[k] = _box_distance(local[k], tree.low[roots[k]], tree.high[roots[k]])
+            bound[k] = _box_distance(local[k], low[roots[k]], high[roots[k]])
             if first < 0 or bound[k] < bound[first]:
                 first = k
         if first < 0 or not np.isfinite(queries[q, 0] + queries[q, 1] + queries[q, 2]):
