@@ -1,7 +1,7 @@
 """Mesh decimation by quadric error: vertices collapse onto neighbours where the surface changes least."""
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy import sparse
 
 
@@ -35,7 +35,14 @@ def decimate(
     alive = len(np.unique(faces))
     while alive > keep:
         target, cost = _cheapest(vertices, faces, quadric, importance, rim)
-        chosen = np.flatnonzero(_independent(cost, faces))
+        # Vertices cheaper than all others within two edges.
+        own = lowest = cost + 1e-15 * np.arange(len(cost))
+        for _ in range(2):
+            around, wider = lowest[faces].min(1), lowest.copy()
+            for corner in range(3):
+                np.minimum.at(wider, faces[:, corner], around)
+            lowest = wider
+        chosen = np.flatnonzero(np.isfinite(own) & (own <= lowest))
         chosen = chosen[np.argsort(cost[chosen])][: alive - keep]
         if not len(chosen):
             break
@@ -78,16 +85,3 @@ def _cheapest(vertices, faces, quadric, importance, rim) -> tuple[np.ndarray, np
         gone = (onto == left) | (onto == right)
         cost[vertex[~gone & ((before * after).sum(1) <= 0.3 * size)]] = np.inf
     return target, cost
-
-
-def _independent(cost: np.ndarray, faces: np.ndarray) -> Bool[np.ndarray, "vertex"]:
-    """Vertices cheaper than all others within two edges."""
-    lowest = cost + 1e-15 * np.arange(len(cost))
-    own = lowest.copy()
-    for _ in range(2):
-        around = lowest[faces].min(1)
-        wider = lowest.copy()
-        for corner in range(3):
-            np.minimum.at(wider, faces[:, corner], around)
-        lowest = wider
-    return np.isfinite(own) & (own <= lowest)

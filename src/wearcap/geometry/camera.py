@@ -19,7 +19,7 @@ from wearcap.errors import WearcapError
 _COEFFICIENTS = {"pinhole": (0,), "opencv": (4, 5), "fisheye": (4,), "fisheye624": (12,), "ocam": (13,)}
 
 
-class LensTerms(NamedTuple):
+class _LensTerms(NamedTuple):
     """Distortion coefficients of a camera by their role."""
 
     radial: tuple[float, ...]
@@ -154,7 +154,7 @@ class Camera:
         return bent + shift + tilt, (identity + d_shift + d_tilt) @ d_bent
 
     @cached_property
-    def lens_terms(self) -> "LensTerms":
+    def lens_terms(self) -> "_LensTerms":
         """The coefficients by their role, those that the model lacks as zeros."""
         d = self.distortion
         radial, tangential, prism, affine = d, (0.0, 0.0), (0.0,) * 4, (0.0, 0.0, 1.0)
@@ -167,7 +167,9 @@ class Camera:
         step = 1 if self.model == "ocam" else 2  # a polynomial of the radius, else of its square
         slope = [1.0, *((step * (i + 1) + 1) * k for i, k in enumerate(radial))]
         rising = [r.real ** (2 / step) for r in np.roots(slope[::-1]) if abs(r.imag) < 1e-9 and r.real > 0]
-        return LensTerms(radial, tangential, prism, affine, min([math.pi**2 if self.is_fisheye else math.inf, *rising]))
+        return _LensTerms(
+            radial, tangential, prism, affine, min([math.pi**2 if self.is_fisheye else math.inf, *rising])
+        )
 
     def _invert_lens(self, target: Float[Tensor, "*batch 2"]) -> tuple[Tensor, Tensor]:
         """Plane coordinates that the lens maps to `target`, and a mask of convergence."""

@@ -84,7 +84,7 @@ def render(
     then those of the nearest sample.
     """
     fine = camera.scaled(camera.width * supersample, camera.height * supersample)
-    scene, pose = _joined(meshes), camera_from_world(T_world_cam)
+    scene, pose = _joined(meshes), _camera_from_world(T_world_cam)
     R, t = (part.detach().double().cpu().numpy() for part in (T_world_cam.R, T_world_cam.t))
     in_cam = scene._replace(vertices=(scene.vertices - t) @ R, normals=(scene.normals @ R).astype(np.float32))
     buffers = _empty_buffers(fine)
@@ -256,7 +256,7 @@ class SplatCloud:
         Depth is the point's own, along the optical axis, for fisheyes along the ray.
         """
         nearness, index = _empty_buffers(camera)
-        pose = camera_from_world(T_world_cam)
+        pose = _camera_from_world(T_world_cam)
         blocks = self.points, self.first, self.centers, self.radii + radius_m
         lens, planes = lens_numbers(camera), view_planes(camera)
         raster.draw_splats(blocks, pose, planes, lens, radius_m, True, 0, nearness, index)
@@ -280,7 +280,7 @@ def _point_depths(
     return depth
 
 
-def camera_from_world(T_world_cam: Rigid) -> Float64[np.ndarray, "3 4"]:
+def _camera_from_world(T_world_cam: Rigid) -> Float64[np.ndarray, "3 4"]:
     """[R_cam_world | t_cam_world] in double precision."""
     T_cam_world = T_world_cam.to(torch.float64).inverse()
     return np.concatenate([T_cam_world.R.cpu().numpy(), T_cam_world.t.cpu().numpy()[:, None]], 1)

@@ -107,8 +107,7 @@ class ObjectEditing:
         self._select(self._cloud.in_ball(center, radius_m), add, stroke)
 
     def clear_selection(self) -> None:
-        if len(self.selected):
-            self._step(replace(self._state, selected=np.empty(0, np.int64)))
+        self._select(self.selected, add=False)
 
     def _select(self, points: Int64[np.ndarray, "inside"], add: bool, stroke: object = None) -> None:
         if add:
