@@ -80,7 +80,7 @@ def _build(skeleton: Skeleton, shape: dict[str, float], assets: AnnyAssets) -> B
 
     def misfit(values: np.ndarray) -> np.ndarray:
         person = joint_positions(small, shaped(small, stated | dict(zip(free, values))))
-        return Fit.of(skeleton, person).log_ratios
+        return Fit(skeleton, person).log_ratios
 
     values = least_squares(misfit, np.full(len(free), 0.5), bounds=(0.0, 1.0), diff_step=0.05, max_nfev=12).x
     phenotype = stated | dict(zip(free, values.tolist()))
@@ -151,7 +151,7 @@ def _body(
     assets: AnnyAssets, skeleton: Skeleton, phenotype: dict[str, float], weights: Float[Tensor, "vertex joint"]
 ) -> BodyModel:
     person = shaped(assets, phenotype)
-    fit = Fit.of(skeleton, joint_positions(assets, person))
+    fit = Fit(skeleton, joint_positions(assets, person))
     standing = torch.from_numpy(fit_to(fit, assets, person))
     skin_joints, skin_weights_4 = four_weights(weights)
     used = torch.zeros_like(weights).scatter_(1, skin_joints, skin_weights_4)
