@@ -223,7 +223,9 @@ def test_a_trained_estimator_is_evaluated_and_edits_by_cues(data, tmp_path):
     assert (straight[0] * straight[1]).sum(-1).min() > 0.95
     assert (tmp_path / "capture" / "motion.bvh").is_file()
     assert load_visual_cues(str(manifold / "checkpoints" / "last.ckpt")).window == 80
-    with pytest.raises(WearcapError, match="a checkpoint of WatchRegression|no MotionManifold|motion_manifold|MotionManifold"):
+    with pytest.raises(
+        WearcapError, match="a checkpoint of WatchRegression|no MotionManifold|motion_manifold|MotionManifold"
+    ):
         load_visual_cues(str(run / "checkpoints" / "last.ckpt"))
 
 

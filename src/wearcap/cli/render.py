@@ -9,8 +9,8 @@ from rich import print as show
 from wearcap.body.anny_body import anny_body
 from wearcap.cli.motions import read_motions
 from wearcap.errors import WearcapError
-from wearcap.recording.store import dataset_folder, load_recording
 from wearcap.recording.motion import Motion
+from wearcap.recording.store import dataset_folder, load_recording
 from wearcap.runtime.system import CaptureInput
 from wearcap.viewer.head_path import draw_head_path
 from wearcap.viewer.objects import with_objects
