@@ -1,7 +1,7 @@
 """Forward kinematics of one sample after the other, and its gradient: loops compiled for the CPU.
 
 Why lanes: one sample's chain of 3x3 products is too small for the compiler to vectorise, and scalar code spends an
-instruction per number. Here a value is `_Lanes`: four numbers in one register, a row of a rotation in lanes 0..2 and
+instruction per number. Here a value is `Lanes`: four numbers in one register, a row of a rotation in lanes 0..2 and
 in lane 3 the translation that goes through the same sum. So one multiply-add serves a row and its translation, as
 if by 3x4 matrices [R | t], though memory holds R in nine numbers and t in three. The third row is read and written
 from one number before it, so that four lanes never reach beyond the nine.
@@ -19,15 +19,15 @@ from numba.extending import intrinsic, models, register_model
 from wearcap.geometry.compiled import compiled
 
 
-class _Lanes(types.Type):
-    """Four floats in one register."""
+class Lanes(types.Type):
+    """Four floats in one register. The name stays as it is: compiled code in numba's cache is read by it."""
 
     def __init__(self, dtype):
         self.dtype = dtype
         super().__init__(name=f"Lanes({dtype})")
 
 
-@register_model(_Lanes)
+@register_model(Lanes)
 class _LanesModel(models.PrimitiveModel):
     def __init__(self, manager, lanes):
         number = manager.lookup(lanes.dtype).get_value_type()
@@ -50,7 +50,7 @@ def _load(typingctx, array, index):
         address = _address(context, builder, signature.args[0], *args)
         return builder.load(address, align=signature.args[0].dtype.bitwidth // 8)
 
-    return _Lanes(array.dtype)(array, types.intp), codegen
+    return Lanes(array.dtype)(array, types.intp), codegen
 
 
 @intrinsic
@@ -75,7 +75,7 @@ def _spread(typingctx, array, index):
         one = builder.insert_element(undefined, number, ir.IntType(32)(0))
         return builder.shuffle_vector(one, undefined, ir.Constant(ir.VectorType(ir.IntType(32), 4), [0] * 4))
 
-    return _Lanes(array.dtype)(array, types.intp), codegen
+    return Lanes(array.dtype)(array, types.intp), codegen
 
 
 @intrinsic(prefer_literal=True)
