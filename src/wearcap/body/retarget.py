@@ -189,7 +189,7 @@ def _places(source: TPose, target: TPose, scale: float) -> dict[int, Tensor]:
 
     if len(to.spine) > 1:
         chain(column, to.spine[:-1], to.spine[-1])
-    top = to.spine[-1]
+    top = to.spine[len(to.spine) - 1]
     places[top] = column[-1] if len(to.spine) > 1 else column[0]
     if to.neck:
         chain(at_s[[neck_s, *from_s.neck[1:], from_s.head]], to.neck, to.head)
