@@ -32,8 +32,8 @@ from wearcap.cli.load import load_pipeline
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.recording import Motion, Recording
 from wearcap.recording.acts import true_acts
-from wearcap.recording.locate import dataset_folder, load_recording
 from wearcap.recording.serialize import flatten
+from wearcap.recording.store import dataset_folder, load_recording
 from wearcap.recording.timing import joined
 from wearcap.runtime.system import CaptureInput
 from wearcap.systems.echo.stream import EchoStream, EchoWearer

@@ -10,7 +10,7 @@ from hps_sessions import Session
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from wearcap.body.regions import FOOT_REGIONS
+from wearcap.body.model import FOOT_REGIONS
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.mesh import Mesh

@@ -14,7 +14,7 @@ import torch
 from wearcap.body.anny_body import anny_body
 from wearcap.files import write_text
 from wearcap.geometry.mesh import Mesh
-from wearcap.geometry.pointcloud import voxel_downsample
+from wearcap.geometry.surface import voxel_downsample
 from wearcap.io.formats.ply import Ply, read_ply, write_ply
 from wearcap.prepare.engine import content_hash
 from wearcap.prepare.simulated import source_files

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from wearcap.geometry.camera import Camera
+from wearcap.geometry.render import SplatCloud
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.splats import SplatCloud, camera_from_world
 
 CAMERA = Camera("opencv", 960, 540, 520.0, 520.0, 479.5, 269.5, (-0.05, 0.01, 0.0005, -0.0003))
 FORWARD = Rigid(torch.tensor([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), torch.zeros(3))
@@ -44,7 +44,7 @@ def building(count: int, rooms: int = 10) -> np.ndarray:
 
 def with_numpy(points: np.ndarray) -> np.ndarray:
     """The baseline: project everything, sort by depth, write one pixel per point, the nearest last."""
-    pose = camera_from_world(FORWARD)
+    pose = FORWARD.to(torch.float64).inverse().matrix()[:3].numpy()
     cam = points @ pose[:, :3].T.astype(np.float32) + pose[:, 3].astype(np.float32)
     cam, number = cam[cam[:, 2] > 0.02], np.flatnonzero(cam[:, 2] > 0.02)
     x, y = cam[:, 0] / cam[:, 2], cam[:, 1] / cam[:, 2]

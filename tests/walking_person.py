@@ -3,7 +3,7 @@
 import torch
 
 from wearcap.body.kinematics import forward_kinematics, local_rotations
-from wearcap.body.limb_ik import reach
+from wearcap.body.retarget import reach
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import about_axis, exp, log

@@ -4,15 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from wearcap.body import anny_cache
-from wearcap.body.anny_assets import coefficients, joint_positions, shaped
-from wearcap.body.anny_body import anny_body
-from wearcap.body.anny_cache import load_assets
+from wearcap.body import anny_assets
+from wearcap.body.anny_assets import coefficients, joint_positions, load_assets, shaped
+from wearcap.body.anny_body import DENSITY, anny_body
 from wearcap.body.decimate import decimate
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.retarget import fit_offsets
-from wearcap.body.shape import DENSITY, skeleton_of_height, stature
-from wearcap.body.skeleton import xsens23
+from wearcap.body.skeleton import skeleton_of_height, stature, xsens23
 from wearcap.body.skeletons import skeleton_by_name
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
@@ -154,7 +152,7 @@ def test_joints_are_means_of_their_corners():
 def test_cache_gives_the_same_and_survives_damage(tmp_path, monkeypatch):
     reads = []
     kept = load_assets(4000)
-    monkeypatch.setattr(anny_cache, "read_assets", lambda keep: reads.append(keep) or kept)
+    monkeypatch.setattr(anny_assets, "_read_assets", lambda keep: reads.append(keep) or kept)
     monkeypatch.setenv("WEARCAP_CACHE", str(tmp_path))
     load = load_assets.__wrapped__
     first, second = load(4000), load(4000)

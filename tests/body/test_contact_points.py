@@ -7,14 +7,7 @@ import torch
 
 from walking_person import walk
 from wearcap.body.anny_body import anny_body
-from wearcap.body.contact_points import (
-    BODY_POINTS,
-    HAND_POINTS,
-    contact_points,
-    hand_of_points,
-    in_t_pose,
-    mirrored_points,
-)
+from wearcap.body.contact_points import BODY_POINTS, HAND_POINTS, contact_points, in_t_pose, mirrored_points
 from wearcap.body.skeleton import xsens23
 from wearcap.body.skeletons import skeleton_by_name
 
@@ -48,7 +41,8 @@ def test_twins_are_each_others_and_mirror_images(points):
 
 
 def test_hands_have_points_of_their_own(points):
-    hands = hand_of_points()
+    first = torch.arange(HAND_POINTS)
+    hands = {"left": first, "right": first + BODY_POINTS // 2}
     for side, rows in hands.items():
         assert len(rows) == HAND_POINTS
         wrist = SKELETON.index(f"{side}_wrist")
@@ -58,7 +52,7 @@ def test_hands_have_points_of_their_own(points):
 
 def test_points_are_spread_over_the_body(points):
     at = in_t_pose(points)
-    hand = hand_of_points()["left"]
+    hand = torch.arange(HAND_POINTS)
     rest = torch.arange(len(hand), BODY_POINTS // 2)
     for rows, least in ((hand, 0.02), (rest, 0.1)):
         assert torch.pdist(at[rows]).min() > least

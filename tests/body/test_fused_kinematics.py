@@ -6,9 +6,14 @@ import sys
 import pytest
 import torch
 
-from wearcap.body import fused_kinematics
-from wearcap.body.fused_kinematics import can_fuse, fused_forward_kinematics
-from wearcap.body.kinematics import forward_kinematics, level_forward_kinematics, local_rotations
+from wearcap.body import kinematics
+from wearcap.body.kinematics import (
+    can_fuse,
+    forward_kinematics,
+    fused_forward_kinematics,
+    level_forward_kinematics,
+    local_rotations,
+)
 from wearcap.body.skeletons import skeleton_by_name
 from wearcap.geometry import rotation
 
@@ -57,7 +62,7 @@ def test_gradient_equals_the_level_versions_for_strided_inputs():
 
 @pytest.mark.parametrize("per_sample", [False, True])
 def test_threads_share_the_work_exactly(per_sample, monkeypatch):
-    monkeypatch.setattr(fused_kinematics, "_WORTH_THREADS", 1)
+    monkeypatch.setattr(kinematics, "_WORTH_THREADS", 1)
     skeleton = skeleton_by_name("xsens23")
     inputs = sample(skeleton, (1501,), torch.float32, per_sample)
     threads, results = torch.get_num_threads(), []
@@ -80,7 +85,7 @@ def joints_in_threads(inputs, results):
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs fork")
 def test_a_forked_process_has_threads_of_its_own(monkeypatch):
     """Loader workers are forked after the parent has used its threads."""
-    monkeypatch.setattr(fused_kinematics, "_WORTH_THREADS", 1)
+    monkeypatch.setattr(kinematics, "_WORTH_THREADS", 1)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     skeleton = skeleton_by_name("xsens23")
     inputs = skeleton, *sample(skeleton, (9,), torch.float64)

@@ -5,14 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from wearcap.body.head_level import head_level, with_head_face
 from wearcap.body.kinematics import forward_kinematics, local_rotations
-from wearcap.body.landmarks import landmarks
-from wearcap.body.limb_ik import reach, swing_between
-from wearcap.body.retarget import fit_offsets, retarget
+from wearcap.body.landmarks import head_level, landmarks, with_head_face
+from wearcap.body.retarget import fit_offsets, reach, retarget
 from wearcap.body.skeleton import Skeleton, xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
+from wearcap.geometry.rotation import swing_between
 
 PAIRS = [
     ("hip", "femur"),

@@ -7,14 +7,15 @@ from pathlib import Path
 import pytest
 import torch
 
+from wearcap.body.skeleton import WRISTS
 from wearcap.cli import calibrate as verb
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.formats.poses import write_tum
 from wearcap.recording import ImuStream, RecordingStore
-from wearcap.recording.locate import load_recording
+from wearcap.recording.store import load_recording
 from wearcap.sensors.clock import Clock
-from wearcap.sensors.watches import WRISTS, watches_at
+from wearcap.sensors.watches import watches_at
 from wearcap.simulation.recordings.calibration_session import (
     MARKS,
     STANDING,

@@ -14,7 +14,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.io.formats.camera_json import write_camera
 from wearcap.io.formats.motion_npz import read_motion
-from wearcap.recording.locate import load_recording
+from wearcap.recording.store import load_recording
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,8 @@ import torch
 from wearcap.errors import WearcapError
 from wearcap.geometry import raster, rotation
 from wearcap.geometry.camera import Camera
+from wearcap.geometry.render import SplatCloud, lens_numbers, view_planes
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.splats import SplatCloud, lens_numbers, view_planes
 
 CAMERAS = [
     Camera("pinhole", 64, 48, 40.0, 42.0, 30.0, 25.0),
@@ -76,10 +76,7 @@ def test_blocks_behind_and_beside_are_not_projected():
     pose = np.concatenate([np.eye(3), np.zeros((3, 1))], 1)
     picture = np.full((48, 64), -np.inf, np.float32), np.full((48, 64), -1, np.int32)
     projected = raster.draw_splats(
-        cloud.points,
-        cloud.first,
-        cloud.centers,
-        cloud.radii,
+        (cloud.points, cloud.first, cloud.centers, cloud.radii),
         pose,
         view_planes(camera),
         lens_numbers(camera),

@@ -8,7 +8,7 @@ import torch
 
 from wearcap.body.anny_body import anny_body
 from wearcap.body.kinematics import forward_kinematics
-from wearcap.body.regions import FOOT_REGIONS
+from wearcap.body.model import FOOT_REGIONS
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.surface import SurfaceIndex

@@ -5,11 +5,12 @@ import torch
 
 from bad_packets import TIMES, Mutator, bad_poses, given, unchecked
 from carried_box import boxes, carrying, drawn_echo
+from wearcap.body.skeleton import WRISTS
 from wearcap.recording import Motion
 from wearcap.recording.timing import joined
 from wearcap.sensors.packets import AGREEING
 from wearcap.systems.echo import stream as echo_stream
-from wearcap.systems.echo.stream import WRISTS, EchoStream, EchoWearer
+from wearcap.systems.echo.stream import EchoStream, EchoWearer
 
 FRAMES, FAULT = 45, 21
 

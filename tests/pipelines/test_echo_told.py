@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from carried_box import MIDDLE, box_mesh, boxes, carrying, drawn_echo, scenario_of, scene_object
+from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
@@ -15,7 +16,7 @@ from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording.acts import Act
 from wearcap.scene.environment import Environment
 from wearcap.systems.echo.features import CONTACTS
-from wearcap.systems.echo.observations import WRISTS, Observed, batch_item_of, wrist_poses
+from wearcap.systems.echo.observations import Observed, batch_item_of, wrist_poses
 from wearcap.tracking.head_path import head_path
 
 RECORDING = carrying(1.0)

@@ -8,12 +8,12 @@ import torch
 
 from bad_packets import ROTATIONS, TIMES, VECTORS, Mutator, bad_poses, given, unchecked
 from watched_walk import drawn_pipeline, watched_walk
+from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
 from wearcap.recording.timing import joined
 from wearcap.sensors.packets import AGREEING
-from wearcap.sensors.watches import WRISTS
 from wearcap.systems.mocap_every import stream as mocap_every_stream
 from wearcap.systems.mocap_every.stream import MocapEveryStream, WatchSample, Wearing
 

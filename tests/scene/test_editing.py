@@ -11,12 +11,18 @@ from hypothesis import strategies as st
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rotation import about_axis
-from wearcap.scene.editing import ObjectEditing, points_world
+from wearcap.scene.editing import (
+    ObjectEditing,
+    floor_below,
+    footprint,
+    hinge_places,
+    points_world,
+    snapped,
+    usual_freedom,
+)
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
-from wearcap.scene.placing import floor_below, footprint, hinge_places, snapped, usual_freedom
-from wearcap.scene.scan import Scan
-from wearcap.scene.selection import Box, SlicedCloud, first_hit
+from wearcap.scene.scan import Box, Scan, SlicedCloud, first_hit
 
 FLOOR_M = 0.3
 

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from wearcap.errors import WearcapError
-from wearcap.scene.floor import estimate_floor, floor_from_head
+from wearcap.scene.floor import estimate_floor
 
 
 def surface(rng, low, high, z, count):
@@ -110,16 +110,6 @@ def test_refusals():
         estimate_floor(torch.tensor([[0.0, 0.0, 5.0]]), torch.zeros(10, 3))
     with pytest.raises(WearcapError, match="no head path"):
         estimate_floor(torch.zeros(4, 3), torch.zeros(0, 3))
-    with pytest.raises(WearcapError, match="stature"):
-        floor_from_head(torch.zeros(4, 3), 175.0)
-
-
-def test_floor_from_the_eyes_alone():
-    eyes = torch.zeros(1000, 3)
-    eyes[:, 2] = 0.5 + 0.936 * 1.8
-    eyes[:300, 2] -= 0.5  # sits for a while
-    estimate = floor_from_head(eyes, 1.8)
-    assert estimate.height == pytest.approx(torch.full((1000,), 0.5), abs=1e-4)
 
 
 @pytest.mark.real

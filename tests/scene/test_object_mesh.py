@@ -7,7 +7,7 @@ import pytest
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
-from wearcap.scene.object_mesh import centered, check_object_mesh
+from wearcap.scene.objects import centered, check_object_mesh
 
 CORNERS = np.array([[x, y, z] for x in (-0.2, 0.2) for y in (-0.15, 0.15) for z in (-0.1, 0.1)], np.float32)
 FACES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5]], np.int32)

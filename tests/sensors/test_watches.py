@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from wearcap.body.skeleton import xsens23
+from wearcap.body.skeleton import WRISTS, xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis, geodesic
 from wearcap.recording import ImuStream
-from wearcap.sensors.watches import WRISTS, filtered, watches_at
+from wearcap.sensors.watches import filtered, watches_at
 from wearcap.systems.mocap_every.features import synthetic_wrists
 from wearcap_testing import swaying_motion
 

@@ -9,7 +9,7 @@ from PIL import Image
 
 from boxes import box_mesh
 from wearcap.body.anny_body import anny_body
-from wearcap.body.contact_points import BODY_POINTS, contact_points, hand_of_points
+from wearcap.body.contact_points import BODY_POINTS, HAND_POINTS, contact_points
 from wearcap.cli import render as render_verb
 from wearcap.cli.motions import read_motions
 from wearcap.cli.view import main as view
@@ -137,8 +137,9 @@ def test_truth_touches_what_it_holds():
         (local < 0).all(-1), -local.amax(-1), local.clamp_min(0).norm(dim=-1)
     )  # inside a box: to its nearest side
     assert torch.equal(truth.body_contact_prob[12] > 0.5, distance <= TOUCH_M)
-    assert (truth.body_contact_prob[12] > 0.5)[hand_of_points()["left"]].any()
-    assert not (truth.body_contact_prob > 0.5)[:, hand_of_points()["right"]].any()
+    left, right = (slice(first, first + HAND_POINTS) for first in (0, BODY_POINTS // 2))
+    assert (truth.body_contact_prob[12] > 0.5)[left].any()
+    assert not (truth.body_contact_prob > 0.5)[:, right].any()
     assert with_objects(recording).body_contact_prob is None
     untold = replace(recording, interactions=None, object_motion={})
     assert true_body_contact(untold, truth, HOUSE) is None

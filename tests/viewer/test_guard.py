@@ -26,8 +26,7 @@ from websockets.sync.client import connect
 from wearcap.errors import WearcapError
 from wearcap.io.formats.environment import FILE_NAME
 from wearcap.recording import PointCloud, Recording, RecordingStore
-from wearcap.scene.scan import Scan
-from wearcap.scene.selection import Box
+from wearcap.scene.scan import Box, Scan
 from wearcap.viewer import annotate_server
 from wearcap.viewer.annotate import Desk, Video
 from wearcap.viewer.annotate_server import MAX_CONNECTIONS, AnnotationServer

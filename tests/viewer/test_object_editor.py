@@ -15,11 +15,9 @@ from scanned_room import CHAIR, DOOR_X, DOOR_Y, SOFA, scanned_room
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.formats.environment import read_environment, write_environment
-from wearcap.scene.editing import points_world
+from wearcap.scene.editing import hinge_places, points_world
 from wearcap.scene.environment import Environment
-from wearcap.scene.placing import hinge_places
-from wearcap.scene.scan import Scan
-from wearcap.scene.selection import Box
+from wearcap.scene.scan import Box, Scan
 from wearcap.viewer.object_editor import ObjectEditor
 from wearcap.viewer.object_editor_panels import HINTS, TOOLS
 from wearcap.viewer.object_editor_view import typical_spacing

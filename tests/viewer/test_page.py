@@ -13,7 +13,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.formats.motion_npz import write_motion
 from wearcap.recording import ContactTrack, HeadStream, Motion, PointCloud, Recording, RecordingStore
-from wearcap.recording.locate import dataset_folder
+from wearcap.recording.store import dataset_folder
 from wearcap.viewer.page import CAPTURE_COLOR, Page, Timeline
 from wearcap.viewer.page_layers import AIR_COLOR, CONTACT_COLOR, nearest_frame, stick_body, surface_or_sticks
 from wearcap_browser import chromium

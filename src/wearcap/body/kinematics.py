@@ -1,15 +1,27 @@
-"""Forward kinematics: fused kernels on the CPU, elsewhere vectorised over the levels of the skeleton's tree."""
+"""Forward kinematics: fused kernels on the CPU, elsewhere vectorised over the levels of the skeleton's tree.
+
+The kernels pass once over the joints of each sample, with a backward of their own. With R_j = R_p L_j and
+t_j = t_p + R_p o_j (p the parent of j), and g the gradients, from the leaves to the root: g_L = R_pᵀ g_R,
+g_o = R_pᵀ g_t, and the parent receives g_R L_jᵀ + g_t o_jᵀ and g_t.
+"""
 
 import itertools
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body.fused_kinematics import can_fuse, fused_forward_kinematics
+from wearcap.body import kinematics_kernels
 from wearcap.body.skeleton import Skeleton
 from wearcap.geometry.rigid import Rigid
+
+_WORTH_THREADS = 1 << 16
+"""Number of joints over all samples from which several threads save more than they cost."""
 
 
 def forward_kinematics(
@@ -80,3 +92,79 @@ def local_rotations(
     R_parent = R_world_joint[..., list(skeleton.parents[1:]), :, :]
     local = R_parent.transpose(-1, -2) @ R_world_joint[..., 1:, :, :]
     return torch.cat([R_world_joint[..., :1, :, :], local], -3)
+
+
+def can_fuse(*tensors: Tensor) -> bool:
+    """Whether the kernels support the inputs: plain CPU tensors of one precision, outside compilers and transforms."""
+    first = tensors[0]
+    plain = all(
+        tensor.device.type == "cpu" and tensor.dtype == first.dtype and type(tensor) in (Tensor, torch.nn.Parameter)
+        for tensor in tensors
+    )
+    traced = torch.compiler.is_compiling() or torch.jit.is_tracing()
+    # Inside torch.func's transforms tensors have no memory to hand to a kernel.
+    transformed = torch._C._functorch.maybe_current_level() is not None  # pyright: ignore[reportAttributeAccessIssue]
+    return plain and first.dtype in (torch.float32, torch.float64) and not traced and not transformed
+
+
+def fused_forward_kinematics(
+    skeleton: Skeleton,
+    R_parent_joint: Float[Tensor, "*batch joint 3 3"],
+    t_world_root: Float[Tensor, "*batch 3"],
+    offsets: Float[Tensor, "*#batch joint 3"],
+) -> tuple[Float[Tensor, "*batch joint 3 3"], Float[Tensor, "*batch joint 3"]]:
+    """World rotations and positions (m) of all joints; differentiable once in all three inputs."""
+    batch, joints = R_parent_joint.shape[:-3], len(skeleton)
+    # Expanding raises on shapes that do not fit: the kernels check nothing.
+    R_local, t_root = R_parent_joint.expand(*batch, joints, 3, 3), t_world_root.expand(*batch, 3)
+    shared = offsets.numel() == 3 * joints
+    rows = offsets if shared else offsets.expand(*batch, joints, 3)
+    return _Fused.apply(R_local, t_root, rows, np.array(skeleton.parents))
+
+
+class _Fused(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, R_local: Tensor, t_root: Tensor, offsets: Tensor, parents: np.ndarray):
+        R_local, t_root, offsets = R_local.contiguous(), t_root.contiguous(), offsets.contiguous()
+        R, t = torch.empty_like(R_local), R_local.new_empty(R_local.shape[:-1])
+        arrays = _flat(R_local, t_root, offsets, R, t)
+        _in_parts(kinematics_kernels.forward, parents, arrays, torch.get_num_threads())
+        ctx.save_for_backward(R_local, offsets, R)
+        ctx.parents = parents
+        return R, t
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad_R: Tensor, grad_t: Tensor):
+        R_local, offsets, R = ctx.saved_tensors
+        grad_local, grad_root = torch.empty_like(R_local), R_local.new_empty((*R_local.shape[:-3], 3))
+        wants_offsets = ctx.needs_input_grad[2]
+        grad_offsets = torch.zeros_like(offsets) if wants_offsets else offsets.new_empty(0)
+        inputs = (R_local, offsets, R, grad_R.contiguous(), grad_t.contiguous())
+        arrays = _flat(*inputs, grad_local, grad_root, grad_offsets)
+        all_add_to_one = wants_offsets and offsets.numel() == 3 * len(ctx.parents)
+        threads = 1 if all_add_to_one else torch.get_num_threads()
+        _in_parts(kinematics_kernels.backward, ctx.parents, arrays, threads)
+        return grad_local, grad_root, grad_offsets if wants_offsets else None, None
+
+
+def _flat(*tensors: Tensor) -> list[np.ndarray]:
+    return [tensor.detach().numpy().reshape(-1) for tensor in tensors]
+
+
+def _in_parts(kernel: Callable, parents: np.ndarray, arrays: list[np.ndarray], threads: int) -> None:
+    """Run kernel(start, stop, parents, *arrays) over all samples, in several threads for large batches."""
+    samples = arrays[0].size // (9 * len(parents))
+    threads = threads if samples * len(parents) >= _WORTH_THREADS else 1
+    bounds = [samples * part // threads for part in range(threads + 1)]
+    # The kernels release the interpreter's lock. The calling thread takes the last part.
+    others = [_pool(os.getpid()).submit(kernel, *part, parents, *arrays) for part in itertools.pairwise(bounds[:-1])]
+    kernel(bounds[-2], bounds[-1], parents, *arrays)
+    for other in others:
+        other.result()
+
+
+@lru_cache(maxsize=1)
+def _pool(process: int) -> ThreadPoolExecutor:
+    """Thread pool of this process: a forked process does not inherit its parent's threads."""
+    return ThreadPoolExecutor(max_workers=max(1, (os.cpu_count() or 1) - 1), thread_name_prefix="kinematics")

@@ -20,7 +20,7 @@ from wearcap.geometry.compiled import compiled
 
 
 class Lanes(types.Type):
-    """Four floats in one register."""
+    """Four floats in one register. The name stays as it is: compiled code in numba's cache is read by it."""
 
     def __init__(self, dtype):
         self.dtype = dtype
@@ -43,7 +43,7 @@ def _address(context, builder, array_type, array, index, vector=True):
 
 
 @intrinsic
-def load(typingctx, array, index):
+def _load(typingctx, array, index):
     """The four numbers array[index : index + 4]."""
 
     def codegen(context, builder, signature, args):
@@ -54,7 +54,7 @@ def load(typingctx, array, index):
 
 
 @intrinsic
-def store(typingctx, array, index, lanes):
+def _store(typingctx, array, index, lanes):
     """Put the lanes to array[index : index + 4]."""
 
     def codegen(context, builder, signature, args):
@@ -66,7 +66,7 @@ def store(typingctx, array, index, lanes):
 
 
 @intrinsic
-def spread(typingctx, array, index):
+def _spread(typingctx, array, index):
     """The number array[index] in all four lanes."""
 
     def codegen(context, builder, signature, args):
@@ -79,7 +79,7 @@ def spread(typingctx, array, index):
 
 
 @intrinsic(prefer_literal=True)
-def shuffle(typingctx, low, high, a, b, c, d):
+def _shuffle(typingctx, low, high, a, b, c, d):
     """Four lanes picked, by literal numbers, from low's (0..3) and high's (4..7)."""
     picks = [pick.literal_value for pick in (a, b, c, d)]
 
@@ -90,7 +90,7 @@ def shuffle(typingctx, low, high, a, b, c, d):
 
 
 @intrinsic(prefer_literal=True)
-def store_lane(typingctx, array, index, lanes, which):
+def _store_lane(typingctx, array, index, lanes, which):
     """Put the lane of that literal number to array[index]."""
 
     def codegen(context, builder, signature, args):
@@ -102,7 +102,7 @@ def store_lane(typingctx, array, index, lanes, which):
 
 
 @intrinsic
-def plus(typingctx, a, b):
+def _plus(typingctx, a, b):
     """a + b."""
 
     def codegen(context, builder, signature, args):
@@ -112,7 +112,7 @@ def plus(typingctx, a, b):
 
 
 @intrinsic
-def times(typingctx, a, b):
+def _times(typingctx, a, b):
     """a * b."""
 
     def codegen(context, builder, signature, args):
@@ -122,7 +122,7 @@ def times(typingctx, a, b):
 
 
 @intrinsic
-def plus_times(typingctx, total, a, b):
+def _plus_times(typingctx, total, a, b):
     """total + a * b, rounded once where the processor can."""
 
     def codegen(context, builder, signature, args):
@@ -135,54 +135,54 @@ def plus_times(typingctx, total, a, b):
 
 
 @compiled
-def load_rows(array, index):
+def _load_rows(array, index):
     """Rows of the 3x3 matrix at array[index]; lane 3 is whatever stands there."""
-    last = load(array, index + 5)
-    return load(array, index), load(array, index + 3), shuffle(last, last, 1, 2, 3, 3)
+    last = _load(array, index + 5)
+    return _load(array, index), _load(array, index + 3), _shuffle(last, last, 1, 2, 3, 3)
 
 
 @compiled
-def store_rows(array, index, rows):
+def _store_rows(array, index, rows):
     """Put lanes 0..2 of three rows to the 3x3 matrix at array[index]; a row's lane 3 gives way to the next row."""
-    store(array, index, rows[0])
-    store(array, index + 3, rows[1])
-    store(array, index + 5, shuffle(rows[1], rows[2], 2, 4, 5, 6))
+    _store(array, index, rows[0])
+    _store(array, index + 3, rows[1])
+    _store(array, index + 5, _shuffle(rows[1], rows[2], 2, 4, 5, 6))
 
 
 @compiled
-def with_last(rows, array, index):
+def _with_last(rows, array, index):
     """The rows with the vector at array[index] in lane 3."""
     return (
-        shuffle(rows[0], spread(array, index), 0, 1, 2, 7),
-        shuffle(rows[1], spread(array, index + 1), 0, 1, 2, 7),
-        shuffle(rows[2], spread(array, index + 2), 0, 1, 2, 7),
+        _shuffle(rows[0], _spread(array, index), 0, 1, 2, 7),
+        _shuffle(rows[1], _spread(array, index + 1), 0, 1, 2, 7),
+        _shuffle(rows[2], _spread(array, index + 2), 0, 1, 2, 7),
     )
 
 
 @compiled
-def store_last(array, index, rows):
+def _store_last(array, index, rows):
     """Put the rows' lanes 3 to the vector at array[index]."""
-    store_lane(array, index, rows[0], 3)
-    store_lane(array, index + 1, rows[1], 3)
-    store_lane(array, index + 2, rows[2], 3)
+    _store_lane(array, index, rows[0], 3)
+    _store_lane(array, index + 1, rows[1], 3)
+    _store_lane(array, index + 2, rows[2], 3)
 
 
 @compiled
-def plus_vector(rows, array, index):
+def _plus_vector(rows, array, index):
     """The rows, to each of them the number of the vector at array[index] added: lane 3 is what counts."""
     return (
-        plus(rows[0], spread(array, index)),
-        plus(rows[1], spread(array, index + 1)),
-        plus(rows[2], spread(array, index + 2)),
+        _plus(rows[0], _spread(array, index)),
+        _plus(rows[1], _spread(array, index + 1)),
+        _plus(rows[2], _spread(array, index + 2)),
     )
 
 
 @compiled
-def mixed(array, index, step, rows):
+def _mixed(array, index, step, rows):
     """Sum over k of array[index + k * step] rows[k]."""
-    total = times(spread(array, index), rows[0])
-    total = plus_times(total, spread(array, index + step), rows[1])
-    return plus_times(total, spread(array, index + 2 * step), rows[2])
+    total = _times(_spread(array, index), rows[0])
+    total = _plus_times(total, _spread(array, index + step), rows[1])
+    return _plus_times(total, _spread(array, index + 2 * step), rows[2])
 
 
 @compiled
@@ -192,17 +192,17 @@ def forward(start, stop, parents, R_local, t_root, offsets, R, t):
     stride = 3 * joints if len(offsets) > 3 * joints else 0
     for sample in range(start, stop):
         first = sample * joints
-        store_rows(R, 9 * first, load_rows(R_local, 9 * first))
+        _store_rows(R, 9 * first, _load_rows(R_local, 9 * first))
         for axis in range(3):
-            store_lane(t, 3 * first + axis, spread(t_root, 3 * sample + axis), 0)
+            _store_lane(t, 3 * first + axis, _spread(t_root, 3 * sample + axis), 0)
         for joint in range(1, joints):
             own, above = first + joint, first + parents[joint]
-            L = with_last(load_rows(R_local, 9 * own), offsets, stride * sample + 3 * joint)
+            L = _with_last(_load_rows(R_local, 9 * own), offsets, stride * sample + 3 * joint)
             # R_p [L | o]
             at = 9 * above
-            rows = mixed(R, at, 1, L), mixed(R, at + 3, 1, L), mixed(R, at + 6, 1, L)
-            store_rows(R, 9 * own, rows)
-            store_last(t, 3 * own, plus_vector(rows, t, 3 * above))
+            rows = _mixed(R, at, 1, L), _mixed(R, at + 3, 1, L), _mixed(R, at + 6, 1, L)
+            _store_rows(R, 9 * own, rows)
+            _store_last(t, 3 * own, _plus_vector(rows, t, 3 * above))
 
 
 @compiled
@@ -212,37 +212,37 @@ def backward(start, stop, parents, R_local, offsets, R, grad_R, grad_t, grad_loc
     stride = 3 * joints if len(offsets) > 3 * joints else 0
     unit = np.zeros(4, R.dtype)
     unit[3] = 1
-    last = load(unit, 0)
+    last = _load(unit, 0)
     # One sample's gradients [g_R | g_t], to which the children add on the way to the root; they stay in the cache.
     g = np.empty(12 * joints, R.dtype)
     # From the last sample, as from the last joint: what is read in one direction is fetched ahead.
     for sample in range(stop - 1, start - 1, -1):
         first = sample * joints
         for joint in range(joints):
-            rows = with_last(load_rows(grad_R, 9 * (first + joint)), grad_t, 3 * (first + joint))
+            rows = _with_last(_load_rows(grad_R, 9 * (first + joint)), grad_t, 3 * (first + joint))
             for row in range(3):
-                store(g, 12 * joint + 4 * row, rows[row])
+                _store(g, 12 * joint + 4 * row, rows[row])
         for joint in range(joints - 1, 0, -1):
             own, offset, mine = first + joint, stride * sample + 3 * joint, 12 * joint
-            G = load(g, mine), load(g, mine + 4), load(g, mine + 8)
+            G = _load(g, mine), _load(g, mine + 4), _load(g, mine + 8)
             # R_pᵀ [g_R | g_t]
             at = 9 * (first + parents[joint])
-            rows = mixed(R, at, 3, G), mixed(R, at + 1, 3, G), mixed(R, at + 2, 3, G)
-            store_rows(grad_local, 9 * own, rows)
+            rows = _mixed(R, at, 3, G), _mixed(R, at + 1, 3, G), _mixed(R, at + 2, 3, G)
+            _store_rows(grad_local, 9 * own, rows)
             if len(grad_offsets) > 0:
-                store_last(grad_offsets, offset, plus_vector(rows, grad_offsets, offset))
+                _store_last(grad_offsets, offset, _plus_vector(rows, grad_offsets, offset))
             # Columns of L over 0, and o over 1: the parent receives [g_R Lᵀ + g_t oᵀ | g_t].
-            x, y, z = load_rows(R_local, 9 * own)
-            xy, z = shuffle(x, y, 0, 4, 1, 5), shuffle(z, last, 0, 1, 2, 4)
-            L_0, L_1 = shuffle(xy, z, 0, 1, 4, 7), shuffle(xy, z, 2, 3, 5, 7)
-            L_2 = shuffle(shuffle(x, y, 2, 6, 2, 6), z, 0, 1, 6, 7)
-            o = shuffle(load(offsets, offset - 1), last, 1, 2, 3, 7)
+            x, y, z = _load_rows(R_local, 9 * own)
+            xy, z = _shuffle(x, y, 0, 4, 1, 5), _shuffle(z, last, 0, 1, 2, 4)
+            L_0, L_1 = _shuffle(xy, z, 0, 1, 4, 7), _shuffle(xy, z, 2, 3, 5, 7)
+            L_2 = _shuffle(_shuffle(x, y, 2, 6, 2, 6), z, 0, 1, 6, 7)
+            o = _shuffle(_load(offsets, offset - 1), last, 1, 2, 3, 7)
             above = 12 * parents[joint]
             for row in range(0, 12, 4):
-                total = plus_times(load(g, above + row), spread(g, mine + row), L_0)
-                total = plus_times(total, spread(g, mine + row + 1), L_1)
-                total = plus_times(total, spread(g, mine + row + 2), L_2)
-                store(g, above + row, plus_times(total, spread(g, mine + row + 3), o))
-        G = load(g, 0), load(g, 4), load(g, 8)
-        store_rows(grad_local, 9 * first, G)
-        store_last(grad_root, 3 * sample, G)
+                total = _plus_times(_load(g, above + row), _spread(g, mine + row), L_0)
+                total = _plus_times(total, _spread(g, mine + row + 1), L_1)
+                total = _plus_times(total, _spread(g, mine + row + 2), L_2)
+                _store(g, above + row, _plus_times(total, _spread(g, mine + row + 3), o))
+        G = _load(g, 0), _load(g, 4), _load(g, 8)
+        _store_rows(grad_local, 9 * first, G)
+        _store_last(grad_root, 3 * sample, G)

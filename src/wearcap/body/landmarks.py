@@ -1,40 +1,35 @@
-"""Landmark joints of any skeleton by body part, for retargeting.
+"""What makes skeletons comparable: landmark joints by body part, the T-pose, and the direction of the face.
 
 Hips, knees, ankles, shoulders, elbows, wrists and the head are found by name; spine, neck, collars and toes by their
 position in the tree, since their number and names differ most.
 """
 
+import math
 import re
 from dataclasses import dataclass
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.body.kinematics import forward_kinematics, local_rotations
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
+from wearcap.geometry.rotation import swing_between
 
-_LEGS = (
-    ("hip", "knee", "ankle"),
-    ("femur", "tibia", "foot"),
-    ("upleg", "leg", "foot"),
-    ("thigh", "shin", "foot"),
-    ("thigh", "calf", "foot"),
-    ("upperleg", "lowerleg", "foot"),
-    ("hip", "knee", "foot"),
-    ("upleg", "lowleg", "foot"),
-)
-_ARMS = (
-    ("humerus", "radius", "hand"),
-    ("shoulder", "elbow", "wrist"),
-    ("arm", "forearm", "fingerbase"),
-    ("arm", "forearm", "hand"),
-    ("upperarm", "forearm", "hand"),
-    ("upperarm", "lowerarm", "hand"),
-    ("shldr", "forearm", "hand"),
-    ("uparm", "loarm", "hand"),
-    ("shoulder", "elbow", "hand"),
-)
+_LEGS = """hip knee ankle, femur tibia foot, upleg leg foot, thigh shin foot, thigh calf foot, upperleg lowerleg foot,
+    hip knee foot, upleg lowleg foot"""
+_ARMS = """humerus radius hand, shoulder elbow wrist, arm forearm fingerbase, arm forearm hand, upperarm forearm hand,
+    upperarm lowerarm hand, shldr forearm hand, uparm loarm hand, shoulder elbow hand"""
 """Names of (hip, knee, ankle) and (shoulder, elbow, wrist) in use: xsens and SMPL, CMU, Mixamo, Poser, Unreal …
 
 CMU's `lwrist` is the middle of the forearm (its only freedom is the forearm's twist); `lhand` is the wrist.
 """
+_SPLAY = 0.17
+"""Lateral angle (rad) of a bind pose's shins above which its feet are taken to be rolled with them."""
+_UPRIGHT = math.cos(math.radians(25))
+_NATURAL_PITCH = math.radians(7)
+"""Average downward pitch of the head of an upright person (ours)."""
 
 
 @dataclass(frozen=True)
@@ -73,22 +68,18 @@ def _ancestors(skeleton: Skeleton, joint: int) -> list[int]:
     return chain
 
 
-def _limb(by_name: dict[str, int], side: str, alternatives, skeleton: Skeleton) -> tuple[int, int, int]:
+def _limb(by_name: dict[str, int], side: str, limb: str, skeleton: Skeleton) -> tuple[int, int, int]:
+    alternatives = [names.split() for names in (_LEGS if limb == "leg" else _ARMS).split(",")]
     for names in alternatives:
         for prefix in (side, side[0]):
             first, second, third = (by_name.get(prefix + name, -1) for name in names)
             if min(first, second, third) >= 0:
                 return first, second, third
     raise WearcapError(
-        f"the {side} {'leg' if alternatives is _LEGS else 'arm'} of skeleton {skeleton.name!r} is not recognised",
+        f"the {side} {limb} of skeleton {skeleton.name!r} is not recognised",
         expected="joints named like " + " or ".join("/".join(n) for n in alternatives[:3]),
         fix=f"It has {', '.join(skeleton.joint_names)}; rename them.",
     )
-
-
-def _toe(skeleton: Skeleton, ankle: int) -> int | None:
-    children = [joint for joint, parent in enumerate(skeleton.parents) if parent == ankle]
-    return min(children, key=lambda j: -skeleton.t_parent_joint[j, 0].item(), default=None)
 
 
 def landmarks(skeleton: Skeleton) -> Landmarks:
@@ -104,9 +95,10 @@ def landmarks(skeleton: Skeleton) -> Landmarks:
     head = by_name["head"]
     limb, collar, toe, forearm = {}, {}, {}, {}
     for side in ("left", "right"):
-        limb[f"{side}_leg"] = _limb(by_name, side, _LEGS, skeleton)
-        limb[f"{side}_arm"] = _limb(by_name, side, _ARMS, skeleton)
-        toe[side] = _toe(skeleton, limb[f"{side}_leg"][2])
+        limb[f"{side}_leg"] = _limb(by_name, side, "leg", skeleton)
+        limb[f"{side}_arm"] = _limb(by_name, side, "arm", skeleton)
+        below = [joint for joint, parent in enumerate(skeleton.parents) if parent == limb[f"{side}_leg"][2]]
+        toe[side] = max(below, key=lambda joint: skeleton.t_parent_joint[joint, 0].item(), default=None)
         forearm[side] = skeleton.parents[limb[f"{side}_arm"][2]]
     above_head = _ancestors(skeleton, head)
     top = next(j for j in _ancestors(skeleton, limb["left_arm"][0]) if j in above_head)
@@ -118,3 +110,75 @@ def landmarks(skeleton: Skeleton) -> Landmarks:
         raise WearcapError(f"skeleton {skeleton.name!r} has no spine", expected="a joint between root and arms")
     neck = above_head[1 : above_head.index(top)][::-1]
     return Landmarks(0, tuple(spine), tuple(neck), head, limb, collar, toe, forearm)
+
+
+@dataclass(frozen=True)
+class TPose:
+    """A skeleton in T-pose with its root at the origin: landmarks, rotations and joint positions."""
+
+    marks: Landmarks
+    R: Float[Tensor, "joint 3 3"]
+    """Rotations from the bind pose."""
+    t: Float[Tensor, "joint 3"]
+
+    @property
+    def hip_centre(self) -> Float[Tensor, "3"]:
+        return (self.t[self.marks.limb["left_leg"][0]] + self.t[self.marks.limb["right_leg"][0]]) / 2
+
+
+def t_pose(skeleton: Skeleton) -> TPose:
+    """The T-pose, whatever the bind pose: legs straight down, arms straight sideways, all else as in the bind pose."""
+    marks = landmarks(skeleton)
+    rest = skeleton.rest_joints.double()
+    aim: dict[int, tuple[Tensor, Tensor]] = {}
+    feet = {}
+    for name, (first, second, third) in marks.limb.items():
+        y = 1.0 if name.startswith("left") else -1.0
+        direction = torch.tensor([0.0, 0.0, -1.0] if name.endswith("leg") else [0.0, y, 0.0], dtype=rest.dtype)
+        aim[first] = (rest[second] - rest[first], direction)
+        aim[second] = (rest[third] - rest[second], direction)
+        if name.endswith("leg"):
+            feet[third] = aim[second]
+    R = [torch.eye(3, dtype=rest.dtype)] * len(skeleton)
+    for joint in range(1, len(skeleton)):
+        R[joint] = R[skeleton.parents[joint]]
+        if joint in aim:
+            R[joint] = swing_between(*aim[joint])
+        elif joint in feet:
+            bone, down = feet[joint]
+            splayed = bone[1].abs() > _SPLAY * bone.norm()
+            R[joint] = swing_between(bone, down) if splayed else torch.eye(3, dtype=rest.dtype)
+    R_t = torch.stack(R)
+    local = local_rotations(skeleton, R_t)
+    t = forward_kinematics(skeleton, local, torch.zeros(3, dtype=rest.dtype)).t
+    return TPose(marks, R_t, t)
+
+
+def head_level(
+    skeleton: Skeleton, R_parent_joint: Float[Tensor, "time joint 3 3"], at_least: int = 30
+) -> Float[Tensor, "3 3"] | None:
+    """R_head_face: the constant tilt of the face in the head joint's axes, found from the upright frames.
+
+    Marker sets such as CMU's leave the head frame pitched by 5…45°, by subject. Over frames whose pelvis is
+    upright, the face is taken to look 7° down in the median and not to lean sideways; heading is not touched.
+    None if fewer than `at_least` frames are upright. For subjects with many motions, average the results.
+    """
+    origin = R_parent_joint.new_zeros(len(R_parent_joint), 3)
+    R_world = forward_kinematics(skeleton, R_parent_joint, origin).R
+    upright = R_world[:, 0, 2, 2] > _UPRIGHT
+    if int(upright.sum()) < at_least:
+        return None
+    up_head = R_world[upright, skeleton.index("head")][:, 2, :].median(0).values
+    sin, cos = math.sin(_NATURAL_PITCH), math.cos(_NATURAL_PITCH)
+    return swing_between(up_head.new_tensor([-sin, 0.0, cos]), up_head)
+
+
+def with_head_face(
+    skeleton: Skeleton, R_parent_joint: Float[Tensor, "*batch joint 3 3"], R_head_face: Float[Tensor, "3 3"]
+) -> Float[Tensor, "*batch joint 3 3"]:
+    """The motion with the head joint's axes rotated to the face's; joints above the head are unchanged."""
+    origin = R_parent_joint.new_zeros(*R_parent_joint.shape[:-3], 3)
+    R_world = forward_kinematics(skeleton, R_parent_joint, origin).R.clone()
+    head = skeleton.index("head")
+    R_world[..., head, :, :] = R_world[..., head, :, :] @ R_head_face.to(R_world)
+    return local_rotations(skeleton, R_world)

@@ -1,4 +1,4 @@
-"""Retargeting: motion from one skeleton to another, and skeletons fitted to another's bone lengths.
+"""Retargeting: motion from one skeleton to another, and skeletons fitted to another's bone lengths; two-bone inverse kinematics.
 
 A joint's *turn* is its world-axes rotation from the T-pose to the current pose. Turns are comparable between skeletons,
 whatever their bind poses, and are what retargeting transfers.
@@ -12,11 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics, local_rotations
-from wearcap.body.landmarks import Landmarks
-from wearcap.body.limb_ik import reach
+from wearcap.body.landmarks import TPose, t_pose
 from wearcap.body.skeleton import Site, Skeleton
-from wearcap.body.t_pose import TPose, t_pose
-from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.rotation import swing_between
 
 _SIDES = ("left", "right")
 
@@ -24,30 +22,14 @@ _SIDES = ("left", "right")
 # ------------------------------------------------------------------------------------------------ rotations
 
 
-def _overlaps(source: Float[Tensor, "knot_s"], target: Float[Tensor, "knot_t"]) -> Float[Tensor, "seg_t seg_s"]:
-    """Share of each target segment that overlaps each source segment, both chains scaled to length 1."""
-    source, target = source / source[-1].clamp_min(1e-9), target / target[-1].clamp_min(1e-9)
-    low = torch.maximum(target[:-1, None], source[None, :-1])
-    high = torch.minimum(target[1:, None], source[None, 1:])
-    share = (high - low).clamp_min(0) + 1e-9
-    return share / share.sum(1, keepdim=True)
-
-
 def _knots(pose: TPose, joints: tuple[int, ...], end: int) -> Float[Tensor, "knot"]:
     """Arc length at each joint of a chain and at its end."""
-    points = pose.t[[*joints, end]]
+    return _arc_lengths(pose.t[[*joints, end]])
+
+
+def _arc_lengths(points: Float[Tensor, "point 3"]) -> Float[Tensor, "point"]:
     steps = (points[1:] - points[:-1]).norm(dim=-1)
     return torch.cat([steps.new_zeros(1), steps.cumsum(0)])
-
-
-def _spread(
-    turn: Float[Tensor, "*batch joint 3 3"], share: Float[Tensor, "seg_t seg_s"]
-) -> Float[Tensor, "*batch seg_t 3 3"]:
-    """Mean turn of each target segment, weighted by its share of the source's segments."""
-    quat = roma.rotmat_to_unitquat(turn)
-    quat = torch.where((quat * quat[..., :1, :]).sum(-1, keepdim=True) < 0, -quat, quat)
-    mean = torch.einsum("ts,...sq->...tq", share.to(quat), quat)
-    return roma.unitquat_to_rotmat(torch.nn.functional.normalize(mean, dim=-1))
 
 
 def _carry(
@@ -58,9 +40,20 @@ def _carry(
     given: dict[int, Tensor] = {to.root: turn[..., from_s.root, :, :], to.head: turn[..., from_s.head, :, :]}
 
     def chain(joints_s: tuple[int, ...], end_s: int, joints_t: tuple[int, ...], end_t: int) -> None:
-        if joints_s and joints_t:
-            share = _overlaps(_knots(source, joints_s, end_s), _knots(target, joints_t, end_t))
-            given.update(zip(joints_t, _spread(turn[..., list(joints_s), :, :], share).unbind(-3)))
+        """Give each target segment the mean turn of the source's, weighted by how much of its length they overlap."""
+        if not joints_s or not joints_t:
+            return
+        knots_s, knots_t = _knots(source, joints_s, end_s), _knots(target, joints_t, end_t)
+        knots_s, knots_t = knots_s / knots_s[-1].clamp_min(1e-9), knots_t / knots_t[-1].clamp_min(1e-9)
+        low = torch.maximum(knots_t[:-1, None], knots_s[None, :-1])
+        high = torch.minimum(knots_t[1:, None], knots_s[None, 1:])
+        share = (high - low).clamp_min(0) + 1e-9
+        share = share / share.sum(1, keepdim=True)
+        quat = roma.rotmat_to_unitquat(turn[..., list(joints_s), :, :])
+        quat = torch.where((quat * quat[..., :1, :]).sum(-1, keepdim=True) < 0, -quat, quat)
+        mean = torch.einsum("ts,...sq->...tq", share.to(quat), quat)
+        turns = roma.unitquat_to_rotmat(torch.nn.functional.normalize(mean, dim=-1))
+        given.update(zip(joints_t, turns.unbind(-3)))
 
     top_s, top_t = from_s.spine[-1], to.spine[-1]
     chain(from_s.spine[:-1] or (top_s,), top_s if len(from_s.spine) > 1 else from_s.head, to.spine[:-1], top_t)
@@ -101,33 +94,45 @@ def retarget(
     centre = T_world_source.t[..., hips, :].mean(-2)
     t_root = centre - (R_world[..., 0, :, :] @ pose_t.hip_centre.to(centre)[:, None])[..., 0]
     T_world = forward_kinematics(target, local_rotations(target, R_world), t_root)
-    R_world = _landed(T_world, T_world_source.t, pose_s.marks, pose_t.marks)
-    return local_rotations(target, R_world), t_root
-
-
-def _landed(
-    T_world: Rigid, t_source: Float[Tensor, "*batch joint_s 3"], source: Landmarks, target: Landmarks
-) -> Float[Tensor, "*batch joint 3 3"]:
-    """World rotations with limbs bent so that ankles and wrists meet the source's; hands' and feet's are unchanged."""
     R = T_world.R.clone()
-    for name, (first, second, third) in target.limb.items():
+    for name, (first, second, third) in pose_t.marks.limb.items():
         # In double precision: a nearly straight limb's bend is the root of a difference of squares.
         a, b, c = (T_world.t[..., joint, :].double() for joint in (first, second, third))
-        turns = reach(a, b, c, t_source[..., source.limb[name][2], :].double())
+        turns = reach(a, b, c, T_world_source.t[..., pose_s.marks.limb[name][2], :].double())
         upper, lower = (turn.to(R) for turn in turns)
         R[..., first, :, :] = upper @ R[..., first, :, :]
         R[..., second, :, :] = lower @ R[..., second, :, :]
-        if name.endswith("arm"):
-            for joint in _between(target, name):
-                R[..., joint, :, :] = lower @ R[..., joint, :, :]
-    return R
+        twist = pose_t.marks.forearm[name.split("_")[0]]
+        if name.endswith("arm") and twist != second:  # a joint between elbow and wrist turns with the forearm
+            R[..., twist, :, :] = lower @ R[..., twist, :, :]
+    return local_rotations(target, R), t_root
 
 
-def _between(marks: Landmarks, name: str) -> list[int]:
-    """Twist joints between elbow and wrist, which turn with the forearm."""
-    _, elbow, _ = marks.limb[name]
-    forearm = marks.forearm[name.split("_")[0]]
-    return [] if forearm == elbow else [forearm]
+def reach(
+    start: Float[Tensor, "*batch 3"],
+    middle: Float[Tensor, "*batch 3"],
+    end: Float[Tensor, "*batch 3"],
+    goal: Float[Tensor, "*batch 3"],
+) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3 3"]]:
+    """World rotations to left-multiply onto those of the upper and the lower bone so that `end` reaches `goal`.
+
+    Bone lengths and the plane of the bend are kept; a goal out of reach is approached along its direction.
+    """
+    upper, lower = (middle - start).norm(dim=-1), (end - middle).norm(dim=-1)
+    aim = goal - start
+    distance = aim.norm(dim=-1)
+    near, far = (upper - lower).abs() * 1.001 + 1e-9, upper + lower
+    distance = torch.minimum(torch.maximum(distance, near), far)
+    aim = torch.nn.functional.normalize(aim, dim=-1)
+    # Turn the bend's plane with the limb before bending, so that a straight arm keeps its elbow's direction.
+    turn = swing_between(end - start, aim)
+    bend = (turn @ (middle - start)[..., None])[..., 0]
+    bend = torch.nn.functional.normalize(bend - (bend * aim).sum(-1, keepdim=True) * aim, dim=-1)
+    along = (distance**2 + upper**2 - lower**2) / (2 * distance)
+    beside = (upper**2 - along**2).clamp_min(0).sqrt()
+    elbow = start + along[..., None] * aim + beside[..., None] * bend
+    hand = start + distance[..., None] * aim
+    return swing_between(middle - start, elbow - start), swing_between(end - middle, hand - elbow)
 
 
 # ---------------------------------------------------------------------------------------------- proportions
@@ -140,7 +145,7 @@ def fit_offsets(source: Skeleton, target: Skeleton) -> Skeleton:
     Heels and toe tips are copied where the source has them, other sites scaled.
     """
     pose_s, pose_t = t_pose(source), t_pose(target)
-    scale = _size(pose_s) / _size(pose_t)
+    scale = _head_height(pose_s) / _head_height(pose_t)
     places = _places(pose_s, pose_t, float(scale))
     t = pose_t.t.clone()
     for joint, parent in enumerate(target.parents):
@@ -155,20 +160,10 @@ def fit_offsets(source: Skeleton, target: Skeleton) -> Skeleton:
     return replace(fitted, sites=_fitted_sites(source, target, pose_s, replace(pose_t, t=t), float(scale)))
 
 
-def _size(pose: TPose) -> Tensor:
+def _head_height(pose: TPose) -> Tensor:
     """Height of the head joint above the ankles (m)."""
     ankles = pose.t[[pose.marks.limb[f"{side}_leg"][2] for side in _SIDES], 2]
     return pose.t[pose.marks.head, 2] - ankles.mean()
-
-
-def _resampled(points: Float[Tensor, "point 3"], fractions: Float[Tensor, "knot"]) -> Float[Tensor, "knot 3"]:
-    """Points of a polyline at fractions of its length."""
-    steps = (points[1:] - points[:-1]).norm(dim=-1)
-    arc = torch.cat([steps.new_zeros(1), steps.cumsum(0)])
-    wanted = (fractions * arc[-1]).contiguous()
-    after = torch.searchsorted(arc, wanted).clamp(1, len(points) - 1)
-    weight = ((wanted - arc[after - 1]) / steps[after - 1].clamp_min(1e-9))[:, None]
-    return points[after - 1] * (1 - weight) + points[after] * weight
 
 
 def _places(source: TPose, target: TPose, scale: float) -> dict[int, Tensor]:
@@ -183,9 +178,14 @@ def _places(source: TPose, target: TPose, scale: float) -> dict[int, Tensor]:
     places = {to.root: target.t[to.root], to.head: at_s[from_s.head]}
 
     def chain(points: Tensor, joints: tuple[int, ...], end: int) -> None:
-        arc = _knots(target, joints, end)[:-1]
-        fractions = arc / _knots(target, joints, end)[-1].clamp_min(1e-9)
-        places.update(zip(joints, _resampled(points, fractions).unbind(0)))
+        """Place a chain's joints on a polyline, at the fractions of its length that they have in the target."""
+        knots = _knots(target, joints, end)
+        arc = _arc_lengths(points)
+        wanted = (knots[:-1] / knots[-1].clamp_min(1e-9) * arc[-1]).contiguous()
+        after = torch.searchsorted(arc, wanted).clamp(1, len(points) - 1)
+        steps = (points[1:] - points[:-1]).norm(dim=-1)
+        weight = ((wanted - arc[after - 1]) / steps[after - 1].clamp_min(1e-9))[:, None]
+        places.update(zip(joints, (points[after - 1] * (1 - weight) + points[after] * weight).unbind(0)))
 
     if len(to.spine) > 1:
         chain(column, to.spine[:-1], to.spine[-1])
@@ -227,7 +227,11 @@ def _fitted_sites(source: Skeleton, target: Skeleton, pose_s: TPose, pose_t: TPo
         if not {heel, tip} <= set(at):
             continue
         if {heel, tip} <= set(source.sites):
-            at |= {name: _on_foot(source, pose_s, pose_t, side, name) for name in (heel, tip)}
+            ankle_s, ankle_t = (pose.marks.limb[f"{side}_leg"][2] for pose in (pose_s, pose_t))
+            for name in (heel, tip):  # the same offset from the ankle
+                site, joint = source.sites[name], source.index(source.sites[name].joint)
+                offset = pose_s.R[joint] @ torch.tensor(site.t_joint_site, dtype=torch.float64)
+                at[name] = pose_s.t[joint] + offset - pose_s.t[ankle_s] + pose_t.t[ankle_t]
         # One flat sole: toe joints and the ends of toe bones lie at different heights in every file.
         sole = at[heel][2] if heel not in source.sites else torch.minimum(at[heel][2], at[tip][2])
         at |= {name: torch.cat([at[name][:2], sole[None]]) for name in (heel, tip)}
@@ -237,12 +241,3 @@ def _fitted_sites(source: Skeleton, target: Skeleton, pose_s: TPose, pose_t: TPo
         x, y, z = (pose_t.R[joint].T @ (at[name] - pose_t.t[joint])).tolist()
         sites[name] = Site(site.joint, (x, y, z))
     return sites
-
-
-def _on_foot(source: Skeleton, pose_s: TPose, pose_t: TPose, side: str, name: str) -> Float[Tensor, "3"]:
-    """T-pose position on the target of a foot site of the source: the same offset from the ankle."""
-    site = source.sites[name]
-    joint = source.index(site.joint)
-    offset = pose_s.R[joint] @ torch.tensor(site.t_joint_site, dtype=torch.float64)
-    ankle_s, ankle_t = (pose.marks.limb[f"{side}_leg"][2] for pose in (pose_s, pose_t))
-    return pose_s.t[joint] + offset - pose_s.t[ankle_s] + pose_t.t[ankle_t]

@@ -6,6 +6,7 @@ their bind pose as rest, in the same axes; `retarget` reconciles the two. Offset
 """
 
 import difflib
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -17,6 +18,12 @@ from wearcap.errors import WearcapError
 
 FOOT_PATCHES = ("left_heel", "left_toe_tip", "right_heel", "right_toe_tip")
 """Sites with floor contact labels and predictions, always in this order."""
+
+FEET = 2
+"""Number of feet: contacts by foot come in the order left, right."""
+FOOT_JOINTS = ("left_toe", "right_toe")
+"""Joint of each foot whose position and contact stand for the foot's."""
+WRISTS = ("left_wrist", "right_wrist")
 
 MIRROR = (1.0, -1.0, 1.0)
 """Factors that mirror a position left to right: y changes its sign."""
@@ -147,49 +154,55 @@ class Skeleton:
         return self.with_offsets(self.t_parent_joint * scale)
 
 
-def mirrored(rows: list[tuple[str, str, tuple[float, float, float]]]) -> list:
+def mirrored(rows: Sequence) -> list[tuple[str, str, tuple[float, float, float]]]:
     """The right side's rows (y negated, left→right in names) for rows that describe the left side."""
-    swap = lambda name: name.replace("left", "right")  # noqa: E731
-    return [(swap(name), swap(parent), (x, -y, z)) for name, parent, (x, y, z) in rows]
+    return [(n.replace("left", "right"), p.replace("left", "right"), (x, -y, z)) for n, p, (x, y, z) in rows]
 
 
-def build_skeleton(name: str, rows: list, sites: list) -> Skeleton:
-    """A skeleton from rows (joint, parent, offset); left-hand sites (name, joint, offset) get right-hand twins."""
+def build_skeleton(name: str, rows: Sequence, left_toe: str | None = None) -> Skeleton:
+    """A skeleton from rows (joint, parent, offset), with sites where `left_toe` names the joint of the left toes."""
     names = tuple(row[0] for row in rows)
     parents = tuple(names.index(row[1]) if row[1] else -1 for row in rows)
-    offsets = torch.tensor([row[2] for row in rows])
-    table = {site: Site(joint, offset) for site, joint, offset in [*sites, *mirrored(sites)]}
-    table["crown"] = Site("head", (0.02, 0.0, 0.185))
-    return Skeleton(name, names, parents, offsets, table)
+    skeleton = Skeleton(name, names, parents, torch.tensor([row[2] for row in rows]))
+    if left_toe is None:
+        return skeleton
+    left = [
+        ("left_heel", "left_ankle", (-0.050, 0.0, -0.080)), ("left_toe_tip", left_toe, (0.070, 0.0, -0.018)),
+        ("left_fingertip", "left_wrist", (0.0, 0.185, 0.0)), ("left_palm", "left_wrist", (0.0, 0.080, -0.015)),
+    ]  # fmt: skip
+    sites = {site: Site(joint, offset) for site, joint, offset in [*left, *mirrored(left)]}
+    return replace(skeleton, sites=sites | {"crown": Site("head", (0.02, 0.0, 0.185))})
 
 
 def xsens23() -> Skeleton:
     """Xsens MVN's 23 segments, named by the joint at each segment's origin, at the size of a 1.75 m adult."""
     arm = [
-        ("left_collar", "t8", (0.0, 0.035, 0.085)),
-        ("left_shoulder", "left_collar", (0.0, 0.145, 0.0)),
-        ("left_elbow", "left_shoulder", (0.0, 0.290, 0.0)),
-        ("left_wrist", "left_elbow", (0.0, 0.250, 0.0)),
-    ]
+        ("left_collar", "t8", (0.0, 0.035, 0.085)), ("left_shoulder", "left_collar", (0.0, 0.145, 0.0)),
+        ("left_elbow", "left_shoulder", (0.0, 0.290, 0.0)), ("left_wrist", "left_elbow", (0.0, 0.250, 0.0)),
+    ]  # fmt: skip
     leg = [
-        ("left_hip", "pelvis", (0.0, 0.085, 0.0)),
-        ("left_knee", "left_hip", (0.0, 0.0, -0.430)),
-        ("left_ankle", "left_knee", (0.0, 0.0, -0.420)),
-        ("left_toe", "left_ankle", (0.155, 0.0, -0.062)),
-    ]
+        ("left_hip", "pelvis", (0.0, 0.085, 0.0)), ("left_knee", "left_hip", (0.0, 0.0, -0.430)),
+        ("left_ankle", "left_knee", (0.0, 0.0, -0.420)), ("left_toe", "left_ankle", (0.155, 0.0, -0.062)),
+    ]  # fmt: skip
     spine = [
-        ("pelvis", "", (0.0, 0.0, 0.0)),
-        ("l5", "pelvis", (0.0, 0.0, 0.095)),
-        ("l3", "l5", (0.0, 0.0, 0.105)),
-        ("t12", "l3", (0.0, 0.0, 0.095)),
-        ("t8", "t12", (0.0, 0.0, 0.095)),
-        ("neck", "t8", (0.0, 0.0, 0.135)),
+        ("pelvis", "", (0.0, 0.0, 0.0)), ("l5", "pelvis", (0.0, 0.0, 0.095)), ("l3", "l5", (0.0, 0.0, 0.105)),
+        ("t12", "l3", (0.0, 0.0, 0.095)), ("t8", "t12", (0.0, 0.0, 0.095)), ("neck", "t8", (0.0, 0.0, 0.135)),
         ("head", "neck", (0.0, 0.0, 0.090)),
-    ]
-    sites = [
-        ("left_heel", "left_ankle", (-0.050, 0.0, -0.080)),
-        ("left_toe_tip", "left_toe", (0.070, 0.0, -0.018)),
-        ("left_fingertip", "left_wrist", (0.0, 0.185, 0.0)),
-        ("left_palm", "left_wrist", (0.0, 0.080, -0.015)),
-    ]
-    return build_skeleton("xsens23", [*spine, *mirrored(arm), *arm, *mirrored(leg), *leg], sites)
+    ]  # fmt: skip
+    rows = [*spine, *mirrored(arm), *arm, *mirrored(leg), *leg]
+    return build_skeleton("xsens23", rows, "left_toe")
+
+
+def stature(skeleton: Skeleton) -> float:
+    """Height (m) of a person with this skeleton, from soles to crown."""
+    points = skeleton.rest_sites.values()
+    top = max([skeleton.rest_joints[:, 2].max().item(), *(point[2].item() for point in points)])
+    return top + skeleton.root_height
+
+
+def skeleton_of_height(height_m: float, skeleton: Skeleton | None = None) -> Skeleton:
+    """A skeleton (xsens23 by default) scaled to a person's height. Raises WearcapError outside 0.5…2.6 m."""
+    if not 0.5 <= height_m <= 2.6:
+        raise WearcapError(f"a height of {height_m} m", expected="0.5 to 2.6 m")
+    skeleton = skeleton or xsens23()
+    return skeleton.scaled(height_m / stature(skeleton))

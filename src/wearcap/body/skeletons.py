@@ -16,34 +16,20 @@ from wearcap.geometry.rotation import about_axis
 
 _SMPL_BODY = (
     ("pelvis", "", (0.0, 0.0, 0.0)),
-    ("left_hip", "pelvis", (0.0, 0.085, -0.075)),
-    ("right_hip", "pelvis", (0.0, -0.085, -0.075)),
+    ("left_hip", "pelvis", (0.0, 0.085, -0.075)), ("right_hip", "pelvis", (0.0, -0.085, -0.075)),
     ("spine1", "pelvis", (0.0, 0.0, 0.110)),
-    ("left_knee", "left_hip", (0.0, 0.0, -0.430)),
-    ("right_knee", "right_hip", (0.0, 0.0, -0.430)),
+    ("left_knee", "left_hip", (0.0, 0.0, -0.430)), ("right_knee", "right_hip", (0.0, 0.0, -0.430)),
     ("spine2", "spine1", (0.0, 0.0, 0.110)),
-    ("left_ankle", "left_knee", (0.0, 0.0, -0.420)),
-    ("right_ankle", "right_knee", (0.0, 0.0, -0.420)),
+    ("left_ankle", "left_knee", (0.0, 0.0, -0.420)), ("right_ankle", "right_knee", (0.0, 0.0, -0.420)),
     ("spine3", "spine2", (0.0, 0.0, 0.095)),
-    ("left_foot", "left_ankle", (0.155, 0.0, -0.062)),
-    ("right_foot", "right_ankle", (0.155, 0.0, -0.062)),
+    ("left_foot", "left_ankle", (0.155, 0.0, -0.062)), ("right_foot", "right_ankle", (0.155, 0.0, -0.062)),
     ("neck", "spine3", (0.0, 0.0, 0.135)),
-    ("left_collar", "spine3", (0.0, 0.035, 0.085)),
-    ("right_collar", "spine3", (0.0, -0.035, 0.085)),
+    ("left_collar", "spine3", (0.0, 0.035, 0.085)), ("right_collar", "spine3", (0.0, -0.035, 0.085)),
     ("head", "neck", (0.0, 0.0, 0.090)),
-    ("left_shoulder", "left_collar", (0.0, 0.145, 0.0)),
-    ("right_shoulder", "right_collar", (0.0, -0.145, 0.0)),
-    ("left_elbow", "left_shoulder", (0.0, 0.290, 0.0)),
-    ("right_elbow", "right_shoulder", (0.0, -0.290, 0.0)),
-    ("left_wrist", "left_elbow", (0.0, 0.250, 0.0)),
-    ("right_wrist", "right_elbow", (0.0, -0.250, 0.0)),
-)
-_SMPL_SITES = (
-    ("left_heel", "left_ankle", (-0.050, 0.0, -0.080)),
-    ("left_toe_tip", "left_foot", (0.070, 0.0, -0.018)),
-    ("left_fingertip", "left_wrist", (0.0, 0.185, 0.0)),
-    ("left_palm", "left_wrist", (0.0, 0.080, -0.015)),
-)
+    ("left_shoulder", "left_collar", (0.0, 0.145, 0.0)), ("right_shoulder", "right_collar", (0.0, -0.145, 0.0)),
+    ("left_elbow", "left_shoulder", (0.0, 0.290, 0.0)), ("right_elbow", "right_shoulder", (0.0, -0.290, 0.0)),
+    ("left_wrist", "left_elbow", (0.0, 0.250, 0.0)), ("right_wrist", "right_elbow", (0.0, -0.250, 0.0)),
+)  # fmt: skip
 _FINGERS = {
     "index": ((0.025, 0.085, 0.0), 0.032),
     "middle": ((0.003, 0.088, 0.0), 0.034),
@@ -68,18 +54,18 @@ def _hand(side: str) -> list[tuple[str, str, tuple[float, float, float]]]:
 
 def smplx22() -> Skeleton:
     """SMPL-X's (and SMPL+H's) root and 21 body joints."""
-    return build_skeleton("smplx22", list(_SMPL_BODY), list(_SMPL_SITES))
+    return build_skeleton("smplx22", _SMPL_BODY, "left_foot")
 
 
 def smpl24() -> Skeleton:
     """SMPL's 24 joints."""
     hands = [("left_hand", "left_wrist", (0.0, 0.080, 0.0)), ("right_hand", "right_wrist", (0.0, -0.080, 0.0))]
-    return build_skeleton("smpl24", [*_SMPL_BODY, *hands], list(_SMPL_SITES))
+    return build_skeleton("smpl24", [*_SMPL_BODY, *hands], "left_foot")
 
 
 def smplh52() -> Skeleton:
     """SMPL+H's 52 joints: the body and fifteen finger joints of each hand."""
-    return build_skeleton("smplh52", [*_SMPL_BODY, *_hand("left"), *_hand("right")], list(_SMPL_SITES))
+    return build_skeleton("smplh52", [*_SMPL_BODY, *_hand("left"), *_hand("right")], "left_foot")
 
 
 def _cmu_side(letter: str) -> list[tuple[str, str, tuple[float, float, float]]]:
@@ -107,7 +93,7 @@ def cmu31() -> Skeleton:
     ]  # fmt: skip
     left, right = _cmu_side("l"), _cmu_side("r")
     rows = [spine[0], *left[:5], *right[:5], *spine[1:], *left[5:], *right[5:]]
-    upright = replace(build_skeleton("cmu31", rows, []), sites={})
+    upright = build_skeleton("cmu31", rows)
     R = torch.eye(3).repeat(len(upright), 1, 1)
     splay = torch.tensor(20.0).deg2rad()
     R[upright.index("lfemur")], R[upright.index("rfemur")] = about_axis("x", splay), about_axis("x", -splay)

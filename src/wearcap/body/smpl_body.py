@@ -6,8 +6,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from wearcap.body.model import BodyModel, four_weights
-from wearcap.body.regions import contact_regions
+from wearcap.body.model import BodyModel, contact_regions, four_weights
 from wearcap.body.skeleton import Site, Skeleton
 from wearcap.body.skeletons import skeleton_by_name
 from wearcap.errors import WearcapError
@@ -49,7 +48,9 @@ def smpl_body(arrays: SmplArrays, betas: Float[Tensor, "beta"] | None = None) ->
     joints = arrays.joint_regressor @ vertices
     vertices, joints = ((points - joints[0]) @ _WORLD_MODEL.to(points).T for points in (vertices, joints))
     named = skeleton_by_name(_SKELETON_OF[count])
-    carrier = _carriers(arrays.parents, len(named))
+    carrier = list(range(count))  # the nearest ancestor that the skeleton keeps, for each joint of the file
+    for joint in range(len(named), count):
+        carrier[joint] = carrier[arrays.parents[joint]]
     weights = arrays.weights.new_zeros(len(vertices), len(named)).index_add_(1, torch.tensor(carrier), arrays.weights)
     if arrays.parents[: len(named)] != named.parents:
         raise WearcapError(f"a joint tree other than {named.name}'s", expected="an SMPL family file")
@@ -60,16 +61,11 @@ def smpl_body(arrays: SmplArrays, betas: Float[Tensor, "beta"] | None = None) ->
     skeleton = replace(skeleton, sites=skeleton.sites | _surface_sites(skeleton, vertices, regions))
     blend = None
     if arrays.pose_directions is not None:
-        blend = _pose_blend(arrays.pose_directions, len(named)).float()
+        # In our axes, per entry of our (R_parent_joint - I), of the joints that the skeleton keeps.
+        P = _WORLD_MODEL.to(arrays.pose_directions)
+        entries = arrays.pose_directions.unflatten(-1, (-1, 3, 3))[..., : len(named) - 1, :, :]
+        blend = torch.einsum("dc,vcjab,ka,lb->jklvd", P, entries, P, P).flatten(0, 2).float()
     return BodyModel(skeleton, vertices.float(), arrays.faces, skin_joints, skin_weights.float(), regions, blend)
-
-
-def _carriers(parents: tuple[int, ...], kept: int) -> list[int]:
-    """The nearest ancestor that the skeleton keeps, for each joint of the file."""
-    carrier = list(range(len(parents)))
-    for joint in range(kept, len(parents)):
-        carrier[joint] = carrier[parents[joint]]
-    return carrier
 
 
 def _surface_sites(
@@ -87,11 +83,3 @@ def _surface_sites(
         x, y, z = (place - skeleton.rest_joints[skeleton.index(joint)]).tolist()
         sites[name] = Site(joint, (x, y, z))
     return sites
-
-
-def _pose_blend(directions: Float[Tensor, "vertex 3 feature"], kept: int) -> Float[Tensor, "feature_kept vertex 3"]:
-    """Pose offsets in our axes, per entry of our (R_parent_joint - I), of the joints that the skeleton keeps."""
-    P = _WORLD_MODEL.to(directions)
-    entries = directions.unflatten(-1, (-1, 3, 3))[..., : kept - 1, :, :]
-    turned = torch.einsum("dc,vcjab,ka,lb->jklvd", P, entries, P, P)
-    return turned.flatten(0, 2)

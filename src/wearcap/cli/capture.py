@@ -26,7 +26,7 @@ from wearcap.io.formats.motion_npz import write_motion
 from wearcap.io.formats.scene_folder import cloud_file, read_scan
 from wearcap.io.formats.smpl import read_smpl
 from wearcap.recording import Motion, Recording
-from wearcap.recording.locate import dataset_folder, load_recording
+from wearcap.recording.store import dataset_folder, load_recording
 from wearcap.runtime.system import CaptureInput, StageOptions, System
 from wearcap.scene.environment import Environment
 from wearcap.viewer.objects import with_objects

@@ -9,8 +9,8 @@ from rich import print as show
 from wearcap.body.anny_body import anny_body
 from wearcap.cli.motions import read_motions
 from wearcap.errors import WearcapError
-from wearcap.recording.locate import dataset_folder, load_recording
 from wearcap.recording.motion import Motion
+from wearcap.recording.store import dataset_folder, load_recording
 from wearcap.runtime.system import CaptureInput
 from wearcap.viewer.objects import with_objects
 from wearcap.viewer.picture import contact_sheet, draw_head_path, save_png, shared_frames, write_video

@@ -26,7 +26,7 @@ def main(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
 
     from wearcap.cli.motions import read_motions
-    from wearcap.recording.locate import dataset_folder, load_recording
+    from wearcap.recording.store import dataset_folder, load_recording
     from wearcap.runtime.system import CaptureInput
     from wearcap.viewer.page import Page
 

@@ -6,7 +6,6 @@ from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
 
-FEET = 2
 LIMBS = {
     "stature": (),
     "leg": ("left_knee", "left_ankle"),

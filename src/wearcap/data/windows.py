@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
-from wearcap.body.skeleton import FOOT_PATCHES, MIRROR, Skeleton
-from wearcap.data.features import FEET, body_size
+from wearcap.body.skeleton import FEET, FOOT_PATCHES, MIRROR, Skeleton
+from wearcap.data.features import body_size
 from wearcap.data.surroundings import NOTHING, Surroundings
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid

@@ -12,8 +12,7 @@ from pathlib import Path
 from wearcap.errors import WearcapError
 from wearcap.export.read import load_exported
 from wearcap.recording import Recording
-from wearcap.recording.locate import dataset_folder
-from wearcap.recording.store import RecordingFile, save_recording
+from wearcap.recording.store import RecordingFile, dataset_folder, save_recording
 from wearcap.runtime.system import CaptureInput, System
 
 

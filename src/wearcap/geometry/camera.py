@@ -7,6 +7,7 @@ Every model projects a point to `focal * lens(m) + centre`. The plane coordinate
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,6 +17,19 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 
 _COEFFICIENTS = {"pinhole": (0,), "opencv": (4, 5), "fisheye": (4,), "fisheye624": (12,), "ocam": (13,)}
+
+
+class _LensTerms(NamedTuple):
+    """Distortion coefficients of a camera by their role."""
+
+    radial: tuple[float, ...]
+    tangential: tuple[float, float]
+    """OpenCV's (p2, p1); Project Aria's in the file's order."""
+    prism: tuple[float, ...]
+    affine: tuple[float, float, float]
+    """OCamCalib's (e, d, c)."""
+    fold: float
+    """Square of the largest undistorted radius (or angle) up to which the radial polynomial is increasing."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +91,19 @@ class Camera:
 
         Differentiable in the points. Invalid pixels are finite but meaningless.
         """
-        plane, seen = self._to_plane(points_cam)
+        xy, z = points_cam[..., :2], points_cam[..., 2]
+        if self.is_fisheye:
+            square = (xy**2).sum(-1)
+            on_axis = square < 1e-18
+            radius = torch.where(on_axis, 1.0, square).sqrt()
+            theta = torch.atan2(radius, z)
+            scale = torch.where(on_axis, 1 / torch.where(z.abs() < 1e-9, 1.0, z), theta / radius)
+            plane, behind = xy * scale[..., None], on_axis & (z <= 0)
+            seen = ~behind & (torch.where(on_axis, 0.0, theta) ** 2 < self.lens_terms.fold)
+        else:
+            ahead = z > 1e-6
+            plane = xy / torch.where(ahead, z, 1.0)[..., None]
+            seen = ahead & ((plane**2).sum(-1) < self.lens_terms.fold)
         distorted, _ = self._lens(plane)
         pixels = distorted * plane.new_tensor([self.fx, self.fy]) + plane.new_tensor([self.cx, self.cy])
         x, y = pixels.unbind(-1)
@@ -98,24 +124,6 @@ class Camera:
                 rest = self._lens(root)[0]
             plane = root + (step @ (target - rest)[..., None])[..., 0]
             plane = torch.where(found[..., None], plane, torch.nan)
-        return self._from_plane(plane)
-
-    def _to_plane(self, points: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor]:
-        """Plane coordinates of points, and a mask of those within the lens's field of view."""
-        xy, z = points[..., :2], points[..., 2]
-        if not self.is_fisheye:
-            ahead = z > 1e-6
-            plane = xy / torch.where(ahead, z, 1.0)[..., None]
-            return plane, ahead & ((plane**2).sum(-1) < self._fold)
-        square = (xy**2).sum(-1)
-        on_axis = square < 1e-18
-        radius = torch.where(on_axis, 1.0, square).sqrt()
-        theta = torch.atan2(radius, z)
-        scale = torch.where(on_axis, 1 / torch.where(z.abs() < 1e-9, 1.0, z), theta / radius)
-        behind = on_axis & (z <= 0)
-        return xy * scale[..., None], ~behind & (torch.where(on_axis, 0.0, theta) ** 2 < self._fold)
-
-    def _from_plane(self, plane: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
         if not self.is_fisheye:
             ray = torch.cat([plane, torch.ones_like(plane[..., :1])], -1)
             return torch.nn.functional.normalize(ray, dim=-1)
@@ -127,47 +135,45 @@ class Camera:
 
     def _lens(self, plane: Float[Tensor, "*batch 2"]) -> tuple[Tensor, Tensor]:
         """Distorted plane coordinates "*batch 2" and their Jacobian "*batch 2 2"."""
+        terms = self.lens_terms
+        bent, d_bent = _radial(plane, terms.radial, of_square=self.model != "ocam")
         if self.model == "ocam":
-            (c, d, e), powers = self.distortion[:3], self.distortion[3:]
-            bent, d_bent = _radial_odd_and_even(plane, powers)
+            e, d, c = terms.affine
             affine = plane.new_tensor([[1.0, e], [d, c]])  # OCamCalib counts rows first, we count columns first
             return bent @ affine.T, affine @ d_bent
-        radial, (first, second), prism = self._terms
-        bent, d_bent = _radial(plane, radial)
         if self.model == "opencv":  # the tangential term sees the undistorted point
-            shift, d_shift = _tangential(plane, (second, first))
+            shift, d_shift = _tangential(plane, terms.tangential)
             return bent + shift, d_bent + d_shift
-        shift, d_shift = _tangential(bent, (first, second))
-        tilt, d_tilt = _thin_prism(bent, prism)
+        shift, d_shift = _tangential(bent, terms.tangential)
+        # Thin prism: (s0 s + s1 s², s2 s + s3 s²), s = |bent|².
+        s = (bent**2).sum(-1, keepdim=True)
+        first, second = bent.new_tensor(terms.prism[0::2]), bent.new_tensor(terms.prism[1::2])
+        tilt = first * s + second * s**2
+        d_tilt = (2 * first + 4 * second * s)[..., :, None] * bent[..., None, :]
         identity = torch.eye(2, dtype=plane.dtype, device=plane.device)
         return bent + shift + tilt, (identity + d_shift + d_tilt) @ d_bent
 
     @cached_property
-    def _terms(self) -> tuple[tuple[float, ...], tuple[float, float], tuple[float, ...]]:
-        """(radial coefficients, the two tangential ones as written in the file, thin-prism ones)."""
+    def lens_terms(self) -> "_LensTerms":
+        """The coefficients by their role, those that the model lacks as zeros."""
         d = self.distortion
+        radial, tangential, prism, affine = d, (0.0, 0.0), (0.0,) * 4, (0.0, 0.0, 1.0)
         if self.model == "opencv":
-            return (*d[:2], *d[4:]), (d[2], d[3]), (0.0,) * 4
-        if self.model == "fisheye624":
-            return d[:6], (d[6], d[7]), d[8:]
-        return d, (0.0, 0.0), (0.0,) * 4
-
-    @cached_property
-    def _fold(self) -> float:
-        """Square of the largest undistorted radius (or angle) up to which the radial polynomial is increasing."""
-        if self.model == "ocam":
-            slope = [1.0, *((i + 2) * k for i, k in enumerate(self.distortion[3:]))]
-        else:
-            slope = [1.0, *((2 * i + 3) * k for i, k in enumerate(self._terms[0]))]
-        roots = np.roots(slope[::-1])
-        rising = [root.real for root in roots if abs(root.imag) < 1e-9 and root.real > 0]
-        if self.model == "ocam":  # a polynomial of the radius, not of its square
-            rising = [root**2 for root in rising]
-        return min([math.pi**2 if self.is_fisheye else math.inf, *rising])
+            radial, tangential = (*d[:2], *d[4:]), (d[3], d[2])
+        elif self.model == "fisheye624":
+            radial, tangential, prism = d[:6], (d[6], d[7]), d[8:]
+        elif self.model == "ocam":
+            radial, affine = d[3:], (d[2], d[1], d[0])
+        step = 1 if self.model == "ocam" else 2  # a polynomial of the radius, else of its square
+        slope = [1.0, *((step * (i + 1) + 1) * k for i, k in enumerate(radial))]
+        rising = [r.real ** (2 / step) for r in np.roots(slope[::-1]) if abs(r.imag) < 1e-9 and r.real > 0]
+        return _LensTerms(
+            radial, tangential, prism, affine, min([math.pi**2 if self.is_fisheye else math.inf, *rising])
+        )
 
     def _invert_lens(self, target: Float[Tensor, "*batch 2"]) -> tuple[Tensor, Tensor]:
         """Plane coordinates that the lens maps to `target`, and a mask of convergence."""
-        limit = min(0.999 * math.sqrt(self._fold), 1e3)
+        limit = min(0.999 * math.sqrt(self.lens_terms.fold), 1e3)
         plane = target
         for _ in range(25):
             plane = plane * (limit / plane.norm(dim=-1, keepdim=True).clamp(min=limit))
@@ -175,30 +181,19 @@ class Camera:
             plane = plane - torch.linalg.solve_ex(jacobian, value - target)[0]
         tolerance = 1e4 * torch.finfo(target.dtype).eps
         close = ((self._lens(plane)[0] - target).abs() < tolerance).all(-1)
-        found = close & ((plane**2).sum(-1) < self._fold)
+        found = close & ((plane**2).sum(-1) < self.lens_terms.fold)
         return torch.where(found[..., None], plane, torch.zeros_like(plane)), found
 
 
-def _radial(m: Tensor, coefficients: tuple[float, ...]) -> tuple[Tensor, Tensor]:
-    """m (1 + k1 s + k2 s² + …), s = |m|², and its Jacobian."""
-    s = (m**2).sum(-1, keepdim=True)
+def _radial(m: Tensor, coefficients: tuple[float, ...], of_square: bool) -> tuple[Tensor, Tensor]:
+    """m (1 + k1 s + k2 s² + …), s = |m|² or, not `of_square`, |m|; and its Jacobian."""
+    s = (m**2).sum(-1, keepdim=True) if of_square else m.norm(dim=-1, keepdim=True)
     gain, slope = torch.zeros_like(s), torch.zeros_like(s)
     for k in reversed((1.0, *coefficients)):
         slope = slope * s + gain
         gain = gain * s + k
     identity = torch.eye(2, dtype=m.dtype, device=m.device)
-    return m * gain, gain[..., None] * identity + 2 * slope[..., None] * m[..., :, None] * m[..., None, :]
-
-
-def _radial_odd_and_even(m: Tensor, coefficients: tuple[float, ...]) -> tuple[Tensor, Tensor]:
-    """m (1 + k1 r + k2 r² + …), r = |m|, and its Jacobian."""
-    r = m.norm(dim=-1, keepdim=True)
-    gain, slope = torch.zeros_like(r), torch.zeros_like(r)
-    for k in reversed((1.0, *coefficients)):
-        slope = slope * r + gain
-        gain = gain * r + k
-    identity = torch.eye(2, dtype=m.dtype, device=m.device)
-    along = slope / r.clamp(min=torch.finfo(m.dtype).tiny)
+    along = 2 * slope if of_square else slope / s.clamp(min=torch.finfo(m.dtype).tiny)
     return m * gain, gain[..., None] * identity + along[..., None] * m[..., :, None] * m[..., None, :]
 
 
@@ -209,10 +204,3 @@ def _tangential(m: Tensor, coefficients: tuple[float, float]) -> tuple[Tensor, T
     identity = torch.eye(2, dtype=m.dtype, device=m.device)
     outer = m[..., :, None] * q + q[:, None] * m[..., None, :]
     return 2 * along * m + (m**2).sum(-1, keepdim=True) * q, 2 * (outer + along[..., None] * identity)
-
-
-def _thin_prism(m: Tensor, coefficients: tuple[float, ...]) -> tuple[Tensor, Tensor]:
-    """(s0 s + s1 s², s2 s + s3 s²), s = |m|², and its Jacobian."""
-    s = (m**2).sum(-1, keepdim=True)
-    first, second = m.new_tensor(coefficients[0::2]), m.new_tensor(coefficients[1::2])
-    return first * s + second * s**2, (2 * first + 4 * second * s)[..., :, None] * m[..., None, :]

@@ -5,13 +5,53 @@ a plane, so that interpolating it is exact), the height towards the light for or
 """
 
 import math
+from typing import NamedTuple
+
+import numpy as np
 
 from wearcap.geometry.compiled import compiled
 
 
+class Triangles(NamedTuple):
+    """Arrays of all triangles of a picture; vertices and normals in the camera's axes where they are shaded."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray
+    """Of each vertex, float32."""
+    smooth: np.ndarray
+    """Whether a face is shaded with its vertices' normals."""
+    casts: np.ndarray
+    """Whether a face casts shadows."""
+    colors: np.ndarray
+    """Table of RGB 0…255, float32."""
+    color_rows: np.ndarray
+    """Row of the table for each corner of each face."""
+
+
+class Shadows(NamedTuple):
+    """Height maps of what casts shadows: towards the key light and from below. Empty maps cast none."""
+
+    axes: np.ndarray = np.zeros((6, 4))
+    """Rows of the two maps: right, up, towards the viewer, each with its offset."""
+    scale: float = 1.0
+    """Texels per metre."""
+    nearest: np.ndarray = np.zeros((0, 0), np.float32)
+    high: np.ndarray = np.zeros((0, 0), np.float32)
+    low: np.ndarray = np.zeros((0, 0), np.float32)
+    """Extremes of `nearest` over the 4 x 4 texels of a query, which decide most pixels at once."""
+    contact: np.ndarray = np.zeros((0, 0), np.float32)
+    """exp(height / fade) of the surfaces seen from below, blurred."""
+    fade: float = 1.0
+    """Height (m) over which a contact shade loses 63 % of its strength."""
+
+
 @compiled
-def fill_triangle(x0, y0, w0, x1, y1, w1, x2, y2, w2, number, nearness, index):
-    """Draw one triangle given in pixels with the nearness w of its corners."""
+def _fill_triangle(a, b, c, number, nearness, index):
+    """Draw one triangle given by its corners (x and y in pixels, nearness w)."""
+    x0, y0, w0 = a
+    x1, y1, w1 = b
+    x2, y2, w2 = c
     height, width = nearness.shape
     area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
     if not abs(area) > 1e-12:
@@ -45,60 +85,35 @@ def fill_triangle(x0, y0, w0, x1, y1, w1, x2, y2, w2, number, nearness, index):
 @compiled
 def draw_pinhole(vertices, faces, fx, fy, cx, cy, near, nearness, index):
     """Triangles with corners in the camera's axes, clipped at the plane z = near."""
-    px, py, pw = [0.0] * 4, [0.0] * 4, [0.0] * 4
+    corners = [(0.0, 0.0, 0.0)] * 4
     for number in range(len(faces)):
         count = 0
         for corner in range(3):
             a, b = faces[number, corner], faces[number, (corner + 1) % 3]
             za, zb = vertices[a, 2], vertices[b, 2]
             if za >= near:
-                px[count] = fx * vertices[a, 0] / za + cx
-                py[count] = fy * vertices[a, 1] / za + cy
-                pw[count] = 1.0 / za
+                corners[count] = (fx * vertices[a, 0] / za + cx, fy * vertices[a, 1] / za + cy, 1.0 / za)
                 count += 1
             if (za >= near) != (zb >= near):
                 blend = (near - za) / (zb - za)
-                px[count] = fx * (vertices[a, 0] + blend * (vertices[b, 0] - vertices[a, 0])) / near + cx
-                py[count] = fy * (vertices[a, 1] + blend * (vertices[b, 1] - vertices[a, 1])) / near + cy
-                pw[count] = 1.0 / near
+                x = fx * (vertices[a, 0] + blend * (vertices[b, 0] - vertices[a, 0])) / near + cx
+                y = fy * (vertices[a, 1] + blend * (vertices[b, 1] - vertices[a, 1])) / near + cy
+                corners[count] = (x, y, 1.0 / near)
                 count += 1
         for last in range(2, count):
-            fill_triangle(
-                px[0],
-                py[0],
-                pw[0],
-                px[last - 1],
-                py[last - 1],
-                pw[last - 1],
-                px[last],
-                py[last],
-                pw[last],
-                number,
-                nearness,
-                index,
-            )
+            _fill_triangle(corners[0], corners[last - 1], corners[last], number, nearness, index)
 
 
 @compiled
-def draw_projected(pixels, vertex_nearness, valid, faces, nearness, index):
-    """Triangles whose corners are already pixels; those with a corner that is not valid are left out."""
+def draw_projected(pixels, near, valid, faces, nearness, index):
+    """Triangles whose corners are already pixels of nearness `near`; none with a corner that is not valid."""
     for number in range(len(faces)):
         a, b, c = faces[number, 0], faces[number, 1], faces[number, 2]
         if valid[a] and valid[b] and valid[c]:
-            fill_triangle(
-                pixels[a, 0],
-                pixels[a, 1],
-                vertex_nearness[a],
-                pixels[b, 0],
-                pixels[b, 1],
-                vertex_nearness[b],
-                pixels[c, 0],
-                pixels[c, 1],
-                vertex_nearness[c],
-                number,
-                nearness,
-                index,
-            )
+            first = (pixels[a, 0], pixels[a, 1], near[a])
+            second = (pixels[b, 0], pixels[b, 1], near[b])
+            third = (pixels[c, 0], pixels[c, 1], near[c])
+            _fill_triangle(first, second, third, number, nearness, index)
 
 
 _BULGE = 4.0
@@ -109,7 +124,7 @@ _BULGE = 4.0
 def project_point(x, y, z, lens):
     """Pixel of a point in camera axes, and its nearness: 1/z, for fisheyes 1/distance; 0 if not visible.
 
-    `lens` is laid out as in `geometry.splats.lens_numbers`. Pixels may be outside the image.
+    `lens` is laid out as in `geometry.render.lens_numbers`. Pixels may be outside the image.
     """
     square = x * x + y * y
     if lens[0] == 0.0:  # plane coordinates x/z, y/z
@@ -174,15 +189,16 @@ def _disc(x, y, r, w, bulge, number, nearness, index):
 
 
 @compiled
-def draw_splats(points, first, centers, radii, pose, planes, lens, radius, metric, offset, nearness, index):
+def draw_splats(blocks, pose, planes, lens, radius, metric, offset, nearness, index):
     """Project points, block by block, and draw those that the camera sees as discs.
 
-    Block b holds points first[b] … first[b + 1] - 1 within `radii[b]` of `centers[b]`; a block that lies beyond one
-    of `planes` (inward normal in the camera's axes) is passed over. `pose`: [R_cam_world | t_cam_world].
+    `blocks`: points, first, centers, radii. Block b holds points first[b] … first[b + 1] - 1 within `radii[b]` of
+    `centers[b]`; one that lies beyond one of `planes` (inward normal in the camera's axes) is passed over. `pose`: [R_cam_world | t_cam_world].
     `radius`: in metres where `metric`, else in pixels. Discs of metres are paraboloids whose rims lie `_BULGE` radii
     behind their centres: on a slanted surface the disc in front would else hide its neighbour, and what is painted
     there would seem shifted. Returns the number of points that were projected.
     """
+    points, first, centers, radii = blocks
     height, width = nearness.shape
     focal = 0.5 * (lens[1] + lens[2])
     bulge = _BULGE / (radius * focal * focal) if metric else 0.0
@@ -230,12 +246,8 @@ def _hit(rx, ry, rz, vertices, a, b, c):
 
 
 @compiled
-def _key_visibility(x, y, z, axes, scale, shadow, shadow_high, shadow_low):
-    """Part (0…1) of the key light that reaches a point: percentage-closer filtering over 4 x 4 texels.
-
-    `axes` are the map's rows: right, up, towards the light, each with its offset. `shadow_high/low` are the
-    map's extremes over that neighbourhood, which decide most pixels at once.
-    """
+def _key_visibility(x, y, z, axes, scale, shadow, high, low):
+    """Part (0…1) of the key light that reaches a point: percentage-closer filtering over 4 x 4 texels."""
     size = len(shadow)
     u = (axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z + axes[0, 3]) * scale
     v = (axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z + axes[1, 3]) * scale
@@ -243,9 +255,9 @@ def _key_visibility(x, y, z, axes, scale, shadow, shadow_high, shadow_low):
     column, row = math.floor(u), math.floor(v)
     if column < 2 or row < 2 or column > size - 4 or row > size - 4:
         return 1.0
-    if shadow_high[row, column] <= d:
+    if high[row, column] <= d:
         return 1.0
-    if shadow_low[row, column] > d:
+    if low[row, column] > d:
         return 0.0
     du, dv, lit = u - column, v - row, 0.0
     for i in range(-1, 3):
@@ -259,10 +271,7 @@ def _key_visibility(x, y, z, axes, scale, shadow, shadow_high, shadow_low):
 
 @compiled
 def _contact_shade(x, y, z, axes, scale, contact, fade):
-    """Fraction (0…1) of the sky occluded by geometry close above an upward surface: largest where they touch.
-
-    `contact` holds exp(height / fade) of the surfaces seen from below, blurred; rows 3-5 of `axes` place it.
-    """
+    """Fraction (0…1) of the sky occluded by geometry close above an upward surface: largest where they touch."""
     u = (axes[3, 0] * x + axes[3, 1] * y + axes[3, 2] * z + axes[3, 3]) * scale
     v = (axes[4, 0] * x + axes[4, 1] * y + axes[4, 2] * z + axes[4, 3]) * scale
     height = axes[5, 0] * x + axes[5, 1] * y + axes[5, 2] * z + axes[5, 3]
@@ -296,55 +305,28 @@ def _seen_normal(face, a, b, c, second, third, rx, ry, rz, vertices, normals, sm
 
 @compiled
 def resolve(
-    nearness,
-    index,
-    rays,
-    samples,
-    pose,
-    vertices,
-    faces,
-    normals,
-    smooth,
-    casts,
-    colors,
-    color_rows,
-    point_colors,
-    light,
-    axes,
-    scale,
-    shadow,
-    shadow_high,
-    shadow_low,
-    contact,
-    fade,
-    background,
-    color,
-    depth,
-    number,
+    nearness, index, rays, samples, pose, scene, point_colors, light, shadows, background, color, depth, number
 ):
     """Shade the visible samples and average `samples` x `samples` of them into each pixel of the picture.
 
-    `light`: direction to the key light (3), its strength, the ambient light from below and from above. A
-    pixel's depth and number are those of its nearest sample.
+    `scene`: `Triangles`; `shadows`: `Shadows`; `light`: direction to the key light (3), its strength, the ambient light
+    from below and from above. A pixel's depth and number are those of its nearest sample.
     """
-    shadows = len(shadow) > 0
+    vertices, faces, normals, smooth, casts, colors, color_rows = scene
+    axes, scale, shadow, high, low, contact, fade = shadows
+    total, rgb = samples * samples, np.empty(3)
     for row in range(color.shape[0]):
         for column in range(color.shape[1]):
-            red, green, blue, best, best_number = 0.0, 0.0, 0.0, 0.0, -1
-            for sample in range(samples * samples):
+            rgb[:] = 0.0
+            best, best_number = 0.0, -1
+            for sample in range(total):
                 v, u = row * samples + sample // samples, column * samples + sample % samples
                 face, w = index[v, u], nearness[v, u]
                 if face >= 0 and w > best:
                     best, best_number = w, face
-                if face < 0:
-                    red += background[row, 0]
-                    green += background[row, 1]
-                    blue += background[row, 2]
-                    continue
-                if face >= len(faces):
-                    red += point_colors[face - len(faces), 0]
-                    green += point_colors[face - len(faces), 1]
-                    blue += point_colors[face - len(faces), 2]
+                if face < 0 or face >= len(faces):
+                    for k in range(3):
+                        rgb[k] += background[row, k] if face < 0 else point_colors[face - len(faces), k]
                     continue
                 rx, ry, rz = rays[v, u, 0], rays[v, u, 1], rays[v, u, 2]
                 a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
@@ -356,27 +338,23 @@ def resolve(
                 wz = pose[2, 0] * nx + pose[2, 1] * ny + pose[2, 2] * nz
                 key = light[3] * max(0.0, wx * light[0] + wy * light[1] + wz * light[2])
                 ambient = light[4] + (light[5] - light[4]) * (0.5 + 0.5 * wz)
-                if shadows:
+                if len(shadow) > 0:
                     z = 1.0 / w
                     x = pose[0, 0] * rx * z + pose[0, 1] * ry * z + pose[0, 2] * rz * z + pose[0, 3]
                     y = pose[1, 0] * rx * z + pose[1, 1] * ry * z + pose[1, 2] * rz * z + pose[1, 3]
                     z = pose[2, 0] * rx * z + pose[2, 1] * ry * z + pose[2, 2] * rz * z + pose[2, 3]
                     if key > 0:
-                        key *= _key_visibility(
-                            x + 0.015 * wx, y + 0.015 * wy, z + 0.015 * wz, axes, scale, shadow, shadow_high, shadow_low
-                        )
+                        out_x, out_y, out_z = x + 0.015 * wx, y + 0.015 * wy, z + 0.015 * wz
+                        key *= _key_visibility(out_x, out_y, out_z, axes, scale, shadow, high, low)
                     if wz > 0.3 and not casts[face]:
                         hidden = _contact_shade(x, y, z, axes, scale, contact, fade)
                         ambient *= 1.0 - 0.75 * hidden
                         key *= 1.0 - 0.5 * hidden
                 ra, rb, rc = color_rows[face, 0], color_rows[face, 1], color_rows[face, 2]
                 shade = ambient + key
-                red += shade * (first * colors[ra, 0] + second * colors[rb, 0] + third * colors[rc, 0])
-                green += shade * (first * colors[ra, 1] + second * colors[rb, 1] + third * colors[rc, 1])
-                blue += shade * (first * colors[ra, 2] + second * colors[rb, 2] + third * colors[rc, 2])
-            total = samples * samples
-            color[row, column, 0] = min(255.0, red / total + 0.5)
-            color[row, column, 1] = min(255.0, green / total + 0.5)
-            color[row, column, 2] = min(255.0, blue / total + 0.5)
+                for k in range(3):
+                    rgb[k] += shade * (first * colors[ra, k] + second * colors[rb, k] + third * colors[rc, k])
+            for k in range(3):
+                color[row, column, k] = min(255.0, rgb[k] / total + 0.5)
             depth[row, column] = 1.0 / best if best_number >= 0 else math.inf
             number[row, column] = best_number

@@ -84,3 +84,20 @@ def wrap_angle(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 def mean_rotation(R: Float[Tensor, "sample 3 3"]) -> Float[Tensor, "3 3"]:
     """Chordal mean: the rotation nearest to the arithmetic mean of the matrices."""
     return roma.special_procrustes(R.mean(0))  # pyright: ignore[reportReturnType]
+
+
+def swing_between(a: Float[Tensor, "*#batch 3"], b: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """The smallest rotation that turns direction a onto direction b (any lengths; opposite ones: half a turn)."""
+    a, b = torch.broadcast_tensors(a, b)
+    a, b = torch.nn.functional.normalize(a, dim=-1), torch.nn.functional.normalize(b, dim=-1)
+    cos = (a * b).sum(-1)[..., None, None]
+    v = torch.linalg.cross(a, b)
+    zero = torch.zeros_like(v[..., 0])
+    K = torch.stack([zero, -v[..., 2], v[..., 1], v[..., 2], zero, -v[..., 0], -v[..., 1], v[..., 0], zero], -1)
+    K = K.unflatten(-1, (3, 3))
+    eye = torch.eye(3, dtype=a.dtype, device=a.device)
+    swing = eye + K + K @ K / (1 + cos).clamp_min(1e-6)
+    across = torch.linalg.cross(a, eye[a.abs().argmin(-1)])
+    across = torch.nn.functional.normalize(across, dim=-1)[..., None]
+    half_turn = 2 * across @ across.transpose(-1, -2) - eye
+    return torch.where(cos < -1 + 1e-6, half_turn, swing)

@@ -1,4 +1,4 @@
-"""Nearest points and local planes of a large point cloud: a hashed grid, searched by compiled loops.
+"""Nearest points and local planes of a large point cloud: a hashed grid, searched by compiled loops; downsampling.
 
 A scene's cloud has tens of millions of points and is queried millions of times for feet: with cells of a few points a
 query takes less than a microsecond, against about ten with a KD-tree.
@@ -7,7 +7,9 @@ query takes less than a microsecond, against about ten with a KD-tree.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+import torch
+from jaxtyping import Float, Float32, Float64, Int64
+from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.compiled import compiled
@@ -15,7 +17,6 @@ from wearcap.geometry.compiled import compiled
 _CELL_M = 0.05
 _POINTS_PER_CELL = 12
 """Cells are halved until they hold no more than this on average."""
-_EMPTY = np.int64(-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,7 @@ class SurfaceIndex:
         order = np.argsort(key, kind="stable")
         cells, first, count = np.unique(key[order], return_index=True, return_counts=True)
         slots = 1 << int(2 * len(cells)).bit_length()
-        table = np.full(slots, _EMPTY), np.zeros(slots, np.int64), np.zeros(slots, np.int64)
+        table = np.full(slots, -1), np.zeros(slots, np.int64), np.zeros(slots, np.int64)
         _fill_table(cells, first.astype(np.int64), count.astype(np.int64), *table)
         return cls(points[order], order, size, origin, *table)
 
@@ -57,17 +58,21 @@ class SurfaceIndex:
         self, queries: Float64[np.ndarray, "query 3"], reach_m: float = 0.5
     ) -> tuple[Float64[np.ndarray, "query"], Int64[np.ndarray, "query"]]:
         """Distance (m) to the nearest point and its index in the cloud; infinity and -1 beyond `reach_m`."""
-        distance, index = np.empty(len(queries)), np.empty(len(queries), np.int64)
-        _nearest_all(queries, reach_m, *self._grid, distance, index)
-        return distance, np.where(index >= 0, self.order[index], -1)
+        distance, row = self._search(queries, reach_m)
+        return distance, np.where(row >= 0, self.order[row], -1)
 
     def nearest_points(
         self, queries: Float64[np.ndarray, "query 3"], reach_m: float = 0.5
     ) -> Float64[np.ndarray, "query 3"]:
         """Position of the nearest point (m); NaN beyond `reach_m`."""
-        distance, index = np.empty(len(queries)), np.empty(len(queries), np.int64)
-        _nearest_all(queries, reach_m, *self._grid, distance, index)
-        return np.where(index[:, None] >= 0, self.points[index], np.nan).astype(np.float64)
+        _, row = self._search(queries, reach_m)
+        return np.where(row[:, None] >= 0, self.points[row], np.nan).astype(np.float64)
+
+    def _search(self, queries: np.ndarray, reach_m: float) -> tuple[np.ndarray, np.ndarray]:
+        """Distance (m) to the nearest point and its row in `points`; infinity and -1 beyond the reach."""
+        distance, row = np.empty(len(queries)), np.empty(len(queries), np.int64)
+        _nearest_all(queries, reach_m, self._grid, distance, row)
+        return distance, row
 
     def plane(
         self, queries: Float64[np.ndarray, "query 3"], radius_m: float = 0.06, reach_m: float = 0.5
@@ -78,12 +83,23 @@ class SurfaceIndex:
         NaN where the nearest point is beyond `reach_m` or fewer than six points are found.
         """
         origin, normal = np.empty_like(queries), np.empty_like(queries)
-        _plane_all(queries, radius_m, reach_m, *self._grid, origin, normal)
+        _plane_all(queries, radius_m, reach_m, self._grid, origin, normal)
         return origin, normal
 
     @property
     def _grid(self) -> tuple:
         return self.points, self.cell_m, self.origin, self.keys, self.first, self.count
+
+
+def voxel_downsample(
+    points: Float[Tensor, "point 3"], voxel_size: float
+) -> tuple[Float[Tensor, "voxel 3"], Int64[Tensor, "point"]]:
+    """Mean of the points in each occupied voxel (edge length in m), and the voxel index of every point."""
+    cell = torch.floor(points.double() / voxel_size).long()
+    _, voxel, count = torch.unique(cell, dim=0, return_inverse=True, return_counts=True)
+    total = torch.zeros(len(count), 3, dtype=torch.float64, device=points.device)
+    total.index_add_(0, voxel, points.double())
+    return (total / count[:, None]).to(points.dtype), voxel
 
 
 def _pack(points: np.ndarray, origin: np.ndarray, cell_m: float) -> Int64[np.ndarray, "point"]:
@@ -129,8 +145,10 @@ def _find(x, y, z, keys):
 
 
 @compiled
-def nearest_point(px, py, pz, reach, points, cell_m, origin, keys, first, count):
+def _nearest_point(p, reach, grid):
     """(squared distance, row) of the nearest point within reach, else (inf, -1); searches shells of cells outwards."""
+    points, cell_m, origin, keys, first, count = grid
+    px, py, pz = p[0], p[1], p[2]
     ux, uy, uz = (px - origin[0]) / cell_m, (py - origin[1]) / cell_m, (pz - origin[2]) / cell_m
     cx, cy, cz = int(np.floor(ux)), int(np.floor(uy)), int(np.floor(uz))
     inner = min(ux - cx, cx + 1 - ux, uy - cy, cy + 1 - uy, uz - cz, cz + 1 - uz) * cell_m
@@ -154,57 +172,51 @@ def nearest_point(px, py, pz, reach, points, cell_m, origin, keys, first, count)
 
 
 @compiled
-def _nearest_all(queries, reach, points, cell_m, origin, keys, first, count, distance, index):
+def _nearest_all(queries, reach, grid, distance, row):
     for q in range(len(queries)):
-        square, row = nearest_point(
-            queries[q, 0], queries[q, 1], queries[q, 2], reach, points, cell_m, origin, keys, first, count
-        )
-        distance[q], index[q] = np.sqrt(square), row
+        square, row[q] = _nearest_point(queries[q], reach, grid)
+        distance[q] = np.sqrt(square)
 
 
 @compiled
-def _plane_all(queries, radius, reach, points, cell_m, origin, keys, first, count, plane_origin, normal):
+def _plane_all(queries, radius, reach, grid, plane_origin, normal):
+    """Write the planes through the points around the nearest one; NaN where fewer than six are there."""
+    points, cell_m, origin, keys, first, count = grid
     for q in range(len(queries)):
-        _, row = nearest_point(
-            queries[q, 0], queries[q, 1], queries[q, 2], reach, points, cell_m, origin, keys, first, count
-        )
         plane_origin[q], normal[q] = np.nan, np.nan
-        if row >= 0:
-            fit_plane(points[row], radius, points, cell_m, origin, keys, first, count, plane_origin[q], normal[q])
-
-
-@compiled
-def fit_plane(center, radius, points, cell_m, origin, keys, first, count, plane_origin, normal):
-    """Write the plane through the points around `center`; nothing is written where fewer than six are there."""
-    low = np.floor((center - origin - radius) / cell_m)
-    high = np.floor((center - origin + radius) / cell_m)
-    total, number = 0.0, 0
-    mean, moment = np.zeros(3), np.zeros((3, 3))
-    for x in range(int(low[0]), int(high[0]) + 1):
-        for y in range(int(low[1]), int(high[1]) + 1):
-            for z in range(int(low[2]), int(high[2]) + 1):
-                slot = _find(x, y, z, keys)
-                if slot < 0:
-                    continue
-                for i in range(first[slot], first[slot] + count[slot]):
-                    d = points[i] - center
-                    square = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) / (radius * radius)
-                    if square < 1.0:
-                        weight = 1.0 - square
-                        total += weight
-                        number += 1
-                        for a in range(3):
-                            mean[a] += weight * d[a]
-                            for b in range(3):
-                                moment[a, b] += weight * d[a] * d[b]
-    if number < 6:
-        return
-    mean /= total
-    for a in range(3):
-        for b in range(3):
-            moment[a, b] = moment[a, b] / total - mean[a] * mean[b]
-    _, vectors = np.linalg.eigh(moment)
-    sign = 1.0 if vectors[2, 0] >= 0 else -1.0
-    for a in range(3):
-        plane_origin[a] = center[a] + mean[a]
-        normal[a] = sign * vectors[a, 0]
+        _, row = _nearest_point(queries[q], reach, grid)
+        if row < 0:
+            continue
+        center = points[row]
+        low = np.floor((center - origin - radius) / cell_m)
+        high = np.floor((center - origin + radius) / cell_m)
+        total, number = 0.0, 0
+        mean, moment = np.zeros(3), np.zeros((3, 3))
+        for x in range(int(low[0]), int(high[0]) + 1):
+            for y in range(int(low[1]), int(high[1]) + 1):
+                for z in range(int(low[2]), int(high[2]) + 1):
+                    slot = _find(x, y, z, keys)
+                    if slot < 0:
+                        continue
+                    for i in range(first[slot], first[slot] + count[slot]):
+                        d = points[i] - center
+                        square = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) / (radius * radius)
+                        if square < 1.0:
+                            weight = 1.0 - square
+                            total += weight
+                            number += 1
+                            for a in range(3):
+                                mean[a] += weight * d[a]
+                                for b in range(3):
+                                    moment[a, b] += weight * d[a] * d[b]
+        if number < 6:
+            continue
+        mean /= total
+        for a in range(3):
+            for b in range(3):
+                moment[a, b] = moment[a, b] / total - mean[a] * mean[b]
+        _, vectors = np.linalg.eigh(moment)
+        sign = 1.0 if vectors[2, 0] >= 0 else -1.0
+        for a in range(3):
+            plane_origin[q, a] = center[a] + mean[a]
+            normal[q, a] = sign * vectors[a, 0]

@@ -65,9 +65,26 @@ def interpolate(
     timestamps: Float64[Tensor, "time"], value: Float[Tensor, "time *rest"], at: Float64[Tensor, "new_time"]
 ) -> Float[Tensor, "new_time *rest"]:
     """Values at other times, by linear interpolation. Raises WearcapError for times outside, as `resample`."""
+    require_rising(timestamps)
+    if not len(timestamps):
+        raise WearcapError("nothing to resample", expected="at least one frame")
+    slack = timestamps.diff().median().item() if len(timestamps) > 1 else 0.0
+    outside = ~((at >= timestamps[0] - slack) & (at <= timestamps[-1] + slack))
+    if outside.any():
+        raise WearcapError(
+            f"{int(outside.sum())} of {len(at)} times, first {at[outside][0].item():.3f} s, lie outside the stream",
+            expected=f"times from {timestamps[0].item():.3f} s to {timestamps[-1].item():.3f} s",
+        )
+    return _lerp(value, *_brackets(timestamps, at))
+
+
+def slerp(
+    timestamps: Float64[Tensor, "time"], R: Float[Tensor, "time *rest 3 3"], at: Float64[Tensor, "new_time"]
+) -> Float[Tensor, "new_time *rest 3 3"]:
+    """Rotations at any times, at constant angular velocity between frames; beyond the ends they are constant."""
     before, after, blend = _brackets(timestamps, at)
-    blend = blend.to(value.dtype).reshape(-1, *[1] * (value.ndim - 1))
-    return torch.lerp(value[before], value[after], blend)
+    turn = rotation.log(R[before].mT @ R[after])
+    return R[before] @ rotation.exp(blend.to(R.dtype).reshape(-1, *[1] * (R.ndim - 2)) * turn)
 
 
 def interpolate_clamped(
@@ -92,33 +109,16 @@ def resample(trajectory: Trajectory, timestamps: Float64[Tensor, "new_time"]) ->
     The end poses are extended by up to one median frame step outside the trajectory; times further outside, and
     timestamps that do not rise, raise WearcapError.
     """
-    return _resampled(trajectory, timestamps, _brackets(trajectory.timestamps, timestamps))
+    t = interpolate(trajectory.timestamps, trajectory.t_world_body, timestamps)
+    return Trajectory(timestamps, slerp(trajectory.timestamps, trajectory.R_world_body, timestamps), t)
 
 
-def _resampled(trajectory: Trajectory, timestamps: Tensor, brackets: tuple) -> Trajectory:
-    before, after, blend = brackets
-    R, t = trajectory.R_world_body, trajectory.t_world_body
-    blend = blend.to(t.dtype)[:, None]
-    turn = rotation.log(R[before].mT @ R[after])
-    return Trajectory(timestamps, R[before] @ rotation.exp(blend * turn), torch.lerp(t[before], t[after], blend))
+def _lerp(value: Tensor, before: Tensor, after: Tensor, blend: Tensor) -> Tensor:
+    return torch.lerp(value[before], value[after], blend.to(value.dtype).reshape(-1, *[1] * (value.ndim - 1)))
 
 
 def _brackets(timestamps: Tensor, at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Frames before and after each time, and how far between them it lies (0…1)."""
-    require_rising(timestamps)
-    if not len(timestamps):
-        raise WearcapError("nothing to resample", expected="at least one frame")
-    slack = timestamps.diff().median().item() if len(timestamps) > 1 else 0.0
-    outside = ~((at >= timestamps[0] - slack) & (at <= timestamps[-1] + slack))
-    if outside.any():
-        raise WearcapError(
-            f"{int(outside.sum())} of {len(at)} times, first {at[outside][0].item():.3f} s, lie outside the stream",
-            expected=f"times from {timestamps[0].item():.3f} s to {timestamps[-1].item():.3f} s",
-        )
-    return _clamped_brackets(timestamps, at)
-
-
-def _clamped_brackets(timestamps: Tensor, at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     after = torch.searchsorted(timestamps, at.contiguous(), right=True).clamp(max=len(timestamps) - 1)
     before = (after - 1).clamp(min=0)
     span = timestamps[after] - timestamps[before]
@@ -202,7 +202,9 @@ def filled(trajectory: Trajectory, valid: Bool[Tensor, "time"]) -> Trajectory:
     if not valid.any():
         raise WearcapError("no valid pose to interpolate from", expected="at least one valid frame")
     good = trajectory[valid]
-    return _resampled(good, trajectory.timestamps, _clamped_brackets(good.timestamps, trajectory.timestamps))
+    t = _lerp(good.t_world_body, *_brackets(good.timestamps, trajectory.timestamps))
+    R = slerp(good.timestamps, good.R_world_body, trajectory.timestamps)
+    return Trajectory(trajectory.timestamps, R, t)
 
 
 def find_gaps(timestamps: Float64[Tensor, "time"], max_step_s: float) -> Int64[Tensor, "gap"]:

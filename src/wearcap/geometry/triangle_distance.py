@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -13,18 +14,24 @@ _LEAF = 4
 """Faces in a leaf of the tree."""
 
 
-@dataclass(frozen=True, eq=False)
-class TriangleIndex:
-    """A mesh's triangles (m), ready for nearest-point queries. Build it with `TriangleIndex.build`."""
+class _Tree(NamedTuple):
+    """A tree of boxes over triangles (m)."""
 
     corners: Float64[np.ndarray, "face 3 3"]
     """Ordered by leaf."""
-    order: Int64[np.ndarray, "face"]
-    """Index in the mesh of each of `corners`."""
     low: Float64[np.ndarray, "node 3"]
     high: Float64[np.ndarray, "node 3"]
     span: Int64[np.ndarray, "node 3"]
     """First and last + 1 of a node's faces, and its left child (the right one follows it), 0 at leaves."""
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleIndex:
+    """A mesh's triangles (m), ready for nearest-point queries. Build it with `TriangleIndex.build`."""
+
+    tree: _Tree
+    order: Int64[np.ndarray, "face"]
+    """Index in the mesh of each of the tree's faces."""
 
     @classmethod
     def build(cls, vertices: Float64[np.ndarray, "vertex 3"], faces: Int64[np.ndarray, "face 3"]) -> "TriangleIndex":
@@ -38,7 +45,7 @@ class TriangleIndex:
         low, high, span = np.empty((nodes, 3)), np.empty((nodes, 3)), np.zeros((nodes, 3), np.int64)
         order = np.arange(len(faces))
         used = _build(corners.mean(1), corners.min(1), corners.max(1), order, low, high, span)
-        return cls(np.ascontiguousarray(corners[order]), order, low[:used], high[:used], span[:used])
+        return cls(_Tree(np.ascontiguousarray(corners[order]), low[:used], high[:used], span[:used]), order)
 
     def nearest(
         self, queries: Float64[np.ndarray, "query 3"]
@@ -57,7 +64,7 @@ class TriangleIndex:
 
     def _search(self, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         distance, face, point = (np.empty(len(queries)), np.empty(len(queries), np.int64), np.empty((len(queries), 3)))
-        _nearest_all(queries, self.corners, self.low, self.high, self.span, distance, face, point)
+        _nearest_all(queries, self.tree, distance, face, point)
         return distance, self.order[face], point
 
 
@@ -65,29 +72,22 @@ class TriangleIndex:
 class BodiesIndex:
     """Index of several rigidly moving meshes for nearest-body queries. Build it with `BodiesIndex.build`."""
 
-    corners: Float64[np.ndarray, "face 3 3"]
-    low: Float64[np.ndarray, "node 3"]
-    high: Float64[np.ndarray, "node 3"]
-    span: Int64[np.ndarray, "node 3"]
+    tree: _Tree
     roots: Int64[np.ndarray, "body"]
     """First node of each body's tree; bodies of one shape share it."""
 
     @classmethod
     def build(cls, shapes: Sequence[TriangleIndex], shape_of_body: Int64[np.ndarray, "body"]) -> "BodiesIndex":
         """Join the shapes' trees. Raises ValueError without a shape."""
-        first_face = np.cumsum([0, *(len(shape.corners) for shape in shapes)])
-        first_node = np.cumsum([0, *(len(shape.span) for shape in shapes)])
+        trees = [shape.tree for shape in shapes]
+        first_face = np.cumsum([0, *(len(tree.corners) for tree in trees)])
+        first_node = np.cumsum([0, *(len(tree.span) for tree in trees)])
         spans = []
-        for shape, face, node in zip(shapes, first_face, first_node):
-            child = np.where(shape.span[:, 2:] > 0, shape.span[:, 2:] + node, 0)
-            spans.append(np.concatenate([shape.span[:, :2] + face, child], 1))
-        return cls(
-            np.concatenate([shape.corners for shape in shapes]),
-            np.concatenate([shape.low for shape in shapes]),
-            np.concatenate([shape.high for shape in shapes]),
-            np.concatenate(spans),
-            first_node[shape_of_body],
-        )
+        for tree, face, node in zip(trees, first_face, first_node):
+            child = np.where(tree.span[:, 2:] > 0, tree.span[:, 2:] + node, 0)
+            spans.append(np.concatenate([tree.span[:, :2] + face, child], 1))
+        corners, low, high, _ = (np.concatenate(part) for part in zip(*trees))
+        return cls(_Tree(corners, low, high, np.concatenate(spans)), first_node[shape_of_body])
 
     def nearest(
         self,
@@ -96,26 +96,12 @@ class BodiesIndex:
         R_world_body: Float64[np.ndarray, "chosen 3 3"],
         t_world_body: Float64[np.ndarray, "chosen 3"],
         reach_m: float,
-    ) -> tuple[Int64[np.ndarray, "query"], Float64[np.ndarray, "query"], Float64[np.ndarray, "query 3"]]:
-        """For each point the nearest of the chosen bodies (its number among all), the distance (m) and the closest
-        point in the world; -1, infinity and NaN where none is nearer than `reach_m`."""
-        count = len(queries)
-        body, distance, point = np.empty(count, np.int64), np.empty(count), np.empty((count, 3))
-        _nearest_bodies(
-            queries,
-            R_world_body,
-            t_world_body,
-            self.roots[bodies],
-            reach_m,
-            self.corners,
-            self.low,
-            self.high,
-            self.span,
-            body,
-            distance,
-            point,
-        )
-        return np.append(bodies, -1)[body], distance, point
+    ) -> tuple[Int64[np.ndarray, "query"], Float64[np.ndarray, "query"]]:
+        """For each point the nearest of the chosen bodies (its number among all) and the distance (m); -1 and infinity
+        where none is nearer than `reach_m`."""
+        body, distance = np.empty(len(queries), np.int64), np.empty(len(queries))
+        _nearest_bodies(queries, R_world_body, t_world_body, self.roots[bodies], reach_m, self.tree, body, distance)
+        return np.append(bodies, -1)[body], distance
 
 
 @compiled
@@ -200,8 +186,9 @@ def _triangle_nearest(p, triangle):
 
 
 @compiled
-def _nearest_face(p, root, best, corners, low, high, span, stack, reach):
+def _nearest_face(p, root, best, tree, stack, reach):
     """(squared distance, row in `corners`) of the face nearest to p below a node; (best, -1) where none is nearer."""
+    corners, low, high, span = tree
     found = -1
     depth, stack[0], reach[0] = 1, root, _box_distance(p, low[root], high[root])
     while depth > 0:
@@ -228,8 +215,9 @@ def _nearest_face(p, root, best, corners, low, high, span, stack, reach):
 
 
 @compiled
-def _nearest_all(queries, corners, low, high, span, distance, face, point):
+def _nearest_all(queries, tree, distance, face, point):
     """Neighbouring queries are often near each other, as along a path: the last one's face bounds the search."""
+    corners = tree.corners
     stack, reach = np.empty(128, np.int64), np.empty(128)
     last = 0
     for q in range(len(queries)):
@@ -238,7 +226,7 @@ def _nearest_all(queries, corners, low, high, span, distance, face, point):
             distance[q], face[q], point[q] = np.nan, 0, np.nan
             continue
         best, _, _ = _triangle_nearest(p, corners[last])
-        best, found = _nearest_face(p, 0, best, corners, low, high, span, stack, reach)
+        best, found = _nearest_face(p, 0, best, tree, stack, reach)
         last = found if found >= 0 else last
         _, s, t = _triangle_nearest(p, corners[last])
         distance[q], face[q] = np.sqrt(best), last
@@ -248,12 +236,13 @@ def _nearest_all(queries, corners, low, high, span, distance, face, point):
 
 
 @compiled
-def _nearest_bodies(queries, R, t, roots, reach_m, corners, low, high, span, body, distance, point):
+def _nearest_bodies(queries, R, t, roots, reach_m, tree, body, distance):
     """Every body's box bounds its distance; the nearest box is searched first, the others only while they can win."""
+    _, low, high, _ = tree
     stack, reach = np.empty(128, np.int64), np.empty(128)
     bound, local = np.empty(len(roots)), np.empty((len(roots), 3))
     for q in range(len(queries)):
-        body[q], distance[q], point[q] = -1, np.inf, np.nan
+        body[q], distance[q] = -1, np.inf
         first = -1
         for k in range(len(roots)):
             dx, dy, dz = queries[q, 0] - t[k, 0], queries[q, 1] - t[k, 1], queries[q, 2] - t[k, 2]
@@ -264,22 +253,11 @@ def _nearest_bodies(queries, R, t, roots, reach_m, corners, low, high, span, bod
                 first = k
         if first < 0 or not np.isfinite(queries[q, 0] + queries[q, 1] + queries[q, 2]):
             continue
-        best, row, owner = reach_m * reach_m, -1, -1
+        best = reach_m * reach_m
         for turn in range(-1, len(roots)):
             k = first if turn < 0 else turn
             if bound[k] >= best or turn == first:
                 continue
-            square, found = _nearest_face(local[k], roots[k], best, corners, low, high, span, stack, reach)
+            square, found = _nearest_face(local[k], roots[k], best, tree, stack, reach)
             if found >= 0:
-                best, row, owner = square, found, k
-        if row < 0:
-            continue
-        body[q], distance[q] = owner, np.sqrt(best)
-        _, s, along = _triangle_nearest(local[owner], corners[row])
-        for axis in range(3):
-            local[owner, axis] = corners[row, 0, axis] + s * (corners[row, 1, axis] - corners[row, 0, axis])
-            local[owner, axis] += along * (corners[row, 2, axis] - corners[row, 0, axis])
-        for axis in range(3):
-            point[q, axis] = t[owner, axis]
-            for b in range(3):
-                point[q, axis] += R[owner, axis, b] * local[owner, b]
+                best, body[q], distance[q] = square, k, np.sqrt(square)

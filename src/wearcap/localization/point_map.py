@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float32, Float64, Int32, UInt8
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
+from wearcap.geometry.render import SplatCloud
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.splats import SplatCloud
 from wearcap.localization.features import Extractor, Features
 from wearcap.scene.scan import Scan
 

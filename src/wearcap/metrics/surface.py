@@ -6,8 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from wearcap.body.model import BodyModel
-from wearcap.body.regions import FOOT_REGIONS
+from wearcap.body.model import FOOT_REGIONS, BodyModel
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid

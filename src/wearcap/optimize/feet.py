@@ -7,8 +7,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from wearcap.body.model import BodyModel
-from wearcap.body.regions import FOOT_REGIONS
+from wearcap.body.model import FOOT_REGIONS, BodyModel
 from wearcap.body.skeleton import Skeleton
 from wearcap.geometry.rigid import Rigid
 

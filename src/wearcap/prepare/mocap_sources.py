@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body.head_level import head_level, with_head_face
+from wearcap.body.landmarks import head_level, with_head_face
 from wearcap.errors import WearcapError, nearest
 from wearcap.io.datasets.amass import read_amass
 from wearcap.io.formats.asf_amc import read_amc, read_asf

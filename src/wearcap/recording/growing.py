@@ -43,8 +43,13 @@ def follow_pieces(
     while True:
         ended = (folder / END).exists()  # checked first, so that pieces written before the end are not missed
         if piece_path(folder, number).exists():
-            piece = _read(piece_path(folder, number), refused)
-            if piece is not None:
+            try:
+                piece = RecordingFile(piece_path(folder, number)).load()
+            except WearcapError:
+                if refused is None:
+                    raise
+                refused["piece: damaged file"] += 1
+            else:
                 yield piece
             number, since = number + 1, time.monotonic()
         elif ended:
@@ -58,13 +63,3 @@ def follow_pieces(
             )
         else:
             time.sleep(poll_s)
-
-
-def _read(path: Path, refused: Counter[str] | None) -> Recording | None:
-    try:
-        return RecordingFile(path).load()
-    except WearcapError:
-        if refused is None:
-            raise
-        refused["piece: damaged file"] += 1
-        return None

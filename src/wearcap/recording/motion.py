@@ -13,6 +13,10 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording.interactions import Interactions
 
+PROBABILITIES = ("contact_prob", "hand_contact_prob", "body_contact_prob")
+"""Optional fields of a Motion with a row per frame."""
+PER_FRAME = ("timestamps", "R_parent_joint", "t_world_root", *PROBABILITIES)
+
 
 @dataclass(frozen=True)
 class Motion:
@@ -56,23 +60,16 @@ class Motion:
 
     def sliced(self, start: int, stop: int) -> "Motion":
         """Frames start…stop-1; object trajectories keep their own clocks and are cut to the same time span."""
-        times = self.timestamps[start:stop]
-        contact = None if self.contact_prob is None else self.contact_prob[start:stop]
-        hands = None if self.hand_contact_prob is None else self.hand_contact_prob[start:stop]
-        skin = None if self.body_contact_prob is None else self.body_contact_prob[start:stop]
-        objects = self.object_motion
-        if objects is not None and len(times):
-            objects = {name: _within(track, times[0].item(), times[-1].item()) for name, track in objects.items()}
-        return replace(
-            self,
-            timestamps=times,
-            R_parent_joint=self.R_parent_joint[start:stop],
-            t_world_root=self.t_world_root[start:stop],
-            contact_prob=contact,
-            hand_contact_prob=hands,
-            body_contact_prob=skin,
-            object_motion=objects,
-        )
+        rows = {name: getattr(self, name) for name in PER_FRAME if getattr(self, name) is not None}
+        cut = replace(self, **{name: row[start:stop] for name, row in rows.items()})
+        if self.object_motion is None or not len(cut):
+            return cut
+        objects = {}
+        for name, track in self.object_motion.items():
+            first = int(torch.searchsorted(track.timestamps, cut.timestamps[0].item()))
+            last = int(torch.searchsorted(track.timestamps, cut.timestamps[-1].item(), right=True))
+            objects[name] = track[first:last]
+        return replace(cut, object_motion=objects)
 
     def moved(self, T_new_world: Rigid) -> "Motion":
         """The motion and its objects in the coordinates of another world frame."""
@@ -86,9 +83,3 @@ class Motion:
                 for name, track in objects.items()
             }
         return replace(self, R_parent_joint=R, t_world_root=self.t_world_root @ R_new.mT + t_new, object_motion=objects)
-
-
-def _within(track: Trajectory, start_s: float, stop_s: float) -> Trajectory:
-    first = int(torch.searchsorted(track.timestamps, start_s))
-    last = int(torch.searchsorted(track.timestamps, stop_s, right=True))
-    return Trajectory(track.timestamps[first:last], track.R_world_body[first:last], track.t_world_body[first:last])

@@ -17,31 +17,15 @@ from wearcap.body.skeleton import Site, Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.recording import recording as containers
+from wearcap.recording import recording as parts
 from wearcap.recording.interactions import Interactions
 from wearcap.recording.motion import Motion
 
-KNOWN: dict[str, type] = {
-    cls.__name__: cls
-    for cls in (
-        Motion,
-        Skeleton,
-        Site,
-        Camera,
-        Trajectory,
-        containers.Recording,
-        containers.HeadStream,
-        containers.ImuStream,
-        containers.CameraStream,
-        containers.Localization,
-        containers.PointCloud,
-        containers.Cue,
-        containers.ContactTrack,
-        containers.FloorTrack,
-        containers.Intervals,
-        Interactions,
-    )
+_PARTS = {name: cls for name, cls in vars(parts).items() if getattr(cls, "__module__", "") == parts.__name__}
+KNOWN: dict[str, type] = _PARTS | {
+    cls.__name__: cls for cls in (Motion, Skeleton, Site, Camera, Trajectory, Interactions)
 }
+"""Classes of recordings: those of `recording.py`, and what they consist of."""
 
 
 def flatten(value: Any, key: str = "") -> tuple[Any, dict[str, Tensor]]:
@@ -82,7 +66,13 @@ def unflatten(tree: Any, fetch, known: dict[str, type] = KNOWN) -> Any:
     kind = known[tree["$type"]]
     for name, item in items.items():
         require_part(kind, name, item)
-    _require_one_length(kind, items)
+    times = items.get("timestamps")
+    for name in _over_time(kind) if isinstance(times, Tensor) else ():
+        if isinstance(items.get(name), Tensor) and len(items[name]) != len(times):
+            raise WearcapError(
+                f"{kind.__name__}.{name} has {len(items[name])} rows for {len(times)} timestamps",
+                expected="a row for each timestamp",
+            )
     return kind(**items)
 
 
@@ -114,17 +104,6 @@ def _fits(value: Any, hint: Any) -> bool:
     if hint in (int, float):
         return isinstance(value, int | hint) and not isinstance(value, bool)
     return isinstance(value, origin or hint)
-
-
-def _require_one_length(kind: type, items: dict[str, Any]) -> None:
-    """Raise WearcapError unless all tensors annotated with a time axis are as long as the timestamps."""
-    times = items.get("timestamps")
-    for name in _over_time(kind) if isinstance(times, Tensor) else ():
-        if isinstance(items.get(name), Tensor) and len(items[name]) != len(times):
-            raise WearcapError(
-                f"{kind.__name__}.{name} has {len(items[name])} rows for {len(times)} timestamps",
-                expected="a row for each timestamp",
-            )
 
 
 @functools.cache

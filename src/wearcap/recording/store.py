@@ -64,7 +64,9 @@ class RecordingFile:
         try:
             self._file = safetensors.safe_open(str(self.path), framework="pt")
         except FileNotFoundError as error:
-            raise self._missing(error) from error
+            if self.path.exists():  # safetensors reports unreadable files as missing
+                raise WearcapError(f"cannot be read ({error.strerror or 'no permission'})", where=self.path) from error
+            raise WearcapError("no such recording", where=self.path) from error
         except (safetensors.SafetensorError, OSError, RuntimeError) as error:
             raise WearcapError(
                 "not a readable recording",
@@ -126,12 +128,6 @@ class RecordingFile:
         except (WearcapError, TypeError, ValueError, KeyError, AttributeError) as error:
             raise self._unreadable(error) from error
 
-    def _missing(self, error: OSError) -> WearcapError:
-        """Error for a missing file; safetensors also reports unreadable files as missing."""
-        if self.path.exists():
-            return WearcapError(f"cannot be read ({error.strerror or 'no permission'})", where=self.path)
-        return WearcapError("no such recording", where=self.path)
-
     def _unreadable(self, error: Exception) -> WearcapError:
         return WearcapError(
             f"its description is unreadable ({error})", where=self.path, fix="Prepare this recording again."
@@ -191,8 +187,31 @@ class RecordingStore:
     """A data set on disk. One process may write; any number may read."""
 
     def __init__(self, root: str | Path):
-        self.root = Path(root)
-        self.entries: dict[str, Entry] = self._read_manifest() if self.manifest_path.exists() else {}
+        """Read the manifest, if there is one. Raises WearcapError when it is not readable."""
+        self.root, path = Path(root), Path(root) / MANIFEST
+        self.entries: dict[str, Entry] = {}
+        if not path.exists():
+            return
+        try:
+            manifest = parse_json(path.read_bytes(), path)
+        except OSError as error:
+            raise WearcapError(f"cannot be read ({error.strerror or error})", where=path) from error
+        version = manifest.get("schema_version") if isinstance(manifest, dict) else None
+        if version != SCHEMA_VERSION:
+            raise WearcapError(
+                f"schema version {str(version)[:40]}",
+                where=path,
+                expected=f"version {SCHEMA_VERSION}",
+                fix="Prepare the data set again.",
+            )
+        try:
+            self.entries |= {name: self._entry(name, entry) for name, entry in manifest["recordings"].items()}
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise WearcapError(
+                f"not a readable manifest ({str(error)[:200]})",
+                where=path,
+                fix="Delete it and prepare the data set again.",
+            ) from error
 
     @classmethod
     def open(cls, root: str | Path) -> "RecordingStore":
@@ -209,29 +228,6 @@ class RecordingStore:
     @property
     def manifest_path(self) -> Path:
         return self.root / MANIFEST
-
-    def _read_manifest(self) -> dict[str, Entry]:
-        path = self.manifest_path
-        try:
-            manifest = parse_json(path.read_bytes(), path)
-        except OSError as error:
-            raise WearcapError(f"cannot be read ({error.strerror or error})", where=path) from error
-        version = manifest.get("schema_version") if isinstance(manifest, dict) else None
-        if version != SCHEMA_VERSION:
-            raise WearcapError(
-                f"schema version {str(version)[:40]}",
-                where=path,
-                expected=f"version {SCHEMA_VERSION}",
-                fix="Prepare the data set again.",
-            )
-        try:
-            return {name: self._entry(name, entry) for name, entry in manifest["recordings"].items()}
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise WearcapError(
-                f"not a readable manifest ({str(error)[:200]})",
-                where=path,
-                fix="Delete it and prepare the data set again.",
-            ) from error
 
     def _entry(self, name: str, row: dict[str, Any]) -> Entry:
         """Parse one row of the manifest. Raises ValueError or TypeError for invalid values."""
@@ -333,3 +329,36 @@ def entry_for(recording: Recording, root: Path, split: str, config_hash: str) ->
         license=recording.license,
         config_hash=config_hash,
     )
+
+
+def load_recording(where: str | Path) -> Recording:
+    """Load "DATASET/NAME", a recording's .safetensors file, or a data set that holds just one recording.
+
+    Raises WearcapError that names the choices when there is no such recording.
+    """
+    path = Path(where)
+    if path.is_file():
+        return RecordingFile(path).load()
+    if (path / "manifest.json").is_file():
+        names = RecordingStore.open(path).names()
+        if len(names) == 1:
+            return RecordingStore.open(path).load(names[0])
+        raise WearcapError(
+            f"a data set of {len(names)} recordings",
+            where=path,
+            expected=f"one of them, such as {path / names[0] if names else path / 'NAME'}",
+        )
+    if (path.parent / "manifest.json").is_file():
+        return RecordingStore.open(path.parent).load(path.name)
+    raise WearcapError(
+        "no recording here", where=path, expected="DATASET/NAME or a .safetensors file that `wearcap prepare` wrote"
+    )
+
+
+def dataset_folder(where: str | Path) -> Path:
+    """Folder of the data set of a recording given by the user; file names in the recording are relative to it."""
+    path = Path(where)
+    for folder in (path, *path.parents):
+        if (folder / "manifest.json").is_file():
+            return folder
+    return path.parent

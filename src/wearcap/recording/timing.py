@@ -4,16 +4,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float64
 from torch import Tensor
 
-from wearcap.geometry import rotation
-from wearcap.geometry.trajectory import Trajectory, interpolate
+from wearcap.geometry.trajectory import Trajectory, interpolate, slerp
 from wearcap.recording.interactions import Interactions
-from wearcap.recording.motion import Motion
+from wearcap.recording.motion import PER_FRAME, PROBABILITIES, Motion
 
-PROBABILITIES = ("contact_prob", "hand_contact_prob", "body_contact_prob")
-"""Optional fields of a Motion with a row per frame."""
+_POSES = ("timestamps", "R_world_body", "t_world_body")
 
 
 def resampled(motion: Motion, fps: float | int) -> Motion:
@@ -44,7 +42,7 @@ def at_times(motion: Motion, times: Float64[Tensor, "new_time"]) -> Motion:
     return replace(
         motion,
         timestamps=times,
-        R_parent_joint=_slerp(motion.timestamps, motion.R_parent_joint, times),
+        R_parent_joint=slerp(motion.timestamps, motion.R_parent_joint, times),
         t_world_root=interpolate(motion.timestamps, motion.t_world_root, times),
         **_probabilities(motion, lambda prob: interpolate(motion.timestamps, prob, times)),
     )
@@ -57,39 +55,24 @@ def joined(parts: Sequence[Motion]) -> Motion | None:
     """
     if len(parts) < 2:
         return parts[0] if parts else None
-    fields = ("timestamps", "R_parent_joint", "t_world_root", *PROBABILITIES)
-    rows = {name: [getattr(part, name) for part in parts] for name in fields}
+    rows = {name: [getattr(part, name) for part in parts] for name in PER_FRAME}
     whole = {name: None if any(row is None for row in values) else torch.cat(values) for name, values in rows.items()}
     tracks: dict[str, list[Trajectory]] = {}
     for part in parts:
         for name, track in (part.object_motion or {}).items():
             tracks.setdefault(name, []).append(track)
-    objects = {name: _end_to_end(each) for name, each in tracks.items()} or None
-    found = [part.interactions for part in parts if part.interactions is not None]
-    return replace(parts[0], **whole, object_motion=objects, interactions=_all_of(found) if found else None)
-
-
-def _end_to_end(tracks: list[Trajectory]) -> Trajectory:
-    times, R, t = zip(*((each.timestamps, each.R_world_body, each.t_world_body) for each in tracks))
-    return Trajectory(torch.cat(times), torch.cat(R), torch.cat(t))
-
-
-def _all_of(parts: list[Interactions]) -> Interactions:
-    start, stop, hands = (torch.cat([getattr(each, name) for each in parts]) for name in ("start_s", "stop_s", "hands"))
-    objects, classes = (tuple(name for each in parts for name in getattr(each, key)) for key in ("objects", "classes"))
-    return Interactions(start, stop, hands, objects, classes)
+    objects = {
+        name: Trajectory(*(torch.cat([getattr(track, field) for track in each]) for field in _POSES))
+        for name, each in tracks.items()
+    }
+    found, interactions = [part.interactions for part in parts if part.interactions is not None], None
+    if found:
+        rows = {name: torch.cat([getattr(each, name) for each in found]) for name in ("start_s", "stop_s", "hands")}
+        names = {key: tuple(name for each in found for name in getattr(each, key)) for key in ("objects", "classes")}
+        interactions = Interactions(**rows, **names)
+    return replace(parts[0], **whole, object_motion=objects or None, interactions=interactions)
 
 
 def _probabilities(motion: Motion, change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
     there = {name: getattr(motion, name) for name in PROBABILITIES}
     return {name: change(prob) for name, prob in there.items() if prob is not None}
-
-
-def _slerp(
-    timestamps: Float64[Tensor, "time"], R: Float[Tensor, "time joint 3 3"], at: Float64[Tensor, "new_time"]
-) -> Float[Tensor, "new_time joint 3 3"]:
-    after = torch.searchsorted(timestamps, at, right=True).clamp(1, len(timestamps) - 1)
-    before = after - 1
-    blend = ((at - timestamps[before]) / (timestamps[after] - timestamps[before])).clamp(0, 1).to(R.dtype)
-    turn = rotation.log(R[before].mT @ R[after])
-    return R[before] @ rotation.exp(blend[:, None, None] * turn)

@@ -24,8 +24,6 @@ class Nearest:
     """Index in `Environment.objects`; -1 where none is within reach."""
     distance: Float[Tensor, "query"]
     """Distance (m) from the point to the object's surface; infinity where none is within reach."""
-    point_world: Float[Tensor, "query 3"]
-    """The object's closest point (m), NaN where none is within reach."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,19 +62,14 @@ class Environment:
         return [built[id(item.mesh)] for item in self.objects]
 
     @cached_property
-    def _bodies(self) -> BodiesIndex:
+    def _at_rest(self) -> tuple[BodiesIndex, np.ndarray, np.ndarray]:
+        """Index of all objects, and their initial rotations and positions in double precision."""
         shapes = {id(shape): shape for shape in self._shapes}
         number = {key: k for k, key in enumerate(shapes)}
         of_body = np.array([number[id(shape)] for shape in self._shapes], np.int64)
-        return BodiesIndex.build(list(shapes.values()), of_body)
-
-    @cached_property
-    def _initial_R(self) -> np.ndarray:
-        return np.array([item.R_world_object.tolist() for item in self.objects], np.float64).reshape(-1, 3, 3)
-
-    @cached_property
-    def _initial_t(self) -> np.ndarray:
-        return np.array([item.t_world_object.tolist() for item in self.objects], np.float64).reshape(-1, 3)
+        R = np.array([item.R_world_object.tolist() for item in self.objects], np.float64)
+        t = np.array([item.t_world_object.tolist() for item in self.objects], np.float64)
+        return BodiesIndex.build(list(shapes.values()), of_body), R, t
 
     def nearest(
         self,
@@ -92,17 +85,19 @@ class Environment:
         """
         if contact_class not in (None, *CONTACT_CLASSES):
             raise WearcapError(f"no contact class {contact_class!r}", expected=f"one of {', '.join(CONTACT_CLASSES)}")
-        R, t = self._initial_R.copy(), self._initial_t.copy()
-        for name, pose in (T_world_object or {}).items():
-            R[self.index(name)], t[self.index(name)] = pose.R.numpy(), pose.t.numpy()
+        moved = {self.index(name): pose for name, pose in (T_world_object or {}).items()}
         chosen = np.flatnonzero([contact_class in (None, item.freedom.contact_class) for item in self.objects])
         if not len(chosen):
-            return _nothing(points_world)
-        index, distance, point = self._bodies.nearest(
+            nothing = torch.full((len(points_world),), -1)
+            return Nearest(nothing, torch.full_like(nothing, torch.inf, dtype=points_world.dtype))
+        bodies, R, t = self._at_rest
+        R, t = R.copy(), t.copy()
+        for k, pose in moved.items():
+            R[k], t[k] = pose.R.numpy(), pose.t.numpy()
+        index, distance = bodies.nearest(
             points_world.double().contiguous().numpy(), chosen, R[chosen], t[chosen], float(reach_m)
         )
-        dtype = points_world.dtype
-        return Nearest(torch.from_numpy(index), torch.from_numpy(distance).to(dtype), torch.from_numpy(point).to(dtype))
+        return Nearest(torch.from_numpy(index), torch.from_numpy(distance).to(points_world.dtype))
 
     def distance(
         self, name: str, points_world: Float[Tensor, "time 3"], T_world_object: Rigid
@@ -139,12 +134,3 @@ def hinge_gap_m(item: SceneObject) -> float:
     low, high = box_in_world(item)[:, :2]
     pivot = np.array(item.freedom.pivot[:2])
     return float(np.linalg.norm(np.maximum(np.maximum(low - pivot, pivot - high), 0.0)))
-
-
-def _nothing(points_world: Tensor) -> Nearest:
-    count = len(points_world)
-    return Nearest(
-        torch.full((count,), -1),
-        points_world.new_full((count,), float("inf")),
-        points_world.new_full((count, 3), float("nan")),
-    )

@@ -1,4 +1,4 @@
-"""Height of the floor below the wearer, from points of the surroundings or from the head path alone."""
+"""Height of the floor below the wearer, from points of the surroundings."""
 
 from dataclasses import dataclass
 
@@ -10,9 +10,6 @@ from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from wearcap.errors import WearcapError
-
-EYE_HEIGHT_OF_STATURE = 0.936
-"""Eyes above the floor as a share of stature, standing (Drillis and Contini 1966)."""
 
 _BIN_M = 0.02
 
@@ -39,7 +36,7 @@ _FAINT = 0.1
 _CLEARANCE_M = (0.3, 2.3)
 """Smallest and largest height of the head above the floor."""
 _CHANGE_COST = 20.0
-"""Cost of a metre up or down, in the units of `_evidence` (ours, as all weights here)."""
+"""Cost of a metre up or down, in the units of the evidence (ours, as all weights here)."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +64,9 @@ def estimate_floor(
     points = points_world.detach().cpu().numpy()
     if not len(head) or not np.isfinite(head).all():
         raise WearcapError("no head path, or one with NaN", expected="finite head positions")
-    keys, key_of_frame = _key_positions(head)
+    arc = np.concatenate([[0.0], np.linalg.norm(np.diff(head, axis=0), axis=1).cumsum()])
+    _, first, key_of_frame = np.unique(np.floor(arc / _KEY_STEP_M), return_index=True, return_inverse=True)
+    keys = head[first]
     bottom = keys[:, 2].min() - _CLEARANCE_M[1]
     bins = int(np.ceil((keys[:, 2].max() - _CLEARANCE_M[0] - bottom) / _BIN_M)) + 1
     near, wide = (_votes(points, keys, bottom, bins, reach) for reach in (_NEAR, _WIDE))
@@ -76,41 +75,28 @@ def estimate_floor(
         raise WearcapError(
             "no points below the head's path",
             expected="a cloud in the head's world, z up",
-            fix="Give the wearer's stature instead: floor_from_head.",
+            fix="Check that the cloud and the head path share one world, and that the cloud shows the floor.",
         )
     heights = bottom + (np.arange(bins) + 0.5) * _BIN_M
-    clearance, evidence = keys[:, 2:] - heights, _evidence(votes)
+    clearance = keys[:, 2:] - heights
+    # Cost of each height: how weak its layer is beside the strongest there, and the share of points below it.
+    layer = gaussian_filter1d(votes, 1.5, axis=1)
+    strength = (layer + _FAINT) / (layer.max(1, keepdims=True) + _FAINT)
+    margin = int(0.08 / _BIN_M)
+    below = np.pad(votes.cumsum(1), ((0, 0), (margin, 0)))[:, :bins]
+    share = below / np.maximum(votes.sum(1, keepdims=True), 1)  # a single point below is no evidence
+    evidence = -np.log(strength) + 6.0 * share.clip(max=0.4)
     if standing_m is None:
         first = _cheapest_path(evidence + _posture_cost(clearance, 1.9, 20.0), _CHANGE_COST * _BIN_M)
         standing_m = _usual_clearance(np.take_along_axis(clearance, first[:, None], 1)[:, 0])
     # With the wearer's height, a ceiling below an upper floor is no longer mistaken for that floor.
     chosen = _cheapest_path(evidence + _posture_cost(clearance, standing_m + 0.03, 40.0), _CHANGE_COST * _BIN_M)
-    support = gaussian_filter1d(votes, 1.5, axis=1)[np.arange(len(keys)), chosen] * (1.5 * np.sqrt(2 * np.pi))
+    support = layer[np.arange(len(keys)), chosen] * (1.5 * np.sqrt(2 * np.pi))
     refined = _centre_of_layer(votes, chosen, heights)
     return FloorEstimate(
         torch.tensor(refined[key_of_frame], dtype=torch.float32),
         torch.tensor((support / (support + 10))[key_of_frame], dtype=torch.float32),
     )
-
-
-def floor_from_head(t_world_eyes: Float[Tensor, "time 3"], stature_m: float) -> FloorEstimate:
-    """One floor height for the whole path, from the eye height while upright (its 90th percentile).
-
-    Valid if the wearer stands or walks for a tenth of the time and stays on one storey; confidence 0.2.
-    Raises WearcapError for an implausible stature.
-    """
-    if not 0.5 < stature_m < 2.6:
-        raise WearcapError(f"stature {stature_m} m", expected="metres, between 0.5 and 2.6")
-    upright = torch.quantile(t_world_eyes[:, 2].double(), 0.9).item()
-    height = upright - EYE_HEIGHT_OF_STATURE * stature_m
-    return FloorEstimate(torch.full((len(t_world_eyes),), height), torch.full((len(t_world_eyes),), 0.2))
-
-
-def _key_positions(head: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One key position per `_KEY_STEP_M` of path, and the key of each frame."""
-    arc = np.concatenate([[0.0], np.linalg.norm(np.diff(head, axis=0), axis=1).cumsum()])
-    _, first, key_of_frame = np.unique(np.floor(arc / _KEY_STEP_M), return_index=True, return_inverse=True)
-    return head[first], key_of_frame
 
 
 def _votes(points: np.ndarray, keys: np.ndarray, bottom: float, bins: int, reach: _Reach) -> np.ndarray:
@@ -136,16 +122,6 @@ def _votes(points: np.ndarray, keys: np.ndarray, bottom: float, bins: int, reach
 
 def _cell_key(cell: np.ndarray) -> np.ndarray:
     return cell[..., 0] * (1 << 32) + cell[..., 1]
-
-
-def _evidence(votes: np.ndarray) -> np.ndarray:
-    """Cost of each height: how weak its layer is beside the strongest there, and the share of points below it."""
-    layer = gaussian_filter1d(votes, 1.5, axis=1)
-    strength = (layer + _FAINT) / (layer.max(1, keepdims=True) + _FAINT)
-    margin = int(0.08 / _BIN_M)
-    below = np.pad(votes.cumsum(1), ((0, 0), (margin, 0)))[:, : votes.shape[1]]
-    share = below / np.maximum(votes.sum(1, keepdims=True), 1)  # a single point below is no evidence
-    return -np.log(strength) + 6.0 * share.clip(max=0.4)
 
 
 def _posture_cost(clearance: np.ndarray, tallest: float, slope: float) -> np.ndarray:

@@ -1,6 +1,5 @@
 """Floor height below the wearer, updated from foot contacts and points (MocapEvery, appendix D.2)."""
 
-from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -70,34 +69,29 @@ class _Cloud:
         return np.concatenate(columns, 1) if columns else np.full((len(positions), 1), np.nan)
 
 
-@dataclass(frozen=True)
-class UpdateSettings:
-    """Parameters of D.2 with the paper's values; durations in frames at 30 Hz."""
+class FloorUpdate:
+    """Floor update of D.2 with the paper's values; durations in frames at 30 Hz.
 
-    contact: float = 0.5
+    The rule of `SETTLED` looks that many frames ahead, so the floor height lags by as many.
+    """
+
+    CONTACT = 0.5
     """Contact probability above which a foot is in contact."""
-    radius_m: float = 0.15
+    RADIUS_M = 0.15
     """Radius around the foot within which points are averaged."""
-    min_points: int = 10
+    MIN_POINTS = 10
     """Fewest points for an average; with fewer the foot's own height is used."""
-    min_change_m: float = 0.1
+    MIN_CHANGE_M = 0.1
     """Smallest change of the floor height."""
-    settled: int = 5
+    SETTLED = 5
     """No update at frames where both feet are in contact for this many frames before and after."""
-    min_frames: int = 25
+    MIN_FRAMES = 25
     """Fewest frames between updates."""
 
-
-class FloorUpdate:
-    """Floor update of D.2. The `settled` rule looks that many frames ahead, so the floor height lags by as many."""
-
-    def __init__(self, initial_m: float, settings: UpdateSettings | None = None):
-        self._settings, self._height = settings or UpdateSettings(), initial_m
-        self._cloud = _Cloud()
-        self._since = self._settings.min_frames
-        keep = 2 * self._settings.settled
-        self._contact = np.zeros((keep, 2), bool)
-        self._feet = np.full((keep, 2, 3), np.nan)
+    def __init__(self, initial_m: float):
+        self._height, self._cloud, self._since = initial_m, _Cloud(), self.MIN_FRAMES
+        self._contact = np.zeros((2 * self.SETTLED, 2), bool)
+        self._feet = np.full((2 * self.SETTLED, 2, 3), np.nan)
         self._latest: np.ndarray | None = None
         """Position (m) of the foot that was in contact last."""
 
@@ -108,65 +102,48 @@ class FloorUpdate:
         return torch.full((len(t_world_head),), self._height)
 
     def follow(self, contact_prob: Float[Tensor, "time foot"], t_world_foot: Float[Tensor, "time foot 3"]) -> None:
-        settled = self._settings.settled
+        settled = self.SETTLED
         prob = contact_prob.detach().cpu().numpy()
-        contact = np.concatenate([self._contact, prob > self._settings.contact])
+        contact = np.concatenate([self._contact, prob > self.CONTACT])
         feet = np.concatenate([self._feet, t_world_foot.detach().cpu().double().numpy()])
-        standing = contact.all(1)
-        still = np.lib.stride_tricks.sliding_window_view(standing, 2 * settled + 1).all(1)
+        still = np.lib.stride_tricks.sliding_window_view(contact.all(1), 2 * settled + 1).all(1)
         best = np.concatenate([np.zeros((2 * settled, 2)), prob]).argmax(1)
         for k, frame in enumerate(range(settled, len(contact) - settled)):
             self._since += 1
             if contact[frame].any():
                 self._latest = feet[frame, best[frame] if contact[frame].all() else int(contact[frame, 1])]
-            if self._latest is not None and not still[k] and self._since >= self._settings.min_frames:
-                self._update(self._latest)
+            if self._latest is None or still[k] or self._since < self.MIN_FRAMES:
+                continue
+            near = self._cloud.within(self._latest, self.RADIUS_M)
+            height = float(near.mean()) if len(near) >= self.MIN_POINTS else float(self._latest[2])
+            if abs(height - self._height) >= self.MIN_CHANGE_M:
+                self._height, self._since = height, 0
         self._contact, self._feet = contact[-2 * settled :], feet[-2 * settled :]
-
-    def _update(self, foot: np.ndarray) -> None:
-        near = self._cloud.within(foot, self._settings.radius_m)
-        height = float(near.mean()) if len(near) >= self._settings.min_points else float(foot[2])
-        if abs(height - self._height) >= self._settings.min_change_m:
-            self._height, self._since = height, 0
-
-
-@dataclass(frozen=True)
-class FollowSettings:
-    """Parameters of `FloorFollow` (ours), for 30 Hz."""
-
-    contact: float = 0.5
-    """Contact probability above which a foot corrects the floor."""
-    radius_m: float = 0.15
-    """Horizontal distance to a foot within which points belong to the floor."""
-    reach_m: float = 0.12
-    """Vertical distance to its sole within which they do."""
-    points: int = 12
-    """Number of nearest points that are used."""
-    min_points: int = 4
-    """Fewest points within both distances; with fewer the sole's height is used."""
-    gain: float = 0.05
-    """Share of the floor's error that a frame of full contact corrects, measured by the sole's height."""
-    gain_points: float = 0.1
-    """The same, measured by points below the sole."""
-    walking_m_s: tuple[float, float] = (0.1, 0.3)
-    """Head speeds between which the head's rise starts to move the floor, and moves it fully."""
-    level: float = 0.15
-    """Smoothing factor of the head's height (Holt's method), against the ups and downs of steps and nods."""
-    trend: float = 0.01
-    """Smoothing factor of the head's rate of rise."""
 
 
 class FloorFollow:
     """Floor that rises and falls with the walking wearer's head and is corrected by standing feet (ours, after D.2).
 
     There is no threshold, so it also follows slopes; on stairs the head moves the floor before the next foot is down,
-    for which D.2 waits. Feet, or the points below them, correct the error of the head's estimate.
+    for which D.2 waits. Feet, or the points below them, correct the error of the head's estimate. Values for 30 Hz.
     """
 
-    def __init__(self, initial_m: float, sole_m: float, fps: float, settings: FollowSettings | None = None):
+    CONTACT = 0.5
+    """Contact probability above which a foot corrects the floor."""
+    RADIUS_M, REACH_M = 0.15, 0.12
+    """Horizontal distance to a foot, and vertical distance to its sole, within which points belong to the floor."""
+    POINTS, MIN_POINTS = 12, 4
+    """Number of nearest points that are used, and fewest of them within both distances (else the sole is used)."""
+    GAIN, GAIN_POINTS = 0.05, 0.1
+    """Share of the floor's error that a frame of full contact corrects, measured by the sole's height or by points."""
+    WALKING_M_S = (0.1, 0.3)
+    """Head speeds between which the head's rise starts to move the floor, and moves it fully."""
+    LEVEL, TREND = 0.15, 0.01
+    """Smoothing factors of the head's height (Holt's method; against steps and nods) and of its rate of rise."""
+
+    def __init__(self, initial_m: float, sole_m: float, fps: float):
         """`sole_m`: height of the foot joint above the floor when the foot is flat."""
-        self._settings, self._sole, self._fps = settings or FollowSettings(), sole_m, fps
-        self._cloud = _Cloud()
+        self._sole, self._fps, self._cloud = sole_m, fps, _Cloud()
         self._floors = np.array([initial_m])
         """Floor heights (m) of the latest block of frames."""
         self._head: np.ndarray | None = None
@@ -181,10 +158,10 @@ class FloorFollow:
         return torch.from_numpy(self._floors).float()
 
     def follow(self, contact_prob: Float[Tensor, "time foot"], t_world_foot: Float[Tensor, "time foot 3"]) -> None:
-        settings, correction = self._settings, 0.0
-        weight = (contact_prob.detach().cpu().numpy() - settings.contact).clip(0) / (1 - settings.contact)
+        correction = 0.0
+        weight = (contact_prob.detach().cpu().numpy() - self.CONTACT).clip(0) / (1 - self.CONTACT)
         height, from_points = self._floor_at(t_world_foot.detach().cpu().double().numpy())
-        weight = weight * np.where(from_points, settings.gain_points, settings.gain)
+        weight = weight * np.where(from_points, self.GAIN_POINTS, self.GAIN)
         total = weight.sum(1)
         target = (weight * height).sum(1) / np.where(total > 0, total, 1)
         share = weight.max(1)
@@ -194,30 +171,28 @@ class FloorFollow:
 
     def _rise(self, head: np.ndarray) -> float:
         """Rise of the floor (m) within a frame, from the head's smoothed height (Holt's linear trend)."""
-        settings = self._settings
         if self._head is None:
             self._head, self._level = head, float(head[2])
         velocity = (head[:2] - self._head[:2]) * self._fps
-        self._velocity += settings.level * (velocity - self._velocity)
+        self._velocity += self.LEVEL * (velocity - self._velocity)
         self._head = head
         before, innovation = self._level, float(head[2]) - self._level - self._trend
-        self._level += self._trend + settings.level * innovation
-        self._trend += settings.trend * innovation
-        low, high = settings.walking_m_s
+        self._level += self._trend + self.LEVEL * innovation
+        self._trend += self.TREND * innovation
+        low, high = self.WALKING_M_S
         walking = float(np.clip((np.hypot(*self._velocity) - low) / (high - low), 0, 1))
         return walking * (self._level - before)
 
     def _floor_at(self, feet: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Floor height (m) at feet "time foot 3", from points where there are enough, else from the soles; and whether
         it is from points."""
-        settings, soles = self._settings, feet[..., 2] - self._sole
+        soles = feet[..., 2] - self._sole
         if self._cloud.empty:
             return soles, np.zeros(soles.shape, bool)
         positions = np.concatenate([feet[..., :2], soles[..., None]], -1).reshape(-1, 3)
-        reach = float(np.hypot(settings.radius_m, settings.reach_m))
-        heights = self._cloud.nearest(positions, reach, settings.points)
-        heights[np.abs(heights - positions[:, 2:]) > settings.reach_m] = np.nan
-        few = np.isfinite(heights).sum(1, keepdims=True) < settings.min_points
+        heights = self._cloud.nearest(positions, float(np.hypot(self.RADIUS_M, self.REACH_M)), self.POINTS)
+        heights[np.abs(heights - positions[:, 2:]) > self.REACH_M] = np.nan
+        few = np.isfinite(heights).sum(1, keepdims=True) < self.MIN_POINTS
         heights = np.where(few, positions[:, 2:], heights)
         return np.nanmedian(heights, 1).reshape(soles.shape), ~few.reshape(soles.shape)
 

@@ -12,7 +12,7 @@ from wearcap.scene.objects import SceneObject
 
 ANCHORS = ("right", "middle")
 """Reference point of an object held by two hands: the right hand (thesis), or the middle of both (ours)."""
-LEAST_APART_M = 0.05
+_LEAST_APART_M = 0.05
 """Smallest distance between the hands that defines a direction; below it the last angle is kept."""
 
 
@@ -40,47 +40,32 @@ def follow_hands(
     palms = palms_world[:, holds].double()
     kind = item.freedom.kind
     if kind in ("hinge", "axis"):
-        change = hinge_angle(item, palms) if kind == "hinge" else axis_displacement(item, palms)
+        if kind == "hinge":  # signed angle of the palms about the hinge (eq. 5.6, 5.4), averaged over hands
+            arm = palms[..., :2] - torch.tensor(item.freedom.pivot, dtype=palms.dtype)[:2]
+            change = _turned(arm.transpose(0, 1)).mean(0)
+        else:
+            change = ((palms - palms[:1]) @ torch.tensor(item.freedom.axis, dtype=palms.dtype)).mean(1)
         value = item.freedom.clamped(state.value + change)
         return item.freedom.moved(item.T_world_object, value), value
-    T = carried(state.T_world_object, palms, anchor)
-    if kind == "plane":
-        T.t[:, 2] = state.T_world_object.t[2].to(T.t)
-    return T, torch.zeros(len(palms), dtype=torch.float64)
-
-
-def hinge_angle(item: SceneObject, palms: Float[Tensor, "time hand 3"]) -> Float[Tensor, "time"]:
-    """Signed angle (rad, unwrapped) of the holding palms about the hinge (eq. 5.6, 5.4), averaged over hands."""
-    arm = palms[..., :2] - torch.tensor(item.freedom.pivot, dtype=palms.dtype)[:2]
-    return turned(arm.transpose(0, 1)).mean(0)
-
-
-def axis_displacement(item: SceneObject, palms: Float[Tensor, "time hand 3"]) -> Float[Tensor, "time"]:
-    """Displacement (m) of the holding palms along an object's axis, averaged over hands."""
-    axis = torch.tensor(item.freedom.axis, dtype=palms.dtype)
-    return ((palms - palms[:1]) @ axis).mean(1)
-
-
-def carried(start: Rigid, palms: Float[Tensor, "time hand 3"], anchor: str) -> Rigid:
-    """O* = R^α (O − h) + h + t, α the turn of the vector from the right hand to the left (eq. 5.3–5.5, 5.7).
-
-    h is the right hand or the middle of both, t its translation; a single hand gives a translation only. The height
-    follows the hands, too.
-    """
+    # O* = R^α (O − h) + h + t, α the turn of the vector from the right hand to the left (eq. 5.3–5.5, 5.7). h is the
+    # right hand or the middle of both, t its translation; a single hand gives a translation only.
     alone = palms.shape[1] == 1
     point = palms[:, -1] if alone or anchor == "right" else palms.mean(1)
-    angle = palms.new_zeros(len(palms)) if alone else turned((palms[:, 0] - palms[:, -1])[None, :, :2])[0]
+    angle = palms.new_zeros(len(palms)) if alone else _turned((palms[:, 0] - palms[:, -1])[None, :, :2])[0]
     R = rotation.about_axis("z", angle)
-    lever = start.t.to(palms) - point[0]
-    return Rigid(R @ start.R.to(palms), point + (R @ lever[:, None])[..., 0])
+    start = state.T_world_object
+    t = point + (R @ (start.t.to(palms) - point[0])[:, None])[..., 0]
+    if kind == "plane":
+        t[:, 2] = start.t[2].to(t)
+    return Rigid(R @ start.R.to(palms), t), torch.zeros(len(palms), dtype=torch.float64)
 
 
-def turned(vectors: Float[Tensor, "hand time 2"]) -> Float[Tensor, "hand time"]:
+def _turned(vectors: Float[Tensor, "hand time 2"]) -> Float[Tensor, "hand time"]:
     """Signed angle (rad) from the first vector to each one, unwrapped over time; short vectors keep the last angle.
 
     Before the first vector that is long enough the angle is 0.
     """
-    long = vectors.norm(dim=-1) > LEAST_APART_M
+    long = vectors.norm(dim=-1) > _LEAST_APART_M
     first = long.long().argmax(-1, keepdim=True)
     frame = torch.where(long, torch.arange(vectors.shape[1]), first).cummax(-1).values
     kept = vectors.gather(1, frame[..., None].expand_as(vectors))

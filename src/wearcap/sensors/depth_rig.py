@@ -16,10 +16,9 @@ from sklearn.cluster import DBSCAN
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
-from wearcap.geometry.pointcloud import voxel_downsample
 from wearcap.geometry.render import Splats, render
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.surface import SurfaceIndex
+from wearcap.geometry.surface import SurfaceIndex, voxel_downsample
 
 CLUSTER_EPS_M = 0.12
 """DBSCAN's distance (thesis §4.5.1)."""

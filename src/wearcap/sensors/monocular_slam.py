@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float, Float64
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from wearcap.body.limb_ik import swing_between
 from wearcap.errors import WearcapError
+from wearcap.geometry.rotation import swing_between
 from wearcap.geometry.trajectory import Trajectory, filled, find_gaps, interpolate, require_rising, resample
 from wearcap.recording.recording import ImuStream
 from wearcap.sensors.imu import GRAVITY, acceleration

@@ -15,11 +15,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording.recording import ImuStream
 from wearcap.sensors.stillness import StepCheck, Stretch, during, require, still_intervals, unstillness_deg
-from wearcap.sensors.watches import WRISTS, require_sides
+from wearcap.sensors.watches import require_sides
 
 FACING_DEG = 90.0
 """The T-pose faces the world's y."""

@@ -6,12 +6,12 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import find_gaps
 from wearcap.recording import ImuStream
 
-WRISTS = ("left_wrist", "right_wrist")
 MAX_GAP_S = 0.5
 """Longest gap (s) between a watch's samples that is interpolated."""
 FILTER = 7

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics, local_rotations
-from wearcap.body.limb_ik import reach
+from wearcap.body.retarget import reach
 from wearcap.body.skeleton import Skeleton
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion

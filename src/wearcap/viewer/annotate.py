@@ -17,10 +17,9 @@ from wearcap.io.formats.contact_labels import LabelClock, annotation_of, hcontac
 from wearcap.io.formats.environment import read_environment
 from wearcap.io.formats.video import video_info
 from wearcap.recording.interactions import HANDS
-from wearcap.recording.locate import dataset_folder, load_recording
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
-from wearcap.recording.store import RecordingStore
+from wearcap.recording.store import RecordingStore, dataset_folder, load_recording
 from wearcap.viewer.annotation_file import AnnotationFile, label_path, starting_labels
 
 _DRAWN_SITES = ("heel", "toe_tip", "fingertip")

@@ -18,10 +18,9 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import matrix_from_quat_wxyz
 from wearcap.io.formats.environment import MAX_HINGE_GAP_M, read_environment, write_environment
-from wearcap.scene.editing import ObjectEditing, points_world
+from wearcap.scene.editing import ObjectEditing, hinge_places, points_world, snapped
 from wearcap.scene.environment import hinge_gap_m
 from wearcap.scene.objects import Freedom, SceneObject
-from wearcap.scene.placing import hinge_places, snapped
 from wearcap.scene.scan import Scan
 from wearcap.viewer.object_editor_panels import HINTS, TOOLS, ObjectPanel, SelectPanel
 from wearcap.viewer.object_editor_view import EditorView

@@ -5,7 +5,7 @@ import viser
 
 from wearcap.scene.editing import USUAL_KIND
 from wearcap.scene.objects import Freedom, SceneObject
-from wearcap.scene.selection import Box
+from wearcap.scene.scan import Box
 
 TOOLS: tuple[str, ...] = ("look", "box", "brush", "eraser", "hinge / slide", "try")
 HINTS = {

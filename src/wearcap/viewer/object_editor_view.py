@@ -11,8 +11,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import quat_wxyz_from_matrix
 from wearcap.scene.editing import points_world
 from wearcap.scene.objects import SceneObject
-from wearcap.scene.scan import Scan
-from wearcap.scene.selection import Box, first_hit
+from wearcap.scene.scan import Box, Scan, first_hit
 from wearcap.viewer.page_layers import by_height
 
 SHOWN_POINTS, SHOWN_SELECTED, SHOWN_OF_OBJECT = 250_000, 80_000, 40_000

@@ -28,7 +28,7 @@ from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import check_rising
 from wearcap.io.formats.smpl import shape_from_betas, smpl_motion
 from wearcap.io.formats.text import read_json
-from wearcap.scene.object_mesh import centered, check_object_mesh
+from wearcap.scene.objects import centered, check_object_mesh
 
 FPS = 30
 """Frame rate (Hz) of the release that has `smpl_fit_all.npz`; the older release has one frame per second in folders."""

@@ -14,13 +14,14 @@ import yaml
 from jaxtyping import Float
 from torch import Tensor
 
+from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.files import MAX_JSON_DEPTH
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.hps import nominal_mount
-from wearcap.io.devices.watch_log import WRISTS, read_watch_log
+from wearcap.io.devices.watch_log import read_watch_log
 from wearcap.io.formats.bounded import understood
 from wearcap.io.formats.npz import require
 from wearcap.io.formats.ply import read_ply

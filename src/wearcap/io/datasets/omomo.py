@@ -28,7 +28,7 @@ from wearcap.io.formats.poses import are_rotations
 from wearcap.io.formats.restricted_pickle import read_pickle
 from wearcap.io.formats.smpl import shape_from_arrays, smpl_motion
 from wearcap.io.formats.wavefront import read_obj
-from wearcap.scene.object_mesh import centered, check_object_mesh
+from wearcap.scene.objects import centered, check_object_mesh
 
 FILES = ("train_diffusion_manip_seq_joints24.p", "test_diffusion_manip_seq_joints24.p")
 MESHES, MESH_ENDING = "captured_objects", "_cleaned_simplified.obj"

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import matrix_from_quat_wxyz
 from wearcap.io.formats.bounded import understood
@@ -22,7 +23,6 @@ G_M_S2 = 9.80665
 MIN_RATE_HZ = 20.0
 UPRIGHT = 0.98
 """Least length of the mean direction of gravity in the world, and its least share along z, of a valid log."""
-WRISTS = ("left_wrist", "right_wrist")
 _XYZ = ("X", "Y", "Z")
 _SENSOR_LOGGER = {
     "turn": [f"rotationRate{axis}" for axis in _XYZ],

@@ -207,11 +207,11 @@ def _drawn(
     index[own >= 0] = -1
     picture = colored(scenery, lens, pose, nearness.ravel(), index.ravel(), light)[0].reshape(*own.shape, 3)
     # The renderer shades the body alone, each face with its own normal.
-    none, no_map = np.zeros(len(body.faces), bool), np.zeros((0, 0), np.float32)
+    none = np.zeros(len(body.faces), bool)
     shaded, rays = np.empty(picture.shape, np.uint8), (lens.rays * lens.reach[:, None]).reshape(picture.shape)
-    mesh = (in_cam, body.faces, body.color, none, none, 255 * body.color, body.faces, body.color)
-    lights = (light, np.zeros((6, 4)), 1.0, no_map, no_map, no_map, no_map, 1.0)
-    images = (np.zeros((view.height, 3), np.float32), shaded, np.empty(own.shape, np.float32), np.empty_like(own))
-    raster.resolve(nearness, own, rays, 1, pose, *mesh, *lights, *images)
+    triangles = raster.Triangles(in_cam, body.faces, body.color, none, none, 255 * body.color, body.faces)
+    background = np.zeros((view.height, 3), np.float32)
+    images = background, shaded, np.empty(own.shape, np.float32), np.empty_like(own)
+    raster.resolve(nearness, own, rays, 1, pose, triangles, body.color, light, raster.Shadows(), *images)
     picture[own >= 0] = shaded[own >= 0]
     return picture

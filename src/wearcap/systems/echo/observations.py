@@ -8,7 +8,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.body.contact_points import BODY_POINTS
-from wearcap.body.skeleton import FOOT_PATCHES
+from wearcap.body.skeleton import FOOT_PATCHES, WRISTS
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
@@ -18,14 +18,13 @@ from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 from wearcap.recording.timing import at_times
 from wearcap.scene.environment import Environment
-from wearcap.scene.object_mesh import check_object
-from wearcap.systems.echo.features import CONTACTS, POINTS
+from wearcap.scene.objects import check_object
+from wearcap.systems.echo.features import CONTACTS
 from wearcap.systems.echo.model import MODALITIES
 from wearcap.systems.echo.objects import ObjectReader, ObjectShape
 from wearcap.systems.echo.queue import Conditioning
 from wearcap.tracking.head_path import HeadPath
 
-WRISTS = POINTS[1:]
 MAX_GAP_S = 0.5
 """Longest gap in a wrist's tracking that is interpolated (s)."""
 SAME_S = 1e-4

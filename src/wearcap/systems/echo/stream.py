@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body import skeleton
-from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeleton import WRISTS, Skeleton
 from wearcap.diffusion import conveyor
 from wearcap.errors import WearcapError
 from wearcap.geometry import rigid, rotation, trajectory
@@ -31,7 +31,7 @@ from wearcap.runtime.graphs import undisturbed
 from wearcap.runtime.session import Session, WearerStream
 from wearcap.runtime.snapshot import classes_of
 from wearcap.scene.environment import Environment
-from wearcap.scene.object_mesh import check_object
+from wearcap.scene.objects import check_object
 from wearcap.sensors import packets, samples
 from wearcap.sensors.packets import (
     CONNECTED_S,
@@ -48,7 +48,7 @@ from wearcap.sensors.packets import (
 )
 from wearcap.sensors.samples import ActiveObject, HeadSample, ObjectSample, WristSample
 from wearcap.systems.echo import queue, static_objects
-from wearcap.systems.echo.features import CONTACTS, POINTS
+from wearcap.systems.echo.features import CONTACTS
 from wearcap.systems.echo.model import MODALITIES
 from wearcap.systems.echo.objects import ObjectShape
 from wearcap.systems.echo.observations import MAX_GAP_S, BatchItem, wrist_poses
@@ -59,7 +59,6 @@ from wearcap.tracking import floor, head_path
 from wearcap.tracking.floor import FloorTracker
 from wearcap.tracking.head_path import Chunk, HeadPath, HeadTrack
 
-WRISTS = POINTS[1:]
 MAX_SEEN = 1000
 """Most object observations that are buffered; the oldest are dropped."""
 ASIDE_M, BELOW = 0.25, 0.47

@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.data.features import FEET, LIMBS, first_repeated
+from wearcap.body.skeleton import FEET
+from wearcap.data.features import LIMBS, first_repeated
 from wearcap.data.statistics import MIN_SCALE, collate
 from wearcap.data.windows import WindowDataset
 from wearcap.errors import WearcapError

@@ -8,8 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
-from wearcap.body.skeleton import Skeleton
-from wearcap.data.features import FEET
+from wearcap.body.skeleton import FEET, Skeleton
 from wearcap.data.windows import Window, WindowDataset
 from wearcap.diffusion.process import add_noise
 from wearcap.diffusion.schedule import Schedule

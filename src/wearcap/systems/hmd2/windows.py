@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from wearcap.data.features import FEET
+from wearcap.body.skeleton import FEET
 from wearcap.diffusion.sampler import Denoise, sample
 from wearcap.diffusion.schedule import Schedule
 from wearcap.geometry.rigid import Rigid

@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import UInt8
 
+from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.io.formats.video import read_frames, read_image
 from wearcap.localization.features import Extractor, GlobalDescriptor, Matcher, RootSift
@@ -23,7 +24,6 @@ from wearcap.sensors.clock import Clock, fit_clock, retime
 from wearcap.sensors.imu import synthesize_imu
 
 CLOCKS = ("shared", "claps", "auto")
-WRISTS = ("left_wrist", "right_wrist")
 MAP_NAME = "map.safetensors"
 USUAL_HZ = 6.0
 """Default number of frames localised per second; the suit's motion bridges the frames between."""

@@ -11,7 +11,7 @@ from wearcap.body.anny_body import anny_body
 from wearcap.metrics.scores import score
 from wearcap.metrics.surface import foot_surface, foot_vertices
 from wearcap.recording import Motion, Recording
-from wearcap.recording.locate import dataset_folder, load_recording
+from wearcap.recording.store import dataset_folder, load_recording
 from wearcap.runtime.system import CaptureInput
 from wearcap.scene.scan import Scan
 from wearcap.systems.hps.camera import Localize

@@ -6,11 +6,12 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
+from wearcap.body.skeleton import FEET
 from wearcap.errors import WearcapError
 from wearcap.runtime.describe import skeleton_from_json, skeleton_to_json
 from wearcap.runtime.graphs import Exports, Run
 from wearcap.systems.mocap_every.features import WatchFeatures
-from wearcap.systems.mocap_every.model import FEET, Estimate, WatchEstimator, estimator_graph
+from wearcap.systems.mocap_every.model import Estimate, WatchEstimator, estimator_graph
 from wearcap.systems.mocap_every.pipeline import MocapEvery
 
 SETTINGS = ("stride", "lookahead", "floor", "anchor", "mirror_average")

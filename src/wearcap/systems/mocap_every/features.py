@@ -8,14 +8,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
-from wearcap.body.skeleton import MIRROR, Skeleton
+from wearcap.body.skeleton import FOOT_JOINTS, MIRROR, WRISTS, Skeleton
 from wearcap.data.features import LIMBS, first_repeated
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.sensors.imu import acceleration
 
-WRISTS = ("left_wrist", "right_wrist")
-ENDS = ("left_wrist", "right_wrist", "left_toe", "right_toe")
+ENDS = (*WRISTS, *FOOT_JOINTS)
 """End-effectors whose positions the first stage predicts: hands and feet."""
 FRAMES = ("own", "heading", "head", "world")
 TRACKED = ("watches", "positions")

@@ -6,9 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wearcap.body.skeleton import FEET
 from wearcap.geometry import rotation
-
-FEET = 2
 
 
 class Posed(NamedTuple):

@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
-from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeleton import FEET, Skeleton
 from wearcap.data.statistics import MIN_SCALE, collate
 from wearcap.metrics.position import mpjpe_cm
 from wearcap.systems.mocap_every.manifold import MotionManifold
-from wearcap.systems.mocap_every.manifold_features import FEET, Posed, decode_window, encode_window, origin_of
+from wearcap.systems.mocap_every.manifold_features import Posed, decode_window, encode_window, origin_of
 from wearcap.systems.mocap_every.training_windows import WatchDataset, WatchWindow
 from wearcap.training.base import WeighedTerms
 

@@ -6,13 +6,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from wearcap.body.skeleton import FEET
 from wearcap.models.layers import Normalizer, TemporalBlend
 from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.runtime.graphs import Graph
 
 ENDS_SIZE = 12
 """Size of the positions of two hands and two feet."""
-FEET = 2
 
 
 class Estimate(NamedTuple):

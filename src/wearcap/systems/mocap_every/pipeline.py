@@ -21,7 +21,6 @@ from wearcap.scene.floor_update import FloorFixed, FloorFollow, FloorFollower, F
 from wearcap.sensors.watches import watches_at
 from wearcap.systems.mocap_every.energy import LatentSolution
 from wearcap.systems.mocap_every.features import Sensed, WatchFeatures, synthetic_wrists
-from wearcap.systems.mocap_every.model import FEET as CONTACTS
 from wearcap.systems.mocap_every.model import Estimate, WatchEstimator, estimator_graph
 from wearcap.systems.mocap_every.visual_cues import VisualCues
 from wearcap.systems.mocap_every.windows import EstimatorWindows, FinalPoses

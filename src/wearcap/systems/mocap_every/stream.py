@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body import skeleton
-from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeleton import WRISTS, Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry import rigid
 from wearcap.geometry.rigid import Rigid
@@ -43,7 +43,7 @@ from wearcap.sensors.packets import (
     values_fault,
 )
 from wearcap.sensors.samples import HeadSample, WatchSample
-from wearcap.sensors.watches import FILTER, MAX_GAP_S, WRISTS, filtered
+from wearcap.sensors.watches import FILTER, MAX_GAP_S, filtered
 from wearcap.systems.mocap_every import features, windows
 from wearcap.systems.mocap_every.features import Sensed
 from wearcap.systems.mocap_every.pipeline import MocapEvery

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
-from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeleton import FEET, FOOT_JOINTS, Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
@@ -30,10 +30,8 @@ from wearcap.systems.mocap_every.energy import (
     solve_latent,
 )
 from wearcap.systems.mocap_every.manifold import MotionManifold
-from wearcap.systems.mocap_every.manifold_features import FEET, Posed, decode_window, encode_window, origin_of
+from wearcap.systems.mocap_every.manifold_features import Posed, decode_window, encode_window, origin_of
 from wearcap.tracking.anchor import anchored_to_head
-
-FOOT_JOINTS = ("left_toe", "right_toe")
 
 
 @dataclass(frozen=True, eq=False)

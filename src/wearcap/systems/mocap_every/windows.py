@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
-from wearcap.body.skeleton import MIRROR, Skeleton
+from wearcap.body.skeleton import FOOT_JOINTS, MIRROR, Skeleton
 from wearcap.data.features import body_size
 from wearcap.data.windows import mirrored_rotations
 from wearcap.geometry import rotation
@@ -21,9 +21,6 @@ from wearcap.systems.mocap_every.features import Sensed, mirrored, to_world
 
 if TYPE_CHECKING:
     from wearcap.systems.mocap_every.pipeline import MocapEvery
-
-FEET = ("left_toe", "right_toe")
-"""Foot joints whose contact is predicted and whose positions update the floor."""
 
 
 class FinalPoses(NamedTuple):
@@ -47,7 +44,7 @@ class EstimatorWindows:
     def __init__(self, pipeline: "MocapEvery", skeleton: Skeleton, floor: FloorFollower):
         self._pipeline, self._skeleton, self.floor = pipeline, skeleton, floor
         self._size = body_size(skeleton)[None]
-        self._feet = skeleton.indices(*FEET)
+        self._feet = skeleton.indices(*FOOT_JOINTS)
         window = pipeline.net.window
         position = torch.arange(1, window + 1, dtype=torch.float32)
         self._weight = torch.minimum(position, window + 1 - position).square()[:, None]
