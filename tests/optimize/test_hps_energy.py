@@ -258,7 +258,8 @@ def gaze_step(R_world_head: torch.Tensor, t_world_root: torch.Tensor) -> torch.T
 
 
 @pytest.mark.parametrize(
-    "solve", [solve_banded, lambda e, d: solve_adam_windows(e, d, AdamSettings(60, 59, 600, 2e-3))]
+    "solve",
+    [solve_banded, lambda e, d: solve_adam_windows(e, d, AdamSettings(steps=400, learning_rate=3e-3, full_mesh=False))],
 )
 def test_a_term_that_is_added_to_the_table_finds_its_planted_answer(solve, monkeypatch):
     monkeypatch.setitem(TERMS, "beacon", Term(beacon_distance, ("t_root",), reach=1))

@@ -1,8 +1,11 @@
 """Second-order solver of the bending energy (ours), in time linear in the path's length.
 
 The initial path is the unique minimum of a convex relaxation in which steps may also stretch, so no initial guess is
-needed. Gauss-Newton steps follow, each one backward and one forward pass (`trajectory_kernels`). The forward pass
-feeds the current position back into the turns, so errors do not accumulate over paths of kilometres.
+needed. Gauss-Newton steps follow, each one backward and one forward pass. Given a frame's position and its step's
+turn, the rest of the path does not depend on what came before. So the least energy from a frame to the end is, to
+second order, a quadratic form of these three numbers: the backward pass computes it for all frames (Riccati recursion),
+with feedback gains from position and previous turn to the next turn. The forward pass feeds the current position back
+into the turns, so errors do not accumulate over paths of kilometres.
 """
 
 import numpy as np
