@@ -122,7 +122,7 @@ def reweight(square, kind, delta, smooth):
 
 
 @compiled
-def exp_and_jacobian(v, R, J):
+def _exp_and_jacobian(v, R, J):
     """Rotation matrix of a rotation vector, and its right Jacobian: exp(v + d) ≈ exp(v) exp(J d)."""
     square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     if square < 1e-8:
@@ -145,7 +145,7 @@ def exp_and_jacobian(v, R, J):
 
 
 @compiled
-def turn_between(A, B, v):
+def _turn_between(A, B, v):
     """Rotation vector (world axes, rad) that rotates A into B: log(B Aᵀ), angles up to π."""
     R = np.zeros((3, 3))
     for i in range(3):
@@ -168,13 +168,13 @@ def turn_between(A, B, v):
 
 
 @compiled
-def pose_all(theta, R_root, t, parents, offsets, R, c, axes):
+def _pose_all(theta, R_root, t, parents, offsets, R, c, axes):
     """Forward kinematics of the optimised joints (index 0: root): rotations, origins, perturbation axes (world)."""
     R_local, J = np.empty((3, 3)), np.empty((3, 3))
     for j in range(len(t)):
         R[j, 0], c[j, 0], axes[j, 0] = R_root[j], t[j], R_root[j]
         for a in range(theta.shape[1]):
-            exp_and_jacobian(theta[j, a], R_local, J)
+            _exp_and_jacobian(theta[j, a], R_local, J)
             above = parents[a]
             for i in range(3):
                 c[j, a + 1, i] = c[j, above, i]
@@ -191,7 +191,7 @@ def pose_all(theta, R_root, t, parents, offsets, R, c, axes):
 
 
 @compiled
-def patch_points(R, c, leg_chains, arms, shares, patch, points):
+def _patch_points(R, c, leg_chains, arms, shares, patch, points):
     """Positions of patch vertices, each skinned to the last two joints of its leg."""
     for j in range(len(R)):
         for n in range(len(patch)):
@@ -207,7 +207,7 @@ def patch_points(R, c, leg_chains, arms, shares, patch, points):
 
 
 @compiled
-def vertex_twist(R, chain, arms, shares, A):
+def _vertex_twist(R, chain, arms, shares, A):
     """Transposed Jacobian (12, 3) of a patch vertex in the twists (v, ω) of its leg's last two joints.
 
     Returns the number of rows used: six if the second joint has no weight.
@@ -229,7 +229,7 @@ def vertex_twist(R, chain, arms, shares, A):
 
 
 @compiled
-def foot_map(c, axes, chain, T):
+def _foot_map(c, axes, chain, T):
     """Jacobian, 12 x (6 + 3 joints), of the twists of a leg's last two joints in translation, root and leg joints."""
     T[:] = 0.0
     for h in range(2):
@@ -255,11 +255,11 @@ def foot_map(c, axes, chain, T):
 @compiled
 def update_kinematics(theta, R_root, t, body, kin):
     """Compute joint poses, patch vertices and derivatives of a state."""
-    pose_all(theta, R_root, t, body.parents, body.offsets, kin.R, kin.c, kin.axes)
-    patch_points(kin.R, kin.c, body.leg_chains, body.arms, body.shares, body.patch, kin.points)
+    _pose_all(theta, R_root, t, body.parents, body.offsets, kin.R, kin.c, kin.axes)
+    _patch_points(kin.R, kin.c, body.leg_chains, body.arms, body.shares, body.patch, kin.points)
     for j in range(len(t)):
         for f in range(2):
-            foot_map(kin.c[j], kin.axes[j], body.leg_chains[f], kin.foot_maps[j, f])
+            _foot_map(kin.c[j], kin.axes[j], body.leg_chains[f], kin.foot_maps[j, f])
 
 
 @compiled
@@ -281,7 +281,7 @@ def gather(theta, t, body, rows, smooth, kin, forms, energy):
 
 
 @compiled
-def rho(k, square, share, rows, smooth, energy):
+def _rho(k, square, share, rows, smooth, energy):
     """Add a residual's energy; returns its weight in the least-squares problem."""
     value, weight = reweight(square, rows.kind[k], rows.delta[k], smooth)
     energy[rows.number[k]] += rows.weight[k] * share * value
@@ -290,9 +290,9 @@ def rho(k, square, share, rows, smooth, energy):
 
 @compiled
 def weigh(k, square, share, rows, smooth, energy, weight):
-    """Fill `weight` (residual) as `rho` does, for a term that is differentiated automatically."""
+    """Fill `weight` (residual) as `_rho` does, for a term that is differentiated automatically."""
     for e in range(len(square)):
-        weight[e] = rho(k, square[e], share[e], rows, smooth, energy)
+        weight[e] = _rho(k, square[e], share[e], rows, smooth, energy)
 
 
 @compiled
@@ -303,8 +303,8 @@ def _gather_motion(j, k, t, body, rows, smooth, kin, forms, energy):
         r = (t[j + 1] - t[j] if pair else t[j]) - rows.positions[slot, j]
     else:
         joint, step = 0 if value == ROOT else body.head_chain[-1], rows.rotations[slot, j]
-        turn_between(step @ kin.R[j, joint] if pair else step, kin.R[j + pair, joint], r)
-    w = rho(k, r @ r, rows.share[rows.slot[k, 2], j], rows, smooth, energy)
+        _turn_between(step @ kin.R[j, joint] if pair else step, kin.R[j + pair, joint], r)
+    w = _rho(k, r @ r, rows.share[rows.slot[k, 2], j], rows, smooth, energy)
     forms.small[j + pair, value] += w
     forms.small_gradient[j + pair, value] += w * r
     if pair:
@@ -322,17 +322,17 @@ def _gather_pose(j, k, theta, body, rows, smooth, forms, energy):
         for a in range(theta.shape[1]):
             for i in range(3):
                 square += (theta[j, a, i] - rows.theta_imu[j, a, i]) ** 2
-        forms.pose[j] += rho(k, square, rows.share[rows.slot[k, 2], j], rows, smooth, energy)
+        forms.pose[j] += _rho(k, square, rows.share[rows.slot[k, 2], j], rows, smooth, energy)
     else:
         for f in range(2):
             for joint in body.leg_chains[f]:
                 for i in range(3):
-                    square += pose_change(j, joint, i, theta, rows.theta_imu) ** 2
-        forms.pose_step[j] += rho(k, square, rows.share[rows.slot[k, 2], j], rows, smooth, energy)
+                    square += _pose_change(j, joint, i, theta, rows.theta_imu) ** 2
+        forms.pose_step[j] += _rho(k, square, rows.share[rows.slot[k, 2], j], rows, smooth, energy)
 
 
 @compiled
-def pose_change(j, joint, i, theta, theta_imu):
+def _pose_change(j, joint, i, theta, theta_imu):
     """Change of a joint's deviation from the suit's axis-angle from frame j to j + 1 (rad)."""
     here = theta[j, joint - 1, i] - theta_imu[j, joint - 1, i]
     return theta[j + 1, joint - 1, i] - theta_imu[j + 1, joint - 1, i] - here
@@ -350,16 +350,16 @@ def _gather_contact(j, body, rows, smooth, kin, forms, energy):
             if rows.value[k] != SOLES or rows.reach[k] != 1 or rows.sole_share[factor, j, n] == 0:
                 continue
             share = rows.sole_share[factor, j, n]
-            width = vertex_twist(kin.R[j], body.leg_chains[f], body.arms[n], body.shares[n], A)
+            width = _vertex_twist(kin.R[j], body.leg_chains[f], body.arms[n], body.shares[n], A)
             _difference(kin.points[j, n], rows.points[slot, j, n], r)
             if normal < 0:
-                w = rho(k, _square(r), share, rows, smooth, energy)
+                w = _rho(k, _square(r), share, rows, smooth, energy)
                 _add_square(Q, A, width, w)
                 _add_gradient(g, A, width, r, w)
                 continue
             up = rows.points[normal, j, n]
             distance = r[0] * up[0] + r[1] * up[1] + r[2] * up[2]
-            w = rho(k, distance * distance, share, rows, smooth, energy)
+            w = _rho(k, distance * distance, share, rows, smooth, energy)
             for i in range(width):
                 along[i] = A[i, 0] * up[0] + A[i, 1] * up[1] + A[i, 2] * up[2]
                 g[i] += w * distance * along[i]
@@ -377,11 +377,11 @@ def _gather_slide(j, k, body, rows, smooth, kin, forms, energy):
         if share == 0:
             continue
         f = body.patch[n] // 2
-        width = vertex_twist(kin.R[j], body.leg_chains[f], body.arms[n], body.shares[n], A)
-        vertex_twist(kin.R[j + 1], body.leg_chains[f], body.arms[n], body.shares[n], B)
+        width = _vertex_twist(kin.R[j], body.leg_chains[f], body.arms[n], body.shares[n], A)
+        _vertex_twist(kin.R[j + 1], body.leg_chains[f], body.arms[n], body.shares[n], B)
         _difference(kin.points[j + 1, n], kin.points[j, n], r)
         _difference(r, rows.points[slot, j, n], r)
-        w = rho(k, _square(r), share, rows, smooth, energy)
+        w = _rho(k, _square(r), share, rows, smooth, energy)
         _add_square(forms.foot[j, f], A, width, w)
         _add_square(forms.foot[j + 1, f], B, width, w)
         _add_gradient(forms.foot_gradient[j, f], A, width, r, -w)
@@ -435,7 +435,7 @@ def _fill_trunk(j, theta, theta_imu, body, kin, forms, diagonal, gradient):
     """Add translation, root and head; eliminating the spine turns its pose prior into the form w (J Jᵀ)⁻¹ of the
     head."""
     D, g, R = diagonal[j], gradient[j], kin.R[j, 0]
-    inverse, turn = spine_form(theta, theta_imu, body, kin, j)
+    inverse, turn = _spine_form(theta, theta_imu, body, kin, j)
     pull = inverse @ turn
     for i in range(3):
         D[i, i] += forms.small[j, 0]
@@ -451,7 +451,7 @@ def _fill_trunk(j, theta, theta_imu, body, kin, forms, diagonal, gradient):
 
 
 @compiled
-def spine_form(theta, theta_imu, body, kin, j):
+def _spine_form(theta, theta_imu, body, kin, j):
     """((J Jᵀ)⁻¹, J d): J is the head rotation's Jacobian (world axes) in the spine's axis-angles, d their deviation
     from the suit's."""
     gram, turn = np.zeros((3, 3)), np.zeros(3)
@@ -493,7 +493,7 @@ def _fill_foot(j, f, theta, theta_imu, body, kin, forms, diagonal, below, gradie
             away = theta[j, chain[k] - 1, i] - theta_imu[j, chain[k] - 1, i]
             gradient[j, at] += forms.pose[j] * away
             if j + 1 < len(diagonal):
-                w, change = forms.pose_step[j], pose_change(j, chain[k], i, theta, theta_imu)
+                w, change = forms.pose_step[j], _pose_change(j, chain[k], i, theta, theta_imu)
                 diagonal[j, at, at] += w
                 diagonal[j + 1, at, at] += w
                 below[j, at, at] -= w
@@ -528,7 +528,7 @@ def apply_step(step, scale, theta, R_root, t, theta_imu, body, kin):
     """Update a state by -`scale` times the system's solution; the spine follows the head's rotation."""
     R_turn, J = np.empty((3, 3)), np.empty((3, 3))
     for j in range(len(t)):
-        inverse, turn = spine_form(theta, theta_imu, body, kin, j)
+        inverse, turn = _spine_form(theta, theta_imu, body, kin, j)
         pull = inverse @ (turn - step[j, HEAD : HEAD + 3])
         for joint in body.head_chain:
             for k in range(3):
@@ -545,7 +545,7 @@ def apply_step(step, scale, theta, R_root, t, theta_imu, body, kin):
                     theta[j, chain[k] - 1, i] -= scale * step[j, at + i]
         for i in range(3):
             t[j, i] -= scale * step[j, i]
-        exp_and_jacobian(-scale * step[j, 3:6], R_turn, J)
+        _exp_and_jacobian(-scale * step[j, 3:6], R_turn, J)
         R_root[j] = R_root[j] @ R_turn
 
 

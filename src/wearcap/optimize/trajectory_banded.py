@@ -21,7 +21,7 @@ TINY = 1e-12
 
 
 @compiled
-def stretch_freely(step, link, last_link, first, share, target, weight, free_start, place, z):
+def _stretch_freely(step, link, last_link, first, share, target, weight, free_start, place, z):
     """Solve the convex relaxation in which a step may also stretch: complex factors z instead of turns.
 
     Minimises Σ weight |place − target|² + Σ link |z − previous z|² exactly, and fills z (step) and place (time), both
@@ -62,7 +62,7 @@ def stretch_freely(step, link, last_link, first, share, target, weight, free_sta
 
 
 @compiled
-def link_form(change, link, norm, smooth):
+def _link_form(change, link, norm, smooth):
     """(energy of a link, curvature of its quadratic approximation, change wrapped to ±π)."""
     change -= 2 * np.pi * np.round(change / (2 * np.pi))
     if norm == SQUARE:
@@ -72,39 +72,39 @@ def link_form(change, link, norm, smooth):
 
 
 @compiled
-def control_form(square, loss, delta, smooth):
+def _control_form(square, loss, delta, smooth):
     """(ρ of a squared distance, its weight in reweighted least squares); a norm's tip is smoothed in both."""
     rho, weight = reweight(square, loss, delta, smooth)
     return (1.0 / weight if loss == NORM else rho), weight
 
 
 @compiled
-def control_weights(distance, loss, delta, smooth):
+def _control_weights(distance, loss, delta, smooth):
     """Weights in reweighted least squares for distances (m)."""
     weights = np.empty_like(distance)
     for i in range(len(distance)):
-        weights[i] = control_form(distance[i] ** 2, loss, delta, smooth)[1]
+        weights[i] = _control_form(distance[i] ** 2, loss, delta, smooth)[1]
     return weights
 
 
 @compiled
-def energy(turn, place, link, last_link, first, share, target, weight, kinds, smooth):
+def _energy(turn, place, link, last_link, first, share, target, weight, kinds, smooth):
     """(control, bending) energy of a path; `kinds`: norm of the links, loss, its delta; `smooth` in m and rad."""
     norm, loss, delta = kinds
     control, bending, before = 0.0, 0.0, 0.0
     for s in range(len(turn)):
         if not np.isinf(link[s]):
-            bending += link_form(turn[s] - before, link[s], norm, smooth)[0]
+            bending += _link_form(turn[s] - before, link[s], norm, smooth)[0]
         before = turn[s]
         for i in range(first[s], first[s + 1]):
             x = place[s, 0] + share[i] * (place[s + 1, 0] - place[s, 0]) - target[i, 0]
             y = place[s, 1] + share[i] * (place[s + 1, 1] - place[s, 1]) - target[i, 1]
-            control += weight[i] * control_form(x * x + y * y, loss, delta, smooth)[0]
-    return control, bending + link_form(before, last_link, norm, smooth)[0]
+            control += weight[i] * _control_form(x * x + y * y, loss, delta, smooth)[0]
+    return control, bending + _link_form(before, last_link, norm, smooth)[0]
 
 
 @compiled
-def value_pass(turn, place, link, last_link, first, share, target, weight, kinds, smooth, damping, gains):
+def _value_pass(turn, place, link, last_link, first, share, target, weight, kinds, smooth, damping, gains):
     """Fill gains (step, 4): each turn's change as a linear function of the changes (x, y, previous turn) and 1.
 
     Returns the quadratic form (xx, xy, yy, x, y) of the least energy in the change of the first point.
@@ -112,7 +112,7 @@ def value_pass(turn, place, link, last_link, first, share, target, weight, kinds
     norm, loss, delta = kinds
     count = len(turn)
     xx, xy, yy, xt, yt, gx, gy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    _, tt, off = link_form(turn[count - 1], last_link, norm, smooth)
+    _, tt, off = _link_form(turn[count - 1], last_link, norm, smooth)
     gt = tt * off
     for s in range(count - 1, -1, -1):
         ahead_x, ahead_y = place[s + 1, 0] - place[s, 0], place[s + 1, 1] - place[s, 1]
@@ -124,7 +124,7 @@ def value_pass(turn, place, link, last_link, first, share, target, weight, kinds
         for i in range(first[s], first[s + 1]):
             u = share[i]
             rx, ry = place[s, 0] + u * ahead_x - target[i, 0], place[s, 1] + u * ahead_y - target[i, 1]
-            w = weight[i] * control_form(rx * rx + ry * ry, loss, delta, smooth)[1]
+            w = weight[i] * _control_form(rx * rx + ry * ry, loss, delta, smooth)[1]
             ix, iy = u * jx, u * jy
             xx, yy = xx + w, yy + w
             xt, yt, tt = xt + w * ix, yt + w * iy, tt + w * (ix * ix + iy * iy)
@@ -132,7 +132,7 @@ def value_pass(turn, place, link, last_link, first, share, target, weight, kinds
         if np.isinf(link[s]):
             gains[s, 0], gains[s, 1], gains[s, 2], gains[s, 3] = 0.0, 0.0, 1.0, 0.0
             continue
-        _, k, off = link_form(turn[s] - (turn[s - 1] if s > 0 else 0.0), link[s], norm, smooth)
+        _, k, off = _link_form(turn[s] - (turn[s - 1] if s > 0 else 0.0), link[s], norm, smooth)
         pull = k * off
         force, rest = gt + pull, tt + damping * (tt + k) + TINY
         whole = k + rest
@@ -144,7 +144,7 @@ def value_pass(turn, place, link, last_link, first, share, target, weight, kinds
 
 
 @compiled
-def walk(turn, place, step, gains, share, shift, new_turn, new_place):
+def _walk(turn, place, step, gains, share, shift, new_turn, new_place):
     """Roll out a new path: each turn changes by the gains applied to the offset from the old path so far.
 
     `share` scales the constant part of the gains (step length); `shift` (2) moves the first point.
@@ -228,7 +228,7 @@ class _Path:
     def terms(self, smooth: float, turn: np.ndarray | None = None, place: np.ndarray | None = None) -> dict:
         """Energy by term of a path (default: the current one), with norms smoothed by `smooth`."""
         turn, place = self.turn if turn is None else turn, self.place if place is None else place
-        control, bending = energy(turn, place, self.link, self.last_link, *self.controls, self.kinds, smooth)
+        control, bending = _energy(turn, place, self.link, self.last_link, *self.controls, self.kinds, smooth)
         return {"control": control, "bending": bending, "total": control + bending}
 
     def begin(self) -> None:
@@ -241,22 +241,22 @@ class _Path:
         at = np.repeat(np.arange(len(step)), np.diff(first))
         distance = np.zeros(len(weight))
         for _ in range(RELAXED_PASSES):
-            half = 0.5 * weight * control_weights(distance, *self.kinds[1:], RELAXED_M)
-            stretch_freely(
+            half = 0.5 * weight * _control_weights(distance, *self.kinds[1:], RELAXED_M)
+            _stretch_freely(
                 step, soft * self.link, soft * self.last_link, first, share, complex_target, half, self.free, place, z
             )
             distance = abs(place[at] + share * (place[at + 1] - place[at]) - complex_target)
         self.gains[:] = 0.0
         turn = np.angle(z * np.conj(np.concatenate([z[:1], z[:-1]]))).cumsum() + np.angle(z[0])
         shift = np.array([place[0].real, place[0].imag])
-        walk(turn, self.place, self.step, self.gains, 0.0, shift, self.new_turn, self.new_place)
+        _walk(turn, self.place, self.step, self.gains, 0.0, shift, self.new_turn, self.new_place)
         if self.terms(0.0, self.new_turn, self.new_place)["total"] < self.terms(0.0)["total"]:
             self._take()
 
     def improve(self, smooth: float, damping: float, before: float) -> tuple[float, float]:
         """One Gauss-Newton step; returns the decrease of the smoothed energy, and the damping for the next step."""
         for _ in range(8):
-            xx, xy, yy, x, y = value_pass(
+            xx, xy, yy, x, y = _value_pass(
                 self.turn,
                 self.place,
                 self.link,
@@ -273,7 +273,7 @@ class _Path:
                 shift = -np.linalg.solve([[xx + ridge, xy], [xy, yy + ridge]], [x, y])
             for share in (1.0, 0.5, 0.25):
                 there = self.new_turn, self.new_place
-                walk(self.turn, self.place, self.step, self.gains, share, share * shift, *there)
+                _walk(self.turn, self.place, self.step, self.gains, share, share * shift, *there)
                 after = self.terms(smooth, *there)["total"]
                 if after < before:
                     self._take()
