@@ -221,6 +221,8 @@ class Stretch:
 
         def slot(kind: str, name: str) -> int:
             value = self.values[name].double().numpy()
+            if kind == "sole_share":
+                value = np.broadcast_to(value.reshape(len(value), -1), (len(value), vertices))
             stacks[kind].append(np.zeros((length, *value.shape[1:])))
             stacks[kind][-1][: len(value)] = value
             return len(stacks[kind]) - 1

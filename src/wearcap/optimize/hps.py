@@ -32,7 +32,7 @@ class Term:
     """Number of consecutive frames on which a residual depends: 1, or 2 (then the first residual is that of frames 0
     and 1)."""
     share: str = "ones"
-    """Name in `data_values` of the factor of each residual's energy."""
+    """Name in `data_values` of the factor of each residual's energy, of the residuals' shape; "ones": no factor."""
     expected: tuple[str, ...] = ()
     """For a cost that measures how far its first input is from an expected value or step: the name of that value in
     `data_values`, then that of the only direction measured, if there is one. The derivative is then known; a cost
