@@ -20,10 +20,8 @@ from wearcap.cli.conf import compose
 from wearcap.geometry import rotation
 from wearcap.geometry.surface import SurfaceIndex
 from wearcap.optimize.adam_windows import AdamSettings, solve_adam_windows
-from wearcap.optimize.banded import BandedSettings
-from wearcap.optimize.feet import FootPatches
-from wearcap.optimize.hps import HpsData, HpsEnergy, HpsState, energy_terms
-from wearcap.optimize.stretches import solve_in_stretches
+from wearcap.optimize.banded import BandedSettings, solve_in_stretches
+from wearcap.optimize.hps import FootPatches, HpsData, HpsEnergy, HpsState, energy_terms
 from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_recording
 from wearcap.systems.hps.pipeline import turns
 

@@ -12,7 +12,7 @@ import torch
 from ireplica_runs import Case, pipeline_of
 
 from wearcap.body.anny_body import anny_body
-from wearcap.metrics.interaction import handlings
+from wearcap.metrics.objects import handlings
 from wearcap.recording import Motion, RecordingStore
 from wearcap.recording.timing import at_times
 from wearcap.scene.environment import Environment

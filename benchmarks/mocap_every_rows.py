@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wearcap.body.kinematics import site_positions
@@ -13,7 +14,6 @@ from wearcap.cli.conf import compose
 from wearcap.cli.load import load_pipeline
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import interpolate_clamped
-from wearcap.metrics.floor import floor_error_m, stood_on
 from wearcap.metrics.position import joint_error_cm
 from wearcap.metrics.scores import score_in_world, truth_at
 from wearcap.metrics.table import Row, evaluate_motion
@@ -147,3 +147,34 @@ def _at(motion: Motion, truth: Motion, seen: Tensor, name: str) -> Row:
         "jitter_m_s3": evaluate_motion(motion, truth)["jitter_m_s3"],
     }
     return Row(name, 0, int(seen.sum()), scores)
+
+
+def stood_on(
+    sole_height: Float[Tensor, "time foot"], contact: Bool[Tensor, "time foot"]
+) -> tuple[Float[Tensor, "time"], Float[Tensor, "time"]]:
+    """Lowest and highest ground (m) that the feet stand on, or stood on last.
+
+    `sole_height` is the height of each foot's lowest point. On level ground and slopes both are nearly equal; on stairs
+    they differ by a step. Before its first contact a foot uses the ground of that contact; a foot without contact is
+    ignored.
+    """
+    ground = []
+    frames = torch.arange(len(contact))
+    for foot in range(contact.shape[1]):
+        stands = contact[:, foot].nonzero()[:, 0]
+        if not len(stands):
+            continue
+        latest = stands[(torch.searchsorted(stands, frames, right=True) - 1).clamp_min(0)]
+        ground.append(sole_height[latest, foot])
+    if not ground:
+        nowhere = torch.full((len(contact),), torch.nan)
+        return nowhere, nowhere
+    both = torch.stack(ground)
+    return both.amin(0), both.amax(0)
+
+
+def floor_error_m(
+    height: Float[Tensor, "time"], low: Float[Tensor, "time"], high: Float[Tensor, "time"]
+) -> Float[Tensor, "time"]:
+    """Distance (m) of a floor's height from the interval between the lowest and the highest ground stood on."""
+    return torch.maximum(low - height, height - high).clamp_min(0)

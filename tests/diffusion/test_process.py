@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from wearcap.diffusion.process import add_noise, posterior_step
-from wearcap.diffusion.sampler import sample
+from wearcap.diffusion.process import add_noise, posterior_step, sample
 from wearcap.diffusion.schedule import CosineSchedule, LinearSchedule
 
 SCHEDULES = [CosineSchedule(), LinearSchedule()]

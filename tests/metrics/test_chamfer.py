@@ -8,7 +8,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.mesh import capsules
 from wearcap.geometry.rigid import Rigid
-from wearcap.metrics.chamfer import Chamfer, chamfer, mean_chamfer, seen_vertices
+from wearcap.metrics.surface import Chamfer, chamfer, mean_chamfer, seen_vertices
 
 
 def square(side: float, cells: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from wearcap.errors import WearcapError
-from wearcap.metrics.cues import cue_errors_cm
+from wearcap.metrics.scores import cue_errors_cm
 from wearcap.recording import Cue
 from wearcap_testing import swaying_motion
 

@@ -5,9 +5,16 @@ import torch
 from torch import nn
 
 from wearcap.errors import WearcapError
-from wearcap.systems.ireplica.contact_network import FRAMES, REACH, fit_temperature
 from wearcap.systems.ireplica.contact_sequence import ContactSequence
-from wearcap.systems.ireplica.contact_transformer import ContactTransformer, EncoderLayer, load_released, sinusoids
+from wearcap.systems.ireplica.contact_transformer import (
+    FRAMES,
+    REACH,
+    ContactTransformer,
+    EncoderLayer,
+    fit_temperature,
+    load_released,
+    sinusoids,
+)
 
 
 def parameters(net: nn.Module) -> int:

@@ -14,13 +14,10 @@ from wearcap.geometry import rotation
 from wearcap.geometry.surface import SurfaceIndex
 from wearcap.optimize import costs
 from wearcap.optimize.adam_windows import AdamSettings, solve_adam_windows
-from wearcap.optimize.banded import BandedSettings, Stretch, solve_banded
-from wearcap.optimize.banded_assembly import LEGS
-from wearcap.optimize.banded_mapping import fill_system
+from wearcap.optimize.banded import BandedSettings, Stretch, _spans, solve_banded, solve_in_stretches
+from wearcap.optimize.banded_kernels import LEGS
 from wearcap.optimize.costs import Loss
-from wearcap.optimize.feet import FootPatches
-from wearcap.optimize.hps import TERMS, HpsData, HpsEnergy, HpsState, energy_terms
-from wearcap.optimize.stretches import _spans, solve_in_stretches
+from wearcap.optimize.hps import TERMS, FootPatches, HpsData, HpsEnergy, HpsState, Term, energy_terms
 
 MIXED = {
     "hold": Loss("cauchy", 0.05),
@@ -101,14 +98,14 @@ def rotations(count: int) -> torch.Tensor:
             lambda a, b, c: costs.head_orientation(rotation.exp(a), rotation.exp(b), rotation.exp(c)),
             lambda: (rotations(4), rotations(1)[0], rotations(4)),
         ),
-        (costs.foot_contact, lambda: (randn(3, 4, 3), randn(3, 4, 3))),
-        (costs.foot_plane, lambda: (randn(3, 4, 3), randn(3, 4, 3), randn(3, 4, 3))),
-        (costs.foot_slide, lambda: (randn(3, 4, 3),)),
-        (costs.translation_step, lambda: (randn(4, 3), randn(3, 3))),
+        (costs.position_offset, lambda: (randn(4, 3), randn(4, 3))),
+        (costs.position_offset, lambda: (randn(3, 4, 3), randn(3, 4, 3))),
+        (costs.plane_distance, lambda: (randn(3, 4, 3), randn(3, 4, 3), randn(3, 4, 3))),
+        (costs.position_step, lambda: (randn(4, 3), randn(3, 3))),
+        (costs.position_step, lambda: (randn(3, 4, 3), randn(2, 4, 3))),
         (lambda a, b: costs.rotation_step(rotation.exp(a), rotation.exp(b)), lambda: (rotations(4), rotations(3))),
-        (costs.pose_prior, lambda: (randn(4, 5, 3), randn(4, 5, 3))),
+        (costs.pose_offset, lambda: (randn(4, 5, 3), randn(4, 5, 3))),
         (costs.pose_step, lambda: (randn(4, 5, 3), randn(4, 5, 3))),
-        (costs.translation_hold, lambda: (randn(4, 3), randn(4, 3))),
     ],
 )
 def test_each_cost_has_the_derivative_that_autograd_says(cost, inputs):
@@ -169,18 +166,35 @@ def test_compiled_energy_and_gradient_agree_with_autograd(name):
     by_t, by_turn, by_theta = torch.autograd.grad(
         sum(terms.values()), [t, turn, theta], allow_unused=True, materialize_grads=True
     )
-    fill_system(stretch.theta, stretch.active.arrays, stretch.frames, stretch.kin, stretch.forms, *stretch.system)
+    stretch.fill_system()
     blocks, _, gradient = stretch.system
     by_theta = by_theta[:, stretch.columns].numpy()
-    legs = stretch.active.arrays.leg_chains.ravel() - 1
+    legs = stretch.body.leg_chains.ravel() - 1
     assert np.abs(gradient[:, :3] - by_t.numpy()).max() < 1e-5
     assert np.abs(gradient[:, 3:6] - by_turn.numpy()).max() < 1e-5
     assert np.abs(gradient[:, LEGS:] - by_theta[:, legs].reshape(len(t), -1)).max() < 1e-5
-    spine = stretch.active.arrays.head_chain
+    spine = stretch.body.head_chain
     J = stretch.kin.axes[:, spine].transpose(0, 2, 1, 3).reshape(len(t), 3, -1)
     by_head = np.linalg.inv(J @ J.mT) @ J @ by_theta[:, spine - 1].reshape(len(t), -1, 1)
     assert np.abs(gradient[:, 6:9] - by_head[..., 0]).max() < 1e-5
     assert np.abs(blocks - blocks.mT).max() < 1e-9
+
+
+@pytest.mark.parametrize("name", [name for name in TERMS if name != "pose"])
+def test_automatic_derivatives_agree_with_the_compiled_ones(name, monkeypatch):
+    data = still_data(7, 0.002)
+    data.contact[2:4, 0] = data.cam_confidence[3] = data.hold_confidence[5] = 0.0
+    state, energy = disturbed(data, 0.002), HpsEnergy({name: 3.0}, MIXED)
+    systems = []
+    for term in (TERMS[name], replace(TERMS[name], expected=())):
+        monkeypatch.setitem(TERMS, name, term)
+        stretch = Stretch(energy, data, state)
+        systems.append([np.array(stretch.evaluate(1e-3, look_up=True)["total"])])
+        stretch.fill_system()
+        systems[-1] += [part.copy() for part in stretch.system]
+    block = 0.05 if TERMS[name].inputs[0].startswith("R_") else 1e-9  # the kernels leave out half the turn's own slope
+    for known, automatic, tolerance in zip(*systems, (1e-9, block, block, 1e-9)):
+        assert np.abs(known - automatic).max() <= tolerance * np.abs(known).max()
 
 
 def planted() -> tuple[HpsData, HpsState]:
@@ -228,6 +242,47 @@ def test_the_banded_solver_finds_a_planted_motion():
     assert away.max() < 0.02  # the median of positions that are 2 cm off, and each tenth 1 m
     assert rotation.geodesic(solution.state.R_world_root, truth.R_world_root).max() < 0.003
     assert (solution.state.theta - truth.theta).abs().max() < 0.003
+
+
+BEACON = torch.tensor([2.0, 1.0, 0.5], dtype=torch.float64)
+
+
+def beacon_distance(t_world_root: torch.Tensor) -> torch.Tensor:
+    """Toy cost of one frame: distance (m) of the root from a beacon that measures 1.5 m."""
+    return (t_world_root - BEACON).norm(dim=-1, keepdim=True) - 1.5
+
+
+def gaze_step(R_world_head: torch.Tensor, t_world_root: torch.Tensor) -> torch.Tensor:
+    """Toy cost of two frames: speed of the point 1 m in front of the head's orientation from frame to frame."""
+    return (t_world_root + R_world_head[:, :, 0]).diff(dim=0)
+
+
+@pytest.mark.parametrize(
+    ("solve", "away_m"),
+    [
+        (solve_banded, 0.04),
+        (lambda e, d: solve_adam_windows(e, d, AdamSettings(steps=250, learning_rate=3e-3, full_mesh=False)), 0.3),
+    ],
+    ids=["banded", "adam"],
+)
+def test_a_term_that_is_added_to_the_table_finds_its_planted_answer(solve, away_m, monkeypatch):
+    monkeypatch.setitem(TERMS, "beacon", Term(beacon_distance, ("t_root",), reach=1))
+    monkeypatch.setitem(TERMS, "gaze", Term(gaze_step, ("R_head", "t_root"), reach=2))
+    data = still_data(12, 0.01)
+    weights = {"self": 10.0, "pose": 20.0, "hold": 5.0, "root_step": 40.0, "beacon": 1e4, "gaze": 1e4}
+    energy = HpsEnergy(weights, {"beacon": Loss("square"), "gaze": Loss("square"), "hold": Loss("square")})
+    solution = solve(energy, data)
+    t = solution.state.t_world_root
+    assert (t - BEACON).norm(dim=1) == pytest.approx(torch.full((12,), 1.5), abs=5e-3)
+    nearest = BEACON + 1.5 * torch.nn.functional.normalize(data.start.t_world_root.mean(0) - BEACON, dim=0)
+    assert (t - nearest).norm(dim=1).max() < away_m  # `hold` leaves it where the start is nearest to the sphere
+    assert solution.history[-1]["gaze"] < 0.01 * solution.history[0]["gaze"]
+
+
+def test_the_banded_solver_refuses_a_new_term_of_the_spine(monkeypatch):
+    monkeypatch.setitem(TERMS, "stiff", Term(lambda theta: theta.flatten(1), ("theta",), reach=1))
+    with pytest.raises(WearcapError, match="cannot minimise the term 'stiff'"):
+        solve_banded(HpsEnergy({"pose": 1.0, "hold": 1.0, "stiff": 1.0}), still_data(4))
 
 
 def test_the_banded_solver_goes_no_less_low_than_adam():

@@ -24,7 +24,6 @@ from wearcap.optimize.trajectory import (
     wrapped,
 )
 from wearcap.optimize.trajectory_banded import bend_banded
-from wearcap.optimize.trajectory_closed import bend_closed
 
 NOWHERE = torch.zeros(2, dtype=torch.float64)
 VARIANTS = {
@@ -240,35 +239,6 @@ def test_no_rigidity_meets_the_control_points():
     }
     assert off[1e-4] < 1e-3
     assert off[1e3] > 10 * off[1e-4]
-
-
-def test_the_closed_form_is_the_limit_of_the_solver():
-    """One contact, both ends held: the linear problem, the exact one, and the solver with next to no rigidity."""
-    path, timestamps = stroll(120, seed=8)
-    times, ends = timestamps[[70, -1]], path[[70, -1]]
-    for size in (1e-4, 0.03):
-        points = ends + size * torch.tensor([[0.6, -0.8], [0.0, 0.0]]).double()
-        problem = bending_problem(
-            path, timestamps, times, points, None, Bending(1e-8, clamped_ends=True, loss=Loss("square"))
-        )
-        ours = bend_banded(problem, iterations=100, tolerance=0.0)
-        closed = bend_closed(problem)
-        assert (closed.path - ours.path).norm(dim=1).amax() < 5e-3 * size
-        assert (closed.path[70] - points[0]).norm() < 1e-6
-        assert closed.history[-1]["bending"] == pytest.approx(ours.history[-1]["bending"], rel=1e-2)
-        # Small turns alone: the first linear problem says it all but for their squares
-        assert closed.history[1]["bending"] == pytest.approx(closed.history[-1]["bending"], rel=10 * size)
-
-
-def test_the_closed_form_says_what_it_cannot_do():
-    timestamps = torch.arange(50).double() / 30
-    path = torch.stack([timestamps, torch.zeros(50)], -1).double()
-    held = Bending(clamped_ends=True)
-    problem = bending_problem(path, timestamps, timestamps[[20, -1]], path[[25, -1]], None, held)
-    with pytest.raises(WearcapError, match="out of reach"):
-        bend_closed(problem)
-    with pytest.raises(WearcapError, match="clamped_ends"):
-        bend_closed(bending_problem(path, timestamps, timestamps[[20]], path[[25]], None, Bending()))
 
 
 @pytest.mark.parametrize("solver", [bend_banded, functools.partial(bend_adam, iterations=50)])

@@ -2,13 +2,7 @@ import pytest
 import torch
 
 from wearcap.errors import WearcapError
-from wearcap.systems.ireplica.contact_intervals import (
-    ContactInterval,
-    ContactSettings,
-    ContactStream,
-    active,
-    contact_intervals,
-)
+from wearcap.systems.ireplica.contact_intervals import ContactInterval, ContactSettings, active, contact_intervals
 
 
 def times(count: int, fps: float = 60.0) -> torch.Tensor:
@@ -41,38 +35,8 @@ def test_an_interval_is_split_where_the_hands_change():
 def test_nothing_in_nothing_out():
     assert contact_intervals(torch.zeros(0, 2, dtype=torch.bool)) == []
     assert contact_intervals(torch.zeros(9, 2, dtype=torch.bool)) == []
-    assert ContactStream().flush() == []
 
 
-@pytest.mark.parametrize("seed", range(8))
-@pytest.mark.parametrize("gap_s", [0.0, 0.25, 0.5])
-def test_frame_by_frame_gives_the_same_as_all_at_once(seed, gap_s):
-    torch.manual_seed(seed)
-    count = 600
-    logits = torch.randn(count // 6, 2).repeat_interleave(6, 0) + 0.3 * torch.randn(count, 2)
-    prob = torch.sigmoid(logits - 0.8)
-    stamps = (times(count) + 0.004 * torch.rand(count)).contiguous()
-    settings = ContactSettings(0.5, gap_s)
-    stream, found = ContactStream(settings), []
-    for row, time in zip(prob, stamps.tolist()):
-        found += stream.push(row, time)
-        assert len(stream._undecided) <= 2 + (gap_s + 0.05) * 60
-    assert found + stream.flush() == contact_intervals(active(prob, stamps, settings))
-
-
-def test_settings_and_times_that_make_no_sense_are_refused():
+def test_settings_that_make_no_sense_are_refused():
     with pytest.raises(WearcapError, match="between 0 and 1"):
         ContactSettings(threshold=1.0)
-    stream = ContactStream(ContactSettings(gap_s=0.5))
-    stream.push(torch.tensor([1.0, 0.0]), 1.0)
-    stream.push(torch.tensor([0.0, 0.0]), 1.1)
-    with pytest.raises(WearcapError, match="rising"):
-        stream.push(torch.tensor([0.0, 0.0]), 1.1)
-
-
-def test_a_frame_that_goes_back_is_refused_when_nothing_waits():
-    stream = ContactStream()
-    stream.push(torch.ones(2), 1.0)
-    for time in (1.0, 0.5, float("nan")):
-        with pytest.raises(WearcapError, match="rising"):
-            stream.push(torch.ones(2), time)

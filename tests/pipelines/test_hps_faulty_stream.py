@@ -13,7 +13,7 @@ from test_hps_stream import pieces
 from bad_packets import Mutator, broken, unchecked
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
-from wearcap.optimize.solution import Solution
+from wearcap.optimize.hps import Solution
 from wearcap.recording import Motion, Recording
 from wearcap.recording.growing import close_pieces, follow_pieces, piece_path, write_piece
 from wearcap.systems.hps import stream as hps_stream

@@ -28,7 +28,7 @@ from wearcap.systems.hps import pipeline as hps_module
 from wearcap.systems.hps.camera import MapLocalization, Synchronization
 from wearcap.systems.hps.pipeline import HPS, at_frames
 from wearcap.systems.hps.published import HpsBaseline
-from wearcap.systems.ireplica.bent_suit import BentSuit
+from wearcap.systems.ireplica.published import BentSuit
 
 ENERGY = HpsEnergy(
     {

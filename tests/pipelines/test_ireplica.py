@@ -13,7 +13,7 @@ from wearcap.geometry.rotation import about_axis
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.contact_labels import LabelClock, labels_of
 from wearcap.io.formats.environment import write_environment
-from wearcap.metrics.interaction import summary
+from wearcap.metrics.objects import summary
 from wearcap.optimize.contact_correction import OffsetSettings
 from wearcap.optimize.trajectory import Bending, bend
 from wearcap.optimize.trajectory_banded import bend_banded
@@ -23,13 +23,11 @@ from wearcap.runtime.digest import digest
 from wearcap.runtime.system import CaptureInput, StagedSystem
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
-from wearcap.systems.ireplica.attachment import AttachmentSettings
-from wearcap.systems.ireplica.hand_snapping import HandSnapping
-from wearcap.systems.ireplica.object_tracker import PALMS, ObjectTracker
+from wearcap.systems.ireplica.object_tracker import PALMS, AttachmentSettings, ObjectTracker
 from wearcap.systems.ireplica.pipeline import IReplica
 from wearcap.systems.ireplica.published import held_when_near, interpolated_objects, static_objects
 from wearcap.systems.ireplica.scores import score_interactions
-from wearcap.systems.ireplica.snapping import BendCorrection, HingeFit, SnapCorrection, fit_about_hinge
+from wearcap.systems.ireplica.snapping import BendCorrection, HandSnapping, HingeFit, SnapCorrection, fit_about_hinge
 
 FPS, FRAMES = 60.0, 360
 TAKE, LEAVE = 60, 240

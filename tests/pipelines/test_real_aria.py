@@ -19,7 +19,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate, resample
 from wearcap.io.datasets.adt import read_adt
 from wearcap.io.devices.aria_mps import read_closed_loop, read_mps
-from wearcap.metrics.cues import cue_errors_cm
+from wearcap.metrics.scores import cue_errors_cm
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import HeadStream, Motion, PointCloud, Recording
 from wearcap.scene.floor import estimate_floor

@@ -1,7 +1,6 @@
 import torch
 
-from wearcap.systems.ireplica.contact_intervals import ContactInterval
-from wearcap.systems.ireplica.settling import chains, settled
+from wearcap.systems.ireplica.contact_intervals import ContactInterval, chains, settled
 
 FPS = 60.0
 LEFT, RIGHT, BOTH = (True, False), (False, True), (True, True)

@@ -17,7 +17,7 @@ from wearcap.runtime import digest as digests
 from wearcap.runtime.digest import code_digest, digest, modules_of
 from wearcap.runtime.stages import Stage, StageCache, run_stages
 from wearcap.sensors.clock import Clock
-from wearcap.systems.ireplica.hand_snapping import HandSnapping
+from wearcap.systems.ireplica.snapping import HandSnapping
 
 CLOCK = Clock(torch.tensor([1.5, 9.0]).double(), torch.tensor([0.5, 8.0]).double(), 0.1, 0.0, 2)
 
@@ -221,6 +221,6 @@ def test_the_modules_of_what_a_stage_reads():
     energy = functools.partial(code_digest, HandSnapping())
     assert modules_of([energy, {"a": torch.ones(2)}, 3]) == {
         "wearcap.runtime.digest",
-        "wearcap.systems.ireplica.hand_snapping",
+        "wearcap.systems.ireplica.snapping",
         "wearcap.optimize.contact_correction",
     }

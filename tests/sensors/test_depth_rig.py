@@ -14,7 +14,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
-from wearcap.metrics.chamfer import chamfer, seen_vertices
+from wearcap.metrics.surface import chamfer, seen_vertices
 from wearcap.sensors.depth_rig import (
     Background,
     DepthView,

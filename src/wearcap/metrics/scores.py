@@ -1,15 +1,18 @@
 """Scores of one capture against its recording's ground truth."""
 
+from collections.abc import Mapping
+
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
-from wearcap.geometry.trajectory import nearest_frames
-from wearcap.metrics.position import mpjpe_cm, root_error_cm
+from wearcap.geometry.trajectory import interpolate, nearest_frames
+from wearcap.metrics.position import joint_error_cm, mpjpe_cm, root_error_cm
 from wearcap.metrics.table import Row, evaluate_motion
 from wearcap.recording import Motion, Recording
+from wearcap.recording.recording import Cue
 from wearcap.recording.timing import at_times
 from wearcap.tracking.anchor import anchored_to_head
 
@@ -84,3 +87,26 @@ def _foot_contact(recording: Recording) -> Bool[Tensor, "time patch"] | None:
     if track is None or not set(FOOT_PATCHES) <= set(track.parts):
         return None
     return track.contact[:, [track.parts.index(patch) for patch in FOOT_PATCHES]]
+
+
+def cue_errors_cm(motion: Motion, cues: Mapping[str, Cue]) -> dict[str, Float[Tensor, "_"]]:
+    """Distance (cm) of the motion's joints from 3D keypoints of the same name, at the keypoints' times.
+
+    Both must share clock and world. Keypoints of confidence 0, outside the motion's time span, or of joints that the
+    skeleton lacks are ignored. Raises WearcapError if none is left.
+    """
+    errors = {}
+    joints = motion.T_world_joint.t
+    for name, cue in cues.items():
+        if name not in motion.skeleton or cue.points.shape[-1] != 3:
+            continue
+        usable = (cue.timestamps >= motion.timestamps[0]) & (cue.timestamps <= motion.timestamps[-1])
+        usable &= (cue.confidence > 0) & cue.points.isfinite().all(-1)
+        if usable.any():
+            at = interpolate(motion.timestamps, joints[:, motion.skeleton.index(name)], cue.timestamps[usable])
+            errors[name] = joint_error_cm(at, cue.points[usable])
+    if not errors:
+        raise WearcapError(
+            "no keypoint to compare this motion with", expected="3D cues named like its joints, on its clock"
+        )
+    return errors

@@ -1,16 +1,27 @@
-"""Distance of the feet to the scanned surface, and sliding along it, during contact (thesis Table 4.3)."""
+"""Distances between a captured body and scans: of standing feet (thesis Table 4.3), of the whole body (Tables 4.1, 4.2).
+
+"Bidirectional Chamfer distance between the SMPL model and the ground truth point cloud, without Procrustes
+alignment" (thesis §4.5.1): the thesis gives no formula. Ours is the mean of the two directions' mean (not squared)
+distances. Inputs in metres, results in centimetres, as in the tables.
+"""
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from wearcap.body.model import FOOT_REGIONS, BodyModel
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
+from wearcap.geometry.camera import Camera
+from wearcap.geometry.mesh import Mesh
+from wearcap.geometry.render import render
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.surface import SurfaceIndex
+from wearcap.geometry.triangle_distance import TriangleIndex
 
 
 @dataclass(frozen=True)
@@ -71,3 +82,70 @@ def foot_vertices(
     vertices = [body.vertices(T_world_joint, FOOT_REGIONS[patch]) for patch in FOOT_PATCHES]
     touching = [contact[:, i, None].expand(-1, part.shape[1]) for i, part in enumerate(vertices)]
     return torch.cat(vertices, 1), torch.cat(touching, 1)
+
+
+@dataclass(frozen=True)
+class Chamfer:
+    """Mean distances (cm) in both directions."""
+
+    cloud_to_body_cm: float
+    body_to_cloud_cm: float
+
+    @property
+    def mean_cm(self) -> float:
+        """The bidirectional distance."""
+        return 0.5 * (self.cloud_to_body_cm + self.body_to_cloud_cm)
+
+
+def chamfer(
+    vertices: Float[Tensor, "vertex 3"],
+    cloud: Float[Tensor, "point 3"],
+    *,
+    faces: Int64[Tensor, "face 3"] | None = None,
+    seen: Bool[Tensor, "vertex"] | None = None,
+) -> Chamfer:
+    """Bidirectional Chamfer distance of one frame, without alignment.
+
+    Without `faces`: the literal form, vertices to points both ways, biased by the spacing of vertices. With `faces`
+    (ours, the better default): points are measured to the surface. The other direction uses the `seen` vertices,
+    by default all; soles and armpits, which no camera sees, then add a constant. Raises WearcapError for an empty
+    cloud, no seen vertex, or NaN.
+    """
+    body, points = vertices.detach().cpu().double().numpy(), cloud.detach().cpu().double().numpy()
+    checked = body if seen is None else body[seen.cpu().numpy()]
+    for name, rows in (("the body", checked), ("the cloud", points)):
+        if not len(rows) or not np.isfinite(rows).all():
+            raise WearcapError(
+                f"{name} has {len(rows)} points" + (", some of them NaN or infinite" if len(rows) else ""),
+                expected="at least one point, all finite",
+            )
+    if faces is None:
+        to_body, _ = KDTree(body).query(points)
+    else:
+        to_body, _ = TriangleIndex.build(body, faces.cpu().numpy()).nearest(points)
+    to_cloud, _ = KDTree(points).query(checked)
+    return Chamfer(100 * float(np.mean(to_body)), 100 * float(np.mean(to_cloud)))
+
+
+def seen_vertices(
+    vertices: Float[Tensor, "vertex 3"], faces: Int64[Tensor, "face 3"], cameras: list[Camera], T_world_cam: Rigid
+) -> Bool[Tensor, "vertex"]:
+    """Vertices of faces visible to any of the cameras (poses "camera"), with occlusion by the body only (ours)."""
+    mesh = Mesh(
+        vertices.detach().cpu().numpy().astype(np.float32), faces.cpu().numpy().astype(np.int32), np.ones(3, np.float32)
+    )
+    seen = torch.zeros(len(vertices), dtype=torch.bool)
+    for number, camera in enumerate(cameras):
+        visible = np.unique(render(camera, T_world_cam[number], [mesh]).index)
+        seen[faces.cpu()[torch.from_numpy(visible[visible >= 0]).long()].reshape(-1)] = True
+    return seen
+
+
+def mean_chamfer(frames: list[Chamfer]) -> Chamfer:
+    """Mean over frames: one row's entry in Tables 4.1 and 4.2. Raises WearcapError without frames."""
+    if not frames:
+        raise WearcapError("no frames to average", expected="at least one frame with a cloud")
+    return Chamfer(
+        float(np.mean([frame.cloud_to_body_cm for frame in frames])),
+        float(np.mean([frame.body_to_cloud_cm for frame in frames])),
+    )

@@ -205,13 +205,12 @@ def write_scores(path: str | Path, methods: Scores, about: dict[str, str | int |
     are not finite become null."""
     tree = {
         method: {
-            metric: {key: None if _undefined(value) else value for key, value in asdict(summary).items()}
+            metric: {
+                key: value if value is not None and math.isfinite(value) else None
+                for key, value in asdict(summary).items()
+            }
             for metric, summary in scores.items()
         }
         for method, scores in methods.items()
     }
     write_text(path, json.dumps({"about": about or {}, "methods": tree}, indent=1, allow_nan=False) + "\n")
-
-
-def _undefined(value: float | int | None) -> bool:
-    return value is None or not math.isfinite(value)

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.optimize.hps import HpsData, HpsEnergy, HpsState, energy_terms
-from wearcap.optimize.solution import Solution
+from wearcap.optimize.hps import HpsData, HpsEnergy, HpsState, Solution, energy_terms
 
 
 @dataclass(frozen=True)

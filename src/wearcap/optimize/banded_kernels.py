@@ -1,15 +1,108 @@
-"""Compiled kernels of the banded solver: rotations, forward kinematics of the optimised joints, block elimination.
+"""Compiled kernels of the banded solver: kinematics, assembly of the normal equations, block elimination.
 
 Derivatives are taken in world axes: a perturbation of joint i rotates all its descendants about the columns of
 `axes[i]`. The two joints that a foot's vertices are skinned to move as twists (v, ω), so that twenty vertices need one
 12 x 12 form.
+
+Assembly has two passes. First (`gather`) each term adds its quadratic form in the value it acts on: translation,
+rotations of root and head (world axes), twist of each foot. These forms are small, and none couples two of the five.
+Then `fill_system` maps them to the unknowns of a frame: translation (3), root rotation (3, right perturbation), head
+rotation relative to the root's (3), axis-angles of the two legs. The spine's joints are eliminated: of all spine poses
+with the same head rotation, the one nearest to the suit's pose has the least energy. `systems/hps/README.md` derives
+the system.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
 from wearcap.geometry.compiled import compiled
 
 NORM, SQUARE, HUBER, CAUCHY = 0, 1, 2, 3
+"""Kinds of loss, in the order of `costs.LOSSES`."""
+TRANSLATION, ROOT, HEAD_ROTATION, POSE, LEG_POSE, SOLES, DIFFERENTIATED = range(7)
+"""Values that a term acts on; a `DIFFERENTIATED` term is not added by these kernels."""
+HEAD = 6
+"""Index of the head's first unknown in a frame, after translation and root."""
+LEGS = 9
+"""Index of the legs' first unknown in a frame."""
+
+
+class Body(NamedTuple):
+    """The optimised part of a skeleton: root (index 0) and the joints from it to head and toes."""
+
+    parents: np.ndarray
+    offsets: np.ndarray
+    head_chain: np.ndarray
+    """Indices of the joints from the spine to the head."""
+    leg_chains: np.ndarray
+    """(2, joints) indices of the joints from hip to toe."""
+    arms: np.ndarray
+    """(vertex, 2, 3) patch vertices in the axes of their leg's last two joints (m)."""
+    shares: np.ndarray
+    """(vertex, 2) skinning weights of these two joints."""
+    patch: np.ndarray
+
+
+class Kinematics(NamedTuple):
+    """Kinematics of all frames at the current state: joint rotations R and origins c, perturbation axes, patch
+    vertices."""
+
+    R: np.ndarray
+    c: np.ndarray
+    axes: np.ndarray
+    points: np.ndarray
+    foot_maps: np.ndarray
+    """(time, 2, 12, 6 + leg) Jacobians of the twists of each leg's last two joints."""
+
+
+class Forms(NamedTuple):
+    """Quadratic forms in the variables that the terms act on; `small`: translation, root and head, whose forms are w
+    I."""
+
+    small: np.ndarray
+    """(time, 3) weights w of translation, root and head."""
+    small_step: np.ndarray
+    """(pair, 3, 3, 3) couplings with the next frame, whose variables are the rows."""
+    small_gradient: np.ndarray
+    foot: np.ndarray
+    """(time, 2, 12, 12) forms of the foot twists, lower triangles."""
+    foot_step: np.ndarray
+    foot_gradient: np.ndarray
+    pose: np.ndarray
+    """(time) weights of the pose prior."""
+    pose_step: np.ndarray
+    """(pair) weights of the legs' pose steps."""
+
+
+class Rows(NamedTuple):
+    """The weighted terms, sorted by reach: what `gather` needs of `hps.TERMS`. Arrays over pairs have a last, unused
+    frame."""
+
+    number: np.ndarray
+    """Index of each term in `hps.TERMS`."""
+    value: np.ndarray
+    """Which value it acts on: TRANSLATION …"""
+    reach: np.ndarray
+    weight: np.ndarray
+    """Weight over number of residuals."""
+    kind: np.ndarray
+    """Kind of loss: NORM …"""
+    delta: np.ndarray
+    slot: np.ndarray
+    """(term, 3) indices into the arrays below: of the expected value, of its normal (-1: none), of the share."""
+    share: np.ndarray
+    """(slot, time) factors of the residuals."""
+    positions: np.ndarray
+    """(slot, time, 3) expected translations or displacements."""
+    rotations: np.ndarray
+    """(slot, time, 3, 3) expected rotations."""
+    points: np.ndarray
+    """(slot, time, vertex, 3) expected positions or displacements of the patch vertices, and normals."""
+    sole_share: np.ndarray
+    """(slot, time, vertex) factors of the patch vertices' residuals."""
+    theta_imu: np.ndarray
+    """(time, joint, 3) expected axis-angles: the suit's."""
 
 
 @compiled
@@ -29,7 +122,7 @@ def reweight(square, kind, delta, smooth):
 
 
 @compiled
-def exp_and_jacobian(v, R, J):
+def _exp_and_jacobian(v, R, J):
     """Rotation matrix of a rotation vector, and its right Jacobian: exp(v + d) ≈ exp(v) exp(J d)."""
     square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     if square < 1e-8:
@@ -52,8 +145,13 @@ def exp_and_jacobian(v, R, J):
 
 
 @compiled
-def log_of(R, v):
-    """Rotation vector of a rotation matrix (angles up to π)."""
+def _turn_between(A, B, v):
+    """Rotation vector (world axes, rad) that rotates A into B: log(B Aᵀ), angles up to π."""
+    R = np.zeros((3, 3))
+    for i in range(3):
+        for k in range(3):
+            for m in range(3):
+                R[i, k] += B[i, m] * A[k, m]
     v[0], v[1], v[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
     sine = 0.5 * np.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
     cosine = 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
@@ -70,24 +168,13 @@ def log_of(R, v):
 
 
 @compiled
-def turn_between(A, B, v):
-    """Rotation vector (world axes, rad) that rotates A into B: log(B Aᵀ)."""
-    M = np.zeros((3, 3))
-    for i in range(3):
-        for k in range(3):
-            for m in range(3):
-                M[i, k] += B[i, m] * A[k, m]
-    log_of(M, v)
-
-
-@compiled
-def pose_all(theta, R_root, t, parents, offsets, R, c, axes):
+def _pose_all(theta, R_root, t, parents, offsets, R, c, axes):
     """Forward kinematics of the optimised joints (index 0: root): rotations, origins, perturbation axes (world)."""
     R_local, J = np.empty((3, 3)), np.empty((3, 3))
     for j in range(len(t)):
         R[j, 0], c[j, 0], axes[j, 0] = R_root[j], t[j], R_root[j]
         for a in range(theta.shape[1]):
-            exp_and_jacobian(theta[j, a], R_local, J)
+            _exp_and_jacobian(theta[j, a], R_local, J)
             above = parents[a]
             for i in range(3):
                 c[j, a + 1, i] = c[j, above, i]
@@ -104,7 +191,7 @@ def pose_all(theta, R_root, t, parents, offsets, R, c, axes):
 
 
 @compiled
-def patch_points(R, c, leg_chains, arms, shares, patch, points):
+def _patch_points(R, c, leg_chains, arms, shares, patch, points):
     """Positions of patch vertices, each skinned to the last two joints of its leg."""
     for j in range(len(R)):
         for n in range(len(patch)):
@@ -120,7 +207,7 @@ def patch_points(R, c, leg_chains, arms, shares, patch, points):
 
 
 @compiled
-def vertex_twist(R, chain, arms, shares, A):
+def _vertex_twist(R, chain, arms, shares, A):
     """Transposed Jacobian (12, 3) of a patch vertex in the twists (v, ω) of its leg's last two joints.
 
     Returns the number of rows used: six if the second joint has no weight.
@@ -142,7 +229,7 @@ def vertex_twist(R, chain, arms, shares, A):
 
 
 @compiled
-def foot_map(c, axes, chain, T):
+def _foot_map(c, axes, chain, T):
     """Jacobian, 12 x (6 + 3 joints), of the twists of a leg's last two joints in translation, root and leg joints."""
     T[:] = 0.0
     for h in range(2):
@@ -163,6 +250,303 @@ def foot_map(c, axes, chain, T):
                 T[6 * h + 2, at] = u[0] * y - u[1] * x
                 for i in range(3):
                     T[6 * h + 3 + i, at] = u[i]
+
+
+@compiled
+def update_kinematics(theta, R_root, t, body, kin):
+    """Compute joint poses, patch vertices and derivatives of a state."""
+    _pose_all(theta, R_root, t, body.parents, body.offsets, kin.R, kin.c, kin.axes)
+    _patch_points(kin.R, kin.c, body.leg_chains, body.arms, body.shares, body.patch, kin.points)
+    for j in range(len(t)):
+        for f in range(2):
+            _foot_map(kin.c[j], kin.axes[j], body.leg_chains[f], kin.foot_maps[j, f])
+
+
+@compiled
+def gather(theta, t, body, rows, smooth, kin, forms, energy):
+    """Add the reweighted forms of all terms at this state to `forms`, and their energies to `energy`."""
+    for j in range(len(t)):
+        _gather_contact(j, body, rows, smooth, kin, forms, energy)
+        for k in range(len(rows.reach)):
+            value, pair = rows.value[k], rows.reach[k] == 2
+            if j + rows.reach[k] > len(t) or value == DIFFERENTIATED:
+                continue
+            if value == SOLES and pair:
+                _gather_slide(j, k, body, rows, smooth, kin, forms, energy)
+            elif value != SOLES and rows.share[rows.slot[k, 2], j] > 0:
+                if value in (POSE, LEG_POSE):
+                    _gather_pose(j, k, theta, body, rows, smooth, forms, energy)
+                else:
+                    _gather_motion(j, k, t, body, rows, smooth, kin, forms, energy)
+
+
+@compiled
+def _rho(k, square, share, rows, smooth, energy):
+    """Add a residual's energy; returns its weight in the least-squares problem."""
+    value, weight = reweight(square, rows.kind[k], rows.delta[k], smooth)
+    energy[rows.number[k]] += rows.weight[k] * share * value
+    return rows.weight[k] * share * weight
+
+
+@compiled
+def weigh(k, square, share, rows, smooth, energy, weight):
+    """Fill `weight` (residual) as `_rho` does, for a term that is differentiated automatically."""
+    for e in range(len(square)):
+        weight[e] = _rho(k, square[e], share[e], rows, smooth, energy)
+
+
+@compiled
+def _gather_motion(j, k, t, body, rows, smooth, kin, forms, energy):
+    """Add a term of one frame's translation or rotation, or of its step to the next: ½ w |r + next - step here|²."""
+    value, slot, pair, r, step = rows.value[k], rows.slot[k, 0], rows.reach[k] == 2, np.empty(3), np.eye(3)
+    if value == TRANSLATION:
+        r = (t[j + 1] - t[j] if pair else t[j]) - rows.positions[slot, j]
+    else:
+        joint, step = 0 if value == ROOT else body.head_chain[-1], rows.rotations[slot, j]
+        _turn_between(step @ kin.R[j, joint] if pair else step, kin.R[j + pair, joint], r)
+    w = _rho(k, r @ r, rows.share[rows.slot[k, 2], j], rows, smooth, energy)
+    forms.small[j + pair, value] += w
+    forms.small_gradient[j + pair, value] += w * r
+    if pair:
+        forms.small[j, value] += w
+        forms.small_step[j, value] -= w * step
+        forms.small_gradient[j, value] -= w * (step.T @ r)
+
+
+@compiled
+def _gather_pose(j, k, theta, body, rows, smooth, forms, energy):
+    """Add the weight of a term of all joints' axis-angles, or of the legs' from frame to frame; `fill_system` adds
+    the rest."""
+    square = 0.0
+    if rows.value[k] == POSE:
+        for a in range(theta.shape[1]):
+            for i in range(3):
+                square += (theta[j, a, i] - rows.theta_imu[j, a, i]) ** 2
+        forms.pose[j] += _rho(k, square, rows.share[rows.slot[k, 2], j], rows, smooth, energy)
+    else:
+        for f in range(2):
+            for joint in body.leg_chains[f]:
+                for i in range(3):
+                    square += _pose_change(j, joint, i, theta, rows.theta_imu) ** 2
+        forms.pose_step[j] += _rho(k, square, rows.share[rows.slot[k, 2], j], rows, smooth, energy)
+
+
+@compiled
+def _pose_change(j, joint, i, theta, theta_imu):
+    """Change of a joint's deviation from the suit's axis-angle from frame j to j + 1 (rad)."""
+    here = theta[j, joint - 1, i] - theta_imu[j, joint - 1, i]
+    return theta[j + 1, joint - 1, i] - theta_imu[j + 1, joint - 1, i] - here
+
+
+@compiled
+def _gather_contact(j, body, rows, smooth, kin, forms, energy):
+    """Add the terms of one frame's patch vertices, measured in all directions or along a normal."""
+    A, along, r = np.empty((12, 3)), np.empty(12), np.empty(3)
+    for n in range(len(body.patch)):
+        f = body.patch[n] // 2
+        Q, g = forms.foot[j, f], forms.foot_gradient[j, f]
+        for k in range(len(rows.reach)):
+            slot, normal, factor = rows.slot[k]
+            if rows.value[k] != SOLES or rows.reach[k] != 1 or rows.sole_share[factor, j, n] == 0:
+                continue
+            share = rows.sole_share[factor, j, n]
+            width = _vertex_twist(kin.R[j], body.leg_chains[f], body.arms[n], body.shares[n], A)
+            _difference(kin.points[j, n], rows.points[slot, j, n], r)
+            if normal < 0:
+                w = _rho(k, _square(r), share, rows, smooth, energy)
+                _add_square(Q, A, width, w)
+                _add_gradient(g, A, width, r, w)
+                continue
+            up = rows.points[normal, j, n]
+            distance = r[0] * up[0] + r[1] * up[1] + r[2] * up[2]
+            w = _rho(k, distance * distance, share, rows, smooth, energy)
+            for i in range(width):
+                along[i] = A[i, 0] * up[0] + A[i, 1] * up[1] + A[i, 2] * up[2]
+                g[i] += w * distance * along[i]
+                for m in range(i + 1):
+                    Q[i, m] += w * along[i] * along[m]
+
+
+@compiled
+def _gather_slide(j, k, body, rows, smooth, kin, forms, energy):
+    """Add a term of the patch vertices' displacement to the next frame."""
+    A, B, r = np.empty((12, 3)), np.empty((12, 3)), np.empty(3)
+    slot, _, factor = rows.slot[k]
+    for n in range(len(body.patch)):
+        share = rows.sole_share[factor, j, n]
+        if share == 0:
+            continue
+        f = body.patch[n] // 2
+        width = _vertex_twist(kin.R[j], body.leg_chains[f], body.arms[n], body.shares[n], A)
+        _vertex_twist(kin.R[j + 1], body.leg_chains[f], body.arms[n], body.shares[n], B)
+        _difference(kin.points[j + 1, n], kin.points[j, n], r)
+        _difference(r, rows.points[slot, j, n], r)
+        w = _rho(k, _square(r), share, rows, smooth, energy)
+        _add_square(forms.foot[j, f], A, width, w)
+        _add_square(forms.foot[j + 1, f], B, width, w)
+        _add_gradient(forms.foot_gradient[j, f], A, width, r, -w)
+        _add_gradient(forms.foot_gradient[j + 1, f], B, width, r, w)
+        Q = forms.foot_step[j, f]
+        for i in range(width):
+            x, y, z = w * B[i, 0], w * B[i, 1], w * B[i, 2]
+            for m in range(width):
+                Q[i, m] -= x * A[m, 0] + y * A[m, 1] + z * A[m, 2]
+
+
+@compiled
+def _difference(a, b, r):
+    r[0], r[1], r[2] = a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@compiled
+def _square(r):
+    return r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
+
+
+@compiled
+def _add_square(Q, A, width, weight):
+    """Q += weight A Aᵀ, the lower triangle, over the first `width` rows."""
+    for i in range(width):
+        x, y, z = weight * A[i, 0], weight * A[i, 1], weight * A[i, 2]
+        for k in range(i + 1):
+            Q[i, k] += x * A[k, 0] + y * A[k, 1] + z * A[k, 2]
+
+
+@compiled
+def _add_gradient(g, A, width, r, weight):
+    for i in range(width):
+        g[i] += weight * (A[i, 0] * r[0] + A[i, 1] * r[1] + A[i, 2] * r[2])
+
+
+@compiled
+def fill_system(theta, theta_imu, body, kin, forms, diagonal, below, gradient):
+    """Fill diagonal blocks (time, n, n), couplings (pair, n, n; rows of the next frame) and gradient (time, n)."""
+    diagonal[:], below[:], gradient[:] = 0.0, 0.0, 0.0
+    for j in range(len(diagonal)):
+        _fill_trunk(j, theta, theta_imu, body, kin, forms, diagonal, gradient)
+        for f in range(2):
+            _fill_foot(j, f, theta, theta_imu, body, kin, forms, diagonal, below, gradient)
+        if j + 1 < len(diagonal):
+            _fill_trunk_step(j, kin, forms, below)
+
+
+@compiled
+def _fill_trunk(j, theta, theta_imu, body, kin, forms, diagonal, gradient):
+    """Add translation, root and head; eliminating the spine turns its pose prior into the form w (J Jᵀ)⁻¹ of the
+    head."""
+    D, g, R = diagonal[j], gradient[j], kin.R[j, 0]
+    inverse, turn = _spine_form(theta, theta_imu, body, kin, j)
+    pull = inverse @ turn
+    for i in range(3):
+        D[i, i] += forms.small[j, 0]
+        D[3 + i, 3 + i] += forms.small[j, 1] + forms.small[j, 2]
+        D[HEAD + i, HEAD + i] += forms.small[j, 2]
+        g[i] += forms.small_gradient[j, 0, i]
+        g[HEAD + i] += forms.small_gradient[j, 2, i] + forms.pose[j] * pull[i]
+        for k in range(3):
+            g[3 + i] += R[k, i] * (forms.small_gradient[j, 1, k] + forms.small_gradient[j, 2, k])
+            D[HEAD + i, 3 + k] += forms.small[j, 2] * R[i, k]
+            D[3 + k, HEAD + i] += forms.small[j, 2] * R[i, k]
+            D[HEAD + i, HEAD + k] += forms.pose[j] * inverse[i, k]
+
+
+@compiled
+def _spine_form(theta, theta_imu, body, kin, j):
+    """((J Jᵀ)⁻¹, J d): J is the head rotation's Jacobian (world axes) in the spine's axis-angles, d their deviation
+    from the suit's."""
+    gram, turn = np.zeros((3, 3)), np.zeros(3)
+    for joint in body.head_chain:
+        J = kin.axes[j, joint]
+        for i in range(3):
+            for k in range(3):
+                turn[i] += J[i, k] * (theta[j, joint - 1, k] - theta_imu[j, joint - 1, k])
+                for m in range(3):
+                    gram[i, k] += J[i, m] * J[k, m]
+    return np.linalg.inv(gram), turn
+
+
+@compiled
+def _fill_trunk_step(j, kin, forms, below):
+    """Add the couplings of translation, root and head with the next frame's."""
+    B, here, after, head = below[j], kin.R[j, 0], kin.R[j + 1, 0], forms.small_step[j, 2]
+    for i in range(3):
+        for k in range(3):
+            B[i, k] += forms.small_step[j, 0, i, k]
+            B[HEAD + i, HEAD + k] += head[i, k]
+            for m in range(3):
+                B[HEAD + i, 3 + k] += head[i, m] * here[m, k]
+                B[3 + i, HEAD + k] += after[m, i] * head[m, k]
+                for l in range(3):
+                    both = forms.small_step[j, 1, m, l] + head[m, l]
+                    B[3 + i, 3 + k] += after[m, i] * both * here[l, k]
+
+
+@compiled
+def _fill_foot(j, f, theta, theta_imu, body, kin, forms, diagonal, below, gradient):
+    """Add a foot's twist forms and the leg's pose terms."""
+    chain, T = body.leg_chains[f], kin.foot_maps[j, f]
+    first = LEGS + 3 * len(chain) * f
+    for k in range(len(chain)):
+        for i in range(3):
+            at = first + 3 * k + i
+            diagonal[j, at, at] += forms.pose[j]
+            away = theta[j, chain[k] - 1, i] - theta_imu[j, chain[k] - 1, i]
+            gradient[j, at] += forms.pose[j] * away
+            if j + 1 < len(diagonal):
+                w, change = forms.pose_step[j], _pose_change(j, chain[k], i, theta, theta_imu)
+                diagonal[j, at, at] += w
+                diagonal[j + 1, at, at] += w
+                below[j, at, at] -= w
+                gradient[j, at] -= w * change
+                gradient[j + 1, at] += w * change
+    Q = forms.foot[j, f]
+    if Q[0, 0] > 0:
+        for i in range(12):
+            for k in range(i):
+                Q[k, i] = Q[i, k]
+        _scatter(diagonal[j], first, np.dot(T.T, np.dot(Q, T)))
+        along = np.dot(T.T, forms.foot_gradient[j, f])
+        for a in range(len(along)):
+            gradient[j, a if a < 6 else first + a - 6] += along[a]
+    if j + 1 < len(diagonal) and forms.foot_step[j, f, 0, 0] != 0:
+        _scatter(below[j], first, np.dot(kin.foot_maps[j + 1, f].T, np.dot(forms.foot_step[j, f], T)))
+
+
+@compiled
+def _scatter(target, first, block):
+    """Add a block over (translation, root, leg) to a frame's rows and columns."""
+    for a in range(len(block)):
+        row = a if a < 6 else first + a - 6
+        for b in range(6):
+            target[row, b] += block[a, b]
+        for b in range(6, len(block)):
+            target[row, first + b - 6] += block[a, b]
+
+
+@compiled
+def apply_step(step, scale, theta, R_root, t, theta_imu, body, kin):
+    """Update a state by -`scale` times the system's solution; the spine follows the head's rotation."""
+    R_turn, J = np.empty((3, 3)), np.empty((3, 3))
+    for j in range(len(t)):
+        inverse, turn = _spine_form(theta, theta_imu, body, kin, j)
+        pull = inverse @ (turn - step[j, HEAD : HEAD + 3])
+        for joint in body.head_chain:
+            for k in range(3):
+                away = theta[j, joint - 1, k] - theta_imu[j, joint - 1, k]
+                along = 0.0
+                for i in range(3):
+                    along += kin.axes[j, joint, i, k] * pull[i]
+                theta[j, joint - 1, k] += scale * (along - away)
+        for f in range(2):
+            chain = body.leg_chains[f]
+            for k in range(len(chain)):
+                at = LEGS + 3 * (len(chain) * f + k)
+                for i in range(3):
+                    theta[j, chain[k] - 1, i] -= scale * step[j, at + i]
+        for i in range(3):
+            t[j, i] -= scale * step[j, i]
+        _exp_and_jacobian(-scale * step[j, 3:6], R_turn, J)
+        R_root[j] = R_root[j] @ R_turn
 
 
 @compiled

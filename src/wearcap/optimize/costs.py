@@ -1,7 +1,8 @@
 """The terms of HPS as pure functions that return residuals; `Loss` maps residuals to energy.
 
 A residual is one vector per frame, pair of frames or patch vertex. The thesis's energies are means of residual norms
-(`Loss("norm")`); other losses are ours. Frames at 30 Hz, rotations as matrices, metres, radians.
+(`Loss("norm")`); other losses are ours. Frames at 30 Hz, rotations as matrices, metres, radians. The table `hps.TERMS`
+says which values each term compares.
 """
 
 from dataclasses import dataclass
@@ -51,33 +52,30 @@ def head_orientation(
     return _turn(R_world_head @ R_head_cam, R_world_cam)
 
 
-def foot_contact(
-    points: Float[Tensor, "time vertex 3"], surface: Float[Tensor, "time vertex 3"]
-) -> Float[Tensor, "time vertex 3"]:
-    """Offset (m) of patch vertices M_n from their nearest scene points v(n) (thesis eq. 4.6)."""
-    return points - surface
+def position_offset(
+    position: Float[Tensor, "time *vertex 3"], expected: Float[Tensor, "time *vertex 3"]
+) -> Float[Tensor, "time *vertex 3"]:
+    """Offset (m): of patch vertices M_n from their nearest scene points v(n) (thesis eq. 4.6), of the root from its
+    camera-based initial position (released code; no equation)."""
+    return position - expected
 
 
-def foot_plane(
-    points: Float[Tensor, "time vertex 3"],
+def plane_distance(
+    position: Float[Tensor, "time vertex 3"],
     origin: Float[Tensor, "time vertex 3"],
     normal: Float[Tensor, "time vertex 3"],
 ) -> Float[Tensor, "time vertex 1"]:
     """Signed distance (m) of patch vertices from the scan's local plane (ours): eq. 4.6, insensitive to point
     spacing."""
-    return ((points - origin) * normal).sum(-1, keepdim=True)
+    return ((position - origin) * normal).sum(-1, keepdim=True)
 
 
-def foot_slide(points: Float[Tensor, "time vertex 3"]) -> Float[Tensor, "pair vertex 3"]:
-    """Displacement (m) of patch vertices from frame to frame (thesis eq. 4.7)."""
-    return points.diff(dim=0)
-
-
-def translation_step(
-    t_world_root: Float[Tensor, "time 3"], expected: Float[Tensor, "pair 3"]
-) -> Float[Tensor, "pair 3"]:
-    """Root displacement (m) minus the expected one: zero (thesis eq. 4.9) or the suit's (released code)."""
-    return t_world_root.diff(dim=0) - expected
+def position_step(
+    position: Float[Tensor, "time *vertex 3"], expected: Float[Tensor, "pair *vertex 3"]
+) -> Float[Tensor, "pair *vertex 3"]:
+    """Displacement (m) from frame to frame minus the expected one: zero of patch vertices (thesis eq. 4.7), zero (eq.
+    4.9) or the suit's (released code) of the root."""
+    return position.diff(dim=0) - expected
 
 
 def rotation_step(
@@ -91,7 +89,7 @@ def rotation_step(
     return _turn(expected @ R_world_body[:-1], R_world_body[1:])
 
 
-def pose_prior(
+def pose_offset(
     theta: Float[Tensor, "time joint 3"], theta_imu: Float[Tensor, "time joint 3"]
 ) -> Float[Tensor, "time component"]:
     """Deviation of all joints' axis-angles but the root's from the suit's, one vector per frame (thesis eq. 4.12)."""
@@ -102,12 +100,7 @@ def pose_step(
     theta: Float[Tensor, "time joint 3"], theta_imu: Float[Tensor, "time joint 3"]
 ) -> Float[Tensor, "pair component"]:
     """Change of the deviation from the suit's pose from frame to frame; the suit's errors vary slowly (ours)."""
-    return pose_prior(theta, theta_imu).diff(dim=0)
-
-
-def translation_hold(t_world_root: Float[Tensor, "time 3"], target: Float[Tensor, "time 3"]) -> Float[Tensor, "time 3"]:
-    """Offset (m) of the root from its camera-based initial position (released code; no equation)."""
-    return t_world_root - target
+    return pose_offset(theta, theta_imu).diff(dim=0)
 
 
 def _turn(R_a: Float[Tensor, "*batch 3 3"], R_b: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:

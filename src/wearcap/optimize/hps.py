@@ -1,37 +1,69 @@
-"""The energy of HPS (thesis eq. 4.1–4.12): data of a recording, unknowns, and the terms that relate them."""
+"""The energy of HPS (thesis eq. 4.1–4.12): one table of its terms, the unknowns, and the data of a recording."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
+from wearcap.body.model import FOOT_REGIONS, BodyModel
+from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.surface import SurfaceIndex
 from wearcap.optimize import costs
 from wearcap.optimize.costs import Loss
-from wearcap.optimize.feet import FootPatches
 
-TERMS = (
-    "self",
-    "contact",
-    "contact_plane",
-    "slide",
-    "translation_smooth",
-    "root_smooth",
-    "head_smooth",
-    "pose",
-    "hold",
-    "translation_step",
-    "root_step",
-    "head_step",
-    "pose_step",
-)
-"""Names of the terms, as configs weight them; each is a function of `costs`."""
 
+@dataclass(frozen=True)
+class Term:
+    """One row of the energy: what a term measures, on which values, and how far it reaches over time."""
+
+    cost: Callable[..., Tensor]
+    """Residuals of all frames (or pairs of frames), a pure function of `costs`."""
+    inputs: tuple[str, ...]
+    """Arguments of `cost`: names of `state_values`, the first one, and of `data_values`."""
+    reach: int
+    """Number of consecutive frames on which a residual depends: 1, or 2 (then the first residual is that of frames 0
+    and 1)."""
+    share: str = "ones"
+    """Name in `data_values` of the factor of each residual's energy, of the residuals' shape; "ones": no factor."""
+    expected: tuple[str, ...] = ()
+    """For a cost that measures how far its first input is from an expected value or step: the name of that value in
+    `data_values`, then that of the only direction measured, if there is one. The derivative is then known; a cost
+    without an expected value is differentiated automatically."""
+
+
+TERMS = {
+    "self": Term(
+        costs.head_orientation, ("R_head", "R_head_cam", "R_world_cam"), 1, "cam_confidence", ("R_localized_head",)
+    ),
+    "contact": Term(costs.position_offset, ("soles", "ground_point"), 1, "on_ground", ("ground_point",)),
+    "contact_plane": Term(
+        costs.plane_distance,
+        ("soles", "ground_origin", "ground_normal"),
+        1,
+        "on_ground",
+        ("ground_origin", "ground_normal"),
+    ),
+    "slide": Term(costs.position_step, ("soles", "no_slide"), 2, "stays", ("no_slide",)),
+    "translation_smooth": Term(costs.position_step, ("t_root", "no_step"), 2, expected=("no_step",)),
+    "root_smooth": Term(costs.rotation_step, ("R_root", "no_turn"), 2, expected=("no_turn",)),
+    "head_smooth": Term(costs.rotation_step, ("R_head", "no_turn"), 2, expected=("no_turn",)),
+    "pose": Term(costs.pose_offset, ("theta", "theta_imu"), 1, expected=("theta_imu",)),
+    "hold": Term(costs.position_offset, ("t_root", "t_start"), 1, "hold_confidence", ("t_start",)),
+    "translation_step": Term(costs.position_step, ("t_root", "t_step"), 2, expected=("t_step",)),
+    "root_step": Term(costs.rotation_step, ("R_root", "R_root_step"), 2, expected=("R_root_step",)),
+    "head_step": Term(costs.rotation_step, ("R_head", "R_head_step"), 2, expected=("R_head_step",)),
+    "pose_step": Term(costs.pose_step, ("theta_legs", "theta_legs_imu"), 2, expected=("theta_legs_imu",)),
+}
+"""The terms by name, as configs weight them: E = Σ weight · mean of share · ρ(residual)."""
+
+PATCH_VERTICES = 10
 SURFACE_REACH_M = 0.5
 """Distance (m) to the nearest scanned point above which a foot has no scene below it."""
 LEAST_UPRIGHT = 0.7
@@ -63,6 +95,11 @@ class HpsEnergy:
     def loss(self, name: str) -> Loss:
         return self.losses.get(name, Loss())
 
+    def reading(self, value: str) -> list[str]:
+        """Names of the weighted terms that read a value of `data_values`."""
+        rows = [name for name, weight in self.weights.items() if weight > 0]
+        return [name for name in rows if value in (*TERMS[name].inputs, TERMS[name].share)]
+
 
 @dataclass(frozen=True, eq=False)
 class HpsState:
@@ -81,6 +118,77 @@ class HpsState:
     @property
     def R_parent_joint(self) -> Float[Tensor, "time joint 3 3"]:
         return torch.cat([self.R_world_root[:, None], rotation.exp(self.theta)], 1)
+
+
+@dataclass(frozen=True, eq=False)
+class FootPatches:
+    """Vertices of the patches (B_k of thesis eq. 4.6), skinned without the rest of the body: 40 instead of
+    thousands."""
+
+    body: BodyModel
+    vertex: Int64[Tensor, "vertex"]
+    patch: Int64[Tensor, "vertex"]
+    """Index in `FOOT_PATCHES` of each vertex's patch."""
+
+    @classmethod
+    def of(cls, body: BodyModel, count: int = PATCH_VERTICES) -> "FootPatches":
+        """Choose `count` evenly spread vertices of each region (all vertices of a smaller region)."""
+        chosen = [_spread(body, body.regions[name], count) for name in FOOT_REGIONS.values()]
+        patch = torch.cat([torch.full((len(v),), k) for k, v in enumerate(chosen)])
+        return cls(body, torch.cat(chosen), patch)
+
+    @property
+    def legs(self) -> list[list[int]]:
+        """Joints of the left and the right leg, from hip to toe; the patches are skinned to the last two."""
+        skeleton = self.body.skeleton
+        return [chain_to(skeleton, skeleton.index(f"{side}_toe")) for side in ("left", "right")]
+
+    def points(self, T_world_joint: Rigid) -> Float[Tensor, "time vertex 3"]:
+        """World positions (m) of the vertices, given the poses of all joints."""
+        return self._only.vertices(T_world_joint)
+
+    def share(self, contact: Float[Tensor, "*batch patch"]) -> Float[Tensor, "*batch vertex"]:
+        """Contact of each vertex's patch, divided by its number of vertices, so that sums over vertices are patch
+        means."""
+        size = torch.bincount(self.patch, minlength=len(FOOT_REGIONS)).to(contact)
+        return (contact / size)[..., self.patch]
+
+    def middles(self, points: Float[Tensor, "time vertex 3"]) -> Float[Tensor, "time patch 3"]:
+        """Mean position of each patch's vertices."""
+        one = torch.nn.functional.one_hot(self.patch, len(FOOT_REGIONS)).to(points)
+        return torch.einsum("tvi,vp->tpi", points, one / one.sum(0))
+
+    @cached_property
+    def _only(self) -> BodyModel:
+        """Body model that consists of the patches only."""
+        whole = self.body
+        blend = None if whole.pose_blend is None else whole.pose_blend[:, self.vertex]
+        return BodyModel(
+            whole.skeleton,
+            whole.rest_vertices[self.vertex],
+            whole.faces[:0],
+            whole.skin_joints[self.vertex],
+            whole.skin_weights[self.vertex],
+            pose_blend=blend,
+        )
+
+
+def chain_to(skeleton: Skeleton, joint: int) -> list[int]:
+    """Joints on the chain from the root (excluded) to `joint`."""
+    chain = []
+    while joint > 0:
+        chain.append(joint)
+        joint = skeleton.parents[joint]
+    return chain[::-1]
+
+
+def _spread(body: BodyModel, region: Int64[Tensor, "all"], count: int) -> Int64[Tensor, "chosen"]:
+    """Farthest-point sampling of a region's vertices."""
+    points = body.rest_vertices[region]
+    chosen = [int((points - points.mean(0)).norm(dim=1).argmax())]
+    while len(chosen) < min(count, len(region)):
+        chosen.append(int(torch.cdist(points, points[chosen]).min(1).values.argmax()))
+    return region[chosen]
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,10 +239,6 @@ class HpsData:
         tensors = {name: value.to(dtype) for name, value in vars(self).items() if isinstance(value, Tensor)}
         return replace(self, start=HpsState(*(part.to(dtype) for part in vars(self.start).values())), **tensors)
 
-    def pose(self, state: HpsState) -> Rigid:
-        """World poses of all joints in a state."""
-        return forward_kinematics(self.patches.body.skeleton, state.R_parent_joint, state.t_world_root)
-
 
 @dataclass(frozen=True, eq=False)
 class Ground:
@@ -152,18 +256,19 @@ def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: H
 
     Each patch has one plane, that below its centroid. `found` is 0 everywhere without a scene.
     """
-    if data.surface is None or not (energy.weight("contact") or energy.weight("contact_plane")):
+    to_point, to_plane = energy.reading("ground_point"), energy.reading("ground_normal")
+    if data.surface is None or not (to_point or to_plane):
         none = torch.zeros_like(points.detach())
         return Ground(none, none, none, none[..., 0])
     dtype, points = points.dtype, points.detach().double()
     stands, patch = data.contact > 0, data.patches.patch
     point, origin, normal = points.clone(), torch.zeros_like(points), torch.zeros_like(points)
     found = stands[:, patch].double()
-    if energy.weight("contact"):
+    if to_point:
         seek = stands[:, patch]
         point[seek] = torch.from_numpy(data.surface.nearest_points(points[seek].numpy(), SURFACE_REACH_M))
         found *= point.isfinite().all(-1)
-    if energy.weight("contact_plane"):
+    if to_plane:
         where, up = (torch.zeros(*stands.shape, 3, dtype=torch.float64) for _ in range(2))
         queries = data.patches.middles(points)[stands].numpy()
         where[stands], up[stands] = map(torch.from_numpy, data.surface.plane(queries, reach_m=SURFACE_REACH_M))
@@ -173,51 +278,75 @@ def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: H
     return Ground(*(part.to(dtype) for part in parts))
 
 
-def energy_terms(
-    energy: HpsEnergy, data: HpsData, state: HpsState, ground: Ground | None = None, full_mesh: bool = False
-) -> dict[str, Float[Tensor, ""]]:
-    """Weighted terms of eq. 4.1, differentiable in the state.
-
-    `ground` None: queried for this state. `full_mesh` skins the whole body and takes the patches from it, as the
-    thesis does, with the same result.
-    """
-    T_world_joint = data.pose(state)
-    head = data.patches.body.skeleton.index("head")
-    legs = [joint - 1 for leg in data.patches.legs for joint in leg]
-    points = _patch_points(data, T_world_joint, full_mesh)
-    if ground is None:
-        ground = find_ground(data, points, energy)
-    stands = data.patches.share(data.contact) / 4
-    stays = data.patches.share(data.contact[1:] * data.contact[:-1]) / 4
-    R_head, R_root, t = T_world_joint.R[:, head], state.R_world_root, state.t_world_root
-    same = torch.eye(3).to(R_root).expand(len(data) - 1, 3, 3)
-    elements = {
-        "self": lambda: (costs.head_orientation(R_head, data.R_head_cam, data.R_world_cam), data.cam_confidence),
-        "contact": lambda: (costs.foot_contact(points, ground.point), stands * ground.found),
-        "contact_plane": lambda: (costs.foot_plane(points, ground.origin, ground.normal), stands * ground.found),
-        "slide": lambda: (costs.foot_slide(points), stays),
-        "translation_smooth": lambda: (costs.translation_step(t, torch.zeros_like(t[1:])), None),
-        "root_smooth": lambda: (costs.rotation_step(R_root, same), None),
-        "head_smooth": lambda: (costs.rotation_step(R_head, same), None),
-        "pose": lambda: (costs.pose_prior(state.theta, data.start.theta), None),
-        "hold": lambda: (costs.translation_hold(t, data.start.t_world_root), data.hold_confidence),
-        "translation_step": lambda: (costs.translation_step(t, data.t_step), None),
-        "root_step": lambda: (costs.rotation_step(R_root, data.R_root_step), None),
-        "head_step": lambda: (costs.rotation_step(R_head, data.R_head_step), None),
-        "pose_step": lambda: (costs.pose_step(state.theta[:, legs], data.start.theta[:, legs]), None),
+def data_values(data: HpsData, ground: Ground) -> dict[str, Tensor]:
+    """Values by name that do not depend on the state: the fields of `HpsData`, and what the terms derive from them."""
+    contact, patches = data.contact, data.patches
+    t, theta_imu, soles = data.start.t_world_root, data.start.theta, ground.point
+    derived = {
+        "ones": torch.ones_like(t[:, 0]),
+        "t_start": t,
+        "theta_imu": theta_imu,
+        "theta_legs_imu": theta_imu[:, _leg_columns(patches)],
+        "R_localized_head": data.R_world_cam @ data.R_head_cam.T,
+        "ground_point": ground.point,
+        "ground_origin": ground.origin,
+        "ground_normal": ground.normal,
+        "on_ground": patches.share(contact) / 4 * ground.found,
+        "stays": patches.share(contact[1:] * contact[:-1]) / 4,
+        "no_slide": torch.zeros_like(soles[1:]),
+        "no_step": torch.zeros_like(t[1:]),
+        "no_turn": torch.eye(3).to(t).expand(len(data) - 1, 3, 3),
     }
+    return {name: value for name, value in vars(data).items() if isinstance(value, Tensor)} | derived
+
+
+def state_values(data: HpsData, state: HpsState, full_mesh: bool = False) -> dict[str, Tensor]:
+    """Values by name that depend on the state: translations t, rotations R (world), axis-angles θ, patch vertices.
+
+    `full_mesh` skins the whole body and takes the patches from it, as the thesis does, with the same result.
+    """
+    patches = data.patches
+    T_world_joint = forward_kinematics(patches.body.skeleton, state.R_parent_joint, state.t_world_root)
+    whole = patches.body.vertices(T_world_joint)[:, patches.vertex] if full_mesh else None
+    return {
+        "t_root": state.t_world_root,
+        "R_root": state.R_world_root,
+        "R_head": T_world_joint.R[:, patches.body.skeleton.index("head")],
+        "theta": state.theta,
+        "theta_legs": state.theta[:, _leg_columns(patches)],
+        "soles": patches.points(T_world_joint) if whole is None else whole,
+    }
+
+
+def energy_terms(
+    energy: HpsEnergy, data: HpsData, state: HpsState, full_mesh: bool = False
+) -> dict[str, Float[Tensor, ""]]:
+    """Weighted terms of eq. 4.1, differentiable in the state; the scene below the feet is queried for this state."""
+    of_state = state_values(data, state, full_mesh)
+    values = of_state | data_values(data, find_ground(data, of_state["soles"], energy))
     terms = {}
     for name, weight in energy.weights.items():
         if weight == 0:
             continue
-        residual, share_of = elements[name]()
-        value = energy.loss(name)(residual)
-        value = value if share_of is None else value * share_of
-        terms[name] = weight * value.sum() / max(len(residual), 1)
+        term = TERMS[name]
+        residual = term.cost(*(values[value] for value in term.inputs))
+        rho = energy.loss(name)(residual)
+        rho = rho if term.share == "ones" else rho * values[term.share]
+        terms[name] = weight * rho.sum() / max(len(residual), 1)
     return terms
 
 
-def _patch_points(data: HpsData, T_world_joint: Rigid, full_mesh: bool) -> Float[Tensor, "time vertex 3"]:
-    if full_mesh:
-        return data.patches.body.vertices(T_world_joint)[:, data.patches.vertex]
-    return data.patches.points(T_world_joint)
+def _leg_columns(patches: FootPatches) -> list[int]:
+    """Columns of θ that are the legs' joints, the left leg's first."""
+    return [joint - 1 for leg in patches.legs for joint in leg]
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Result of a solver: final state, energy history and stopping reason."""
+
+    state: HpsState
+    history: list[dict[str, float]] = field(default_factory=list)
+    """Energy by term and in "total", one entry per iteration (mean over windows or stretches)."""
+    reason: str = ""
+    """Why the solver stopped."""

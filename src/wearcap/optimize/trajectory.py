@@ -189,12 +189,6 @@ def bent(
     return torch.cat([start, start + turned.cumsum(0)])
 
 
-def control_offset(path: Float64[Tensor, "time 2"], problem: BendingProblem) -> Float64[Tensor, "control 2"]:
-    """Offsets l̂(τ_i) − p_i (m; eq. 5.2), the path being linear within steps."""
-    at, share = problem.control_step, problem.control_share[:, None]
-    return torch.lerp(path[at], path[at + 1], share) - problem.control_points
-
-
 def heading_change(
     heading: Float64[Tensor, "step"], original: Float64[Tensor, "step"], clamped: bool = False
 ) -> Float64[Tensor, "link"]:
@@ -208,9 +202,11 @@ def heading_change(
 def energy_terms(
     problem: BendingProblem, turn: Float64[Tensor, "step"], shift: Float64[Tensor, "2"]
 ) -> dict[str, Float64[Tensor, ""]]:
-    """Terms of eq. 5.2, differentiable in φ (rad) and in the shift of the first point (m)."""
-    settings = problem.settings
-    offset = control_offset(bent(problem, turn, shift), problem)
+    """Terms of eq. 5.2, differentiable in φ (rad) and in the shift of the first point (m); the path is linear within
+    steps."""
+    settings, path = problem.settings, bent(problem, turn, shift)
+    at, share = problem.control_step, problem.control_share[:, None]
+    offset = torch.lerp(path[at], path[at + 1], share) - problem.control_points
     off = turn[problem.leader]
     change = heading_change(off, torch.zeros_like(off), settings.clamped_ends)
     seconds = problem.link_s if settings.clamped_ends else problem.link_s[1:-1]

@@ -18,8 +18,7 @@ from safetensors.torch import load, save
 
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, write_text
-from wearcap.optimize.hps import HpsState
-from wearcap.optimize.solution import Solution
+from wearcap.optimize.hps import HpsState, Solution
 from wearcap.recording.serialize import KNOWN, dumps, flatten, unflatten
 from wearcap.runtime.digest import code_digest, digest, modules_of
 from wearcap.sensors.clock import Clock

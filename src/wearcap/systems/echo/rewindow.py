@@ -7,8 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.diffusion.process import posterior_step
-from wearcap.diffusion.sampler import step_levels
+from wearcap.diffusion.process import posterior_step, step_levels
 from wearcap.systems.echo.model import MODALITIES
 from wearcap.systems.echo.queue import Conditioning, EchoQueue, Model, Outputs
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from wearcap.body.skeleton import Skeleton
 from wearcap.data.features import body_size
 from wearcap.data.surroundings import latest_before
-from wearcap.diffusion.sampler import Denoise, step_levels
+from wearcap.diffusion.process import Denoise, step_levels
 from wearcap.diffusion.schedule import Schedule
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
@@ -58,7 +58,7 @@ class HMD2(LearnedSystem):
     live: bool = False
     """Whether the floor at a frame is estimated from earlier data only, as it must be in a stream."""
     spacing: float = 1.0
-    """Spacing of the steps' noise levels (`diffusion.sampler.step_levels`)."""
+    """Spacing of the steps' noise levels (`diffusion.process.step_levels`)."""
     inpaint: bool = False
     """Whether steps overwrite the overlap with the last window's poses (thesis eq. 6.5) or re-denoise it (ours)."""
     fade: int = 20

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wearcap.body.skeleton import FEET
-from wearcap.diffusion.sampler import Denoise, sample
+from wearcap.diffusion.process import Denoise, sample
 from wearcap.diffusion.schedule import Schedule
 from wearcap.geometry.rigid import Rigid
 from wearcap.systems.hmd2.features import HeadFeatures

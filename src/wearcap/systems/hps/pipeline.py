@@ -21,9 +21,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, finite_difference, resample
-from wearcap.optimize.feet import FootPatches
-from wearcap.optimize.hps import HpsData, HpsEnergy, HpsState
-from wearcap.optimize.solution import Solution
+from wearcap.optimize.hps import FootPatches, HpsData, HpsEnergy, HpsState, Solution
 from wearcap.recording import Motion, Recording
 from wearcap.recording.growing import follow_pieces
 from wearcap.recording.recording import Localization
@@ -112,7 +110,7 @@ class HPS(StagedSystem):
 
     def require_scan(self, scan: Path | Scan | None, where: str) -> None:
         """Raise WearcapError when a term of the energy needs a scan and there is none."""
-        terms = [name for name in ("contact", "contact_plane") if self.energy.weight(name)]
+        terms = self.energy.reading("on_ground")
         if scan is None and terms:
             raise WearcapError(
                 f"no scan of the scene, which the energy's term {' and '.join(terms)} needs",

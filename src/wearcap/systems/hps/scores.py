@@ -18,8 +18,7 @@ from wearcap.body.model import BodyModel
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
 from wearcap.geometry.surface import SurfaceIndex
-from wearcap.metrics.chamfer import Chamfer, chamfer, mean_chamfer
-from wearcap.metrics.surface import FootSurface, foot_surface, foot_vertices
+from wearcap.metrics.surface import Chamfer, FootSurface, chamfer, foot_surface, foot_vertices, mean_chamfer
 from wearcap.metrics.table import evaluate_motion
 from wearcap.recording import Motion, Recording
 from wearcap.recording.recording import Intervals

@@ -3,7 +3,7 @@
 import lightning
 from lightning.pytorch import Callback
 
-from wearcap.systems.ireplica.contact_network import fit_temperature
+from wearcap.systems.ireplica.contact_transformer import fit_temperature
 from wearcap.systems.ireplica.training import ContactDetection
 
 

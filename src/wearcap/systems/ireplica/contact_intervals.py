@@ -1,7 +1,6 @@
 """Contact probabilities to intervals with a fixed set of contacting hands (thesis §5.3.2)."""
 
-from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import torch
@@ -9,6 +8,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from wearcap.errors import WearcapError
+from wearcap.scene.objects import CONTACT_CLASSES
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,14 @@ class ContactInterval:
     stop: int
     hands: tuple[bool, bool]
 
+    def continues(self, before: "ContactInterval") -> bool:
+        """Whether this interval follows another without a gap and shares a hand with it."""
+        return before.stop == self.start and any(a and b for a, b in zip(before.hands, self.hands))
+
+
+Span = tuple[ContactInterval, str]
+"""A contact interval and its class of interaction."""
+
 
 def active(
     contact_prob: Float[Tensor, "time hand"], timestamps: Float64[Tensor, "time"], settings: ContactSettings
@@ -61,67 +69,71 @@ def contact_intervals(contact: Bool[Tensor, "time hand"]) -> list[ContactInterva
     return [ContactInterval(a, b, (bool(left), bool(right))) for a, b, (left, right) in rows if left or right]
 
 
-@dataclass
-class ContactStream:
-    """Streaming version of `active` and `contact_intervals`: returns an interval as soon as it is certain to be over.
+def class_intervals(
+    contact_prob: dict[str, Float[Tensor, "time hand"]],
+    timestamps: Float64[Tensor, "time"],
+    contact: ContactSettings,
+    one_class: bool,
+) -> list[Span]:
+    """Contact intervals of every class, in order of time. With `one_class`, a hand's less probable class is dropped."""
+    if one_class and len(contact_prob) > 1:
+        best = torch.stack(list(contact_prob.values())).amax(0)
+        contact_prob = {name: torch.where(prob >= best, prob, 0.0) for name, prob in contact_prob.items()}
+    found = [
+        (interval, name)
+        for name in CONTACT_CLASSES
+        if name in contact_prob
+        for interval in contact_intervals(active(contact_prob[name], timestamps, contact))
+    ]
+    return sorted(found, key=lambda row: (row[0].start, row[0].stop))
 
-    A frame without contact is decided after `gap_s`, or earlier if contact returns. Memory is bounded by the gap.
+
+def settled(
+    spans: list[Span], palms_world: Float[Tensor, "time hand 3"], timestamps: Float64[Tensor, "time"], settle_s: float
+) -> list[Span]:
+    """Cut approach and retreat off the intervals (ours), each up to `settle_s` long, as a hand is at rest when it
+    takes and releases.
+
+    The networks report contact during the approach to an object and the retreat from it too: some tenths of a second
+    in which the object would follow hands that do not hold it.
+    Consecutive intervals of a class that share a hand form one hold; it begins and ends where the hands that begin and
+    end it are slowest. Intervals entirely before or after that are dropped.
     """
+    if settle_s <= 0 or len(timestamps) < 3:
+        return spans
+    reach = max(1, round(settle_s / float(timestamps.diff().median())))
+    speed = palms_world.diff(dim=0).norm(dim=-1) / timestamps.diff()[:, None].to(palms_world)
+    speed = torch.cat([speed, speed[-1:]])
+    kept: list[Span] = []
+    for chain in chains(spans):
+        first, last = chain[0][0], chain[-1][0]
+        middle = (first.start + last.stop) // 2
+        start = _slowest(speed, chain, first.start, reach, first.start, min(first.start + reach, middle))
+        stop = _slowest(speed, chain, last.stop - reach, reach, max(last.stop - reach, middle), last.stop)
+        for contact, contact_class in chain:
+            cut = replace(contact, start=max(contact.start, start), stop=min(contact.stop, stop + 1))
+            if cut.start < cut.stop:
+                kept.append((cut, contact_class))
+    return sorted(kept, key=lambda row: (row[0].start, row[0].stop))
 
-    settings: ContactSettings = field(default_factory=ContactSettings)
-    _undecided: deque = field(default_factory=deque)
-    """Undecided frames, oldest first: (index, time, above threshold per hand)."""
-    _last: list[float] = field(default_factory=lambda: [-float("inf")] * 2)
-    _now_s: float = -float("inf")
-    _count: int = 0
-    _open: tuple[int, tuple[bool, bool]] | None = None
 
-    def push(self, contact_prob: Float[Tensor, "hand"], time_s: float) -> list[ContactInterval]:
-        """Add one frame's probabilities; returns intervals that are over. Raises WearcapError unless time rises."""
-        if not time_s > self._now_s:
-            raise WearcapError(f"a frame at {time_s} s after one at {self._now_s} s", expected="rising times")
-        self._now_s = time_s
-        above = [bool(p >= self.settings.threshold) for p in contact_prob.tolist()]
-        for hand in range(2):
-            if above[hand]:
-                if time_s - self._last[hand] <= self.settings.gap_s + 1e-9:
-                    for _, time, contact in self._undecided:
-                        contact[hand] |= time > self._last[hand]
-                self._last[hand] = time_s
-        self._undecided.append((self._count, time_s, above))
-        self._count += 1
-        return self._decided(time_s)
-
-    def flush(self) -> list[ContactInterval]:
-        """Return the remaining intervals at the end of the recording."""
-        done = self._decided(float("inf"))
-        return done + self._closed(self._count)
-
-    def _decided(self, now_s: float) -> list[ContactInterval]:
-        """Process frames that no later contact can change: every hand is in contact, or was released longer than the
-        gap ago."""
-        done = []
-        while self._undecided:
-            number, time, contact = self._undecided[0]
-            if any(
-                not on and last < time and now_s - last < self.settings.gap_s for on, last in zip(contact, self._last)
-            ):
+def chains(spans: list[Span]) -> list[list[Span]]:
+    """Group intervals into holds: intervals of one class that follow without a gap and share a hand."""
+    found: list[list[Span]] = []
+    for contact, contact_class in spans:
+        for chain in reversed(found[-4:]):
+            if chain[-1][1] == contact_class and contact.continues(chain[-1][0]):
+                chain.append((contact, contact_class))
                 break
-            self._undecided.popleft()
-            done += self._step(number, (contact[0], contact[1]))
-        return done
+        else:
+            found.append([(contact, contact_class)])
+    return found
 
-    def _step(self, number: int, contact: tuple[bool, bool]) -> list[ContactInterval]:
-        if self._open is not None and self._open[1] == contact:
-            return []
-        done = self._closed(number)
-        if any(contact):
-            self._open = (number, contact)
-        return done
 
-    def _closed(self, stop: int) -> list[ContactInterval]:
-        if self._open is None:
-            return []
-        start, hands = self._open
-        self._open = None
-        return [ContactInterval(start, stop, hands)]
+def _slowest(speed: Float[Tensor, "time hand"], hold: list[Span], near: int, reach: int, start: int, stop: int) -> int:
+    """Frame in start … stop − 1 with the least mean speed of the hands in contact within `reach` frames from `near`."""
+    if stop <= start:
+        return start
+    rows = [contact.hands for contact, _ in hold if contact.start < near + reach and contact.stop > near]
+    hands = torch.tensor([any(column) for column in zip(*rows)] if rows else hold[0][0].hands)
+    return start + int(speed[start:stop, hands].mean(1).argmin())

@@ -14,9 +14,8 @@ from wearcap.geometry.trajectory import interpolate
 from wearcap.models.build import build
 from wearcap.models.checkpoint import read_checkpoint
 from wearcap.recording import Motion
-from wearcap.systems.ireplica.contact_network import FRAMES, REACH, ContactNetwork
 from wearcap.systems.ireplica.contact_sequence import ContactSequence
-from wearcap.systems.ireplica.contact_transformer import ContactTransformer
+from wearcap.systems.ireplica.contact_transformer import FRAMES, REACH, ContactNetwork, ContactTransformer
 from wearcap.systems.ireplica.features import FEATURES, PoseFeatures, in_skeleton, pose_frames, worn
 
 NETWORKS = {cls.__name__: cls for cls in (ContactTransformer, ContactSequence)}

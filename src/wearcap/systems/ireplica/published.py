@@ -1,7 +1,8 @@
 """Baselines of iReplica (thesis §5.4.3): static objects, objects interpolated between true poses, contact by
 proximity."""
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float
@@ -9,14 +10,19 @@ from torch import Tensor
 
 from wearcap.body.kinematics import site_positions
 from wearcap.geometry import rotation
-from wearcap.geometry.trajectory import Trajectory
-from wearcap.metrics.interaction import handlings
-from wearcap.recording import Motion
+from wearcap.geometry.trajectory import Trajectory, interpolate
+from wearcap.metrics.objects import handlings
+from wearcap.optimize.trajectory import BentPath
+from wearcap.recording import Motion, Recording
 from wearcap.recording.interactions import Interactions
+from wearcap.recording.timing import resampled
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import CONTACT_CLASSES
-from wearcap.systems.ireplica.attachment import object_trajectories
-from wearcap.systems.ireplica.object_tracker import PALMS, ObjectTracker
+from wearcap.sensors.initialization import align_suit, body_camera, inliers
+from wearcap.systems.hps.camera import Localize, MapLocalization, Synchronization
+from wearcap.systems.hps.pipeline import required
+from wearcap.systems.hps.published import PlacedSuit
+from wearcap.systems.ireplica.object_tracker import PALMS, ObjectTracker, object_trajectories
 from wearcap.systems.ireplica.scores import poses_at
 
 NEAR_M = 0.08
@@ -83,3 +89,35 @@ def nearness(
             near = found[scene_object.freedom.contact_class]
             near[:, hand] = torch.maximum(near[:, hand], (distance <= NEAR_M).float())
     return found
+
+
+@dataclass(frozen=True)
+class BentSuit(PlacedSuit):
+    """Places the suit's motion by bending its path in the ground plane; pose and height are the suit's."""
+
+    bend: Callable[..., BentPath]
+    """`optimize.trajectory.bend` with its settings and solver."""
+    fps: float = 30.0
+    name: str = "bent_suit"
+    synchronization: Synchronization = field(default_factory=Synchronization)
+    localization: Localize = field(default_factory=MapLocalization)
+
+    @property
+    def placing(self) -> Callable[..., BentPath]:
+        return self.bend
+
+    def place(self, recording: Recording) -> Motion:
+        """Compute F_tr(l, p) of eq. 5.2; p are root positions from the localised camera positions, without outliers."""
+        suit, localization, T_head_cam = required(recording)
+        motion = align_suit(resampled(suit, self.fps), localization, T_head_cam)[0]
+        first, last = motion.timestamps[0], motion.timestamps[-1]
+        use = inliers(localization) & (localization.timestamps >= first) & (localization.timestamps <= last)
+        times = localization.timestamps[use].contiguous()
+        carried = body_camera(motion, T_head_cam.t) - motion.t_world_root
+        points = localization.t_world_cam[use] - interpolate(motion.timestamps, carried, times)
+        path = motion.t_world_root[:, :2].double()
+        bent = self.bend(path, motion.timestamps, times, points[:, :2].double(), localization.confidence[use].double())
+        R = motion.R_parent_joint.clone()
+        R[:, 0] = rotation.about_axis("z", bent.frame_turn.to(R)) @ R[:, 0]
+        root = torch.cat([bent.path.to(motion.t_world_root), motion.t_world_root[:, 2:]], 1)
+        return replace(motion, R_parent_joint=R, t_world_root=root, provenance={"pipeline": self.name})

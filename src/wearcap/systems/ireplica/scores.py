@@ -19,7 +19,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
 from wearcap.io.formats.environment import read_environment
-from wearcap.metrics.interaction import Handling, contact_mean, handlings, object_error, summary
+from wearcap.metrics.objects import Handling, contact_mean, handlings, object_error, summary
 from wearcap.metrics.position import mpjpe_cm
 from wearcap.metrics.table import Row
 from wearcap.recording import Motion, Recording

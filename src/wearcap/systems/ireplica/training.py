@@ -11,8 +11,8 @@ from wearcap.data.statistics import collate
 from wearcap.geometry import rotation
 from wearcap.metrics.detection import mean_detection_scores
 from wearcap.runtime.graphs import Exports
-from wearcap.systems.ireplica.contact_network import REACH, ContactNetwork
 from wearcap.systems.ireplica.contact_prediction import ContactDetector
+from wearcap.systems.ireplica.contact_transformer import REACH, ContactNetwork
 from wearcap.systems.ireplica.export import exports
 from wearcap.systems.ireplica.features import PoseFeatures
 from wearcap.systems.ireplica.training_windows import ContactDataset, ContactWindow

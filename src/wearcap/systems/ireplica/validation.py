@@ -8,7 +8,7 @@ import torch
 from lightning.pytorch import Callback
 
 from wearcap.io.formats.environment import read_environment
-from wearcap.metrics.interaction import summary
+from wearcap.metrics.objects import summary
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.runtime.system import CaptureInput
 from wearcap.systems.ireplica.contact_prediction import ContactDetector, ContactPredictor
