@@ -19,7 +19,16 @@ from wearcap.models.image_encoder import EgoViewEncoder
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.recording.recording import CameraStream
 from wearcap.sensors.slam import R_DEVICE_CAM
-from wearcap.systems.hmd2.egoview_frames import HANDS, POINTS, EgoFrame, EgoFrames, limb_points
+from wearcap.systems.hmd2.egoview_frames import (
+    HANDS,
+    POINTS,
+    EgoFrame,
+    EgoFrames,
+    half_mirrored,
+    limb_points,
+    relit,
+    turned,
+)
 from wearcap.systems.hmd2.egoview_training import view_scores
 from wearcap_testing import recording_of, swaying_motion
 
