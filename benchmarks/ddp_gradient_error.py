@@ -18,10 +18,11 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from wearcap.cli.conf import compose
-from wearcap.data.datamodule import MotionWindows
+from wearcap.data.datamodule import WindowsModule
 from wearcap.data.statistics import collate
-from wearcap.data.windows import SeededSampler, Window
+from wearcap.data.windows import SeededSampler
 from wearcap.systems.hmd2.training import MotionDiffusion
+from wearcap.systems.hmd2.training_windows import HeadWindow
 
 PROCESSES = 2
 JOINT_BATCH = 8
@@ -35,7 +36,7 @@ class WeightedLoss(nn.Module):
         super().__init__()
         self.system = system
 
-    def forward(self, batch: Window) -> Tensor:
+    def forward(self, batch: HeadWindow) -> Tensor:
         weights = self.system.loss_weights
         terms = self.system.terms(batch)
         return torch.stack([weights.get(name, 0.0) * term for name, term in terms.items()]).sum()
@@ -64,7 +65,7 @@ def measure() -> list[dict]:
 def gradients(folder: str, rank: int, world: int) -> dict[str, Tensor]:
     """Gradients of one step on this process's share of the joint batch."""
     config = compose("train", ["experiment=motion_diffusion_head", f"paths.datasets={folder}", "paths.run=unused"])
-    data: MotionWindows = instantiate(config.data)
+    data: WindowsModule = instantiate(config.data)
     dataset = data.dataset("train")
     loss = WeightedLoss(instantiate(config.model)).eval()
     loss.system.set_statistics(dataset)

@@ -40,8 +40,8 @@ from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.stream import HeadSample, HMD2Session, Wearer
-from wearcap.training.checkpoint import RunCheckpointIO
 from wearcap.training.loggers import read_metrics
+from wearcap.training.run import RunCheckpointIO
 from wearcap.viewer.annotation_file import AnnotationFile
 from wearcap_testing import recording_of, small_dataset, swaying_motion
 
@@ -115,7 +115,7 @@ def _train(folder: Path, finished: Finished) -> None:
             "callbacks.capture=null",
             f"hydra.run.dir={folder}",
             f"paths.outputs={folder.parent}",
-            "data.window=60",
+            "data.dataset.window=60",
             "trainer.accelerator=cpu",
             "trainer.max_steps=100000000",
             "logger.csv.flush_logs_every_n_steps=1",

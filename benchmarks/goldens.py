@@ -103,8 +103,8 @@ TWO = "data.sources.cmu=null"
 VAL = "data.val_sources.cmu.root=data/walkers"
 ONE = "data.sources.simulated.root=data/walkers"
 TRAININGS: dict[str, tuple[str, ...]] = {
-    "motion_diffusion_head": (QUIET, ONE, "data.window=120"),
-    "hmd2": (QUIET, ONE, TWO, "data.window=120"),
+    "motion_diffusion_head": (QUIET, ONE, "data.dataset.window=120"),
+    "hmd2": (QUIET, ONE, TWO, "data.dataset.window=120"),
     "mocap_every": (ONE, TWO, VAL),
     "echo": (
         "data.sources.objects.root=data/objects",
@@ -114,11 +114,11 @@ TRAININGS: dict[str, tuple[str, ...]] = {
     ),
     "contact_sequence": ("data.sources.simulated.root=data/flats", "callbacks.tracking=null"),
     "contact_transformer_sliding": ("data.sources.simulated.root=data/flats", "callbacks.tracking=null"),
-    "pose_regressor_hands": (ONE, "data.window=120"),
+    "pose_regressor_hands": (ONE, "data.dataset.window=120"),
     "motion_manifold": (ONE, TWO, VAL),
     "motion_autoencoder": (ONE, TWO),
-    "voxel_autoencoder": (ONE, TWO, "data.window=120"),
-    "object_encoder": ("data.per_class=2", "data.val_per_class=1", "data.root=data/clouds"),
+    "voxel_autoencoder": (ONE, TWO, "data.dataset.window=120"),
+    "object_encoder": ("data.dataset.per_class={train: 2, val: 1}", "data.dataset.root=data/clouds"),
     "egoview": (ONE, TWO),
 }
 """Experiments with what they are trained on, for three steps."""
@@ -193,8 +193,8 @@ def trained(name: str) -> Arrays:
             f"experiment={name}",
             f"hydra.run.dir={output}",
             "trainer.max_steps=3",
-            "data.steps_per_epoch=3",
-            "data.batch_size=4",
+            "data.loading.steps_per_epoch=3",
+            "data.loading.batch_size=4",
             "trainer.log_every_n_steps=1",
             *TRAININGS[name],
         ]

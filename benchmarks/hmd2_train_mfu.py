@@ -16,9 +16,9 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from wearcap.cli.conf import compose
 from wearcap.data.features import LIMBS
-from wearcap.data.windows import Window
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.systems.hmd2.training import MotionDiffusion
+from wearcap.systems.hmd2.training_windows import HeadWindow
 
 PEAK_TFLOPS = {"H200": 989.0, "H100": 989.0, "A100": 312.0}
 BATCH = 512
@@ -31,7 +31,7 @@ def measure(batch: int = BATCH, steps: int = 30) -> list[dict]:
     if peak is None:
         print(f"hmd2_train_mfu: left out, the peak of {torch.cuda.get_device_name()} is not known", file=sys.stderr)
         return []
-    windows = Window(*(part.cuda() for part in _windows(batch)))
+    windows = HeadWindow(*(part.cuda() for part in _windows(batch)))
     with FlopCounterMode(display=False) as counter:
         _Training(compile=False).step(windows)
     training = _Training(compile=True)
@@ -68,7 +68,7 @@ class _Training:
         self.system.train()
         self.optimizer = torch.optim.AdamW(self.system.net.parameters(), fused=device == "cuda")
 
-    def step(self, batch: Window) -> None:
+    def step(self, batch: HeadWindow) -> None:
         with torch.autocast(batch.valid.device.type, torch.bfloat16):
             terms, weights = self.system.terms(batch), self.system.loss_weights
         torch.stack([weights.get(name, 0.0) * term for name, term in terms.items()]).sum().backward()
@@ -76,12 +76,12 @@ class _Training:
         self.optimizer.zero_grad(set_to_none=True)
 
 
-def _windows(batch: int, time_steps: int = 240, joints: int = 23) -> Window:
+def _windows(batch: int, time_steps: int = 240, joints: int = 23) -> HeadWindow:
     """Random windows: how fast does not ask how well."""
     shape = batch, time_steps
     turns = torch.linalg.qr(torch.randn(*shape, joints, 3, 3))[0]
     there = torch.ones(shape, dtype=torch.bool)
-    return Window(
+    return HeadWindow(
         R_parent_joint=turns,
         R_world_head=turns[:, :, 0].clone(),
         t_world_head=torch.randn(*shape, 3),

@@ -36,7 +36,7 @@ def measure(steps: int = 100, overrides: tuple[str, ...] = ()) -> list[dict]:
                 f"paths.datasets={folder}",
                 f"paths.run={folder}",
                 f"trainer.max_steps={steps + WARM_UP}",
-                f"data.steps_per_epoch={steps + WARM_UP}",
+                f"data.loading.steps_per_epoch={steps + WARM_UP}",
                 *overrides,
             ],
         )

@@ -49,7 +49,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     table = new_table(f"Hands in the head camera's pictures, {options.split} split", ["", *COLUMNS.values()])
     rows = {}
     for root in options.datasets:
-        frames = EgoFrames([Source(root)], options.split, EVERY * (10 if options.quick else 1))
+        frames = EgoFrames([Source(root)], options.split, every=EVERY * (10 if options.quick else 1))
         rows[root] = _scores(system, frames)
         table.add_row(Path(root).name, *(f"{rows[root][key]:.{1 if 'cm' in key else 3}f}" for key in COLUMNS))
     Console(width=120).print(table)

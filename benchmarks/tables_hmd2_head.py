@@ -18,7 +18,7 @@ OURS = ("experiment=motion_diffusion_head",)
 ABLATIONS = {
     "document's frame, losses and draws": ("experiment=motion_diffusion_head_paper",),
     "noise levels drawn uniformly": (*OURS, "model.level_tilt=0"),
-    "all windows drawn alike": (*OURS, "data.balance=1"),
+    "all windows drawn alike": (*OURS, "data.dataset.balance=1"),
     "condition without context": (*OURS, "model.net.context=0"),
 }
 DOCUMENT: Scores = {
@@ -36,7 +36,12 @@ COLUMNS = (
     "truth_physicality",
     "floor_penetration_cm",
 )
-QUICK = ("trainer.max_steps=300", "data.steps_per_epoch=100", "data.batch_size=16", "callbacks.average.decay=0.98")
+QUICK = (
+    "trainer.max_steps=300",
+    "data.loading.steps_per_epoch=100",
+    "data.loading.batch_size=16",
+    "callbacks.average.decay=0.98",
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

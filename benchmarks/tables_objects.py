@@ -22,8 +22,7 @@ from wearcap.files import write_text
 from wearcap.models.checkpoint import load_trained
 from wearcap.models.point_encoder import bounds, to_unit_sphere
 from wearcap.simulation.places.object_clouds import generate_clouds
-from wearcap.systems.echo.object_clouds import CloudAugmentation
-from wearcap.systems.echo.object_training import ObjectEncoding
+from wearcap.systems.echo.object_training import CloudAugmentation, ObjectEncoding
 
 VIEWS = {"as it is": None, "about the vertical": 0.0, "in any way": 1.0}
 

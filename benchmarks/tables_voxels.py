@@ -19,12 +19,12 @@ from rich.console import Console
 from tabling import finite, new_table
 from torch import Tensor
 
-from wearcap.data.place_codes import PlaceCodes
-from wearcap.data.windows import Source
+from wearcap.data.surroundings import PlaceCodes
+from wearcap.data.windows import Source, Windows
 from wearcap.files import write_text
 from wearcap.metrics.occupancy import distance_mae_cm, occupancy_iou, occupied_distance_mae_cm
 from wearcap.scene.voxels import VoxelGrid
-from wearcap.systems.hmd2.point_codes_windows import PlaceDataset
+from wearcap.systems.hmd2.point_codes_training import PlaceContent
 from wearcap.viewer.picture import save_png
 
 Rebuild = Callable[[Tensor], Tensor]
@@ -43,7 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def grids_of(root: Path, split: str, count: int, grid: VoxelGrid) -> Tensor:
     """Grids (m) spread evenly over a split's windows of 4 s."""
-    dataset = PlaceDataset([Source(str(root))], split, grid=grid, window=240, frames=8, fps=60.0)
+    content = PlaceContent(grid, frames=8)
+    dataset = Windows([Source(str(root))], split, content=content, window=240, stride=240, fps=60.0)
     chosen = torch.linspace(0, len(dataset) - 1, max(1, count // 8)).long().tolist()
     return torch.cat([dataset[(index, seed)].grids for seed, index in enumerate(chosen)])
 

@@ -21,7 +21,7 @@ from wearcap_testing import recording_of, small_dataset, suited, swaying_motion
 
 SMALL = [
     "debug=fast",
-    "data.window=60",
+    "data.dataset.window=60",
     "trainer.accelerator=cpu",
     "model.net.width=32",
     "model.net.layers=1",
@@ -243,7 +243,7 @@ ROWS = {
             "train",
             "experiment=echo",
             f"paths.datasets={tmp}/none",
-            "data.encoder=null",
+            "data.dataset.content.encoder=null",
             f"hydra.run.dir={out}",
         ],
         "no data set here",

@@ -62,7 +62,7 @@ sys.path.insert(0, sys.argv[1])
 import echo_stream_memory, lightning_step_vs_loop
 
 print(json.dumps(echo_stream_memory.measure(minutes=0.2)[0]))
-print(json.dumps(lightning_step_vs_loop.measure(steps=4, overrides=("data.batch_size=2",))[0]))
+print(json.dumps(lightning_step_vs_loop.measure(steps=4, overrides=("data.loading.batch_size=2",))[0]))
 """
 
 

@@ -9,14 +9,16 @@ import torch
 from contact_motion import CLASSES, bending, bending_dataset, bending_recording
 from wearcap.body.skeleton import xsens23
 from wearcap.body.skeletons import smpl24, smplh52
-from wearcap.data.windows import Source, mirrored_rotations
+from wearcap.data.transforms import Cut, DropFrames, Mirror, Shift, TimeStretch, mirrored_rotations
+from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import RecordingStore
 from wearcap.systems.ireplica.features import HandViews, SmplAngles, in_skeleton, pose_frames, worn
-from wearcap.systems.ireplica.training_windows import Augmentation, ContactDataset, interpolated, pose_errors
+from wearcap.systems.ireplica.training_windows import ContactContent, PoseNoise, pose_errors
 
-QUIET = Augmentation(mirror=False, noise_deg=0.0, stretch=1.0, drop=0.0)
+SHIFTED = {"shift": Shift(), "stretch": TimeStretch(1.0), "drop": DropFrames(0.0)}
+ALL = {"shift": Shift(), "stretch": TimeStretch(), "drop": DropFrames(), "noise": PoseNoise(), "mirror": Mirror()}
 
 
 @pytest.fixture(scope="module")
@@ -24,11 +26,10 @@ def root(tmp_path_factory):
     return bending_dataset(tmp_path_factory.mktemp("contact")).root
 
 
-def dataset(root, augmentation=QUIET, skeleton=None, **more):
-    settings = {"window": 120, "stride": 40, "fps": 60.0, "classes": CLASSES} | more
-    return ContactDataset(
-        [Source(str(root))], "train", skeleton=skeleton or xsens23(), augmentation=augmentation, **settings
-    )
+def dataset(root, transforms=None, features=None, split="train", stride=40, stream="suit") -> Windows:
+    content = ContactContent(features or HandViews(), CLASSES, 60.0, stream)
+    settings = {"window": 120, "stride": stride, "fps": 60.0, "transforms": transforms}
+    return Windows([Source(str(root))], split, True, content=content, **settings)
 
 
 def test_a_plain_window_is_the_recordings_own(root):
@@ -43,7 +44,7 @@ def test_a_plain_window_is_the_recordings_own(root):
 
 
 def test_content_is_a_function_of_the_seed(root):
-    windows = dataset(root, Augmentation())
+    windows = dataset(root, ALL)
     first, again, other = windows[(2, 7)], windows[(2, 7)], windows[(2, 8)]
     assert all(torch.equal(a, b) for a, b in zip(first, again))
     assert not torch.equal(first.R_parent_joint, other.R_parent_joint)
@@ -51,7 +52,7 @@ def test_content_is_a_function_of_the_seed(root):
 
 
 def test_a_mirrored_window_swaps_hands_and_sides(root):
-    plain, turned = dataset(root), dataset(root, replace(QUIET, mirror=True), stride=1)
+    plain, turned = dataset(root), dataset(root, SHIFTED | {"mirror": Mirror()}, stride=1)
     seen = [turned[(0, seed)] for seed in range(20)]
     swapped = [window.contact.any(0)[0].any() != plain[(0, 0)].contact.any(0)[0].any() for window in seen]
     assert 3 < sum(swapped) < 17
@@ -64,7 +65,7 @@ def test_a_mirrored_window_swaps_hands_and_sides(root):
 
 def test_stretched_windows_keep_poses_and_truth_together(root):
     """Bent elbows are contacts, at any speed and with frames lost."""
-    windows = dataset(root, Augmentation(mirror=False, noise_deg=0.0, stretch=1.2, drop=0.3))
+    windows = dataset(root, {"shift": Shift(), "stretch": TimeStretch(1.2), "drop": DropFrames(0.3)})
     body = xsens23()
     for seed in range(6):
         window = windows[(seed, seed)]
@@ -80,7 +81,8 @@ def test_lost_frames_are_bridged():
     motion = bending(30)[0]
     kept = torch.ones(30, dtype=torch.bool)
     kept[[7, 8, 15]] = False
-    R = interpolated(motion.R_parent_joint, kept, torch.arange(29) * 1.0)
+    cut = Cut(0, 29, 30, speed=1.0, kept=kept)
+    R = cut.take("R_parent_joint", motion.R_parent_joint, sensed=True)
     assert torch.equal(
         R[kept[:29]], rotation.matrix_from_rot6d(rotation.rot6d_from_matrix(motion.R_parent_joint[:29]))[kept[:29]]
     )
@@ -105,7 +107,7 @@ def test_another_skeleton_and_rate_are_converted(tmp_path):
         t_world_root=recording.suit.t_world_root[::2],
     )
     store.add(replace(recording, suit=half), split="train", config_hash="test")
-    window = dataset(tmp_path, skeleton=smpl24())[(0, 0)]
+    window = dataset(tmp_path, features=SmplAngles())[(0, 0)]
     expected = in_skeleton(xsens23(), worn(xsens23(), smpl24()), recording.suit.R_parent_joint[:120])
     assert rotation.geodesic(window.R_parent_joint, expected).max() < math.radians(2)
 
@@ -117,9 +119,7 @@ def test_recordings_without_truth_or_suit_are_named(tmp_path):
     with pytest.raises(WearcapError, match="a.safetensors: this recording has no interactions"):
         dataset(tmp_path)[(0, 0)]
     with pytest.raises(WearcapError, match="no suit"):
-        ContactDataset(
-            [Source(str(tmp_path))], "val", window=120, stride=40, fps=60.0, classes=CLASSES, skeleton=xsens23()
-        )[(0, 0)]
+        dataset(tmp_path, split="val")[(0, 0)]
     with pytest.raises(WearcapError, match='expected.*"suit" or "motion"|"suit" or "motion"'):
         dataset(tmp_path, stream="watch")
 

@@ -12,12 +12,13 @@ from wearcap.body.contact_points import BODY_POINTS, contact_points
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
 from wearcap.data.statistics import collate
-from wearcap.data.windows import Source
+from wearcap.data.transforms import Cut, Draws, EarlyEnd, Mirror, Shift, mirrored
+from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.systems.echo.features import POINTS
 from wearcap.systems.echo.objects import ObjectReader, ObjectShape, body_contact
-from wearcap.systems.echo.training_windows import EchoDataset, echo_track, mirror_window
+from wearcap.systems.echo.training_windows import EchoContent, echo_track
 from wearcap_testing import small_dataset
 
 SKELETON = xsens23()
@@ -35,9 +36,14 @@ def people(tmp_path_factory):
     return str(small_dataset(tmp_path_factory.mktemp("people"), (200,) * 6).root)
 
 
-def dataset(*roots: str, split: str = "train", **settings) -> EchoDataset:
-    given = {"features": small_features(), "encoder": None, "window": WINDOW, "stride": 4} | settings
-    return EchoDataset([Source(root) for root in roots], split, **given)
+def dataset(*roots: str, fps: float = 30.0, objects: bool = True, **transforms) -> Windows:
+    content = EchoContent(small_features(fps=fps), None, objects=objects)
+    settings = {"window": WINDOW, "stride": 4, "fps": fps, "every": None, "transforms": transforms}
+    return Windows([Source(root) for root in roots], "train", True, content=content, **settings)
+
+
+def mirror_images(root: str) -> Windows:
+    return dataset(root, mirror=lambda window, _: mirrored(window))
 
 
 def track_of(recording, environment=None, every: int = 1):
@@ -63,13 +69,13 @@ def test_a_window_is_what_the_recording_was(root):
 
 
 def test_a_mirror_seen_twice_shows_what_was_there(root):
-    window = dataset(root)[0]
-    for part, back in zip(window, mirror_window(mirror_window(window, SKELETON), SKELETON)):
+    twice = dataset(root, mirror=lambda window, _: mirrored(mirrored(window)))
+    for part, back in zip(dataset(root)[0], twice[0]):
         torch.testing.assert_close(part, back, atol=1e-6, rtol=0)
 
 
 def test_in_a_mirror_the_points_are_still_those_of_the_body(root):
-    window = mirror_window(dataset(root)[2], SKELETON)
+    window = mirror_images(root)[2]
     body = forward_kinematics(SKELETON, *window.body, window.t_parent_joint[None])
     at = body[:, SKELETON.indices(*POINTS)]
     torch.testing.assert_close(at.R, window.R_world_point, atol=1e-4, rtol=0)
@@ -86,10 +92,10 @@ def mirrored_shape(shape: ObjectShape) -> ObjectShape:
 def test_contacts_in_a_mirror_are_those_of_the_mirrored_geometry(root):
     windows = dataset(root)
     shape = mirrored_shape(windows.track(0).objects[0])
-    surface = contact_points(anny_body(SKELETON))
+    surface, images = contact_points(anny_body(SKELETON)), mirror_images(root)
     same = total = touching = 0
     for k in range(len(windows)):
-        window = mirror_window(windows[k], SKELETON)
+        window = images[k]
         body = forward_kinematics(SKELETON, *window.body, window.t_parent_joint[None])
         touches = body_contact(surface.vertices(body), shape, window.T_world_object, 0.05)
         labels = window.contact[:, :BODY_POINTS] > 0
@@ -103,7 +109,7 @@ def test_the_mirrored_box_is_where_the_mirrored_window_has_it(root):
     """Points of the object's surface, through the mirror: moments, code and pose belong together."""
     windows = dataset(root)
     plain = windows[1]
-    flipped = mirror_window(plain, SKELETON)
+    flipped = mirror_images(root)[1]
     shape = windows.track(0).objects[0]
     flip = torch.tensor([1.0, -1.0, 1.0])
     world = (plain.T_world_object[:, None] @ shape.cloud) * flip
@@ -114,7 +120,7 @@ def test_the_mirrored_box_is_where_the_mirrored_window_has_it(root):
 
 
 def test_windows_are_functions_of_their_seed(root):
-    windows = dataset(root, mirror=True, beginnings=0.5)
+    windows = dataset(root, shift=Shift(), mirror=Mirror(), ending=EarlyEnd(0.5, 6))
     for one, two in zip(windows[(1, 7)], windows[(1, 7)]):
         assert torch.equal(one, two)
     assert not torch.equal(windows[(1, 7)].noise, windows[(1, 8)].noise)
@@ -124,7 +130,7 @@ def test_windows_are_functions_of_their_seed(root):
 
 
 def test_a_mirrored_windows_code_is_the_mirror_images(root):
-    windows = dataset(root, mirror=True)
+    windows = dataset(root, mirror=Mirror())
     shape = windows.track(0).objects[0]
     object.__setattr__(shape, "code_mirrored", shape.code + 5.0)
     codes = {windows[(0, k)].object_code[0, 0].item() for k in range(12)}
@@ -132,7 +138,7 @@ def test_a_mirrored_windows_code_is_the_mirror_images(root):
 
 
 def test_what_ends_before_it_is_full_is_padded(root):
-    windows = dataset(root, beginnings=1.0)
+    windows = dataset(root, ending=EarlyEnd(1.0, 6))
     for k in range(8):
         window = windows[(0, k)]
         count = int(window.valid.sum())
@@ -158,7 +164,7 @@ def test_data_sets_of_several_rates_stand_side_by_side(root, people):
     assert {every for *_, every in windows.recordings} == {1, 2}
     last = windows[len(windows) - 1]
     store, name, every = windows.recordings[-1]
-    motion, start = store.load(name).motion, int(windows.starts[-1, 1])
+    motion, start = store.load(name).motion, int(windows.starts[-1, 1]) // every
     assert torch.equal(last.t_world_root, motion.t_world_root[::every][start : start + WINDOW])
 
 
@@ -167,9 +173,8 @@ def test_an_object_may_change_within_a_window():
     track = track_of(recording, boxes(TWO))
     change = int((track.active == 1).nonzero()[0])
     assert (track.active[change - 1 : change + 1] == torch.tensor([0, 1])).all()
-    windows = EchoDataset.__new__(EchoDataset)
-    windows.features, windows.window = small_features(), WINDOW
-    window = windows._cut(track, change - 5, WINDOW, False, torch.Generator().manual_seed(0))
+    content, cut = EchoContent(small_features(), None), Cut(change - 5, WINDOW, len(track.floor_height))
+    window = content.item(track, cut, content.read(track, cut, Draws(0)), Draws(0))
     first, second = track.objects
     for k, shape in ((4, first), (5, second)):
         assert torch.equal(window.object_code[k], shape.code)
@@ -192,7 +197,7 @@ def test_a_track_without_an_active_object_has_index_minus_one():
 def test_rates_that_are_no_multiple_are_refused(tmp_path, fps):
     root = small_dataset(tmp_path).root
     with pytest.raises(WearcapError, match="recordings of 60 frames per second. Expected one rate that is a whole"):
-        dataset(str(root), features=small_features(fps=fps))
+        dataset(str(root), fps=fps)
 
 
 def test_recordings_without_foot_contacts_are_refused():

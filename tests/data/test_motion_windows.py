@@ -2,14 +2,16 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 
 from wearcap.body.skeleton import xsens23
-from wearcap.data.motion_features import MotionFeatures
-from wearcap.data.motion_windows import MovementDataset, MovementWindows, mirror
-from wearcap.data.windows import Source
+from wearcap.data.datamodule import Loading, WindowsModule
+from wearcap.data.motion_features import MotionFeatures, Movement, MovementContent
+from wearcap.data.transforms import Mirror, Shift, Window, joint_twins, mirrored
+from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import Motion
@@ -72,8 +74,11 @@ def test_windows_are_cut_whole_and_at_their_stride():
 
 
 def test_a_mirror_swaps_left_and_right():
-    movement = FEATURES.movement(swaying_motion(60)).windows(20, 20)
-    seen = mirror(movement, FEATURES.skeleton)
+    whole = FEATURES.movement(swaying_motion(60))
+    movement = whole.windows(20, 20)
+    values = {"t_world_joint": whole.joints, "R_world_root": whole.R_world_root, "floor_height": whole.floor_height}
+    swapped = mirrored(Window(values, {"t_world_joint": joint_twins(FEATURES.skeleton)}))
+    seen = Movement(*swapped.values.values()).windows(20, 20)
     there, here = FEATURES.encode(seen)[0], FEATURES.encode(movement)[0]
     assert torch.allclose(there[:, 0], -here[:, 0], atol=1e-4)
     assert torch.allclose(there[:, [1, 3]], here[:, [1, 3]], atol=1e-4)
@@ -81,20 +86,21 @@ def test_a_mirror_swaps_left_and_right():
     joints, joints_seen = FEATURES.joints(here[None])[0], FEATURES.joints(there[None])[0]
     flip = torch.tensor([1.0, -1.0, 1.0])
     assert torch.allclose(joints_seen[:, left], joints[:, right] * flip, atol=1e-4)
-    again = mirror(seen, FEATURES.skeleton)
-    torch.testing.assert_close(again.joints, movement.joints)
+    torch.testing.assert_close(mirrored(swapped).values["t_world_joint"], whole.joints)
 
 
 def test_windows_of_a_data_set_are_its_true_motion(tmp_path):
     store = small_dataset(tmp_path)
-    plain = MovementDataset([Source(str(tmp_path))], "train", features=FEATURES, window=60, stride=30)
+    varied = {"shift": Shift(), "mirror": Mirror()}
+    settings = {"content": MovementContent(FEATURES), "window": 60, "stride": 30, "fps": 60.0, "transforms": varied}
+    plain = Windows([Source(str(tmp_path))], "train", **settings)
     for index in (0, 5, len(plain) - 1):
         recording, start, _ = plain.starts[index].tolist()
         motion = store.load(plain.recordings[recording][1]).motion
         truth = motion.sliced(start, start + 60)
         torch.testing.assert_close(plain[index].joints, truth.T_world_joint.t[::3], atol=1e-5, rtol=0)
         assert torch.equal(plain[index].R_world_root, truth.R_parent_joint[::3, 0])
-    data = MovementWindows({"a": {"root": str(tmp_path)}}, FEATURES, 60, 30, batch_size=4, steps_per_epoch=2)
+    data = WindowsModule(partial(Windows, **settings), Loading(4, 2), {"a": {"root": str(tmp_path)}})
     data.setup("fit")
     batches = list(data.train_dataloader())
     assert [len(batch.joints) for batch in batches] == [4, 4]

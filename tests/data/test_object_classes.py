@@ -2,7 +2,7 @@
 
 import pytest
 
-from wearcap.data.object_classes import OBJECT_CLASSES, object_class
+from wearcap.data.objects import OBJECT_CLASSES, object_class
 from wearcap.errors import WearcapError
 
 BEHAVE = (
@@ -73,5 +73,5 @@ def test_every_object_of_both_data_sets_has_a_class():
 def test_an_unknown_name_is_refused_with_those_that_are_known():
     with pytest.raises(WearcapError, match="no class for the object 'boxlarg'.*chairblack.*Did you mean 'boxlarge'"):
         object_class("boxlarg")
-    with pytest.raises(WearcapError, match="no class for the object 'spaceship'.*one of backpack.*object_classes.py"):
+    with pytest.raises(WearcapError, match="no class for the object 'spaceship'.*one of backpack.*objects.py"):
         object_class("spaceship")

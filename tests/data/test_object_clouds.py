@@ -1,14 +1,17 @@
 """Clouds of objects: even by area, the same for a seed; generated objects, their splits, their variation, their file."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 
-from wearcap.data.surface_points import object_cloud
+from wearcap.data.datamodule import Loading, WindowsModule
+from wearcap.data.objects import object_cloud
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.simulation.places.object_clouds import generate_clouds
-from wearcap.systems.echo.object_clouds import CloudAugmentation, ObjectClouds, random_rotation
+from wearcap.systems.echo.object_training import CloudAugmentation, ObjectClouds, random_rotation
 
 CLASSES = ["box", "chair", "drawer", "door"]
 
@@ -92,15 +95,9 @@ def test_views_are_rotated_as_configured():
 
 
 def test_a_datamodule_keeps_its_objects_in_a_file(tmp_path):
-    settings = {
-        "classes": CLASSES,
-        "per_class": 3,
-        "val_per_class": 2,
-        "batch_size": 4,
-        "steps_per_epoch": 2,
-        "points": 64,
-    }
-    data = ObjectClouds(str(tmp_path), generate_clouds, **settings)
+    settings = {"root": str(tmp_path), "generate": generate_clouds, "classes": CLASSES, "points": 64}
+    settings["per_class"] = {"train": 3, "val": 2}
+    data = WindowsModule(partial(ObjectClouds, **settings), Loading(4, 2))
     data.setup("fit")
     batches = list(data.train_dataloader())
     assert len(batches) == 2
@@ -111,8 +108,8 @@ def test_a_datamodule_keeps_its_objects_in_a_file(tmp_path):
     assert torch.equal(first.points[0, 0], first_cloud), "as it is"
     assert not torch.equal(first.points[0, 0], first.points[0, 1])
     made = (tmp_path / "train.safetensors").stat().st_mtime_ns
-    data.dataset("train")
+    ObjectClouds([], "train", **settings)
     assert (tmp_path / "train.safetensors").stat().st_mtime_ns == made
-    assert len(ObjectClouds(str(tmp_path), generate_clouds, **settings | {"per_class": 4}).dataset("train")) == 16
+    assert len(ObjectClouds([], "train", **settings | {"per_class": {"train": 4}})) == 16
     with pytest.raises(WearcapError, match="'chair'"):
-        ObjectClouds(str(tmp_path), generate_clouds, **settings | {"classes": ["chairr"]}).dataset("train")
+        ObjectClouds([], "train", **settings | {"classes": ["chairr"]})

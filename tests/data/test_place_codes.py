@@ -7,13 +7,14 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from wearcap.data.place_codes import PlaceCodes
-from wearcap.data.windows import Source
+from wearcap.data.surroundings import PlaceCodes
+from wearcap.data.transforms import Mirror
+from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import PointCloud, RecordingStore
 from wearcap.scene.voxels import VoxelGrid, mirrored, voxelize
-from wearcap.systems.hmd2.point_codes_windows import PlaceDataset
+from wearcap.systems.hmd2.point_codes_training import PlaceContent
 from wearcap_testing import recording_of, swaying_motion
 
 
@@ -91,9 +92,9 @@ def test_another_networks_checkpoint_is_refused(tmp_path):
         _ = PlaceCodes(tmp_path / "x.ckpt").encoder
 
 
-def drawn(store, **changes) -> PlaceDataset:
-    settings = {"grid": VoxelGrid(), "window": 60, "frames": 5, "fps": 60.0} | changes
-    return PlaceDataset([Source(str(store.root))], "train", **settings)
+def drawn(store, mirror: bool = False) -> Windows:
+    content, settings = PlaceContent(VoxelGrid(), frames=5), {"window": 60, "stride": 60, "fps": 60.0}
+    return Windows([Source(str(store.root))], "train", mirror, content=content, transforms={"m": Mirror()}, **settings)
 
 
 def test_drawn_grids_are_the_recordings_own(store):
@@ -135,5 +136,5 @@ def test_what_is_drawn_depends_on_the_seed_alone(store):
 def test_data_without_points_is_refused(tmp_path):
     store = RecordingStore(tmp_path)
     store.add(recording_of(swaying_motion(90), "r0"), split="train", config_hash="test")
-    with pytest.raises(WearcapError, match="has points"):
+    with pytest.raises(WearcapError, match="with points"):
         drawn(store)

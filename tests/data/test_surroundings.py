@@ -7,10 +7,12 @@ import torch
 from safetensors.torch import save_file
 
 from wearcap.data.surroundings import Surroundings, embeddings_of, latest_before
-from wearcap.data.windows import Source, WindowDataset
+from wearcap.data.transforms import EarlyEnd, Mirror
+from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.recording import CameraStream, PointCloud, RecordingStore
+from wearcap.systems.hmd2.training_windows import HeadContent
 from wearcap.tracking.floor import floor_from_path, floor_from_points, tracked_floor
 from wearcap_testing import recording_of, swaying_motion
 
@@ -21,6 +23,9 @@ class CountedCodes:
     """Codes that count the frames, and count down from zero in the mirror."""
 
     size = 3
+
+    def prepare(self, store, names):
+        """They are made where they are read."""
 
     def file_of(self, root, entry):
         path = root / f"{entry.sha256}.codes"
@@ -52,15 +57,15 @@ def store(tmp_path) -> RecordingStore:
     return store
 
 
-def dataset(store: RecordingStore, **changes) -> WindowDataset:
+def dataset(store: RecordingStore, **transforms) -> Windows:
     surroundings = object.__new__(Surroundings)  # codes without a network
     object.__setattr__(surroundings, "places", CountedCodes())
     object.__setattr__(surroundings, "images", "toy")
-    settings = {"window": 120, "stride": 60, "fps": 60.0, "surroundings": surroundings} | changes
-    return WindowDataset([Source(str(store.root))], "train", **settings)
+    settings = {"content": HeadContent(surroundings), "window": 120, "stride": 60, "fps": 60.0}
+    return Windows([Source(str(store.root))], "train", True, transforms=transforms, **settings)
 
 
-def first_of(windows: WindowDataset, name: str, start: int) -> int:
+def first_of(windows: Windows, name: str, start: int) -> int:
     return next(
         index
         for index, (recording, first, _) in enumerate(windows.starts.tolist())
@@ -70,7 +75,7 @@ def first_of(windows: WindowDataset, name: str, start: int) -> int:
 
 def test_codes_and_pictures_are_those_of_the_windows_frames(store):
     windows = dataset(store)
-    assert windows.image_size == SIZE
+    assert windows.content.image_size == SIZE
     window = windows[first_of(windows, "a", 60)]
     frames = torch.arange(60, 180)
     assert torch.equal(window.points[:, 0], frames.float())
@@ -88,7 +93,7 @@ def test_a_recording_without_pictures_says_so(store):
 
 
 def test_the_mirror_reads_what_the_mirror_shows(store):
-    windows = dataset(store, mirror=True)
+    windows = dataset(store, mirror=Mirror())
     index = first_of(windows, "a", 60)
     seen = [windows[(index, seed)] for seed in range(12)]
     signs = {(w.points[:, 0].sign().sum().item(), w.image[:, 0].sign().sum().item()) for w in seen}
@@ -96,7 +101,7 @@ def test_the_mirror_reads_what_the_mirror_shows(store):
 
 
 def test_beginnings_are_cut_short(store):
-    whole, cut = dataset(store), dataset(store, beginnings=1.0)
+    whole, cut = dataset(store), dataset(store, ending=EarlyEnd(1.0))
     lengths = {int(cut[(0, seed)].valid.sum()) for seed in range(20)}
     assert whole[(0, 0)].valid.all()
     assert min(lengths) >= 10
@@ -108,9 +113,9 @@ def test_beginnings_are_cut_short(store):
 
 
 def test_data_without_the_encoders_embeddings_is_refused(store):
-    surroundings = Surroundings(None, "clip")
+    content = HeadContent(Surroundings(None, "clip"))
     with pytest.raises(WearcapError, match="no recording has embeddings of 'clip'.*prepare embeddings"):
-        WindowDataset([Source(str(store.root))], "train", window=120, stride=60, fps=60.0, surroundings=surroundings)
+        Windows([Source(str(store.root))], "train", content=content, window=120, stride=60, fps=60.0)
 
 
 def test_the_newest_picture_counts_while_it_is_fresh():

@@ -1,25 +1,28 @@
 """Windows of heads and wrists: what they tell does not depend on north, on the rate of a file, or on who looks in a mirror."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import xsens23
 from wearcap.data.statistics import collate
-from wearcap.data.windows import Source
-from wearcap.errors import WearcapError
-from wearcap.systems.mocap_every.features import ENDS, Sensed, WatchFeatures, to_world
-from wearcap.systems.mocap_every.training_windows import (
-    Variation,
-    WatchDataset,
-    WatchWindow,
-    mirrored_window,
+from wearcap.data.transforms import (
+    Cut,
+    Mirror,
+    Scale,
+    SensorErrors,
+    Shift,
+    StillStart,
+    TimeStretch,
+    Yaw,
+    mirrored,
     scaled,
     turned,
-    watched,
 )
+from wearcap.data.windows import Source, Windows
+from wearcap.errors import WearcapError
+from wearcap.systems.mocap_every.features import ENDS, Sensed, WatchFeatures, to_world
+from wearcap.systems.mocap_every.training_windows import WatchContent, WatchWindow
 from wearcap_testing import small_dataset
 
 SKELETON = xsens23()
@@ -30,8 +33,17 @@ def root(tmp_path_factory):
     return str(small_dataset(tmp_path_factory.mktemp("data")).root)
 
 
-def dataset(root: str, split: str = "train", **settings) -> WatchDataset:
-    return WatchDataset([Source(root)], split, window=40, stride=10, fps=60.0, every=2, **settings)
+MOVED = {"shift": Shift(whole=False), "stretch": TimeStretch(1.0)}
+SEEN = {"yaw": Yaw(), "mirror": Mirror()}
+
+
+def dataset(root: str, **transforms) -> Windows:
+    settings = {"window": 40, "stride": 10, "fps": 30.0, "every": 2, "transforms": transforms}
+    return Windows([Source(root)], "train", True, content=WatchContent(), **settings)
+
+
+def changed(root: str, change, index: int = 0) -> WatchWindow:
+    return dataset(root, change=lambda window, _: change(window))[index]
 
 
 def batch(root: str, **settings) -> WatchWindow:
@@ -67,7 +79,7 @@ def test_north_and_place_make_no_difference(root, frame):
     """All but the head's up-vector in the world, which the document tells as it is."""
     features = WatchFeatures(frame=frame, absolute=frame != "head")
     window = dataset(root)[3]
-    moved = turned(window, 1.3)
+    moved = changed(root, lambda window: turned(window, 1.3), 3)
     moved = moved._replace(t_world_head=moved.t_world_head + torch.tensor([5.0, -3.0, 0.0]))
     here, there = (told(features, collate([w])) for w in (window, moved))
     torch.testing.assert_close(here, there, atol=1e-4, rtol=0)
@@ -89,16 +101,16 @@ def test_motion_comes_back_as_it_went_in(root, frame, where):
 
 def test_a_mirror_seen_twice_shows_what_was_there(root):
     window = dataset(root)[0]
-    for part, back in zip(window, mirrored_window(mirrored_window(window, SKELETON), SKELETON)):
+    for part, back in zip(window, changed(root, lambda window: mirrored(mirrored(window)))):
         torch.testing.assert_close(part, back, atol=1e-6, rtol=0)
 
 
 def test_in_a_mirror_the_wrists_are_still_those_of_the_body(root):
     for window in (
         dataset(root)[0],
-        mirrored_window(dataset(root)[0], SKELETON),
-        turned(dataset(root)[0], 2.0),
-        scaled(dataset(root)[0], 1.2),
+        changed(root, mirrored),
+        changed(root, lambda window: turned(window, 2.0)),
+        changed(root, lambda window: scaled(window, 1.2)),
     ):
         body = forward_kinematics(SKELETON, window.R_parent_joint, window.t_world_root, window.t_parent_joint[None])
         wrists = SKELETON.indices(*ENDS[:2])
@@ -109,22 +121,21 @@ def test_in_a_mirror_the_wrists_are_still_those_of_the_body(root):
 
 
 def test_faster_windows_hold_more_of_the_recording_and_stronger_accelerations(root):
-    store, name = dataset(root).recordings[0]
-    whole = watched(store.path_of(name), 2)
-    frames = torch.arange(40) * 2.0
-    plain, fast = whole.window(frames), whole.window(frames * 1.25, 1.25)
-    torch.testing.assert_close(
-        fast.t_world_root[32], plain.t_world_root[39] * 0 + whole.t_world_root[80], atol=1e-4, rtol=0
-    )
-    at = whole.sensed.acc_world_wrist[80]
-    torch.testing.assert_close(fast.acc_world_wrist[32], 1.25**2 * at, atol=1e-4, rtol=0)
-    between = whole.window(torch.tensor([10.5]))
-    mean = (whole.t_world_root[10] + whole.t_world_root[11]) / 2
-    torch.testing.assert_close(between.t_world_root[0], mean, atol=1e-6, rtol=0)
+    windows = dataset(root)
+    whole = windows.track(0).values
+    fast = Cut(0, 40, len(whole["floor_height"]), step=2, speed=1.25)
+    acc, place = (fast.take(name, whole[name]) for name in ("acc_world_wrist", "t_world_root"))
+    torch.testing.assert_close(place[32], whole["t_world_root"][80], atol=1e-4, rtol=0)
+    torch.testing.assert_close(acc[32], 1.25**2 * whole["acc_world_wrist"][80], atol=1e-4, rtol=0)
+    between = Cut(10.5, 1, len(whole["floor_height"])).take("t_world_root", whole["t_world_root"])
+    mean = (whole["t_world_root"][10] + whole["t_world_root"][11]) / 2
+    torch.testing.assert_close(between[0], mean, atol=1e-6, rtol=0)
 
 
 def test_windows_are_functions_of_their_seed(root):
-    windows = dataset(root, augment=True, variation=Variation(1.2, 1.1, 2.0, 0.1, 1.0, 0.02), beginnings=0.5)
+    errors = SensorErrors(1.0, 2.0, 0.1, 0.02)
+    moved = MOVED | {"stretch": TimeStretch(1.2), "beginnings": StillStart(0.5), "scale": Scale(1.1)}
+    windows = dataset(root, **moved, **SEEN, errors=errors)
     for one, two in zip(windows[(1, 7)], windows[(1, 7)]):
         assert torch.equal(one, two)
     assert not torch.equal(windows[(1, 7)].R_world_wrist, windows[(1, 8)].R_world_wrist)
@@ -133,8 +144,8 @@ def test_windows_are_functions_of_their_seed(root):
 
 
 def test_errors_are_those_of_the_variation(root):
-    plain = dataset(root, augment=True)
-    wrong = dataset(root, augment=True, variation=Variation(wrist_deg=3.0))
+    plain = dataset(root, **MOVED, **SEEN)
+    wrong = dataset(root, **MOVED, yaw=Yaw(), errors=SensorErrors(wrist_deg=3.0), mirror=Mirror())
     angles = []
     for k in range(40):
         a, b = plain[(0, k)], wrong[(0, k)]
@@ -146,7 +157,7 @@ def test_errors_are_those_of_the_variation(root):
 
 
 def test_a_beginning_stands_still(root):
-    windows = dataset(root, augment=True, beginnings=1.0)
+    windows = dataset(root, **MOVED, **SEEN, beginnings=StillStart(1.0))
     held = [int((windows[(0, k)].t_world_head.diff(dim=0).abs().amax(-1) == 0).sum()) for k in range(20)]
     assert max(held) > 10
     assert min(held) < 30
@@ -160,11 +171,10 @@ def test_unknown_settings(wrong):
 
 def test_another_rate_is_refused(root):
     with pytest.raises(WearcapError, match="frames per second"):
-        WatchDataset([Source(root)], "train", window=40, stride=10, fps=30.0, every=1)
+        Windows([Source(root)], "train", content=WatchContent(), window=40, stride=10, fps=30.0)
 
 
 def test_sensed_is_the_first_half_of_a_window(root):
     window = batch(root)
     assert isinstance(window.sensed, Sensed)
     assert window.sensed.t_world_wrist is window.t_world_wrist
-    assert replace(Variation(), scale=2.0).scale == 2.0

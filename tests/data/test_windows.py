@@ -1,16 +1,21 @@
 """Windows: the right frames, padding, mirror, and draws that depend on seed and step alone."""
 
+from functools import partial
+
 import pytest
 import torch
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import xsens23
-from wearcap.data.datamodule import MotionWindows
+from wearcap.data.datamodule import Loading, WindowsModule
 from wearcap.data.statistics import collate
-from wearcap.data.windows import FixedSampler, SeededSampler, Source, WindowDataset, mirror_window
+from wearcap.data.transforms import Mirror, Shift, mirrored
+from wearcap.data.windows import FixedSampler, SeededSampler, Source, Windows
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
-from wearcap.systems.hmd2.features import HeadFeatures, feature_statistics
+from wearcap.systems.hmd2.features import HeadFeatures
+from wearcap.systems.hmd2.training import feature_statistics
+from wearcap.systems.hmd2.training_windows import HeadContent
 from wearcap.tracking.anchor import anchor
 from wearcap_testing import small_dataset
 
@@ -20,9 +25,12 @@ def store(tmp_path_factory):
     return small_dataset(tmp_path_factory.mktemp("windows"))
 
 
-def dataset(store, **changes) -> WindowDataset:
-    settings = {"window": 120, "stride": 60, "fps": 60.0} | changes
-    return WindowDataset([Source(str(store.root))], "train", **settings)
+def dataset(*stores, **changes) -> Windows:
+    settings = {"content": HeadContent(), "window": 120, "stride": 60, "fps": 60.0} | changes
+    sources = [
+        Source(str(store.root), weight) for store, weight in zip(stores, (3.0, 1.0) if len(stores) > 1 else (1.0,))
+    ]
+    return Windows(sources, "train", True, **settings)
 
 
 def test_a_window_holds_the_recordings_own_frames(store):
@@ -66,17 +74,15 @@ def test_hanging_the_truth_from_the_head_gives_the_truth(store):
 
 def test_the_mirror_swaps_sides_and_is_its_own_inverse(store):
     skeleton, window = xsens23(), dataset(store)[(0, 0)]
-    mirrored = mirror_window(window, skeleton)
-    again = mirror_window(mirrored, skeleton)
-    assert torch.allclose(again.R_parent_joint, window.R_parent_joint)
+    swapped = dataset(store, transforms={"mirror": lambda window, _: mirrored(window)})[(0, 0)]
     flip = torch.tensor([1.0, -1.0, 1.0])
     pose = lambda w: anchor(skeleton, w.R_parent_joint, Rigid(w.R_world_head, w.t_world_head))[1].t  # noqa: E731
     left, right = skeleton.index("left_wrist"), skeleton.index("right_wrist")
-    assert torch.allclose(pose(mirrored)[:, left], pose(window)[:, right] * flip, atol=1e-5)
+    assert torch.allclose(pose(swapped)[:, left], pose(window)[:, right] * flip, atol=1e-5)
 
 
 def test_noise_and_augmentation_are_functions_of_the_seed(store):
-    windows = dataset(store, mirror=True)
+    windows = dataset(store, transforms={"shift": Shift(), "mirror": Mirror()})
     assert all(torch.equal(a, b) for a, b in zip(windows[(0, 7)], windows[(0, 7)]))
     assert not torch.equal(windows[(0, 7)].noise, windows[(0, 8)].noise)
 
@@ -99,9 +105,7 @@ def test_epochs_differ_and_repeat():
 
 def test_sources_are_drawn_by_their_weights(store, tmp_path):
     other = small_dataset(tmp_path)
-    both = WindowDataset(
-        [Source(str(store.root), 3.0), Source(str(other.root), 1.0)], "train", window=120, stride=60, fps=60.0
-    )
+    both = dataset(store, other)
     drawn = list(SeededSampler(both.weights, 4000, seed=0))
     from_first = sum(both.recordings[both.starts[i][0]][0].root == store.root for i, _ in drawn)
     assert from_first / 4000 == pytest.approx(0.75, abs=0.03)
@@ -118,15 +122,16 @@ def test_statistics_normalise_what_the_loader_gives(store):
     assert encoded.std(0).mean() == pytest.approx(1.0, abs=0.3)
 
 
-def test_a_wrong_rate_and_an_empty_split_are_named(store):
+def test_a_wrong_rate_and_an_empty_split_are_named(store, tmp_path):
     with pytest.raises(WearcapError, match=r"60.0 frames per second.*Expected 30"):
         dataset(store, fps=30.0)
-    with pytest.raises(WearcapError, match="no windows"):
-        dataset(store, min_frames=10_000)
+    with pytest.raises(WearcapError, match="no windows in split 'train'.*at least 30 frames"):
+        dataset(small_dataset(tmp_path, (20,) * 6))
 
 
 def test_datamodule_batches(store):
-    data = MotionWindows({"a": {"root": str(store.root)}, "b": None}, 120, 60, 60.0, batch_size=4, steps_per_epoch=3)
+    dataset = partial(Windows, content=HeadContent(), window=120, stride=60, fps=60.0)
+    data = WindowsModule(dataset, Loading(4, steps_per_epoch=3), {"a": {"root": str(store.root)}, "b": None})
     data.setup("fit")
     batches = list(data.train_dataloader())
     assert len(batches) == 3

@@ -121,7 +121,7 @@ def test_no_command_runs_what_a_checkpoint_asks_for(verb, kind, data, tmp_path, 
             f"resume={path}",
             "callbacks.progress=null",
             "trainer.accelerator=cpu",
-            "data.window=60",
+            "data.dataset.window=60",
             f"paths.outputs={tmp_path}/outputs",
         ],
     }[verb]

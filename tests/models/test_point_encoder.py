@@ -5,8 +5,15 @@ import torch
 from torch.nn import functional as F
 
 from wearcap.errors import WearcapError
-from wearcap.models.point_encoder import PointNeXt, cloud_extents, load_object_encoder
-from wearcap.models.point_sampling import ball_query, farthest_points, rows_at, spread_first
+from wearcap.models.point_encoder import (
+    PointNeXt,
+    ball_query,
+    cloud_extents,
+    farthest_points,
+    load_object_encoder,
+    rows_at,
+    spread_first,
+)
 
 SMALL = {"width": 8, "strides": [4, 2], "blocks": [0, 1], "neighbours": [8, 8], "radius": 0.3}
 

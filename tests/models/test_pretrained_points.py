@@ -8,8 +8,7 @@ from safetensors.torch import save_file
 from torch.nn import functional as F
 
 from wearcap.errors import WearcapError
-from wearcap.models.point_encoder import to_unit_sphere
-from wearcap.models.pretrained_points import load_openpoints
+from wearcap.models.point_encoder import load_openpoints, to_unit_sphere
 
 RADII = (0.15, 0.225, 0.3375, 0.50625)
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from carried_box import GRIP, WINDOW, boxes, carried_dataset, carrying, drawn_echo, scenario_of, small_features
-from wearcap.data.windows import Source
+from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.metrics.objects import vertex_error_cm
@@ -19,7 +19,7 @@ from wearcap.systems.echo.features import CONTACTS
 from wearcap.systems.echo.observations import batch_item_of
 from wearcap.systems.echo.published import NearestEcho, RigidWrist
 from wearcap.systems.echo.scores import MEASURES, MODALITIES, observed_share, score_echo, truth_of
-from wearcap.systems.echo.training_windows import EchoDataset
+from wearcap.systems.echo.training_windows import EchoContent
 from wearcap.tracking.head_path import head_path
 
 RECORDING = carrying(1.5)
@@ -37,9 +37,10 @@ def truth(scenario):
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory) -> EchoDataset:
+def dataset(tmp_path_factory) -> Windows:
     root = carried_dataset(tmp_path_factory.mktemp("carried"))
-    return EchoDataset([Source(root)], "train", features=small_features(), encoder=None, window=WINDOW, stride=4)
+    content = EchoContent(small_features(), None)
+    return Windows([Source(root)], "train", content=content, window=WINDOW, stride=4, fps=30.0, every=None)
 
 
 def perfect(truth):

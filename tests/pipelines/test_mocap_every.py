@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from watched_walk import WINDOW, drawn_pipeline, watched_walk
-from wearcap.data.windows import mirrored_name
+from wearcap.data.transforms import mirrored_name
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis
 from wearcap.metrics.scores import score_in_world

@@ -55,7 +55,7 @@ def test_a_flipped_bit_is_one_error(verb, dataset, memory, tmp_path, capsys):
             "debug=fast",
             f"data.sources.simulated.root={dataset}",
             "trainer.accelerator=cpu",
-            "data.window=60",
+            "data.dataset.window=60",
             "callbacks.progress=null",
             f"paths.outputs={tmp_path}/o",
             f"hydra.run.dir={tmp_path}/r",

@@ -75,10 +75,10 @@ def learned(people, tmp_path_factory) -> Path:
     run = tmp_path_factory.mktemp("runs") / "run"
     more = [
         "trainer.max_steps=120",
-        "data.steps_per_epoch=60",
-        "data.batch_size=8",
-        "data.window=120",
-        "data.stride=30",
+        "data.loading.steps_per_epoch=60",
+        "data.loading.batch_size=8",
+        "data.dataset.window=120",
+        "data.dataset.stride=30",
         "callbacks.average.decay=0.9",
         "optimizer.scheduler.warmup=10",
         "optimizer.optimizer.lr=0.01",
@@ -107,10 +107,10 @@ def test_the_checkpoint_carries_its_temperatures(learned):
 
 def test_resumed_equals_straight_through(data, tmp_path):
     more = [
-        "data.steps_per_epoch=2",
-        "data.batch_size=2",
-        "data.window=90",
-        "data.val_windows=4",
+        "data.loading.steps_per_epoch=2",
+        "data.loading.batch_size=2",
+        "data.dataset.window=90",
+        "data.loading.val_windows=4",
         "optimizer.scheduler.total=6",
     ]
     straight, first, second = (tmp_path / name for name in ("straight", "first", "second"))

@@ -13,7 +13,7 @@ from wearcap.body.skeleton import xsens23
 from wearcap.cli import capture, evaluate, train
 from wearcap.cli.conf import conf_dir
 from wearcap.data.statistics import collate
-from wearcap.data.windows import Source
+from wearcap.data.windows import Source, Windows
 from wearcap.diffusion.levels import LevelMix
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
@@ -23,7 +23,7 @@ from wearcap.models.checkpoint import load_trained
 from wearcap.systems.echo.features import OBJECT_SIZE
 from wearcap.systems.echo.model import EchoDenoiser
 from wearcap.systems.echo.training import EchoDiffusion
-from wearcap.systems.echo.training_windows import EchoDataset, EchoWindow
+from wearcap.systems.echo.training_windows import EchoContent, EchoWindow
 from wearcap_testing import small_dataset
 
 pytestmark = pytest.mark.usefixtures("few_statistics")
@@ -52,9 +52,10 @@ def people(tmp_path_factory) -> str:
     return str(small_dataset(tmp_path_factory.mktemp("people"), (200,) * 6).root)
 
 
-def dataset(features, *roots: str) -> EchoDataset:
+def dataset(features, *roots: str) -> Windows:
     sources = [Source(root) for root in roots]
-    return EchoDataset(sources, "train", features=features, encoder=None, window=WINDOW, stride=4)
+    content = EchoContent(features, None)
+    return Windows(sources, "train", content=content, window=WINDOW, stride=4, fps=features.fps, every=None)
 
 
 def batch(features, *roots: str, count: int = 8) -> EchoWindow:
@@ -222,9 +223,9 @@ def arguments(experiment: str, data: str, people: str, run: Path, *more: str) ->
         "debug=fast",
         f"hydra.run.dir={run}",
         f"paths.outputs={run.parent}",
-        f"data.window={WINDOW}",
-        "data.workers=0",
-        "data.encoder=null",
+        f"data.dataset.window={WINDOW}",
+        "data.loading.workers=0",
+        "data.dataset.content.encoder=null",
         "model.encoder=null",
         "features.shape_size=0",
         "model.net.width=32",
@@ -259,7 +260,7 @@ def test_every_experiment_runs(experiment, data, people, tmp_path):
 def test_stopped_and_resumed_equals_straight_through(data, people, tmp_path):
     """Batches, noise, levels and dropout are functions of seed and step."""
     more = (
-        "data.steps_per_epoch=2",
+        "data.loading.steps_per_epoch=2",
         "model.net.dropout=0.3",
         "optimizer.scheduler.total=6",
         "optimizer.scheduler.warmup=1",

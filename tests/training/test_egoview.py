@@ -19,8 +19,16 @@ from wearcap.models.image_encoder import EgoViewEncoder
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.recording.recording import CameraStream
 from wearcap.sensors.slam import R_DEVICE_CAM
-from wearcap.systems.hmd2.egoview_augmentation import half_mirrored, relit, turned
-from wearcap.systems.hmd2.egoview_frames import HANDS, POINTS, EgoFrame, EgoFrames, limb_points
+from wearcap.systems.hmd2.egoview_frames import (
+    HANDS,
+    POINTS,
+    EgoFrame,
+    EgoFrames,
+    half_mirrored,
+    limb_points,
+    relit,
+    turned,
+)
 from wearcap.systems.hmd2.egoview_training import view_scores
 from wearcap_testing import recording_of, swaying_motion
 
@@ -82,7 +90,7 @@ def arguments(data: Path, run: Path, *more: str) -> list[str]:
         "data.sources.cmu=null",
         f"hydra.run.dir={run}",
         f"paths.outputs={run.parent}",
-        "data.every=2",
+        "data.dataset.every=2",
         "trainer.accelerator=cpu",
         "trainer.log_every_n_steps=1",
         "trainer.enable_progress_bar=false",
@@ -211,8 +219,8 @@ def learned(data, tmp_path_factory) -> Path:
             data,
             run,
             "trainer.max_steps=40",
-            "data.steps_per_epoch=40",
-            "data.batch_size=32",
+            "data.loading.steps_per_epoch=40",
+            "data.loading.batch_size=32",
             "model.net.channels=[16,24,32]",
             "callbacks.average.decay=0.8",
             "optimizer.scheduler.warmup=5",
@@ -243,9 +251,9 @@ def test_the_encoder_comes_out_of_the_checkpoint(learned, data):
 
 def test_resumed_equals_straight_through(data, tmp_path):
     more = [
-        "data.steps_per_epoch=2",
-        "data.batch_size=4",
-        "data.val_windows=8",
+        "data.loading.steps_per_epoch=2",
+        "data.loading.batch_size=4",
+        "data.loading.val_windows=8",
         "optimizer.scheduler.total=6",
         "model.net.channels=[8,8,8]",
     ]

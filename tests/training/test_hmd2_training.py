@@ -9,7 +9,7 @@ import torch
 
 from wearcap.cli import capture, evaluate, train
 from wearcap.cli.conf import conf_dir
-from wearcap.data.place_codes import PlaceCodes
+from wearcap.data.surroundings import PlaceCodes
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.io.formats.motion_npz import read_motion
@@ -71,10 +71,10 @@ def places(data, tmp_path_factory) -> Path:
             f"hydra.run.dir={run}",
             "trainer.max_steps=2",
             f"paths.outputs={run.parent}",
-            "data.window=20",
-            "data.frames=4",
-            "data.batch_size=4",
-            "data.steps_per_epoch=2",
+            "data.dataset.window=20",
+            "data.dataset.content.frames=4",
+            "data.loading.batch_size=4",
+            "data.loading.steps_per_epoch=2",
             *QUIET,
         ]
     )
@@ -90,7 +90,7 @@ def trained(experiment: str, data: Path, places: Path | None, run: Path, *more: 
             "debug=fast",
             f"hydra.run.dir={run}",
             f"paths.outputs={run.parent}",
-            "data.window=60",
+            "data.dataset.window=60",
             "trainer.precision=32-true",
             *([] if places is None else [f"surroundings.places.checkpoint={places}"]),
             "model.net.width=32",

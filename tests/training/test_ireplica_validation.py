@@ -11,6 +11,8 @@ import torch
 
 from contact_motion import CLASSES, bending_recording
 from wearcap.body.kinematics import site_positions
+from wearcap.data.datamodule import Loading, WindowsModule
+from wearcap.data.windows import Windows
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
@@ -24,7 +26,7 @@ from wearcap.systems.ireplica.features import HandViews
 from wearcap.systems.ireplica.object_tracker import PALMS, ObjectTracker
 from wearcap.systems.ireplica.pipeline import IReplica
 from wearcap.systems.ireplica.training import ContactDetection
-from wearcap.systems.ireplica.training_windows import ContactWindows
+from wearcap.systems.ireplica.training_windows import ContactContent
 from wearcap.systems.ireplica.validation import IReplicaValidation, fit
 
 
@@ -76,9 +78,9 @@ def validated(root: Path, registration: TrueMotion) -> dict:
     features = HandViews()
     torch.manual_seed(0)
     module = ContactDetection(partial(ContactSequence, width=8), features, list(CLASSES), 60.0, torch.optim.Adam)
-    data = ContactWindows(
-        {"s": {"root": str(root), "weight": 1.0}}, features, list(CLASSES), 120, 120, 60.0, 4, stream="suit"
-    )
+    content = ContactContent(features, list(CLASSES), 60.0)
+    dataset = partial(Windows, content=content, window=120, stride=120, fps=60.0)
+    data = WindowsModule(dataset, Loading(4), {"s": {"root": str(root), "weight": 1.0}})
     data.val = data.dataset("val")
     callback = IReplicaValidation(
         partial(IReplica, registration=registration, tracker=ObjectTracker(None)), every_n_epochs=1

@@ -29,7 +29,7 @@ def arguments(data: Path, run: Path, *more: str) -> list[str]:
         "experiment=motion_autoencoder",
         f"data.sources.simulated.root={data}",
         "data.sources.cmu=null",
-        "data.window=72",
+        "data.dataset.window=72",
         f"hydra.run.dir={run}",
         f"paths.outputs={run.parent}",
         "model.net.channels=[16,16,16]",
@@ -47,7 +47,7 @@ def arguments(data: Path, run: Path, *more: str) -> list[str]:
 def checkpoint(data, tmp_path_factory) -> Path:
     run = tmp_path_factory.mktemp("runs") / "run"
     quick = ["optimizer.optimizer.lr=0.02", "optimizer.scheduler.warmup=5", "trainer.max_steps=40"]
-    train.main(arguments(data, run, *quick, "data.steps_per_epoch=20", "data.batch_size=8"))
+    train.main(arguments(data, run, *quick, "data.loading.steps_per_epoch=20", "data.loading.batch_size=8"))
     return run / "checkpoints" / "last.ckpt"
 
 
@@ -82,7 +82,7 @@ def test_evaluation_shows_it_beside_the_other_scores(checkpoint, data, tmp_path,
         [
             "experiment=pose_regressor_head",
             f"data.sources.simulated.root={data}",
-            "data.window=60",
+            "data.dataset.window=60",
             "debug=fast",
             f"hydra.run.dir={run}",
             f"paths.outputs={tmp_path}",

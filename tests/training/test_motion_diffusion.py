@@ -6,11 +6,12 @@ from torch import nn
 
 from wearcap.body.skeleton import xsens23
 from wearcap.data.statistics import collate
-from wearcap.data.windows import Source, WindowDataset
+from wearcap.data.windows import Source, Windows
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.training import MotionDiffusion
+from wearcap.systems.hmd2.training_windows import HeadContent
 from wearcap_testing import small_dataset
 
 
@@ -45,7 +46,7 @@ def system(batch, level_tilt: float) -> MotionDiffusion:
 
 def test_a_tilt_draws_high_levels_more_often_and_the_truth_costs_nothing(tmp_path):
     store = small_dataset(tmp_path)
-    windows = WindowDataset([Source(str(store.root))], "train", window=60, stride=30, fps=60.0)
+    windows = Windows([Source(str(store.root))], "train", content=HeadContent(), window=60, stride=30, fps=60.0)
     batch = collate([windows[(i % len(windows), i)] for i in range(400)])
     for tilt in (0.0, 2.0):
         module = system(batch, tilt)
@@ -60,7 +61,7 @@ def test_a_tilt_draws_high_levels_more_often_and_the_truth_costs_nothing(tmp_pat
 
 def test_the_last_frames_that_exist_weigh_more_by_the_tail(tmp_path):
     store = small_dataset(tmp_path)
-    windows = WindowDataset([Source(str(store.root))], "train", window=60, stride=30, fps=60.0)
+    windows = Windows([Source(str(store.root))], "train", content=HeadContent(), window=60, stride=30, fps=60.0)
     batch = collate([windows[(0, 0)]])
     batch = batch._replace(valid=torch.arange(60)[None] < 50)
     module = system(batch, 0.0)

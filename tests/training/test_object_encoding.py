@@ -29,11 +29,10 @@ def trained(experiment: str, data: Path, run: Path, *more: str) -> Path:
             f"paths.datasets={data}",
             f"hydra.run.dir={run}",
             f"paths.outputs={run.parent}",
-            "data.classes=[box,chair,bottle]",
-            "data.per_class=8",
-            "data.val_per_class=3",
-            "data.points=120",
-            "data.batch_size=6",
+            "data.dataset.classes=[box,chair,bottle]",
+            "data.dataset.per_class={train: 8, val: 3}",
+            "data.dataset.points=120",
+            "data.loading.batch_size=6",
             "model.net.encoder.width=4",
             "trainer.accelerator=cpu",
             "trainer.log_every_n_steps=1",
@@ -48,7 +47,7 @@ def trained(experiment: str, data: Path, run: Path, *more: str) -> Path:
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_it_learns_and_its_checkpoint_encodes(experiment, data, tmp_path):
-    steps = ("trainer.max_steps=24", "data.steps_per_epoch=12", "optimizer.scheduler.warmup=2")
+    steps = ("trainer.max_steps=24", "data.loading.steps_per_epoch=12", "optimizer.scheduler.warmup=2")
     checkpoint = trained(experiment, data, tmp_path / "run", *steps, "optimizer.optimizer.lr=0.01")
     with open(tmp_path / "run" / "metrics.csv") as file:
         rows = list(csv.DictReader(file))
@@ -79,7 +78,7 @@ def test_it_learns_and_its_checkpoint_encodes(experiment, data, tmp_path):
 
 @pytest.mark.slow
 def test_resuming_equals_training_straight_through(data, tmp_path, capsys):
-    short = ("data.steps_per_epoch=3", "optimizer.scheduler.total=6", "optimizer.scheduler.warmup=2")
+    short = ("data.loading.steps_per_epoch=3", "optimizer.scheduler.total=6", "optimizer.scheduler.warmup=2")
     straight = trained("object_encoder", data, tmp_path / "straight", "trainer.max_steps=6", *short)
     half = trained("object_encoder", data, tmp_path / "half", "trainer.max_steps=3", *short)
     resumed = trained("object_encoder", data, tmp_path / "resumed", "trainer.max_steps=6", *short, f"resume={half}")

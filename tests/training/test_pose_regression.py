@@ -13,12 +13,14 @@ from wearcap.body.skeleton import xsens23
 from wearcap.cli import evaluate, train
 from wearcap.cli.conf import compose
 from wearcap.data.statistics import collate
-from wearcap.data.windows import Source, WindowDataset
+from wearcap.data.transforms import Mirror, Shift
+from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
 from wearcap.models.checkpoint import load_trained
 from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, encode_pose
 from wearcap.systems.hmd2.pose_regressor.training import PoseRegression
+from wearcap.systems.hmd2.training_windows import HeadContent
 from wearcap_testing import small_dataset
 
 pytestmark = pytest.mark.usefixtures("few_statistics")
@@ -42,8 +44,8 @@ def arguments(experiment: str, data: Path, run: Path, *more: str) -> list[str]:
         f"paths.outputs={run.parent}",
         "trainer.accelerator=cpu",
         "trainer.precision=32-true",
-        "data.workers=0",
-        "data.window=60",
+        "data.loading.workers=0",
+        "data.dataset.window=60",
         "trainer.log_every_n_steps=1",
         "trainer.enable_progress_bar=false",
         "callbacks.progress=null",
@@ -66,7 +68,10 @@ def system(points: tuple[str, ...] = HANDS, net=PoseRegressor) -> PoseRegression
 
 
 def batch(data: Path, split: str = "train", mirror: bool = False):
-    windows = WindowDataset([Source(str(data))], split, window=60, stride=30, fps=60.0, mirror=mirror)
+    varied = {"shift": Shift(), "mirror": Mirror()}
+    windows = Windows(
+        [Source(str(data))], split, mirror, content=HeadContent(), window=60, stride=30, fps=60.0, transforms=varied
+    )
     return collate([windows[(i % len(windows), i)] for i in range(16)])
 
 
@@ -97,7 +102,7 @@ def test_the_truth_costs_nothing_and_another_pose_does(data, mirror):
 
 def test_padding_is_no_lesson(data):
     """The recording of 90 frames ends within a window of 120: what is said behind its end costs nothing."""
-    windows = WindowDataset([Source(str(data))], "train", window=120, stride=30, fps=60.0)
+    windows = Windows([Source(str(data))], "train", content=HeadContent(), window=120, stride=30, fps=60.0)
     short = next(i for i, row in enumerate(windows.starts.tolist()) if row[2] == 90)
     one = collate([windows[(short, 0)]])
     module = system(net=Oracle).eval()
@@ -115,7 +120,9 @@ def test_it_learns_and_hands_help(data):
     for points in (("head",), HANDS):
         torch.manual_seed(0)
         module, windows = system(points), batch(data, mirror=True)
-        module.set_statistics(WindowDataset([Source(str(data))], "train", window=60, stride=30, fps=60.0), limit=16)
+        module.set_statistics(
+            Windows([Source(str(data))], "train", content=HeadContent(), window=60, stride=30, fps=60.0), limit=16
+        )
         optimizer = torch.optim.AdamW(module.parameters(), lr=3e-3)
         before = module.eval().terms(windows)["joints"].item()
         for _ in range(40):
@@ -163,9 +170,9 @@ def test_the_full_size_is_avatarposers(experiment, inputs):
 def test_the_other_experiments_take_a_step(experiment, data, tmp_path):
     run = tmp_path / "run"
     more = (
-        ["data.batch_size=2"]
+        ["data.loading.batch_size=2"]
         if experiment == "pose_regressor_head"
-        else ["data.batch_size=2", "optimizer.scheduler.warmup=1"]
+        else ["data.loading.batch_size=2", "optimizer.scheduler.warmup=1"]
     )
     command = arguments(experiment, data, run, *more)
     train.main(command)

@@ -14,12 +14,12 @@ import pytest
 import torch
 
 from wearcap.errors import WearcapError
-from wearcap.training.checkpoint import TRAINING_STATE, RunCheckpointIO, require_resumable
 from wearcap.training.loggers import RunCSVLogger, read_metrics
+from wearcap.training.run import TRAINING_STATE, RunCheckpointIO, require_resumable
 
 SAVES = """
 import sys, torch
-from wearcap.training.checkpoint import RunCheckpointIO
+from wearcap.training.run import RunCheckpointIO
 path, step = sys.argv[1], 0
 while True:
     step += 1

@@ -46,7 +46,7 @@ def arguments(data: Path, run: Path, *more: str) -> list[str]:
         "debug=fast",
         f"hydra.run.dir={run}",
         f"paths.outputs={run.parent}",
-        "data.window=60",
+        "data.dataset.window=60",
         "trainer.accelerator=cpu",
         "logger.csv.flush_logs_every_n_steps=1",
         "trainer.log_every_n_steps=1",
@@ -68,7 +68,7 @@ def checkpoint(data, tmp_path_factory) -> Path:
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_every_experiment_takes_a_step(experiment, data, tmp_path):
     run = tmp_path / "run"
-    changed = arguments(data, run, "trainer.precision=32-true", "data.workers=0", "data.batch_size=2")
+    changed = arguments(data, run, "trainer.precision=32-true", "data.loading.workers=0", "data.loading.batch_size=2")
     train.main([f"experiment={experiment}", *changed[1:]])
     assert (run / "checkpoints" / "last.ckpt").is_file()
 
@@ -104,7 +104,7 @@ def losses(run: Path, name: str = "train/loss") -> dict[int, str]:
 @pytest.mark.slow
 def test_killed_and_resumed_equals_straight_through(data, tmp_path):
     """A process killed in its third epoch goes on from the second's checkpoint with exactly the same losses."""
-    more = ["trainer.max_steps=12", "data.steps_per_epoch=3", "callbacks.capture=null", "name=kill"]
+    more = ["trainer.max_steps=12", "data.loading.steps_per_epoch=3", "callbacks.capture=null", "name=kill"]
     train.main(arguments(data, tmp_path / "straight/run", *more))
     killed = tmp_path / "killed/train/kill/first"
     command = arguments(data, killed, *more, f"paths.outputs={tmp_path / 'killed'}", "trainer.max_steps=100000")
@@ -135,7 +135,7 @@ def test_killed_and_resumed_equals_straight_through(data, tmp_path):
 @pytest.mark.slow
 def test_a_run_resumed_in_its_folder_goes_on_with_its_log(data, tmp_path):
     run = tmp_path / "run"
-    more = ["data.steps_per_epoch=3", "callbacks.capture=null", "optimizer.scheduler.total=12"]
+    more = ["data.loading.steps_per_epoch=3", "callbacks.capture=null", "optimizer.scheduler.total=12"]
 
     def trained(steps: int, *resume: str) -> list[tuple[int, str]]:
         train.main(arguments(data, run, *more, f"trainer.max_steps={steps}", *resume))
@@ -186,11 +186,11 @@ def test_overfits_one_batch(data, tmp_path):
         "debug=overfit",
         "trainer.max_steps=60",
         "model.net.dropout=0",
-        "data.batch_size=2",
-        "data.steps_per_epoch=1",
+        "data.loading.batch_size=2",
+        "data.loading.steps_per_epoch=1",
         "optimizer.optimizer.lr=0.01",
         "optimizer.scheduler.warmup=5",
-        "data.workers=0",
+        "data.loading.workers=0",
         "callbacks.capture=null",
     ]
     train.main([a for a in arguments(data, run, *more) if a != "debug=fast"])

@@ -9,7 +9,7 @@ import torch
 
 from wearcap.cli import train
 from wearcap.cli.conf import conf_dir
-from wearcap.data.place_codes import PlaceCodes
+from wearcap.data.surroundings import PlaceCodes
 from wearcap.recording import PointCloud, RecordingStore
 from wearcap_testing import recording_of, swaying_motion
 
@@ -39,9 +39,9 @@ def trained(experiment: str, data: Path, run: Path, *more: str) -> Path:
             "data.sources.cmu=null",
             f"hydra.run.dir={run}",
             f"paths.outputs={run.parent}",
-            "data.window=20",
-            "data.frames=4",
-            "data.batch_size=4",
+            "data.dataset.window=20",
+            "data.dataset.content.frames=4",
+            "data.loading.batch_size=4",
             "trainer.accelerator=cpu",
             "trainer.log_every_n_steps=1",
             "trainer.enable_progress_bar=false",
@@ -55,7 +55,7 @@ def trained(experiment: str, data: Path, run: Path, *more: str) -> Path:
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_it_learns_and_its_checkpoint_encodes(experiment, data, tmp_path):
-    checkpoint = trained(experiment, data, tmp_path / "run", "trainer.max_steps=24", "data.steps_per_epoch=12")
+    checkpoint = trained(experiment, data, tmp_path / "run", "trainer.max_steps=24", "data.loading.steps_per_epoch=12")
     with open(tmp_path / "run" / "metrics.csv") as file:
         rows = list(csv.DictReader(file))
     losses = [float(row["train/loss"]) for row in rows if row["train/loss"]]
@@ -72,7 +72,7 @@ def test_it_learns_and_its_checkpoint_encodes(experiment, data, tmp_path):
 
 @pytest.mark.slow
 def test_resuming_equals_training_straight_through(data, tmp_path):
-    short = ("data.steps_per_epoch=3", "optimizer.scheduler.total=6", "optimizer.scheduler.warmup=2")
+    short = ("data.loading.steps_per_epoch=3", "optimizer.scheduler.total=6", "optimizer.scheduler.warmup=2")
     straight = trained("voxel_autoencoder", data, tmp_path / "straight", "trainer.max_steps=6", *short)
     half = trained("voxel_autoencoder", data, tmp_path / "half", "trainer.max_steps=3", *short)
     resumed = trained("voxel_autoencoder", data, tmp_path / "resumed", "trainer.max_steps=6", *short, f"resume={half}")

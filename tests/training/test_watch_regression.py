@@ -12,7 +12,7 @@ from wearcap.body.skeleton import xsens23
 from wearcap.cli import capture, evaluate, train
 from wearcap.cli.conf import compose
 from wearcap.data.statistics import collate
-from wearcap.data.windows import Source
+from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
 from wearcap.io.datasets.amass import read_amass
 from wearcap.io.formats.motion_npz import read_motion
@@ -22,7 +22,7 @@ from wearcap.systems.mocap_every.manifold import MotionManifold
 from wearcap.systems.mocap_every.manifold_training import ManifoldTraining
 from wearcap.systems.mocap_every.model import Estimate, LastPoseEstimator, TwoStageEstimator
 from wearcap.systems.mocap_every.training import WatchRegression
-from wearcap.systems.mocap_every.training_windows import WatchDataset
+from wearcap.systems.mocap_every.training_windows import WatchContent
 from wearcap.systems.mocap_every.visual_cues import load_visual_cues
 from wearcap_testing import small_dataset
 
@@ -65,7 +65,7 @@ def arguments(experiment: str, data: Path, run: Path, *more: str) -> list[str]:
         f"paths.outputs={run.parent}",
         "trainer.accelerator=cpu",
         "trainer.precision=32-true",
-        "data.workers=0",
+        "data.loading.workers=0",
         "trainer.log_every_n_steps=1",
         "trainer.enable_progress_bar=false",
         "callbacks.progress=null",
@@ -74,7 +74,7 @@ def arguments(experiment: str, data: Path, run: Path, *more: str) -> list[str]:
 
 
 def batch(data: Path):
-    windows = WatchDataset([Source(str(data))], "train", window=40, stride=10, fps=60.0, every=2)
+    windows = Windows([Source(str(data))], "train", content=WatchContent(), window=40, stride=10, fps=30.0, every=2)
     return collate([windows[(k % len(windows), k)] for k in range(16)])
 
 
@@ -125,7 +125,7 @@ def test_both_stages_and_contacts_are_learned(data):
     torch.manual_seed(0)
     windows, learner = batch(data), system()
     learner.set_statistics(
-        WatchDataset([Source(str(data))], "train", window=40, stride=10, fps=60.0, every=2), limit=20
+        Windows([Source(str(data))], "train", content=WatchContent(), window=40, stride=10, fps=30.0, every=2), limit=20
     )
     terms = learner.terms(windows)
     sum(WEIGHTS[name] * term for name, term in terms.items()).backward()
@@ -238,7 +238,7 @@ def test_the_manifold_keeps_time_and_learns(data):
     torch.manual_seed(0)
     windows, learner = batch(data), manifold_system()
     learner.set_statistics(
-        WatchDataset([Source(str(data))], "train", window=40, stride=10, fps=60.0, every=2), limit=20
+        Windows([Source(str(data))], "train", content=WatchContent(), window=40, stride=10, fps=30.0, every=2), limit=20
     )
     assert learner.net.size == 5 + 6 * 23
     optimizer, losses = torch.optim.AdamW(learner.parameters(), 3e-3), []

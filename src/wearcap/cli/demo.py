@@ -27,12 +27,12 @@ def main(arguments: list[str]) -> None:
         [
             "experiment=motion_diffusion_head",
             f"data.sources.simulated.root={data}",
-            f"data.steps_per_epoch={max(1, options.steps // 2)}",
+            f"data.loading.steps_per_epoch={max(1, options.steps // 2)}",
             f"trainer.max_steps={options.steps}",
             f"hydra.run.dir={out}/train",
             "callbacks.capture.every_n_epochs=100",
             "callbacks.average.decay=0.98",
-            "data.batch_size=16",
+            "data.loading.batch_size=16",
         ],
     )
     _step(

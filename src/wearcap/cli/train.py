@@ -15,8 +15,7 @@ from wearcap.cli.conf import hydra_main
 from wearcap.data.surroundings import embeddings_of
 from wearcap.locks import folder_lock
 from wearcap.recording.store import RecordingStore
-from wearcap.training.checkpoint import ConfigInCheckpoint, RunCheckpointIO
-from wearcap.training.run import fit, keep_freed_memory, record_run, resume_path
+from wearcap.training.run import ConfigInCheckpoint, RunCheckpointIO, fit, keep_freed_memory, record_run, resume_path
 
 HELP = "train a model: wearcap train experiment=motion_diffusion_head data=cmu"
 
@@ -68,7 +67,7 @@ def _train(config: DictConfig, run: Path) -> float:
 def _name_embeddings(config: DictConfig) -> None:
     """Set the name and the dimension of the image embeddings to those in the data (`surroundings.images=clip`)."""
     surroundings = config.get("surroundings")
-    if surroundings and surroundings.images and "surroundings" in config.data:
+    if surroundings and surroundings.images and "surroundings" in config.data.dataset.get("content", {}):
         stores = [RecordingStore.open(source.root) for source in config.data.sources.values() if source]
         surroundings.images, surroundings.image_size = embeddings_of(surroundings.images, stores)
 

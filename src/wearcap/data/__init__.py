@@ -1,4 +1,5 @@
-"""Windows of recordings for training, and their DataModules.
+"""Windows of recordings for training.
 
-Open `windows.py` first: each system's `training_windows.py` is made alike. Where recordings come from: `wearcap.prepare`.
+Open `windows.py` first (the data set), then `transforms.py` (its augmentations) and `datamodule.py` (how samples are
+loaded); each system's `training_windows.py` says what its windows hold. Where recordings come from: `wearcap.prepare`.
 """

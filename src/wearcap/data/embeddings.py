@@ -36,7 +36,8 @@ def embed_camera(camera: CameraStream, folder: Path, encoder: ImageEncoder, cach
     """
     files = _files(camera, folder)
     name = embedding_name(encoder)
-    kept = (cache or folder / "cache") / f"embeddings-{name}" / f"{_content(files)}.safetensors"
+    content = hashlib.sha256("".join(map(sha256_of, files)).encode()).hexdigest()
+    kept = (cache or folder / "cache") / f"embeddings-{name}" / f"{content[:32]}.safetensors"
     embeddings = _read(kept, encoder.size)
     if embeddings is None:
         embeddings = _embed(pictures(camera, folder), encoder)
@@ -80,10 +81,6 @@ def _files(camera: CameraStream, folder: Path) -> list[Path]:
             expected="the files that the recording names, below the data set's folder",
         )
     return files
-
-
-def _content(files: list[Path]) -> str:
-    return hashlib.sha256("".join(map(sha256_of, files)).encode()).hexdigest()[:32]
 
 
 def _read(path: Path, size: int) -> dict[str, Tensor] | None:

@@ -1,10 +1,12 @@
-"""Features that the head-driven networks share: body size and frame differences."""
+"""What the head-driven networks share: body size, frame differences, true contacts of the feet."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
+from wearcap.metrics import physics
+from wearcap.recording.recording import Recording
 
 LIMBS = {
     "stature": (),
@@ -26,3 +28,14 @@ def body_size(skeleton: Skeleton) -> Float[Tensor, "limb"]:
 def first_repeated(step: Float[Tensor, "batch step *rest"]) -> Float[Tensor, "batch time *rest"]:
     """Differences to the previous frame for every frame; the first frame repeats the second's."""
     return torch.cat([step[:, :1], step], 1)
+
+
+def true_foot_contact(recording: Recording) -> Bool[Tensor, "time foot"]:
+    """Contact of the left and right foot at the motion's frames, as recorded or else estimated from the true motion."""
+    motion, track = recording.motion, recording.contacts
+    assert motion is not None
+    if track is not None and set(FOOT_PATCHES) <= set(track.parts) and len(track.contact) == len(motion):
+        return physics.foot_contact(track.contact[:, [track.parts.index(patch) for patch in FOOT_PATCHES]])
+    pose = motion.T_world_joint
+    points = physics.foot_points(motion.skeleton, pose)
+    return physics.contact_from_motion(points, physics.local_floor(pose.t, motion.fps), motion.fps)

@@ -1,22 +1,99 @@
 """Conditions of a window beside the head's path: codes of the points around the body, and image embeddings."""
 
+import hashlib
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import NamedTuple
 
 import safetensors
 import torch
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Bool, Float, Float16, Float64, Int64
+from rich.progress import track
+from safetensors.torch import save
 from torch import Tensor
 
-from wearcap.data.place_codes import PlaceCodes
+from wearcap.data.windows import open_recording
 from wearcap.errors import WearcapError
-from wearcap.recording.store import RecordingFile, RecordingStore
+from wearcap.files import atomic_path
+from wearcap.models.checkpoint import load_network
+from wearcap.models.voxel_autoencoder import VoxelAutoencoder
+from wearcap.recording import HeadStream, PointCloud
+from wearcap.recording.store import Entry, RecordingStore
+from wearcap.scene.voxels import VoxelMap, mirrored
 
 MAX_PICTURE_AGE_S = 0.2
 """Largest age (s) at which an image still conditions a frame."""
+_AT_ONCE = 2048
+"""Grids that are encoded at a time."""
+
+
+class PlaceCodes:
+    """Codes of the points around the body by a trained voxel autoencoder (thesis §6.2)."""
+
+    def __init__(self, checkpoint: str | Path):
+        """`checkpoint`: path or name of a checkpoint of experiment=voxel_autoencoder."""
+        self.checkpoint = checkpoint
+
+    @cached_property
+    def encoder(self) -> VoxelAutoencoder:
+        """The network, in evaluation mode. Raises WearcapError when the checkpoint is missing or another network's."""
+        return load_network(self.checkpoint, VoxelAutoencoder, "voxel_autoencoder").requires_grad_(False)
+
+    @property
+    def size(self) -> int:
+        return self.encoder.size
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """16 hex digits that depend on the weights and the grid."""
+        digest = hashlib.sha256(repr(self.encoder.grid).encode())
+        for name, value in sorted(self.encoder.state_dict().items()):
+            digest.update(name.encode() + value.contiguous().numpy().tobytes())
+        return digest.hexdigest()[:16]
+
+    def file_of(self, root: Path, entry: Entry) -> Path:
+        """File of a recording's codes, made if it is missing.
+
+        It contains `code` and, for the surroundings mirrored left to right, `code_mirrored` ("time feature", float16)
+        at the head stream's timestamps; no rows for a recording without points.
+        """
+        path = root / "cache" / f"places-{self.fingerprint}" / f"{entry.sha256}.safetensors"
+        if not path.is_file():
+            file = RecordingStore.open(root).open_file(Path(entry.file).stem)
+            code, code_mirrored = self._encoded(file.part("points"), file.part("head"))
+            with atomic_path(path) as temporary:
+                temporary.write_bytes(save({"code": code, "code_mirrored": code_mirrored}))
+        return path
+
+    def prepare(self, store: RecordingStore, names: Iterable[str]) -> None:
+        """Compute the missing codes of recordings."""
+        folder = store.root / "cache" / f"places-{self.fingerprint}"
+        todo = [name for name in names if not (folder / f"{store.entries[name].sha256}.safetensors").is_file()]
+        for name in track(todo, f"points of {store.root.name}", disable=not todo):
+            self.file_of(store.root, store.entries[name])
+
+    @torch.inference_mode()
+    def _encoded(
+        self, cloud: PointCloud | None, head: HeadStream
+    ) -> tuple[Float16[Tensor, "time feature"], Float16[Tensor, "time feature"]]:
+        """Codes of the points that had been seen by each head frame, and of the same points mirrored left to right.
+
+        No rows without points.
+        """
+        if cloud is None or not len(cloud.points_world):
+            return torch.zeros(0, self.size, dtype=torch.float16), torch.zeros(0, self.size, dtype=torch.float16)
+        code = torch.zeros(len(head.timestamps), self.size, dtype=torch.float16)
+        code_mirrored = code.clone()
+        surroundings = VoxelMap(self.encoder.grid)
+        surroundings.add(cloud.points_world, cloud.first_seen)
+        for start in range(0, len(code), _AT_ONCE):
+            part = slice(start, start + _AT_ONCE)
+            grids = surroundings.voxelize(head.T_world_device[part], head.timestamps[part])
+            code[part], code_mirrored[part] = self.encoder.encode(grids), self.encoder.encode(mirrored(grids))
+        return code, code_mirrored
 
 
 class Seen(NamedTuple):
@@ -58,11 +135,11 @@ class Surroundings:
                 points, points_valid = rows[start:stop].float(), torch.ones(count, dtype=torch.bool)
         image, image_valid = torch.zeros(count, image_size), torch.zeros(count, dtype=torch.bool)
         key = "camera.embedding_mirrored" if mirrored else "camera.embedding"
-        if self.images is not None and _pictured(path) == self.images and key in _open(path).keys:
+        if self.images is not None and _pictured(path) == self.images and key in open_recording(path).keys:
             picture, image_valid = (part[start:stop] for part in _latest(path))
             if image_valid.any():
                 first, last = picture[image_valid][[0, -1]].tolist()
-                shown = _open(path).window(key, first, last + 1).float()
+                shown = open_recording(path).window(key, first, last + 1).float()
                 image = shown[(picture - first).clamp(0, len(shown) - 1)]
         return Seen(points, points_valid, image, image_valid)
 
@@ -79,7 +156,7 @@ def embeddings_of(encoder: str, stores: list[RecordingStore]) -> tuple[str, int]
     `encoder` is the full name or NAME alone. Raises WearcapError when there are none, or several kinds.
     """
     kinds: set[tuple[str, int]] = set()
-    for file in (_open(store.path_of(name)) for store in stores for name in store.names()):
+    for file in (open_recording(store.path_of(name)) for store in stores for name in store.names()):
         full = _pictured(file.path)
         if full is not None and not _ENCODER_NAME.fullmatch(full):
             raise WearcapError(f"embeddings of {full[:80]!r}", where=file.path, expected="the plain name of an encoder")
@@ -97,11 +174,6 @@ def embeddings_of(encoder: str, stores: list[RecordingStore]) -> tuple[str, int]
 
 
 @cache
-def _open(path: Path) -> RecordingFile:
-    return RecordingFile(path)
-
-
-@cache
 def _codes(path: Path):
     return safetensors.safe_open(str(path), framework="pt")
 
@@ -109,13 +181,13 @@ def _codes(path: Path):
 @cache
 def _pictured(path: Path) -> str | None:
     """Name of the encoder whose embeddings a recording has."""
-    file = _open(path)
+    file = open_recording(path)
     return file.part("camera").embedding_name if "camera.embedding" in file.keys else None
 
 
 @cache
 def _latest(path: Path) -> tuple[Int64[Tensor, "time"], Bool[Tensor, "time"]]:
-    file = _open(path)
+    file = open_recording(path)
     return latest_before(file.tensor("camera.timestamps"), file.tensor("head.timestamps"))
 
 

@@ -24,7 +24,7 @@ class LevelEmbedding(nn.Module):
         return self.mlp(torch.cat([angle.sin(), angle.cos()], -1))
 
 
-class RotaryAttention(nn.Module):
+class _RotaryAttention(nn.Module):
     """Multi-head self-attention with rotary positions (Su et al. 2021), fused by PyTorch."""
 
     cos: Tensor
@@ -72,7 +72,7 @@ class AdaptiveBlock(nn.Module):
         super().__init__()
         self.norm_attention = nn.LayerNorm(width, elementwise_affine=False)
         self.norm_mlp = nn.LayerNorm(width, elementwise_affine=False)
-        self.attention = RotaryAttention(width, heads, max_tokens, streams)
+        self.attention = _RotaryAttention(width, heads, max_tokens, streams)
         self.mlp = nn.Sequential(
             nn.Linear(width, feedforward), nn.GELU(), nn.Dropout(dropout), nn.Linear(feedforward, width)
         )

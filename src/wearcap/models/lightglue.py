@@ -70,7 +70,7 @@ class SelfBlock(nn.Module):
         return x + self.ffn(torch.cat([x, message], -1))
 
 
-class CrossBlock(nn.Module):
+class _CrossBlock(nn.Module):
     """Cross-attention: each keypoint attends to those of the other image; keys and queries share one projection."""
 
     def __init__(self, width: int, heads: int):
@@ -99,13 +99,13 @@ class CrossBlock(nn.Module):
         return self._updated(x0, seen0), self._updated(x1, seen1)
 
 
-class Layer(nn.Module):
+class _Layer(nn.Module):
     """Self-attention in each image, then cross-attention."""
 
     def __init__(self, width: int, heads: int):
         super().__init__()
         self.self_attn = SelfBlock(width, heads)
-        self.cross_attn = CrossBlock(width, heads)
+        self.cross_attn = _CrossBlock(width, heads)
 
     def forward(
         self,
@@ -135,7 +135,7 @@ class MatchAssignment(nn.Module):
         return similarity.log_softmax(2) + similarity.log_softmax(1) + matchable
 
 
-class TokenConfidence(nn.Module):
+class _TokenConfidence(nn.Module):
     """Confidence of a keypoint that further layers will not change its match (eq. 10)."""
 
     def __init__(self, width: int):
@@ -172,9 +172,9 @@ class LightGlue(nn.Module):
         super().__init__()
         self.width, self.stop_confidence = width, stop_confidence
         self.posenc = RotaryPosition(width // heads)
-        self.transformers = nn.ModuleList(Layer(width, heads) for _ in range(layers))
+        self.transformers = nn.ModuleList(_Layer(width, heads) for _ in range(layers))
         self.log_assignment = nn.ModuleList(MatchAssignment(width) for _ in range(layers))
-        self.token_confidence = nn.ModuleList(TokenConfidence(width) for _ in range(layers - 1))
+        self.token_confidence = nn.ModuleList(_TokenConfidence(width) for _ in range(layers - 1))
 
     def _settled(
         self, layer: int, x0: Float[Tensor, "batch keypoint0 width"], x1: Float[Tensor, "batch keypoint1 width"]

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 _VGG16 = (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512)
 
 
-def vgg16_trunk() -> nn.Sequential:
+def _vgg16_trunk() -> nn.Sequential:
     """Convolutions 1_1 to 5_3 of VGG16 (Simonyan & Zisserman 2015); layers stand where torchvision numbers them."""
     layers, channels = [], 3
     for width in _VGG16:
@@ -48,7 +48,7 @@ class NetVLAD(nn.Module):
 
     def __init__(self, clusters: int = 64, whitened: int = 0, bias: bool = False):
         super().__init__()
-        self.encoder = vgg16_trunk()
+        self.encoder = _vgg16_trunk()
         self.pool = VladPooling(clusters, 512, bias)
         self.WPCA = nn.Sequential(nn.Conv2d(clusters * 512, whitened, 1)) if whitened else None
         # ImageNet's colours, in which VGG16 was trained.

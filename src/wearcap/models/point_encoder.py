@@ -1,5 +1,9 @@
-"""PointNeXt (Qian et al. 2022): the feature of an object's surface points that conditions ECHO."""
+"""PointNeXt (Qian et al. 2022): the feature of an object's surface points that conditions ECHO.
 
+Sampling and neighbourhoods are batched, exact, and independent of the points' order.
+"""
+
+import re
 from collections.abc import Sequence
 from math import prod
 from pathlib import Path
@@ -11,9 +15,16 @@ from torch.nn import functional as F
 
 from wearcap.errors import WearcapError
 from wearcap.models.checkpoint import load_network
-from wearcap.models.point_sampling import ball_query, rows_at, spread_first
+from wearcap.models.weights import load_weights, read_weights
 
 _LEAST_M = 1e-9
+_LAST = 5
+"""Index of the stage that pools all remaining points; 0 is the stem."""
+_LAYER = {"0": "linear", "1": "norm"}
+_HEAD = "prediction."
+_NAME = re.compile(
+    r"(?:encoder\.)?encoder\.(?P<stage>\d)\.0\.(?P<part>convs|skipconv)\.(?P<number>\d)(?:\.(?P<layer>[01]))?\.(?P<tensor>\w+)"
+)
 
 
 def bounds(points: Float[Tensor, "batch point 3"]) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch 3"]]:
@@ -34,6 +45,58 @@ def to_unit_sphere(
     centered = points - bounds(points)[1][:, None]
     radius = centered.norm(dim=-1).amax(1).clamp_min(_LEAST_M)
     return centered / radius[:, None, None], radius
+
+
+@torch.no_grad()
+def farthest_points(points: Float[Tensor, "batch point 3"], count: int) -> Int64[Tensor, "batch chosen"]:
+    """Indices of `count` points, each the farthest from all before it; the first is the farthest from the origin.
+
+    Its first n indices are the farthest-point sample of n. Points at equal positions are used once before any repeats.
+    """
+    x, y, z = (axis.contiguous() for axis in points.unbind(-1))
+    chosen = torch.empty(len(points), count, dtype=torch.int64, device=points.device)
+    apart = torch.full_like(x, torch.inf)
+    latest = points.square().sum(-1).argmax(-1, keepdim=True)
+    for number in range(count):
+        chosen[:, number] = latest[:, 0]
+        square = (x - x.gather(1, latest)).square_()
+        square += (y - y.gather(1, latest)).square_()
+        square += (z - z.gather(1, latest)).square_()
+        apart = torch.minimum(apart, square)
+        latest = apart.argmax(-1, keepdim=True)
+    return chosen
+
+
+@torch.no_grad()
+def spread_first(points: Float[Tensor, "batch point 3"], count: int) -> Int64[Tensor, "batch point"]:
+    """A permutation of all points that starts with the farthest-point sample of `count`."""
+    chosen = farthest_points(points, count)
+    rank = torch.full(points.shape[:2], count, dtype=torch.int64, device=points.device)
+    rank.scatter_(1, chosen, torch.arange(count, device=points.device).expand_as(chosen))
+    return rank.argsort(dim=1, stable=True)
+
+
+@torch.no_grad()
+def ball_query(
+    centers: Float[Tensor, "batch center 3"], points: Float[Tensor, "batch point 3"], radius: float, neighbours: int
+) -> Int64[Tensor, "batch center neighbour"]:
+    """Indices of the `neighbours` points nearest to each centre within a radius, filled up by the nearest one.
+
+    The nearest point is included at any distance.
+    """
+    apart = torch.cdist(centers, points, compute_mode="donot_use_mm_for_euclid_dist")
+    near, index = apart.topk(min(neighbours, points.shape[1]), largest=False)
+    return torch.where(near <= radius, index, index[..., :1])
+
+
+def rows_at(
+    values: Float[Tensor, "batch point feature"], index: Int64[Tensor, "batch *at"]
+) -> Float[Tensor, "batch *at feature"]:
+    """Gathers rows of a batch of tables by index."""
+    batch, count, width = values.shape
+    first = torch.arange(batch, device=index.device) * count
+    flat = (index.flatten(1) + first[:, None]).flatten()
+    return values.reshape(-1, width).index_select(0, flat).reshape(*index.shape, width)
 
 
 class PointNeXt(nn.Module):
@@ -83,9 +146,9 @@ class PointNeXt(nn.Module):
         stages = []
         for stage, (stride, count, most) in enumerate(zip(strides, blocks, neighbours)):
             narrow, near = width << stage, radius * radius_scaling**stage
-            parts: list[nn.Module] = [SetAbstraction(narrow, 2 * narrow, stride, near, most, normalized)]
+            parts: list[nn.Module] = [_SetAbstraction(narrow, 2 * narrow, stride, near, most, normalized)]
             wider = near * radius_scaling
-            parts += [InvResMLP(2 * narrow, wider, most, normalized, expansion) for _ in range(count)]
+            parts += [_InvResMLP(2 * narrow, wider, most, normalized, expansion) for _ in range(count)]
             stages.append(_Stage(parts))
         self.stages = nn.ModuleList(stages)
         self.whole = nn.ModuleList([_Layer(self.size + 3, self.size), _Layer(self.size, self.size)])
@@ -110,7 +173,7 @@ class PointNeXt(nn.Module):
         return f.max(1).values
 
 
-class SetAbstraction(nn.Module):
+class _SetAbstraction(nn.Module):
     """Keeps the first points; each adds the maximum of an MLP over its ball to its feature."""
 
     def __init__(self, width: int, wide: int, stride: int, radius: float, neighbours: int, normalized: bool):
@@ -130,7 +193,7 @@ class SetAbstraction(nn.Module):
         return p[:, :count], F.relu(inside.max(2).values + self.skip(f[:, :count]))
 
 
-class InvResMLP(nn.Module):
+class _InvResMLP(nn.Module):
     """A residual block: the maximum over each point's ball, then a wide MLP, added to the point's feature."""
 
     def __init__(self, width: int, radius: float, neighbours: int, normalized: bool, expansion: int):
@@ -214,3 +277,45 @@ def load_object_encoder(path: str | Path) -> PointNeXt:
     Raises WearcapError when the checkpoint is missing, damaged or another network's.
     """
     return load_network(path, PointNeXt, "object_encoder", part="net.encoder").requires_grad_(False)
+
+
+def load_openpoints(path: str | Path, normalized: bool = True) -> PointNeXt:
+    """PointNeXt-S with the user's own weights: a `.pth` or `.safetensors` file that OpenPoints' training of its
+    `cfgs/modelnet40ply2048/pointnext-s.yaml` wrote (ECHO says PointNeXt; which one is our reading), frozen.
+
+    With C=64 the feature has 1024 numbers, with C=32 it has 512. Its classification head is left out. ModelNet40's objects have y up: ours are rotated to that. `normalized`: positions in a
+    ball were divided by its radius in training, as published; false for a config without `normalize_dp: True`, to which
+    the ModelNet40 file's `normalize_xyz` means nothing in newer OpenPoints. Raises WearcapError for a file of another
+    format or with code in it, and for weights of another network.
+    """
+    tensors = {_own_name(name): value for name, value in read_weights(path).items() if not name.startswith(_HEAD)}
+    stem = tensors.get("stem.weight")
+    if stem is None or stem.ndim < 2 or stem.shape[1] != 3:
+        given = "a tensor of other axes" if stem is not None else "nothing"
+        raise WearcapError(
+            f"these are not the weights of PointNeXt-S: encoder.encoder.0.0.convs.0.0.weight is {given}",
+            where=path,
+            expected="a checkpoint of OpenPoints' cfgs/modelnet40ply2048/pointnext-s.yaml (in_channels: 3)",
+        )
+    encoder = PointNeXt(width=len(stem), normalized=normalized, y_up=True)
+    # The weights of a pointwise convolution are a matrix.
+    pointwise = {name: value.ndim > 2 and value.shape[2:].numel() == 1 for name, value in tensors.items()}
+    own = {name: value.flatten(1) if pointwise[name] else value for name, value in tensors.items()}
+    load_weights(encoder, own, name="PointNeXt-S (ModelNet40)", where=path)
+    return encoder.requires_grad_(False).eval()
+
+
+def _own_name(name: str) -> str:
+    """Our name of an OpenPoints tensor; unknown names stay."""
+    found = _NAME.fullmatch(name)
+    if found is None:
+        return name
+    stage, part, number, layer, tensor = found.group("stage", "part", "number", "layer", "tensor")
+    if part == "skipconv":
+        return f"stages.{int(stage) - 1}.0.skip.{tensor}"
+    if int(stage) == 0:
+        return f"stem.{tensor}"
+    place = (
+        f"whole.{number}" if int(stage) == _LAST else f"stages.{int(stage) - 1}.0.{('first', 'second')[number == '1']}"
+    )
+    return f"{place}.{_LAYER[layer or '0']}.{tensor}"

@@ -34,7 +34,7 @@ class VoxelAutoencoder(nn.Module):
         """The grid's settings (see `VoxelGrid`), and the code's `size`. Raises WearcapError for other layers."""
         super().__init__()
         self.grid, self.size = VoxelGrid(cells, size_m, below_m, clip_m), size
-        kinds = {"convolutions": ConvolutionLayers, "sparse": SparseLayers}
+        kinds = {"convolutions": _ConvolutionLayers, "sparse": _SparseLayers}
         if layers not in kinds:
             raise WearcapError(f"no layers {layers!r}", expected=f"one of {', '.join(kinds)}")
         self.layers = kinds[layers](cells, size)
@@ -62,7 +62,7 @@ class VoxelAutoencoder(nn.Module):
         return 1 - grids / self.grid.clip_m
 
 
-class ConvolutionLayers(nn.Module):
+class _ConvolutionLayers(nn.Module):
     """Four convolutions and average pooling; four transposed convolutions back; plain squared error (thesis §6.4).
 
     Without padding 10 cells become 8, 6, 4 and 2 per side; the last are averaged, and decoding starts from as many.
@@ -96,7 +96,7 @@ class ConvolutionLayers(nn.Module):
         """Nothing to do: these weights are initialised at random."""
 
 
-class SparseLayers(nn.Module):
+class _SparseLayers(nn.Module):
     """A linear code, decoded to a sparse grid in a few learned steps (LISTA, Gregor & LeCun 2010).
 
     A few tens of the 1000 cells contain a point; that many can be recovered from 128 linear measurements by thresholded

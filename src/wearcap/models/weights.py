@@ -40,23 +40,9 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
             return load_file(path)
         except (OSError, safetensors.SafetensorError) as error:
             raise WearcapError(f"not a readable safetensors file ({error})", where=path) from error
-    content = _load_pickle(path)
-    for key in _NESTED:
-        if isinstance(content, Mapping) and isinstance(content.get(key), Mapping):
-            content = content[key]
-    if not isinstance(content, Mapping) or not all(isinstance(value, Tensor) for value in content.values()):
-        raise WearcapError(
-            "the file does not hold a network's named tensors",
-            where=path,
-            expected="a state_dict, alone or under the key state_dict",
-        )
-    return {_without_parallel(str(name)): value for name, value in content.items()}
-
-
-def _load_pickle(path: Path) -> object:
     try:
         with torch.serialization.safe_globals(_NUMBERS):
-            return torch.load(path, map_location="cpu", weights_only=True)
+            content: object = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         raise WearcapError(
             "the file is damaged, or holds more than tensors and was not opened, since loading it would run its code",
@@ -66,10 +52,18 @@ def _load_pickle(path: Path) -> object:
         ) from error
     except Exception as error:  # torch.load may raise anything on bytes of another format
         raise WearcapError("not a readable PyTorch file", where=path) from error
-
-
-def _without_parallel(name: str) -> str:
-    return ".".join(part for part in name.split(".") if part != "module")
+    for key in _NESTED:
+        if isinstance(content, Mapping) and isinstance(content.get(key), Mapping):
+            content = content[key]
+    if not isinstance(content, Mapping) or not all(isinstance(value, Tensor) for value in content.values()):
+        raise WearcapError(
+            "the file does not hold a network's named tensors",
+            where=path,
+            expected="a state_dict, alone or under the key state_dict",
+        )
+    return {
+        ".".join(part for part in str(name).split(".") if part != "module"): value for name, value in content.items()
+    }
 
 
 def load_weights(network: nn.Module, tensors: Mapping[str, Tensor], *, name: str, where: str | Path) -> None:

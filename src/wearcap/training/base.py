@@ -1,45 +1,67 @@
-"""Base classes of the LightningModules: seeded steps, optimiser from the config, logged losses."""
+"""The base of the LightningModules: seeded steps, optimiser from the config, logged losses."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import lightning
 import torch
 from torch import Tensor
 
-
-class SeededSteps(lightning.LightningModule):
-    """Makes a step's randomness (dropout, augmentation) a function of seed and step, so that resumed runs repeat it."""
-
-    seed: int
-
-    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
-        torch.manual_seed((self.seed + 1) * 1_000_003 + self.global_step * 64 + self.global_rank)
+OptimizerOf = Callable[..., torch.optim.Optimizer]
+SchedulerOf = Callable[..., torch.optim.lr_scheduler.LRScheduler] | None
 
 
-class GivenOptimizer(lightning.LightningModule):
-    """Optimises `net` with the constructor's optimiser and, if there is one, scheduler, which advances every step."""
+class Training(lightning.LightningModule):
+    """Optimises the "loss" that `measure` returns, and logs all of its values, in training and validation.
 
-    _optimizer: Callable[..., torch.optim.Optimizer]
-    _scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None
+    By default the loss is the sum of `terms` times `loss_weights`; a term without a weight is only logged.
+    """
 
-    def configure_optimizers(self):
-        optimizer = self._optimizer(self.get_submodule("net").parameters())
-        if self._scheduler is None:
-            return optimizer
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": self._scheduler(optimizer), "interval": "step"}}
+    parts: ClassVar[tuple[str, ...]] = ()
+    """Attributes that are constructor arguments of the system's pipeline."""
 
+    def __init__(
+        self,
+        optimizer: OptimizerOf,
+        scheduler: SchedulerOf = None,
+        loss_weights: dict[str, float] | None = None,
+        seed: int = 0,
+    ):
+        """`optimizer` is called with the trained parameters, `scheduler` with the optimiser; it advances every step."""
+        super().__init__()
+        self.loss_weights, self.seed = dict(loss_weights or {}), seed
+        self._optimizer, self._scheduler = optimizer, scheduler
 
-class Measured(GivenOptimizer):
-    """Trains on the "loss" that `measure` returns, and logs all of its values, in training and validation."""
-
-    def measure(self, batch: tuple[Tensor, ...]) -> dict[str, Tensor]:
-        """The "loss" of a batch and further values to log."""
-        raise NotImplementedError
+    def set_statistics(self, dataset: Any) -> None:
+        """Compute normalisation from a training split; a resumed run loads it with the weights."""
 
     def pipeline_parts(self) -> dict[str, Any]:
         """Constructor arguments of the pipeline that belong to the trained model."""
+        return {name: getattr(self, name) for name in self.parts}
+
+    def terms(self, batch: Any) -> dict[str, Tensor]:
+        """Every loss term of a batch, unweighted."""
         raise NotImplementedError
+
+    def measure(self, batch: Any) -> dict[str, Tensor]:
+        """The "loss" of a batch and further values to log."""
+        terms = self.terms(batch)
+        weighed = [self.loss_weights.get(name, 0.0) * term for name, term in terms.items()]
+        return {"loss": torch.stack(weighed).sum(), **terms}
+
+    def train(self, mode: bool = True) -> "Training":
+        """Set the training mode; frozen encoders stay in evaluation mode."""
+        super().train(mode)
+        for part in self.children():
+            trained = [parameter.requires_grad for parameter in part.parameters()]
+            if trained and not any(trained):
+                part.eval()
+        return self
+
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        """Make the step's randomness (dropout, augmentation) a function of seed and step, so that resumed runs repeat
+        it."""
+        torch.manual_seed((self.seed + 1) * 1_000_003 + self.global_step * 64 + self.global_rank)
 
     def _step(self, batch: tuple[Tensor, ...], stage: str) -> Tensor:
         measured = self.measure(batch)
@@ -59,17 +81,8 @@ class Measured(GivenOptimizer):
     def validation_step(self, batch: tuple[Tensor, ...], batch_idx: int) -> None:
         self._step(batch, "val")
 
-
-class WeighedTerms(Measured):
-    """The loss is the sum of `terms` times `loss_weights`; a term without a weight is only logged."""
-
-    loss_weights: dict[str, float]
-
-    def terms(self, batch) -> dict[str, Tensor]:
-        """Every loss term of a batch, unweighted."""
-        raise NotImplementedError
-
-    def measure(self, batch: tuple[Tensor, ...]) -> dict[str, Tensor]:
-        terms = self.terms(batch)
-        weighed = [self.loss_weights.get(name, 0.0) * term for name, term in terms.items()]
-        return {"loss": torch.stack(weighed).sum(), **terms}
+    def configure_optimizers(self):
+        optimizer = self._optimizer([each for each in self.parameters() if each.requires_grad])
+        if self._scheduler is None:
+            return optimizer
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": self._scheduler(optimizer), "interval": "step"}}

@@ -12,7 +12,7 @@ from wearcap.metrics.scores import score
 from wearcap.metrics.table import aggregate
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.runtime.system import System
-from wearcap.training.base import Measured
+from wearcap.training.base import Training
 
 
 def is_due(trainer: lightning.Trainer, every_n_epochs: int) -> bool:
@@ -42,7 +42,7 @@ class CaptureValidation(Callback):
         self.recordings, self.max_seconds, self.every_n_epochs = recordings, max_seconds, every_n_epochs
         self.draw = draw
 
-    def on_validation_epoch_end(self, trainer: lightning.Trainer, pl_module: Measured) -> None:
+    def on_validation_epoch_end(self, trainer: lightning.Trainer, pl_module: Training) -> None:
         if not is_due(trainer, self.every_n_epochs):
             return
         pipeline = self.pipeline(**pl_module.pipeline_parts(), device=str(pl_module.device))

@@ -25,12 +25,12 @@ class RunCSVLogger(CSVLogger):
     @property
     @rank_zero_experiment
     def experiment(self) -> ExperimentWriter:
-        if not isinstance(self._experiment, MetricsFile):
-            self._experiment = MetricsFile(self.log_dir, self._resumed)
+        if not isinstance(self._experiment, _MetricsFile):
+            self._experiment = _MetricsFile(self.log_dir, self._resumed)
         return self._experiment
 
 
-class MetricsFile(ExperimentWriter):
+class _MetricsFile(ExperimentWriter):
     """Appends rows to `metrics.csv`; whatever else has to change in it is written as a new file and renamed."""
 
     def __init__(self, log_dir: str, resumed: bool):

@@ -2,22 +2,21 @@
 
 from collections.abc import Callable
 
-import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from wearcap.data.motion_features import MotionFeatures, Movement
-from wearcap.data.motion_windows import MovementDataset
-from wearcap.data.statistics import collate
+from wearcap.data.statistics import drawn_batches, standardize
+from wearcap.data.windows import Windows
 from wearcap.metrics.position import mpjpe_cm
 from wearcap.models.motion_autoencoder import MotionAutoencoder
-from wearcap.training.base import Measured
+from wearcap.training.base import OptimizerOf, SchedulerOf, Training
 
 MIN_SCALE = 0.02
 """Smallest standard deviation that features are divided by: those that hardly vary would become mostly noise."""
 
 
-class MotionEncoding(Measured):
+class MotionEncoding(Training):
     """Reconstruction of windows of true motion; the loss is the smooth L1 of normalised features."""
 
     def __init__(
@@ -25,21 +24,16 @@ class MotionEncoding(Measured):
         net: Callable[..., MotionAutoencoder],
         features: MotionFeatures,
         window: int,
-        optimizer: Callable[..., torch.optim.Optimizer],
-        scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
+        optimizer: OptimizerOf,
+        scheduler: SchedulerOf = None,
     ):
-        super().__init__()
+        super().__init__(optimizer, scheduler)
         self.features, self.window = features, window
         self.net = net(size=features.size, frames=window // features.every)
-        self._optimizer, self._scheduler = optimizer, scheduler
 
-    def set_statistics(self, dataset: MovementDataset, limit: int = 1000) -> None:
-        """Compute normalisation from a training split; a resumed run loads it with the weights."""
-        random = torch.Generator().manual_seed(0)
-        drawn = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
-        features = self.features.encode(collate([dataset[item] for item in zip(drawn, range(limit))]))
-        mean, scale = features.mean((0, 1)), features.std((0, 1)).clamp_min(MIN_SCALE)
-        self.net.normalizer.set(mean, scale)
+    def set_statistics(self, dataset: Windows, limit: int = 1000) -> None:
+        (batch,) = drawn_batches(dataset, limit)
+        standardize(self.net.normalizer, self.features.encode(batch), MIN_SCALE)
 
     def measure(self, batch: Movement) -> dict[str, Tensor]:
         """The loss, and the mean error of reconstructed joints (cm)."""

@@ -1,38 +1,96 @@
-"""One training run: its folder, resuming, and the record of config, commit and library versions."""
+"""One training run: its folder, its checkpoints, resuming, and the record of config, commit and library versions."""
 
 import ctypes
 import importlib.metadata
+import io
 import json
 import platform
 import subprocess
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import lightning
 import torch
+from lightning.fabric.plugins.io.checkpoint_io import CheckpointIO
+from lightning.pytorch import Callback
+from torch import Tensor
 
-from wearcap.data.datamodule import SeededWindows
+import wearcap
+from wearcap.data.datamodule import WindowsModule
 from wearcap.errors import WearcapError
-from wearcap.files import write_text
-from wearcap.training.checkpoint import require_resumable
+from wearcap.files import atomic_path, write_text
+from wearcap.models.build import check_weights
+from wearcap.models.checkpoint import read_run_file
+from wearcap.training.base import Training
+
+TRAINING_STATE = ("state_dict", "optimizer_states", "lr_schedulers", "loops", "epoch", "global_step")
+"""Entries of a checkpoint that resuming a training requires."""
 
 
-@runtime_checkable
-class System(Protocol):
-    """A LightningModule that normalises its inputs by statistics of its training windows."""
+class ConfigInCheckpoint(Callback):
+    """Adds the composed config and the version to every checkpoint."""
 
-    def set_statistics(self, dataset: Any) -> None: ...
+    def __init__(self, config: dict[str, Any]):
+        self.config = config
 
-    def state_dict(self) -> dict[str, Any]: ...
+    def on_save_checkpoint(self, trainer, pl_module, checkpoint: dict[str, Any]) -> None:
+        checkpoint["wearcap"] = {"version": wearcap.__version__, "config": json.dumps(self.config)}
 
 
-def fit(system: System, data: SeededWindows, trainer: lightning.Trainer, resume: Path | None = None) -> None:
+class RunCheckpointIO(CheckpointIO):
+    """Writes checkpoints atomically (synced beside the target, then renamed): a killed run leaves the old or new file.
+
+    Lightning's own writer copies over the old file when the folder of temporary files is on another file system.
+    """
+
+    def __init__(self, folder: str | Path):
+        """`folder`: of the run; checkpoints elsewhere, which a file to resume from may name, are never removed."""
+        self.folder = Path(folder).resolve()
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
+        """Write a checkpoint. Raises WearcapError when the disk is full or the folder cannot be written."""
+        content = io.BytesIO()  # PyTorch's own writing to a file does not report why it failed
+        torch.save(checkpoint, content)
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(content.getbuffer())
+
+    def load_checkpoint(
+        self, path: str | Path, map_location: Any = None, weights_only: bool | None = None
+    ) -> dict[str, Any]:
+        """Read a checkpoint onto the CPU. Raises WearcapError as `read_run_file` does."""
+        return read_run_file(path)
+
+    def remove_checkpoint(self, path: str | Path) -> None:
+        """Remove a checkpoint of this run."""
+        path = Path(path).resolve()
+        if self.folder in path.parents and path.suffix == ".ckpt":
+            path.unlink(missing_ok=True)
+
+
+def fit(system: Training, data: WindowsModule, trainer: lightning.Trainer, resume: Path | None = None) -> None:
     """Train from scratch or resume from a checkpoint; a killed run resumes without repeating or skipping a step."""
     if resume is None:
         system.set_statistics(data.dataset("train"))
     else:
         require_resumable(resume, system.state_dict())
     trainer.fit(system, datamodule=data, ckpt_path=resume, weights_only=True)
+
+
+def require_resumable(path: str | Path, own: Mapping[str, Tensor]) -> None:
+    """Raise WearcapError unless a file is a training run's checkpoint whose weights fit a model's own.
+
+    Its config is not read: the command line defines the training.
+    """
+    saved = read_run_file(path)
+    missing = [key for key in TRAINING_STATE if key not in saved]
+    if missing or not isinstance(saved["state_dict"], dict):
+        raise WearcapError(
+            f"a checkpoint without {missing[0] if missing else 'weights'}",
+            where=path,
+            expected="a run's .ckpt file, as `wearcap train` writes it",
+        )
+    check_weights(own, saved["state_dict"], path)
 
 
 def keep_freed_memory() -> None:
@@ -70,9 +128,15 @@ def resume_path(resume: str | None, own: Path, runs: Path) -> Path | None:
 
 def record_run(folder: Path, config_yaml: str) -> None:
     """Write the config, the git commit and the library versions into a run's folder."""
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=40"]
+    try:
+        here = Path(__file__).parent
+        commit = subprocess.run(command, cwd=here, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        commit = "not a git checkout"
     names = ("wearcap", "torch", "lightning", "numpy", "hydra-core", "numba", "anny")
     record = {
-        "commit": _git_commit(),
+        "commit": commit,
         "python": platform.python_version(),
         "machine": f"{platform.machine()}, {torch.get_num_threads()} threads, "
         + (torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"),
@@ -80,12 +144,3 @@ def record_run(folder: Path, config_yaml: str) -> None:
     }
     write_text(folder / "config.yaml", config_yaml)
     write_text(folder / "run.json", json.dumps(record, indent=1) + "\n")
-
-
-def _git_commit() -> str:
-    here = Path(__file__).parent
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=40"]
-    try:
-        return subprocess.run(command, cwd=here, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return "not a git checkout"

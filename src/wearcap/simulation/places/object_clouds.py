@@ -9,7 +9,7 @@ from jaxtyping import Float, Int64
 from rich.progress import track
 from torch import Tensor
 
-from wearcap.data.surface_points import POINTS, object_cloud
+from wearcap.data.objects import POINTS, object_cloud
 from wearcap.errors import WearcapError, nearest
 from wearcap.simulation.places.interactive_flat import build_interactive_flat
 from wearcap.simulation.places.movables import MOVABLES, make_movable

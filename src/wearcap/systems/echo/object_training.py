@@ -1,36 +1,136 @@
-"""Training of the object encoder: classification, size regression and instance discrimination from its feature."""
+"""Training of the object encoder on augmented views of generated objects: category, size, and identity from its feature."""
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
+import safetensors
 import torch
 from jaxtyping import Float, Int64
+from safetensors.torch import load_file, save
 from torch import Tensor
 from torch.nn import functional as F
+from torch.utils.data import Dataset
 
+from wearcap.data.objects import POINTS
+from wearcap.data.windows import Source
+from wearcap.files import atomic_path
+from wearcap.geometry import rotation
 from wearcap.models.point_encoder import ObjectNetwork, bounds, to_unit_sphere
-from wearcap.systems.echo.object_clouds import ObjectCloudDataset, ObjectViews
-from wearcap.training.base import WeighedTerms
+from wearcap.training.base import OptimizerOf, SchedulerOf, Training
 
+_KEY = "made_of"
 _TEMPERATURE = 0.1
 
 
-class ObjectEncoding(WeighedTerms):
-    """Trains the feature to predict the category and the half extents, and to match two views of the same object."""
+class ObjectViews(NamedTuple):
+    """Augmented views of one object's point cloud (m), or a batch of objects (a leading "batch" axis)."""
+
+    points: Float[Tensor, "*batch view point 3"]
+    label: Int64[Tensor, "*batch"]
+
+
+@dataclass(frozen=True)
+class CloudAugmentation:
+    """Augmentation of a cloud: anisotropic scaling along the object's axes, jitter, rotation, and dropped points."""
+
+    stretch: float = 0.1
+    """Largest deviation of each axis's scale factor from 1."""
+    jitter_m: float = 0.002
+    """Standard deviation of the noise on each coordinate (m)."""
+    least_kept: float = 0.5
+    """Smallest share of points that are kept; dropped points are replaced by duplicates of kept ones."""
+    turned: float = 0.5
+    """Share of views with a uniformly random rotation; the others are rotated about the vertical axis."""
+
+    def __call__(self, points: Float[Tensor, "point 3"], random: torch.Generator) -> Float[Tensor, "point 3"]:
+        """An augmented cloud (m); all randomness comes from the generator."""
+        points = points * (1 + self.stretch * (2 * torch.rand(3, generator=random) - 1))
+        points = points + self.jitter_m * torch.randn(points.shape, generator=random)
+        any_way, angle, share = torch.rand(3, generator=random).tolist()
+        about_up = rotation.about_axis("z", torch.tensor(2 * torch.pi * angle))
+        points = points @ (random_rotation(random) if any_way < self.turned else about_up).T
+        kept = max(1, int((self.least_kept + (1 - self.least_kept) * share) * len(points)))
+        order = torch.randperm(len(points), generator=random)
+        repeats = torch.randint(kept, (len(points) - kept,), generator=random)
+        return points[order[torch.cat([torch.arange(kept), repeats])]]
+
+
+def random_rotation(random: torch.Generator) -> Float[Tensor, "3 3"]:
+    """A uniformly random rotation: Q of a Gaussian matrix's QR decomposition, made right-handed."""
+    q, r = torch.linalg.qr(torch.randn(3, 3, generator=random))
+    R = q * r.diagonal().sign()
+    return R * R.det().sign()
+
+
+class ObjectClouds(Dataset):
+    """Two views of each generated object: both augmented in training, else one original and one augmented.
+
+    An item's index is (object, seed), or the object alone.
+    """
 
     def __init__(
         self,
-        net: ObjectNetwork,
-        loss_weights: dict[str, float],
-        optimizer: Callable[..., torch.optim.Optimizer],
-        scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
+        sources: Sequence[Source],
+        split: str,
+        augmented: bool = False,
+        *,
+        root: str,
+        generate: Callable[[str, Sequence[str], int, int], tuple[Tensor, Tensor]],
+        classes: Sequence[str],
+        per_class: dict[str, int],
+        points: int = POINTS,
+        augmentation: CloudAugmentation | None = None,
+    ):
+        """`per_class` objects per class for each split ("train", "val"), cached in `root`; there are no `sources`.
+
+        `generate` creates clouds that are missing, or were made with other settings, from a split, classes, a number of
+        objects per class and a number of points: clouds "object point 3" (m) and class indices "object".
+        """
+        count, path = per_class[split], Path(root) / f"{split}.safetensors"
+        made_of = json.dumps([list(classes), count, points])
+        if _made_of(path) != made_of:
+            clouds, labels = generate(split, tuple(classes), count, points)
+            with atomic_path(path) as temporary:
+                temporary.write_bytes(save({"clouds": clouds, "labels": labels}, {_KEY: made_of}))
+        tensors = load_file(path)
+        self.clouds: Float[Tensor, "object point 3"] = tensors["clouds"]
+        self.labels: Int64[Tensor, "object"] = tensors["labels"]
+        self.augmentation, self.augmented = augmentation or CloudAugmentation(), augmented
+        self.weights = torch.ones(len(self.labels))
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def __getitem__(self, item: tuple[int, int] | int) -> ObjectViews:
+        index, seed = item if isinstance(item, tuple) else (item, item)
+        random, cloud = torch.Generator().manual_seed(seed), self.clouds[index]
+        first = self.augmentation(cloud, random) if self.augmented else cloud
+        return ObjectViews(torch.stack([first, self.augmentation(cloud, random)]), self.labels[index])
+
+
+def _made_of(path: Path) -> str | None:
+    try:
+        with safetensors.safe_open(str(path), framework="pt") as file:
+            return (file.metadata() or {}).get(_KEY)
+    except (safetensors.SafetensorError, OSError):
+        return None
+
+
+class ObjectEncoding(Training):
+    """Trains the feature to predict the category and the half extents, and to match two views of the same object.
+
+    Each cloud is normalised by itself, and batch norm keeps its own statistics: none are set before.
+    """
+
+    def __init__(
+        self, net: ObjectNetwork, loss_weights: dict[str, float], optimizer: OptimizerOf, scheduler: SchedulerOf = None
     ):
         """`loss_weights` of the terms "category", "extents" and "instance"."""
-        super().__init__()
-        self.net, self.loss_weights = net, loss_weights
-        self._optimizer, self._scheduler = optimizer, scheduler
-
-    def set_statistics(self, dataset: ObjectCloudDataset) -> None:
-        """Nothing to set: each cloud is normalised by itself, and batch norm keeps its own statistics."""
+        super().__init__(optimizer, scheduler, loss_weights)
+        self.net = net
 
     def terms(self, batch: ObjectViews) -> dict[str, Tensor]:
         """Loss terms, and the classification accuracy on each view ("accuracy_1", "accuracy_2")."""

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wearcap.body.skeleton import FOOT_PATCHES, MIRROR
-from wearcap.data.surface_points import object_cloud
+from wearcap.data.objects import object_cloud
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid

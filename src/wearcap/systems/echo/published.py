@@ -10,6 +10,7 @@ from torch import Tensor
 from wearcap.body.contact_points import BODY_POINTS
 from wearcap.data.features import body_size
 from wearcap.data.statistics import MIN_SCALE
+from wearcap.data.windows import Windows
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
@@ -20,7 +21,7 @@ from wearcap.systems.echo.objects import ObjectReader
 from wearcap.systems.echo.observations import BatchItem, Scenario, batch_item_of
 from wearcap.systems.echo.pipeline import motion_of, object_tracks
 from wearcap.systems.echo.queue import Outputs
-from wearcap.systems.echo.training_windows import EchoDataset, EchoTrack
+from wearcap.systems.echo.training_windows import EchoContent, EchoTrack
 from wearcap.tracking.head_path import head_path
 
 NO_CLASS = "none"
@@ -62,9 +63,10 @@ class NearestEcho:
     """Ground truth of all training frames."""
 
     @classmethod
-    def fit(cls, dataset: EchoDataset, window: int = 30, stride: int = 3, sample: int = 3) -> "NearestEcho":
+    def fit(cls, dataset: Windows, window: int = 30, stride: int = 3, sample: int = 3) -> "NearestEcho":
         """Compute descriptors of a training split's windows."""
-        features = _own(dataset.features)
+        assert isinstance(dataset.content, EchoContent)
+        features, encoder = _own(dataset.content.features), dataset.content.encoder
         channels, outputs, starts, labels, first = [], [], [], [], 0
         for number in range(len(dataset.recordings)):
             track = dataset.track(number)
@@ -84,7 +86,7 @@ class NearestEcho:
         for name in sorted(set(labels)):
             mine = torch.tensor([start for start, label in zip(starts, labels) if label == name])
             descriptor[name], frames[name] = whole[mine[:, None] + offsets].flatten(1), mine
-        return cls(features, dataset.encoder, window, sample, mean, scale, descriptor, frames, torch.cat(outputs))
+        return cls(features, encoder, window, sample, mean, scale, descriptor, frames, torch.cat(outputs))
 
     def capture_scenarios(self, scenarios: Sequence[Scenario], seeds: Sequence[int]) -> list[Motion]:
         """One motion per scenario; deterministic, seeds are ignored."""
@@ -150,9 +152,10 @@ class RigidWrist:
     """Mean orientation of each class in yaw-aligned head axes."""
 
     @classmethod
-    def fit(cls, dataset: EchoDataset) -> "RigidWrist":
+    def fit(cls, dataset: Windows) -> "RigidWrist":
         """Compute the means over a training split."""
-        features = _own(dataset.features)
+        assert isinstance(dataset.content, EchoContent)
+        features, encoder = _own(dataset.content.features), dataset.content.encoder
         rows: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {}
         for number in range(len(dataset.recordings)):
             track = dataset.track(number)
@@ -175,7 +178,7 @@ class RigidWrist:
             raise WearcapError(
                 "these training recordings have no contact with objects", expected="recordings with objects in hands"
             )
-        return cls(features, dataset.encoder, place, offset, turn)
+        return cls(features, encoder, place, offset, turn)
 
     def attached(self, motion: Motion, item: BatchItem) -> Motion:
         """The motion with its objects attached to wrists."""

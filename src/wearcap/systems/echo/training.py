@@ -1,7 +1,6 @@
 """Training of ECHO: tri-variate diffusion of human, object and contacts (ECHO §3.2, eq. 5–7, 12, 13)."""
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -10,7 +9,8 @@ from torch import Tensor
 from wearcap.body.contact_points import BODY_POINTS
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
-from wearcap.data.statistics import MIN_SCALE, collate
+from wearcap.data.statistics import MIN_SCALE, drawn_batches, standardize
+from wearcap.data.windows import Windows
 from wearcap.diffusion.levels import LevelMix
 from wearcap.diffusion.process import add_noise
 from wearcap.diffusion.schedule import Schedule
@@ -20,12 +20,12 @@ from wearcap.models.point_encoder import PointNeXt
 from wearcap.systems.echo.features import CONTACTS, OBJECT_SIZE, Body, EchoFeatures
 from wearcap.systems.echo.model import EchoDenoiser
 from wearcap.systems.echo.pipeline import Echo
-from wearcap.systems.echo.training_windows import EchoDataset, EchoWindow
+from wearcap.systems.echo.training_windows import EchoContent, EchoWindow
 from wearcap.training import losses
-from wearcap.training.base import SeededSteps, WeighedTerms
+from wearcap.training.base import OptimizerOf, SchedulerOf, Training
 
 
-class EchoDiffusion(SeededSteps, WeighedTerms):
+class EchoDiffusion(Training):
     """x0-prediction with an independent noise level for every frame and modality.
 
     Loss terms, weighted by `loss_weights`: "human", "object" and "contact" are mean squares in normalised space (the
@@ -37,6 +37,7 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
 
     system = Echo
     """The system that captures with the network."""
+    parts = ("net", "features", "schedule", "skeleton", "encoder", "contacts")
 
     def __init__(
         self,
@@ -46,15 +47,15 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
         skeleton: Skeleton,
         loss_weights: dict[str, float],
         levels: LevelMix,
-        optimizer: Callable[..., torch.optim.Optimizer],
-        scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
+        optimizer: OptimizerOf,
+        scheduler: SchedulerOf = None,
         encoder: PointNeXt | None = None,
         contacts: bool = True,
         seed: int = 0,
     ):
         """`encoder` (frozen) computes the objects' features. `contacts` False leaves that modality out, as in ECHO's
         ablation."""
-        super().__init__()
+        super().__init__(optimizer, scheduler, loss_weights, seed)
         self.net = net(
             human_size=features.human_size,
             object_size=OBJECT_SIZE,
@@ -64,21 +65,18 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
         )
         self.encoder = None if encoder is None else encoder.requires_grad_(False).eval()
         self.features, self.schedule, self.skeleton, self.mix = features, schedule, skeleton, levels
-        self.loss_weights, self.contacts, self.seed = dict(loss_weights), contacts, seed
-        self._optimizer, self._scheduler = optimizer, scheduler
+        self.contacts = contacts
         self._feet = skeleton.indices("left_ankle", "left_toe", "right_ankle", "right_toe")
 
-    def set_statistics(self, dataset: EchoDataset, limit: int = 1500) -> None:
-        """Compute normalisation from a training split; a resumed run loads it with the weights."""
-        if dataset.features != self.features:
+    def set_statistics(self, dataset: Windows, limit: int = 1500) -> None:
+        content = dataset.content
+        assert isinstance(content, EchoContent)
+        if content.features != self.features:
             raise WearcapError(
                 "windows of other features than the model's", expected="equal data.features and model.features"
             )
-        random = torch.Generator().manual_seed(0)
-        drawn = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
         rows: dict[str, list[Tensor]] = {"human": [], "object": [], "condition": []}
-        for first in range(0, limit, 100):
-            batch = collate([dataset[item] for item in zip(drawn[first : first + 100], range(first, first + 100))])
+        for batch in drawn_batches(dataset, limit, 100):
             frame = self.features.canonical(batch.points)
             rows["human"].append(self.features.encode_body(batch.body, frame)[batch.valid])
             rows["object"].append(
@@ -90,9 +88,9 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
         mean, scale = (torch.cat(part) for part in zip(*ranges))
         contact = torch.zeros(CONTACTS), torch.ones(CONTACTS)
         self.net.motion_normalizer.set(torch.cat([mean, contact[0]]), torch.cat([scale, contact[1]]))
-        self.net.condition_normalizer.set(condition.mean(0), condition.std(0).clamp_min(MIN_SCALE))
-        if self.encoder is not None and dataset.encoder is not None:
-            self.encoder.load_state_dict(dataset.encoder.state_dict())
+        standardize(self.net.condition_normalizer, condition)
+        if self.encoder is not None and content.encoder is not None:
+            self.encoder.load_state_dict(content.encoder.state_dict())
 
     def _range(self, rows: Float[Tensor, "row value"]) -> tuple[Tensor, Tensor]:
         """Mean and scale per value. If outputs are re-expressed as the window advances, root and object vectors get
@@ -104,24 +102,6 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
             for part in (slice(0, 3), slice(3, 9)):
                 mean[part], scale[part] = 0.0, rows[:, part].square().mean().sqrt()
         return mean, scale
-
-    def pipeline_parts(self) -> dict[str, Any]:
-        """The arguments of an `Echo` pipeline that come from training."""
-        return {
-            "net": self.net,
-            "features": self.features,
-            "schedule": self.schedule,
-            "skeleton": self.skeleton,
-            "encoder": self.encoder,
-            "contacts": self.contacts,
-        }
-
-    def train(self, mode: bool = True) -> "EchoDiffusion":
-        """Set the mode; the frozen object encoder stays in evaluation mode."""
-        super().train(mode)
-        if self.encoder is not None:
-            self.encoder.eval()
-        return self
 
     def _levels(self, batch: EchoWindow) -> Float[Tensor, "batch time modality"]:
         """Noise levels of a batch; absent modalities are at level 1, pure noise."""
@@ -136,12 +116,10 @@ class EchoDiffusion(SeededSteps, WeighedTerms):
         human = self.features.encode_body(batch.body, frame)
         scene_object = self.features.encode_object(batch.T_world_object, frame)
         x0 = self.net.motion_normalizer(torch.cat([human, scene_object, 2 * batch.contact - 1], -1))
-        return torch.where(self._counts(batch), x0, self._blank(x0))
-
-    def _blank(self, x0: Tensor) -> Tensor:
-        """x0 for frames without an object: zeros for its pose, and no contact."""
+        # Frames without an object have zeros for its pose, and no contact.
         human, scene_object, contact = x0.split(self.net.sizes, -1)
-        return torch.cat([human, torch.zeros_like(scene_object), -torch.ones_like(contact)], -1)
+        blank = torch.cat([human, torch.zeros_like(scene_object), -torch.ones_like(contact)], -1)
+        return torch.where(self._counts(batch), x0, blank)
 
     def _counts(self, batch: EchoWindow) -> Tensor:
         """Mask of meaningful features: all with an active object, else human and foot contacts."""

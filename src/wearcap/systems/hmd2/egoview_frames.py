@@ -1,6 +1,12 @@
-"""Head camera frames labelled with the positions of the wearer's own limbs, to train our image encoder."""
+"""Head camera frames labelled with the positions of the wearer's own limbs, to train our image encoder.
+
+Batches of them are augmented: light and colours, the camera's rotation on the head, mirror images. Augmented images are
+normalised and have the encoder's size; random numbers come from torch's default generator.
+"""
 
 import hashlib
+import math
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -9,13 +15,14 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
+from torch.nn import functional as F
 from torch.utils.data import Dataset
 
-from wearcap.data.datamodule import SeededWindows
 from wearcap.data.embeddings import pictures
 from wearcap.data.windows import Source
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
+from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import interpolate
 from wearcap.recording.motion import Motion
@@ -29,6 +36,8 @@ POINTS = tuple(
 )
 """Joints and sites whose positions in the camera's frame are learned; left and right alternate."""
 HANDS = tuple(f"{side}_palm" for side in ("left", "right"))
+_SWAPPED = [index ^ 1 for index in range(len(POINTS))]
+"""Index of each point's counterpart on the other side."""
 
 
 class EgoFrame(NamedTuple):
@@ -66,11 +75,16 @@ class EgoFrames(Dataset):
     """Every `every`-th frame of the recordings of one split that have a motion and a head camera's images.
 
     Images are decoded once, into arrays in each data set's `cache`, and memory-mapped. Items are indexed by
-    (frame, seed), or by frame. Weights are set so that frames that show a hand make up `hand_share` of the draws
-    (0: their natural share).
+    (frame, seed), or by frame.
     """
 
-    def __init__(self, sources: list[Source], split: str, every: int, hand_share: float = 0.0):
+    def __init__(
+        self, sources: Sequence[Source], split: str, augmented: bool = False, *, every: int, hand_share: float = 0.0
+    ):
+        """In training, frames that show a hand make up `hand_share` of the draws (0: their natural share).
+
+        Augmentation is the training's, which works on whole batches. Raises WearcapError for a split without images.
+        """
         self._pictures, self.weights = list[UInt8[np.ndarray, "time height width 3"]](), torch.empty(0)
         points, visible, weights, intrinsics = [], [], [], []
         for source in sources:
@@ -97,7 +111,7 @@ class EgoFrames(Dataset):
         self.point_cam, self.visible, self.weights = torch.cat(points), torch.cat(visible), torch.cat(weights)
         self.intrinsics = torch.cat(intrinsics)
         shown = self.visible[:, [POINTS.index(name) for name in HANDS]].any(-1)
-        if hand_share and shown.any() and not shown.all():
+        if hand_share and split == "train" and shown.any() and not shown.all():
             own = self.weights[shown].sum() / self.weights.sum()
             self.weights = self.weights * torch.where(shown, hand_share / own, (1 - hand_share) / (1 - own))
         self._first = np.cumsum([0, *(len(frames) for frames in self._pictures)])
@@ -145,26 +159,55 @@ def decoded(camera: CameraStream, root: Path, every: int) -> UInt8[np.ndarray, "
     return _array(path)
 
 
-class EgoViewFrames(SeededWindows):
-    """Lightning data of the image encoder's training; see `EgoFrames`, and `SeededWindows` with frames for windows."""
+def relit(pictures: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch 3 height width"]:
+    """Images with random gain, shift, channel mixing and noise, drawn per image."""
+    like = pictures[:, :1, :1, :1]
+    mix = torch.eye(3, device=pictures.device) + 0.3 * torch.randn(len(pictures), 3, 3, device=pictures.device)
+    mix = mix / mix.sum(-1, keepdim=True).clamp_min(0.3)
+    pictures = (mix @ pictures.flatten(2)).unflatten(2, pictures.shape[2:])
+    gain, shift = (0.25 * torch.randn_like(like)).exp(), 0.3 * torch.randn_like(like)
+    noise = 0.15 * torch.rand_like(like) * torch.randn_like(pictures)
+    return (gain * pictures + shift + noise).clamp(-2.0, 2.4)
 
-    def __init__(
-        self,
-        sources: dict[str, dict | None],
-        every: int,
-        batch_size: int,
-        hand_share: float = 0.0,
-        steps_per_epoch: int | None = None,
-        val_windows: int | None = None,
-        workers: int = 0,
-        seed: int = 0,
-        val_sources: dict[str, dict | None] | None = None,
-    ):
-        super().__init__(sources, batch_size, steps_per_epoch, val_windows, workers, seed, val_sources)
-        self.every, self.hand_share = every, hand_share
 
-    def dataset(self, split: str) -> EgoFrames:
-        """Frames of a split; in the training split frames that show a hand are drawn with `hand_share`."""
-        if split == "train":
-            return EgoFrames(self.sources, split, self.every, self.hand_share)
-        return EgoFrames(self.val_sources, split, self.every)
+def turned(
+    pictures: Float[Tensor, "batch 3 height width"],
+    intrinsics: Float[Tensor, "batch 4"],
+    point_cam: Float[Tensor, "batch point 3"],
+    visible: Bool[Tensor, "batch point"],
+    deviation_deg: float,
+) -> tuple[Float[Tensor, "batch 3 height width"], Float[Tensor, "batch point 3"], Bool[Tensor, "batch point"]]:
+    """Images and points as seen by a slightly rotated camera, with angles of `deviation_deg` per axis.
+
+    `intrinsics` are fx, fy, cx, cy of the images (lens distortion is ignored, as rotations are small). Areas outside
+    the original image are grey, and points there are not visible.
+    """
+    height, width = pictures.shape[2:]
+    axis = math.radians(deviation_deg) * torch.randn(len(pictures), 3, device=pictures.device)
+    R = rotation.exp(axis)
+    focal, centre = intrinsics[:, None, :2], intrinsics[:, None, 2:]
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    pixels = torch.stack([x, y], -1).reshape(1, -1, 2).to(pictures)
+    ray = F.pad((pixels - centre) / focal, (0, 1), value=1.0) @ R  # by the inverse of R, row by row
+    source = ray[..., :2] / ray[..., 2:].clamp_min(0.1) * focal + centre
+    size = pictures.new_tensor([width, height])
+    grid = ((2 * source + 1) / size - 1).unflatten(1, (height, width))
+    moved = point_cam @ R.transpose(1, 2)
+    drawn = moved[..., :2] / moved[..., 2:].clamp_min(1e-3) * focal + centre
+    inside = ((drawn >= -0.5) & (drawn < size - 0.5)).all(-1) & (moved[..., 2] > 0)
+    return F.grid_sample(pictures, grid, align_corners=False), moved, visible & inside
+
+
+def half_mirrored(
+    pictures: Float[Tensor, "batch 3 height width"],
+    point_cam: Float[Tensor, "batch point 3"],
+    visible: Bool[Tensor, "batch point"],
+) -> tuple[Float[Tensor, "batch 3 height width"], Float[Tensor, "batch point 3"], Bool[Tensor, "batch point"]]:
+    """A random half of the images flipped horizontally, with left and right points exchanged."""
+    flip = torch.rand(len(pictures), device=pictures.device) < 0.5
+    across = point_cam.new_tensor([-1.0, 1.0, 1.0])
+    return (
+        torch.where(flip[:, None, None, None], pictures.flip(-1), pictures),
+        torch.where(flip[:, None, None], point_cam[:, _SWAPPED] * across, point_cam),
+        torch.where(flip[:, None], visible[:, _SWAPPED], visible),
+    )

@@ -1,7 +1,5 @@
 """Training of our small image encoder to locate the wearer's own limbs in a head camera's frame."""
 
-from collections.abc import Callable
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -10,36 +8,34 @@ from torch.nn import functional as F
 from wearcap.metrics.detection import average_precision
 from wearcap.models.image_encoder import EgoViewEncoder, letterboxed
 from wearcap.models.layers import Normalizer
-from wearcap.systems.hmd2.egoview_augmentation import half_mirrored, relit, turned
-from wearcap.systems.hmd2.egoview_frames import HANDS, POINTS, EgoFrame, EgoFrames
-from wearcap.training.base import SeededSteps
+from wearcap.systems.hmd2.egoview_frames import HANDS, POINTS, EgoFrame, EgoFrames, half_mirrored, relit, turned
+from wearcap.training.base import OptimizerOf, SchedulerOf, Training
 
 LEAST_SPREAD_M = 0.02
 
 
-class EgoView(SeededSteps):
+class EgoView(Training):
     """Linear heads on the embedding predict which of `POINTS` are in the image, and their positions.
 
     The loss is the binary cross-entropy of visibility plus the Huber loss of visible points' positions in standard
     deviations. The heads are linear so that the embedding itself represents the positions. `turn_deg`: the
-    `deviation_deg` of `egoview_augmentation.turned`.
+    `deviation_deg` of `egoview_frames.turned`.
     """
 
     def __init__(
         self,
         net: EgoViewEncoder,
-        optimizer: Callable[..., torch.optim.Optimizer],
-        scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
+        optimizer: OptimizerOf,
+        scheduler: SchedulerOf = None,
         dropout: float = 0.0,
         augment: bool = True,
         turn_deg: float = 5.0,
         seed: int = 0,
     ):
-        super().__init__()
+        super().__init__(optimizer, scheduler, seed=seed)
         self.net, self.heads = net, nn.Linear(net.size, 4 * len(POINTS))
         self.normalizer = Normalizer(3 * len(POINTS))
-        self.dropout, self.augment, self.turn_deg, self.seed = nn.Dropout(dropout), augment, turn_deg, seed
-        self._optimizer, self._scheduler = optimizer, scheduler
+        self.dropout, self.augment, self.turn_deg = nn.Dropout(dropout), augment, turn_deg
         self._validated: list[tuple[Tensor, Tensor, EgoFrame]] = []
 
     def set_statistics(self, dataset: EgoFrames) -> None:
@@ -81,21 +77,15 @@ class EgoView(SeededSteps):
         seen = F.binary_cross_entropy_with_logits(logits, visible.to(logits.dtype))
         return seen + (miss * visible).sum() / visible.sum().clamp_min(1)
 
-    def training_step(self, batch: EgoFrame, batch_idx: int) -> Tensor:
+    def measure(self, batch: EgoFrame) -> dict[str, Tensor]:
+        """The loss, in training of augmented images; in validation predictions are kept for the scores."""
         varied = self.pictures(batch), batch.point_cam, batch.visible
-        if self.augment:
+        if not self.training:
+            self._validated.append((*self(varied[0]), batch))
+        elif self.augment:
             pictures, *points = turned(varied[0], self._intrinsics(batch), *varied[1:], self.turn_deg)
             varied = half_mirrored(relit(pictures), *points)
-        loss = self.loss(*varied)
-        self.log("train/loss", loss, batch_size=len(batch.picture), prog_bar=True)
-        return loss
-
-    def validation_step(self, batch: EgoFrame, batch_idx: int) -> None:
-        pictures = self.pictures(batch)
-        self.log(
-            "val/loss", self.loss(pictures, batch.point_cam, batch.visible), batch_size=len(pictures), sync_dist=True
-        )
-        self._validated.append((*self(pictures), batch))
+        return {"loss": self.loss(*varied)}
 
     def on_validation_epoch_end(self) -> None:
         logits, places = (torch.cat([part[k] for part in self._validated]) for k in range(2))
@@ -104,12 +94,6 @@ class EgoView(SeededSteps):
         for name, value in view_scores(logits.sigmoid(), places, mean, truth.point_cam, truth.visible).items():
             self.log(f"val/{name}", value)
         self._validated.clear()
-
-    def configure_optimizers(self):
-        optimizer = self._optimizer(self.parameters())
-        if self._scheduler is None:
-            return optimizer
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": self._scheduler(optimizer), "interval": "step"}}
 
 
 def view_scores(

@@ -1,49 +1,90 @@
-"""Training of the autoencoder of the points around the body (thesis §6.2.1, §6.4)."""
+"""Training of the autoencoder of the points around the body (thesis §6.2.1, §6.4), and its windows of voxel grids."""
 
-from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
+from jaxtyping import Float, Float64
 from torch import Tensor
 
-from wearcap.data.statistics import collate
+from wearcap.data.statistics import drawn_batches
+from wearcap.data.transforms import Cut, Draws, Window
+from wearcap.data.windows import Content, Windows
+from wearcap.geometry.rigid import Rigid
 from wearcap.metrics.occupancy import distance_mae_cm, occupancy_iou, occupied_distance_mae_cm
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
-from wearcap.systems.hmd2.point_codes_windows import PlaceDataset, Places
-from wearcap.training.base import GivenOptimizer
+from wearcap.recording.store import RecordingFile, RecordingStore
+from wearcap.scene.voxels import VoxelGrid, VoxelMap, mirrored
+from wearcap.training.base import OptimizerOf, SchedulerOf, Training
 
 
-class VoxelReconstruction(GivenOptimizer):
+class Places(NamedTuple):
+    """Voxel grids (truncated distances, m) of some frames, or a batch of them (a leading "batch" axis)."""
+
+    grids: Float[Tensor, "*batch time x y z"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Surveyed:
+    """A recording's map of points, and the device's path through it."""
+
+    map: VoxelMap
+    T_world_device: Rigid
+    timestamps: Float64[Tensor, "time"]
+
+
+class PlaceContent(Content):
+    """Voxel grids of `frames` random frames of each window, of recordings that have points."""
+
+    requires = " with points that tracking found"
+    tracks_at_once = 512
+
+    def __init__(self, grid: VoxelGrid, frames: int):
+        self.grid, self.frames = grid, frames
+
+    def usable(self, store: RecordingStore, name: str) -> bool:
+        file = RecordingFile(store.path_of(name))
+        return "points.points_world" in file.keys and file.length("points.points_world") > 0
+
+    def min_frames(self, window: int, stretch: float) -> int:
+        return 1
+
+    def open(self, store: RecordingStore, name: str, every: int) -> _Surveyed:
+        file = RecordingFile(store.path_of(name))
+        cloud, head, surroundings = file.part("points"), file.part("head"), VoxelMap(self.grid)
+        surroundings.add(cloud.points_world, cloud.first_seen)
+        return _Surveyed(surroundings, head.T_world_device, head.timestamps)
+
+    def read(self, track: _Surveyed, cut: Cut, random: Draws) -> Window:
+        valid = int(cut.valid.sum())
+        chosen = cut.frames[torch.randint(valid, (self.frames,), generator=random.generator)]
+        return Window({"grids": track.map.voxelize(track.T_world_device[chosen], track.timestamps[chosen])})
+
+    def item(self, track: _Surveyed, cut: Cut, window: Window, random: Draws) -> Places:
+        return Places(mirrored(window.values["grids"]) if window.mirrored else window.values["grids"])
+
+
+class VoxelReconstruction(Training):
     """Trains an autoencoder of voxel grids by the network's own reconstruction loss."""
 
-    def __init__(
-        self,
-        net: VoxelAutoencoder,
-        optimizer: Callable[..., torch.optim.Optimizer],
-        scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
-    ):
-        super().__init__()
+    def __init__(self, net: VoxelAutoencoder, optimizer: OptimizerOf, scheduler: SchedulerOf = None):
+        super().__init__(optimizer, scheduler)
         self.net = net
-        self._optimizer, self._scheduler = optimizer, scheduler
 
-    def set_statistics(self, dataset: PlaceDataset, limit: int = 1500) -> None:
+    def set_statistics(self, dataset: Windows, limit: int = 1500) -> None:
         """Initialise the weights from a training split; a resumed run loads its own."""
-        random = torch.Generator().manual_seed(0)
-        drawn = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
-        self.net.start_from(collate([dataset[item] for item in zip(drawn, range(limit))]).grids.flatten(0, 1))
+        (batch,) = drawn_batches(dataset, limit)
+        self.net.start_from(batch.grids.flatten(0, 1))
 
-    def training_step(self, batch: Places, batch_idx: int) -> Tensor:
+    def measure(self, batch: Places) -> dict[str, Tensor]:
+        """The loss, and in validation the errors of the reconstructed grids."""
         grids = batch.grids.flatten(0, 1)
-        loss = self.net.loss(grids)
-        self.log("train/loss", loss, batch_size=len(grids), prog_bar=True)
-        return loss
-
-    def validation_step(self, batch: Places, batch_idx: int) -> None:
-        grids = batch.grids.flatten(0, 1)
+        loss = {"loss": self.net.loss(grids)}
+        if self.training:
+            return loss
         rebuilt, clip_m = self.net.decode(self.net.encode(grids)), self.net.grid.clip_m
-        scores = {
-            "val/loss": self.net.loss(grids),
-            "val/distance_cm": distance_mae_cm(rebuilt, grids),
-            "val/held_distance_cm": occupied_distance_mae_cm(rebuilt, grids, clip_m),
-            "val/occupancy_iou": occupancy_iou(rebuilt, grids, clip_m),
+        return loss | {
+            "distance_cm": distance_mae_cm(rebuilt, grids),
+            "held_distance_cm": occupied_distance_mae_cm(rebuilt, grids, clip_m),
+            "occupancy_iou": occupancy_iou(rebuilt, grids, clip_m),
         }
-        self.log_dict(scores, batch_size=len(grids), sync_dist=True)

@@ -1,7 +1,6 @@
 """Training of the conditional motion diffusion model (thesis §6.2, eq. 6.1–6.4)."""
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -9,22 +8,24 @@ from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import FEET, Skeleton
-from wearcap.data.windows import Window, WindowDataset
+from wearcap.data.statistics import MIN_SCALE, drawn_batches
+from wearcap.data.windows import Windows
 from wearcap.diffusion.process import add_noise
 from wearcap.diffusion.schedule import Schedule
 from wearcap.errors import WearcapError
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
-from wearcap.systems.hmd2.features import HeadFeatures, feature_statistics
+from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import Conditions, MotionDenoiser
 from wearcap.systems.hmd2.pipeline import HMD2
+from wearcap.systems.hmd2.training_windows import HeadContent, HeadWindow
 from wearcap.training import losses
-from wearcap.training.base import SeededSteps, WeighedTerms
+from wearcap.training.base import OptimizerOf, SchedulerOf, Training
 
 _TAIL_FRAMES = 20
 """Decay length, in frames, of the extra loss weight of a window's last frames."""
 
 
-class MotionDiffusion(SeededSteps, WeighedTerms):
+class MotionDiffusion(Training):
     """x0-prediction under one noise level per window; loss terms are weighed by `loss_weights`.
 
     "motion" is the thesis's plain MSE; "joints", "velocity" and "skate" are ours (0 leaves them out). Levels are drawn
@@ -36,6 +37,7 @@ class MotionDiffusion(SeededSteps, WeighedTerms):
 
     system = HMD2
     """The system that captures with the network."""
+    parts = ("net", "features", "schedule", "skeleton", "fps", "place_encoder", "image_encoder")
 
     def __init__(
         self,
@@ -45,8 +47,8 @@ class MotionDiffusion(SeededSteps, WeighedTerms):
         skeleton: Skeleton,
         fps: float,
         loss_weights: dict[str, float],
-        optimizer: Callable[..., torch.optim.Optimizer],
-        scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
+        optimizer: OptimizerOf,
+        scheduler: SchedulerOf = None,
         level_tilt: float = 0.0,
         drop: float = 0.0,
         tail: float = 0.0,
@@ -58,7 +60,7 @@ class MotionDiffusion(SeededSteps, WeighedTerms):
     ):
         """`place_encoder` (frozen, thesis §6.2) encodes the points; `image_encoder` names the encoder of the image
         embeddings, `image_size` features each. None leaves that modality out."""
-        super().__init__()
+        super().__init__(optimizer, scheduler, loss_weights, seed)
         self.net = net(
             motion_size=features.motion_size,
             condition_size=features.condition_size,
@@ -68,16 +70,16 @@ class MotionDiffusion(SeededSteps, WeighedTerms):
         self.place_encoder = None if place_encoder is None else place_encoder.requires_grad_(False).eval()
         self.image_encoder, self.drop, self.tail = image_encoder, drop, tail
         self.features, self.schedule, self.skeleton, self.fps = features, schedule, skeleton, fps
-        self.loss_weights, self.level_tilt, self.seed = dict(loss_weights), level_tilt, seed
-        self._optimizer, self._scheduler = optimizer, scheduler
+        self.level_tilt = level_tilt
         self._feet = [skeleton.index(f"{side}_{joint}") for side in ("left", "right") for joint in ("ankle", "toe")]
         # Methods, since compiled modules would put every weight into checkpoints a second time.
         self._denoise = torch.compile(self.net.forward) if compile else self.net.forward
         self._encode = torch.compile(self.net.encode) if compile else self.net.encode
 
-    def set_statistics(self, dataset: WindowDataset) -> None:
-        """Compute normalisation from a training split; a resumed run loads it with the weights."""
-        _require_same_inputs(self, dataset)
+    def set_statistics(self, dataset: Windows) -> None:
+        content = dataset.content
+        assert isinstance(content, HeadContent)
+        _require_same_inputs(self, content)
         statistics = feature_statistics(dataset, self.features)
         self.net.motion_normalizer.set(*statistics["motion"])
         encoder = self.net.condition_encoder
@@ -85,29 +87,10 @@ class MotionDiffusion(SeededSteps, WeighedTerms):
         for name, optional in (("points", encoder.points), ("image", encoder.image)):
             if optional is not None:
                 optional.normalizer.set(*statistics[name])
-        if self.place_encoder is not None and dataset.surroundings.places is not None:
-            self.place_encoder.load_state_dict(dataset.surroundings.places.encoder.state_dict())
+        if self.place_encoder is not None and content.surroundings.places is not None:
+            self.place_encoder.load_state_dict(content.surroundings.places.encoder.state_dict())
 
-    def pipeline_parts(self) -> dict[str, Any]:
-        """Constructor arguments of `HMD2` that belong to the trained model."""
-        return {
-            "net": self.net,
-            "features": self.features,
-            "schedule": self.schedule,
-            "skeleton": self.skeleton,
-            "fps": self.fps,
-            "place_encoder": self.place_encoder,
-            "image_encoder": self.image_encoder,
-        }
-
-    def train(self, mode: bool = True) -> "MotionDiffusion":
-        """Set the training mode; the frozen place encoder stays in evaluation mode."""
-        super().train(mode)
-        if self.place_encoder is not None:
-            self.place_encoder.eval()
-        return self
-
-    def conditions(self, batch: Window) -> Conditions:
+    def conditions(self, batch: HeadWindow) -> Conditions:
         """Conditioning of a batch, with modalities dropped by the windows' random numbers."""
         kept = batch.chance[:, None] >= self.drop
         points_valid, image_valid = batch.points_valid & kept[..., 0], batch.image_valid & kept[..., 1]
@@ -116,7 +99,7 @@ class MotionDiffusion(SeededSteps, WeighedTerms):
         head = self.features.condition(batch.R_world_head, batch.t_world_head, floor, batch.size, self.fps)
         return Conditions(head, batch.points, points_valid, batch.image, image_valid)
 
-    def _predicted(self, batch: Window, x0: Tensor) -> Tensor:
+    def _predicted(self, batch: HeadWindow, x0: Tensor) -> Tensor:
         """x̂0 of a batch in normalised motion space; half the windows are self-conditioned on a first estimate."""
         encoded = self._encode(self.conditions(batch), batch.valid)
         level = batch.level ** (1 / (1 + self.level_tilt))
@@ -133,7 +116,7 @@ class MotionDiffusion(SeededSteps, WeighedTerms):
         left = valid.sum(1, keepdim=True) - 1 - torch.arange(valid.shape[1], device=valid.device)
         return valid * (1 + self.tail * torch.exp(-left.clamp_min(0) / _TAIL_FRAMES))
 
-    def terms(self, batch: Window) -> dict[str, Tensor]:
+    def terms(self, batch: HeadWindow) -> dict[str, Tensor]:
         """Every loss term of a batch, unweighted."""
         weight = self._weight(batch.valid)
         motion = self.features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
@@ -150,22 +133,46 @@ class MotionDiffusion(SeededSteps, WeighedTerms):
             terms["skate"] = losses.foot_skate(feet, batch.foot_contact, weight, self.fps)
         return terms
 
-    def _from_head(self, R_parent_joint: Tensor, batch: Window) -> Tensor:
+    def _from_head(self, R_parent_joint: Tensor, batch: HeadWindow) -> Tensor:
         """Joint positions relative to the head joint (m), as anchoring the body to the true head gives them."""
         origin = torch.zeros_like(batch.t_world_head)
         joints = forward_kinematics(self.skeleton, R_parent_joint, origin, batch.t_parent_joint[:, None]).t
         return joints - joints[:, :, self.skeleton.index("head"), None]
 
 
-def _require_same_inputs(system: MotionDiffusion, dataset: WindowDataset) -> None:
+def _require_same_inputs(system: MotionDiffusion, content: HeadContent) -> None:
     """Raise WearcapError unless the windows contain the inputs of the model."""
-    net, places = system.net, dataset.surroundings.places
+    net, places, images = system.net, content.surroundings.places, content.surroundings.images
     points_size = 0 if places is None else places.size
-    if (net.points_size, net.image_size) != (points_size, dataset.image_size):
+    if (net.points_size, net.image_size) != (points_size, content.image_size):
         raise WearcapError(
-            f"windows with points of {points_size} and images of {dataset.image_size} features",
+            f"windows with points of {points_size} and images of {content.image_size} features",
             expected=f"{net.points_size} and {net.image_size}, as the model has",
-            fix="Set data.surroundings and model.{place_encoder,image_encoder,image_size} alike.",
+            fix="Set data.dataset.content.surroundings and model.{place_encoder,image_encoder,image_size} alike.",
         )
-    if system.image_encoder != dataset.surroundings.images and net.image_size:
-        raise WearcapError(f"embeddings of {dataset.surroundings.images!r}", expected=system.image_encoder)
+    if system.image_encoder != images and net.image_size:
+        raise WearcapError(f"embeddings of {images!r}", expected=system.image_encoder)
+
+
+def feature_statistics(dataset: Windows, features: HeadFeatures, limit: int = 2000) -> dict[str, tuple[Tensor, Tensor]]:
+    """(mean, scale) of "motion", "head", "points" and "image" over at most `limit` windows drawn by dataset weights."""
+    sums: dict[str, list[Tensor]] = {}
+    for batch in drawn_batches(dataset, min(limit, 4 * len(dataset)), 64):
+        motion = features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
+        head = features.condition(batch.R_world_head, batch.t_world_head, batch.floor_height, batch.size, dataset.fps)
+        for name, value, valid in (
+            ("motion", motion, batch.valid),
+            ("head", head, batch.valid),
+            ("points", batch.points, batch.valid & batch.points_valid),
+            ("image", batch.image, batch.valid & batch.image_valid),
+        ):
+            rows = value[valid].double()
+            moments = torch.stack([torch.ones_like(rows).sum(0), rows.sum(0), rows.square().sum(0)])
+            sums.setdefault(name, []).append(moments)
+    result = {}
+    for name, parts in sums.items():
+        number, total, squares = torch.stack(parts).sum(0)
+        mean = total / number.clamp_min(1)
+        scale = (squares / number.clamp_min(1) - mean**2).clamp_min(0).sqrt().clamp_min(MIN_SCALE)
+        result[name] = (mean.float(), scale.float())
+    return result

@@ -10,10 +10,8 @@ from lightning.pytorch import Callback
 from wearcap.body.anny_body import anny_body
 from wearcap.metrics.scores import score
 from wearcap.metrics.surface import foot_surface, foot_vertices
-from wearcap.recording import Motion, Recording
 from wearcap.recording.store import dataset_folder, load_recording
 from wearcap.runtime.system import CaptureInput
-from wearcap.scene.scan import Scan
 from wearcap.systems.hps.camera import Localize
 from wearcap.systems.hps.pipeline import HPS
 
@@ -61,7 +59,13 @@ def validated(pipeline: HPS, where: str) -> dict[str, float]:
     source = CaptureInput.in_dataset(recording, folder)
     results = pipeline.results(source)
     motion, nan = pipeline.motion(results["initialize"], results["optimize"]), float("nan")
-    feet = surface_scores(motion, recording, source.read_scan())
+    scan, feet = source.read_scan(), {"surface_cm": nan, "sliding_cm": nan}
+    if scan is not None and motion.contact_prob is not None:
+        # Distance to the scan and sliding of the feet that the suit reports in contact (thesis Table 4.3).
+        body = anny_body(motion.skeleton, recording.shape or None)
+        points, touching = foot_vertices(body, motion.T_world_joint, motion.contact_prob >= 0.5)
+        found = foot_surface(points, touching, scan.surface)
+        feet = {"surface_cm": found.distance_cm, "sliding_cm": found.sliding_cm}
     scores = score(motion, recording, where, 0).scores if recording.motion is not None else {}
     return {
         "world_root_cm": scores.get("world_root_cm", nan),
@@ -69,13 +73,3 @@ def validated(pipeline: HPS, where: str) -> dict[str, float]:
         **feet,
         "localized_share": (results["localize"].confidence > 0).double().mean().item(),
     }
-
-
-def surface_scores(motion: Motion, recording: Recording, scan: Scan | None) -> dict[str, float]:
-    """Distance to the scan and sliding of the feet that the suit reports in contact (thesis Table 4.3)."""
-    if scan is None or motion.contact_prob is None:
-        return {"surface_cm": float("nan"), "sliding_cm": float("nan")}
-    body = anny_body(motion.skeleton, recording.shape or None)
-    points, touching = foot_vertices(body, motion.T_world_joint, motion.contact_prob >= 0.5)
-    found = foot_surface(points, touching, scan.surface)
-    return {"surface_cm": found.distance_cm, "sliding_cm": found.sliding_cm}

@@ -7,7 +7,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from wearcap.data.statistics import collate
+from wearcap.data.statistics import drawn_batches
+from wearcap.data.windows import Windows
 from wearcap.geometry import rotation
 from wearcap.metrics.detection import mean_detection_scores
 from wearcap.runtime.graphs import Exports
@@ -15,11 +16,11 @@ from wearcap.systems.ireplica.contact_prediction import ContactDetector
 from wearcap.systems.ireplica.contact_transformer import REACH, ContactNetwork
 from wearcap.systems.ireplica.export import exports
 from wearcap.systems.ireplica.features import PoseFeatures
-from wearcap.systems.ireplica.training_windows import ContactDataset, ContactWindow
-from wearcap.training.base import GivenOptimizer, SeededSteps
+from wearcap.systems.ireplica.training_windows import ContactWindow
+from wearcap.training.base import OptimizerOf, SchedulerOf, Training
 
 
-class ContactDetection(SeededSteps, GivenOptimizer):
+class ContactDetection(Training):
     """Trains a contact network for some classes of interaction; loss and scores are per frame."""
 
     def __init__(
@@ -28,46 +29,32 @@ class ContactDetection(SeededSteps, GivenOptimizer):
         features: PoseFeatures,
         classes: list[str],
         fps: float,
-        optimizer: Callable[..., torch.optim.Optimizer],
-        scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
+        optimizer: OptimizerOf,
+        scheduler: SchedulerOf = None,
         seed: int = 0,
     ):
-        super().__init__()
+        super().__init__(optimizer, scheduler, seed=seed)
         self.net = net(inputs=features.size, classes=len(classes))
-        self.features, self.classes, self.fps, self.seed = features, tuple(classes), fps, seed
-        self._optimizer, self._scheduler = optimizer, scheduler
+        self.features, self.classes, self.fps = features, tuple(classes), fps
         self._validated: list[tuple[Tensor, Tensor]] = []
 
     def exports(self) -> Exports:
         """The contact network as a graph."""
         return exports(ContactDetector(self.net.eval(), self.features, self.classes, self.fps))
 
-    def set_statistics(self, dataset: ContactDataset, limit: int = 400) -> None:
-        """Set the input normalisation from a training split; a resumed run restores it with the weights."""
-        random = torch.Generator().manual_seed(0)
-        windows = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
-        self.net.normalize_on(self._pose(collate([dataset[item] for item in zip(windows, range(limit))])))
+    def set_statistics(self, dataset: Windows, limit: int = 400) -> None:
+        (batch,) = drawn_batches(dataset, limit)
+        self.net.normalize_on(self._pose(batch))
 
     def _pose(self, batch: ContactWindow) -> Float[Tensor, "batch time feature"]:
         return self.features.encode(batch.R_parent_joint @ rotation.exp(batch.error))
 
-    def _predictions(
-        self, batch: ContactWindow
-    ) -> tuple[Float[Tensor, "batch out hand class"], Bool[Tensor, "batch out hand class"]]:
-        """Logits, and ground truth of the predicted frames."""
-        return self.net(self._pose(batch)), batch.contact[:, REACH:-REACH]
-
-    def training_step(self, batch: ContactWindow, batch_idx: int) -> Tensor:
-        logits, truth = self._predictions(batch)
-        loss = F.binary_cross_entropy_with_logits(logits, truth.to(logits.dtype))
-        self.log("train/loss", loss, batch_size=len(truth), prog_bar=True)
-        return loss
-
-    def validation_step(self, batch: ContactWindow, batch_idx: int) -> None:
-        logits, truth = self._predictions(batch)
-        loss = F.binary_cross_entropy_with_logits(logits, truth.to(logits.dtype))
-        self.log("val/loss", loss, batch_size=len(truth), sync_dist=True)
-        self._validated.append((logits.flatten(0, 1), truth.flatten(0, 1)))
+    def measure(self, batch: ContactWindow) -> dict[str, Tensor]:
+        """The loss; in validation logits and ground truth of the predicted frames are kept for the scores."""
+        logits, truth = self.net(self._pose(batch)), batch.contact[:, REACH:-REACH]
+        if not self.training:
+            self._validated.append((logits.flatten(0, 1), truth.flatten(0, 1)))
+        return {"loss": F.binary_cross_entropy_with_logits(logits, truth.to(logits.dtype))}
 
     def validated(self) -> tuple[Float[Tensor, "sample hand class"], Bool[Tensor, "sample hand class"]]:
         """Logits and ground truth of the validation epoch so far, from all processes."""

@@ -1,25 +1,19 @@
-"""Training windows of poses with true hand contact; content and order are functions of seed and step."""
+"""Training windows of poses with true hand contact."""
 
 import math
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
-from torch.utils.data import Dataset
 
-from wearcap.body.skeleton import Skeleton
-from wearcap.body.skeletons import skeleton_by_name
-from wearcap.data.datamodule import SeededWindows
-from wearcap.data.windows import Source, mirrored_rotations, requested, share_out
+from wearcap.data.transforms import Cut, Draws, Window, joint_twins
+from wearcap.data.windows import Content, Windows, open_recording
 from wearcap.errors import WearcapError
-from wearcap.geometry import rotation
 from wearcap.recording import Motion
 from wearcap.recording.interactions import Interactions
-from wearcap.recording.store import RecordingFile
+from wearcap.recording.store import RecordingFile, RecordingStore
 from wearcap.systems.ireplica.features import PoseFeatures, is_even, pose_frames
 
 
@@ -33,91 +27,14 @@ class ContactWindow(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Augmentation:
-    """Augmentation of training windows. Zeros (and a stretch of 1) disable it."""
+class PoseNoise:
+    """Noise of joint rotations: a random mixture of constant, slow and per-frame noise of at most `largest_deg`."""
 
-    mirror: bool = True
-    """Whether half of the windows are mirrored."""
-    noise_deg: float = 5.0
-    """Largest noise of joint rotations (°): a random mixture of constant, slow and per-frame noise."""
-    stretch: float = 1.2
-    """Largest factor by which time is stretched or compressed; poses are then interpolated between frames."""
-    drop: float = 0.2
-    """Largest share of frames that are dropped and interpolated."""
+    largest_deg: float = 5.0
 
-
-NONE = Augmentation(mirror=False, noise_deg=0.0, stretch=1.0, drop=0.0)
-
-
-class ContactDataset(Dataset):
-    """Windows of one split, in the skeleton of a network's input. An item is indexed by (window, seed), or by window.
-
-    `stream` is "suit" (sensed poses) or "motion" (ground truth). Recordings with the same skeleton and frame rate are
-    read from the memory map; others are converted on first use and kept in memory.
-    """
-
-    def __init__(
-        self,
-        sources: list[Source],
-        split: str,
-        *,
-        window: int,
-        stride: int,
-        fps: float,
-        classes: tuple[str, ...],
-        skeleton: Skeleton,
-        stream: str = "suit",
-        augmentation: Augmentation = NONE,
-        balance: float = 1.0,
-    ):
-        if stream not in ("suit", "motion"):
-            raise WearcapError(f"no stream of poses {stream!r}", expected='"suit" or "motion"')
-        self.window, self.stride, self.fps, self.classes = window, stride, fps, classes
-        self.skeleton, self.stream, self.augmentation = skeleton, stream, augmentation
-        self.longest = math.ceil(window * augmentation.stretch) + 1
-        self.recordings, self.starts, self.weights = share_out(
-            sources, split, window=window, stride=stride, fps=fps, balance=balance, min_frames=self.longest
-        )
-
-    def __len__(self) -> int:
-        return len(self.starts)
-
-    def __getitem__(self, item: tuple[int, int] | int) -> ContactWindow:
-        index, random = requested(item)
-        recording, start, _ = self.starts[index].tolist()
-        store, name = self.recordings[recording]
-        poses = _poses(store.path_of(name), self.stream, self.skeleton.name, self.fps)
-        shift, mirrored, speed = torch.rand(3, generator=random).tolist()
-        if self.augmentation != NONE:
-            start += int(shift * self.stride)
-        start = min(start, poses.length - self.longest)
-        place = torch.arange(self.window) * self.augmentation.stretch ** (2 * speed - 1)
-        R = poses.rotations(start, start + self.longest)
-        if self.augmentation != NONE:
-            R = interpolated(R, self._kept(random), place)
-        contact = poses.contact(start + place, self.classes)
-        error = pose_errors(self.window, len(self.skeleton), self.augmentation.noise_deg, random)
-        if self.augmentation.mirror and mirrored < 0.5:
-            R, contact = mirrored_rotations(R, self.skeleton), contact.flip(1)
-        return ContactWindow(R[: self.window], error, contact)
-
-    def _kept(self, random: torch.Generator) -> Bool[Tensor, "time"]:
-        share = self.augmentation.drop * torch.rand(1, generator=random)
-        kept = torch.rand(self.longest, generator=random) >= share
-        kept[[0, -1]] = True
-        return kept
-
-
-def interpolated(
-    R: Float[Tensor, "time joint 3 3"], kept: Bool[Tensor, "time"], place: Float[Tensor, "new_time"]
-) -> Float[Tensor, "new_time joint 3 3"]:
-    """Rotations at fractional frames `place`, interpolated linearly (and orthogonalised) between the kept frames."""
-    frames = kept.nonzero()[:, 0]
-    after = torch.searchsorted(frames, place, right=True).clamp(1, len(frames) - 1)
-    before = frames[after - 1]
-    blend = ((place - before) / (frames[after] - before))[:, None, None, None].to(R.dtype)
-    columns = torch.lerp(R[before, :, :, :2], R[frames[after], :, :, :2], blend)
-    return rotation.matrix_from_rot6d(columns.transpose(-1, -2).flatten(-2))
+    def __call__(self, window: Window, random: Draws) -> Window:
+        frames, joints = window.values["R_parent_joint"].shape[:2]
+        return window.changed(error=pose_errors(frames, joints, self.largest_deg, random.generator))
 
 
 def pose_errors(
@@ -138,89 +55,67 @@ def pose_errors(
 
 
 @dataclass(frozen=True, eq=False)
-class _Poses:
-    """An open recording: poses at the data set's rate, and interactions."""
+class _PoseTrack:
+    """An open recording: poses at the windows' rate, and interactions."""
 
     file: RecordingFile
-    stream: str
     timestamps: Float64[Tensor, "time"]
     interactions: Interactions
     converted: Float[Tensor, "time joint 3 3"] | None
-
-    @property
-    def length(self) -> int:
-        return len(self.timestamps)
-
-    def rotations(self, start: int, stop: int) -> Float[Tensor, "time joint 3 3"]:
-        if self.converted is not None:
-            return self.converted[start:stop]
-        return self.file.window(f"{self.stream}.R_parent_joint", start, stop)
-
-    def contact(self, place: Float[Tensor, "place"], classes: tuple[str, ...]) -> Bool[Tensor, "place hand class"]:
-        """True contact at fractional frames `place`."""
-        below = place.long().clamp(max=self.length - 2)
-        times = torch.lerp(self.timestamps[below], self.timestamps[below + 1], place.double() - below)
-        return torch.stack([self.interactions.hand_contact(times, name) for name in classes], -1)
+    """Poses of another skeleton or rate after conversion; others are read from the file."""
 
 
-@cache
-def _poses(path: Path, stream: str, skeleton_name: str, fps: float) -> _Poses:
-    """Open a recording, once per process."""
-    file, skeleton = RecordingFile(path), skeleton_by_name(skeleton_name)
-    interactions = file.part("interactions")
-    if f"{stream}.timestamps" not in file.keys or interactions is None:
-        missing = "interactions" if interactions is None else stream
-        raise WearcapError(
-            f"this recording has no {missing}, which contact detection learns from",
-            where=path,
-            fix="Prepare a data set with interactions, such as `wearcap prepare simulated_interactions`.",
-        )
-    timestamps = file.tensor(f"{stream}.timestamps")
-    motion: Motion = file.part(stream)
-    if is_even(timestamps, fps) and motion.skeleton.joint_names == skeleton.joint_names:
-        return _Poses(file, stream, timestamps, interactions, None)
-    timestamps, converted = pose_frames(motion, skeleton, fps)
-    return _Poses(file, stream, timestamps, interactions, converted.contiguous())
+class ContactContent(Content):
+    """Windows of poses in the skeleton of a network's input.
 
+    `stream` is "suit" (sensed poses) or "motion" (ground truth). Recordings with the same skeleton and frame rate are
+    read from the memory map; others are converted on first use and kept in memory.
+    """
 
-class ContactWindows(SeededWindows):
-    """Data module of windows of poses with true hand contact."""
+    draws = ("shift", "mirror", "speed")
 
-    def __init__(
-        self,
-        sources: dict[str, dict | None],
-        features: PoseFeatures,
-        classes: list[str],
-        window: int,
-        stride: int,
-        fps: float,
-        batch_size: int,
-        steps_per_epoch: int | None = None,
-        val_windows: int | None = None,
-        workers: int = 0,
-        seed: int = 0,
-        stream: str = "suit",
-        augmentation: Augmentation = NONE,
-        balance: float = 1.0,
-        val_sources: dict[str, dict | None] | None = None,
-    ):
-        """See `SeededWindows` and `ContactDataset`; `augmentation` and `balance` apply to training only."""
-        super().__init__(sources, batch_size, steps_per_epoch, val_windows, workers, seed, val_sources)
-        self.features, self.classes = features, tuple(classes)
-        self.window, self.stride, self.fps, self.stream = window, stride, fps, stream
-        self.augmentation, self.balance = augmentation, balance
+    def __init__(self, features: PoseFeatures, classes: list[str] | tuple[str, ...], fps: float, stream: str = "suit"):
+        if stream not in ("suit", "motion"):
+            raise WearcapError(f"no stream of poses {stream!r}", expected='"suit" or "motion"')
+        self.skeleton, self.classes, self.fps, self.stream = features.skeleton, tuple(classes), fps, stream
+        self._twins = {"R_parent_joint": joint_twins(self.skeleton), "contact": [1, 0]}
 
-    def dataset(self, split: str) -> ContactDataset:
-        train = split == "train"
-        return ContactDataset(
-            self.sources if train else self.val_sources,
-            split,
-            window=self.window,
-            stride=self.stride,
-            fps=self.fps,
-            classes=self.classes,
-            skeleton=self.features.skeleton,
-            stream=self.stream,
-            augmentation=self.augmentation if train else NONE,
-            balance=self.balance if train else 1.0,
-        )
+    def min_frames(self, window: int, stretch: float) -> int:
+        return math.ceil(window * stretch) + 1
+
+    def cut(self, track: _PoseTrack, start: int, frames: int, every: int, windows: Windows) -> Cut:
+        length, longest = len(track.timestamps), self.min_frames(windows.window, windows.stretch)
+        return Cut(start, windows.window, length, windows.stride, latest=length - longest, stretch=windows.stretch)
+
+    def open(self, store: RecordingStore, name: str, every: int) -> _PoseTrack:
+        file = open_recording(store.path_of(name))
+        interactions = file.part("interactions")
+        if f"{self.stream}.timestamps" not in file.keys or interactions is None:
+            missing = "interactions" if interactions is None else self.stream
+            raise WearcapError(
+                f"this recording has no {missing}, which contact detection learns from",
+                where=file.path,
+                fix="Prepare a data set with interactions, such as `wearcap prepare simulated_interactions`.",
+            )
+        timestamps = file.tensor(f"{self.stream}.timestamps")
+        motion: Motion = file.part(self.stream)
+        if is_even(timestamps, self.fps) and motion.skeleton.joint_names == self.skeleton.joint_names:
+            return _PoseTrack(file, timestamps, interactions, None)
+        timestamps, converted = pose_frames(motion, self.skeleton, self.fps)
+        return _PoseTrack(file, timestamps, interactions, converted.contiguous())
+
+    def read(self, track: _PoseTrack, cut: Cut, random: Draws) -> Window:
+        start, stop = cut.bounds
+        name = f"{self.stream}.R_parent_joint"
+        R = track.file.window(name, start, stop) if track.converted is None else track.converted[start:stop]
+        origin, place = cut.place
+        place = origin + place
+        below = place.long().clamp(max=len(track.timestamps) - 2)
+        times = torch.lerp(track.timestamps[below], track.timestamps[below + 1], place.double() - below)
+        contact = torch.stack([track.interactions.hand_contact(times, each) for each in self.classes], -1)
+        values = {"R_parent_joint": cut.take("R_parent_joint", R, start, sensed=True), "contact": contact}
+        return Window(values, self._twins)
+
+    def item(self, track: _PoseTrack, cut: Cut, window: Window, random: Draws) -> ContactWindow:
+        R = window.values["R_parent_joint"]
+        return ContactWindow(R, window.values.get("error", torch.zeros(R.shape[:-1])), window.values["contact"])

@@ -1,4 +1,4 @@
-"""Validation of a contact network in training by the object motion that iReplica captures with its current weights."""
+"""Callbacks of the contact networks' validation: temperatures, and the object motion that iReplica captures."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,10 +12,22 @@ from wearcap.metrics.objects import summary
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.runtime.system import CaptureInput
 from wearcap.systems.ireplica.contact_prediction import ContactDetector, ContactPredictor
+from wearcap.systems.ireplica.contact_transformer import fit_temperature
 from wearcap.systems.ireplica.pipeline import IReplica
 from wearcap.systems.ireplica.scores import score_interactions
 from wearcap.systems.ireplica.training import ContactDetection
 from wearcap.training.callbacks import is_due
+
+
+class FitTemperature(Callback):
+    """Fits the network's temperatures after every validation epoch; the checkpoint stores them with the weights.
+
+    It must come before the weight averaging in the list of callbacks: the temperatures belong to the averaged weights.
+    """
+
+    def on_validation_epoch_end(self, trainer: lightning.Trainer, pl_module: ContactDetection) -> None:
+        logits, truth = pl_module.validated()
+        pl_module.net.temperature.copy_(fit_temperature(logits.flatten(0, 1), truth.flatten(0, 1)))
 
 
 class IReplicaValidation(Callback):

@@ -2,20 +2,20 @@
 
 from collections.abc import Callable
 
-import torch
 from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import FEET, Skeleton
-from wearcap.data.statistics import MIN_SCALE, collate
+from wearcap.data.statistics import drawn_batches, standardize
+from wearcap.data.windows import Windows
 from wearcap.metrics.position import mpjpe_cm
 from wearcap.systems.mocap_every.manifold import MotionManifold
 from wearcap.systems.mocap_every.manifold_features import Posed, decode_window, encode_window, origin_of
-from wearcap.systems.mocap_every.training_windows import WatchDataset, WatchWindow
-from wearcap.training.base import WeighedTerms
+from wearcap.systems.mocap_every.training_windows import WatchWindow
+from wearcap.training.base import OptimizerOf, SchedulerOf, Training
 
 
-class ManifoldTraining(WeighedTerms):
+class ManifoldTraining(Training):
     """Trains the autoencoder to reconstruct windows of ground-truth motion.
 
     L1 loss terms (eq. 9), weighted by `loss_weights`: "contact", "root" (translation and rotation), "rotation" of the
@@ -28,21 +28,17 @@ class ManifoldTraining(WeighedTerms):
         skeleton: Skeleton,
         fps: float,
         loss_weights: dict[str, float],
-        optimizer: Callable[..., torch.optim.Optimizer],
-        scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
+        optimizer: OptimizerOf,
+        scheduler: SchedulerOf = None,
     ):
-        super().__init__()
+        super().__init__(optimizer, scheduler, loss_weights)
         self.net = net(size=FEET + 3 + 6 * len(skeleton))
-        self.skeleton, self.fps, self.loss_weights = skeleton, fps, dict(loss_weights)
-        self._optimizer, self._scheduler = optimizer, scheduler
+        self.skeleton, self.fps = skeleton, fps
 
-    def set_statistics(self, dataset: WatchDataset, limit: int = 1000) -> None:
-        """Compute the normalisation from a training split; a resumed run restores it with the weights."""
-        random = torch.Generator().manual_seed(0)
-        drawn = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
-        window = _posed(collate([dataset[item] for item in zip(drawn, range(limit))]))
-        rows = encode_window(window, origin_of(window)).flatten(0, 1)
-        self.net.normalizer.set(rows.mean(0), rows.std(0).clamp_min(MIN_SCALE))
+    def set_statistics(self, dataset: Windows, limit: int = 1000) -> None:
+        (batch,) = drawn_batches(dataset, limit)
+        window = _posed(batch)
+        standardize(self.net.normalizer, encode_window(window, origin_of(window)))
 
     def terms(self, batch: WatchWindow) -> dict[str, Tensor]:
         """Unweighted loss terms of a batch, and the mean joint error (cm)."""

@@ -1,7 +1,6 @@
 """Training of MocapEvery's estimator with the losses of §3.3 (eq. 2–4)."""
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -10,16 +9,17 @@ from torch.nn import functional as F
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
-from wearcap.data.statistics import MIN_SCALE, collate
+from wearcap.data.statistics import drawn_batches, standardize
+from wearcap.data.windows import Windows
 from wearcap.systems.mocap_every.features import ENDS, Canonical, WatchFeatures, to_world
 from wearcap.systems.mocap_every.model import TrainedEstimator
 from wearcap.systems.mocap_every.pipeline import MocapEvery
-from wearcap.systems.mocap_every.training_windows import WatchDataset, WatchWindow
-from wearcap.training.base import SeededSteps, WeighedTerms
+from wearcap.systems.mocap_every.training_windows import WatchWindow
+from wearcap.training.base import OptimizerOf, SchedulerOf, Training
 from wearcap.training.losses import EPSILON_M2
 
 
-class WatchRegression(SeededSteps, WeighedTerms):
+class WatchRegression(Training):
     """Regression of body motion from the head and two wrists.
 
     Loss terms, weighted by `loss_weights`, are means over frames and joints: "root" and "rotation" (eq. 2), "position"
@@ -31,6 +31,7 @@ class WatchRegression(SeededSteps, WeighedTerms):
 
     system = MocapEvery
     """The system that captures with the network."""
+    parts = ("net", "features", "skeleton", "fps")
 
     def __init__(
         self,
@@ -39,42 +40,29 @@ class WatchRegression(SeededSteps, WeighedTerms):
         skeleton: Skeleton,
         fps: float,
         loss_weights: dict[str, float],
-        optimizer: Callable[..., torch.optim.Optimizer],
-        scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
+        optimizer: OptimizerOf,
+        scheduler: SchedulerOf = None,
         end_weight: float = 1.0,
         seed: int = 0,
     ):
         """`end_weight`: weight of hands and feet relative to the other joints in "position"."""
-        super().__init__()
+        super().__init__(optimizer, scheduler, loss_weights, seed)
         self.net = net(feature_size=features.size, motion_size=features.motion_size)
         self.features, self.skeleton, self.fps = features, skeleton, fps
-        self.loss_weights, self.seed = dict(loss_weights), seed
         self._ends = skeleton.indices(*ENDS)
         weights = torch.ones(len(skeleton))
         weights[self._ends] = end_weight
         self.register_buffer("_joint_weights", weights / weights.mean(), persistent=False)
-        self._optimizer, self._scheduler = optimizer, scheduler
 
-    def pipeline_parts(self) -> dict[str, Any]:
-        """Constructor arguments of a `MocapEvery` pipeline that come from the checkpoint."""
-        return {"net": self.net, "features": self.features, "skeleton": self.skeleton, "fps": self.fps}
-
-    def set_statistics(self, dataset: WatchDataset, limit: int = 1500) -> None:
-        """Compute the normalisation from a training split; a resumed run restores it with the weights."""
-        random = torch.Generator().manual_seed(0)
-        drawn = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
-        batch = collate([dataset[item] for item in zip(drawn, range(limit))])
+    def set_statistics(self, dataset: Windows, limit: int = 1500) -> None:
+        (batch,) = drawn_batches(dataset, limit)
         features, motion, canonical = self._inputs(batch)
         ends = self._ends_from_world(
             self._joints(motion, batch, canonical)[:, :, self._ends], batch, canonical
         ).flatten(-2)
-        for normalizer, rows in (
-            (self.net.feature_normalizer, features),
-            (self.net.motion_normalizer, motion),
-            (self.net.ends_normalizer, ends),
-        ):
-            rows = rows.flatten(0, 1)
-            normalizer.set(rows.mean(0), rows.std(0).clamp_min(MIN_SCALE))
+        standardize(self.net.feature_normalizer, features)
+        standardize(self.net.motion_normalizer, motion)
+        standardize(self.net.ends_normalizer, ends)
 
     def _inputs(
         self, batch: WatchWindow

@@ -13,7 +13,7 @@ from torch import Tensor
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import FOOT_JOINTS, MIRROR, Skeleton
 from wearcap.data.features import body_size
-from wearcap.data.windows import mirrored_rotations
+from wearcap.data.transforms import mirrored_rotations
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.scene.floor_update import FloorFollower

@@ -1,7 +1,6 @@
 """Training of the pose regressor: AvatarPoser's losses (Jiang et al. 2022) on HMD²'s training windows."""
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from jaxtyping import Float, Int64
@@ -9,17 +8,18 @@ from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
-from wearcap.data.statistics import MIN_SCALE, collate
-from wearcap.data.windows import Window, WindowDataset
+from wearcap.data.statistics import drawn_batches, standardize
+from wearcap.data.windows import Windows
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, decode_pose, encode_pose, pasts
 from wearcap.systems.hmd2.pose_regressor.pipeline import PoseRegressorCapture
-from wearcap.training.base import SeededSteps, WeighedTerms
+from wearcap.systems.hmd2.training_windows import HeadWindow
+from wearcap.training.base import OptimizerOf, SchedulerOf, Training
 from wearcap.training.losses import joint_velocity, masked_mean
 
 
-class PoseRegression(SeededSteps, WeighedTerms):
+class PoseRegression(Training):
     """Regression of single frames from past frames; `pairs` of neighbouring frames are predicted per window.
 
     Loss terms, weighted by `loss_weights`, are mean absolute errors: "root" and "rotation" of 6D rotations, "joints" of
@@ -29,6 +29,7 @@ class PoseRegression(SeededSteps, WeighedTerms):
 
     system = PoseRegressorCapture
     """The system that captures with the network."""
+    parts = ("net", "points", "skeleton", "fps")
 
     def __init__(
         self,
@@ -37,43 +38,30 @@ class PoseRegression(SeededSteps, WeighedTerms):
         skeleton: Skeleton,
         fps: float,
         loss_weights: dict[str, float],
-        optimizer: Callable[..., torch.optim.Optimizer],
-        scheduler: Callable[..., torch.optim.lr_scheduler.LRScheduler] | None = None,
+        optimizer: OptimizerOf,
+        scheduler: SchedulerOf = None,
         pairs: int = 4,
         seed: int = 0,
     ):
-        super().__init__()
+        super().__init__(optimizer, scheduler, loss_weights, seed)
         self.net = net(feature_size=points.size, motion_size=6 * len(skeleton))
         self.points, self.skeleton, self.fps = points, skeleton, fps
-        self.loss_weights, self.pairs, self.seed = dict(loss_weights), pairs, seed
-        self._optimizer, self._scheduler = optimizer, scheduler
+        self.pairs = pairs
 
-    def pipeline_parts(self) -> dict[str, Any]:
-        """Constructor arguments of `PoseRegressorCapture` that belong to the trained model."""
-        return {"net": self.net, "points": self.points, "skeleton": self.skeleton, "fps": self.fps}
-
-    def set_statistics(self, dataset: WindowDataset, limit: int = 500) -> None:
-        """Compute normalisation from a training split; a resumed run loads it with the weights."""
-        random = torch.Generator().manual_seed(0)
-        drawn = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
-        windows = [dataset[item] for item in zip(drawn, range(limit))]
+    def set_statistics(self, dataset: Windows, limit: int = 500) -> None:
         features, motion = [], []
-        for start in range(0, limit, 64):
-            batch = collate(windows[start : start + 64])
+        for batch in drawn_batches(dataset, limit, 64):
             features.append(self._features(batch)[batch.valid])
             motion.append(encode_pose(batch.R_parent_joint, batch.R_world_head)[batch.valid])
-        for normalizer, rows in (
-            (self.net.feature_normalizer, torch.cat(features)),
-            (self.net.motion_normalizer, torch.cat(motion)),
-        ):
-            normalizer.set(rows.mean(0), rows.std(0).clamp_min(MIN_SCALE))
+        standardize(self.net.feature_normalizer, torch.cat(features))
+        standardize(self.net.motion_normalizer, torch.cat(motion))
 
-    def _features(self, batch: Window) -> Float[Tensor, "batch time feature"]:
+    def _features(self, batch: HeadWindow) -> Float[Tensor, "batch time feature"]:
         T_world_head = Rigid(batch.R_world_head, batch.t_world_head)
         poses = self.points.poses(self.skeleton, T_world_head, batch.R_parent_joint, batch.t_parent_joint[:, None])
         return self.points.encode(poses.R, poses.t, batch.floor_from_head, batch.stature, self.fps)
 
-    def _frame_pairs(self, batch: Window) -> Int64[Tensor, "batch end"]:
+    def _frame_pairs(self, batch: HeadWindow) -> Int64[Tensor, "batch end"]:
         """Indices of pairs of neighbouring frames, spread evenly over each window, in training with a random shift."""
         count, time = batch.valid.shape
         places = torch.arange(self.pairs, device=batch.valid.device)
@@ -81,7 +69,7 @@ class PoseRegression(SeededSteps, WeighedTerms):
         last = ((places + shift.to(places.device)) * time / self.pairs).long().clamp(1, time - 1)
         return torch.stack([last - 1, last], -1).flatten(1).expand(count, -1)
 
-    def terms(self, batch: Window) -> dict[str, Tensor]:
+    def terms(self, batch: HeadWindow) -> dict[str, Tensor]:
         """Every loss term of a batch, unweighted."""
         ends = self._frame_pairs(batch)
         rows = torch.arange(len(ends), device=ends.device)[:, None]
@@ -99,7 +87,7 @@ class PoseRegression(SeededSteps, WeighedTerms):
         }
 
     def _from_head(
-        self, R_parent_joint: Float[Tensor, "batch end joint 3 3"], batch: Window
+        self, R_parent_joint: Float[Tensor, "batch end joint 3 3"], batch: HeadWindow
     ) -> Float[Tensor, "batch end joint 3"]:
         """Joint positions relative to the head joint (m)."""
         origin = torch.zeros_like(R_parent_joint[:, :, 0, 0])

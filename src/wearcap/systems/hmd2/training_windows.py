@@ -1,0 +1,153 @@
+"""Training windows of HMD² and of its baseline: head paths with the true pose and what surrounds the wearer."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from wearcap.body.skeleton import FEET, Skeleton
+from wearcap.data.features import body_size, true_foot_contact
+from wearcap.data.surroundings import NOTHING, Surroundings
+from wearcap.data.transforms import Cut, Draws, Window, joint_twins
+from wearcap.data.windows import Content, open_recording
+from wearcap.errors import WearcapError
+from wearcap.geometry.rigid import Rigid
+from wearcap.recording.store import RecordingFile, RecordingStore
+from wearcap.tracking.floor import floor_from_path, floor_from_points
+
+MIN_FRAMES = 30
+"""Fewest frames of a recording that is trained on."""
+
+
+class HeadWindow(NamedTuple):
+    """One window, or a batch of them (a leading "batch" axis on every field); frames beyond a clip are padding."""
+
+    R_parent_joint: Float[Tensor, "*batch time joint 3 3"]
+    R_world_head: Float[Tensor, "*batch time 3 3"]
+    t_world_head: Float[Tensor, "*batch time 3"]
+    floor_height: Float[Tensor, "*batch time"]
+    """Floor height (m) below the head, from points if there are any, else from the head's path."""
+    floor_from_head: Float[Tensor, "*batch time"]
+    """Floor height (m) below the head, from the head's path alone."""
+    valid: Bool[Tensor, "*batch time"]
+    t_parent_joint: Float[Tensor, "*batch joint 3"]
+    size: Float[Tensor, "*batch limb"]
+    """`body_size` of the wearer (m)."""
+    foot_contact: Float[Tensor, "*batch time foot"]
+    """1 where heel or toes of the left and right foot touch the floor."""
+    points: Float[Tensor, "*batch time point_feature"]
+    points_valid: Bool[Tensor, "*batch time"]
+    image: Float[Tensor, "*batch time image_feature"]
+    image_valid: Bool[Tensor, "*batch time"]
+    """Points and images: see `Surroundings`; no columns for a modality that is left out."""
+    noise: Float[Tensor, "*batch time motion"]
+    level: Float[Tensor, "*batch 1"]
+    chance: Float[Tensor, "*batch 3"]
+    """Diffusion noise and level, and uniform random numbers that decide on dropped modalities and self-conditioning;
+    drawn here so that they depend on seed and step, not on the process."""
+
+    @property
+    def stature(self) -> Float[Tensor, "*batch"]:
+        """Height of the head joint in the rest pose (m)."""
+        return self.size[..., 0]
+
+
+@dataclass(frozen=True, eq=False)
+class _HeadTrack:
+    """A recording's open file, values that all of its windows share, and values per frame that are small."""
+
+    store: RecordingStore
+    name: str
+    file: RecordingFile
+    skeleton: Skeleton
+    twins: dict[str, list[int]]
+    T_device_head: Rigid
+    size: Float[Tensor, "limb"]
+    floor_height: Float[Tensor, "time"]
+    floor_from_head: Float[Tensor, "time"]
+    foot_contact: Float[Tensor, "time foot"]
+
+
+class HeadContent(Content):
+    """Windows of head paths and motions. Codes of points are computed where they are missing."""
+
+    draws = ("shift", "mirror", "ends", "end")
+
+    def __init__(self, surroundings: Surroundings = NOTHING):
+        self.surroundings, self.image_size = surroundings, 0
+
+    def prepare(self, stores: Sequence[RecordingStore], split: str) -> None:
+        if self.surroundings.places is not None:
+            for store in stores:
+                self.surroundings.places.prepare(store, store.names(split))
+        self.image_size = self.surroundings.image_size([*stores])
+
+    def min_frames(self, window: int, stretch: float) -> int:
+        return MIN_FRAMES
+
+    def open(self, store: RecordingStore, name: str, every: int) -> _HeadTrack:
+        file = open_recording(store.path_of(name))
+        if file.length("head.timestamps") != file.length("motion.timestamps"):
+            raise WearcapError(
+                "head and motion have different lengths",
+                where=file.path,
+                expected="both on one clock",
+                fix="Prepare the recording again.",
+            )
+        recording = file.load()
+        head, motion = recording.head, recording.motion
+        assert head is not None
+        assert motion is not None
+        stature, t_world_head = motion.skeleton.height_of("head"), head.T_world_head.t
+        from_path = floor_from_path(head.timestamps, t_world_head, stature)
+        from_points = floor_from_points(recording.points, t_world_head, stature)
+        twins = joint_twins(motion.skeleton)
+        return _HeadTrack(
+            store,
+            name,
+            file,
+            motion.skeleton,
+            dict.fromkeys(("R_parent_joint", "t_parent_joint"), twins) | {"foot_contact": [1, 0]},
+            Rigid(head.R_head_device, head.t_head_device).inverse(),
+            body_size(motion.skeleton),
+            from_path if from_points is None else from_points,
+            from_path,
+            true_foot_contact(recording).float(),
+        )
+
+    def read(self, track: _HeadTrack, cut: Cut, random: Draws) -> Window:
+        start, stop = cut.bounds
+        device = (track.file.window(f"head.{name}_world_device", start, stop) for name in ("R", "t"))
+        head = Rigid(*device) @ track.T_device_head
+        local = track.file.window("motion.R_parent_joint", start, stop)
+        values = {
+            "R_parent_joint": cut.take("R_parent_joint", local, start),
+            "R_world_head": cut.take("R_world_head", head.R, start, sensed=True),
+            "t_world_head": cut.take("t_world_head", head.t, start, sensed=True),
+            "floor_height": cut.take("floor_height", track.floor_height, sensed=True),
+            "floor_from_head": cut.take("floor_from_head", track.floor_from_head, sensed=True),
+            "t_parent_joint": track.skeleton.t_parent_joint,
+            "size": track.size,
+            "foot_contact": cut.take("foot_contact", track.foot_contact),
+        }
+        return Window(values, track.twins)
+
+    def item(self, track: _HeadTrack, cut: Cut, window: Window, random: Draws) -> HeadWindow:
+        """Raises WearcapError where points were scaled, which codes do not follow."""
+        if window.scale != 1 and self.surroundings.places is not None:
+            raise WearcapError(
+                "codes of points cannot be scaled", fix="Leave out transforms.scale, or the points (surroundings=head)."
+            )
+        start, stop = cut.bounds
+        seen = self.surroundings.read(track.store, track.name, start, stop, window.mirrored, self.image_size)
+        return HeadWindow(
+            **window.values,
+            valid=cut.valid,
+            **{name: part[cut.frames - start] for name, part in seen._asdict().items()},
+            noise=torch.randn(cut.count, 6 * len(track.skeleton) + FEET, generator=random.generator),
+            level=torch.rand(1, generator=random.generator),
+            chance=torch.rand(3, generator=random.generator),
+        )
