@@ -231,6 +231,7 @@ def _stream(folder: Path, finished: Finished) -> None:
         head, at = recording.head, frame % FRAMES
         pose = Rigid(head.R_world_device[at], head.t_world_device[at])
         session.push([[HeadSample(frame / 60.0, pose)]])
+        session.poses()
         frame += 1
         session.save(path)
         finished(frame)
@@ -239,7 +240,7 @@ def _stream(folder: Path, finished: Finished) -> None:
 def _check_stream(folder: Path, least: int) -> None:
     path = folder / "session.safetensors"
     if least or path.is_file():
-        HMD2Session.load(path, _pipeline()).flush()
+        HMD2Session.load(path, _pipeline()).poses(ended=True)
 
 
 WRITERS = {

@@ -275,12 +275,13 @@ def hmd2_streamed() -> Motion | None:
             else (camera.timestamps > before) & (camera.timestamps <= now)
         )
         embedding = camera.embedding[shown][-1] if shown is not None and bool(shown.any()) else None
-        parts += session.push([[HeadSample(now, head.T_world_device[number], points.points_world[new], embedding)]])
+        session.push([[HeadSample(now, head.T_world_device[number], points.points_world[new], embedding)]])
+        parts += session.poses()
         before = now
         if number == len(head.timestamps) // 2:
             session.save("streams/hmd2.safetensors")
             session = HMD2Session.load("streams/hmd2.safetensors", pipeline)
-    return joined([part for part in (*parts, *session.flush()) if part is not None])
+    return joined([part for part in (*parts, *session.poses(ended=True)) if part is not None])
 
 
 def mocap_every_streamed() -> Motion | None:

@@ -41,7 +41,8 @@ def measure(minutes: int = 60, settle: int = 10, max_points: int = 100_000) -> l
     session = HMD2Session(pipeline, [Wearer(xsens23())], [0], Memory(max_points=max_points))
     walk, early, predicted = Walk(pipeline, new_points=10, forever=True), 0.0, 0
     for second in range(60 * minutes):
-        motion = session.push([[walk.moment(60 * second + i) for i in range(60)]])[0]
+        session.push([[walk.moment(60 * second + i) for i in range(60)]])
+        motion = session.poses()[0]
         predicted += 0 if motion is None else len(motion)
         if second + 1 == 60 * settle:
             early = _peak_mib()

@@ -105,6 +105,7 @@ class Streamed:
         begin = time.perf_counter()
         for moment in moments:
             self.session.push([[moment]])
+            self.session.poses()
         self.seconds.append(time.perf_counter() - begin)
 
     def fill(self) -> "Streamed":

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeleton import FEET, Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.metrics.scores import score_in_world
@@ -134,7 +134,7 @@ class MocapEvery(LearnedSystem):
         """Run the network; the prediction is on the CPU."""
         if self._run is not None:
             output = self._run(features=features.to(self.device)).cpu()
-            return Estimate(output[..., :-CONTACTS], output[..., -CONTACTS:], None)
+            return Estimate(output[..., :-FEET], output[..., -FEET:], None)
         output = self.net(features.to(self.device))
         return Estimate(*(part if part is None else part.cpu() for part in output))
 
