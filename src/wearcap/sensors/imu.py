@@ -86,7 +86,7 @@ def synthesize_imu(
         worn = R_joint_imu @ rotation.exp(torch.from_numpy(strap).float())
     fps, times = motion.fps, motion.timestamps
     path = Trajectory(times, T_world_joint.R @ worn, position)
-    if noise is not None and (noise.clock_offset_s or noise.clock_ppm):
+    if noise is not None and rng is not None and (noise.clock_offset_s or noise.clock_ppm):
         # The path is sampled when the sensor's clock shows the recording's timestamps.
         offset = float(rng.uniform(-1, 1)) * noise.clock_offset_s
         rate = 1 + 1e-6 * noise.clock_ppm * float(rng.standard_normal())

@@ -61,7 +61,8 @@ def head_stream(
     Without `noise` exact; with it, `rng` draws jitter and drift.
     """
     T_world_head = motion.joint("head")
-    R, t = T_world_head.R.contiguous(), T_world_head @ t_head_device
+    R = T_world_head.R.contiguous()
+    t: Tensor = T_world_head @ t_head_device  # pyright: ignore[reportAssignmentType]
     if noise is not None:
         assert rng is not None, "noise needs a generator"
         jitter = smooth_noise(rng, len(t), 6, noise.jitter_period_s, motion.fps)
