@@ -15,7 +15,7 @@ WINDOW, FPS = 16, 30.0
 def drawn_pipeline(multi_stage: bool = True, **settings) -> MocapEvery:
     """A small pipeline whose network has drawn weights."""
     torch.manual_seed(0)
-    features = WatchFeatures(body=True)
+    features = WatchFeatures("heading", body=True)
     net = TwoStageEstimator(features.size, features.motion_size, WINDOW, 32, 1, 2, 32, 16, 0.0, multi_stage, 2)
     given = {"stride": 4, "lookahead": 8, **settings}
     return MocapEvery(net.eval(), features, xsens23(), FPS, **given)

@@ -69,7 +69,7 @@ def told(features: WatchFeatures, window: WatchWindow) -> torch.Tensor:
     ],
 )
 def test_sizes_are_the_papers(root, settings, size):
-    features = WatchFeatures(**settings)
+    features = WatchFeatures(**{"frame": "heading"} | settings)
     assert features.size == size
     assert told(features, batch(root)).shape == (8, 40, size)
 
@@ -166,7 +166,7 @@ def test_a_beginning_stands_still(root):
 @pytest.mark.parametrize("wrong", [{"frame": "moon"}, {"wrists": "gloves"}, {"root": "tree"}])
 def test_unknown_settings(wrong):
     with pytest.raises(WearcapError, match="watch features have no"):
-        WatchFeatures(**wrong)
+        WatchFeatures(**{"frame": "heading"} | wrong)
 
 
 def test_another_rate_is_refused(root):

@@ -13,7 +13,9 @@ def drawn(**shares) -> tuple[torch.Tensor, torch.Tensor]:
     random = torch.Generator().manual_seed(0)
     frames = torch.rand(*SHAPE[:2], SHAPE[2] + 1, generator=random)
     draws = torch.rand(SHAPE[0], DRAWS, generator=random)
-    return LevelMix(**shares).levels(frames, draws), frames[..., :-1]
+    return LevelMix(**{"independent": 0.25, "conveyor": 0.6, "observed": 0.15} | shares).levels(frames, draws), frames[
+        ..., :-1
+    ]
 
 
 def test_levels_are_of_every_frame_and_modality_and_within_their_range():
@@ -91,4 +93,4 @@ def test_as_many_windows_as_asked_for_are_known_whole(whole):
 )
 def test_shares_and_ramps_that_cannot_be_are_refused(wrong):
     with pytest.raises(WearcapError, match="Expected shares that add up"):
-        LevelMix(**wrong)
+        LevelMix(**{"independent": 0.25, "conveyor": 0.6, "observed": 0.15} | wrong)

@@ -190,7 +190,7 @@ def test_bursts_of_wrong_points_are_left_out_by_a_robust_loss():
         kind: bend(
             drifted(true, 0.02), timestamps, timestamps, points, settings=Bending(1.0, loss=loss), solver=bend_banded
         )
-        for kind, loss in (("norm", Loss()), ("cauchy", Loss("cauchy", 0.15)))
+        for kind, loss in (("norm", Loss("norm")), ("cauchy", Loss("cauchy", 0.15)))
     }
     error = {kind: (solved.path - true).norm(dim=1).mean() for kind, solved in solve.items()}
     assert error["cauchy"] < 0.03

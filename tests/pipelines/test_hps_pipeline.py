@@ -136,7 +136,9 @@ def test_a_killed_capture_goes_on_to_the_same_motion(walk, tmp_path, monkeypatch
         (
             lambda r, root: (
                 r,
-                replace(PIPELINE, solver=functools.partial(SOLVER, settings=BandedSettings(iterations=2))),
+                replace(
+                    PIPELINE, solver=functools.partial(SOLVER, settings=BandedSettings(iterations=2, relaxation=1.5))
+                ),
             ),
             ["optimize"],
         ),

@@ -128,7 +128,7 @@ def test_without_watches_those_of_the_true_motion_are_worn(recording):
 
 def test_three_tracked_points_need_a_truth(recording):
     pipeline = drawn_pipeline()
-    pipeline.features = WatchFeatures(body=True, wrists="positions")
+    pipeline.features = WatchFeatures("heading", body=True, wrists="positions")
     assert pipeline(recording).R_parent_joint.isfinite().all()
     with pytest.raises(WearcapError, match="no hand positions"):
         pipeline(replace(recording, motion=None))

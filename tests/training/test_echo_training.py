@@ -66,7 +66,7 @@ def batch(features, *roots: str, count: int = 8) -> EchoWindow:
 def learner(net=None, frame: str = "own", **changes) -> EchoDiffusion:
     features = small_features(frame)
     make = net or partial(EchoDenoiser, window=WINDOW, width=32, layers=1, heads=2, feedforward=32, dropout=0.0)
-    given = {"loss_weights": WEIGHTS, "levels": LevelMix(ramp=(4, 16)), "optimizer": torch.optim.AdamW}
+    given = {"loss_weights": WEIGHTS, "levels": LevelMix(0.25, 0.6, 0.15, ramp=(4, 16)), "optimizer": torch.optim.AdamW}
     return EchoDiffusion(make, features, CosineSchedule(), xsens23(), **given | changes)
 
 

@@ -79,7 +79,7 @@ def batch(data: Path):
 
 
 def system(net=None, **features) -> WatchRegression:
-    estimated = WatchFeatures(**features)
+    estimated = WatchFeatures(**{"frame": "heading"} | features)
     make = net or (
         lambda **sizes: TwoStageEstimator(
             **sizes, window=40, width=32, layers=1, heads=2, feedforward=32, hidden=32, dropout=0.0, frames_per_token=2

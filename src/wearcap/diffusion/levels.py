@@ -21,9 +21,9 @@ class LevelMix:
     `observed` of the windows some frames of one modality are at level 0, as sparse observations are.
     """
 
-    independent: float = 0.25
-    conveyor: float = 0.6
-    observed: float = 0.15
+    independent: float
+    conveyor: float
+    observed: float
     whole: float = 0.0
     """Share of the windows with observations in which all frames of that modality are observed."""
     ramp: tuple[int, int] | list[int] = (10, 60)

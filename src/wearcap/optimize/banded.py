@@ -48,7 +48,7 @@ are compared with the suit's: all joints' frame by frame, the legs' from frame t
 class BandedSettings:
     """Iterations and tolerances of the solver."""
 
-    iterations: int = 20
+    iterations: int = 8
     smooth_start: float = 1e-2
     """Smoothing of norms (m, rad) in the first iteration."""
     smooth_end: float = 3e-4
@@ -57,7 +57,7 @@ class BandedSettings:
     """Relative decrease of the energy below which the solver stops, once the smoothing has reached its end."""
     damping: float = 1e-6
     """Relative increase of the system's diagonal (Levenberg-Marquardt)."""
-    relaxation: float = 1.5
+    relaxation: float = 1.0
     """Step length after the first two iterations; above 1, the reweighting of norms converges sooner."""
 
 

@@ -21,7 +21,7 @@ LOSSES = ("norm", "square", "huber", "cauchy")
 class Loss:
     """Loss ρ of a residual's norm s: s; s²; s²/2δ up to δ and s − δ/2 beyond; or δ/2 · log(1 + (s/δ)²)."""
 
-    kind: str = "norm"
+    kind: str
     """One of `LOSSES`, in the order of the formulas above."""
     delta: float = 1.0
     """Norm δ at which "huber" and "cauchy" change from quadratic to robust, in the residual's unit."""

@@ -93,7 +93,7 @@ class HpsEnergy:
         return self.weights.get(name, 0.0)
 
     def loss(self, name: str) -> Loss:
-        return self.losses.get(name, Loss())
+        return self.losses.get(name, Loss("norm"))
 
     def reading(self, value: str) -> list[str]:
         """Names of the weighted terms that read a value of `data_values`."""

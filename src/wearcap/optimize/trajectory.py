@@ -231,7 +231,7 @@ def bent_path(
     return BentPath(bent(problem, turn, shift), turn, heading, history, reason)
 
 
-def bend_adam(problem: BendingProblem, iterations: int = 1000, learning_rate: float = 1e-2) -> BentPath:
+def bend_adam(problem: BendingProblem, iterations: int = 1000, learning_rate: float = 3e-3) -> BentPath:
     """The thesis's solver (§5.4.2), Adam with a learning rate in rad and m. Returns the best state of all
     iterations."""
     turn = torch.zeros(len(problem.leader), dtype=torch.float64, requires_grad=True)

@@ -145,7 +145,7 @@ class InitializationSettings:
     """Time span of a tangent (thesis: 10 frames at 30 Hz)."""
     min_speed: float = 0.3
     """m/s over a tangent; slower frames are stationary."""
-    yaw_smoothing_s: float = 10.0
+    yaw_smoothing_s: float = 30.0
     path_smoothing_s: float = 1.0
     """Standard deviation (as for yaw) of the smoothing of the difference between camera and suit path, for
     bridge="suit" only; 0: none (thesis)."""

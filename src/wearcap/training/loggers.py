@@ -18,7 +18,7 @@ class RunCSVLogger(CSVLogger):
     """`metrics.csv` of a run. A resumed run keeps the rows before its first step; one from scratch keeps the old file
     as `metrics.previous.csv`. Lightning's own logger deletes the file before there are new rows."""
 
-    def __init__(self, save_dir: str, resume: str | None = None, flush_logs_every_n_steps: int = 100):
+    def __init__(self, save_dir: str, resume: str | None = None, flush_logs_every_n_steps: int = 10):
         super().__init__(save_dir, name="", version="", flush_logs_every_n_steps=flush_logs_every_n_steps)
         self._resumed = resume is not None
 

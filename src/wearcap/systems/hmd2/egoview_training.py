@@ -29,7 +29,7 @@ class EgoView(Training):
         scheduler: SchedulerOf = None,
         dropout: float = 0.0,
         augment: bool = True,
-        turn_deg: float = 5.0,
+        turn_deg: float = 6.0,
         seed: int = 0,
     ):
         super().__init__(optimizer, scheduler, seed=seed)

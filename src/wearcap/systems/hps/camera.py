@@ -44,7 +44,7 @@ class Localize(Protocol):
 class Synchronization:
     """Synchronisation of camera and suit."""
 
-    clock: str = "shared"
+    clock: str = "auto"
     """"shared": both use the same clock. "claps": by claps detected in both. "auto": by claps where a wrist wears a
     sensor, else shared."""
     camera_claps_s: list[float] | None = None

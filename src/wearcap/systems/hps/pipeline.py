@@ -55,7 +55,7 @@ Solver = Callable[[HpsEnergy, HpsData], Solution]
 class Evidence:
     """How much the optimisation trusts the suit's contacts and the localisation."""
 
-    max_contact_speed: float | None = 0.6
+    max_contact_speed: float | None = 0.35
     """Largest speed (m/s, in the suit's own motion) at which a foot patch's contact flag is used; None: all flags are
     used (thesis)."""
     confident: bool = True

@@ -41,7 +41,7 @@ class BendCorrection(Correction):
 
     bend: Callable[..., BentPath]
     """`optimize.trajectory.bend` with its settings and solver."""
-    transition_s: float = 1.5
+    transition_s: float = 3.0
 
     def offset(
         self, contact: ContactInterval, scene_object: SceneObject, points_world: Float[Tensor, "hand 3"], goes_on: bool

@@ -83,7 +83,7 @@ def synthetic_wrists(
 class WatchFeatures:
     """Encodes sensor windows and body motions in canonical, head-based coordinates."""
 
-    frame: str = "heading"
+    frame: str
     """Canonical frame. "head": the pose of the window's first head (the paper). "heading": the same without its tilt,
     so that z stays up (ours). "own" (ours): head-centred, yaw-aligned coordinates of each frame's own head, with
     velocities instead of a path, so that the features do not depend on the position in the window. "world": world

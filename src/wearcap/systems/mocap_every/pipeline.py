@@ -60,7 +60,7 @@ class MocapEvery(LearnedSystem):
     """follow: ours. update: the paper's D.2. points: below the head, from points only. fixed: constant height."""
     anchor: bool = True
     """Whether the body is anchored to the measured head (ours) or keeps the estimator's translation (the paper)."""
-    mirror_average: bool = False
+    mirror_average: bool = True
     """Mirror test-time augmentation: the prediction for the mirrored window is averaged in (ours)."""
     cues: VisualCues | None = None
     """Motion editing by the recording's keypoints (§3.4); None: no editing."""
