@@ -165,7 +165,7 @@ def test_a_capture_says_what_it_listened_to(checkpoint, data, tmp_path):
 
 def test_windows_and_model_must_see_the_same(data, places, tmp_path):
     with pytest.raises(WearcapError, match="points of 0 and images of 64 features.*Expected 128 and 64"):
-        trained("hmd2", data, places, tmp_path / "run", "data.surroundings.places=null")
+        trained("hmd2", data, places, tmp_path / "run", "data.dataset.content.surroundings.places=null")
 
 
 @pytest.mark.parametrize("surroundings", ["points", "images", "head"])
