@@ -20,7 +20,8 @@ from wearcap.optimize.trajectory_banded import bend_banded
 from wearcap.recording import Motion, Recording
 from wearcap.recording.interactions import Interactions
 from wearcap.runtime.digest import digest
-from wearcap.runtime.system import CaptureInput, StagedSystem
+from wearcap.runtime.stages import StagedSystem
+from wearcap.runtime.system import CaptureInput
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.systems.ireplica.object_tracker import PALMS, AttachmentSettings, ObjectTracker

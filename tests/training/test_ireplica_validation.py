@@ -18,7 +18,7 @@ from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.environment import write_environment
 from wearcap.recording import CameraStream, Localization, Recording, RecordingStore
-from wearcap.runtime.system import StagedSystem
+from wearcap.runtime.stages import StagedSystem
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.systems.ireplica.contact_sequence import ContactSequence

@@ -7,6 +7,7 @@ propagates to later stages only as far as results differ.
 
 import json
 import time
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +20,10 @@ from safetensors.torch import load, save
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, write_text
 from wearcap.optimize.hps import HpsState, Solution
+from wearcap.recording import Motion, Recording
 from wearcap.recording.serialize import KNOWN, dumps, flatten, unflatten
 from wearcap.runtime.digest import code_digest, digest, modules_of
+from wearcap.runtime.system import Captured, CaptureInput, StageOptions, System
 from wearcap.sensors.clock import Clock
 from wearcap.sensors.initialization import Initialization
 
@@ -150,3 +153,38 @@ def _kept(stage: Stage, key: str, cache: StageCache | None, console: Console) ->
     except WearcapError as error:
         console.print(f"{stage.name}: {error.where} is {error.what}; it is made again", markup=False, soft_wrap=True)
         return None
+
+
+class StagedSystem(System):
+    """A system that runs in stages, each of which can be cached; seeds have no effect."""
+
+    draws = False
+
+    @abstractmethod
+    def stages(self, source: CaptureInput) -> list[Stage]:
+        """The stages in order. Raises WearcapError when the recording lacks an input of the system."""
+
+    @abstractmethod
+    def motion_of(self, results: dict[str, Any]) -> Motion | None:
+        """The motion after the stages that were run; None if there is none yet."""
+
+    def report(self, source: CaptureInput, results: dict[str, Any]) -> dict[str, Any]:
+        """Findings of the stages that were run, as plain data for JSON."""
+        return {}
+
+    def results(self, recording: Recording | CaptureInput) -> dict[str, Any]:
+        """Results of all stages by name, without a cache."""
+        return run_stages(self.stages(CaptureInput.of(recording)))[0]
+
+    def capture(
+        self, recordings: Sequence[Recording | CaptureInput], seeds: Sequence[int], options: StageOptions | None = None
+    ) -> list[Captured]:
+        """One capture per recording, with a report of its stages. Raises WearcapError as `stages` and the stages do."""
+        return [self._captured(CaptureInput.of(recording), options or StageOptions()) for recording in recordings]
+
+    def _captured(self, source: CaptureInput, options: StageOptions) -> Captured:
+        name = source.recording.name
+        cache = None if options.cache is None else StageCache(options.cache / name)
+        results, runs = run_stages(self.stages(source), cache, options.until, options.console)
+        report = {"pipeline": self.name, "recording": name, "stages": [vars(run) for run in runs]}
+        return Captured(self.motion_of(results), report | self.report(source, results))

@@ -1,6 +1,6 @@
 """The interface of every capture system, learned or optimised: what commands, evaluation, callbacks and notebooks use.
 
-A system's folder has the same rooms by name: `pipeline.py` defines the `System`, `stream.py` its `Session`, `export.py`
+A system's folder has the same rooms by name: `pipeline.py` defines the `System`, `stream.py` its `SESSION`, `export.py`
 its graphs (`exports`, `from_export`). A further system is a further folder under `systems/` with its configs.
 """
 
@@ -24,8 +24,6 @@ from wearcap.metrics.table import Row
 from wearcap.models.checkpoint import load_trained
 from wearcap.recording import Motion, Recording
 from wearcap.runtime.graphs import Exports
-from wearcap.runtime.session import Session
-from wearcap.runtime.stages import Stage, StageCache, run_stages
 from wearcap.scene.environment import Environment
 from wearcap.scene.scan import Scan
 
@@ -159,9 +157,9 @@ class System(ABC):
         """The objects that a motion is shown with; None where there are none."""
         return source.objects(self.environment)
 
-    def stream(self, *args: Any, **kwargs: Any) -> Session:
-        """A streaming capture of one or several wearers: `Session` in the system's `stream.py`."""
-        return self._room("stream", "captures streams").Session(self, *args, **kwargs)
+    def stream(self, *args: Any, **kwargs: Any) -> Any:
+        """A streaming capture of one or several wearers: the `runtime.session.Session` of the system's `stream.py`."""
+        return self._room("stream", "captures streams").SESSION(self, *args, **kwargs)
 
     def follow(self, folder: Path, scan: Scan | None, refused: Counter[str]) -> Iterator[Motion]:
         """Final pieces of motion of a recording that still grows in a folder; `refused` counts unusable pieces."""
@@ -202,38 +200,3 @@ class LearnedSystem(System):
         once = {id(recording): CaptureInput.of(recording) for recording in recordings}
         motions = self.motions([once[id(recording)] for recording in recordings], seeds)
         return [Captured(motion) for motion in motions]
-
-
-class StagedSystem(System):
-    """A system that runs in stages, each of which can be cached; seeds have no effect."""
-
-    draws = False
-
-    @abstractmethod
-    def stages(self, source: CaptureInput) -> list[Stage]:
-        """The stages in order. Raises WearcapError when the recording lacks an input of the system."""
-
-    @abstractmethod
-    def motion_of(self, results: dict[str, Any]) -> Motion | None:
-        """The motion after the stages that were run; None if there is none yet."""
-
-    def report(self, source: CaptureInput, results: dict[str, Any]) -> dict[str, Any]:
-        """Findings of the stages that were run, as plain data for JSON."""
-        return {}
-
-    def results(self, recording: Recording | CaptureInput) -> dict[str, Any]:
-        """Results of all stages by name, without a cache."""
-        return run_stages(self.stages(CaptureInput.of(recording)))[0]
-
-    def capture(
-        self, recordings: Sequence[Recording | CaptureInput], seeds: Sequence[int], options: StageOptions | None = None
-    ) -> list[Captured]:
-        """One capture per recording, with a report of its stages. Raises WearcapError as `stages` and the stages do."""
-        return [self._captured(CaptureInput.of(recording), options or StageOptions()) for recording in recordings]
-
-    def _captured(self, source: CaptureInput, options: StageOptions) -> Captured:
-        name = source.recording.name
-        cache = None if options.cache is None else StageCache(options.cache / name)
-        results, runs = run_stages(self.stages(source), cache, options.until, options.console)
-        report = {"pipeline": self.name, "recording": name, "stages": [vars(run) for run in runs]}
-        return Captured(self.motion_of(results), report | self.report(source, results))

@@ -26,8 +26,8 @@ from wearcap.recording import Motion, Recording
 from wearcap.recording.growing import follow_pieces
 from wearcap.recording.recording import Localization
 from wearcap.recording.timing import resampled
-from wearcap.runtime.stages import Stage
-from wearcap.runtime.system import CaptureInput, StagedSystem
+from wearcap.runtime.stages import Stage, StagedSystem
+from wearcap.runtime.system import CaptureInput
 from wearcap.scene.scan import Scan
 from wearcap.sensors.clock import Clock
 from wearcap.sensors.initialization import (

@@ -8,8 +8,8 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory, filled, interpolate
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import resampled
-from wearcap.runtime.stages import Stage
-from wearcap.runtime.system import CaptureInput, StagedSystem
+from wearcap.runtime.stages import Stage, StagedSystem
+from wearcap.runtime.system import CaptureInput
 from wearcap.sensors.initialization import align_suit, body_camera, inliers
 from wearcap.systems.hps.camera import (
     Localize,

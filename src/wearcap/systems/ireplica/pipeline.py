@@ -16,8 +16,8 @@ from wearcap.io.formats.environment import read_environment
 from wearcap.metrics.table import Row
 from wearcap.recording import Motion
 from wearcap.recording.timing import resampled
-from wearcap.runtime.stages import Stage, run_stages
-from wearcap.runtime.system import CaptureInput, StagedSystem
+from wearcap.runtime.stages import Stage, StagedSystem, run_stages
+from wearcap.runtime.system import CaptureInput
 from wearcap.scene.environment import Environment
 from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 from wearcap.systems.ireplica.object_tracker import ObjectTracker
