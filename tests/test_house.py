@@ -92,6 +92,25 @@ def test_systems_do_not_use_each_other():
             assert parts[:2] != ["wearcap", "systems"] or parts[2] in allowed, f"{path}, line {line}: {name}"
 
 
+def test_commands_know_no_system():
+    """The verbs ask `runtime.system.System`; they import no system and name no system's class."""
+    classes = {
+        node.name
+        for path in (SOURCE / "systems").rglob("pipeline.py")
+        for node in ast.walk(parsed(path))
+        if isinstance(node, ast.ClassDef)
+    }
+    assert {"HPS", "HMD2", "Echo"} <= classes
+    for path in (SOURCE / "cli").glob("*.py"):
+        tree = parsed(path)
+        assert not [name for name, _ in imports(tree) if name.startswith("wearcap.systems")], path
+        named = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+        named |= {
+            node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)
+        }
+        assert not named & classes, path
+
+
 def trains(path: Path) -> bool:
     """Whether a module may know Lightning: `training/`, a DataModule, and what trains in a system's folder."""
     return folder_of(path) in ("training", "data", "cli") or (folder_of(path) == "systems" and path.stem in TRAINING)
