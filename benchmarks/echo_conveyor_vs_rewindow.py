@@ -1,8 +1,8 @@
 """ECHO's conveyor against windows that are denoised from scratch (h = 10): time per frame, and error of both.
 
-Both have the context and the steps of `pipeline=echo`, no guidance, in the same lanes, in turn. Windows need all steps
+Both have the context and the steps of `pipeline=echo`, no guidance, in the same batch, in turn. Windows need all steps
 (112) for 10 frames, the conveyor two for each: 5.6 times as many, less its queue. value: the conveyor's ms per frame
-and lane, once its window is full; baseline: the windows'; ratio = baseline / value, to be at least `goal`. Where there is
+and batch item, once its window is full; baseline: the windows'; ratio = baseline / value, to be at least `goal`. Where there is
 a checkpoint `echo` and the test split of datasets/simulated_objects, also E_v2v (cm) and MPJPE (mm) over the beginnings
 of some of its recordings: value the conveyor's, baseline the windows', ratio = value / baseline, to be at most `goal`.
 """
@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from echo_runs import NAME, figure, lanes_of, pipeline_of
+from echo_runs import NAME, conditions_of, figure, pipeline_of
 
 from wearcap.models.checkpoint import shared_checkpoints
 from wearcap.recording import Recording, RecordingStore
@@ -42,7 +42,7 @@ def measure(items: int = 4, rounds: int = 6, recordings: int = 4, seconds: float
 def _time(conveyor: Echo, windows: Echo, items: int, rounds: int) -> dict:
     """In turn: as many frames through the queue as one window gives."""
     window = conveyor.net.window
-    conditioning = lanes_of(conveyor, items, (window + STRIDE * (rounds + 1)) / conveyor.fps)
+    conditioning = conditions_of(conveyor, items, (window + STRIDE * (rounds + 1)) / conveyor.fps)
     queue, again = _queue(conveyor, items), _queue(windows, items)
     assert isinstance(again, Rewindow)
     for number in range(window):
@@ -94,7 +94,7 @@ def _errors(conveyor: Echo, windows: Echo, recordings: int, seconds: float) -> l
 
 
 def _beginning(recording: Recording, seconds: float) -> Recording:
-    """Its first seconds: the head's path says for how long something is captured."""
+    """Its first seconds: the head's path determines how long the capture is."""
     head = recording.head
     assert head is not None
     count = int(torch.searchsorted(head.timestamps, head.timestamps[0] + seconds))

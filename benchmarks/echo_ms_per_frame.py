@@ -1,7 +1,7 @@
 """ECHO on a GPU, the paper's size without guidance: milliseconds per frame.
 
 Drawn weights; context and steps of `pipeline=echo` (two for every frame that enters), compiled with CUDA graphs in float32.
-A frame is everything from what is told of it to body, object and contacts in the world: one wearer alone, and eight side by
+A frame is everything from its conditions to body, object and contacts in the world: one wearer alone, and eight side by
 side, of whom each has an eighth of the time. baseline: the paper's 13.73 ms on an RTX 4090; ratio = baseline / value, to
 be at least `goal` (1.4 ms, on an H200). Without a CUDA device it is left out.
 """
@@ -9,12 +9,12 @@ be at least `goal` (1.4 ms, on an H200). Without a CUDA device it is left out.
 import time
 
 import torch
-from echo_runs import figure, lanes_of, pipeline_of
+from echo_runs import conditions_of, figure, pipeline_of
 from online import without_cuda
 
 from wearcap.systems.echo.pipeline import Echo
 
-DOCUMENT_MS = 13.73
+PAPER_MS = 13.73
 GOAL_MS = 1.4
 
 
@@ -22,19 +22,19 @@ def measure(frames: int = 200, items: tuple[int, ...] = (1, 8), device: str = "c
     if device == "cuda" and without_cuda("echo_ms_per_frame"):
         return []
     runtime = "compile" if device == "cuda" else "eager"
-    pipeline = pipeline_of("echo", device, "echo_full", runtime=runtime, guidance=None)
+    pipeline = pipeline_of("echo", device, "full/echo", runtime=runtime, guidance=None)
     rows = []
     for count in items:
         value = _milliseconds(pipeline, frames, count)
         name = "echo_ms_per_frame" + (f"_{count}_wearers" if count > 1 else "")
-        rows.append(figure(name, value, "ms", DOCUMENT_MS, DOCUMENT_MS / value, DOCUMENT_MS / GOAL_MS))
+        rows.append(figure(name, value, "ms", PAPER_MS, PAPER_MS / value, PAPER_MS / GOAL_MS))
     return rows
 
 
 @torch.no_grad()
 def _milliseconds(pipeline: Echo, frames: int, items: int) -> float:
     pipeline.prepare()
-    conditioning, filling = lanes_of(pipeline, items, (frames + 90) / pipeline.fps), 90
+    conditioning, filling = conditions_of(pipeline, items, (frames + 90) / pipeline.fps), 90
     queue = pipeline.queue([pipeline.skeleton] * items, list(range(items)), [{}] * items, [[]] * items)
     for number in range(filling):
         queue.push(conditioning.frames(slice(number, number + 1)))

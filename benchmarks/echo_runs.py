@@ -1,4 +1,4 @@
-"""Streams and lanes for benchmarks of ECHO: the shared checkpoint, or its size with drawn weights, and walks with boxes."""
+"""Streams and batches for benchmarks of ECHO: the shared checkpoint, or its size with drawn weights, and walks with boxes."""
 
 import sys
 import time
@@ -31,7 +31,7 @@ HELD_S = 2.0
 def pipeline_of(
     config_name: str, device: str = "cpu", experiment: str = NAME, overrides: tuple[str, ...] = (), **settings
 ) -> Echo:
-    """A pipeline config around the checkpoint of an experiment's name, or around drawn weights of its size, and says so."""
+    """A pipeline config around the checkpoint of an experiment's name, or around drawn weights of its size, which is printed."""
     config = compose("capture", [f"pipeline={config_name}", "recording=none"]).pipeline
     config.update(settings)
     if experiment in shared_checkpoints() and not overrides:
@@ -93,8 +93,8 @@ def frames_per_second(pipeline: Echo, frames: int, repeats: int) -> float:
     return sorted(rates)[repeats // 2]
 
 
-def lanes_of(pipeline: Echo, items: int, duration_s: float) -> Conditioning:
-    """What is told of several walks of a human alone, side by side."""
+def conditions_of(pipeline: Echo, items: int, duration_s: float) -> Conditioning:
+    """Conditions of several walks of a human alone, as one batch."""
     reader, parts = pipeline.reader(), []
     for seed in range(items):
         recording = swinging(f"walk_{seed}", duration_s, seed, fps=FPS)

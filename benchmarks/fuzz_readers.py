@@ -140,7 +140,7 @@ def _limit_worker() -> None:
 
 
 def _work(name: str, seed: int, first: int, last: int, kept: Path, place, pipe) -> None:
-    """A worker process: inputs `first` to `last` of a reader; `place` says which one is being read, and since when."""
+    """A worker process: inputs `first` to `last` of a reader; `place` holds which one is being read, and since when."""
     _limit_worker()
     shared = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
     with tempfile.TemporaryDirectory(dir=shared) as folder:

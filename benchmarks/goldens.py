@@ -5,7 +5,7 @@
     python benchmarks/goldens.py --list              the cases
 
 A case prepares data, trains a few steps, captures, streams, evaluates or exports. Of each array that comes out the file
-holds a SHA-256 and 16 values spread over it, so that another CPU, which sums in another order, can be told from
+holds a SHA-256 and 16 values spread over it, so that another CPU, which sums in another order, can be distinguished from
 another result: a case is "equal" where all hashes are, else "close" within `--tolerance`, else it differs.
 """
 
@@ -96,7 +96,26 @@ CAPTURES: dict[str, tuple[str | None, str, tuple[str, ...]]] = {
     "ireplica_paper": ("[contact_transformer_sliding,contact_transformer_hinged]", "flats", ()),
     "pose_regressor": ("runs/pose_regressor_hands/checkpoints/last.ckpt", "walkers", ()),
 }
-"""Pipelines with their checkpoint, data set, and overrides that keep them short."""
+"""Captures with their checkpoint, data set, and overrides that keep them short."""
+PIPELINES = {
+    "hmd2_paper": "paper/hmd2",
+    "hmd2_mean": "ablation/hmd2_mean",
+    "egoego_style": "baseline/egoego_style",
+    "mocap_every_paper": "paper/mocap_every",
+    "echo_paper": "paper/echo",
+    "echo_rewindow": "ablation/echo_rewindow",
+    "bodiffusion_object": "baseline/bodiffusion_object",
+    "hps_paper": "paper/hps",
+    "hps_paper_adam": "paper/hps_adam",
+    "hps_without_scene": "paper/hps_without_scene",
+    "hps_imu": "baseline/hps_imu",
+    "hps_imu_cam": "baseline/hps_imu_cam",
+    "hps_imu_cam_filtered": "baseline/hps_imu_cam_filtered",
+    "bent_suit": "paper/bent_suit",
+    "ireplica_without_correction": "ablation/ireplica_without_correction",
+    "ireplica_paper": "paper/ireplica",
+}
+"""Pipeline configs of the captures that are not named after theirs."""
 
 QUIET = "callbacks.capture=null"
 TWO = "data.sources.cmu=null"
@@ -172,7 +191,7 @@ def captured(name: str) -> Arrays:
     output = Path("captures", name)
     capture.main(
         [
-            f"pipeline={name}",
+            f"pipeline={PIPELINES.get(name, name)}",
             f"recording={recording_of(dataset)}",
             f"output={output}",
             "video=false",
@@ -253,7 +272,7 @@ def exported(name: str) -> Arrays:
 
 
 def _pipeline(name: str, dataset: str, *settings: str) -> tuple[Any, Recording, str]:
-    config = compose("capture", [f"pipeline={name}", "recording=none", *settings]).pipeline
+    config = compose("capture", [f"pipeline={PIPELINES.get(name, name)}", "recording=none", *settings]).pipeline
     place = recording_of(dataset)
     checkpoint = CAPTURES[name][0]
     return load_pipeline(checkpoint, config, "cpu"), load_recording(place), place

@@ -1,7 +1,7 @@
 """HMD² while it is recorded, for an hour: growth of the process' memory from the tenth minute to the sixtieth.
 
 A small network (one layer, one step, h = 60) follows a walk there and back; points come all the time and are
-forgotten as `Memory` says. value: peak memory (MiB) after the hour; baseline: after ten minutes; ratio = value /
+forgotten as by `Memory`. value: peak memory (MiB) after the hour; baseline: after ten minutes; ratio = value /
 baseline, to be at most `goal`.
 """
 

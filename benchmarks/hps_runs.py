@@ -21,11 +21,11 @@ from wearcap.simulation.recordings.localization_noise import with_outage
 from wearcap.systems.hps.scores import HpsScores, HpsTruth, Outage, disturbance, planted_outages, score_hps
 
 ROWS = {
-    "IMU": "hps_imu",
-    "IMU + Cam": "hps_imu_cam",
-    "IMU + Cam (filtered)": "hps_imu_cam_filtered",
-    "HPS w/o scene": "hps_without_scene",
-    "HPS": "hps_paper",
+    "IMU": "baseline/hps_imu",
+    "IMU + Cam": "baseline/hps_imu_cam",
+    "IMU + Cam (filtered)": "baseline/hps_imu_cam_filtered",
+    "HPS w/o scene": "paper/hps_without_scene",
+    "HPS": "paper/hps",
     "ours": "hps",
 }
 """The papers' rows, as this project states them, and ours: names of pipeline configs."""

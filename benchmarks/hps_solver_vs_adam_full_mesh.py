@@ -29,7 +29,7 @@ WINDOWS = slice(0, 199)
 
 
 def measure(duration_s: float = 60.0, steps: int = 500) -> list[dict]:
-    energy = document_energy()
+    energy = paper_energy()
     data = walk(duration_s, vertices=6890)
     settings = BandedSettings(iterations=20, relaxation=1.5)
 
@@ -62,8 +62,8 @@ def measure(duration_s: float = 60.0, steps: int = 500) -> list[dict]:
     return figures
 
 
-def document_energy() -> HpsEnergy:
-    config = compose("capture", ["pipeline=hps_paper", "recording=none"])
+def paper_energy() -> HpsEnergy:
+    config = compose("capture", ["pipeline=paper/hps", "recording=none"])
     return instantiate(config.pipeline.energy, _convert_="all")
 
 

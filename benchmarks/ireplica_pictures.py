@@ -32,14 +32,14 @@ def draw(dataset: Path, split: str, checkpoint: str, folder: Path) -> None:
         case = Case.load(dataset, name)
         held = case.recording.interactions
         assert held is not None
-        for thing, start, stop in handlings(held.start_s, held.stop_s, held.objects):
-            kind = case.environment.by_name(thing).category
+        for object_name, start, stop in handlings(held.start_s, held.stop_s, held.objects):
+            kind = case.environment.by_name(object_name).category
             inside = (held.start_s >= start) & (held.start_s < stop)
             both = bool((held.hands[inside].sum(1) == 2).any())
             worth = (both or kind not in ("sofa", "table"), min(stop - start, 9.0))
             if kind in WANTED and worth > best.get(kind, ((False, 0.0),))[0]:
-                best[kind] = (worth, name, thing, start, stop)
-    for kind, (_, name, thing, start, stop) in best.items():
+                best[kind] = (worth, name, object_name, start, stop)
+    for kind, (_, name, object_name, start, stop) in best.items():
         case = Case.load(dataset, name)
         assert case.recording.suit is not None
         motion = pipeline.interact(
@@ -48,10 +48,10 @@ def draw(dataset: Path, split: str, checkpoint: str, folder: Path) -> None:
         truth = with_objects(case.recording)
         assert truth is not None
         true = replace(at_times(truth, motion.timestamps), object_motion=truth.object_motion)
-        save_png(folder / f"{kind}.png", sheet(case, true, motion, thing, start, stop))
+        save_png(folder / f"{kind}.png", sheet(case, true, motion, object_name, start, stop))
 
 
-def sheet(case: Case, true: Motion, motion: Motion, thing: str, start: float, stop: float) -> np.ndarray:
+def sheet(case: Case, true: Motion, motion: Motion, object_name: str, start: float, stop: float) -> np.ndarray:
     """Truth and capture from before the touch to behind the release."""
     times = torch.linspace(start - AROUND_S, stop + AROUND_S, FRAMES, dtype=torch.float64)
     frames = torch.searchsorted(motion.timestamps, times).clamp(0, len(motion) - 1).tolist()
@@ -62,14 +62,14 @@ def sheet(case: Case, true: Motion, motion: Motion, thing: str, start: float, st
         columns=FRAMES,
         size=(300, 300),
         body=body,
-        environment=surroundings(case.environment, thing),
+        environment=surroundings(case.environment, object_name),
         distance=5.0,
     )
 
 
-def surroundings(environment: Environment, thing: str) -> Environment:
+def surroundings(environment: Environment, object_name: str) -> Environment:
     """What is moved, and what stands beside it, walls of cupboards and doors that would hide it left out."""
-    moved = environment.by_name(thing)
+    moved = environment.by_name(object_name)
     near = [
         item
         for item in environment.objects

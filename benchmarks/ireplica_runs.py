@@ -88,7 +88,7 @@ def run_recording(run: RecordingRun) -> dict[str, Any]:
     torch.set_num_threads(1)
     case = Case.load(run.dataset, run.name)
     ours = pipeline_of("ireplica", run.networks.ours)
-    published = pipeline_of("ireplica_paper", run.networks.published)
+    published = pipeline_of("paper/ireplica", run.networks.published)
     motion, bent = ours.registered(case.source), published.registered(case.source)
     contacts = {"ours": _contacts(ours, case), "published": _contacts(published, case)}
     rows = {

@@ -2,7 +2,7 @@
 
 A building of nine painted rooms, scanned at 15 mm; 56 database pictures (640 x 360) in each, lifted to 3D by point
 maps; 24 frames of a walk through three rooms as queries. First figure: a video, the last pose helping to choose
-database pictures. Second: every picture on its own, 40 retrieved. Baseline of both: the paper's way, the
+database pictures. Second: every picture on its own, 40 retrieved. Baseline of both: the paper's method, the
 query's keypoints paired with those of each of the 40 retrieved pictures in turn (mutual nearest neighbours, OpenCV's brute
 force), then the same RANSAC; features are the same. value and baseline: frames per second on 2 threads, features included, decoding not;
 frames without a pose within 5 cm and 0.5° of the truth stop the benchmark. ratio = value / baseline; the goal is for

@@ -20,7 +20,7 @@ __all__ = ["figure", "pipeline_of", "watched"]
 
 
 def pipeline_of(config_name: str) -> MocapEvery:
-    """A pipeline config around the project's checkpoint, or around drawn weights of that size, and says so."""
+    """A pipeline config around the project's checkpoint, or around drawn weights of that size, which is printed."""
     config = compose("capture", [f"pipeline={config_name}", "recording=none"]).pipeline
     if NAME in shared_checkpoints():
         pipeline = load_pipeline(NAME, config, "cpu")

@@ -22,15 +22,15 @@ from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.stream import HeadSample, HMD2Session, Wearer
 
-EXPERIMENTS = {"small": "hmd2", "full": "hmd2_full"}
-"""Of the same name: configs, and checkpoints where they exist."""
+EXPERIMENTS = {"small": "hmd2", "full": "full/hmd2"}
+"""Experiments of both sizes; where there is a checkpoint, it has the same name."""
 IMAGE = 64
 LAP_S = 20.0
 """The walk leads there and back, over and over."""
 
 
 def pipeline_of(size: str, device: str = "cpu", **settings) -> HMD2:
-    """The online pipeline around a checkpoint of the project, or around random weights of that size, and says so."""
+    """The online pipeline around a checkpoint of the project, or around random weights of that size, which is printed."""
     config = compose("capture", ["pipeline=hmd2_online", "recording=none"]).pipeline
     if EXPERIMENTS[size] in shared_checkpoints():
         pipeline = load_pipeline(EXPERIMENTS[size], config, device)
@@ -72,7 +72,7 @@ def random_net(size: str) -> MotionDenoiser:
 
 
 class Walk:
-    """A head's way there and back at 60 Hz, with an embedding every other frame, and points on the first lap or forever."""
+    """A head's path there and back at 60 Hz, with an embedding every other frame, and points on the first lap or forever."""
 
     def __init__(self, pipeline: HMD2, new_points: int = 40, forever: bool = False):
         self.pipeline, self.new_points, self.forever = pipeline, new_points, forever
@@ -139,16 +139,16 @@ def figure(name: str, value: float, baseline: float, goal: float) -> dict:
     }
 
 
-def beside_paper(name: str, stride: int, document: float, pushes: int) -> list[dict]:
+def beside_paper(name: str, stride: int, paper: float, pushes: int) -> list[dict]:
     """Full model on a GPU at one stride in 20 steps, beside the paper's frames per second; nothing without a GPU."""
     if without_cuda(name):
         return []
     pipeline = pipeline_of("full", "cuda", stride=stride, steps=20, spacing=1.0, runtime="auto", precision="auto")
-    return [figure(name, frames_per_second(pipeline, pushes), document, 10.0)]
+    return [figure(name, frames_per_second(pipeline, pushes), paper, 10.0)]
 
 
 def without_cuda(name: str) -> bool:
-    """Whether a benchmark for a GPU has none; says so."""
+    """Whether a benchmark for a GPU has none, which is printed."""
     if not torch.cuda.is_available():
         print(f"{name}: left out, no CUDA device", file=sys.stderr)
     return not torch.cuda.is_available()

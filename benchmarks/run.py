@@ -5,7 +5,7 @@
 
 A benchmark is a module in this folder with `measure() -> list[dict]`; each dict is one figure with the keys
 name, value, unit, baseline, ratio, goal. `value` is ours and `baseline` what it is compared with, measured side by
-side in the same run; the module's docstring says what `ratio` divides by what and on which side of `goal` it
+side in the same run; the module's docstring defines what `ratio` divides by what and on which side of `goal` it
 should lie.
 """
 

@@ -1,15 +1,15 @@
-"""A system's tables as in its document, with ours, baselines and ablations.
+"""A system's tables as in its paper, with ours, baselines and ablations.
 
     python benchmarks/tables.py SYSTEM [--quick] [--help]
 
 Prints them and writes OUTPUT/SYSTEM.json (OUTPUT is outputs/tables). Systems:
 
-    hmd2          HMD2 with points and pictures: its document's tables on held-out people and places
+    hmd2          HMD2 with points and pictures: its paper's tables on held-out people and places
     hmd2_head     HMD2 on the head path alone: MPJPE and its parts, realism, beside trivial baselines
-    hps           HPS on simulated sessions: its document's three tables, drift, outages of localisation
-    ireplica      iReplica on simulated interactions: its document's tables, robustness
+    hps           HPS on simulated sessions: its paper's three tables, drift, outages of localisation
+    ireplica      iReplica on simulated interactions: its paper's tables, robustness
     echo          ECHO: bodies, objects and contacts; baselines, ablations, sparse observations
-    mocap_every   MocapEvery: bodies, floors on hillsides, hands in the picture; its document's Tables 2 to 7
+    mocap_every   MocapEvery: bodies, floors on hillsides, hands in the picture; its paper's Tables 2 to 7
     egoview       our image encoder: hands in the head camera's pictures
     voxels        codes of the points around the body: what they bring back
     objects       the object encoder's feature: category, extents, instance of objects unknown to it

@@ -1,13 +1,14 @@
 """ECHO on held-out people, places and objects: the paper's Tables 1, 2, 3, 4 (ablation) and S2 on the data at hand.
 
-Bodies and objects are measured where they are put in the world, over whole recordings. Rows without a checkpoint are
-left out and said so. Checkpoints come by name (checkpoints/) or path; those of baselines and ablations from
-RUNS/NAME/checkpoints/last.ckpt, where `wearcap train experiment=NAME paths.run=RUNS/NAME` puts them. Means and spreads
-are over seeds of the diffusion, as in the paper.
+Bodies and objects are measured where they are put in the world, over whole recordings. Checkpoints come by name
+(checkpoints/) or path; those of baselines and ablations from RUNS/NAME/checkpoints/last.ckpt. A row without its
+checkpoint is left out, and the command that trains it is printed (`TRAININGS`). Means and spreads are over seeds of the
+diffusion, as in the paper.
 """
 
 import argparse
 import json
+import shlex
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -29,42 +30,60 @@ from wearcap.systems.echo.scores import MEASURES, score_echo
 OBJECTS = MEASURES
 HUMAN = ("mpjpe_mm", "mpjve_mm", "foot_contact", "true_foot_contact", "jitter_m_s3", "true_jitter_m_s3")
 UNGUIDED = ("pipeline=echo", "pipeline.guidance=null")
+SHORT = ("experiment=echo", "trainer.max_steps=900")
+TRAININGS: dict[str, tuple[str, ...]] = {
+    "echo_short": SHORT,
+    "echo_window": (*SHORT, "features.frame=window"),
+    "echo_world": (*SHORT, "features.frame=world"),
+    "echo_without_contacts": (*SHORT, "model.contacts=false"),
+    "echo_without_people": (*SHORT, "data.sources.cmu=null"),
+    "echo_without_auxiliary": (
+        *SHORT,
+        "model.loss_weights={object_vertices: 0.0, joints: 0.0, velocity: 0.0, skate: 0.0}",
+    ),
+    "echo_paper_losses": (*SHORT, "model.loss_weights={object_vertices: 0.1, joints: 0.1, velocity: 0.0, skate: 0.05}"),
+    "echo_three_streams": (*SHORT, "model.net.streams=3"),
+    "bodiffusion_object": ("experiment=baseline/bodiffusion_object",),
+}
+"""Overrides of `wearcap train` by the run's name: ECHO trained briefly, and each ablation of it trained as long: the
+paper's canonical frame (window) and none (world), the losses of the three modalities alone, the weights of ECHO eq. 13,
+and a token per frame and modality."""
 ABLATIONS: dict[str, tuple[str, ...]] = {
     "ours without guidance, as long as the others": ("echo_short", *UNGUIDED),
     "the same, objects move untouched": ("echo_short", *UNGUIDED, "pipeline.static_threshold=null"),
     "the same, guided by contacts": ("echo_short", "pipeline=echo"),
-    "document's frame": ("echo_window", *UNGUIDED),
+    "the paper's frame": ("echo_window", *UNGUIDED),
     "no canonical frame": ("echo_world", *UNGUIDED),
     "no contacts": ("echo_without_contacts", *UNGUIDED),
     "no humans alone": ("echo_without_people", *UNGUIDED),
     "no auxiliary losses": ("echo_without_auxiliary", *UNGUIDED),
-    "document's weights of losses": ("echo_paper_losses", *UNGUIDED),
+    "the paper's weights of losses": ("echo_paper_losses", *UNGUIDED),
     "three tokens per frame": ("echo_three_streams", *UNGUIDED),
-    "BoDiffusion-style + object": ("bodiffusion_object", "pipeline=bodiffusion_object"),
+    "BoDiffusion-style + object": ("bodiffusion_object", "pipeline=baseline/bodiffusion_object"),
 }
 SETTINGS = {
     "ours": ("pipeline=echo",),
     "objects move untouched": ("pipeline=echo", "pipeline.static_threshold=null"),
-    "told where objects stand at first": ("pipeline=echo", "pipeline.placed=true"),
+    "initial object poses observed": ("pipeline=echo", "pipeline.placed=true"),
     "not guided by contacts": UNGUIDED,
     "not anchored to the head": ("pipeline=echo", "pipeline.anchor=false"),
     "steps evenly spaced": ("pipeline=echo", "pipeline.spacing=1.0"),
     "the stochastic posterior": ("pipeline=echo", "pipeline.eta=1.0"),
     "noise redrawn (eq. 11 as printed)": ("pipeline=echo", "pipeline.step=redraw", "pipeline.spacing=1.0"),
     "context of 40: latency of 20 frames": ("pipeline=echo", "pipeline.context=40"),
-    "all as in the paper": ("pipeline=echo_paper",),
+    "all as in the paper": ("pipeline=paper/echo",),
 }
 SHARES = {"human": (0.01, 0.05, 0.1, 0.25, 1.0), "object": (0.01, 0.05, 0.1, 0.25, 1.0), "contact": (0.01, 0.05, 0.1, 0.25, 1.0)}  # fmt: skip
-DOCUMENT: Scores = {
+PAPER: Scores = {
     name: {key: Summary(value, None, 4) for key, value in zip(keys, values)}
     for name, keys, values in (
-        ("document: BEHAVE", (*OBJECTS[:3], *OBJECTS[4:8]), (61.4, 66.8, 0.91, 29.5, 17.1, 82.1, 1.4)),
-        ("document: OMOMO", (*OBJECTS[:3], *OBJECTS[4:8]), (64.1, 69.7, 0.95, 26.7, 15.6, 86.8, 1.2)),
-        ("document: BoDiffusion+Obj, BEHAVE", (*OBJECTS[:3], *OBJECTS[4:6]), (84.1, 95.9, 0.96, 36.1, 24.5)),
-        ("document: all contacts given, BEHAVE", (*OBJECTS[:2], *OBJECTS[4:6]), (59.0, 65.1, 27.0, 14.2)),
-        ("document: no contacts, BEHAVE", ("mpjpe_mm", "v2v_cm"), (72.1, 33.0)),
-        ("document: no AMASS, BEHAVE", ("mpjpe_mm", "v2v_cm"), (83.4, 34.9)),
-        ("document: no canonical frame, BEHAVE", ("mpjpe_mm", "v2v_cm"), (125.0, 39.5)),
+        ("paper: BEHAVE", (*OBJECTS[:3], *OBJECTS[4:8]), (61.4, 66.8, 0.91, 29.5, 17.1, 82.1, 1.4)),
+        ("paper: OMOMO", (*OBJECTS[:3], *OBJECTS[4:8]), (64.1, 69.7, 0.95, 26.7, 15.6, 86.8, 1.2)),
+        ("paper: BoDiffusion+Obj, BEHAVE", (*OBJECTS[:3], *OBJECTS[4:6]), (84.1, 95.9, 0.96, 36.1, 24.5)),
+        ("paper: all contacts given, BEHAVE", (*OBJECTS[:2], *OBJECTS[4:6]), (59.0, 65.1, 27.0, 14.2)),
+        ("paper: no contacts, BEHAVE", ("mpjpe_mm", "v2v_cm"), (72.1, 33.0)),
+        ("paper: no AMASS, BEHAVE", ("mpjpe_mm", "v2v_cm"), (83.4, 34.9)),
+        ("paper: no canonical frame, BEHAVE", ("mpjpe_mm", "v2v_cm"), (125.0, 39.5)),
     )
 }  # fmt: skip
 
@@ -72,11 +91,11 @@ DOCUMENT: Scores = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--datasets", type=Path, default=Path("datasets"), help="folder of the prepared data sets")
     parser.add_argument("--split", default="test", help="train, val or test")
-    parser.add_argument("--checkpoint", default="echo", help="ours")
+    parser.add_argument("--checkpoint", default="echo", help="our checkpoint")
     parser.add_argument("--runs", type=Path, default=Path("outputs/train"), help="folder of the other trainings")
     parser.add_argument("--recordings", type=int, help="no more than so many of each data set")
     parser.add_argument("--seeds", type=int, default=4, help="runs of each row")
-    parser.add_argument("--lanes", type=int, default=12, help="recordings that share a batch")
+    parser.add_argument("--items", type=int, default=12, help="recordings that share a batch")
     parser.add_argument("--pipeline", nargs="*", default=[], help="overrides for all rows, as pipeline.per_frame=1")
     parser.add_argument(
         "--parts",
@@ -117,7 +136,7 @@ def _objects(options: argparse.Namespace, progress: Progress) -> tuple[str, tupl
         mine.append(score_echo(one.motion, one.truth, one.name, one.seed))
         stuck.append(score_echo(wrist.attached(one.motion, one.item), one.truth, one.name, one.seed))
     scores |= {"ours, object stuck to the nearer wrist": aggregate(stuck), "ours": aggregate(mine)}
-    return f"Table 1: objects, {options.split}", OBJECTS, scores | DOCUMENT
+    return f"Table 1: objects, {options.split}", OBJECTS, scores | PAPER
 
 
 def _settings(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
@@ -128,7 +147,7 @@ def _settings(options: argparse.Namespace, progress: Progress) -> tuple[str, tup
 
 
 def _ablation(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
-    """Table 4: networks that were trained alike, but for one thing."""
+    """Table 4: networks that were trained alike, but for one choice."""
     store, names = recordings_of(options, "simulated_objects")
     methods = _trained(ABLATIONS, options, progress)
     return f"Ablation: {options.split}", OBJECTS, _scores(methods, options, progress, store, names)
@@ -142,7 +161,12 @@ def _trained(rows: dict[str, tuple[str, ...]], options: argparse.Namespace, prog
         if path.is_file():
             methods.append(Method(name, str(path), tuple(pipeline)))
         else:
-            progress.console.print(f"left out: {name} (no {path})")
+            command = shlex.join(
+                ["wearcap", "train", *TRAININGS[run], f"name={run}", f"paths.run={options.runs / run}"]
+            )
+            progress.console.print(
+                f"left out: {name} (no {path}); train it by: {command}", markup=False, soft_wrap=True
+            )
     return methods
 
 

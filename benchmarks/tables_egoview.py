@@ -60,12 +60,12 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
 
 def _scores(system: EgoView, frames: EgoFrames) -> dict[str, float]:
     batches = DataLoader(frames, batch_size=256)
-    said, truth = [], []
+    predicted, truth = [], []
     for batch in track(batches, description="frames"):
         batch = EgoFrame(*batch)
-        said.append(system(system.pictures(batch)))
+        predicted.append(system(system.pictures(batch)))
         truth.append((batch.point_cam, batch.visible))
-    logits, places = (torch.cat(parts) for parts in zip(*said))
+    logits, places = (torch.cat(parts) for parts in zip(*predicted))
     point_cam, visible = (torch.cat(parts) for parts in zip(*truth))
     mean = system.normalizer.mean.unflatten(-1, (len(POINTS), 3)).expand_as(places)
     return view_scores(logits.sigmoid(), places, mean, point_cam, visible)

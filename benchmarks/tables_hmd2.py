@@ -1,7 +1,7 @@
-"""HMD² with head path, points and images on held-out people and places: Tables 6.1 to 6.10 of its document.
+"""HMD² with head path, points and images on held-out people and places: Tables 6.1 to 6.10 of the thesis.
 
 Every row captures whole recordings with every seed; ± is the deviation over seeds. Rows without a checkpoint are left
-out and said so. Checkpoints come by name (checkpoints/) or path.
+out, which is printed. Checkpoints come by name (checkpoints/) or path.
 """
 
 import argparse
@@ -34,7 +34,7 @@ COLUMNS = {
     "jitter_ratio": "jitter",
     "seam_ratio": "seam",
 }
-DOCUMENT = {
+PAPER = {
     "EgoEgo": (16.61, 34.64, 35.69, 20.15, 3.68, 2.43),
     "AvatarPoser (head)": (10.64, 21.51, 27.61, 12.99, 1.69, 4.21),
     "HMD² (h = 180)": (8.36, 16.64, 2.16, 15.74, 1.03, 1.03),
@@ -169,7 +169,7 @@ def _latencies(options: argparse.Namespace, h: int) -> list[Method]:
     ahead = min(LOOKAHEAD, 240 - h)
     both = (f"pipeline.stride={h}", "pipeline.steps=5", "pipeline.live=true")
     return [
-        _ours(options, f"h = {h}, the paper's", *both, pipeline="hmd2_paper"),
+        _ours(options, f"h = {h}, the paper's", *both, pipeline="paper/hmd2"),
         _ours(options, f"h = {h}", *both, "pipeline.fade=10", "pipeline.lookahead=0"),
         _ours(options, f"h = {h}, {ahead} ahead", *both, "pipeline.fade=10", f"pipeline.lookahead={ahead}"),
     ]
@@ -188,12 +188,12 @@ def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
     ]
     wanted = [
         *(Method(name) for name in BASELINES),
-        Method("EgoEgo-style", options.egoego, ("pipeline=egoego_style",)),
+        Method("EgoEgo-style", options.egoego, ("pipeline=baseline/egoego_style",)),
         *regressors,
         *ablations,
         *separate,
-        _ours(options, "full, the paper's windows", pipeline="hmd2_paper"),
-        _ours(options, "full, one step to the mean", pipeline="hmd2_mean"),
+        _ours(options, "full, the paper's windows", pipeline="paper/hmd2"),
+        _ours(options, "full, one step to the mean", pipeline="ablation/hmd2_mean"),
     ]
     there = [method for method in wanted if method.checkpoint is None or _exists(method.checkpoint)]
     for method in wanted:
@@ -216,7 +216,7 @@ def _table(title: str, results: list[Result]) -> Table:
 
 def _paper() -> Table:
     table = new_table("the paper, on Nymeria", ["", "MPJPE", "hand", "FID", "divers.", "phys.", "floor"])
-    for name, values in DOCUMENT.items():
+    for name, values in PAPER.items():
         table.add_row(name, *(f"{value:.2f}" for value in values))
     return table
 

@@ -16,13 +16,13 @@ from wearcap.metrics.table import Scores, Summary, rich_table, write_scores
 
 OURS = ("experiment=motion_diffusion_head",)
 ABLATIONS = {
-    "document's frame, losses and draws": ("experiment=motion_diffusion_head_paper",),
+    "the paper's frame, losses and draws": ("experiment=paper/motion_diffusion_head",),
     "noise levels drawn uniformly": (*OURS, "model.level_tilt=0"),
     "all windows drawn alike": (*OURS, "data.dataset.balance=1"),
     "condition without context": (*OURS, "model.net.context=0"),
 }
-DOCUMENT: Scores = {
-    "HMD2's document, on Nymeria": {"mpjpe_cm": Summary(9.28, None, 1), "hand_pe_cm": Summary(19.47, None, 1)}
+PAPER: Scores = {
+    "HMD2's paper, on Nymeria": {"mpjpe_cm": Summary(9.28, None, 1), "hand_pe_cm": Summary(19.47, None, 1)}
 }
 COLUMNS = (
     "mpjpe_cm",
@@ -57,16 +57,16 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     """Print and write the table; returns its path."""
     checkpoints = options.checkpoint or _trained("ours", OURS, options)
     scores = {**_evaluated(checkpoints, options, "hmd2", baselines=True)}
-    scores["wearcap, one step to the mean"] = _evaluated(checkpoints, options, "hmd2_mean")["wearcap"]
+    scores["wearcap, one step to the mean"] = _evaluated(checkpoints, options, "ablation/hmd2_mean")["wearcap"]
     if not options.no_ablations:
         for row, overrides in ABLATIONS.items():
             scores[row] = _evaluated(_trained(row, overrides, options), options, "hmd2")["wearcap"]
         if not options.quick:
             scores["wearcap, latency 0.17 s"] = _evaluated(checkpoints, options, "hmd2_online")["wearcap"]
     path = options.output / "hmd2_head.json"
-    show(rich_table(f"HMD2, head path alone ({options.data})", {**scores, **DOCUMENT}, COLUMNS))
+    show(rich_table(f"HMD2, head path alone ({options.data})", {**scores, **PAPER}, COLUMNS))
     facts = {"data": options.data, "quick": str(options.quick), "checkpoints": " ".join(map(str, checkpoints))}
-    write_scores(path, {**scores, **DOCUMENT}, {**about, **facts})
+    write_scores(path, {**scores, **PAPER}, {**about, **facts})
     return path
 
 

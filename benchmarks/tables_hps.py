@@ -1,4 +1,4 @@
-"""HPS on simulated sessions of more than 400 m: Tables 4.1 to 4.3 of its document, drift, outages, time per stage.
+"""HPS on simulated sessions of more than 400 m: Tables 4.1 to 4.3 of the paper, drift, outages, time per stage.
 
 Sessions, scans and the rig's clouds are kept in OUTPUT/hps/cache, pictures go to OUTPUT/hps.
 """
@@ -21,7 +21,7 @@ from wearcap.files import write_text
 from wearcap.simulation.recordings.hps import HpsConfig, Protocol
 from wearcap.systems.hps.scores import in_order
 
-DOCUMENT = {
+PAPER = {
     "stand": {
         "IMU": (6.85, 54.49, 69.02, 108.44), "IMU + Cam": (9.24, 742.32, 136.81, 32.17),
         "IMU + Cam (filtered)": (10.48, 6.93, 5.93, 6.15), "HPS w/o scene": (7.21, 6.48, 5.80, 5.69),
@@ -34,7 +34,7 @@ DOCUMENT = {
     },
 }  # fmt: skip
 """Thesis Tables 4.1 and 4.2 (cm)."""
-DOCUMENT_FEET = {
+PAPER_FEET = {
     "IMU": (188.38, 0.92),
     "IMU + Cam": (39.8, 52.09),
     "IMU + Cam (filtered)": (0.95, 1.75),
@@ -176,7 +176,7 @@ def _chamfer_table(name: str, places: list[str], entries: dict[str, Any]) -> Tab
     title = f"{TITLES[name]}: bidirectional Chamfer (cm), in brackets the paper's"
     table = new_table(title, ["", *places])
     for row, summaries in entries.items():
-        known = DOCUMENT[name].get(row, ())
+        known = PAPER[name].get(row, ())
         beside = [f"  [{value:.2f}]" for value in known] if len(known) == len(summaries) else []
         beside += [""] * (len(summaries) - len(beside))
         table.add_row(row, *(cell(summary) + value for summary, value in zip(summaries, beside)))
@@ -189,7 +189,7 @@ def _feet_table(tree: dict[str, Any]) -> Table:
         ["", "to surface, signed", "absolute", "sliding", "absolute, true contact", "sliding, true contact"],
     )
     for row, feet in tree["feet"].items():
-        known, true = DOCUMENT_FEET.get(row), tree["feet_true_contact"][row]
+        known, true = PAPER_FEET.get(row), tree["feet_true_contact"][row]
         beside = [f"  [{value:g}]" for value in known] if known else ["", ""]
         table.add_row(
             row,

@@ -1,4 +1,4 @@
-"""iReplica on simulated recordings of held-out people and objects: Tables 5.1 to 5.5 of its document, and robustness.
+"""iReplica on simulated recordings of held-out people and objects: Tables 5.1 to 5.5 of the paper, and robustness.
 
 HPS with noisy localisation registers the wearer; every row below captures the same motion. Recordings of the split are
 dealt out to `--seeds` groups: means are over groups, ± their deviation. Without checkpoints, the networks are those in
@@ -25,15 +25,15 @@ from wearcap.metrics.detection import mean_detection_scores
 from wearcap.recording import RecordingStore
 from wearcap.scene.objects import CONTACT_CLASSES
 
-DOCUMENT_END = {"HPS": (60.81, 46.89), "as published": (6.88, 7.13), "as published, w/o contact corr.": (11.68, 10.28)}
+PAPER_END = {"HPS": (60.81, 46.89), "as published": (6.88, 7.13), "as published, w/o contact corr.": (11.68, 10.28)}
 """Thesis Table 5.1, column All: cm and degrees."""
-DOCUMENT_HAND = {"HPS": 33.61, "HPS w/ GT": 10.44, "as published": 2.93, "as published, w/o contact corr.": 11.37}
+PAPER_HAND = {"HPS": 33.61, "HPS w/ GT": 10.44, "as published": 2.93, "as published, w/o contact corr.": 11.37}
 """Thesis Table 5.2, column All (cm)."""
-DOCUMENT_DETECTION = (0.807, 0.786, 0.880, 0.905)
+PAPER_DETECTION = (0.807, 0.786, 0.880, 0.905)
 """Thesis Table 5.3: AP, precision, recall, accuracy at 0.5."""
-DOCUMENT_GAPS = (13.61, 8.49, 7.13, 8.86, 8.86)
+PAPER_GAPS = (13.61, 8.49, 7.13, 8.86, 8.86)
 """Thesis Table 5.4 (cm)."""
-DOCUMENT_CHAMFER = {"HPS": (9.771, 22.651), "as published": (8.981, 8.471)}
+PAPER_CHAMFER = {"HPS": (9.771, 22.651), "as published": (8.981, 8.471)}
 """Thesis Table 5.5: body and object (cm)."""
 KINDS = {
     "door": ("door", "window", "cabinet_door"),
@@ -84,7 +84,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
         RecordingRun(options.dataset, name, networks, index < seeds and not (options.no_robustness or options.quick))
         for index, name in enumerate(names)
     ]
-    found = Parallel(n_jobs=options.jobs)(delayed(_told)(run) for run in runs)
+    found = Parallel(n_jobs=options.jobs)(delayed(_run_printed)(run) for run in runs)
     groups: list[list[Any]] = [list(found[k::seeds]) for k in range(seeds)]
     tree = {"about": about | {"dataset": str(options.dataset), "split": options.split, "recordings": names}} | _tree(
         groups
@@ -95,7 +95,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     return path
 
 
-def _told(run: RecordingRun) -> dict[str, Any]:
+def _run_printed(run: RecordingRun) -> dict[str, Any]:
     found = run_recording(run)
     rows = found["rows"]["ours"]["handlings"]
     ends = sum(row["end_cm"] for row in rows) / max(len(rows), 1)
@@ -197,7 +197,7 @@ def _ends(tree: dict[str, Any]) -> Table:
         ["", *KINDS, "all", "median"],
     )
     for row, found in tree["rows"].items():
-        known = DOCUMENT_END.get(row)
+        known = PAPER_END.get(row)
         beside = f"  [{known[0]:.1f} / {known[1]:.1f}]" if known else ""
         cells = [_two(found["kinds"][kind]) for kind in KINDS]
         shown.add_row(row, *cells, _two(found["all"], spread=True) + beside, _two(found["median"]))
@@ -221,7 +221,7 @@ def _hands(tree: dict[str, Any]) -> Table:
         ["", *columns.values(), "body (MPJPE)", "untouched moved"],
     )
     for row, found in tree["rows"].items():
-        known = DOCUMENT_HAND.get(row)
+        known = PAPER_HAND.get(row)
         cells = [cell(found["all"][name], 1) for name in columns]
         cells[0] += f"  [{known:.1f}]" if known else ""
         shown.add_row(row, *cells, cell(found["whole"]["mpjpe_cm"], 1), cell(found["whole"]["false_moves_cm"], 1))
@@ -235,14 +235,14 @@ def _detections(tree: dict[str, Any]) -> Table:
         shown.add_row(name, *(cell(found["detection"][column], 3) for column in columns))
         for kind, scores in found["by_class"].items():
             shown.add_row(f"  {kind}", *(cell(scores[column], 3) for column in columns))
-    shown.add_row("the paper's, on H-contact", *(f"{value:.3f}" for value in DOCUMENT_DETECTION), "")
+    shown.add_row("the paper's, on H-contact", *(f"{value:.3f}" for value in PAPER_DETECTION), "")
     return shown
 
 
 def _gaps(tree: dict[str, Any]) -> Table:
     shown = new_table("Table 5.4: gaps filled (s) and where objects end (cm)", ["", *tree["gaps"]])
     shown.add_row("ours", *(cell(found, 1) for found in tree["gaps"].values()))
-    shown.add_row("the paper's", *(f"{value:.2f}" for value in DOCUMENT_GAPS))
+    shown.add_row("the paper's", *(f"{value:.2f}" for value in PAPER_GAPS))
     return shown
 
 
@@ -252,7 +252,7 @@ def _chamfer(tree: dict[str, Any]) -> Table:
         ["", "body", "object"],
     )
     for row, found in tree["rows"].items():
-        known = DOCUMENT_CHAMFER.get(row)
+        known = PAPER_CHAMFER.get(row)
         beside = [f"  [{value:.1f}]" for value in known] if known else ["", ""]
         names = ("body_chamfer_cm", "object_chamfer_cm")
         shown.add_row(row, *(cell(found["whole"][name], 1) + value for name, value in zip(names, beside)))

@@ -1,13 +1,14 @@
 """MocapEvery on held-out people and places: the paper's Tables 2 to 7 on the data at hand.
 
-Bodies are measured where they are put in the world. Rows without a checkpoint are left out and said so. Checkpoints
-come by name (checkpoints/) or path; those of baselines and ablations from RUNS/NAME/checkpoints/last.ckpt, where
-`wearcap train experiment=EXPERIMENT paths.run=RUNS/NAME` puts them; further seeds of a training from RUNS/NAME_1,
-RUNS/NAME_2 and so on: the table gives their mean and spread.
+Bodies are measured where they are put in the world. Checkpoints come by name (checkpoints/) or path; those of baselines
+and ablations from RUNS/NAME/checkpoints/last.ckpt, and further seeds of a training from RUNS/NAME_1 and RUNS/NAME_2: the
+table gives their mean and spread. A row without its checkpoint is left out, and the command that trains it is printed
+(`TRAININGS`).
 """
 
 import argparse
 import json
+import shlex
 from pathlib import Path
 
 from mocap_every_calibration import GOALS, calibration_scores
@@ -35,24 +36,43 @@ BODY = (
 )
 FLOOR = ("upper_pe_cm", "lower_pe_cm", "mpjpe_cm", "floor_cm", "floor_within_3cm", "floor_within_3cm_smoothed")
 CUES = ("right_hand_cm", "right_arm_cm", "upper_cm", "mpjpe_cm", "jitter_m_s3")
+OURS = "experiment=mocap_every"
+TRAININGS: dict[str, tuple[str, ...]] = {
+    "mocap_every_avatarposer": ("experiment=baseline/mocap_every_avatarposer",),
+    "mocap_every_paper": ("experiment=paper/mocap_every",),
+    "mocap_every_neither": (
+        OURS,
+        "model.net.multi_stage=false",
+        "model.features.frame=world",
+        "model.features.absolute=false",
+    ),
+    "mocap_every_one_stage": (OURS, "model.net.multi_stage=false"),
+    "mocap_every_short": (OURS,),
+    "mocap_every_hands": (OURS, "model.features.wrists=positions"),
+}
+"""Overrides of `wearcap train` by the run's name: ablations after the paper's Table 7 without its first stage, and
+without its data representation as well (world coordinates); and AvatarPoser's protocol 1, with tracked hands instead of
+accelerations."""
+STEPS = ("trainer.max_steps=1000", "data.loading.steps_per_epoch=250")
+"""All of these are trained so long."""
 TRAINED = {
     "AvatarPoser-style, watches": (
         "mocap_every_avatarposer",
         ("pipeline=mocap_every", "pipeline.stride=1", "pipeline.lookahead=0", "pipeline.mirror_average=false"),
     ),
-    "as in the paper": ("mocap_every_paper", ("pipeline=mocap_every_paper",)),
+    "as in the paper": ("mocap_every_paper", ("pipeline=paper/mocap_every",)),
     "neither": ("mocap_every_neither", ("pipeline=mocap_every",)),
     "+ representation": ("mocap_every_one_stage", ("pipeline=mocap_every",)),
     "+ multi-stage": ("mocap_every_short", ("pipeline=mocap_every",)),
     "+ multi-stage, hands tracked": ("mocap_every_hands", ("pipeline=mocap_every",)),
 }
-"""Rows: run, and pipeline. "+ multi-stage" is experiment=mocap_every, trained for as many steps as the others."""
-DOCUMENT: Scores = {
+"""Rows: run, and pipeline."""
+PAPER: Scores = {
     name: {key: Summary(value, None, 1) for key, value in zip(BODY, values)}
     for name, values in {
-        "document: AMASS": (4.95, 5.20, 17.00, 4.36, 1.64),
-        "document: neither": (5.85, 8.50, 27.63),
-        "document: + representation": (5.58, 6.71, 23.69),
+        "paper: AMASS": (4.95, 5.20, 17.00, 4.36, 1.64),
+        "paper: neither": (5.85, 8.50, 27.63),
+        "paper: + representation": (5.58, 6.71, 23.69),
     }.items()
 }
 FLOORS = ("fixed", "update", "points", "follow")
@@ -61,7 +81,7 @@ FLOORS = ("fixed", "update", "points", "follow")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--datasets", type=Path, default=Path("datasets"), help="folder of the prepared data sets")
     parser.add_argument("--split", default="test", help="train, val or test")
-    parser.add_argument("--checkpoint", default="mocap_every", help="ours")
+    parser.add_argument("--checkpoint", default="mocap_every", help="our checkpoint")
     parser.add_argument("--manifold", default="motion_manifold", help="where motion is edited by cues")
     parser.add_argument("--runs", type=Path, default=Path("outputs/train"), help="folder of the other trainings")
     parser.add_argument("--recordings", type=int, help="no more than so many of each data set")
@@ -112,7 +132,12 @@ def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
         paths = [options.runs / seeded / "checkpoints" / "last.ckpt" for seeded in (run, f"{run}_1", f"{run}_2")]
         trained[name] = [Method(name, str(path), (*pipeline, level)) for path in paths if path.is_file()]
         if not trained[name]:
-            progress.console.print(f"left out: {name} (no {paths[0]})")
+            command = shlex.join(
+                ["wearcap", "train", *TRAININGS[run], *STEPS, f"name={run}", f"paths.run={options.runs / run}"]
+            )
+            progress.console.print(
+                f"left out: {name} (no {paths[0]}); train it by: {command}", markup=False, soft_wrap=True
+            )
     rows = {name: methods for name, methods in trained.items() if methods}
     rows |= {method.name: [method] for method in ours}
     store, names = recordings_of(options, "cmu")
@@ -125,7 +150,7 @@ def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
             for recording, captured in captures(method, store, names, lambda b=bar: progress.advance(b))
         ]
         scores[name] = aggregate(scored)
-    return f"Tables 2, 6, 7: CMU, {options.split}", BODY, scores | DOCUMENT
+    return f"Tables 2, 6, 7: CMU, {options.split}", BODY, scores | PAPER
 
 
 def _floor(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
@@ -148,9 +173,9 @@ def _floor(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[
         scores[method.name] = aggregate(
             [floor_row(*pair) for pair in captures(method, store, names, lambda b=bar: progress.advance(b))]
         )
-    both = (("document: fixed", (9.19, 16.58, 12.35)), ("document: update", (6.04, 7.19, 6.53)))
-    document = {name: {key: Summary(v, None, 1) for key, v in zip(FLOOR, values)} for name, values in both}
-    return f"Table 3: hillsides, {options.split}", FLOOR, scores | document
+    both = (("paper: fixed", (9.19, 16.58, 12.35)), ("paper: update", (6.04, 7.19, 6.53)))
+    paper = {name: {key: Summary(v, None, 1) for key, v in zip(FLOOR, values)} for name, values in both}
+    return f"Table 3: hillsides, {options.split}", FLOOR, scores | paper
 
 
 def _cues(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
@@ -178,9 +203,9 @@ def _cues(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
             scores[f"{data}: estimated"] = aggregate(before)
             scores[f"{data}: {label}"] = aggregate(after)
             progress.console.print(f"{data}: {sum(row.frames for row in before)} frames show the wrist")
-    both = (("document: estimated", (11.91, 9.72, 8.04)), ("document: edited", (5.55, 5.97, 6.65)))
-    document = {name: {key: Summary(v, None, 1) for key, v in zip(CUES, values)} for name, values in both}
-    return f"Table 4: frames that show the right wrist, {options.split}", CUES, scores | document
+    both = (("paper: estimated", (11.91, 9.72, 8.04)), ("paper: edited", (5.55, 5.97, 6.65)))
+    paper = {name: {key: Summary(v, None, 1) for key, v in zip(CUES, values)} for name, values in both}
+    return f"Table 4: frames that show the right wrist, {options.split}", CUES, scores | paper
 
 
 def _calibration(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:

@@ -3,7 +3,7 @@
 Category by the network's own head: of objects as they are, turned about the vertical, and turned in any way. Extents:
 mean error of the half extents along the axes, as a share of the cloud's radius. Found again: the same object turned
 in any way, as nearest by the projected feature among all of the test. Beside it the nearest training object by
-its half extents in metres, which knows the size that the encoder is not told. Speed: milliseconds per cloud of one core, one at a time.
+its half extents in metres, which knows the size, whereas the encoder does not. Speed: milliseconds per cloud of one core, one at a time.
 """
 
 import argparse
@@ -57,21 +57,21 @@ def milliseconds(system: ObjectEncoding, clouds: Float[Tensor, "batch point 3"])
 
 def scored(system: ObjectEncoding, clouds: Tensor, labels: Tensor) -> tuple[dict[str, dict[str, float]], Tensor]:
     """Scores by view, and the confusion of views turned in any way (rows: true)."""
-    rows, projected, said = {}, {}, labels
+    rows, projected, predicted = {}, {}, labels
     for name, turned in VIEWS.items():
         seen = views(clouds, turned)
         feature = torch.cat([system.net.encoder(part) for part in seen.split(64)])
-        said = system.net.category(feature).argmax(-1)
+        predicted = system.net.category(feature).argmax(-1)
         extents = bounds(seen)[0] / to_unit_sphere(seen)[1][:, None]
         projected[name] = F.normalize(system.net.instance(feature), dim=-1)
         again = (projected[name] @ projected["as it is"].T).argmax(1) == torch.arange(len(clouds))
         rows[name] = {
-            "accuracy": (said == labels).float().mean().item(),
+            "accuracy": (predicted == labels).float().mean().item(),
             "extents_error": (system.net.extents(feature) - extents).abs().mean().item(),
             "found_again": again.float().mean().item(),
         }
     count = len(system.net.classes)
-    return rows, (labels * count + said).bincount(minlength=count**2).reshape(count, count)
+    return rows, (labels * count + predicted).bincount(minlength=count**2).reshape(count, count)
 
 
 @torch.inference_mode()

@@ -1,6 +1,6 @@
 """How far simulated people differ from CMU's: gait statistics of straight walking, and a discriminator.
 
-The discriminator is a small network that sees two seconds of head and wrist paths and says which they are from; it is
+The discriminator is a small network that sees two seconds of head and wrist paths and predicts which they are from; it is
 judged on people it has not seen. 50 % means that it cannot tell.
 """
 

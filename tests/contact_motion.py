@@ -32,7 +32,7 @@ def bending(frames: int, seed: int = 0, skeleton: Skeleton | None = None) -> tup
         start,
         start + 1.0,
         torch.nn.functional.one_hot(hand, 2).bool(),
-        ("thing",) * len(start),
+        ("object",) * len(start),
         tuple(CLASSES[k] for k in kind.tolist()),
     )
     return replace(motion, R_parent_joint=R), interactions

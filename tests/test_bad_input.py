@@ -277,7 +277,7 @@ ROWS = {
         lambda data, ckpt, tmp, out: hps(
             suited(tmp / "d"),
             out,
-            "pipeline=hps_without_scene",
+            "pipeline=paper/hps_without_scene",
             "pipeline.synchronization.clock=claps",
             "pipeline.synchronization.camera_claps_s=[1.0]",
         ),
@@ -292,7 +292,7 @@ ROWS = {
         "Motion.contact_prob has 50 rows for 90 timestamps",
     ),
     "hps: no stage": (
-        lambda data, ckpt, tmp, out: hps(suited(tmp / "d"), out, "pipeline=hps_without_scene", "until=optimise"),
+        lambda data, ckpt, tmp, out: hps(suited(tmp / "d"), out, "pipeline=paper/hps_without_scene", "until=optimise"),
         "no stage 'optimise'",
     ),
     "evaluate: no data set for hps": (
@@ -337,17 +337,17 @@ ROWS = {
 
 
 @pytest.mark.parametrize("row", ROWS)
-def test_a_verb_says_it_once_and_leaves_nothing(row, trained, tmp_path, capfd):
+def test_a_verb_reports_it_once_and_leaves_nothing(row, trained, tmp_path, capfd):
     arguments, message = ROWS[row]
     out = tmp_path / "out"
     out.mkdir()
     command = arguments(*trained, tmp_path, out)
     capfd.readouterr()
     assert exit_code(command) == 2
-    told = [line for line in capfd.readouterr().err.splitlines() if line.strip()]
-    assert len(told) == 1, told
-    assert told[0].startswith(f"wearcap {command[0]}: ")
-    assert message in told[0]
+    printed = [line for line in capfd.readouterr().err.splitlines() if line.strip()]
+    assert len(printed) == 1, printed
+    assert printed[0].startswith(f"wearcap {command[0]}: ")
+    assert message in printed[0]
     assert not files_in(out)
 
 
@@ -379,9 +379,9 @@ def test_a_full_disk_and_a_locked_folder(verb, fault, message, trained, tmp_path
     monkeypatch.setattr("wearcap.files.os.replace", refuse)
     capfd.readouterr()
     assert exit_code(command) == 2
-    told = [line for line in capfd.readouterr().err.splitlines() if line.startswith("wearcap ")]
-    assert len(told) == 1
-    assert message in told[0]
+    printed = [line for line in capfd.readouterr().err.splitlines() if line.startswith("wearcap ")]
+    assert len(printed) == 1
+    assert message in printed[0]
     assert not files_in(out)
 
 
@@ -401,9 +401,9 @@ def test_what_cannot_be_prepared_is_named_and_left_out(fault, tmp_path, capfd):
         lines[place - 1 :] = ["Frames: 3", *lines[place : place + 4]]
     (source / "bad.bvh").write_text("\n".join(lines) + "\n")
     assert exit_code(["prepare", "cmu", f"source={source}", f"output={out}", "jobs=1"]) == 1
-    told = [line for line in capfd.readouterr().err.splitlines() if line.startswith("failed: ")]
-    assert len(told) == 1
-    assert "bad" in told[0]
+    printed = [line for line in capfd.readouterr().err.splitlines() if line.startswith("failed: ")]
+    assert len(printed) == 1
+    assert "bad" in printed[0]
     assert RecordingStore.open(out).names() == ["good"]
     assert files_in(out) == {"manifest.json", "recordings/good.safetensors"}
 

@@ -1,4 +1,4 @@
-"""Scenes, clocks, objects and labels that are wrong: one error each that says what, and nothing is lost."""
+"""Scenes, clocks, objects and labels that are wrong: one error each that names the fault, and nothing is lost."""
 
 import json
 from contextlib import suppress
@@ -72,7 +72,7 @@ def test_contacts_shorter_than_poses(tmp_path, capsys):
     assert "Motion.contact_prob has 50 rows for 90 timestamps" in capsys.readouterr().out
 
 
-def test_no_clap_is_said(tmp_path, capsys):
+def test_no_clap_is_reported(tmp_path, capsys):
     motion = swaying_motion(600)
     wrist = motion.joint("left_wrist")
     imu = ImuStream(motion.timestamps, "left_wrist", R_world_imu=wrist.R, acc_world=torch.zeros(600, 3))
@@ -155,8 +155,8 @@ def test_labels_that_cannot_be_are_refused_and_kept(row, tmp_path, capsys):
     file = output / "r.contacts.json"
     file.write_text(json.dumps(content))
     assert exit_code(["annotate", f"{data}/r", "--output", str(output), "--no-browser"]) == 2
-    told = [line for line in capsys.readouterr().err.splitlines() if line.strip()]
-    assert len(told) == 1
-    assert message in told[0]
+    printed = [line for line in capsys.readouterr().err.splitlines() if line.strip()]
+    assert len(printed) == 1
+    assert message in printed[0]
     assert json.loads(file.read_text()) == content
     assert files_in(output) == {file.name}

@@ -56,7 +56,7 @@ def test_a_command_of_the_pages_is_understood(page, line, tmp_path, monkeypatch)
 
 
 def test_the_pages_name_the_main_commands():
-    told = " ".join(line for _, line in COMMANDS)
+    named = " ".join(line for _, line in COMMANDS)
     for word in (
         "make demo",
         "make test",
@@ -71,7 +71,7 @@ def test_the_pages_name_the_main_commands():
         "launcher=joblib",
         "launcher=slurm",
     ):
-        assert word in told
+        assert word in named
 
 
 @pytest.mark.parametrize("launcher", ["joblib", "slurm", "submitit_local"])

@@ -69,7 +69,7 @@ def test_an_error_of_a_source_keeps_its_path_and_message(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("number", "said"),
+    ("number", "message"),
     [
         (errno.ENOSPC, "the disk is full"),
         (errno.EDQUOT, "the disk is full"),
@@ -77,8 +77,8 @@ def test_an_error_of_a_source_keeps_its_path_and_message(tmp_path):
     ],
 )
 @pytest.mark.parametrize("named", [True, False])
-def test_an_error_of_the_target_is_explained(tmp_path, number, said, named):
-    with pytest.raises(WearcapError, match=rf"target\.npz: {said}"), atomic_path(tmp_path / "target.npz") as to:
+def test_an_error_of_the_target_is_explained(tmp_path, number, message, named):
+    with pytest.raises(WearcapError, match=rf"target\.npz: {message}"), atomic_path(tmp_path / "target.npz") as to:
         raise OSError(number, os.strerror(number), *([str(to)] if named else []))
     assert not names(tmp_path)
 
@@ -137,8 +137,10 @@ def test_a_folder_has_one_writer_and_any_number_of_readers(tmp_path, monkeypatch
     monkeypatch.setattr(locks, "LOCK_PATIENCE_S", 0.1)
     write_text(tmp_path / "manifest.json", "{}")
     with running(HOLDER, tmp_path) as holder:
-        said = rf"another run writes here \(process {holder.pid} on .+, prepare, since \d{{4}}-.+\).+kill {holder.pid}"
-        with pytest.raises(WearcapError, match=said), folder_lock(tmp_path, "prepare"):
+        message = (
+            rf"another run writes here \(process {holder.pid} on .+, prepare, since \d{{4}}-.+\).+kill {holder.pid}"
+        )
+        with pytest.raises(WearcapError, match=message), folder_lock(tmp_path, "prepare"):
             pass
         assert json.loads((tmp_path / "manifest.json").read_text()) == {}
     with folder_lock(tmp_path, "prepare"), folder_lock(tmp_path / "other", "prepare"):
@@ -146,7 +148,7 @@ def test_a_folder_has_one_writer_and_any_number_of_readers(tmp_path, monkeypatch
     assert LOCK not in names(tmp_path)
 
 
-def test_a_lock_file_that_says_nothing_blocks_nobody(tmp_path):
+def test_an_empty_lock_file_blocks_nobody(tmp_path):
     for content in (b"", b"[1]", b"\xff", b'{"pid": "x"}', b'{"pid": 1}'):
         (tmp_path / LOCK).write_bytes(content)
         with folder_lock(tmp_path, "prepare"):
@@ -171,8 +173,8 @@ def test_without_locks_the_run_goes_on_with_a_warning(tmp_path, monkeypatch):
         raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr(files.fcntl, "flock", refuse)
-    said = re.escape(f"{tmp_path}: this file system has no locks")
-    with pytest.warns(UserWarning, match=said), folder_lock(tmp_path, "prepare") as descriptor:
+    message = re.escape(f"{tmp_path}: this file system has no locks")
+    with pytest.warns(UserWarning, match=message), folder_lock(tmp_path, "prepare") as descriptor:
         write_text(tmp_path / "a.txt", "a")
     assert descriptor is None
     assert names(tmp_path) == ["a.txt"]

@@ -89,18 +89,18 @@ def test_the_wheel_carries_every_config_and_split_list(unpacked, tmp_path):
         assert expected == {
             path.relative_to(resources / theirs) for path in (resources / theirs).rglob("*") if path.is_file()
         }
-    told = run(unpacked, tmp_path, "-c", "from wearcap.cli import conf; print(conf.conf_dir(), conf.splits_dir())")
-    assert told.stdout.split() == [str(resources / "conf"), str(resources / "splits")]
+    ended = run(unpacked, tmp_path, "-c", "from wearcap.cli import conf; print(conf.conf_dir(), conf.splits_dir())")
+    assert ended.stdout.split() == [str(resources / "conf"), str(resources / "splits")]
 
 
 @pytest.mark.slow
 def test_the_command_works_from_the_wheel(unpacked, tmp_path):
     version = run(unpacked, tmp_path, "-m", "wearcap.cli.main", "--version")
     assert version.stdout == f"wearcap {__version__}\n"
-    told = run(unpacked, tmp_path, "-m", "wearcap.cli.main", "prepare", "cmu", f"source={tmp_path}")
-    assert told.returncode == 2
+    ended = run(unpacked, tmp_path, "-m", "wearcap.cli.main", "prepare", "cmu", f"source={tmp_path}")
+    assert ended.returncode == 2
     assert (
-        told.stderr
+        ended.stderr
         == f"wearcap prepare: {tmp_path}: no .amc or .bvh files. Expected motion files, plain or .xz or .gz.\n"
     )
     typo = run(unpacked, tmp_path, "-m", "wearcap.cli.main", "train", "data=smulated")

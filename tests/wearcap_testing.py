@@ -1,7 +1,10 @@
 """Small recordings for tests, made in milliseconds: a body that sways while it wanders in a circle."""
 
+import importlib
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import torch
 
@@ -19,6 +22,25 @@ from wearcap.recording import (
     RecordingStore,
 )
 from wearcap.runtime.session import Session
+
+PROJECT = Path(__file__).parents[1]
+
+
+def experiments(*kinds: str) -> list[str]:
+    """Names of the experiments, also in sub-folders ("paper/hmd2"), whose files' names begin with one of `kinds`."""
+    root = PROJECT / "conf" / "experiment"
+    names = (path.relative_to(root).with_suffix("") for path in root.rglob("*.yaml"))
+    return sorted(name.as_posix() for name in names if name.name.startswith(kinds))
+
+
+def benchmark(name: str) -> ModuleType:
+    """A module of `benchmarks/`."""
+    folder = str(PROJECT / "benchmarks")
+    sys.path.insert(0, folder)
+    try:
+        return importlib.import_module(name)
+    finally:
+        sys.path.remove(folder)
 
 
 def swaying_motion(frames: int, seed: int = 0, fps: float = 60.0, skeleton: Skeleton | None = None) -> Motion:

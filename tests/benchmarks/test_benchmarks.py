@@ -1,4 +1,4 @@
-"""Benchmarks and tables run, say what DESIGN asks for, and measure what they claim."""
+"""Benchmarks and tables run, print the figures of DESIGN, and measure what they claim."""
 
 import json
 import math
@@ -136,7 +136,7 @@ def test_gait_statistics_of_a_planted_walk():
     assert not gait.is_walking(walker(1.2, "b", bob=0.2)).any()
 
 
-def test_discriminator_tells_what_can_be_told_and_no_more():
+def test_discriminator_separates_what_can_be_separated_and_no_more():
     from discriminator import held_out_accuracy
 
     random = torch.Generator().manual_seed(0)

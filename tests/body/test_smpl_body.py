@@ -1,4 +1,4 @@
-"""SMPL-family files of the tests' own making: read, shaped, posed as the model's formula says, refused when broken."""
+"""SMPL-family files of the tests' own making: read, shaped, posed by the model's formula, refused when broken."""
 
 import numpy as np
 import pytest

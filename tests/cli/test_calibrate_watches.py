@@ -103,9 +103,9 @@ def apart_deg(wxyz: list[float], R: torch.Tensor) -> float:
 def test_a_session_becomes_a_calibration_and_a_recording(made, files, tmp_path, capsys):
     given = arguments(made, files, tmp_path) | {"recording": f"{tmp_path}/worn.safetensors"}
     calibrate(given)
-    said = capsys.readouterr().out
-    assert "residual" in said
-    assert "no  " not in said.replace("not", "")
+    printed = capsys.readouterr().out
+    assert "residual" in printed
+    assert "no  " not in printed.replace("not", "")
     content = json.loads((tmp_path / "calibration.json").read_text())
     for joint in WRISTS:
         watch, clock = content["watches"][joint], content["clocks"][joint]
@@ -142,16 +142,16 @@ def test_watches_alone_go_into_a_data_set(made, files, tmp_path, capsys):
     assert recording.motion is not None
 
 
-def test_the_guide_says_the_steps_and_where_the_logs_have_them(made, files, tmp_path, capsys):
+def test_the_guide_prints_the_steps_and_where_the_logs_have_them(made, files, tmp_path, capsys):
     given = arguments(made, files, tmp_path)
     for key in ("board", "tpose", "marks", "standing"):
         del given[key]
     calibrate(given, "--guide")
-    said = capsys.readouterr().out
-    assert "1. Lay both watches on the board" in said
-    assert "5. Swing" in said
-    assert "given: swings" in said
-    hint = said.split("try: ")[1].split()
+    printed = capsys.readouterr().out
+    assert "1. Lay both watches on the board" in printed
+    assert "5. Swing" in printed
+    assert "given: swings" in printed
+    hint = printed.split("try: ")[1].split()
     assert [word.split("=")[0] for word in hint] == ["board", "tpose", "marks", "standing"]
     assert not (tmp_path / "calibration.json").exists()
     with pytest.raises(WearcapError, match="no board, tpose, marks, standing.*Give them as board="):
@@ -182,7 +182,7 @@ def test_the_guide_says_the_steps_and_where_the_logs_have_them(made, files, tmp_
         ({"bord": "[1,2]"}, "Did you mean 'board'"),
     ],
 )
-def test_what_is_wrong_is_said_and_nothing_is_written(made, files, tmp_path, change, match):
+def test_what_is_wrong_is_reported_and_nothing_is_written(made, files, tmp_path, change, match):
     change = {key: value.replace("D", str(made.measured.distances_m[0])) for key, value in change.items()}
     with pytest.raises(WearcapError, match=match):
         calibrate(arguments(made, files, tmp_path) | change)

@@ -41,9 +41,9 @@ def test_a_recording_becomes_files_and_a_report(data, tmp_path, capfd):
     start = read_motion(out / "motion.npz")
     assert "initialize: " in capfd.readouterr().err
     capturing(data, out, cache)
-    told = capfd.readouterr().err
-    assert "initialize: reused" in told
-    assert "optimize: reused" not in told
+    printed = capfd.readouterr().err
+    assert "initialize: reused" in printed
+    assert "optimize: reused" not in printed
     assert {path.name for path in out.glob("motion.*")} == {"motion.npz", "motion.bvh", "motion.glb", "motion.mp4"}
     report = json.loads((out / "report.json").read_text())
     assert [stage["reused"] for stage in report["stages"]] == [True] * 4 + [False]
@@ -74,13 +74,13 @@ def test_a_data_set_is_scored(data, tmp_path, capfd):
     scores = written["methods"]["hps"]
     assert scores["world_root_cm"]["mean"] < 8
     assert {path.name for path in (tmp_path / "cache").iterdir()} == {"walk", "other"}
-    evaluate.main([f"dataset={data}", "pipeline=hps_imu", f"output={table}", f"hydra.run.dir={tmp_path}"])
+    evaluate.main([f"dataset={data}", "pipeline=baseline/hps_imu", f"output={table}", f"hydra.run.dir={tmp_path}"])
     imu = json.loads(table.read_text())["methods"]["imu"]
     assert imu["world_root_cm"]["mean"] > scores["world_root_cm"]["mean"]
 
 
 def test_localisation_by_learned_features_is_a_choice():
-    chosen = compose("capture", ["pipeline=hps_paper", "recording=x", "localization@pipeline.localization=superpoint"])
+    chosen = compose("capture", ["pipeline=paper/hps", "recording=x", "localization@pipeline.localization=superpoint"])
     assert chosen.pipeline.localization.extractor._target_.endswith("SuperPointExtractor")
     assert chosen.pipeline.localization._target_.endswith("MapLocalization")
 

@@ -1,4 +1,4 @@
-"""`wearcap scene`: from folders of each kind to a map, and what it says against folders that are none."""
+"""`wearcap scene`: from folders of each kind to a map, and what it reports about folders that are none."""
 
 from pathlib import Path
 
@@ -59,9 +59,9 @@ def test_a_scanned_scene_becomes_a_map(tmp_path, capsys):
     made = run(tmp_path, "check=2")
     assert len(made) == 9
     assert np.abs(made.observations.positions[:, 0] - 3).max() < 0.01
-    said = capsys.readouterr().out
-    assert "2 of 2 photos are found in the map of the others" in said
-    assert "rootsift" in said
+    printed = capsys.readouterr().out
+    assert "2 of 2 photos are found in the map of the others" in printed
+    assert "rootsift" in printed
     few = run(tmp_path, "check=0", "every=3")
     assert few.names == ("00000.png", "00003.png", "00006.png")
     more = run(tmp_path, "check=0", "every=4", f"extend={tmp_path / 'map.safetensors'}")
@@ -98,7 +98,7 @@ def test_a_colmap_model_becomes_a_map(tmp_path, capsys):
     assert "of 2 photos are found" in capsys.readouterr().out
 
 
-def test_what_is_wrong_is_said(tmp_path):
+def test_what_is_wrong_is_reported(tmp_path):
     for overrides, match in (
         ([f"scene={tmp_path / 'none'}"], "no such folder"),
         ([f"scene={tmp_path}"], "no scene of a known kind"),

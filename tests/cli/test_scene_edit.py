@@ -1,4 +1,4 @@
-"""`wearcap scene edit`: what it opens, where it saves, and what it says against what is none."""
+"""`wearcap scene edit`: what it opens, where it saves, and what it reports about what is none."""
 
 import numpy as np
 import pytest
@@ -38,9 +38,9 @@ def test_a_folder_or_a_file_opens_with_what_was_made_before(tmp_path, pages, cap
     a_floor(tmp_path)
     write_environment(an_environment(1.0), tmp_path / "environment.json")
     scene.main(["edit", str(tmp_path), "--port", "18420"])
-    said = capsys.readouterr().out
-    assert "open http://127.0.0.1:" in said
-    assert str(tmp_path / "environment.json") in said
+    printed = capsys.readouterr().out
+    assert "open http://127.0.0.1:" in printed
+    assert str(tmp_path / "environment.json") in printed
     assert pages[0].current == "crate"
     scene.main(
         ["edit", str(tmp_path / "pointcloud.ply"), "--environment", str(tmp_path / "other.json"), "--port", "18420"]
@@ -58,7 +58,7 @@ def test_a_scan_in_millimetres(tmp_path, pages):
         scene.main(["edit", str(tmp_path)])
 
 
-def test_what_is_wrong_is_said(tmp_path, pages):
+def test_what_is_wrong_is_printed(tmp_path, pages):
     for arguments, match in (
         ([str(tmp_path / "none")], "no scan of a scene here"),
         ([str(tmp_path)], r"no scan of a scene here.*pointcloud.ply"),
@@ -82,6 +82,6 @@ def test_help_tells_of_every_option(capsys):
     with pytest.raises(SystemExit) as ended:
         scene.main(["edit", "--help"])
     assert ended.value.code == 0
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     for word in ("scene", "--environment", "--metres-per-unit", "--port", "--host"):
-        assert word in told
+        assert word in printed

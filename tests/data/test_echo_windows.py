@@ -1,4 +1,4 @@
-"""Windows of three points, body, object and contacts: functions of their seed, the same in a mirror."""
+"""Windows of three points, body, object and contacts: functions of their seed, and mirrored consistently."""
 
 from dataclasses import replace
 

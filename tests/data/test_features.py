@@ -78,9 +78,9 @@ def test_contacts_round_trip_and_are_probabilities():
 def test_the_condition_tells_the_body_where_asked_to():
     R, t, floor, _ = path()
     size = body_size(xsens23()).expand(2, -1)
-    plain, told = (HeadFeatures(body=body).condition(R, t, floor, size, FPS) for body in (False, True))
-    assert torch.equal(told[..., : plain.shape[-1]], plain)
-    assert torch.equal(told[0, 3, plain.shape[-1] :], size[0])
+    plain, with_size = (HeadFeatures(body=body).condition(R, t, floor, size, FPS) for body in (False, True))
+    assert torch.equal(with_size[..., : plain.shape[-1]], plain)
+    assert torch.equal(with_size[0, 3, plain.shape[-1] :], size[0])
     assert 0.7 < size[0, 1] < 1.0
     assert size[0, 0] > size[0, 1] > size[0, 2] > 0.4
 

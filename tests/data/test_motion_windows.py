@@ -1,4 +1,4 @@
-"""Windows of true motion and what is said about them: known movements give known features, wherever they happen."""
+"""Windows of true motion and their features: known movements give known features, wherever they happen."""
 
 import math
 from dataclasses import replace
@@ -36,7 +36,7 @@ def test_it_does_not_matter_where_and_which_way_it_happens():
     torch.testing.assert_close(moved, encoded(motion), atol=2e-4, rtol=1e-4)
 
 
-def test_a_body_that_glides_along_a_circle_says_so():
+def test_a_body_that_glides_along_a_circle_is_described_so():
     time = torch.arange(120, dtype=torch.float64) / 60
     angle = 0.5 * time.float()
     R = torch.eye(3).repeat(120, 23, 1, 1)

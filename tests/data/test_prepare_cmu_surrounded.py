@@ -68,8 +68,8 @@ def test_the_same_recordings_with_points(plain):
         assert len(after.points.points_world) > 1000
         assert after.points.first_seen.min() == before.motion.timestamps[0]
         assert after.points.first_seen.max() <= before.motion.timestamps[-1]
-        beneath = (after.points.points_world[:, 2].abs() < 0.05).float().mean()
-        assert beneath > 0.02  # some of the floor was seen
+        on_floor = (after.points.points_world[:, 2].abs() < 0.05).float().mean()
+        assert on_floor > 0.02  # some of the floor was seen
 
 
 def test_again_is_current_and_elsewhere_the_same_bytes(plain, tmp_path):

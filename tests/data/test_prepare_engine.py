@@ -31,7 +31,7 @@ def alone(tmp_path_factory) -> Path:
     return root
 
 
-def test_a_run_writes_what_it_says(alone):
+def test_a_run_writes_what_it_reports(alone):
     store = RecordingStore.open(alone)
     assert store.names("train") == [f"r{index:02}" for index in range(8)]
     assert all(wrong is None for _, wrong in store.verify())
@@ -112,7 +112,7 @@ def test_a_kill_in_the_middle_is_resumed(alone, tmp_path):
     assert digests(tmp_path) == digests(alone)
 
 
-def test_a_killed_worker_is_said_and_the_next_run_goes_on(alone, tmp_path):
+def test_a_killed_worker_is_reported_and_the_next_run_goes_on(alone, tmp_path):
     with pytest.raises(WearcapError, match=r"a worker process was killed.*fewer jobs"):
         prepare(tasks(8, r05="killed"), tmp_path, jobs=2, progress=False)
     assert all(wrong is None for _, wrong in RecordingStore.open(tmp_path).verify())
@@ -136,7 +136,7 @@ def test_a_full_disk_stops_the_run_with_one_message(tmp_path, monkeypatch):
     assert RecordingStore.open(tmp_path).names() == ["r00"]
 
 
-def test_no_permission_is_said_before_any_work(tmp_path, monkeypatch):
+def test_no_permission_is_reported_before_any_work(tmp_path, monkeypatch):
     def refuse(*arguments):
         raise PermissionError(errno.EACCES, "Permission denied")
 

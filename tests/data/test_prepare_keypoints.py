@@ -64,7 +64,7 @@ def only(store: RecordingStore, *names: str) -> RecordingStore:
 
 
 def written(folder: Path, store: RecordingStore, rows: slice = slice(None)) -> Path:
-    """The spot's way for r0 and r1, at some frames."""
+    """The spot's path for r0 and r1, at some frames."""
     for name in ("r0", "r1"):
         camera = store.load(name).camera
         cue = Cue(camera.timestamps[rows], JOINT, way()[rows], torch.ones(FRAMES)[rows])

@@ -196,11 +196,11 @@ def test_the_command_prepares_a_folder_and_names_what_it_cannot_read(bvh_folder,
     with pytest.raises(SystemExit) as caught:
         verb.main(arguments)
     assert caught.value.code == 1
-    told = capfd.readouterr()
-    assert "failed: broken: " in told.err
-    assert "failed: 33_01: " in told.err
-    assert ".asf" in told.err
-    assert "2 written, 0 current, 2 failed" in told.out
+    printed = capfd.readouterr()
+    assert "failed: broken: " in printed.err
+    assert "failed: 33_01: " in printed.err
+    assert ".asf" in printed.err
+    assert "2 written, 0 current, 2 failed" in printed.out
     store = RecordingStore.open(bvh_folder / "out")
     assert store.names() == ["07_01", "dance"]
     assert store.entries["07_01"].subject == "7"

@@ -115,10 +115,10 @@ def test_the_ground_is_found_among_steps_that_are_off_it():
 
 
 def test_long_gaps_are_cut_and_short_ones_bridged(tmp_path, files, capsys):
-    body, thing = files.behave_arrays()
+    body, handled = files.behave_arrays()
     kept = np.r_[0:30, 33:110, 140:180]
-    cut = [{key: value[kept] for key, value in part.items() if value.ndim} for part in (body, thing)]
-    files.write_behave(tmp_path / "in", body=cut[0], thing=cut[1])
+    cut = [{key: value[kept] for key, value in part.items() if value.ndim} for part in (body, handled)]
+    files.write_behave(tmp_path / "in", body=cut[0], handled=cut[1])
     store = prepared("behave", tmp_path)
     motion = store.load(files.BEHAVE_NAME).motion
     assert motion is not None
@@ -163,13 +163,13 @@ def walker(files, fps: float) -> dict:
     return entry
 
 
-@pytest.mark.parametrize(("true", "said", "advice"), [(30.0, 120, "is lower"), (120.0, 30, "is higher")])
-def test_a_rate_at_which_nobody_walks_is_refused(tmp_path, files, true, said, advice):
+@pytest.mark.parametrize(("true", "stated", "advice"), [(30.0, 120, "is lower"), (120.0, 30, "is higher")])
+def test_a_rate_at_which_nobody_walks_is_refused(tmp_path, files, true, stated, advice):
     files.write_omomo(tmp_path, walker(files, true))
     sequences = read_omomo(tmp_path)
     check_rate(sequences, tmp_path, true)
-    with pytest.raises(WearcapError, match=f"at {said} frames per second people walk at .*{advice}"):
-        check_rate(sequences, tmp_path, said)
+    with pytest.raises(WearcapError, match=f"at {stated} frames per second people walk at .*{advice}"):
+        check_rate(sequences, tmp_path, stated)
 
 
 def test_rates_that_are_none_and_sequences_that_fail_alone(tmp_path, files, capsys):
@@ -180,9 +180,9 @@ def test_rates_that_are_none_and_sequences_that_fail_alone(tmp_path, files, caps
     assert "a frame rate of 0 Hz" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         prepared("omomo", tmp_path)
-    told = capsys.readouterr().err
-    assert "failed: sub1_spaceship_000: " in told
-    assert "no mesh of spaceship" in told
+    printed = capsys.readouterr().err
+    assert "failed: sub1_spaceship_000: " in printed
+    assert "no mesh of spaceship" in printed
     assert RecordingStore.open(tmp_path / "out").names() == [files.OMOMO_NAME]
 
 

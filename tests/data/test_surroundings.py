@@ -84,7 +84,7 @@ def test_codes_and_pictures_are_those_of_the_windows_frames(store):
     assert window.image_valid.all()
 
 
-def test_a_recording_without_pictures_says_so(store):
+def test_a_recording_without_pictures_is_reported(store):
     windows = dataset(store)
     window = windows[first_of(windows, "b", 0)]
     assert window.image.shape == (120, SIZE)

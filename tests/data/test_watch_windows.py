@@ -1,4 +1,4 @@
-"""Windows of heads and wrists: what they tell does not depend on north, on the rate of a file, or on who looks in a mirror."""
+"""Windows of heads and wrists: their features do not depend on north or on the rate of a file, and mirrored windows have mirrored features."""
 
 import pytest
 import torch
@@ -51,7 +51,7 @@ def batch(root: str, **settings) -> WatchWindow:
     return collate([windows[(k % len(windows), k)] for k in range(8)])
 
 
-def told(features: WatchFeatures, window: WatchWindow) -> torch.Tensor:
+def encoded(features: WatchFeatures, window: WatchWindow) -> torch.Tensor:
     canonical = features.canonical(window.sensed, window.floor_height)
     return features.encode(window.sensed, window.floor_height, window.size, canonical)
 
@@ -71,17 +71,17 @@ def told(features: WatchFeatures, window: WatchWindow) -> torch.Tensor:
 def test_sizes_are_the_papers(root, settings, size):
     features = WatchFeatures(**{"frame": "heading"} | settings)
     assert features.size == size
-    assert told(features, batch(root)).shape == (8, 40, size)
+    assert encoded(features, batch(root)).shape == (8, 40, size)
 
 
 @pytest.mark.parametrize("frame", ["own", "heading", "head"])
 def test_north_and_place_make_no_difference(root, frame):
-    """All but the head's up-vector in the world, which the document tells as it is."""
+    """All but the head's up-vector in the world, which the paper gives as it is."""
     features = WatchFeatures(frame=frame, absolute=frame != "head")
     window = dataset(root)[3]
     moved = changed(root, lambda window: turned(window, 1.3), 3)
     moved = moved._replace(t_world_head=moved.t_world_head + torch.tensor([5.0, -3.0, 0.0]))
-    here, there = (told(features, collate([w])) for w in (window, moved))
+    here, there = (encoded(features, collate([w])) for w in (window, moved))
     torch.testing.assert_close(here, there, atol=1e-4, rtol=0)
 
 

@@ -68,8 +68,8 @@ def test_balance_shares_the_draws_among_recordings(store):
 def test_hanging_the_truth_from_the_head_gives_the_truth(store):
     window = dataset(store)[(0, 0)]
     true = forward_kinematics(xsens23(), window.R_parent_joint, torch.zeros(120, 3)).t
-    hung = anchor(xsens23(), window.R_parent_joint, Rigid(window.R_world_head, window.t_world_head))[1].t
-    assert torch.allclose(hung - hung[:, :1], true - true[:, :1], atol=1e-5)
+    anchored = anchor(xsens23(), window.R_parent_joint, Rigid(window.R_world_head, window.t_world_head))[1].t
+    assert torch.allclose(anchored - anchored[:, :1], true - true[:, :1], atol=1e-5)
 
 
 def test_the_mirror_swaps_sides_and_is_its_own_inverse(store):

@@ -67,7 +67,7 @@ def test_a_level_per_frame_and_feature_is_one_per_frame_for_each_modality(levels
 
 
 @pytest.mark.parametrize("how", [{}, {"eta": 0.0}, {"step": "redraw"}, {"spacing": 2.0}, {"context": 0}])
-def test_every_frame_leaves_as_a_perfect_denoiser_says(how):
+def test_every_frame_leaves_as_a_perfect_denoiser_predicts(how):
     truth = torch.randn(2, 20, 5)
     conveyor = Conveyor(replace(BELT, **how), SCHEDULE, SIZES, 2)
     ramp, given = conveyor.rolling.ramp, 0
@@ -167,7 +167,7 @@ def test_what_is_known_stays_at_level_0_and_what_is_absent_stays_noise(step):
         assert (x[0, even, :2] == 7).all()
 
 
-def test_every_prediction_may_be_amended():
+def test_every_prediction_may_be_guided():
     conveyor = Conveyor(BELT, SCHEDULE, SIZES, 1)
     conveyor.push(torch.zeros(1, 5))
     for _ in range(BELT.ramp):

@@ -71,7 +71,7 @@ def test_observed_frames_are_of_one_modality_at_a_time():
     assert share.sum() < 0.4
 
 
-def test_what_is_observed_says_nothing_about_the_other_modalities_levels():
+def test_what_is_observed_does_not_change_the_other_modalities_levels():
     levels, _ = drawn(independent=1.0, conveyor=0.0, observed=1.0)
     for modality in range(3):
         observed_parts = levels[..., modality] == 0

@@ -179,7 +179,7 @@ def test_not_a_number_is_refused(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_missing_library_and_wrong_names_are_told(tmp_path, monkeypatch):
+def test_missing_library_and_wrong_names_are_reported(tmp_path, monkeypatch):
     with pytest.raises(WearcapError, match="one of onnx, pt2"):
         write.export_network(Graph(Toy(), toy_example()), tmp_path / "toy.tflite", "tflite", 1e-4)
     with pytest.raises(WearcapError, match=r"ends in \.pt2"):

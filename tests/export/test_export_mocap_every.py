@@ -27,7 +27,7 @@ def exports(tmp_path_factory):
 
 
 @pytest.mark.parametrize("format", ["onnx", "pt2"])
-def test_the_file_says_what_the_network_says(exports, format):
+def test_the_file_gives_what_the_network_gives(exports, format):
     pipeline, recording, report = drawn_pipeline(), watched_walk(), exports[format]
     assert report.max_abs_error < 1e-4
     motion = load_exported(report.path)(recording)

@@ -73,19 +73,19 @@ def behave_arrays(tilt_deg: float = 0.0, seconds: float = 6.0) -> tuple[dict, di
         "frame_times": frame_times(len(motion)),
         "gender": np.array("male"),
     }
-    thing = {
+    handled = {
         "angles": rotation.log(C.double() @ path.R_world_body.double()).numpy(),
         "trans": (path.t_world_body @ C.T).numpy(),
         "frame_times": frame_times(len(motion)),
     }
-    return body, thing
+    return body, handled
 
 
 def write_behave(
     root: Path,
     name: str = BEHAVE_NAME,
     body: dict | None = None,
-    thing: dict | None = None,
+    handled: dict | None = None,
     cat: str = "boxlarge",
     ply: Ply | None = None,
     tilt_deg: float = 0.0,
@@ -94,7 +94,7 @@ def write_behave(
     first, second = behave_arrays(tilt_deg)
     folder = root / "sequences" / name
     folder.mkdir(parents=True, exist_ok=True)
-    for file, arrays, changes in (("smpl", first, body), ("object", second, thing)):
+    for file, arrays, changes in (("smpl", first, body), ("object", second, handled)):
         kept = {key: value for key, value in (arrays | (changes or {})).items() if value is not None}
         np.savez(folder / f"{file}_fit_all.npz", **kept)
     info = {"cat": cat, "gender": "male", "config": "../calibs", "intrinsic": "../calibs", "empty": None}

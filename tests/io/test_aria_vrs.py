@@ -17,7 +17,7 @@ needs_aria = pytest.mark.skipif(
 )
 
 
-def test_without_the_extra_the_message_says_how_to_install(tmp_path, monkeypatch):
+def test_without_the_extra_the_message_names_how_to_install(tmp_path, monkeypatch):
     monkeypatch.setattr(aria_vrs, "data_provider", None)
     for read in (aria_vrs.read_device, lambda path: aria_vrs.extract_video(path, tmp_path / "a.mp4")):
         with pytest.raises(WearcapError, match=r'pip install "wearcap\[aria\]"'):

@@ -48,9 +48,9 @@ def test_a_person_before_a_camera_whose_y_points_down_is_upright(tmp_path):
 def test_the_mesh_is_placed_by_the_data_sets_own_rule(tmp_path):
     """R (v - mean) + t in the camera's frame."""
     write_behave(tmp_path)
-    take, (_, thing) = read_behave(tmp_path, BEHAVE_NAME), behave_arrays()
-    R = rotation.exp(torch.from_numpy(thing["angles"]))
-    in_camera = np.einsum("tij,vj->tvi", R.numpy(), CORNERS - CORNERS.mean(0)) + thing["trans"][:, None]
+    take, (_, handled) = read_behave(tmp_path, BEHAVE_NAME), behave_arrays()
+    R = rotation.exp(torch.from_numpy(handled["angles"]))
+    in_camera = np.einsum("tij,vj->tvi", R.numpy(), CORNERS - CORNERS.mean(0)) + handled["trans"][:, None]
     wanted = in_camera @ R_WORLD_CAMERA.numpy().T
     posed = np.asarray(take.path.T_world_body[:, None] @ torch.from_numpy(take.mesh.vertices))
     np.testing.assert_allclose(posed, wanted, atol=1e-5)
@@ -71,9 +71,9 @@ def test_the_other_folder_and_betas_for_all_frames(tmp_path):
 
 def test_frames_that_were_not_fitted_are_gaps(tmp_path):
     kept = np.r_[0:40, 43:180]
-    body, thing = behave_arrays()
-    cut = [{key: value[kept] for key, value in arrays.items() if value.ndim} for arrays in (body, thing)]
-    write_behave(tmp_path, body=cut[0], thing=cut[1])
+    body, handled = behave_arrays()
+    cut = [{key: value[kept] for key, value in arrays.items() if value.ndim} for arrays in (body, handled)]
+    write_behave(tmp_path, body=cut[0], handled=cut[1])
     times = read_behave(tmp_path, BEHAVE_NAME).motion.timestamps
     assert times.diff()[39].item() == pytest.approx(4 / 30)
 
@@ -113,18 +113,18 @@ THING = {
 def test_a_body_that_cannot_be_is_refused(tmp_path, fault):
     changes, message = BODY[fault]
     write_behave(tmp_path, body=changes)
-    with pytest.raises(WearcapError, match=message) as told:
+    with pytest.raises(WearcapError, match=message) as raised:
         read_behave(tmp_path, BEHAVE_NAME)
-    assert BEHAVE_NAME in str(told.value)
+    assert BEHAVE_NAME in str(raised.value)
 
 
 @pytest.mark.parametrize("fault", THING)
 def test_an_objects_path_that_cannot_be_is_refused(tmp_path, fault):
     changes, message = THING[fault]
-    write_behave(tmp_path, body={"frame_times": None}, thing=changes)
-    with pytest.raises(WearcapError, match=message) as told:
+    write_behave(tmp_path, body={"frame_times": None}, handled=changes)
+    with pytest.raises(WearcapError, match=message) as raised:
         read_behave(tmp_path, BEHAVE_NAME)
-    assert BEHAVE_NAME in str(told.value)
+    assert BEHAVE_NAME in str(raised.value)
 
 
 MESHES = {
@@ -143,9 +143,9 @@ MESHES = {
 def test_a_mesh_that_cannot_be_is_refused(tmp_path, fault):
     ply, message = MESHES[fault]
     write_behave(tmp_path, ply=ply)
-    with pytest.raises(WearcapError, match=message) as told:
+    with pytest.raises(WearcapError, match=message) as raised:
         read_behave(tmp_path, BEHAVE_NAME)
-    assert "boxlarge_f1000.ply" in str(told.value)
+    assert "boxlarge_f1000.ply" in str(raised.value)
 
 
 def test_missing_files_are_named(tmp_path):
@@ -179,8 +179,8 @@ def test_missing_files_are_named(tmp_path):
 def test_damaged_files_give_a_take_or_one_clear_error(tmp_path_factory, data, file):
     root = tmp_path_factory.getbasetemp() / "behave_fuzz"
     few = slice(0, 3)
-    body, thing = ({key: v[few] if v.ndim else v for key, v in part.items()} for part in behave_arrays(seconds=0.2))
-    write_behave(root, body=body, thing=thing)
+    body, handled = ({key: v[few] if v.ndim else v for key, v in part.items()} for part in behave_arrays(seconds=0.2))
+    write_behave(root, body=body, handled=handled)
     path = root / "sequences" / BEHAVE_NAME / file
     path.write_bytes(data.draw(mutated_bytes(path.read_bytes())))
     try:

@@ -98,9 +98,9 @@ def little_free(monkeypatch):
 )
 def test_packed_bombs(little_free, tmp_path, ending, opener, name, read, line):
     path = packed(opener, tmp_path / (name + ending), line, 8 * MIB)
-    told = refused(read, path, "unpacks to more than 100 times its size|without an element|broken XML")
+    reason = refused(read, path, "unpacks to more than 100 times its size|without an element|broken XML")
     if read is not read_mvnx:
-        assert "wearcap --max-file-gib" in told
+        assert "wearcap --max-file-gib" in reason
 
 
 def test_an_archive_of_large_arrays(little_free, tmp_path):

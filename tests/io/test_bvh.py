@@ -180,7 +180,7 @@ def test_what_cannot_be_written_is_refused_and_leaves_nothing(tmp_path):
     assert len(read_bvh(tmp_path / "one.bvh")) == 1
 
 
-def test_giants_and_sleepers_are_told_which_setting_mends_them(tmp_path):
+def test_giants_and_sleepers_are_refused_with_the_setting_that_mends_them(tmp_path):
     still = random_motion(xsens23(), 30)
     calm = dataclasses.replace(still, R_parent_joint=rotation.exp(0.1 * rotation.log(still.R_parent_joint)))
     write_bvh(calm, tmp_path / "m.bvh")

@@ -123,7 +123,7 @@ def test_camera_models(tmp_path, number, model, lens):
 
 
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_every_truncation_is_told(tmp_path, file):
+def test_every_truncation_is_reported(tmp_path, file):
     write_binary_model(tmp_path)
     content = (tmp_path / file).read_bytes()
     for stop in (1, 9, len(content) // 2, len(content) - 1):
@@ -145,7 +145,7 @@ def test_every_truncation_is_told(tmp_path, file):
         ("points3D.txt", "40 1.0", "40 nan", "NaN"),
     ],
 )
-def test_what_is_wrong_is_said_with_its_line(tmp_path, file, old, new, match):
+def test_what_is_wrong_is_reported_with_its_line(tmp_path, file, old, new, match):
     write_text_model(tmp_path)
     text = (tmp_path / file).read_text()
     assert old in text

@@ -1,4 +1,4 @@
-"""Contact labels: round trips through H-contact's JSON and our own, and files that say impossible things."""
+"""Contact labels: round trips through H-contact's JSON and our own, and files with impossible contents."""
 
 import json
 
@@ -69,10 +69,10 @@ def any_labels(draw):
     for hand in ("left", "right"):
         edges = sorted(draw(st.sets(st.integers(0, 600), max_size=12)))
         spans = list(zip(edges[::2], edges[1::2]))
-        things = [draw(st.sampled_from([("", ""), ("sofa", "sliding"), ("door", "hinged")])) for _ in spans]
+        labelled = [draw(st.sampled_from([("", ""), ("sofa", "sliding"), ("door", "hinged")])) for _ in spans]
         labels[hand] = tuple(
-            Label(TIMES[a].item(), TIMES[b].item() if b < 600 else CLOCK.stop_s, *thing)
-            for (a, b), thing in zip(spans, things)
+            Label(TIMES[a].item(), TIMES[b].item() if b < 600 else CLOCK.stop_s, *label_of)
+            for (a, b), label_of in zip(spans, labelled)
         )
     return labels
 
@@ -110,9 +110,9 @@ def test_every_frame_keeps_its_label_through_files_and_interactions(labels):
     ],
 )
 def test_impossible_labels_are_refused(content, message):
-    with pytest.raises(WearcapError, match=message) as told:
+    with pytest.raises(WearcapError, match=message) as raised:
         parsed(content)
-    assert str(told.value).startswith("labels.json: ")
+    assert str(raised.value).startswith("labels.json: ")
 
 
 def test_an_annotation_of_another_recording_is_refused():

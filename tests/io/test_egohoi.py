@@ -177,9 +177,9 @@ CLOCK = LabelClock.of(ONE, torch.arange(120, dtype=torch.float64) / 60)
 )
 def test_contacts_that_cannot_be_are_refused(tmp_path, content, message):
     write_json(content, tmp_path / "a.json")
-    with pytest.raises(WearcapError, match=message) as told:
+    with pytest.raises(WearcapError, match=message) as raised:
         read_egohoi_contacts(tmp_path / "a.json", CLOCK, SOFA, "sliding")
-    assert str(told.value).startswith(str(tmp_path / "a.json"))
+    assert str(raised.value).startswith(str(tmp_path / "a.json"))
 
 
 def test_a_hand_holds_one_object_at_a_time(tmp_path):

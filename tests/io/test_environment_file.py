@@ -22,7 +22,7 @@ FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]], np.int32)
 GREY = np.full(3, 0.6, np.float32)
 
 
-def thing(name="sofa", freedom=Freedom("plane"), mesh=None, turn=0.3, t=(1.1, -2.7, 0.0)) -> SceneObject:
+def scene_object(name="sofa", freedom=Freedom("plane"), mesh=None, turn=0.3, t=(1.1, -2.7, 0.0)) -> SceneObject:
     R = rotation.about_axis("z", torch.tensor(turn))
     return SceneObject(name, "seat", mesh or Mesh(TETRA, FACES, GREY), R, torch.tensor(t), freedom)
 
@@ -34,11 +34,11 @@ def every_kind() -> Environment:
     per_face = Mesh(np.append(TETRA, [[1, 1, 1]], 0).astype(np.float32), FACES, np.eye(4, 3, dtype=np.float32))
     return Environment(
         (
-            thing(),
-            thing("door", door),
-            thing("drawer", drawer, turn=2.0),
-            thing("box", Freedom("free"), cloud),
-            thing("chair", Freedom("hinge", pivot=(1.0, -2.0, 0.0)), per_face),
+            scene_object(),
+            scene_object("door", door),
+            scene_object("drawer", drawer, turn=2.0),
+            scene_object("box", Freedom("free"), cloud),
+            scene_object("chair", Freedom("hinge", pivot=(1.0, -2.0, 0.0)), per_face),
         )
     )
 
@@ -80,7 +80,7 @@ def test_a_second_round_trip_changes_nothing(tmp_path):
     "names", [("../../evil", "/etc/passwd"), ("a/b", "a_b", "A_B"), ("Tür 1", "T r 1"), ("CON", "...")]
 )
 def test_any_name_becomes_a_safe_file_name(tmp_path, names):
-    write_environment(Environment(tuple(thing(name) for name in names)), tmp_path / "flat")
+    write_environment(Environment(tuple(scene_object(name) for name in names)), tmp_path / "flat")
     rows = json.loads((tmp_path / "flat" / "environment.json").read_text())["objects"]
     files = [row["mesh"] for row in rows]
     assert len({file.lower() for file in files}) == len(names)
@@ -167,9 +167,9 @@ def freed(**changes):
 def test_what_cannot_be_true_is_refused(tmp_path, change, message):
     content = plain_file(tmp_path)
     change(content["objects"][0])
-    with pytest.raises(WearcapError, match=message) as told:
+    with pytest.raises(WearcapError, match=message) as raised:
         read(content, tmp_path)
-    assert str(told.value).startswith(str(tmp_path / "environment.json"))
+    assert str(raised.value).startswith(str(tmp_path / "environment.json"))
 
 
 def test_the_whole_file_is_checked(tmp_path):
@@ -195,19 +195,19 @@ def test_the_whole_file_is_checked(tmp_path):
 @pytest.mark.parametrize(
     ("item", "message"),
     [
-        (thing(freedom=Freedom("hinge", pivot=(9.0, 9.0, 0.0))), "hinge is"),
-        (thing(freedom=Freedom("plane", limits=(0.0, 1.0))), "limits of an object"),
-        (thing(t=(math.nan, 0.0, 0.0)), "not finite"),
-        (thing(freedom=Freedom("hinge", pivot=(math.nan, 0.0, 0.0))), "not finite"),
-        (thing(mesh=Mesh(TETRA[:0], FACES[:0], GREY)), "no points"),
-        (thing(name=""), "no name"),
+        (scene_object(freedom=Freedom("hinge", pivot=(9.0, 9.0, 0.0))), "hinge is"),
+        (scene_object(freedom=Freedom("plane", limits=(0.0, 1.0))), "limits of an object"),
+        (scene_object(t=(math.nan, 0.0, 0.0)), "not finite"),
+        (scene_object(freedom=Freedom("hinge", pivot=(math.nan, 0.0, 0.0))), "not finite"),
+        (scene_object(mesh=Mesh(TETRA[:0], FACES[:0], GREY)), "no points"),
+        (scene_object(name=""), "no name"),
     ],
 )
 def test_the_writer_refuses_what_the_reader_would_and_leaves_the_old_file(tmp_path, item, message):
     write_environment(every_kind(), tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
     with pytest.raises(WearcapError, match=message):
-        write_environment(Environment((thing("first"), item)), tmp_path)
+        write_environment(Environment((scene_object("first"), item)), tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
 
 
@@ -251,7 +251,7 @@ MOVABLE = ("Chair", "Sofa", "KitchenTable", "CoffeeTable", "Trash", "NightStand"
 
 
 def furnished(folder) -> Environment:
-    """The small house: furniture where its layout says, and a door that turns about its left edge."""
+    """The small house: furniture where its layout has it, and a door that turns about its left edge."""
     layout = json.loads((folder / "small_house_layout.json").read_text())
     meshes = {}
     for row in layout:

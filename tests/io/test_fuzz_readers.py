@@ -32,7 +32,7 @@ def test_every_module_that_reads_is_in_the_table():
     assert {module for module in reading if f"{module}.read_" not in table} <= {"aria_vrs", "bounded"}
 
 
-def test_failures_are_told_apart():
+def test_failures_are_distinguished():
     def slowly(_):
         raise MemoryError
 

@@ -1,4 +1,4 @@
-"""H-contact in exactly its layout: bodies, contacts, splits, and files that say impossible things."""
+"""H-contact in exactly its layout: bodies, contacts, splits, and files with impossible contents."""
 
 import json
 import math
@@ -109,9 +109,9 @@ def test_bodies_that_cannot_be_are_refused(tmp_path, change, message):
     content = smpl_content(motion(12))
     change(content)
     write_zip(content, tmp_path / "a.json.zip")
-    with pytest.raises(WearcapError, match=message) as told:
+    with pytest.raises(WearcapError, match=message) as raised:
         read_smpl_json(tmp_path / "a.json.zip")
-    assert str(told.value).startswith(str(tmp_path / "a.json.zip"))
+    assert str(raised.value).startswith(str(tmp_path / "a.json.zip"))
 
 
 def test_damaged_archives(tmp_path):
@@ -153,9 +153,9 @@ def test_damaged_bodies_are_read_or_refused(tmp_path_factory, text):
 )
 def test_contacts_that_cannot_be_are_refused(tmp_path, contacts, message):
     write_set(tmp_path, contacts={"contacts": contacts})
-    with pytest.raises(WearcapError, match=message) as told:
+    with pytest.raises(WearcapError, match=message) as raised:
         read_hcontact(tmp_path, DOOR)
-    assert str(told.value).startswith(str(tmp_path / "contacts" / f"{DOOR}.json"))
+    assert str(raised.value).startswith(str(tmp_path / "contacts" / f"{DOOR}.json"))
 
 
 def test_unknown_sequences_and_classes(tmp_path):

@@ -47,7 +47,7 @@ def test_everything_is_read(tmp_path):
     assert read.board.length_m == BOARD_M
 
 
-def test_the_board_says_scale_and_axes(tmp_path):
+def test_the_board_gives_scale_and_axes(tmp_path):
     write_capture(tmp_path)
     read = read_mocap_every_folder(tmp_path)
     scale, T_world_slam = aligned(read.board)
@@ -96,7 +96,7 @@ def test_only_the_trajectory_must_be_there(tmp_path):
         read_mocap_every_folder(tmp_path / "sfm")
 
 
-def test_without_the_video_the_principal_point_says_the_size(tmp_path):
+def test_without_the_video_the_principal_point_gives_the_size(tmp_path):
     write_capture(tmp_path, leave_out=("video/ego_video.MP4",))
     read = read_mocap_every_folder(tmp_path)
     assert (read.camera.width, read.camera.height, read.lens) == (584, 320, None)

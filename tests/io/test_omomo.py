@@ -72,7 +72,7 @@ def test_frames_without_an_objects_pose_are_gaps(tmp_path):
     assert take.motion.timestamps.diff()[39].item() == pytest.approx(11 / 30)
 
 
-def test_an_object_of_two_parts_says_so(tmp_path):
+def test_an_object_of_two_parts_is_reported(tmp_path):
     write_omomo(tmp_path, omomo_entry(name="sub1_mop_000"))
     (tmp_path / "captured_objects" / "mop_cleaned_simplified.obj").write_text(obj_text())
     assert "two parts" in take_of(tmp_path).motion.provenance["object"]
@@ -109,9 +109,9 @@ def test_a_sequence_that_cannot_be_is_refused(tmp_path, fault):
     changes, message = FAULTS[fault]
     entry = {key: value for key, value in (omomo_entry() | changes).items() if value is not None}
     write_omomo(tmp_path, entry)
-    with pytest.raises(WearcapError, match=message) as told:
+    with pytest.raises(WearcapError, match=message) as raised:
         take_of(tmp_path)
-    assert OMOMO_NAME in str(told.value)
+    assert OMOMO_NAME in str(raised.value)
 
 
 MESHES = {
@@ -127,9 +127,9 @@ MESHES = {
 def test_a_mesh_that_cannot_be_is_refused(tmp_path, fault):
     mesh, message = MESHES[fault]
     write_omomo(tmp_path, mesh=mesh)
-    with pytest.raises(WearcapError, match=message) as told:
+    with pytest.raises(WearcapError, match=message) as raised:
         take_of(tmp_path)
-    assert "largebox_cleaned_simplified.obj" in str(told.value)
+    assert "largebox_cleaned_simplified.obj" in str(raised.value)
 
 
 def test_missing_files_are_named(tmp_path):

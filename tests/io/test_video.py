@@ -53,7 +53,7 @@ def test_what_is_no_video(tmp_path):
         list(read_frames(tmp_path / "sound.wav"))
 
 
-def test_pictures_are_not_turned_by_what_their_exif_says(tmp_path):
+def test_pictures_are_not_turned_by_their_exif(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (10, 20, 3)).astype(np.uint8)
     exif = Image.Exif()
     exif[0x0112] = 6

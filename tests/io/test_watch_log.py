@@ -67,9 +67,9 @@ def assert_same(read: ImuStream, watch: ImuStream, turn: bool = True) -> None:
         assert torch.allclose(getattr(read, name), getattr(watch, name), atol=1e-4), name
 
 
-@pytest.mark.parametrize("said", [{}, {"android": True}, {"back": True}, {"android": True, "back": True}])
-def test_unit_sign_and_direction_are_found(tmp_path, said):
-    assert_same(read_watch_log(sensor_logger(moved(), tmp_path / "a.csv", **said), "left_wrist"), moved())
+@pytest.mark.parametrize("options", [{}, {"android": True}, {"back": True}, {"android": True, "back": True}])
+def test_unit_sign_and_direction_are_found(tmp_path, options):
+    assert_same(read_watch_log(sensor_logger(moved(), tmp_path / "a.csv", **options), "left_wrist"), moved())
 
 
 def test_sensorlog_has_gravity_in_what_it_feels_and_may_lack_the_turn_rate(tmp_path):

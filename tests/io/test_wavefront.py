@@ -53,9 +53,9 @@ def test_faces_may_stand_before_their_vertices_and_be_absent(tmp_path):
 )
 def test_hostile_files_are_named(tmp_path, text, message):
     (tmp_path / "a.obj").write_text(text)
-    with pytest.raises(WearcapError, match=message) as told:
+    with pytest.raises(WearcapError, match=message) as raised:
         read_obj(tmp_path / "a.obj")
-    assert "a.obj" in str(told.value)
+    assert "a.obj" in str(raised.value)
 
 
 def test_a_missing_file(tmp_path):

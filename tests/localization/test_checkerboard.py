@@ -1,4 +1,4 @@
-"""Calibration: planted intrinsics come back, bad views go, and what cannot be calibrated is said."""
+"""Calibration: planted intrinsics come back, bad views go, and what cannot be calibrated is reported."""
 
 import json
 from dataclasses import replace
@@ -172,7 +172,7 @@ def test_the_verb_on_a_video(shown, tmp_path):
     ("source", "message"),
     [("none.mp4", "no such file or folder"), (".", "no pictures in this folder"), ("bad.mp4", "not a readable video")],
 )
-def test_the_verb_says_what_is_wrong(source, message, tmp_path, capfd):
+def test_the_verb_reports_what_is_wrong(source, message, tmp_path, capfd):
     (tmp_path / "bad.mp4").write_bytes(b"nothing of a video")
     with pytest.raises(SystemExit) as caught:
         cli.main(["calibrate", *command(tmp_path / source, tmp_path / "out")])

@@ -159,17 +159,17 @@ def test_other_weights_have_another_name(superpoint, netvlad, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("make", "says"),
+    ("make", "message"),
     [
         (SuperPointExtractor, "licensed by Magic Leap .*localization.extractor.weights=PATH"),
         (LightGlueMatcher, "superpoint_lightglue.pth .*localization.matcher.weights=PATH"),
         (NetVladDescriptor, "pytorch-NetVlad .*localization.descriptor.weights=PATH"),
     ],
 )
-def test_without_weights_it_says_where_to_get_them(make, says):
-    with pytest.raises(WearcapError, match=says):
+def test_without_weights_it_names_where_to_get_them(make, message):
+    with pytest.raises(WearcapError, match=message):
         make(None)
-    with pytest.raises(WearcapError, match=f"nowhere.pth: there is no such file.*{says}"):
+    with pytest.raises(WearcapError, match=f"nowhere.pth: there is no such file.*{message}"):
         make("nowhere.pth")
 
 

@@ -1,4 +1,4 @@
-"""MediaPipe's hands: which is whose, and what is said when the package or its model is missing."""
+"""MediaPipe's hands: which is whose, and the message when the package or its model is missing."""
 
 import sys
 from types import ModuleType, SimpleNamespace
@@ -20,9 +20,9 @@ def side(name: str, score: float) -> list[SimpleNamespace]:
 
 @pytest.fixture
 def package(monkeypatch, tmp_path):
-    """A package with the parts of MediaPipe's interface that are used; `said` is its next answer."""
+    """A package with the parts of MediaPipe's interface that are used; `answer` is its next one."""
     fake = ModuleType("mediapipe")
-    fake.said = SimpleNamespace(hand_landmarks=[], handedness=[])
+    fake.answer = SimpleNamespace(hand_landmarks=[], handedness=[])
     fake.shown = []
 
     class Landmarker:
@@ -35,7 +35,7 @@ def package(monkeypatch, tmp_path):
 
         def detect_for_video(self, image, time_ms):
             fake.shown.append((image["data"].shape, time_ms))
-            return fake.said
+            return fake.answer
 
     vision = SimpleNamespace(
         HandLandmarkerOptions=dict, RunningMode=SimpleNamespace(VIDEO="video"), HandLandmarker=Landmarker
@@ -54,7 +54,7 @@ def test_wrists_are_pixels_of_the_wearers_hands(package):
     assert package.options["num_hands"] == 2
     picture = np.zeros((100, 200, 3), np.uint8)
     assert detector(picture, 0.0) == {}
-    package.said = SimpleNamespace(
+    package.answer = SimpleNamespace(
         hand_landmarks=[[mark(0.75, 0.5), mark(0, 0)], [mark(0.25, 0.8), mark(0, 0)]],
         handedness=[side("Right", 0.97), side("Left", 0.9)],
     )

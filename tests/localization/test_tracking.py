@@ -102,7 +102,7 @@ def test_what_cannot_be_tracked_is_named(tmp_path, mapped):
         verb.main([f"paths.outputs={tmp_path}"])
 
 
-def test_without_the_extra_it_says_what_to_install(tmp_path, monkeypatch, capsys):
+def test_without_the_extra_it_names_what_to_install(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     write_pictures(tmp_path / "in", 6)
     assert run_verb("track", [str(tmp_path / "in"), f"paths.outputs={tmp_path / 'out'}"]) == 2

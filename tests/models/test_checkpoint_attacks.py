@@ -126,9 +126,9 @@ def test_no_command_runs_what_a_checkpoint_asks_for(verb, kind, data, tmp_path, 
         ],
     }[verb]
     assert exit_code([*arguments, f"hydra.run.dir={tmp_path}/run"]) == 2
-    said = capsys.readouterr().err
-    assert f"{path}: " in said
-    assert "Traceback" not in said
+    printed = capsys.readouterr().err
+    assert f"{path}: " in printed
+    assert "Traceback" not in printed
     assert not mark.exists()
     assert not (tmp_path / "y.safetensors").exists()
 

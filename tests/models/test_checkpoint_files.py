@@ -48,8 +48,8 @@ def run_file(path: Path, state: dict | None = None, **config) -> Path:
 
 def shared_file(path: Path, state: dict | None = None, config: object = None, **metadata: str) -> Path:
     """A shared checkpoint, or what somebody calls one."""
-    told = metadata or {"wearcap_checkpoint": json.dumps(config or {"name": "toy", "model": MODEL})}
-    save_file(state or {"first.weight": torch.zeros(2, 2)}, path, told)
+    entries = metadata or {"wearcap_checkpoint": json.dumps(config or {"name": "toy", "model": MODEL})}
+    save_file(state or {"first.weight": torch.zeros(2, 2)}, path, entries)
     return path
 
 
@@ -98,7 +98,7 @@ def test_weights_that_are_too_large_for_a_type_are_not_shared_in_it(tmp_path):
     assert not (tmp_path / "nan.safetensors").exists()
 
 
-def test_what_cannot_be_shared_so_is_said(tmp_path):
+def test_what_cannot_be_shared_so_is_reported(tmp_path):
     source = run_file(tmp_path / "run.ckpt")
     with pytest.raises(WearcapError, match=r"Expected NAME\.safetensors"):
         share_checkpoint(source, tmp_path / "other.ckpt")

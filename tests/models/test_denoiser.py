@@ -15,7 +15,7 @@ def small(**changes) -> MotionDenoiser:
     return net.eval()
 
 
-def told(head: torch.Tensor, points: int = 0, image: int = 0) -> Conditions:
+def conditions_of(head: torch.Tensor, points: int = 0, image: int = 0) -> Conditions:
     """Conditions of a head alone, or with random points and pictures everywhere."""
     batch, time, _ = head.shape
     there = torch.ones(batch, time, dtype=torch.bool)
@@ -24,7 +24,7 @@ def told(head: torch.Tensor, points: int = 0, image: int = 0) -> Conditions:
 
 def denoise(net: MotionDenoiser, x_t, level, condition, valid) -> torch.Tensor:
     """x̂0 from a head's condition alone."""
-    return net(x_t, level, net.encode(told(condition), valid), valid)
+    return net(x_t, level, net.encode(conditions_of(condition), valid), valid)
 
 
 def inputs(time: int = 16):
@@ -99,7 +99,7 @@ def test_blending_is_smoother_and_never_mixes_in_padding():
 def test_a_missing_modality_is_null_whatever_its_numbers_are():
     net = small(points_size=3, image_size=4)
     _, _, head, valid = inputs()
-    whole = told(head, 3, 4)
+    whole = conditions_of(head, 3, 4)
     blind = whole._replace(points_valid=valid & False, image_valid=valid & False)
     other = blind._replace(points=blind.points + 5, image=blind.image * torch.inf)
     assert torch.equal(net.encode(blind, valid), net.encode(other, valid))
@@ -114,7 +114,7 @@ def test_a_scene_at_the_null_vector_is_not_taken_for_a_missing_one():
     net = small(points_size=3, frames_per_token=4)
     _, _, head, valid = inputs()
     points = net.condition_encoder.points
-    at_null = told(head, 3)._replace(points=points.normalizer.inverse(points.null).expand(2, 16, 3))
+    at_null = conditions_of(head, 3)._replace(points=points.normalizer.inverse(points.null).expand(2, 16, 3))
     gone = at_null._replace(points_valid=valid & False)
     assert not torch.allclose(net.encode(at_null, valid), net.encode(gone, valid), atol=1e-3)
 
@@ -122,7 +122,7 @@ def test_a_scene_at_the_null_vector_is_not_taken_for_a_missing_one():
 def test_self_conditioning_listens_to_the_last_answer():
     net = small(self_conditioning=True)
     x_t, level, head, valid = inputs()
-    encoded = net.encode(told(head), valid)
+    encoded = net.encode(conditions_of(head), valid)
     first = net(x_t, level, encoded, valid)
     assert torch.equal(net(x_t, level, encoded, valid, torch.zeros_like(x_t)), first)
     assert not torch.allclose(net(x_t, level, encoded, valid, first), first, atol=1e-3)

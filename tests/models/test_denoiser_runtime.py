@@ -1,4 +1,4 @@
-"""The steps of a sampler by other means say what the plain network says."""
+"""The steps of a sampler in other runtimes give the plain network's outputs."""
 
 import os
 import shutil
@@ -24,7 +24,7 @@ def network(device: str = "cpu", **changes) -> MotionDenoiser:
     return net.eval().to(device)
 
 
-def told(net: MotionDenoiser, batch: int, device: str = "cpu"):
+def inputs_of(net: MotionDenoiser, batch: int, device: str = "cpu"):
     """x_t, what the conditions say, `valid` with a window that is still growing, the last x̂0."""
     torch.manual_seed(1)
     valid = torch.arange(16).expand(batch, -1) < torch.tensor([[9]] + [[16]] * (batch - 1))
@@ -39,7 +39,7 @@ def told(net: MotionDenoiser, batch: int, device: str = "cpu"):
 
 def worst(net: MotionDenoiser, runner: StepRunner, batch: int, device: str = "cpu") -> float:
     """Largest difference from the plain network over all levels, on frames that exist."""
-    x_t, encoded, valid, last = told(net, batch, device)
+    x_t, encoded, valid, last = inputs_of(net, batch, device)
     differences = []
     with torch.inference_mode():
         for number, level in enumerate(LEVELS.to(device)):
@@ -56,7 +56,7 @@ def test_a_plan_made_once_changes_nothing(self_conditioning):
     assert worst(net, StepRunner(net, LEVELS), 3) < 1e-5
 
 
-def test_onnx_runtime_says_the_same_for_any_number_of_windows():
+def test_onnx_runtime_gives_the_same_for_any_number_of_windows():
     net = network(self_conditioning=True)
     runner = StepRunner(net, LEVELS, "onnx")
     assert max(worst(net, runner, batch) for batch in (1, 3)) < 1e-5
@@ -72,7 +72,7 @@ def test_pytorch_leaves_the_cores_to_onnx_runtime():
 
 def test_narrow_products_say_nearly_the_same():
     net = network()
-    spread = told(net, 3)[0].std().item()
+    spread = inputs_of(net, 3)[0].std().item()
     assert 0 < worst(net, StepRunner(net, LEVELS, "eager", "bfloat16"), 3) < 0.1 * spread
     assert 0 < worst(net, StepRunner(net, LEVELS, "auto", "narrowest"), 3) < 0.3 * spread, "int8"
 
@@ -101,7 +101,7 @@ def worst_of_compiled(device: str, runtime: str, precision: str) -> float:
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
-def test_compiled_it_says_the_same():
+def test_compiled_it_gives_the_same():
     assert worst_of_compiled("cpu", "compile", "float32") < 1e-5
 
 

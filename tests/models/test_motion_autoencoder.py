@@ -12,7 +12,7 @@ def small(**settings) -> MotionAutoencoder:
     return MotionAutoencoder(12, 16, (24, 24), **({"latent": 8} | settings))
 
 
-def test_it_is_as_small_as_it_says():
+def test_it_is_as_small_as_documented():
     net = MotionAutoencoder(143)
     assert sum(weight.numel() for weight in net.parameters()) < 1e6
     features = torch.randn(3, 80, 143)

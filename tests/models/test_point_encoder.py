@@ -45,7 +45,7 @@ def test_order_place_and_scale_do_not_change_the_feature_and_turning_does():
     assert not torch.allclose(net(points[..., [1, 0, 2]] * torch.tensor([1.0, -1.0, 1.0])), feature, atol=1e-3)
 
 
-def test_extents_are_told_beside_it():
+def test_extents_are_given_beside_it():
     points = torch.tensor([[[0.0, 0.0, 0.0], [2.0, 1.0, 3.0], [1.0, 0.5, -1.0]]])
     torch.testing.assert_close(cloud_extents(points), torch.tensor([[1.0, 0.5, 2.0, 1.0, 0.5, 1.0]]))
 

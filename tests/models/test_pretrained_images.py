@@ -112,7 +112,7 @@ def test_a_path_goes_before_the_variable_and_that_before_the_cache(packages, mon
 def test_missing_weights_are_explained(packages, monkeypatch):
     with pytest.raises(WearcapError, match="no weights of CLIP") as raised:
         Clip()
-    said = str(raised.value)
+    message = str(raised.value)
     for part in (
         "WEARCAP_CLIP_WEIGHTS",
         str(packages / "huggingface/hub"),
@@ -120,7 +120,7 @@ def test_missing_weights_are_explained(packages, monkeypatch):
         "weights=PATH",
         "egoview",
     ):
-        assert part in said
+        assert part in message
     monkeypatch.setenv("HF_HOME", "/elsewhere")
     with pytest.raises(WearcapError, match="/elsewhere/hub"):
         DinoV2()

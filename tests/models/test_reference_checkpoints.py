@@ -28,7 +28,7 @@ def test_a_checkpoint_and_its_card_come_together():
 
 
 @pytest.mark.parametrize("name", shared_checkpoints())
-def test_a_card_says_what_when_and_how(name):
+def test_a_card_states_what_when_and_how(name):
     card = (FOLDER / f"{name}.md").read_text(encoding="utf-8")
     assert card.startswith(f"# {name}\n")
     places = [card.find(heading) for heading in CARD]

@@ -108,7 +108,7 @@ def rotations(count: int) -> torch.Tensor:
         (costs.pose_step, lambda: (randn(4, 5, 3), randn(4, 5, 3))),
     ],
 )
-def test_each_cost_has_the_derivative_that_autograd_says(cost, inputs):
+def test_each_cost_has_the_derivative_of_autograd(cost, inputs):
     torch.manual_seed(1)
     assert torch.autograd.gradcheck(cost, tuple(value.requires_grad_() for value in inputs()))
 
@@ -220,7 +220,7 @@ def planted() -> tuple[HpsData, HpsState]:
     return exact, truth
 
 
-DOCUMENT = {
+PAPER = {
     "self": 10.0,
     "contact": 300.0,
     "slide": 500.0,
@@ -291,7 +291,7 @@ def test_the_banded_solver_refuses_a_new_term_of_the_spine(monkeypatch):
 
 def test_the_banded_solver_goes_no_less_low_than_adam():
     data, _ = planted()
-    energy = HpsEnergy(DOCUMENT)
+    energy = HpsEnergy(PAPER)
     ours = solve_banded(energy, data, BandedSettings(iterations=20, relaxation=1.5))
     adam = solve_adam_windows(energy, data, AdamSettings(steps=40, full_mesh=False))
     true = [sum(energy_terms(energy, data, s.state).values()).item() for s in (ours, adam)]
@@ -300,12 +300,12 @@ def test_the_banded_solver_goes_no_less_low_than_adam():
 
 def test_adam_keeps_the_frame_that_windows_share():
     data, _ = planted()
-    told = []
+    counts = []
     settings = AdamSettings(window=15, advance=14, steps=5, full_mesh=False)
-    solution = solve_adam_windows(HpsEnergy(DOCUMENT), data, settings, told.append)
-    assert told == [15, 29, 40]
+    solution = solve_adam_windows(HpsEnergy(PAPER), data, settings, counts.append)
+    assert counts == [15, 29, 40]
     assert (len(solution.state), len(solution.history)) == (40, 5)
-    alone = solve_adam_windows(HpsEnergy(DOCUMENT), data[:15], settings).state
+    alone = solve_adam_windows(HpsEnergy(PAPER), data[:15], settings).state
     assert torch.equal(solution.state.t_world_root[:15], alone.t_world_root)
     assert torch.equal(solution.state.theta[:15], alone.theta)
     assert (solution.state.t_world_root[15] - data.start.t_world_root[15]).abs().max() > 1e-4
@@ -314,7 +314,7 @@ def test_adam_keeps_the_frame_that_windows_share():
 def test_stretches_join_to_the_whole():
     data, _ = planted()
     data.hold_confidence[9:13] = 0.0  # where a border would lie
-    energy = HpsEnergy(DOCUMENT | {"root_step": 400.0})
+    energy = HpsEnergy(PAPER | {"root_step": 400.0})
     settings = BandedSettings(iterations=12, relaxation=1.5)
     whole = solve_banded(energy, data, settings).state
     joined = solve_in_stretches(energy, data, settings, stretch=10, overlap=8, jobs=1)
@@ -325,7 +325,7 @@ def test_stretches_join_to_the_whole():
     assert all(first <= keep < stop <= last for first, keep, stop, last in spans)
 
 
-def test_an_energy_that_leaves_something_open_says_so():
+def test_an_energy_that_leaves_something_open_is_refused():
     data = still_data(4)
     with pytest.raises(WearcapError, match="does not determine"):
         solve_banded(HpsEnergy({"slide": 1.0}), data)

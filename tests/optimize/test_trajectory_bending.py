@@ -27,7 +27,7 @@ from wearcap.optimize.trajectory_banded import bend_banded
 
 NOWHERE = torch.zeros(2, dtype=torch.float64)
 VARIANTS = {
-    "document": Bending(30.0),
+    "paper": Bending(30.0),
     "free start": Bending(30.0, free_start=True),
     "absolute": Bending(3.0, norm="absolute"),
     "huber": Bending(30.0, loss=Loss("huber", 0.1)),
@@ -133,7 +133,7 @@ def test_a_path_through_half_turns_is_no_bend():
     assert solved.history[-1]["total"] < 1e-3
 
 
-@pytest.mark.parametrize("name", ["document", "absolute", "held"])
+@pytest.mark.parametrize("name", ["paper", "absolute", "held"])
 def test_ours_has_no_more_energy_than_adam(name):
     problem, _ = example(VARIANTS[name])
     ours = bend_banded(problem)
@@ -148,7 +148,7 @@ def test_ours_has_no_more_energy_than_adam(name):
 
 @pytest.mark.parametrize("name", ["squares", "held", "cauchy", "huber"])
 def test_ours_ends_where_the_gradient_vanishes(name):
-    """Against autograd: the compiled passes find a stationary point of the energy that the document writes."""
+    """Against autograd: the compiled passes find a stationary point of the energy of the paper."""
     problem, _ = example(VARIANTS[name])
     solved = bend_banded(problem, iterations=200, tolerance=0.0)
     turn, shift = (solved.turn.clone().requires_grad_(), (solved.path[0] - problem.path[0]).clone().requires_grad_())

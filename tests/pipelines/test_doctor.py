@@ -43,12 +43,12 @@ def wrist(recording, **changes):
     return replace(recording, imu=recording.imu | {"left_wrist": replace(recording.imu["left_wrist"], **changes)})
 
 
-def every(thing, keep):
+def every(part, keep):
     """A stream with only some of its frames."""
-    tensors = {f.name: getattr(thing, f.name) for f in dataclasses.fields(thing)}
-    frames = len(thing.timestamps)
+    tensors = {f.name: getattr(part, f.name) for f in dataclasses.fields(part)}
+    frames = len(part.timestamps)
     return replace(
-        thing, **{k: v[keep] for k, v in tensors.items() if isinstance(v, torch.Tensor) and v.ndim and len(v) == frames}
+        part, **{k: v[keep] for k, v in tensors.items() if isinstance(v, torch.Tensor) and v.ndim and len(v) == frames}
     )
 
 

@@ -16,7 +16,7 @@ from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
 
 
-def thing(name, size=(1.0, 0.6, 0.8), at=(0.0, 0.0, 0.0), freedom=Freedom("plane"), origin=0.0) -> SceneObject:
+def scene_object(name, size=(1.0, 0.6, 0.8), at=(0.0, 0.0, 0.0), freedom=Freedom("plane"), origin=0.0) -> SceneObject:
     """A box on its frame's floor; with origin 0.5 its frame is at its left end."""
     x, y, z = size
     mesh = box_mesh(((origin - 0.5) * x, -y / 2, 0.0), ((origin + 0.5) * x, y / 2, z))
@@ -24,14 +24,14 @@ def thing(name, size=(1.0, 0.6, 0.8), at=(0.0, 0.0, 0.0), freedom=Freedom("plane
 
 
 def door(at=(5.0, 0.0, 0.0), **freedom) -> SceneObject:
-    return thing(
+    return scene_object(
         "door_1", (0.9, 0.05, 2.0), at, Freedom(**{"kind": "hinge", "pivot": at, "limits": (0.0, 1.6)} | freedom), 0.5
     )
 
 
-SOUND = (thing("sofa_1"), thing("table_1", at=(3.0, 0.0, 0.0)), door(),
-         thing("drawer_1", (0.4, 0.4, 0.2), (0.0, 4.0, 0.5), Freedom("axis", axis=(1.0, 0.0, 0.0), limits=(0.0, 0.4))),
-         thing("box_1", (0.3, 0.3, 0.3), (0.0, 0.0, 0.8), Freedom("free")))  # fmt: skip
+SOUND = (scene_object("sofa_1"), scene_object("table_1", at=(3.0, 0.0, 0.0)), door(),
+         scene_object("drawer_1", (0.4, 0.4, 0.2), (0.0, 4.0, 0.5), Freedom("axis", axis=(1.0, 0.0, 0.0), limits=(0.0, 0.4))),
+         scene_object("box_1", (0.3, 0.3, 0.3), (0.0, 0.0, 0.8), Freedom("free")))  # fmt: skip
 
 
 def found(*objects, severity=("error", "warning", "note")) -> list[Finding]:
@@ -51,13 +51,17 @@ def test_a_sound_environment_is_listed():
 @pytest.mark.parametrize(
     ("item", "what", "severity"),
     [
-        (thing("chair_9", (0.0009, 0.0006, 0.001), (7.0, 0.0, 0.0)), "the mesh is tiny", "warning"),
-        (thing("chair_9", (20.0, 0.6, 0.8), (0.0, 30.0, 0.0)), "the mesh is larger than an object", "warning"),
-        (thing("sofa_9"), "are at the same place", "warning"),
-        (thing("chair_9", (0.4, 0.4, 0.5), (3.0, 0.0, 0.05)), "the first stands within the second's box", "note"),
-        (thing("chair_9", at=(9.0, 0.0, -0.5)), "reaches below the floor", "warning"),
-        (thing("box_9", at=(9.0, 0.0, -0.5), freedom=Freedom("free")), "reaches below the floor", "warning"),
-        (thing("chair_9", at=(9.0, 0.0, 0.5)), "slides above the others' floor", "note"),
+        (scene_object("chair_9", (0.0009, 0.0006, 0.001), (7.0, 0.0, 0.0)), "the mesh is tiny", "warning"),
+        (scene_object("chair_9", (20.0, 0.6, 0.8), (0.0, 30.0, 0.0)), "the mesh is larger than an object", "warning"),
+        (scene_object("sofa_9"), "are at the same place", "warning"),
+        (
+            scene_object("chair_9", (0.4, 0.4, 0.5), (3.0, 0.0, 0.05)),
+            "the first stands within the second's box",
+            "note",
+        ),
+        (scene_object("chair_9", at=(9.0, 0.0, -0.5)), "reaches below the floor", "warning"),
+        (scene_object("box_9", at=(9.0, 0.0, -0.5), freedom=Freedom("free")), "reaches below the floor", "warning"),
+        (scene_object("chair_9", at=(9.0, 0.0, 0.5)), "slides above the others' floor", "note"),
         (
             replace(door((8.0, 0.0, 0.0), pivot=(7.7, 0.0, 0.0)), name="door_9"),
             "the hinge is beside the mesh",

@@ -365,8 +365,8 @@ def test_unknown_names_are_refused():
 def test_objects_that_cannot_be_used_are_refused_when_they_are_named():
     mesh = boxes(CARRIED).by_name("box_1").mesh
     huge = Mesh(mesh.vertices * 1000, mesh.faces, mesh.color)
-    things = Environment((scene_object("a", mesh=huge), scene_object("b", "piano")))
-    session = EchoStream(drawn_echo(), EchoWearer(carrying(0.6).skeleton), things)
+    surroundings = Environment((scene_object("a", mesh=huge), scene_object("b", "piano")))
+    session = EchoStream(drawn_echo(), EchoWearer(carrying(0.6).skeleton), surroundings)
     with pytest.raises(WearcapError, match="object 'a': .*looks like millimetres"):
         session.activate("a", 0.0)
     with pytest.raises(WearcapError, match="has no object class 'piano'"):

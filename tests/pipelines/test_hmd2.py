@@ -87,7 +87,7 @@ def test_the_same_seed_repeats_and_another_differs():
 
 
 @pytest.mark.parametrize("frame", ["heading", "window"])
-def test_what_was_said_stays_said(frame):
+def test_final_poses_stay_as_they_are(frame):
     """Frames that a window has given out are not revised by the next: a longer recording begins the same."""
     long, live = swaying_motion(140), pipeline(frame, live=True, lookahead=0)
     short = recording_of(long.sliced(0, 80), "short")

@@ -72,7 +72,7 @@ def push(session: HMD2Session, *conditions: list) -> list[Motion | None]:
 
 
 def run(session: HMD2Session, conditions: list[HeadSample], shift: float = 0.0) -> list[Motion]:
-    """What the first of two wearers is given, in pieces; the second one says nothing."""
+    """What the first of two wearers is given, in pieces; the second one sends nothing."""
     shifted = [moment._replace(timestamp=moment.timestamp + shift) for moment in conditions]
     return [motion for moment in shifted if (motion := push(session, [moment], [])[0]) is not None]
 

@@ -318,7 +318,7 @@ def test_embeddings_of_another_length_are_refused(pipeline):
         )
 
 
-def test_a_floor_that_is_told_is_believed(pipeline):
+def test_a_floor_that_is_given_is_used(pipeline):
     recording = surrounded(40)
     session = HMD2Session(pipeline(), [wearer(recording)], [0])
     stream(session, [moment._replace(floor_height=0.01 * i) for i, moment in enumerate(moments(recording))])

@@ -23,7 +23,7 @@ def test_new_frames_continue_from_observed_ones_and_fade_into_the_prediction():
     steps = whole[1, 8:19, 0].diff()
     assert steps[0] == pytest.approx(1.0)
     assert 0.3 < steps[1] < 1.0, "it goes on as it went, and turns back"
-    assert steps.diff().abs().max() < 1.1, "without a kink, on a way of nine in eight frames"
+    assert steps.diff().abs().max() < 1.1, "without a kink, on a path of nine in eight frames"
     step = blended(x0_hat, observed, is_observed, 0)
     assert torch.equal(step, torch.where(is_observed[..., None], observed, x0_hat))
 

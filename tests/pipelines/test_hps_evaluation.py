@@ -1,4 +1,4 @@
-"""Scores of motions whose errors are planted: what is five centimetres off is said to be five centimetres off."""
+"""Scores of motions whose errors are planted: what is five centimetres off is measured as five centimetres off."""
 
 from dataclasses import replace
 
@@ -107,7 +107,7 @@ def test_chamfer_grows_with_the_shift_up_to_all_of_it(truth: HpsTruth):
 def test_clouds_are_met_at_their_own_time(truth: HpsTruth):
     late = replace(truth.motion, timestamps=truth.motion.timestamps + 0.2)
     off = interval_chamfer(late, truth.body, truth.visits[1])[0]
-    assert off.mean_cm > 1.0, "10 cm of way"
+    assert off.mean_cm > 1.0, "10 cm of path"
     with pytest.raises(WearcapError, match="no captured frame at 1.00 s"):
         interval_chamfer(truth.motion.sliced(0, 20), truth.body, truth.visits[1])
     assert nearest_frames(truth.motion.timestamps, torch.tensor([0.34, 1.01]).double()).tolist() == [10, 30]
@@ -123,7 +123,7 @@ def test_a_captured_turn_leaves_the_root_where_it_is_and_moves_the_joints(truth:
     assert error[0, wrist].item() == pytest.approx(200 * reach[:2].norm().item(), rel=1e-4)
 
 
-def test_the_slope_counts_way_and_not_time():
+def test_the_slope_counts_path_length_and_not_time():
     distance = torch.cat([torch.linspace(0, 100, 500), torch.full((5000,), 100.0), torch.linspace(100, 400, 1500)])
     grown = drift(distance.double(), (3.0 + 0.02 * distance).double())
     assert grown.slope_cm_per_100m == pytest.approx(2.0, abs=0.15)
@@ -134,7 +134,7 @@ def test_the_slope_counts_way_and_not_time():
     assert np.isnan(drift(distance[:50].double(), distance[:50].double()).slope_cm_per_100m)
 
 
-def test_the_way_is_that_over_the_ground():
+def test_the_path_length_is_that_over_the_ground():
     motion = gliding(1.0)
     up = replace(
         motion, t_world_root=motion.t_world_root + torch.linspace(0, 3, 120)[:, None] * torch.tensor([0, 0, 1])

@@ -27,7 +27,7 @@ SECONDS, FAULT = 8, 4
 @pytest.fixture(scope="module")
 def hps() -> HPS:
     """One that believes its start: what is tested is what reaches it."""
-    config = compose("capture", ["pipeline=hps_without_scene", "recording=none"])
+    config = compose("capture", ["pipeline=paper/hps_without_scene", "recording=none"])
     made = instantiate(config.pipeline, _convert_="all")
     made.solver = lambda energy, data: Solution(data.start, [], "start")
     return made
@@ -120,9 +120,9 @@ def test_bad_pieces_in_between_change_nothing(hps, parts, undisturbed):
 @pytest.mark.parametrize("name", bad_localizations(pieces(hps_recording(seconds=1.0))[0].localization))
 def test_bad_camera_poses_are_bridged_by_the_suit(hps, parts, undisturbed, name):
     seen = bad_localizations(parts[FAULT].localization)[name]
-    told = [broken(part, localization=seen) if k == FAULT else part for k, part in enumerate(parts)]
+    given = [broken(part, localization=seen) if k == FAULT else part for k, part in enumerate(parts)]
     stream = HpsStream(hps, parts[0], None, SETTINGS)
-    found = run(stream, told)
+    found = run(stream, given)
     assert sum(stream.refused.values()) == 1
     assert torch.equal(times_of(found), times_of(undisturbed))
     off = torch.cat([m.t_world_root for m in found]) - torch.cat([m.t_world_root for m in undisturbed])
@@ -130,9 +130,9 @@ def test_bad_camera_poses_are_bridged_by_the_suit(hps, parts, undisturbed, name)
 
 
 def test_a_piece_is_missing_or_comes_twice(hps, parts, undisturbed):
-    told = [*parts[:4], parts[2], *parts[5:]]
+    given = [*parts[:4], parts[2], *parts[5:]]
     refused = Counter()
-    found = list(follow(hps, told, None, settings=SETTINGS, refused=refused))
+    found = list(follow(hps, given, None, settings=SETTINGS, refused=refused))
     assert refused == {"suit: off the clock": 1}
     assert torch.equal(times_of(found), times_of(undisturbed))
     assert all(motion.t_world_root.isfinite().all() for motion in found)
@@ -141,8 +141,8 @@ def test_a_piece_is_missing_or_comes_twice(hps, parts, undisturbed):
 @pytest.mark.parametrize("by_s", [-5.0, -1000.0, 3600.0, 1e9])
 def test_where_the_clock_moves_a_new_stretch_begins(hps, parts, undisturbed, by_s):
     refused, odd = Counter(), shifted(parts[2], 500.0)
-    told = [*parts[:3], odd, *parts[3:], *(shifted(part, SECONDS + by_s) for part in parts)]
-    found = list(follow(hps, told, None, settings=SETTINGS, refused=refused))
+    given = [*parts[:3], odd, *parts[3:], *(shifted(part, SECONDS + by_s) for part in parts)]
+    found = list(follow(hps, given, None, settings=SETTINGS, refused=refused))
     assert refused == {"suit: off the clock": 1}
     assert all((motion.timestamps.diff() > 0).all() for motion in found)
     first = times_of(undisturbed)
@@ -151,10 +151,10 @@ def test_where_the_clock_moves_a_new_stretch_begins(hps, parts, undisturbed, by_
     assert all(motion.t_world_root.isfinite().all() for motion in found)
 
 
-def test_where_every_piece_is_bad_it_says_so(hps, parts):
-    told = [broken(part, suit=broken(part.suit, t_world_root=part.suit.t_world_root * math.nan)) for part in parts]
+def test_where_every_piece_is_bad_it_is_reported(hps, parts):
+    given = [broken(part, suit=broken(part.suit, t_world_root=part.suit.t_world_root * math.nan)) for part in parts]
     with pytest.raises(WearcapError, match="no piece can be used .suit: not finite."):
-        list(follow(hps, told, None, settings=SETTINGS))
+        list(follow(hps, given, None, settings=SETTINGS))
 
 
 def test_pieces_without_a_suit_or_a_readable_file_are_passed_over(hps, parts, tmp_path):

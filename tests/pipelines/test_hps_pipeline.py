@@ -1,4 +1,4 @@
-"""HPS from a recording to a motion: planted errors go, steps resume, pictures are localised, faults are said."""
+"""HPS from a recording to a motion: planted errors go, steps resume, pictures are localised, faults are reported."""
 
 import functools
 import sys
@@ -173,7 +173,7 @@ def test_a_baseline_shares_the_first_stages(walk, tmp_path):
         assert placed.motion.provenance["pipeline"] == kind
 
 
-def test_it_is_scored_in_the_world_and_hung(walk, tmp_path):
+def test_it_is_scored_in_the_world_and_anchored(walk, tmp_path):
     store = hps_dataset(tmp_path, walk)
     imu, ours = (next(evaluate(p, store, ["walk"], [0])).scores for p in (HpsBaseline("imu"), PIPELINE))
     assert ours["world_root_cm"] < imu["world_root_cm"]
@@ -306,7 +306,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_what_is_missing_is_said(fault, walk):
+def test_what_is_missing_is_reported(fault, walk):
     change, pipeline, message = FAULTS[fault]
     with pytest.raises(WearcapError, match=message):
         pipeline(CaptureInput(change(walk), scan=Scan(floor_points())))

@@ -125,7 +125,7 @@ def test_pieces_are_followed_until_the_end(tmp_path):
         list(follow_pieces(tmp_path, patience_s=0.2, poll_s=0.05))
 
 
-def test_what_cannot_be_followed_says_why():
+def test_what_cannot_be_followed_is_refused_with_a_reason():
     clapping = hps_recording(seconds=2.0, camera_lead_s=0.3)
     with pytest.raises(WearcapError, match="clock=shared"):
         list(follow(hps(), pieces(clapping), None))

@@ -41,32 +41,34 @@ def cube(name: str, place: torch.Tensor, freedom: Freedom) -> SceneObject:
     return SceneObject(name, "box", Mesh(CUBE, FACES, np.ones(3, np.float32)), torch.eye(3), place.float(), freedom)
 
 
-def walked(way: torch.Tensor) -> Motion:
+def walked(displacement: torch.Tensor) -> Motion:
     """Someone in a T-pose who is moved along x."""
     skeleton = xsens23()
-    root = torch.tensor([0.0, 0.0, skeleton.root_height]) + torch.nn.functional.pad(way[:, None].float(), (0, 2))
-    times = torch.arange(len(way), dtype=torch.float64) / FPS
-    return Motion(times, skeleton, torch.eye(3).repeat(len(way), len(skeleton), 1, 1), root)
+    root = torch.tensor([0.0, 0.0, skeleton.root_height]) + torch.nn.functional.pad(
+        displacement[:, None].float(), (0, 2)
+    )
+    times = torch.arange(len(displacement), dtype=torch.float64) / FPS
+    return Motion(times, skeleton, torch.eye(3).repeat(len(displacement), len(skeleton), 1, 1), root)
 
 
 @pytest.fixture
-def way() -> torch.Tensor:
+def displacement() -> torch.Tensor:
     """At rest, 1 m in the two seconds in which something is held, at rest, on."""
     u = ((torch.arange(FRAMES) - TAKE - 30) / 120.0).clamp(0, 1)
     return u * u * (3 - 2 * u) + 0.5 * ((torch.arange(FRAMES) - 260) / 100.0).clamp(0, 1)
 
 
 @pytest.fixture
-def scene(way) -> tuple[Motion, Environment]:
-    motion = walked(way)
+def scene(displacement) -> tuple[Motion, Environment]:
+    motion = walked(displacement)
     left, right = site_positions(motion.skeleton, motion.T_world_joint, PALMS)[0]
     beside = torch.tensor([0.2, 0.0, 0.0])
-    things = (
+    scene_objects = (
         cube("near", left + beside, Freedom("plane")),
         cube("far", left + 5 * beside, Freedom("plane")),
         cube("door", right + beside, Freedom("hinge", pivot=tuple((right + 4 * beside).tolist()), limits=(-2.0, 2.0))),
     )
-    return motion, Environment(things)
+    return motion, Environment(scene_objects)
 
 
 def held_left(frames: int = FRAMES) -> torch.Tensor:
@@ -89,13 +91,13 @@ def tracker(**settings) -> ObjectTracker:
     return ObjectTracker(None, attachment=AttachmentSettings(**{"settle_s": 0.0} | settings))
 
 
-def test_what_is_held_goes_along_and_stays_where_it_is_left(scene, way):
+def test_what_is_held_goes_along_and_stays_where_it_is_left(scene, displacement):
     motion, environment = scene
     contacts = {"timestamps": motion.timestamps, "sliding": held_left(), "hinged": torch.zeros(FRAMES, 2)}
     captured = tracker()(motion, contacts, environment)
     near = objects_of(captured)["near"]
     moved = near.t_world_body[:, 0] - near.t_world_body[0, 0]
-    torch.testing.assert_close(moved[TAKE:LEAVE], (way - way[TAKE])[TAKE:LEAVE], atol=1e-5, rtol=0)
+    torch.testing.assert_close(moved[TAKE:LEAVE], (displacement - displacement[TAKE])[TAKE:LEAVE], atol=1e-5, rtol=0)
     assert (moved[LEAVE:] == moved[LEAVE - 1]).all()
     assert len(objects_of(captured)["far"]) == 2
     assert held_of(captured).objects == ("near",)
@@ -158,7 +160,7 @@ def test_captured_interactions_are_labels_on_an_uneven_clock(scene):
     assert [len(labels[hand]) for hand in ("left", "right")] == [1, 1]
 
 
-def test_what_cannot_be_tracked_is_said(scene):
+def test_what_cannot_be_tracked_is_reported(scene):
     motion, environment = scene
     contacts = {"timestamps": motion.timestamps + 1e4, "sliding": held_left()}
     with pytest.raises(WearcapError, match="contacts at other times"):
@@ -181,7 +183,7 @@ def test_a_room_without_objects_and_a_motion_of_one_frame(scene):
     assert held_of(throughout).stop_s[-1] == pytest.approx(FRAMES / FPS, abs=0.5)
 
 
-def test_handlings_outside_of_the_capture_spoil_no_mean(scene, way):
+def test_handlings_outside_of_the_capture_spoil_no_mean(scene, displacement):
     """A handling before the capture's first frame is not measured at its last one."""
     motion, environment = scene
     track = Trajectory(motion.timestamps, torch.eye(3).repeat(FRAMES, 1, 1), torch.zeros(FRAMES, 3))
@@ -234,7 +236,7 @@ def test_objects_are_tracked_again_when_a_mesh_changes_wherever_it_lies(scene, t
     assert keys[0] != keys[1]
 
 
-def test_scores_tell_the_perfect_capture_from_the_static_one(scene, way):
+def test_scores_tell_the_perfect_capture_from_the_static_one(scene, displacement):
     motion, environment = scene
     contacts = {"timestamps": motion.timestamps, "sliding": held_left()}
     captured = tracker()(motion, contacts, environment)
@@ -260,7 +262,7 @@ def test_scores_tell_the_perfect_capture_from_the_static_one(scene, way):
     assert near.handlings[0].end_cm < 60
 
 
-def test_objects_keep_their_own_clock(scene, way):
+def test_objects_keep_their_own_clock(scene, displacement):
     motion, environment = scene
     track = Trajectory(motion.timestamps[[0, -1]], torch.eye(3).repeat(2, 1, 1), torch.zeros(2, 3))
     held = Interactions(torch.zeros(0).double(), torch.zeros(0).double(), torch.zeros(0, 2, dtype=torch.bool), (), ())
@@ -294,11 +296,11 @@ def test_corrections_move_the_wearer_to_the_object_and_back(scene):
     torch.testing.assert_close(shift[TAKE:LEAVE], torch.full((LEAVE - TAKE,), 0.1), atol=3e-3, rtol=0)
     assert shift[[0, -1]].abs().max() < 0.03
     assert shift.diff().abs().max() * FPS < 0.25
-    thing = environment.by_name("near")
+    nearest = environment.by_name("near")
     for captured, least, most in ((plain, 0.05, 0.2), (snapped, 0.0, 0.005)):
         palm = site_positions(captured.skeleton, captured.T_world_joint, PALMS)[TAKE:LEAVE, 0]
-        T = objects_of(captured)[thing.name].T_world_body[TAKE:LEAVE]
-        distance, _ = environment.distance(thing.name, palm, T)
+        T = objects_of(captured)[nearest.name].T_world_body[TAKE:LEAVE]
+        distance, _ = environment.distance(nearest.name, palm, T)
         assert least <= distance.mean() < most
 
 
@@ -320,12 +322,12 @@ def test_hands_are_put_onto_what_they_hold_by_the_arms_alone(scene):
     contacts = {"timestamps": motion.timestamps, "sliding": held_left()}
     plain = tracker()(motion, contacts, environment)
     snapped = replace(tracker(), hands=HandSnapping())(motion, contacts, environment)
-    thing = environment.by_name("near")
-    T = objects_of(snapped)[thing.name].T_world_body[TAKE:LEAVE]
+    nearest = environment.by_name("near")
+    T = objects_of(snapped)[nearest.name].T_world_body[TAKE:LEAVE]
     apart = []
     for captured in (plain, snapped):
         palm = site_positions(captured.skeleton, captured.T_world_joint, PALMS)[TAKE:LEAVE, 0]
-        apart.append(environment.distance(thing.name, palm, T)[0].mean())
+        apart.append(environment.distance(nearest.name, palm, T)[0].mean())
     assert apart[1] < 0.004 < 0.05 < apart[0]
     joints = [captured.T_world_joint for captured in (plain, snapped)]
     wrist, elbow = motion.skeleton.indices("left_wrist", "left_elbow")

@@ -52,7 +52,7 @@ def test_where_a_walk_begins_and_where_it_leads_changes_nothing(recording):
     torch.testing.assert_close(here.T_world_joint.t @ turn.mT + shift, there.T_world_joint.t, atol=2e-3, rtol=0)
 
 
-def test_asked_in_a_mirror_left_and_right_are_treated_alike(recording):
+def test_with_mirror_augmentation_left_and_right_are_treated_alike(recording):
     """A recording and its mirror image then give mirror images, whatever the weights."""
     flip = torch.tensor([1.0, -1.0, 1.0])
     turn, head = torch.outer(flip, flip), recording.head
@@ -162,7 +162,7 @@ def test_scores_in_the_world_are_not_aligned(recording):
     assert score_in_world(shifted, recording, "walk", 0).scores["mpjpe_cm"] == pytest.approx(100.0, rel=1e-3)
 
 
-def test_onnx_says_the_same(recording):
+def test_onnx_gives_the_same(recording):
     pytest.importorskip("onnxruntime")
     eager, fast = (drawn_pipeline(floor="fixed")(recording), drawn_pipeline(floor="fixed", runtime="onnx")(recording))
     torch.testing.assert_close(eager.T_world_joint.t, fast.T_world_joint.t, atol=1e-4, rtol=0)

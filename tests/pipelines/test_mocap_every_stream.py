@@ -1,4 +1,4 @@
-"""MocapEvery as a stream: the same motion as in one go, whatever order things come in."""
+"""MocapEvery as a stream: the same motion as in one go, whatever order samples come in."""
 
 import pytest
 import torch
@@ -48,7 +48,7 @@ def streamed(pipeline, recording, late_s: float = 0.0, without: str | None = Non
 
 @pytest.mark.parametrize(("stride", "lookahead"), [(1, 0), (1, 5), (4, 8)])
 @pytest.mark.parametrize("floor", ["follow", "update"])
-def test_a_stream_says_what_a_whole_capture_says(recording, stride, lookahead, floor):
+def test_a_stream_gives_what_a_whole_capture_gives(recording, stride, lookahead, floor):
     pipeline = drawn_pipeline(stride=stride, lookahead=lookahead, floor=floor)
     motion, session = streamed(pipeline, recording)
     whole = pipeline(recording)

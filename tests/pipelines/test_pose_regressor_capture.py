@@ -1,4 +1,4 @@
-"""Captures by the pose regressor: causal, hung from the measured head, hands where they were measured."""
+"""Captures by the pose regressor: causal, anchored to the measured head, hands where they were measured."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ HANDS = ("head", "left_wrist", "right_wrist")
 
 def pipeline(points: tuple[str, ...] = ("head",), **changes) -> PoseRegressorCapture:
     torch.manual_seed(0)
-    tracked = TrackedPoints(points, "world")  # a floor told by the whole path would say what comes
+    tracked = TrackedPoints(points, "world")  # a floor from the whole path would give away the future
     net = PoseRegressor(tracked.size, 138, 40, 32, 2, 4, 64, frames_per_token=4)
     # Bends of some degrees about the rest pose, as a trained one tells them.
     net.motion_normalizer.set(encode_pose(torch.eye(3).expand(23, 3, 3), torch.eye(3)), torch.full((138,), 0.2))

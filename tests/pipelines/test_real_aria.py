@@ -124,7 +124,7 @@ def test_a_true_skeleton_rides_with_the_real_head(real_data):
 
 
 @pytest.mark.real
-def test_a_body_hung_from_the_real_head_beside_the_true_one(real_data):
+def test_a_body_anchored_to_the_real_head_beside_the_true_one(real_data):
     """The wearer stands, bends the head over a bowl and holds it: legs are where a standing body has them, hands are not."""
     recording = read_adt(real_data / "aria_adt_sample" / "raw")
     head = recording.head

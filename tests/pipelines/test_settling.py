@@ -6,7 +6,7 @@ FPS = 60.0
 LEFT, RIGHT, BOTH = (True, False), (False, True), (True, True)
 
 
-def way(*stretches: tuple[int, float]) -> torch.Tensor:
+def palm_path(*stretches: tuple[int, float]) -> torch.Tensor:
     """Palms "time hand 3" that move along x at a speed (m/s) for so many frames, one after the other; both alike."""
     speed = torch.cat([torch.full((frames,), value) for frames, value in stretches])
     x = (speed / FPS).cumsum(0)
@@ -18,7 +18,7 @@ def times(palms: torch.Tensor) -> torch.Tensor:
 
 
 def test_approach_and_retreat_are_cut_off_where_the_hand_rests():
-    palms = way((50, 0.9), (4, 0.0), (60, 0.3), (4, 0.0), (50, 0.9))
+    palms = palm_path((50, 0.9), (4, 0.0), (60, 0.3), (4, 0.0), (50, 0.9))
     spans = [(ContactInterval(40, 130, LEFT), "sliding")]
     ((found, contact_class),) = settled(spans, palms, times(palms), 0.4)
     assert contact_class == "sliding"
@@ -27,7 +27,7 @@ def test_approach_and_retreat_are_cut_off_where_the_hand_rests():
 
 
 def test_no_more_than_the_limit_is_cut_and_nothing_with_zero():
-    palms = way((200, 0.5), (20, 0.0))
+    palms = palm_path((200, 0.5), (20, 0.0))
     spans = [(ContactInterval(20, 190, RIGHT), "hinged")]
     assert settled(spans, palms, times(palms), 0.0) == spans
     ((found, _),) = settled(spans, palms, times(palms), 0.25)
@@ -44,7 +44,7 @@ def test_hands_that_join_and_leave_are_one_hold():
         (ContactInterval(84, 99, LEFT), "sliding"),
     ]
     assert [len(chain) for chain in chains(spans)] == [3, 1, 1]
-    palms = way((20, 0.9), (4, 0.0), (44, 0.3), (4, 0.0), (60, 0.9))
+    palms = palm_path((20, 0.9), (4, 0.0), (44, 0.3), (4, 0.0), (60, 0.9))
     held = [row for row in settled(spans[:4], palms, times(palms), 0.4) if row[1] == "sliding"]
     assert [contact.hands for contact, _ in held] == [BOTH]  # one hand alone came before and after the hold itself
     assert 19 <= held[0][0].start <= 24
@@ -52,6 +52,6 @@ def test_hands_that_join_and_leave_are_one_hold():
 
 
 def test_a_hold_shorter_than_the_limit_keeps_its_middle():
-    palms = way((100, 0.5))
+    palms = palm_path((100, 0.5))
     ((found, _),) = settled([(ContactInterval(40, 50, LEFT), "sliding")], palms, times(palms), 0.4)
     assert found.start <= 45 <= found.stop

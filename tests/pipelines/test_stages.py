@@ -30,7 +30,7 @@ class Settings:
 
 
 def three(settings: Settings, made: list[str], die: bool = False) -> list[Stage]:
-    """start → doubled (rounded) → end; `made` is told what was made."""
+    """start → doubled (rounded) → end; `made` collects what was made."""
 
     def start(done):
         made.append("start")
@@ -63,9 +63,9 @@ def run(cache, settings=Settings(), until=None):
 def test_what_is_current_is_reused(tmp_path):
     first, made, _ = run(tmp_path)
     assert made == ["start", "doubled", "end"]
-    again, made, told = run(tmp_path)
+    again, made, lines = run(tmp_path)
     assert made == []
-    assert told == ["start: reused", "doubled: reused", "end: reused"]
+    assert lines == ["start: reused", "doubled: reused", "end: reused"]
     assert torch.equal(again["start"].camera_s, first["start"].camera_s)
     assert (again["start"].drift_s_per_hour, again["end"]) == (0.1, first["end"])
     assert not list(tmp_path.glob(".*"))
@@ -111,9 +111,9 @@ def test_a_damaged_result_is_made_again_with_a_note(ending, damage, tmp_path):
         path.write_text(path.read_text().replace('"doubled.value"', '"value"').replace("$tensor", "$tenso"))
     else:
         damage(path)
-    _, made, told = run(tmp_path)
+    _, made, lines = run(tmp_path)
     assert made == ["doubled"]
-    noted = [line for line in told if "it is made again" in line]
+    noted = [line for line in lines if "it is made again" in line]
     assert len(noted) == (0 if (damage, ending) == (os.remove, "json") else 1)
     assert run(tmp_path)[1] == []
 

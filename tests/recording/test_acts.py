@@ -1,4 +1,4 @@
-"""Which object is active when: as interactions tell it, with a margin, and never two at a time."""
+"""Which object is active when: as interactions give it, with a margin, and never two at a time."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -95,9 +95,9 @@ def test_interactions_with_what_is_not_known_tell_nothing():
 
 
 def test_interactions_need_not_be_in_order():
-    told = carrying(2.0, carried=(("box_1", "left", 1.2, 1.6), ("box_2", "right", 0.4, 0.8)))
-    assert [act.object for act in true_acts(told, 0.1)] == ["box_2", "box_1"]
-    assert isinstance(told.interactions, Interactions)
+    carried_two = carrying(2.0, carried=(("box_1", "left", 1.2, 1.6), ("box_2", "right", 0.4, 0.8)))
+    assert [act.object for act in true_acts(carried_two, 0.1)] == ["box_2", "box_1"]
+    assert isinstance(carried_two.interactions, Interactions)
 
 
 def test_a_single_object_without_interactions_is_active_throughout():

@@ -62,8 +62,8 @@ def test_a_flipped_bit_is_one_error(verb, dataset, memory, tmp_path, capsys):
         ],
     }[verb]
     assert exit_code(arguments) == (1 if verb == "doctor" else 2)
-    said = capsys.readouterr()
-    assert "checksum differs from the manifest's" in " ".join((said.out + said.err).split())
+    printed = capsys.readouterr()
+    assert "checksum differs from the manifest's" in " ".join((printed.out + printed.err).split())
 
 
 def test_a_hash_of_the_manifest_that_is_wrong_is_noticed(dataset, memory):

@@ -167,7 +167,7 @@ def test_equal_recordings_have_equal_bytes(tmp_path):
     assert sha256_of(tmp_path / "a") == sha256_of(tmp_path / "b")
 
 
-def test_the_manifest_says_what_the_file_is(store):
+def test_the_manifest_describes_the_file(store):
     entry = store.entries["all"]
     assert (entry.frames, entry.fps, entry.subject, entry.split) == (FRAMES, 60.0, "s1", "train")
     assert entry.duration_s == pytest.approx(FRAMES / 60, abs=0.02)

@@ -143,7 +143,7 @@ def test_dabs_of_one_stroke_are_one_step(scan):
     assert len(editing.selected) == 0
 
 
-def test_what_cannot_be_cut_is_said(scan):
+def test_what_cannot_be_cut_is_reported(scan):
     editing = ObjectEditing(scan)
     with pytest.raises(WearcapError, match="box or the brush"):
         editing.cut("door_1", "door")

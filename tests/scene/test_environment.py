@@ -23,7 +23,7 @@ def box(size) -> Mesh:
     return box_mesh((-x / 2, -y / 2, 0.0), (x / 2, y / 2, z))
 
 
-def thing(name, mesh, x=0.0, y=0.0, turn=0.0, freedom=Freedom("plane")) -> SceneObject:
+def scene_object(name, mesh, x=0.0, y=0.0, turn=0.0, freedom=Freedom("plane")) -> SceneObject:
     R = rotation.about_axis("z", torch.tensor(float(turn)))
     return SceneObject(name, "box", mesh, R, torch.tensor([x, y, 0.0]), freedom)
 
@@ -98,7 +98,7 @@ def test_fast_and_plain_search_agree(contact_class):
 def test_distance_over_time_agrees_with_nearest_frame_by_frame():
     rng = np.random.default_rng(1)
     mesh = random_mesh(rng, 60)
-    environment = Environment((thing("a", mesh), thing("b", cloud(rng, 40), x=1.0)))
+    environment = Environment((scene_object("a", mesh), scene_object("b", cloud(rng, 40), x=1.0)))
     frames = 30
     T = Rigid(rotation.exp(torch.tensor(rng.normal(0, 1, (frames, 3)))), torch.tensor(rng.normal(0, 0.5, (frames, 3))))
     points = torch.tensor(rng.normal(0, 0.5, (frames, 3)))
@@ -116,7 +116,7 @@ def test_distance_over_time_agrees_with_nearest_frame_by_frame():
 
 
 def test_distances_of_a_box():
-    environment = Environment((thing("chest", box((2.0, 1.0, 0.5)), x=3.0, turn=math.pi / 2),))
+    environment = Environment((scene_object("chest", box((2.0, 1.0, 0.5)), x=3.0, turn=math.pi / 2),))
     points = torch.tensor([[3.0, 0.0, 0.9], [3.9, 0.0, 0.25], [3.0, 1.3, 0.1], [3.0, 0.0, 0.45]])
     found = environment.nearest(points)
     torch.testing.assert_close(found.distance, torch.tensor([0.4, 0.4, 0.3, 0.05]))
@@ -125,7 +125,9 @@ def test_distances_of_a_box():
 
 
 def test_a_moved_object_is_found_where_it_is_and_others_where_they_began():
-    environment = Environment((thing("near", box((1.0, 1.0, 1.0))), thing("far", box((1.0, 1.0, 1.0)), x=5.0)))
+    environment = Environment(
+        (scene_object("near", box((1.0, 1.0, 1.0))), scene_object("far", box((1.0, 1.0, 1.0)), x=5.0))
+    )
     hand = torch.tensor([[0.0, 0.7, 0.5]])
     assert environment.nearest(hand).object_index.tolist() == [0]
     swapped = {"near": Rigid(torch.eye(3), torch.tensor([5.0, 0, 0])), "far": Rigid(torch.eye(3), torch.zeros(3))}
@@ -135,7 +137,7 @@ def test_a_moved_object_is_found_where_it_is_and_others_where_they_began():
 
 
 def test_points_that_are_not_numbers_touch_nothing():
-    environment = Environment((thing("chest", box((1.0, 1.0, 1.0))),))
+    environment = Environment((scene_object("chest", box((1.0, 1.0, 1.0))),))
     points = torch.tensor([[0.0, 0.7, 0.5], [math.nan, 0.0, 0.0], [0.0, 0.8, 0.5]])
     found = environment.nearest(points)
     assert found.object_index.tolist() == [0, -1, 0]
@@ -148,7 +150,7 @@ def test_points_that_are_not_numbers_touch_nothing():
 def test_nothing_to_find():
     hand = torch.zeros(2, 3)
     assert Environment(()).nearest(hand).object_index.tolist() == [-1, -1]
-    only_sliding = Environment((thing("chest", box((1.0, 1.0, 1.0))),))
+    only_sliding = Environment((scene_object("chest", box((1.0, 1.0, 1.0))),))
     found = only_sliding.nearest(hand, contact_class="hinged")
     assert found.object_index.tolist() == [-1, -1]
     assert found.distance.isinf().all()
@@ -156,7 +158,7 @@ def test_nothing_to_find():
 
 
 def test_names_are_checked():
-    chest = thing("chest", box((1.0, 1.0, 1.0)))
+    chest = scene_object("chest", box((1.0, 1.0, 1.0)))
     with pytest.raises(WearcapError, match="several objects are named 'chest'"):
         Environment((chest, chest))
     environment = Environment((chest,))

@@ -68,7 +68,7 @@ def test_stairs_are_followed():
 
 
 def test_ceiling_of_the_storey_below_is_no_floor():
-    """A layer twice as strong, 15 cm beneath the upper floor, seen from below."""
+    """A layer twice as strong, 15 cm below the upper floor, seen from below."""
     points, head, floor = stairs()
     rng = np.random.default_rng(1)
     ceiling = surface(rng, (16 * 0.28, -1), (16 * 0.28 + 4, 1), 16 * 0.17 - 0.15, 5000)
@@ -114,7 +114,7 @@ def test_refusals():
 
 @pytest.mark.real
 def test_real_room(real_data):
-    """Aria's sample: the trajectory begins at z = 0 with the wearer standing; the floor is one level beneath."""
+    """Aria's sample: the trajectory begins at z = 0 with the wearer standing; the floor is one level below."""
     from wearcap.io.devices.aria_mps import read_mps
 
     recording = read_mps(real_data / "aria_mps")

@@ -127,7 +127,7 @@ def test_sitting_down_is_no_way_down():
     assert follower.ahead(head).abs().max() < 0.01
 
 
-def test_points_beneath_a_sole_that_is_off_draw_the_floor_to_themselves():
+def test_points_below_a_sole_that_is_off_draw_the_floor_to_themselves():
     follower = FloorFollow(0.0, SOLE, 30.0)
     follower.see(torch.cat([points_at(0.0), points_at(0.0) - torch.tensor([0.0, 0.2, 0.0])]))
     for _ in range(60):

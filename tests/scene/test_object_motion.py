@@ -16,7 +16,7 @@ BOTH, LEFT, RIGHT = torch.tensor([True, True]), torch.tensor([True, False]), tor
 TRIANGLE = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32), np.ones(3, np.float32))
 
 
-def thing(freedom: Freedom, t=(1.0, 2.0, 0.0)) -> SceneObject:
+def scene_object(freedom: Freedom, t=(1.0, 2.0, 0.0)) -> SceneObject:
     return SceneObject("a", "sofa", TRIANGLE, torch.eye(3), torch.tensor(t), freedom)
 
 
@@ -27,7 +27,7 @@ def held_points(T: Rigid, points: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize("anchor", ["right", "middle"])
 def test_two_hands_turn_and_shift_an_object_in_the_plane(anchor):
-    sofa = thing(Freedom("plane"))
+    sofa = scene_object(Freedom("plane"))
     angle = torch.linspace(0, 4.0, 200).double()  # on through π
     t = torch.stack([1 + angle.sin(), 2 + angle, 0 * angle], -1)
     true = Rigid(rotation.about_axis("z", angle), t)
@@ -38,23 +38,23 @@ def test_two_hands_turn_and_shift_an_object_in_the_plane(anchor):
 
 
 def test_one_hand_only_shifts_and_the_plane_keeps_its_height():
-    sofa = thing(Freedom("plane"))
+    sofa = scene_object(Freedom("plane"))
     palms = torch.zeros(50, 2, 3).double()
     palms[:, 0] = torch.linspace(0, 1, 50)[:, None].double() * torch.tensor([1.0, -2.0, 0.3]).double()
     found, _ = follow_hands(sofa, ObjectState(sofa.T_world_object), palms, LEFT)
     torch.testing.assert_close(found.t[-1], torch.tensor([2.0, 0.0, 0.0]).double())
     assert (torch.eye(3).double() == found.R).all()
-    box = thing(Freedom("free"))
+    box = scene_object(Freedom("free"))
     lifted, _ = follow_hands(box, ObjectState(box.T_world_object), palms, LEFT)
     assert lifted.t[-1, 2].item() == pytest.approx(0.3)
 
 
 def test_a_door_turns_about_its_hinge_continuously_and_within_its_limits():
-    door = thing(Freedom("hinge", pivot=(1.0, 2.0, 0.0), limits=(0.0, 1.6)))
+    door = scene_object(Freedom("hinge", pivot=(1.0, 2.0, 0.0), limits=(0.0, 1.6)))
     start = 0.4
     angle = start + torch.linspace(0, 2.0, 300).double()
     palms = torch.zeros(300, 2, 3).double()
-    direction = angle + 2.5  # the arm's direction passes ±π on the way
+    direction = angle + 2.5  # the arm's direction passes ±π meanwhile
     palms[:, 1] = torch.stack([1 + 0.7 * direction.cos(), 2 + 0.7 * direction.sin(), 1 + 0 * angle], -1)
     found, value = follow_hands(
         door, ObjectState(door.freedom.moved(door.T_world_object, torch.tensor(start)), start), palms, RIGHT
@@ -66,17 +66,20 @@ def test_a_door_turns_about_its_hinge_continuously_and_within_its_limits():
 
 def test_a_drawer_follows_its_axis_alone():
     axis = (math.cos(0.3), math.sin(0.3), 0.0)
-    drawer = thing(Freedom("axis", axis=axis, limits=(0.0, 0.4)))
+    drawer = scene_object(Freedom("axis", axis=axis, limits=(0.0, 0.4)))
     palms = torch.zeros(60, 2, 3).double()
-    way = torch.linspace(0, 0.6, 60).double()
-    palms[:, 1] = way[:, None] * torch.tensor(axis).double() + torch.tensor([0.0, 0.0, 0.05]) * way[:, None].sin()
+    displacement = torch.linspace(0, 0.6, 60).double()
+    palms[:, 1] = (
+        displacement[:, None] * torch.tensor(axis).double()
+        + torch.tensor([0.0, 0.0, 0.05]) * displacement[:, None].sin()
+    )
     found, value = follow_hands(drawer, ObjectState(drawer.T_world_object), palms, RIGHT)
-    torch.testing.assert_close(value, way.clamp(max=0.4))
+    torch.testing.assert_close(value, displacement.clamp(max=0.4))
     torch.testing.assert_close(found.t[-1], torch.tensor([1.0, 2.0, 0.0]).double() + 0.4 * torch.tensor(axis).double())
 
 
 def test_hands_that_meet_keep_the_last_angle():
-    sofa = thing(Freedom("plane"))
+    sofa = scene_object(Freedom("plane"))
     apart = torch.cat([torch.linspace(0.5, 0.0, 40), torch.zeros(5), torch.linspace(0.0, 0.5, 40)]).double()
     palms = torch.zeros(85, 2, 3).double()
     palms[:, 0, 0], palms[:, 1, 0] = apart / 2, -apart / 2
@@ -86,7 +89,7 @@ def test_hands_that_meet_keep_the_last_angle():
 
 
 def test_hands_that_begin_together_turn_nothing_until_they_part():
-    sofa = thing(Freedom("plane"))
+    sofa = scene_object(Freedom("plane"))
     apart = torch.linspace(0.0, 0.5, 60).double()
     palms = torch.zeros(60, 2, 3).double()
     palms[:, 0, 1], palms[:, 1, 1] = apart / 2, -apart / 2  # along y: not the direction of any default

@@ -18,19 +18,19 @@ MOUNT = Rigid(LEVEL @ rotation.exp(torch.tensor([-0.3, 0.0, 0.0])), torch.tensor
 
 
 def strolling_motion(seconds: float, seed: int = 0, fps: float = 60.0, pauses: bool = True) -> Motion:
-    """Walks along a winding way at 1.2 m/s, stands still for 5 of every 20 s, and looks about all the time."""
+    """Walks along a winding path at 1.2 m/s, stands still for 5 of every 20 s, and looks about all the time."""
     skeleton, frames = xsens23(), int(seconds * fps)
     rng = np.random.default_rng(seed)
     time = torch.arange(frames, dtype=torch.float64) / fps
     speed = 1.2 * ((time % 20 < 15) | (not pauses)).double()
     heading = 1.5 * smooth_noise(rng, frames, 1, 15.0, fps)[:, 0].double()
-    way = torch.stack([speed * heading.cos(), speed * heading.sin(), 0 * time], -1).cumsum(0) / fps
+    walked = torch.stack([speed * heading.cos(), speed * heading.sin(), 0 * time], -1).cumsum(0) / fps
     R = torch.eye(3).repeat(frames, len(skeleton), 1, 1)
     R[:, 0] = rotation.about_axis("z", heading.float())
     look = 0.35 * smooth_noise(rng, frames, 3, 3.0, fps) * torch.tensor([0.3, 0.6, 1.0])
     R[:, skeleton.index("head")] = rotation.exp(look)
     bob = 0.02 * (2 * torch.pi * 1.8 * time).sin()
-    root = way + torch.stack([0 * bob, 0 * bob, skeleton.root_height + bob], -1)
+    root = walked + torch.stack([0 * bob, 0 * bob, skeleton.root_height + bob], -1)
     return Motion(time, skeleton, R, root.float())
 
 

@@ -37,8 +37,8 @@ def test_a_planted_offset_is_recovered(seed, worn):
         require(clock.checks(joint))
 
 
-def test_frames_at_30_hz_bound_the_offset_as_tightly_as_said():
-    """Ten swings at 30 Hz: below 5 ms in nine of ten sessions, about as far off as is said, and better than by their mean."""
+def test_frames_at_30_hz_bound_the_offset_as_tightly_as_reported():
+    """Ten swings at 30 Hz: below 5 ms in nine of ten sessions, about as far off as reported, and better than by their mean."""
     rng = np.random.default_rng(0)
     errors, reported, plain = [], [], []
     for _ in range(100):
@@ -88,7 +88,7 @@ def test_extra_and_missing_swings_do_no_harm():
     assert found.clock.claps == 10
 
 
-def test_what_is_no_swing_is_said():
+def test_what_is_no_swing_is_reported():
     flat = ImuStream(times(np.arange(0, 10, 0.01)), "left_wrist", torch.eye(3).repeat(1000, 1, 1))
     with pytest.raises(WearcapError, match="left_wrist: no arm swing from 0.0 s to 10.0 s.*ten times"):
         swing_peaks(flat)

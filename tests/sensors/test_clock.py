@@ -84,7 +84,7 @@ def test_two_claps_close_together_say_little_of_drift():
     assert abs(clock.drift_s_per_hour) < 0.03
 
 
-def test_what_cannot_be_told_is_refused():
+def test_what_cannot_be_decided_is_refused():
     with pytest.raises(WearcapError, match="no clap found by the camera"):
         fit_clock(times([]), times([1.0]))
     with pytest.raises(WearcapError, match="no clap found by the suit"):

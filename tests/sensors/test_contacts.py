@@ -48,10 +48,10 @@ def test_contacts_from_sensors_on_the_feet(walked):
 def sliding(speed):
     """A T-pose that slides along with these speeds (m/s), one per frame, at 100 Hz."""
     skeleton = xsens23()
-    way = torch.tensor(speed).cumsum(0) / 100
-    R = torch.eye(3).repeat(len(way), len(skeleton), 1, 1)
-    root = torch.stack([way, 0 * way, 0 * way + skeleton.root_height], -1)
-    return Motion(torch.arange(len(way), dtype=torch.float64) / 100, skeleton, R, root)
+    displacement = torch.tensor(speed).cumsum(0) / 100
+    R = torch.eye(3).repeat(len(displacement), len(skeleton), 1, 1)
+    root = torch.stack([displacement, 0 * displacement, 0 * displacement + skeleton.root_height], -1)
+    return Motion(torch.arange(len(displacement), dtype=torch.float64) / 100, skeleton, R, root)
 
 
 def test_hysteresis_ignores_hesitation_and_short_moments():

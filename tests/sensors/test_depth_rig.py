@@ -50,7 +50,7 @@ def test_pixels_that_flicker_are_not_steady():
     assert not steady[4, 4], "now and then 4 cm further: its mean is neither place"
     assert not steady[8].any()
     assert steady.mean() > 0.85
-    assert Background.of(frames[:1]).steady.mean() > 0.85, "a single frame says nothing about flicker"
+    assert Background.of(frames[:1]).steady.mean() > 0.85, "a single frame shows no flicker"
 
 
 def test_what_stands_before_the_background_is_kept_and_flying_pixels_are_not():

@@ -102,7 +102,7 @@ def test_what_tells_no_scale_is_refused(exact):
         by_head_imu(replace(parked, t_world_body=noise), ImuStream(parked.timestamps, "head", acc_imu=force))
 
 
-def test_no_floor_is_said(exact):
+def test_no_floor_is_reported(exact):
     with pytest.raises(WearcapError, match="0 of 0 points below the path.*Look at the floor"):
         by_floor(exact.slam, exact.points_slam[:0], STANDING, 1.6)
     cloud = 10 * torch.randn(40, 3, generator=torch.Generator().manual_seed(0))

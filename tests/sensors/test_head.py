@@ -31,15 +31,15 @@ def test_jitter_is_as_large_as_asked():
     assert off.diff(dim=0).abs().mean() < 0.0005, "smooth from frame to frame"
 
 
-def test_drift_grows_with_the_way_travelled():
+def test_drift_grows_with_the_path_travelled():
     motion = swaying_motion(7200)
-    way = motion.joint("head").t.diff(dim=0).norm(dim=-1).sum()
+    path_length = motion.joint("head").t.diff(dim=0).norm(dim=-1).sum()
     noise = SlamNoise(jitter_m=0.0, jitter_deg=0.0, drift_share=0.02)
     exact = head_stream(motion, SEAT).t_world_device
     ends = torch.stack(
         [head_stream(motion, SEAT, noise, np.random.default_rng(s)).t_world_device[-1] - exact[-1] for s in range(60)]
     )
-    assert ends.std(0).mean() == pytest.approx(0.02 * way.sqrt().item(), rel=0.2)
+    assert ends.std(0).mean() == pytest.approx(0.02 * path_length.sqrt().item(), rel=0.2)
 
 
 def test_heading_drifts_about_the_start():

@@ -23,12 +23,12 @@ from wearcap.sensors.initialization import (
 )
 from wearcap.sensors.simulated import SuitNoise, suit_motion
 
-DOCUMENT = InitializationSettings("tangent", "line", path_smoothing_s=0.0)
+PAPER = InitializationSettings("tangent", "line", path_smoothing_s=0.0)
 SEEN = InitializationSettings(path_smoothing_s=0.0)
 
 
 def drifting(motion, yaw):
-    """The motion as a suit tells it whose heading runs ahead by `yaw` (rad, per frame)."""
+    """The motion as measured by a suit whose heading runs ahead by `yaw` (rad, per frame)."""
     lead = rotation.about_axis("z", yaw.float())
     R = motion.R_parent_joint.clone()
     R[:, 0] = lead @ R[:, 0]
@@ -41,11 +41,11 @@ def yaw_error_deg(found, truth):
     return yaw_between(found.R_parent_joint[:, 0], truth.R_parent_joint[:, 0])[0].rad2deg()
 
 
-@pytest.mark.parametrize("settings", [DOCUMENT, SEEN, InitializationSettings()])
+@pytest.mark.parametrize("settings", [PAPER, SEEN, InitializationSettings()])
 def test_a_perfect_suit_and_camera_are_left_alone(settings):
     motion = strolling_motion(60.0)
     start = initialize(motion, localized(motion, PERFECT), MOUNT.R, MOUNT.t, settings)
-    assert start.yaw_correction.abs().max().rad2deg() < (2.0 if settings is DOCUMENT else 0.05)
+    assert start.yaw_correction.abs().max().rad2deg() < (2.0 if settings is PAPER else 0.05)
     assert (start.motion.t_world_root - motion.t_world_root).norm(dim=-1).max() < 0.015
     assert start.valid.float().mean() > 0.99
 
@@ -54,13 +54,13 @@ def test_the_tangent_takes_the_whole_angle_and_who_stands_keeps_the_last():
     """By eq. 4.13 as printed 60° would become sin 60° = 49.6°."""
     motion = strolling_motion(40.0)
     suit = turned(motion, math.radians(60))
-    start = initialize(suit, localized(motion, PERFECT), MOUNT.R, MOUNT.t, DOCUMENT)
+    start = initialize(suit, localized(motion, PERFECT), MOUNT.R, MOUNT.t, PAPER)
     assert (start.yaw_correction.rad2deg() + 60).abs().max() < 2.0
     standing = (motion.timestamps > 15.5) & (motion.timestamps < 19.5)
     assert start.yaw_correction[standing].diff().abs().max() == 0.0
     late = (motion.timestamps > 15.5) & (motion.timestamps < 38)
     cut = suit.sliced(int(late.nonzero()[0]), int(late.nonzero()[-1]))
-    first = initialize(cut, localized(motion, PERFECT), MOUNT.R, MOUNT.t, DOCUMENT).yaw_correction
+    first = initialize(cut, localized(motion, PERFECT), MOUNT.R, MOUNT.t, PAPER).yaw_correction
     moving = first.diff().nonzero()[0, 0]
     assert moving > 200, "four seconds of standing"
     assert (first[: moving + 1] == first[0]).all()
@@ -72,7 +72,7 @@ def test_a_drifting_heading_is_followed_also_while_standing():
     suit = drifting(motion, drift)
     found = localized(motion, LocalizationNoise())
     errors = {}
-    for name, settings in (("orientation", InitializationSettings()), ("tangent", DOCUMENT)):
+    for name, settings in (("orientation", InitializationSettings()), ("tangent", PAPER)):
         start = initialize(suit, found, MOUNT.R, MOUNT.t, settings)
         errors[name] = yaw_error_deg(start.motion, motion)
     assert errors["orientation"].abs().max() < 3.0
@@ -100,7 +100,7 @@ def test_a_mount_that_is_not_the_nominal_shows_on_the_way():
 
 
 def test_an_outage_is_bridged_by_the_suit():
-    """Ten seconds without a camera on a winding way: the straight line is metres off, the suit centimetres."""
+    """Ten seconds without a camera on a winding path: the straight line is metres off, the suit centimetres."""
     motion = strolling_motion(60.0, pauses=False)
     standing = torch.zeros(len(motion), len(FOOT_PATCHES), dtype=torch.bool)
     suit = suit_motion(motion, standing, SuitNoise(), np.random.default_rng(0))

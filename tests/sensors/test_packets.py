@@ -16,12 +16,12 @@ from wearcap.sensors.packets import AGREEING, Clock, HeadInput
 
 
 @pytest.mark.parametrize("name", VECTORS)
-def test_bad_vectors_are_told(name):
+def test_bad_vectors_are_reported(name):
     assert packets.values_fault(VECTORS[name], (3,), 1000.0)
 
 
 @pytest.mark.parametrize("name", ROTATIONS)
-def test_bad_rotations_are_told(name):
+def test_bad_rotations_are_reported(name):
     assert packets.rotation_fault(ROTATIONS[name])
 
 

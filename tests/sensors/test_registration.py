@@ -29,8 +29,8 @@ def room(points: int, seed: int) -> np.ndarray:
 
 def turned(degrees: float, shift: float, seed: int) -> Rigid:
     random = torch.Generator().manual_seed(seed)
-    axis, way = torch.randn(2, 3, generator=random, dtype=torch.float64)
-    return Rigid(rotation.exp(axis / axis.norm() * np.deg2rad(degrees)), way / way.norm() * shift)
+    axis, direction = torch.randn(2, 3, generator=random, dtype=torch.float64)
+    return Rigid(rotation.exp(axis / axis.norm() * np.deg2rad(degrees)), direction / direction.norm() * shift)
 
 
 POSE = Rigid(rotation.about_axis("z", torch.tensor(0.7, dtype=torch.float64)), torch.tensor([1.0, 1.5, 1.2]).double())
@@ -60,7 +60,7 @@ def test_a_planted_pose_comes_back(scene: np.ndarray, cloud: np.ndarray, degrees
     assert "slide" not in result.summary
 
 
-def test_a_bare_floor_may_slide_and_says_so(scene: np.ndarray):
+def test_a_bare_floor_may_slide_and_it_is_reported(scene: np.ndarray):
     floor = scene[(np.abs(scene[:, 2]) < 0.01) & (scene[:, :2] > 0.5).all(1) & (scene[:, :2] < [1.4, 2.5]).all(1)]
     result = register(floor[::3], scene, Rigid.identity(dtype=torch.float64))
     assert result.least_seen < 0.01

@@ -1,4 +1,4 @@
-"""Semi-dense points: on surfaces, seen from where they are said to have been seen, nothing through walls."""
+"""Semi-dense points: on surfaces, seen from where they are reported to have been seen, nothing through walls."""
 
 from dataclasses import replace
 

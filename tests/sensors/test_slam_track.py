@@ -85,7 +85,7 @@ def test_rotations_are_filled_too():
     assert rotation.geodesic(filled.R_world_body, running().R_world_body).max() < 1e-3
 
 
-def test_a_lasting_jump_is_told_and_not_cut_away():
+def test_a_lasting_jump_is_reported_and_not_cut_away():
     track = running()
     _, valid, jumps = clean_track(moved(track, slice(250, None), [0.0, 2.0, 0.0]))
     assert valid.all()

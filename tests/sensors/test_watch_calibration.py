@@ -54,7 +54,7 @@ def exact(joint: str, *, on_board=None, posed=None, shaken: tuple[float, float] 
 
 
 def both(**wrong) -> dict[str, ImuStream]:
-    """Two exact logs, the right one's steps done as `wrong` says."""
+    """Two exact logs, the right one's steps done as in `wrong`."""
     return {"left_wrist": exact("left_wrist"), "right_wrist": exact("right_wrist", **wrong)}
 
 

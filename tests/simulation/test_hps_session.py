@@ -121,7 +121,7 @@ def long_path():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_localisation_errs_as_the_model_says(long_path, seed):
+def test_localisation_errs_as_modelled(long_path, seed):
     noise = LocalizationNoise()
     found = localize_statistically(long_path, noise, np.random.default_rng(seed))
     seen = found.confidence > 0
@@ -186,7 +186,7 @@ def test_blank_walls_show_less(simulated, site):
     assert grade.min() < 0.5 * grade.max()
 
 
-def test_a_seed_says_everything_and_localisation_can_be_left_out(site):
+def test_a_seed_determines_everything_and_localisation_can_be_left_out(site):
     config = HpsConfig(protocol=replace(SHORT, returns_m=(), end_m=12.0), localization=None)
     one, two = (flatten(simulate_hps(config, "x", "val", 9, world=site).recording)[1] for _ in range(2))
     assert all(torch.equal(one[key], two[key]) for key in one)

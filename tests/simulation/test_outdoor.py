@@ -108,7 +108,7 @@ def test_kerbs_are_stepped_over_only_where_they_can(place):
     assert known.all()
 
 
-def test_feet_in_contact_stand_still_on_what_is_beneath(walks, up_and_down):
+def test_feet_in_contact_stand_still_on_what_is_below(walks, up_and_down):
     for world, simulated in [*walks, up_and_down]:
         patches = patches_of(simulated.motion)
         speed = (patches[1:, :, :2] - patches[:-1, :, :2]).norm(dim=-1) * FPS

@@ -50,7 +50,7 @@ def test_a_scene_is_whole(scenery, folder):
     assert not list(folder.rglob(".*.tmp-*"))
 
 
-def test_a_photo_shows_the_scan_where_it_says(scenery, folder):
+def test_a_photo_shows_the_scan_where_it_is_registered(scenery, folder):
     """Points of the scan that are not hidden have the colour of the pixel that they fall on."""
     photos, scan = read_photos(folder), read_scan(folder / "pointcloud.ply", needs_colors=True)
     photo = photos[4]

@@ -1,4 +1,4 @@
-"""Simulated recordings are complete, their splits never meet, and a seed says everything."""
+"""Simulated recordings are complete, their splits never meet, and a seed determines everything."""
 
 from dataclasses import replace
 
@@ -46,7 +46,7 @@ def test_sensors_agree_with_the_truth(recording):
     assert suit.norm(dim=-1).max() < 1.0
 
 
-def test_a_seed_says_everything(recording):
+def test_a_seed_determines_everything(recording):
     again, other = (simulate_recording(SHORT, "one", "train", seed) for seed in (7, 8))
     first, second, third = (flatten(r)[1] for r in (recording, again, other))
     assert first.keys() == second.keys()

@@ -1,4 +1,4 @@
-"""Simulated depth cameras: they stand where they can, see the person whole, and are as noisy as told."""
+"""Simulated depth cameras: they stand where they can, see the person whole, and are as noisy as set."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def test_without_noise_the_floor_lies_at_its_depth_in_whole_millimetres():
     assert abs(int(rig.empty_mm[0, 0, 144, 160]) - 2000) <= 1
 
 
-def test_the_noise_grows_with_depth_as_told():
+def test_the_noise_grows_with_depth_as_set():
     noise = DepthNoise(bias_m=0.0)
     rig = simulate_rig([FLOOR], [], ABOVE, np.random.default_rng(0), camera=CAMERA, noise=noise, stills=40)
     middle = rig.empty_mm[0, :, 134:154, 150:170].astype(float)

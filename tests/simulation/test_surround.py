@@ -64,9 +64,9 @@ def test_who_sits_has_a_seat(name, seed):
     if name == "perch":  # feet hang
         assert motion.joint("left_ankle").t[-1, 2] > 0.2
     pelvis = motion.t_world_root[-1].double().numpy()
-    beneath = [item for item in world.objects if points_in_convex(pelvis[None, :2], item.footprint)[0]]
-    assert len(beneath) == 1
-    faces = world.mesh.vertices[world.mesh.faces[world.face_object == world.objects.index(beneath[0])]]
+    below = [item for item in world.objects if points_in_convex(pelvis[None, :2], item.footprint)[0]]
+    assert len(below) == 1
+    faces = world.mesh.vertices[world.mesh.faces[world.face_object == world.objects.index(below[0])]]
     near = np.abs(faces.mean(1)[:, :2] - pelvis[:2]).max(1) < 0.25
     tops = faces[near][:, :, 2].max(1)
     assert np.abs(tops - (pelvis[2] - PELVIS_OVER_SEAT_M)).min() < 0.02

@@ -45,7 +45,7 @@ def test_sensors_go_with_the_shifted_motion(pair):
         assert feet.min() > -0.05
 
 
-def test_a_seed_says_everything_and_no_camera_films(pair):
+def test_a_seed_determines_everything_and_no_camera_films(pair):
     again = simulate_two_wearers(CONFIG, "talk", "val", 3, distance_m=2.0)
     for one, other in zip(pair, again):
         assert torch.equal(one.motion.t_world_root, other.motion.t_world_root)

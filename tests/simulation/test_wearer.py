@@ -23,7 +23,7 @@ def patches_of(motion):
 
 
 def below_floor(world, motion):
-    """How far each patch is under the floor beneath it (m)."""
+    """How far each patch is under the floor below it (m)."""
     patches = patches_of(motion).double().numpy()
     floor = world.floor_height(patches[..., :2], patches[..., 2])
     return torch.from_numpy(np.nan_to_num(floor - patches[..., 2], nan=-1.0))

@@ -21,8 +21,8 @@ def test_the_floor_of_a_flight_rises_step_by_step(stairs_flat):
     middles = np.array(flight.start) + ((step - 0.5) * flight.tread)[:, None] * along
     expected = flight.base_z + step * flight.rise
     np.testing.assert_allclose(stairs_flat.floor_height(middles, expected), expected, atol=1e-6)
-    beneath = stairs_flat.floor_height(middles[8:], np.zeros(len(middles) - 8))
-    np.testing.assert_allclose(beneath, 0.0, atol=1e-6)
+    below = stairs_flat.floor_height(middles[8:], np.zeros(len(middles) - 8))
+    np.testing.assert_allclose(below, 0.0, atol=1e-6)
 
 
 def test_no_floor_outside(flat):
@@ -102,7 +102,7 @@ def test_every_solid_faces_outwards(flat):
         assert np.linalg.det(np.stack([a, b, c], 1) - middle).sum() > 0
 
 
-def test_a_seed_says_everything():
+def test_a_seed_determines_everything():
     a, b, c = (build_flat(np.random.default_rng(seed), "flat") for seed in (2, 2, 3))
     np.testing.assert_array_equal(a.mesh.vertices, b.mesh.vertices)
     assert a.mesh.vertices.shape != c.mesh.vertices.shape

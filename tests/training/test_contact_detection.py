@@ -11,17 +11,18 @@ import torch
 
 from contact_motion import CLASSES, bending_dataset
 from wearcap.cli import export, train
-from wearcap.cli.conf import compose, conf_dir
+from wearcap.cli.conf import compose
 from wearcap.cli.load import load_pipeline
 from wearcap.errors import WearcapError
 from wearcap.metrics.detection import average_precision
 from wearcap.models.checkpoint import load_trained, read_checkpoint
 from wearcap.recording import RecordingStore
 from wearcap.systems.ireplica.contact_prediction import ContactPredictor
+from wearcap_testing import experiments
 
 pytestmark = pytest.mark.usefixtures("few_statistics")
 
-EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("contact_*.yaml"))
+EXPERIMENTS = experiments("contact_")
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +88,7 @@ def learned(people, tmp_path_factory) -> Path:
     return run / "checkpoints" / "last.ckpt"
 
 
-def test_what_was_learned_is_told_of_a_recording(learned, people):
+def test_what_was_learned_is_predicted_for_a_recording(learned, people):
     recording = RecordingStore.open(people).load("b6")
     assert recording.suit is not None
     assert recording.interactions is not None
@@ -141,7 +142,7 @@ assert not {"lightning", "hydra", "omegaconf"} & set(sys.modules)
 
 @pytest.fixture(scope="module")
 def tables(learned, data, tmp_path_factory) -> dict[str, Path]:
-    """What the exported file of each format tells of a recording, in a process without Lightning and Hydra."""
+    """What the exported file of each format predicts for a recording, in a process without Lightning and Hydra."""
     folder, source = tmp_path_factory.mktemp("exported"), RecordingStore.open(data).path_of("b3")
     models = {format: folder / format / f"contact.{format}" for format in FORMATS}
     for format, model in models.items():
@@ -161,8 +162,8 @@ def test_the_export_runs_on_a_recording_without_lightning(learned, data, tables,
     prob = ContactPredictor.load(learned)(suit)
     for name in CLASSES:
         for hand, side in enumerate(("left", "right")):
-            told = torch.tensor([float(row[f"{side}_{name}"]) for row in rows])
-            torch.testing.assert_close(told, prob[name][:, hand], atol=1e-5, rtol=0)
+            written = torch.tensor([float(row[f"{side}_{name}"]) for row in rows])
+            torch.testing.assert_close(written, prob[name][:, hand], atol=1e-5, rtol=0)
 
 
 def test_a_contact_checkpoint_is_no_motion_denoiser(learned):

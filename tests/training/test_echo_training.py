@@ -11,7 +11,6 @@ import torch
 from carried_box import WINDOW, carried_dataset, carrying, small_features, small_net
 from wearcap.body.skeleton import xsens23
 from wearcap.cli import capture, evaluate, train
-from wearcap.cli.conf import conf_dir
 from wearcap.data.statistics import collate
 from wearcap.data.windows import Source, Windows
 from wearcap.diffusion.levels import LevelMix
@@ -24,13 +23,11 @@ from wearcap.systems.echo.features import OBJECT_SIZE
 from wearcap.systems.echo.model import EchoDenoiser
 from wearcap.systems.echo.training import EchoDiffusion
 from wearcap.systems.echo.training_windows import EchoContent, EchoWindow
-from wearcap_testing import small_dataset
+from wearcap_testing import benchmark, experiments, small_dataset
 
 pytestmark = pytest.mark.usefixtures("few_statistics")
 
-EXPERIMENTS = sorted(
-    path.stem for kind in ("echo", "bodiffusion") for path in (conf_dir() / "experiment").glob(f"{kind}*.yaml")
-)
+RUNS = {name: (f"experiment={name}",) for name in experiments("echo")} | benchmark("tables_echo").TRAININGS
 WEIGHTS = {
     "human": 1.0,
     "object": 1.0,
@@ -214,12 +211,11 @@ def test_one_batch_is_learned(data, people):
 
 
 def arguments(experiment: str, data: str, people: str, run: Path, *more: str) -> list[str]:
-    human = [] if experiment == "echo_without_people" else [f"data.sources.cmu.root={people}"]
     return [
         f"experiment={experiment}",
         f"data.sources.objects.root={data}",
         f"data.val_sources.objects.root={data}",
-        *human,
+        f"data.sources.cmu.root={people}",
         "debug=fast",
         f"hydra.run.dir={run}",
         f"paths.outputs={run.parent}",
@@ -248,9 +244,10 @@ def losses_of(run: Path) -> dict[int, str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_every_experiment_runs(experiment, data, people, tmp_path):
-    train.main(arguments(experiment, data, people, tmp_path / "run", "trainer.max_steps=2"))
+@pytest.mark.parametrize("changes", RUNS.values(), ids=RUNS)
+def test_every_experiment_and_ablation_runs(changes, data, people, tmp_path):
+    given = arguments("echo", data, people, tmp_path / "run")[1:]
+    train.main([*given, *changes, "trainer.max_steps=2"])
     system, _ = load_trained(tmp_path / "run" / "checkpoints" / "last.ckpt")
     assert isinstance(system, EchoDiffusion)
     assert not torch.equal(system.net.motion_normalizer.scale, torch.ones(sum(system.net.sizes)))
@@ -276,7 +273,7 @@ def test_stopped_and_resumed_equals_straight_through(data, people, tmp_path):
 
 
 def test_with_the_encoder_it_trains_is_evaluated_and_captures(data, people, tmp_path):
-    """The whole way with the objects' shapes, as the configs have it."""
+    """The whole pipeline with the objects' shapes, as the configs have it."""
     run = tmp_path / "run"
     given = [
         row for row in arguments("echo", data, people, run) if "encoder=null" not in row and "shape_size" not in row

@@ -8,18 +8,17 @@ import pytest
 import torch
 
 from wearcap.cli import capture, evaluate, train
-from wearcap.cli.conf import conf_dir
 from wearcap.data.surroundings import PlaceCodes
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.models.checkpoint import load_trained
 from wearcap.recording import CameraStream, PointCloud, Recording, RecordingStore
-from wearcap_testing import recording_of, swaying_motion
+from wearcap_testing import experiments, recording_of, swaying_motion
 
 pytestmark = pytest.mark.usefixtures("few_statistics")
 
-EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("hmd2*.yaml"))
+EXPERIMENTS = experiments("hmd2")
 SIZE = 64
 
 
@@ -145,7 +144,7 @@ def test_one_checkpoint_is_scored_with_any_of_its_senses(checkpoint, data, tmp_p
     assert table["methods"]["wearcap"]["mpjpe_cm"]["mean"] > 1
 
 
-def test_a_capture_says_what_it_listened_to(checkpoint, data, tmp_path):
+def test_a_capture_reports_its_conditions(checkpoint, data, tmp_path):
     capture.main(
         [
             f"checkpoint={checkpoint}",

@@ -60,7 +60,7 @@ class Offset(lightning.LightningModule):
 
 @dataclass(frozen=True)
 class Shifted:
-    """The recording's own localisation, as far off as the module says."""
+    """The recording's own localisation, as far off as the module reports."""
 
     module: Offset
 

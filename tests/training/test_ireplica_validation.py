@@ -51,7 +51,7 @@ class TrueMotion(StagedSystem):
 
 
 def equipped(root: Path, recording: Recording) -> Recording:
-    """With a camera, a scene, and one thing that was never moved."""
+    """With a camera, a scene, and one object that was never moved."""
     motion = recording.motion
     assert motion is not None
     head, times = motion.joint("head"), motion.timestamps
@@ -61,15 +61,15 @@ def equipped(root: Path, recording: Recording) -> Recording:
         np.zeros((0, 3), np.int32),
         np.ones(3, np.float32),
     )
-    thing = SceneObject("thing", "table", mesh, torch.eye(3), place, Freedom("plane"))
-    write_environment(Environment((thing,)), root / "scene")
+    unmoved = SceneObject("unmoved", "table", mesh, torch.eye(3), place, Freedom("plane"))
+    write_environment(Environment((unmoved,)), root / "scene")
     (root / "scene/pointcloud.ply").touch()
     return replace(
         recording,
         camera=CameraStream(times, Camera.pinhole(64, 48, 60.0), torch.eye(3), torch.zeros(3)),
         localization=Localization(times, head.R, head.t, torch.ones(len(times))),
         scene="scene/pointcloud.ply",
-        object_motion={"thing": Trajectory(times[[0, -1]], torch.eye(3).repeat(2, 1, 1), place.repeat(2, 1))},
+        object_motion={"unmoved": Trajectory(times[[0, -1]], torch.eye(3).repeat(2, 1, 1), place.repeat(2, 1))},
         environment="scene/environment.json",
     )
 

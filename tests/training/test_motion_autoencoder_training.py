@@ -1,4 +1,4 @@
-"""The motion autoencoder end to end: it trains, its checkpoint is told from others, evaluation shows what it measures."""
+"""The motion autoencoder end to end: it trains, its checkpoint is told apart from others, evaluation shows what it measures."""
 
 import csv
 import json
@@ -112,5 +112,5 @@ def test_evaluation_shows_it_beside_the_other_scores(checkpoint, data, tmp_path,
         assert scores["mpjpe_cm"]["mean"] > 0
         assert scores["fid"]["mean"] is scores["diversity"]["mean"] is scores["truth_diversity"]["mean"] is None
     assert methods["wearcap"]["fid"]["seeds"] == 2
-    told = " ".join(capsys.readouterr().out.split())
-    assert "mean pose: 8 windows are too few for FID and Diversity (at least 2000)" in told
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "mean pose: 8 windows are too few for FID and Diversity (at least 2000)" in printed

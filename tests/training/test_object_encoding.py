@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from wearcap.cli import export, train
-from wearcap.cli.conf import conf_dir
 from wearcap.models.checkpoint import load_trained
 from wearcap.models.point_encoder import load_object_encoder
 from wearcap.systems.echo.object_training import ObjectEncoding, instance_loss
 from wearcap.training.run import resume_path
+from wearcap_testing import experiments
 
-EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("object_encoder*.yaml"))
+EXPERIMENTS = experiments("object_encoder")
 
 
 @pytest.fixture(scope="module")

@@ -76,7 +76,7 @@ def batch(data: Path, split: str = "train", mirror: bool = False):
 
 
 class Oracle(nn.Module):
-    """Says the poses that it was told."""
+    """Returns the poses that it was given."""
 
     window = 20
 
@@ -101,7 +101,7 @@ def test_the_truth_costs_nothing_and_another_pose_does(data, mirror):
 
 
 def test_padding_is_no_lesson(data):
-    """The recording of 90 frames ends within a window of 120: what is said behind its end costs nothing."""
+    """The recording of 90 frames ends within a window of 120: predictions behind its end cost nothing."""
     windows = Windows([Source(str(data))], "train", content=HeadContent(), window=120, stride=30, fps=60.0)
     short = next(i for i, row in enumerate(windows.starts.tolist()) if row[2] == 90)
     one = collate([windows[(short, 0)]])
@@ -155,7 +155,7 @@ def test_trained_evaluated_and_refused(data, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("experiment", "inputs"), [("pose_regressor_head_full", 18), ("pose_regressor_hands_full", 54)]
+    ("experiment", "inputs"), [("full/pose_regressor_head", 18), ("full/pose_regressor_hands", 54)]
 )
 def test_the_full_size_is_avatarposers(experiment, inputs):
     """4.12 M parameters (Jiang et al. 2022), with their 22 joints for our 23."""
@@ -166,7 +166,7 @@ def test_the_full_size_is_avatarposers(experiment, inputs):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("experiment", ["pose_regressor_head", "egoego_style"])
+@pytest.mark.parametrize("experiment", ["pose_regressor_head", "baseline/egoego_style"])
 def test_the_other_experiments_take_a_step(experiment, data, tmp_path):
     run = tmp_path / "run"
     more = (
@@ -178,8 +178,8 @@ def test_the_other_experiments_take_a_step(experiment, data, tmp_path):
     train.main(command)
     pipeline = (
         ["pipeline=pose_regressor"]
-        if experiment != "egoego_style"
-        else ["pipeline=egoego_style", "pipeline.steps=2", "pipeline.stride=50"]
+        if experiment != "baseline/egoego_style"
+        else ["pipeline=baseline/egoego_style", "pipeline.steps=2", "pipeline.stride=50"]
     )
     evaluate.main(
         [

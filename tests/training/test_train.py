@@ -15,9 +15,9 @@ from wearcap.cli import capture, evaluate, export, train
 from wearcap.cli.conf import compose, conf_dir
 from wearcap.errors import WearcapError
 from wearcap.models.checkpoint import load_trained, read_checkpoint
-from wearcap_testing import small_dataset
+from wearcap_testing import experiments, small_dataset
 
-EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("motion_diffusion*.yaml"))
+EXPERIMENTS = experiments("motion_diffusion")
 KINDS = (
     "motion_",
     "contact_",
@@ -78,8 +78,7 @@ def test_every_experiment_is_tried_by_a_test():
     the autoencoder of FID in test_motion_autoencoder_training, of points in test_voxel_reconstruction, ours of pictures
     in test_egoview, all that sees them in test_hmd2_training; MocapEvery and its manifold in test_watch_regression; of
     objects in test_object_encoding; ECHO in test_echo_training."""
-    named = {path.stem for path in (conf_dir() / "experiment").glob("*.yaml")}
-    assert all(name.startswith(KINDS) for name in named)
+    assert experiments(*KINDS) == experiments("")
 
 
 def test_a_run_leaves_its_record(checkpoint):
@@ -246,7 +245,12 @@ def test_a_checkpoint_of_another_model_is_named(checkpoint, tmp_path):
         load_trained(tmp_path / "other.ckpt")
 
 
-@pytest.mark.parametrize("group", ["data", "features", "model", "optimizer", "trainer", "callbacks", "logger", "debug"])
+@pytest.mark.parametrize(
+    "group",
+    ["data", "features", "model", "optimizer", "trainer", "callbacks", "logger", "debug", "experiment", "pipeline"],
+)
 def test_every_choice_of_every_group_composes(group):
-    for path in sorted((conf_dir() / group).glob("*.yaml")):
-        assert compose("train", [f"{group}={path.stem}", "paths.run=x"])
+    root = conf_dir() / group
+    for path in sorted(root.rglob("*.yaml")):
+        name = path.relative_to(root).with_suffix("").as_posix()
+        assert compose("train", [f"{group}={name}", "paths.run=x"])

@@ -8,14 +8,13 @@ import pytest
 import torch
 
 from wearcap.cli import train
-from wearcap.cli.conf import conf_dir
 from wearcap.data.surroundings import PlaceCodes
 from wearcap.recording import PointCloud, RecordingStore
-from wearcap_testing import recording_of, swaying_motion
+from wearcap_testing import experiments, recording_of, swaying_motion
 
 pytestmark = pytest.mark.usefixtures("few_statistics")
 
-EXPERIMENTS = sorted(path.stem for path in (conf_dir() / "experiment").glob("voxel_autoencoder*.yaml"))
+EXPERIMENTS = experiments("voxel_autoencoder")
 
 
 @pytest.fixture(scope="module")

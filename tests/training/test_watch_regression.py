@@ -24,18 +24,11 @@ from wearcap.systems.mocap_every.model import Estimate, LastPoseEstimator, TwoSt
 from wearcap.systems.mocap_every.training import WatchRegression
 from wearcap.systems.mocap_every.training_windows import WatchContent
 from wearcap.systems.mocap_every.visual_cues import load_visual_cues
-from wearcap_testing import small_dataset
+from wearcap_testing import benchmark, small_dataset
 
 pytestmark = pytest.mark.usefixtures("few_statistics")
 
-EXPERIMENTS = (
-    "mocap_every",
-    "mocap_every_paper",
-    "mocap_every_one_stage",
-    "mocap_every_neither",
-    "mocap_every_hands",
-    "mocap_every_avatarposer",
-)
+TRAININGS = benchmark("tables_mocap_every").TRAININGS
 SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
 WEIGHTS = {
     "root": 1.0,
@@ -89,7 +82,7 @@ def system(net=None, **features) -> WatchRegression:
 
 
 class Oracle(nn.Module):
-    """Says what it was told."""
+    """Returns what it was given."""
 
     window = 40
 
@@ -136,7 +129,7 @@ def test_both_stages_and_contacts_are_learned(data):
 
 
 def test_contacts_come_before_the_body():
-    """The paper's order: what is said of contacts changes what is said of the body."""
+    """The paper's order: the predicted contacts change the predicted body."""
     torch.manual_seed(0)
     net = TwoStageEstimator(31, 141, 40, 32, 1, 2, 32, 16, 0.0).eval()
     features = torch.randn(2, 40, 31)
@@ -148,7 +141,7 @@ def test_contacts_come_before_the_body():
     torch.testing.assert_close(before.ends, after.ends)
 
 
-def test_one_stage_says_no_ends():
+def test_one_stage_predicts_no_ends():
     net = TwoStageEstimator(31, 141, 40, 32, 1, 2, 32, 16, 0.0, multi_stage=False)
     assert net(torch.randn(1, 40, 31)).ends is None
 
@@ -160,7 +153,7 @@ def test_the_last_pose_alone():
 
 
 def test_the_papers_size():
-    config = compose("train", ["experiment=mocap_every_full", "paths.run=none"])
+    config = compose("train", ["experiment=full/mocap_every", "paths.run=none"])
     net = instantiate(config.model, _convert_="all").net
     assert net.embed.out_features == 640
     assert net.embed_ends.out_features == 640
@@ -169,10 +162,10 @@ def test_the_papers_size():
     assert net.body[0].out_features == 256
 
 
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
-def test_every_experiment_runs(experiment, data, tmp_path):
+@pytest.mark.parametrize("changes", TRAININGS.values(), ids=TRAININGS)
+def test_every_experiment_and_ablation_runs(changes, data, tmp_path):
     run = tmp_path / "run"
-    train.main(arguments(experiment, data, run, *SMALL))
+    train.main([*arguments("mocap_every", data, run, *SMALL)[1:], *changes])
     trained, config = load_trained(run / "checkpoints" / "last.ckpt")
     assert isinstance(trained, WatchRegression)
     assert config["model"]["features"]["_target_"].endswith("WatchFeatures")

@@ -1,4 +1,4 @@
-"""A small data set to annotate, an annotator that serves it, and what one says to it."""
+"""A small data set to annotate, an annotator that serves it, and requests to it."""
 
 import http.client
 import json
@@ -24,13 +24,13 @@ TIMES = torch.arange(FRAMES, dtype=torch.float64) / FPS
 CLOCK = LabelClock.of("r0", TIMES)
 
 
-def held(start: list[float], stop: list[float], hands: list[list[bool]], thing: str = "") -> Interactions:
-    kind = "sliding" if thing else ""
+def held(start: list[float], stop: list[float], hands: list[list[bool]], object_name: str = "") -> Interactions:
+    kind = "sliding" if object_name else ""
     return Interactions(
         torch.tensor(start).double(),
         torch.tensor(stop).double(),
         torch.tensor(hands, dtype=torch.bool).reshape(-1, 2),
-        (thing,) * len(start),
+        (object_name,) * len(start),
         (kind,) * len(start),
     )
 
@@ -48,7 +48,7 @@ def a_film(path: Path, seconds: float = 10.0, fps: int = 30) -> Path:
 
 
 def write_flat(root: Path) -> Path:
-    """Recordings r0 (with a camera's video) and r1 (without), and what is known of r0's objects."""
+    """Recordings r0 (with a camera's video) and r1 (without), and r0's objects."""
     store = RecordingStore(root)
     a_film(root / "r0.mp4")
     stamps = torch.arange(300, dtype=torch.float64) / 30

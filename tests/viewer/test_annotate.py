@@ -118,8 +118,8 @@ def test_saves_that_must_not_be(dataset, tmp_path):
             ([], 400, "not a save"),
             (good | {"labels": 3}, 422, "no contact labels"),
         ):
-            told, _, data = ask(server, "POST", "/recordings/0/labels", body)
-            assert told == status
+            answered, _, data = ask(server, "POST", "/recordings/0/labels", body)
+            assert answered == status
             assert message in json.loads(data)["error"]
         assert ask(server, "POST", "/recordings/9/labels", good)[0] == 404
         assert ask(server, "POST", "/recordings/0/labels", good, Origin="http://elsewhere.net")[0] == 403

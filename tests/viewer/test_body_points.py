@@ -75,9 +75,9 @@ def a_recording() -> Recording:
 
 def touching(motion: Motion, prob: float = 0.9, count: int = 20) -> Motion:
     """The first `count` points in contact with a probability, the others just below the threshold."""
-    told = torch.full((len(motion), BODY_POINTS), 0.49)
-    told[:, :count] = prob
-    return replace(motion, body_contact_prob=told)
+    padded = torch.full((len(motion), BODY_POINTS), 0.49)
+    padded[:, :count] = prob
+    return replace(motion, body_contact_prob=padded)
 
 
 @pytest.fixture

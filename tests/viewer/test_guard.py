@@ -325,7 +325,7 @@ def test_a_viser_that_cannot_be_guarded_is_not_served(monkeypatch, capsys):
     assert "18760" not in capsys.readouterr().out, "no address without its token is printed"
 
 
-def test_a_host_that_is_not_this_machines_is_said():
+def test_a_host_that_is_not_this_machines_is_reported():
     for host in ("192.0.2.1", "nowhere.invalid"):
         with pytest.raises(WearcapError, match=f"cannot serve a page on '{host}'"):
             Page(Recording("cloud", points=PointCloud(torch.rand(50, 3))), host=host, port=18765)
@@ -349,7 +349,7 @@ def idle(port: int, count: int) -> Iterator[list[socket.socket]]:
 
 
 def closed(client: socket.socket) -> bool:
-    """Whether the server has closed a connection that said nothing."""
+    """Whether the server has closed a connection that sent nothing."""
     client.setblocking(False)
     try:
         return client.recv(1) == b""
@@ -418,7 +418,7 @@ def test_idle_connections_are_closed(tmp_path, monkeypatch):
         page.stop()
 
 
-def test_too_many_connections_at_work_are_told_so(tmp_path, monkeypatch):
+def test_too_many_connections_at_work_are_answered_so(tmp_path, monkeypatch):
     monkeypatch.setattr(annotate_server, "MAX_CONNECTIONS", 2)
     page = an_annotator(tmp_path)
     going, done = threading.Barrier(3), threading.Event()

@@ -1,4 +1,4 @@
-"""The page of `wearcap scene edit`: its verbs, its file, and a real browser in which a door is cut out and hung."""
+"""The page of `wearcap scene edit`: its verbs, its file, and a real browser in which a door is cut out and gets a hinge."""
 
 import json
 import re
@@ -170,7 +170,7 @@ def test_slides_limits_and_undo(page):
     page.view.show_freedom(page._item(), handled=True)
 
 
-def test_what_cannot_be_saved_is_said_and_kept(page):
+def test_what_cannot_be_saved_is_reported_and_kept(page):
     cut_door(page)
     page.file.mkdir()
     page.run(1.2)
@@ -228,7 +228,7 @@ def on_screen(page: ObjectEditor, point, size: tuple[int, int]) -> tuple[float, 
 
 
 def looks_from(page: ObjectEditor, place) -> bool:
-    """Whether the browser has told that its camera is there."""
+    """Whether the browser has sent its camera."""
     camera = next(iter(page.server.get_clients().values())).camera
     return camera.update_timestamp > 0 and bool(np.allclose(camera.position, place, atol=0.01))
 
@@ -250,7 +250,7 @@ def box_measures(browser: Chromium, page: ObjectEditor, length: float, width: fl
 
 @pytest.mark.browser
 @pytest.mark.slow
-def test_a_door_is_cut_out_and_hung_in_chromium(page, tmp_path):
+def test_a_door_is_cut_out_and_gets_a_hinge_in_chromium(page, tmp_path):
     size = (1000, 700)
     threading.Thread(target=page.run, daemon=True).start()
     with chromium(tmp_path / "profile", page.url, size) as browser:
@@ -303,8 +303,8 @@ def drag_hinge(browser: Chromium, page: ObjectEditor, size: tuple[int, int]) -> 
     browser.screenshot()  # waits until the handle is drawn
     grip = np.add(before, [0.28, 0.0, 0.0])
     goal = np.add(grip, [0.9 * to_the_other_end, 0.0, 0.0])
-    way = [on_screen(page, grip + share * (goal - grip), size) for share in np.linspace(0, 1, 8)]
-    browser.drag(way, pause_s=0.3)
+    path = [on_screen(page, grip + share * (goal - grip), size) for share in np.linspace(0, 1, 8)]
+    browser.drag(path, pause_s=0.3)
     browser.poll(lambda: page._item().freedom.pivot != before)
     assert page._item().freedom.pivot[0] == pytest.approx(before[0] + 0.9 * to_the_other_end, abs=0.06)
     places = hinge_places(points_world(page._item()), 0.0)

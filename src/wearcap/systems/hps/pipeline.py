@@ -116,7 +116,7 @@ class HPS(StagedSystem):
                 f"no scan of the scene, which the energy's term {' and '.join(terms)} needs",
                 where=where,
                 expected="a recording that names its scan, or scene=FOLDER",
-                fix="Without one: pipeline=hps_without_scene.",
+                fix="Without one: pipeline=paper/hps_without_scene.",
             )
 
     def motion_of(self, results: dict[str, Any]) -> Motion | None:
