@@ -9,8 +9,7 @@ from wearcap.body.skeleton import FEET, Skeleton
 from wearcap.data.statistics import drawn_batches, standardize
 from wearcap.data.windows import Windows
 from wearcap.metrics.position import mpjpe_cm
-from wearcap.systems.mocap_every.manifold import MotionManifold
-from wearcap.systems.mocap_every.manifold_features import Posed, decode_window, encode_window, origin_of
+from wearcap.systems.mocap_every.manifold import MotionManifold, Posed
 from wearcap.systems.mocap_every.training_windows import WatchWindow
 from wearcap.training.base import OptimizerOf, SchedulerOf, Training
 
@@ -38,16 +37,16 @@ class ManifoldTraining(Training):
     def set_statistics(self, dataset: Windows, limit: int = 1000) -> None:
         (batch,) = drawn_batches(dataset, limit)
         window = _posed(batch)
-        standardize(self.net.normalizer, encode_window(window, origin_of(window)))
+        standardize(self.net.normalizer, window.encode(window.origin()))
 
     def terms(self, batch: WatchWindow) -> dict[str, Tensor]:
         """Unweighted loss terms of a batch, and the mean joint error (cm)."""
         window = _posed(batch)
-        origin = origin_of(window)
-        X = encode_window(window, origin)
+        origin = window.origin()
+        X = window.encode(origin)
         reconstructed = self.net(X)
         error = (reconstructed - X).abs()
-        joints, joints_true = (self._joints(decode_window(x, origin), batch) for x in (reconstructed, X))
+        joints, joints_true = (self._joints(Posed.decode(x, origin), batch) for x in (reconstructed, X))
         error_m = joints - joints_true
         return {
             "contact": error[..., :FEET].mean(),
