@@ -33,15 +33,6 @@ class ThreePoints(NamedTuple):
     t_world_point: Float[Tensor, "*batch time point 3"]
 
 
-class Modalities(NamedTuple):
-    """Human, object and contacts in normalised space: clean, noised or predicted."""
-
-    human: Float[Tensor, "batch time human"]
-    object: Float[Tensor, "batch time 9"]
-    contact: Float[Tensor, "batch time contact"]
-    """64 body points, then `FOOT_PATCHES`: 1 for contact, -1 for none."""
-
-
 class Body(NamedTuple):
     """A body's motion: local joint rotations and the root's position in the world (m)."""
 
