@@ -35,6 +35,21 @@ from wearcap.systems.echo.static_objects import with_static_objects
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.head_path import HeadPath, head_path
 
+SETTINGS = [
+    "context",
+    "per_frame",
+    "spacing",
+    "eta",
+    "step",
+    "rewindow",
+    "anchor",
+    "static_threshold",
+    "placed",
+    "guidance",
+    "acts",
+]
+"""Settings that a capture depends on."""
+
 
 @dataclass
 class Echo(LearnedSystem):
@@ -266,20 +281,9 @@ class Echo(LearnedSystem):
 
     def settings(self) -> dict[str, str]:
         """Settings that a capture depends on, for its provenance."""
-        return {
-            "pipeline": "echo",
-            "context": str(self.context),
-            "per_frame": str(self.per_frame),
-            "spacing": str(self.spacing),
-            "eta": str(self.eta),
-            "step": self.step,
-            "rewindow": str(self.rewindow),
-            "anchor": str(self.anchor),
-            "static_threshold": str(self.static_below),
-            "placed": str(self.placed),
-            "guidance": str(self.guided_by),
-            "acts": "search" if callable(self.acts) else str(self.acts),
-        }
+        acts = "search" if callable(self.acts) else self.acts
+        used = {"static_threshold": self.static_below, "guidance": self.guided_by, "acts": acts}
+        return {"pipeline": "echo"} | {name: str(used.get(name, getattr(self, name))) for name in SETTINGS}
 
 
 def motion_of(item: BatchItem, outputs: Outputs, anchor: bool, provenance: dict[str, str]) -> Motion:

@@ -17,7 +17,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.point_encoder import PointNeXt
 from wearcap.recording import Motion
-from wearcap.systems.echo.features import Body, EchoFeatures, ThreePoints
+from wearcap.systems.echo.features import OBJECT_SIZE, Body, EchoFeatures, ThreePoints
 from wearcap.systems.echo.objects import ObjectReader
 from wearcap.systems.echo.observations import BatchItem, Scenario, batch_item_of
 from wearcap.systems.echo.pipeline import motion_of, object_tracks
@@ -91,10 +91,9 @@ class NearestEcho:
         descriptor, frames = {}, {}
         for name in sorted(set(labels)):
             mine = torch.tensor([start for start, label in zip(starts, labels) if label == name])
-            descriptor[name], frames[name] = (
-                rearrange(whole[mine[:, None] + offsets], "window frame channel -> window (frame channel)"),
-                mine,
-            )
+            samples = whole[mine[:, None] + offsets]
+            descriptor[name] = rearrange(samples, "window frame channel -> window (frame channel)")
+            frames[name] = mine
         return cls(features, encoder, window, sample, mean, scale, descriptor, frames, torch.cat(outputs))
 
     def capture_scenarios(self, scenarios: Sequence[Scenario], seeds: Sequence[int]) -> list[Motion]:
@@ -127,9 +126,8 @@ class NearestEcho:
 
 def _decoded(features: EchoFeatures, outputs: Float[Tensor, "time feature"], item: BatchItem) -> Outputs:
     frame = features.canonical(item.conditioning.points)
-    human, scene_object, contact = outputs[None].split(
-        (features.human_size, 9, outputs.shape[1] - features.human_size - 9), -1
-    )
+    sizes = features.human_size, OBJECT_SIZE, outputs.shape[1] - features.human_size - OBJECT_SIZE
+    human, scene_object, contact = outputs[None].split(sizes, -1)
     body, T = features.decode_body(human, frame), features.decode_object(scene_object, frame)
     return Outputs(*body, T.R, T.t, contact)
 
@@ -193,7 +191,6 @@ class RigidWrist:
             wrist = int((wrists - expected[:, None]).norm(dim=-1).mean(0).argmin()) if rows.any() else 0
             t[rows] = wrists[:, wrist] + heading[rows] @ self.offset[name][wrist]
             R[rows] = heading[rows] @ self.turn[name]
-        outputs = Outputs(
-            torch.zeros(1, count, 1, 3, 3), torch.zeros(1, count, 3), R[None], t[None], torch.zeros(1, count, 1)
-        )
+        body = torch.zeros(1, count, 1, 3, 3), torch.zeros(1, count, 3)
+        outputs = Outputs(*body, R[None], t[None], torch.zeros(1, count, 1))
         return replace(motion, object_motion=object_tracks(item, outputs), provenance={"pipeline": "rigid_wrist"})

@@ -114,11 +114,9 @@ class EchoQueue:
         any."""
         noise = self._noise(1)[:, 0]
         full = self.conveyor.push(noise)
-        self.conditioning = (
-            fresh
-            if self.conditioning is None
-            else Conditioning(*(torch.cat([a[:, int(full) :], b], 1) for a, b in zip(self.conditioning, fresh)))
-        )
+        if self.conditioning is not None:
+            fresh = Conditioning(*(torch.cat([a[:, int(full) :], b], 1) for a, b in zip(self.conditioning, fresh)))
+        self.conditioning = fresh
         frame = self.pipeline.features.canonical(self.conditioning.points)
         if self.pipeline.features.moves and full:
             # The conveyor's frames are re-expressed in the window's new canonical frame.
@@ -165,10 +163,8 @@ class EchoQueue:
         if conditioning.is_observed.any():
             features = self.pipeline.features
             body = features.encode_body(Body(conditioning.R_parent_joint, conditioning.t_world_root), frame)
-            scene_object = features.encode_object(
-                Rigid(conditioning.R_world_object, conditioning.t_world_object), frame
-            )
-            raw = torch.cat([body, scene_object, 2 * conditioning.contact - 1], -1)
+            T_world_object = Rigid(conditioning.R_world_object, conditioning.t_world_object)
+            raw = torch.cat([body, features.encode_object(T_world_object, frame), 2 * conditioning.contact - 1], -1)
             observed = self.pipeline.net.motion_normalizer(raw.to(self.pipeline.device)).cpu()
         never = torch.zeros_like(conditioning.has_object)
         absent = [never, ~conditioning.has_object, never if self.pipeline.contacts else ~never]
@@ -202,9 +198,8 @@ class EchoQueue:
     def _decoded(self, x: Float[Tensor, "batch frame feature"], part: slice, frame: Rigid) -> Outputs:
         """Some of a window's frames, converted from normalised space to world coordinates."""
         net, features = self.pipeline.net, self.pipeline.features
-        human, scene_object, contact = (
-            net.motion_normalizer.inverse(x[:, part].to(self.pipeline.device)).cpu().split(net.sizes, -1)
-        )
+        raw = net.motion_normalizer.inverse(x[:, part].to(self.pipeline.device)).cpu()
+        human, scene_object, contact = raw.split(net.sizes, -1)
         at = frame if frame.t.shape[1] == 1 else Rigid(frame.R[:, part], frame.t[:, part])
         body, T = features.decode_body(human, at), features.decode_object(scene_object, at)
         return Outputs(*body, T.R, T.t, ((contact + 1) / 2).clamp(0, 1))
@@ -227,8 +222,7 @@ class Rewindow(EchoQueue):
     ) -> Float[Tensor, "batch frame feature"]:
         """A sampled window in normalised space, whose first frames are inpainted with `before`."""
         frame = self.pipeline.features.canonical(conditioning.points)
-        count = conditioning.valid.shape[1]
-        observed_frames = before.shape[1]
+        count, observed_frames = conditioning.valid.shape[1], before.shape[1]
         observation = self._observation(conditioning, frame)
         denoise, correct = self.pipeline.denoiser(self, conditioning, frame)
         levels = step_levels(self.rolling.steps, self.rolling.spacing)
@@ -259,10 +253,8 @@ class Rewindow(EchoQueue):
         while start < count:
             first = max(0, start - context)
             conditioning = whole.frames(slice(first, min(first + self.rolling.window, count)))
-            before, frame = (
-                before[:, before.shape[1] - (start - first) :],
-                self.pipeline.features.canonical(conditioning.points),
-            )
+            before = before[:, before.shape[1] - (start - first) :]
+            frame = self.pipeline.features.canonical(conditioning.points)
             if self._frame is not None and self.pipeline.features.moves:
                 change, observed = frame.inverse() @ self._frame, conditioning.frames(slice(0, start - first))
                 before = self._reexpressed(before, change, torch.zeros(1, 1, len(MODALITIES)), observed)

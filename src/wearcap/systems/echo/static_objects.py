@@ -111,8 +111,7 @@ class StaticObjects:
             self._fading = (number, self._last.get(number, predicted), predicted, 0)
         _, left, found, ago = self._fading
         self._fading = (number, left, found, ago + 1)
-        static = _static(
-            outputs, predicted, left, found, outputs.contact_prob.new_full((1, 1), max(0.0, 1 - ago / FADE))
-        )
+        weight = outputs.contact_prob.new_full((1, 1), max(0.0, 1 - ago / FADE))
+        static = _static(outputs, predicted, left, found, weight)
         self._last[number] = Rigid(static.R_world_object, static.t_world_object)
         return static

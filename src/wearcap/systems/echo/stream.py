@@ -33,7 +33,7 @@ from wearcap.runtime.snapshot import classes_of
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import check_object
 from wearcap.sensors import packets, samples
-from wearcap.sensors.packets import Admitted, Clock, HeadInput
+from wearcap.sensors.packets import MAX_WAITING, Admitted, Clock, HeadInput
 from wearcap.sensors.samples import ActiveObject, HeadSample, ObjectSample, WristSample
 from wearcap.systems.echo import queue, static_objects
 from wearcap.systems.echo.features import CONTACTS
@@ -47,6 +47,8 @@ from wearcap.tracking import floor, head_path
 from wearcap.tracking.floor import FloorTracker
 from wearcap.tracking.head_path import Chunk, HeadPath, HeadTrack
 
+_STATE = skeleton, motion_types, trajectory, rigid, head_path, packets, samples, floor, conveyor, queue, static_objects
+"""Modules with the classes that a session's state consists of."""
 MAX_SEEN = 1000
 """Most object observations that are buffered; the oldest are dropped."""
 ASIDE_M, BELOW = 0.25, 0.47
@@ -185,7 +187,7 @@ class EchoStream(WearerStream):
             place = bisect_left(poses, time, key=_time)
             if place == len(poses) or poses[place][0] != time:
                 poses.insert(place, (time, T.R, T.t))
-                del poses[: -packets.MAX_WAITING]
+                del poses[:-MAX_WAITING]
 
     def take(self, sample: Any) -> None:
         """Take in one sample of the head device, a wrist or an object, or the choice of the active object."""
@@ -218,7 +220,7 @@ class EchoStream(WearerStream):
                 soon = timestamp + 0.499 / self.pipeline.fps
                 self._see(name, soon, self._environment.by_name(name).T_world_object)
         self._acts = [act for act in self._acts if act[0] < timestamp] + [(timestamp, name)]
-        del self._acts[: -packets.MAX_WAITING]
+        del self._acts[:-MAX_WAITING]
         self._update_pending()
 
     def see_object(self, name: str, timestamp: float, T_world_object: Rigid) -> None:
@@ -283,13 +285,8 @@ class EchoStream(WearerStream):
         motions: list[Motion] = []
         if chunk.begins or self._queue is None:
             motions += self._finish()
-            skeleton = self.wearer.skeleton
-            self._queue = self.pipeline.queue(
-                [skeleton],
-                [stretch_seed(self.seed, chunk.first)],
-                [dict(self.wearer.shape)],
-                [list(self._shapes.values())],
-            )
+            seeds, shapes = [stretch_seed(self.seed, chunk.first)], [dict(self.wearer.shape)]
+            self._queue = self.pipeline.queue([self.wearer.skeleton], seeds, shapes, [list(self._shapes.values())])
         mount = Rigid(self.wearer.R_head_device, self.wearer.t_head_device).inverse()
         T_world_head = chunk.T_world_device @ mount
         # The head poses of the last frames may have been corrected.
@@ -360,12 +357,8 @@ class EchoStream(WearerStream):
         frames = [whole.frames(slice(k, k + 1)) for k in range(max(first, 0))]
         for k, (time, conditioning, head) in enumerate(self._pending):
             has, code, number = (value[None] for value in self._active(time))
-            changed = conditioning._replace(
-                has_object=has,
-                object_code=code,
-                object_number=number,
-                is_observed=torch.zeros_like(conditioning.is_observed),
-            )
+            none = torch.zeros_like(conditioning.is_observed)
+            changed = conditioning._replace(has_object=has, object_code=code, object_number=number, is_observed=none)
             changed = self._with_observed_object(changed, time)
             self._pending[k] = (time, changed, head)
             frames.append(changed)
@@ -409,20 +402,7 @@ class EchoSession(Session):
     """A streaming capture of one or several wearers and the objects of one environment, each by an `EchoStream`."""
 
     stream_class = EchoStream
-    classes = classes_of(
-        skeleton,
-        motion_types,
-        trajectory,
-        rigid,
-        head_path,
-        packets,
-        samples,
-        floor,
-        conveyor,
-        queue,
-        static_objects,
-        sys.modules[__name__],
-    )
+    classes = classes_of(*_STATE, sys.modules[__name__])
 
     def __init__(
         self,
@@ -433,9 +413,8 @@ class EchoSession(Session):
     ):
         """Raises WearcapError without wearers, and for a pipeline without a conveyor."""
         seeds = [0] * len(wearers) if seeds is None else seeds
-        super().__init__(
-            pipeline, [EchoStream(pipeline, who, environment, seed) for who, seed in zip(wearers, seeds, strict=True)]
-        )
+        pairs = zip(wearers, seeds, strict=True)
+        super().__init__(pipeline, [EchoStream(pipeline, wearer, environment, seed) for wearer, seed in pairs])
 
     @classmethod
     def settings(cls, system: Echo) -> dict[str, Any]:

@@ -79,9 +79,8 @@ class EchoDiffusion(Training):
         for batch in drawn_batches(dataset, limit, 100):
             frame = self.features.canonical(batch.points)
             rows["human"].append(self.features.encode_body(batch.body, frame)[batch.valid])
-            rows["object"].append(
-                self.features.encode_object(batch.T_world_object, frame)[batch.valid & batch.has_object]
-            )
+            scene_object = self.features.encode_object(batch.T_world_object, frame)
+            rows["object"].append(scene_object[batch.valid & batch.has_object])
             rows["condition"].append(self.features.condition(batch.points, batch.floor_height, batch.size)[batch.valid])
         human, scene_object, condition = (torch.cat(part) for part in rows.values())
         ranges = [self._range(human), self._range(scene_object), (torch.zeros(CONTACTS), torch.ones(CONTACTS))]

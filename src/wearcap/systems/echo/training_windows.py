@@ -132,17 +132,9 @@ class EchoTrack:
             contact[rows, : CONTACTS - len(FOOT_PATCHES)] = body_contact(skin, shape, T, within_m).float()
         contact[:, CONTACTS - len(FOOT_PATCHES) :] = foot_patches(recording)[take].float()
         floor = recording.floor.height[take] if recording.floor is not None else torch.zeros(len(take))
-        return cls(
-            points,
-            floor.float(),
-            motion.skeleton,
-            body_size(motion.skeleton),
-            Body(motion.R_parent_joint[take], motion.t_world_root[take]),
-            contact,
-            objects,
-            active,
-            Rigid(R, t),
-        )
+        wearer = floor.float(), motion.skeleton, body_size(motion.skeleton)
+        truth = Body(motion.R_parent_joint[take], motion.t_world_root[take])
+        return cls(points, *wearer, truth, contact, objects, active, Rigid(R, t))
 
 
 class EchoContent(Content):
@@ -184,10 +176,7 @@ class EchoContent(Content):
         return Cut(start // every, windows.window, length, windows.stride, latest=latest, stretch=windows.stretch)
 
     def read(self, track: EchoTrack, cut: Cut, random: Draws) -> Window:
-        points = {"R_world_point": track.points.R_world_point, "t_world_point": track.points.t_world_point}
-        true = {
-            "R_parent_joint": track.body.R_parent_joint,
-            "t_world_root": track.body.t_world_root,
+        true = track.body._asdict() | {
             "contact": track.contact,
             "R_world_object": track.T_world_object.R,
             "t_world_object": track.T_world_object.t,
@@ -198,7 +187,7 @@ class EchoContent(Content):
         for name in ("R_world_object", "t_world_object"):
             # Nothing is between the poses of two objects.
             values[name][changes] = true[name][cut.frames[changes]]
-        sensed = points | {"floor_height": track.floor_height}
+        sensed = track.points._asdict() | {"floor_height": track.floor_height}
         values |= {name: cut.take(name, part, sensed=True) for name, part in sensed.items()}
         values |= {"size": track.size, "t_parent_joint": track.skeleton.t_parent_joint}
         return Window(values, track.twins)
@@ -210,10 +199,7 @@ class EchoContent(Content):
         """
         active = track.active[cut.frames]
         nothing = (torch.zeros(self.features.object_condition_size), torch.zeros(3), torch.zeros(3, 3))
-        shapes = [
-            (shape.code_mirrored if window.mirrored else shape.code, shape.mean, shape.spread)
-            for shape in track.objects
-        ]
+        shapes = [(s.code_mirrored if window.mirrored else s.code, s.mean, s.spread) for s in track.objects]
         code, mean, spread = (torch.stack(rows)[active] for rows in zip(*shapes, nothing))
         if window.mirrored:
             flip = torch.tensor(MIRROR)

@@ -12,9 +12,7 @@ from wearcap.runtime.describe import skeleton_from_json, skeleton_to_json
 from wearcap.runtime.graphs import Exports, Run
 from wearcap.systems.mocap_every.features import WatchFeatures
 from wearcap.systems.mocap_every.model import Estimate, WatchEstimator
-from wearcap.systems.mocap_every.pipeline import MocapEvery
-
-SETTINGS = ("stride", "lookahead", "floor", "anchor", "mirror_average")
+from wearcap.systems.mocap_every.pipeline import SETTINGS, MocapEvery
 
 
 def exports(pipeline: MocapEvery) -> Exports:

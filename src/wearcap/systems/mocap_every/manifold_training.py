@@ -36,12 +36,12 @@ class ManifoldTraining(Training):
 
     def set_statistics(self, dataset: Windows, limit: int = 1000) -> None:
         (batch,) = drawn_batches(dataset, limit)
-        window = _posed(batch)
+        window = Posed(batch.R_parent_joint, batch.t_world_root, batch.foot_contact)
         standardize(self.net.normalizer, window.encode(window.origin()))
 
     def terms(self, batch: WatchWindow) -> dict[str, Tensor]:
         """Unweighted loss terms of a batch, and the mean joint error (cm)."""
-        window = _posed(batch)
+        window = Posed(batch.R_parent_joint, batch.t_world_root, batch.foot_contact)
         origin = window.origin()
         X = window.encode(origin)
         reconstructed = self.net(X)
@@ -60,7 +60,3 @@ class ManifoldTraining(Training):
     def _joints(self, window: Posed, batch: WatchWindow) -> Tensor:
         offsets = batch.t_parent_joint[:, None]
         return forward_kinematics(self.skeleton, window.R_parent_joint, window.t_world_root, offsets).t
-
-
-def _posed(batch: WatchWindow) -> Posed:
-    return Posed(batch.R_parent_joint, batch.t_world_root, batch.foot_contact)

@@ -30,6 +30,8 @@ from wearcap.tracking.floor import floor_from_points
 from wearcap.tracking.head_path import HeadPath, head_path
 
 FLOORS = ("follow", "update", "points", "fixed")
+SETTINGS = ("stride", "lookahead", "floor", "anchor", "mirror_average")
+"""Settings that a motion depends on; an exported model carries them along."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,14 +112,9 @@ class MocapEvery(LearnedSystem):
         # 2. end-effectors, contacts and poses, window by window; 3. floor height from the feet in contact
         output = [self._capture_stretch(recording, path, sensed, start, stop) for start, stop in path.stretches]
         whole = _bridged(output, path)
-        motion = Motion(
-            path.timestamps,
-            path.skeleton,
-            whole.R_parent_joint,
-            whole.t_world_root,
-            repeat(whole.contact_prob, "time foot -> time (foot patch)", patch=2),
-            provenance=self.settings(),
-        )
+        poses = path.timestamps, path.skeleton, whole.R_parent_joint, whole.t_world_root
+        contact_prob = repeat(whole.contact_prob, "time foot -> time (foot patch)", patch=2)
+        motion = Motion(*poses, contact_prob, provenance=self.settings())
         # 4. anchor the body to the measured head
         if self.anchor:
             motion = anchored_to_head(motion, path.T_world_head)
@@ -214,14 +211,7 @@ class MocapEvery(LearnedSystem):
 
     def settings(self) -> dict[str, str]:
         """Settings that the motion depends on, for its provenance."""
-        return {
-            "pipeline": "mocap_every",
-            "stride": str(self.stride),
-            "lookahead": str(self.lookahead),
-            "floor": self.floor,
-            "anchor": str(self.anchor),
-            "mirror_average": str(self.mirror_average),
-        }
+        return {"pipeline": "mocap_every"} | {name: str(getattr(self, name)) for name in SETTINGS}
 
 
 def _bridged(output: list[FinalPoses], path: HeadPath) -> FinalPoses:

@@ -28,7 +28,7 @@ from wearcap.runtime.snapshot import classes_of
 from wearcap.scene import floor_update
 from wearcap.sensors import packets
 from wearcap.sensors import samples as sample_types
-from wearcap.sensors.packets import Admitted, Clock, HeadInput
+from wearcap.sensors.packets import MAX_WAITING, Admitted, Clock, HeadInput
 from wearcap.sensors.samples import HeadSample, WatchSample
 from wearcap.sensors.watches import FILTER, MAX_GAP_S, filtered
 from wearcap.systems.mocap_every import features, windows
@@ -39,6 +39,8 @@ from wearcap.tracking import head_path
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.head_path import Chunk, HeadTrack
 
+_STATE = skeleton, motion_types, rigid, head_path, packets, sample_types, floor_update, features, windows
+"""Modules with the classes that a session's state consists of."""
 MAX_POINTS = 1_000_000
 """Capacity of the buffer of points that wait for a head pose; the oldest are dropped."""
 
@@ -174,7 +176,7 @@ class MocapEveryStream(WearerStream):
                 index = bisect_left(kept, time, key=_time)
                 if index == len(kept) or kept[index].timestamp != time:
                     kept.insert(index, accepted)
-                    del kept[: -packets.MAX_WAITING]
+                    del kept[:-MAX_WAITING]
 
     def poses(self, ended: bool = False) -> Motion | None:
         """Frames that became final since the last call; `ended`: no more input will come.
@@ -230,9 +232,8 @@ class MocapEveryStream(WearerStream):
         R, acc = self._watches(chunk, end_s)
         sensed = Sensed(T_world_head.R, T_world_head.t, R, acc, torch.zeros_like(acc))
         self._times = torch.cat([self._times, chunk.timestamps])
-        self._heads = Rigid(
-            *(torch.cat(part) for part in zip((self._heads.R, self._heads.t), (T_world_head.R, T_world_head.t)))
-        )
+        R_heads, t_heads = torch.cat([self._heads.R, T_world_head.R]), torch.cat([self._heads.t, T_world_head.t])
+        self._heads = Rigid(R_heads, t_heads)
         return motions + self._to_motion(self._windows.advance(sensed))
 
     def _watches(
@@ -241,8 +242,7 @@ class MocapEveryStream(WearerStream):
         """Wrist orientations and filtered accelerations of a chunk; the filter ignores times outside the stretch."""
         step = 1 / self.pipeline.fps
         frames = torch.arange(-(FILTER // 2), len(chunk.timestamps) + FILTER // 2, dtype=torch.float64)
-        around = chunk.timestamps[0] + step * frames
-        around = around.clamp(self._begin_s, end_s)
+        around = (chunk.timestamps[0] + step * frames).clamp(self._begin_s, end_s)
         streams = []
         for joint, samples in self._samples.items():
             if not samples or samples[-1].timestamp < chunk.timestamps[-1].item() - MAX_GAP_S:
@@ -274,14 +274,9 @@ class MocapEveryStream(WearerStream):
             return []
         times, heads = self._times[:count], self._heads[:count]
         self._times, self._heads = self._times[count:], self._heads[count:]
-        motion = Motion(
-            times,
-            self.wearing.skeleton,
-            output.R_parent_joint,
-            output.t_world_root,
-            output.contact_prob.repeat_interleave(2, -1),
-            provenance=self.pipeline.settings(),
-        )
+        poses = times, self.wearing.skeleton, output.R_parent_joint, output.t_world_root
+        contact_prob = output.contact_prob.repeat_interleave(2, -1)
+        motion = Motion(*poses, contact_prob, provenance=self.pipeline.settings())
         return [anchored_to_head(motion, heads) if self.pipeline.anchor else motion]
 
 
@@ -289,18 +284,7 @@ class MocapEverySession(Session):
     """A streaming capture of one or several wearers, each by a `MocapEveryStream`."""
 
     stream_class = MocapEveryStream
-    classes = classes_of(
-        skeleton,
-        motion_types,
-        rigid,
-        head_path,
-        packets,
-        sample_types,
-        floor_update,
-        features,
-        windows,
-        sys.modules[__name__],
-    )
+    classes = classes_of(*_STATE, sys.modules[__name__])
 
     def __init__(self, pipeline: MocapEvery, wearers: Sequence[Wearing]):
         """Raises WearcapError without wearers."""

@@ -59,10 +59,7 @@ class WatchRegression(Training):
     def set_statistics(self, dataset: Windows, limit: int = 1500) -> None:
         (batch,) = drawn_batches(dataset, limit)
         features, motion, canonical = self._inputs(batch)
-        # The true end-effectors (m) as the first stage predicts them: in the canonical frame, from the origin.
-        ends = self._joints(motion, batch, canonical)[:, :, self._ends] - canonical.t[:, :, None]
-        ends = (canonical.R.mT[:, :, None] @ ends[..., None])[..., 0]
-        ends = ends - self.features.origin(batch.sensed, canonical)[:, :, None]
+        ends = self.ends_from_world(self._joints(motion, batch, canonical)[:, :, self._ends], batch, canonical)
         standardize(self.net.feature_normalizer, features)
         standardize(self.net.motion_normalizer, motion)
         standardize(self.net.ends_normalizer, rearrange(ends, "batch time end xyz -> batch time (end xyz)"))
@@ -82,6 +79,13 @@ class WatchRegression(Training):
         """Joint positions (m) in the world, from motion features."""
         R, t = self.features.decode_motion(motion, batch.sensed, canonical)
         return forward_kinematics(self.skeleton, R, t, batch.t_parent_joint[:, None]).t
+
+    def ends_from_world(
+        self, ends: Float[Tensor, "batch time end 3"], batch: WatchWindow, canonical: Rigid
+    ) -> Float[Tensor, "batch time end 3"]:
+        """End-effectors (m, world) as the first stage predicts them: in the canonical frame, from its origin."""
+        origin = self.features.origin(batch.sensed, canonical)
+        return (canonical.R.mT[:, :, None] @ (ends - canonical.t[:, :, None])[..., None])[..., 0] - origin[:, :, None]
 
     def terms(self, batch: WatchWindow) -> dict[str, Tensor]:
         """Unweighted loss terms of a batch."""

@@ -228,22 +228,20 @@ def _observations(
 ) -> energy.Seen:
     """Observations of a batch of windows; frames outside the capture have confidence 0."""
     camera = recording.camera
-    cues_2d, cues_3d = ([cue for cue in cues if cue.points.shape[-1] == axes] for axes in (2, 3))
-    pixels = (
+    pixels, places = (
         tuple(
-            energy.PixelCue(skeleton.index(c.joint), c.points[frames], c.confidence[frames] * exists) for c in cues_2d
+            kind(skeleton.index(cue.joint), cue.points[frames], cue.confidence[frames] * exists)
+            for cue in cues
+            if cue.points.shape[-1] == axes
         )
-        if camera
-        else ()
-    )
-    places = tuple(
-        energy.PlaceCue(skeleton.index(c.joint), c.points[frames], c.confidence[frames] * exists) for c in cues_3d
+        for kind, axes in ((energy.PixelCue, 2), (energy.PlaceCue, 3))
     )
     poses = tuple(
         energy.PoseCue(v.motion.R_parent_joint[frames], v.confidence[frames] * exists[..., None]) for v in views
     )
-    mount = None if camera is None else Rigid(camera.R_head_cam, camera.t_head_cam)
-    return energy.Seen(head, None if camera is None else camera.camera, mount, pixels, places, poses)
+    if camera is None:
+        return energy.Seen(head, None, None, (), places, poses)
+    return energy.Seen(head, camera.camera, Rigid(camera.R_head_cam, camera.t_head_cam), pixels, places, poses)
 
 
 def _foot_contact(motion: Motion) -> Float[Tensor, "time foot"]:
