@@ -228,14 +228,11 @@ def _observations(
 ) -> energy.Seen:
     """Observations of a batch of windows; frames outside the capture have confidence 0."""
     camera = recording.camera
-    pixels, places = (
-        tuple(
-            kind(skeleton.index(cue.joint), cue.points[frames], cue.confidence[frames] * exists)
-            for cue in cues
-            if cue.points.shape[-1] == axes
-        )
-        for kind, axes in ((energy.PixelCue, 2), (energy.PlaceCue, 3))
-    )
+    rows: dict[int, list[tuple[int, Tensor, Tensor]]] = {2: [], 3: []}
+    for cue in cues:
+        row = skeleton.index(cue.joint), cue.points[frames], cue.confidence[frames] * exists
+        rows.setdefault(cue.points.shape[-1], []).append(row)
+    pixels, places = tuple(energy.PixelCue(*row) for row in rows[2]), tuple(energy.PlaceCue(*row) for row in rows[3])
     poses = tuple(
         energy.PoseCue(v.motion.R_parent_joint[frames], v.confidence[frames] * exists[..., None]) for v in views
     )
