@@ -20,8 +20,7 @@ from wearcap.models.checkpoint import shared_checkpoints
 from wearcap.recording import Recording, RecordingStore
 from wearcap.runtime.system import CaptureInput
 from wearcap.systems.echo.pipeline import Echo
-from wearcap.systems.echo.queue import Conditioning, EchoQueue
-from wearcap.systems.echo.rewindow import Rewindow
+from wearcap.systems.echo.queue import Conditioning, EchoQueue, Rewindow
 
 STRIDE = 10
 DATASET = Path(__file__).resolve().parents[1] / "datasets" / "simulated_objects"

@@ -18,7 +18,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.systems.echo.features import POINTS
 from wearcap.systems.echo.objects import ObjectReader, ObjectShape, body_contact
-from wearcap.systems.echo.training_windows import EchoContent, echo_track
+from wearcap.systems.echo.training_windows import EchoContent, EchoTrack
 from wearcap_testing import small_dataset
 
 SKELETON = xsens23()
@@ -47,7 +47,7 @@ def mirror_images(root: str) -> Windows:
 
 
 def track_of(recording, environment=None, every: int = 1):
-    return echo_track(recording, environment, ObjectReader(small_features(), None), every, 0.05)
+    return EchoTrack.read(recording, environment, ObjectReader(small_features(), None), every, 0.05)
 
 
 def test_a_window_is_what_the_recording_was(root):

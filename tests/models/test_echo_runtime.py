@@ -11,8 +11,8 @@ import torch
 
 from carried_box import WINDOW, drawn_echo, small_features, small_net
 from wearcap.errors import WearcapError
-from wearcap.systems.echo import step_runner as echo_runtime
-from wearcap.systems.echo.step_runner import EchoPlans, EchoRunner
+from wearcap.systems.echo import model as echo_model
+from wearcap.systems.echo.model import EchoPlans, EchoRunner
 
 
 def levels_of(items: int, frames: int, start: int) -> torch.Tensor:
@@ -45,7 +45,7 @@ def test_plans_are_those_of_the_network(streams, items):
 
 
 def test_plans_do_not_pile_up(monkeypatch):
-    monkeypatch.setattr(echo_runtime, "MOST_ROWS", 50)
+    monkeypatch.setattr(echo_model, "MOST_ROWS", 50)
     net = small_net(small_features())
     plans, random = EchoPlans(net), torch.Generator().manual_seed(0)
     for _ in range(20):
@@ -53,7 +53,7 @@ def test_plans_do_not_pile_up(monkeypatch):
         width = net.plan(level).worth[0].shape[-1]
         torch.testing.assert_close(plans(level)[..., :width], net.plan(level).worth[0])
         assert len(plans._rows) == len(plans._number) <= 50 + WINDOW
-        assert len(plans._windows) <= echo_runtime.MOST_WINDOWS
+        assert len(plans._windows) <= echo_model.MOST_WINDOWS
 
 
 def test_batch_items_of_the_same_levels_share_a_plan():
@@ -88,7 +88,7 @@ def test_onnx_runtime_agrees_with_eager():
 
 def worst_of_compiled(device: str) -> float:
     """In its own process: the tests' shape checks cannot be compiled."""
-    program = f"from test_echo_runtime import worst_of; print(worst_of('compile', {device!r}))"
+    program = f"from test_echo_model import worst_of; print(worst_of('compile', {device!r}))"
     here = Path(__file__).parent
     paths = os.pathsep.join([str(here), str(here.parent)])
     # Compiled in that process itself: others that help would have to import PyTorch first.

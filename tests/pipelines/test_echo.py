@@ -17,8 +17,7 @@ from wearcap.recording import Motion
 from wearcap.systems.echo.features import CONTACTS, Body
 from wearcap.systems.echo.observations import Observed, batch_item_of
 from wearcap.systems.echo.pipeline import Echo
-from wearcap.systems.echo.queue import Conditioning, EchoQueue
-from wearcap.systems.echo.rewindow import Rewindow
+from wearcap.systems.echo.queue import Conditioning, EchoQueue, Rewindow
 from wearcap.tracking.head_path import head_path
 
 TWO = (("box_1", "left", 0.1, 0.35), ("box_2", "right", 0.6, 0.8))
@@ -176,9 +175,8 @@ def test_noised_frames_are_re_expressed_when_the_window_advances():
     for at in (0, 3, 6, first, first + 3, first + 6):
         turned[..., at : at + 3] = (change @ noise[..., at : at + 3, None])[..., 0]
     expected = add_noise(truth_of(echo, queue.conditioning, new), turned, level, echo.schedule)
-    queue._frame = old
-    queue._move(new)
-    torch.testing.assert_close(queue.conveyor.x, expected, atol=1e-4, rtol=0)
+    found = queue._reexpressed(queue.conveyor.x, new.inverse() @ old, queue.conveyor.level, queue.conditioning)
+    torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
     assert (new.t - old.t).norm() > 0.1
 
 

@@ -12,8 +12,7 @@ from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_two_wearers
 from wearcap.systems.mocap_every.energy import LatentSolver, LatentWeights
 from wearcap.systems.mocap_every.manifold import MotionManifold
-from wearcap.systems.mocap_every.sessions import capture_session, read_view, simulated_views, write_view
-from wearcap.systems.mocap_every.visual_cues import VisualCues
+from wearcap.systems.mocap_every.visual_cues import View, VisualCues, capture_session, simulated_views
 from wearcap.tracking.anchor import anchored_to_head
 
 
@@ -76,19 +75,19 @@ def test_without_views_everyone_is_as_captured(pair, cues):
 
 def test_a_view_comes_back_from_its_files(pair, tmp_path):
     (view,) = simulated_views(pair, np.random.default_rng(0))["talk-a"]
-    write_view(view, tmp_path / "talk-a.by.talk-b.npz")
-    read = read_view(tmp_path / "talk-a.by.talk-b.npz")
+    view.write(tmp_path / "talk-a.by.talk-b.npz")
+    read = View.read(tmp_path / "talk-a.by.talk-b.npz")
     assert torch.equal(read.motion.R_parent_joint, view.motion.R_parent_joint)
     assert torch.equal(read.confidence, view.confidence)
     np.savez(tmp_path / "talk-a.by.talk-b.confidence.npz", confidence=np.full((3, 2), 0.5))
     with pytest.raises(WearcapError, match="array 'confidence' has shape"):
-        read_view(tmp_path / "talk-a.by.talk-b.npz")
+        View.read(tmp_path / "talk-a.by.talk-b.npz")
     np.savez(tmp_path / "talk-a.by.talk-b.confidence.npz", confidence=2.0 * np.ones(view.confidence.shape))
     with pytest.raises(WearcapError, match="0 to 1"):
-        read_view(tmp_path / "talk-a.by.talk-b.npz")
+        View.read(tmp_path / "talk-a.by.talk-b.npz")
     (tmp_path / "talk-a.by.talk-b.confidence.npz").unlink()
     with pytest.raises(WearcapError, match="no such file"):
-        read_view(tmp_path / "talk-a.by.talk-b.npz")
+        View.read(tmp_path / "talk-a.by.talk-b.npz")
 
 
 def test_a_session_survives_the_store_and_may_be_absent(pair, tmp_path):

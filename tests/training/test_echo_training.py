@@ -90,7 +90,7 @@ def test_the_truth_costs_nothing(data, people, frame):
     system = oracle(frame)
     windows = batch(system.features, data, people)
     at = system.features.canonical(windows.points)
-    system.net.outputs = system._truth(windows, at)
+    system.net.outputs = system.truth(windows, at)
     for name, term in system.terms(windows).items():
         if name != "skate":
             assert term < 0.005, name
@@ -109,12 +109,12 @@ def test_the_vertex_term_is_the_mean_over_the_points(data, frame):
     windows, source = batch(system.features, data), dataset(system.features, data)
     cloud = source.track(0).objects[0].cloud
     at = system.features.canonical(windows.points)
-    outputs = system._truth(windows, at)
+    outputs = system.truth(windows, at)
     turn = rotation.exp(0.7 * torch.randn(*windows.valid.shape, 3))
     R, t = turn @ windows.R_world_object, windows.t_world_object + 0.2 * torch.randn_like(windows.t_world_object)
     first = system.net.sizes[0]
     outputs[..., first : first + OBJECT_SIZE] = system.features.encode_object(type(at)(R, t), at)
-    value = system._vertices(outputs, windows, at)
+    value = system.object_vertices(outputs, windows, at)
     torch.testing.assert_close(value, explicit_vertices(windows, cloud, R, t).mean(), atol=1e-4, rtol=1e-4)
 
 
@@ -141,11 +141,11 @@ def small_net_like(**_):
 def test_absent_objects_are_noise_alone(data, people):
     system = learner()
     windows = batch(system.features, data, people, count=12)
-    levels = system._levels(windows)
+    levels = system.levels(windows)
     assert (levels[..., 1][~windows.has_object] == 1).all()
     assert (levels[..., 1][windows.has_object] < 1).any()
     without = learner(contacts=False)
-    assert (without._levels(windows)[..., 2] == 1).all()
+    assert (without.levels(windows)[..., 2] == 1).all()
     assert "contact" not in without.terms(windows)
 
 

@@ -99,7 +99,7 @@ def test_the_truth_costs_nothing(data, features):
     windows, oracle = batch(data), system(Oracle, **features)
     _, true, canonical = oracle._inputs(windows)
     joints = oracle._joints(true, windows, canonical)[:, :, xsens23().indices(*ENDS)]
-    ends = oracle._ends_from_world(joints, windows, canonical)
+    ends = oracle.ends_from_world(joints, windows, canonical)
     sure = 40 * (2 * windows.foot_contact - 1)
     oracle.net.output = Estimate(true, sure, ends.flatten(-2))
     for name, term in oracle.terms(windows).items():

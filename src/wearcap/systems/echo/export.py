@@ -96,7 +96,7 @@ class _Embedding(nn.Module):
         return self._run(input=whole).flatten(0, 1)[: len(rows)].reshape(*codes.shape[:-1], -1)
 
 
-class ExportedEchoDenoiser(EchoDenoiser):
+class _ExportedEchoDenoiser(EchoDenoiser):
     """A denoiser whose weights are in exported files, run on the CPU."""
 
     exported = True
@@ -126,7 +126,7 @@ def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], abo
         encoder.load_state_dict(weights["encoder"])
         encoder.requires_grad_(False).eval()
     return Echo(
-        ExportedEchoDenoiser(runs, about),
+        _ExportedEchoDenoiser(runs, about),
         EchoFeatures(**about["features"]),
         schedule_from_json(about["schedule"]),
         skeleton_from_json(about["skeleton"]),

@@ -33,15 +33,6 @@ class ThreePoints(NamedTuple):
     t_world_point: Float[Tensor, "*batch time point 3"]
 
 
-class Modalities(NamedTuple):
-    """Human, object and contacts in normalised space: clean, noised or predicted."""
-
-    human: Float[Tensor, "batch time human"]
-    object: Float[Tensor, "batch time 9"]
-    contact: Float[Tensor, "batch time contact"]
-    """64 body points, then `FOOT_PATCHES`: 1 for contact, -1 for none."""
-
-
 class Body(NamedTuple):
     """A body's motion: local joint rotations and the root's position in the world (m)."""
 
@@ -132,9 +123,8 @@ class EchoFeatures:
         step = t.diff(dim=1) * self.fps
         step = torch.cat([step[:, :1] if step.shape[1] else torch.zeros_like(t), step], 1)
         positions = (R_canonical_world @ (t - frame.t[:, :, None])[..., None])[..., 0]
-        first = Rigid(
-            rotation.about_axis("z", rotation.yaw_of(R[:, :1, 0])), t[:, :1, 0]
-        )  # yaw-aligned frame of the window's first head pose
+        # The yaw-aligned frame of the window's first head pose.
+        first = Rigid(rotation.about_axis("z", rotation.yaw_of(R[:, :1, 0])), t[:, :1, 0])
         parts = [
             rotation.rot6d_from_matrix(R_canonical_world @ R).flatten(-2),
             rotation.rot6d_from_matrix(turn).flatten(-2),

@@ -42,10 +42,9 @@ class Guidance:
         """x̂0 after one gradient step (classifier guidance, Dhariwal and Nichol 2021)."""
         with torch.enable_grad():
             x = x0_hat.detach().clone().requires_grad_(True)
-            touch, stand = scene.costs(x, self.threshold)
             grad_touch, grad_stand = (
-                torch.autograd.grad(cost, x, retain_graph=True)[0] if cost.requires_grad else zero
-                for cost, zero in ((touch, torch.zeros_like(x)), (stand, torch.zeros_like(x)))
+                torch.autograd.grad(cost, x, retain_graph=True)[0] if cost.requires_grad else torch.zeros_like(x)
+                for cost in scene.costs(x, self.threshold)
             )
         human = scene.net.sizes[0]
         step = torch.zeros_like(x0_hat)
@@ -74,10 +73,8 @@ class GuidedScene:
         over each frame's points, summed over frames."""
         mean, scale = self.net.motion_normalizer.mean.to(x0_hat), self.net.motion_normalizer.scale.to(x0_hat)
         human, scene_object, contact = (x0_hat * scale + mean).split(self.net.sizes, -1)
-        body, T_object = (
-            self.features.decode_body(human, self.frame),
-            self.features.decode_object(scene_object, self.frame),
-        )
+        body = self.features.decode_body(human, self.frame)
+        T_object = self.features.decode_object(scene_object, self.frame)
         in_contact = (contact.detach() + 1) / 2 > threshold
         has_object = self.conditioning.valid & self.conditioning.has_object
         touch, stand = x0_hat.new_zeros(()), x0_hat.new_zeros(())

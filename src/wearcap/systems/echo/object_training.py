@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import safetensors
 import torch
+from einops import rearrange, reduce, repeat
 from jaxtyping import Float, Int64
 from safetensors.torch import load_file, save
 from torch import Tensor
@@ -25,7 +26,7 @@ _KEY = "made_of"
 _TEMPERATURE = 0.1
 
 
-class ObjectViews(NamedTuple):
+class _ObjectViews(NamedTuple):
     """Augmented views of one object's point cloud (m), or a batch of objects (a leading "batch" axis)."""
 
     points: Float[Tensor, "*batch view point 3"]
@@ -91,7 +92,12 @@ class ObjectClouds(Dataset):
         """
         count, path = per_class[split], Path(root) / f"{split}.safetensors"
         made_of = json.dumps([list(classes), count, points])
-        if _made_of(path) != made_of:
+        try:
+            with safetensors.safe_open(str(path), framework="pt") as file:
+                cached = (file.metadata() or {}).get(_KEY)
+        except (safetensors.SafetensorError, OSError):
+            cached = None
+        if cached != made_of:
             clouds, labels = generate(split, tuple(classes), count, points)
             with atomic_path(path) as temporary:
                 temporary.write_bytes(save({"clouds": clouds, "labels": labels}, {_KEY: made_of}))
@@ -104,19 +110,11 @@ class ObjectClouds(Dataset):
     def __len__(self) -> int:
         return len(self.labels)
 
-    def __getitem__(self, item: tuple[int, int] | int) -> ObjectViews:
+    def __getitem__(self, item: tuple[int, int] | int) -> _ObjectViews:
         index, seed = item if isinstance(item, tuple) else (item, item)
         random, cloud = torch.Generator().manual_seed(seed), self.clouds[index]
         first = self.augmentation(cloud, random) if self.augmented else cloud
-        return ObjectViews(torch.stack([first, self.augmentation(cloud, random)]), self.labels[index])
-
-
-def _made_of(path: Path) -> str | None:
-    try:
-        with safetensors.safe_open(str(path), framework="pt") as file:
-            return (file.metadata() or {}).get(_KEY)
-    except (safetensors.SafetensorError, OSError):
-        return None
+        return _ObjectViews(torch.stack([first, self.augmentation(cloud, random)]), self.labels[index])
 
 
 class ObjectEncoding(Training):
@@ -132,15 +130,15 @@ class ObjectEncoding(Training):
         super().__init__(optimizer, scheduler, loss_weights)
         self.net = net
 
-    def terms(self, batch: ObjectViews) -> dict[str, Tensor]:
+    def terms(self, batch: _ObjectViews) -> dict[str, Tensor]:
         """Loss terms, and the classification accuracy on each view ("accuracy_1", "accuracy_2")."""
-        clouds, views = batch.points.flatten(0, 1), batch.points.shape[1]
+        clouds, views = rearrange(batch.points, "batch view point xyz -> (batch view) point xyz"), batch.points.shape[1]
         feature = self.net.encoder(clouds)
-        logits, labels = self.net.category(feature), batch.label.repeat_interleave(views)
+        logits, labels = self.net.category(feature), repeat(batch.label, "batch -> (batch view)", view=views)
         _, radius = to_unit_sphere(clouds)
         extents = bounds(clouds)[0] / radius[:, None]
-        accuracy = (logits.argmax(-1) == labels).float().unflatten(0, (-1, views)).mean(0)
-        embedding = self.net.instance(feature).unflatten(0, (-1, views))
+        accuracy = reduce((logits.argmax(-1) == labels).float(), "(batch view) -> view", "mean", view=views)
+        embedding = rearrange(self.net.instance(feature), "(batch view) value -> batch view value", view=views)
         return {
             "category": F.cross_entropy(logits, labels),
             "extents": F.l1_loss(self.net.extents(feature), extents),

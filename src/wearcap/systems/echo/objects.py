@@ -1,7 +1,7 @@
 """Objects as conditions of ECHO (class, extents and an encoder's feature), their poses, and body contact with them."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -78,10 +78,7 @@ class ObjectReader:
         key = (id(item.mesh), item.category)
         if key not in self._shapes:
             self._shapes[key] = self._read(item)
-        shape = self._shapes[key]
-        return ObjectShape(
-            item.name, *(getattr(shape, name) for name in ObjectShape.__dataclass_fields__ if name != "name")
-        )
+        return replace(self._shapes[key], name=item.name)
 
     def _read(self, item: SceneObject) -> ObjectShape:
         one_hot = self.features.class_code(item.category)

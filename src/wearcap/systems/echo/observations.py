@@ -77,7 +77,7 @@ def batch_item_of(scenario: Scenario, path: HeadPath, reader: ObjectReader) -> B
     Raises WearcapError for wrists that are not tracked or are swapped, for acts of unknown objects, for objects whose
     mesh or class cannot be used, and for observations beyond the recording.
     """
-    recording, count = scenario.recording, len(path.timestamps)
+    recording = scenario.recording
     R, t = _tracked_points(recording, path)
     names = list(dict.fromkeys(act.object for act in scenario.acts))
     objects = _objects(scenario, names, reader)
@@ -86,17 +86,11 @@ def batch_item_of(scenario: Scenario, path: HeadPath, reader: ObjectReader) -> B
     floor = path.floor_height
     if recording.floor is not None:
         floor = interpolate_clamped(recording.floor.timestamps, recording.floor.height, path.timestamps)
-    observed_parts = _observed(scenario, path, names, objects, active)
-    conditioning = (
-        R,
-        t,
-        floor.float(),
-        active != NO_OBJECT,
-        codes[active],
-        active.float(),
-        torch.ones(count, dtype=torch.bool),
-    )
-    return BatchItem(path, Conditioning(*(part[None] for part in (*conditioning, *observed_parts))), objects)
+    objects_of_frames = active != NO_OBJECT, codes[active], active.float()
+    valid = torch.ones(len(path.timestamps), dtype=torch.bool)
+    observed = _observed(scenario, path, names, objects, active)
+    parts = R, t, floor.float(), *objects_of_frames, valid, *observed
+    return BatchItem(path, Conditioning(*(part[None] for part in parts)), objects)
 
 
 def _tracked_points(
@@ -148,11 +142,9 @@ def wrist_poses(track: Trajectory, at: Float64[Tensor, "time"]) -> Rigid:
     inside = at.clamp(times[0].item(), times[-1].item())
     last = (torch.searchsorted(times, inside + SAME_S, right=True) - 1).clamp_min(0)
     gone = (times[(last + 1).clamp_max(len(times) - 1)] - times[last] > MAX_GAP_S) | (inside - times[last] <= SAME_S)
-    found = resample(track, inside).T_world_body if len(times) > 1 else track.T_world_body[last]
-    last_tracked = track.T_world_body[last]
-    return Rigid(
-        torch.where(gone[:, None, None], last_tracked.R, found.R), torch.where(gone[:, None], last_tracked.t, found.t)
-    )
+    held = track.T_world_body[last]
+    found = resample(track, inside).T_world_body if len(times) > 1 else held
+    return Rigid(torch.where(gone[:, None, None], held.R, found.R), torch.where(gone[:, None], held.t, found.t))
 
 
 def _require_times(times: Float64[Tensor, "frame"], path: HeadPath, what: str, where: str) -> None:
@@ -198,7 +190,7 @@ def _observed(
     joints = len(path.skeleton)
     R, root = torch.eye(3).repeat(count, joints, 1, 1), torch.zeros(count, 3)
     R_object, t_object = torch.eye(3).repeat(count, 1, 1), torch.zeros(count, 3)
-    contact, is_observed = (torch.zeros(count, CONTACTS), torch.zeros(count, len(MODALITIES), dtype=torch.bool))
+    contact, is_observed = torch.zeros(count, CONTACTS), torch.zeros(count, len(MODALITIES), dtype=torch.bool)
     if seen.motion is not None:
         at = _frames(seen.motion.timestamps, path, where)
         if len(seen.motion.skeleton) != joints:

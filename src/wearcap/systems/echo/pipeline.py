@@ -26,16 +26,29 @@ from wearcap.runtime.system import CaptureInput, LearnedSystem
 from wearcap.scene.environment import Environment
 from wearcap.systems.echo.features import EchoFeatures
 from wearcap.systems.echo.guidance import Guidance, GuidedScene
-from wearcap.systems.echo.model import EchoDenoiser
+from wearcap.systems.echo.model import EchoDenoiser, EchoRunner
 from wearcap.systems.echo.objects import ObjectReader, ObjectShape
 from wearcap.systems.echo.observations import BatchItem, Scenario, batch_item_of
-from wearcap.systems.echo.queue import Conditioning, Correction, EchoQueue, Outputs
-from wearcap.systems.echo.rewindow import Rewindow
+from wearcap.systems.echo.queue import Conditioning, Correct, EchoQueue, Outputs, Rewindow
 from wearcap.systems.echo.scores import Truth, score_echo, truth_of
 from wearcap.systems.echo.static_objects import with_static_objects
-from wearcap.systems.echo.step_runner import EchoRunner
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.head_path import HeadPath, head_path
+
+SETTINGS = [
+    "context",
+    "per_frame",
+    "spacing",
+    "eta",
+    "step",
+    "rewindow",
+    "anchor",
+    "static_threshold",
+    "placed",
+    "guidance",
+    "acts",
+]
+"""Settings that a capture depends on."""
 
 
 @dataclass
@@ -202,7 +215,10 @@ class Echo(LearnedSystem):
         self.prepare()
         # 1. Conditioning: three tracked points at the model's rate and codes of the active objects, once for all seeds.
         reader, once = self.reader(), {id(scenario): scenario for scenario in scenarios}
-        item_by = {key: self._item(scenario, reader) for key, scenario in once.items()}
+        item_by = {
+            key: batch_item_of(scenario, head_path(scenario.recording, self.skeleton, self.fps), reader)
+            for key, scenario in once.items()
+        }
         items = [item_by[id(scenario)] for scenario in scenarios]
         # 2. Sampling with the rolling schedule: frames enter as noise one by one and leave clean.
         outputs = self._sampled(items, [scenario.recording for scenario in scenarios], seeds)
@@ -210,9 +226,6 @@ class Echo(LearnedSystem):
         if (threshold := self.static_below) is not None:
             outputs = [with_static_objects(item.conditioning, part, threshold) for item, part in zip(items, outputs)]
         return [motion_of(item, part, self.anchor, self.settings()) for item, part in zip(items, outputs)]
-
-    def _item(self, scenario: Scenario, reader: ObjectReader) -> BatchItem:
-        return batch_item_of(scenario, head_path(scenario.recording, self.skeleton, self.fps), reader)
 
     def _sampled(
         self, items: Sequence[BatchItem], recordings: Sequence[Recording], seeds: Sequence[int]
@@ -249,7 +262,7 @@ class Echo(LearnedSystem):
             queue.guided = pulled_by(skeletons, shapes, objects)
         return queue
 
-    def denoiser(self, queue: EchoQueue, conditioning: Conditioning, frame: Rigid) -> tuple[Denoise, Correction | None]:
+    def denoiser(self, queue: EchoQueue, conditioning: Conditioning, frame: Rigid) -> tuple[Denoise, Correct | None]:
         """x̂0 of the conveyor's frames as a function of x_t and levels, and the guidance that corrects it, if any.
 
         The condition is encoded once per call; the level-dependent part is cached between calls.
@@ -268,20 +281,9 @@ class Echo(LearnedSystem):
 
     def settings(self) -> dict[str, str]:
         """Settings that a capture depends on, for its provenance."""
-        return {
-            "pipeline": "echo",
-            "context": str(self.context),
-            "per_frame": str(self.per_frame),
-            "spacing": str(self.spacing),
-            "eta": str(self.eta),
-            "step": self.step,
-            "rewindow": str(self.rewindow),
-            "anchor": str(self.anchor),
-            "static_threshold": str(self.static_below),
-            "placed": str(self.placed),
-            "guidance": str(self.guided_by),
-            "acts": "search" if callable(self.acts) else str(self.acts),
-        }
+        acts = "search" if callable(self.acts) else self.acts
+        used = {"static_threshold": self.static_below, "guidance": self.guided_by, "acts": acts}
+        return {"pipeline": "echo"} | {name: str(used.get(name, getattr(self, name))) for name in SETTINGS}
 
 
 def motion_of(item: BatchItem, outputs: Outputs, anchor: bool, provenance: dict[str, str]) -> Motion:

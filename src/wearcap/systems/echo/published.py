@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from einops import rearrange
 from jaxtyping import Float, Int64
 from torch import Tensor
 
@@ -16,12 +17,12 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.point_encoder import PointNeXt
 from wearcap.recording import Motion
-from wearcap.systems.echo.features import EchoFeatures, ThreePoints
+from wearcap.systems.echo.features import OBJECT_SIZE, Body, EchoFeatures, ThreePoints
 from wearcap.systems.echo.objects import ObjectReader
 from wearcap.systems.echo.observations import BatchItem, Scenario, batch_item_of
 from wearcap.systems.echo.pipeline import motion_of, object_tracks
 from wearcap.systems.echo.queue import Outputs
-from wearcap.systems.echo.training_windows import EchoContent, EchoTrack
+from wearcap.systems.echo.training_windows import EchoContent
 from wearcap.tracking.head_path import head_path
 
 NO_CLASS = "none"
@@ -72,7 +73,12 @@ class NearestEcho:
             track = dataset.track(number)
             count = len(track.floor_height)
             channels.append(_channels(features, track.points, track.floor_height, track.size))
-            outputs.append(_outputs_of(features, track))
+            # Ground truth in each frame's head-centred coordinates.
+            frame = features.canonical(ThreePoints(*(part[None] for part in track.points)))
+            body, T = Body(*(part[None] for part in track.body)), track.T_world_object
+            T = Rigid(T.R[None], T.t[None])
+            parts = features.encode_body(body, frame), features.encode_object(T, frame), track.contact[None]
+            outputs.append(torch.cat(parts, -1)[0])
             for start in range(0, count - window + 1, stride):
                 active = int(track.active[start + window // 2])
                 starts.append(first + start)
@@ -85,7 +91,9 @@ class NearestEcho:
         descriptor, frames = {}, {}
         for name in sorted(set(labels)):
             mine = torch.tensor([start for start, label in zip(starts, labels) if label == name])
-            descriptor[name], frames[name] = whole[mine[:, None] + offsets].flatten(1), mine
+            samples = whole[mine[:, None] + offsets]
+            descriptor[name] = rearrange(samples, "window frame channel -> window (frame channel)")
+            frames[name] = mine
         return cls(features, encoder, window, sample, mean, scale, descriptor, frames, torch.cat(outputs))
 
     def capture_scenarios(self, scenarios: Sequence[Scenario], seeds: Sequence[int]) -> list[Motion]:
@@ -94,9 +102,8 @@ class NearestEcho:
         return [self._capture(scenario, reader) for scenario in scenarios]
 
     def _capture(self, scenario: Scenario, reader: ObjectReader) -> Motion:
-        item = batch_item_of(
-            scenario, head_path(scenario.recording, scenario.recording.skeleton, self.features.fps), reader
-        )
+        recording = scenario.recording
+        item = batch_item_of(scenario, head_path(recording, recording.skeleton, self.features.fps), reader)
         conditioning, count = item.conditioning, len(item.path.timestamps)
         points = ThreePoints(*(part[0] for part in conditioning.points))
         size = body_size(item.path.skeleton)
@@ -109,7 +116,7 @@ class NearestEcho:
             active = int(conditioning.object_number[0, take[self.window // 2]])
             name = item.objects[active].category if active >= 0 else NO_CLASS
             name = name if name in self.descriptor else NO_CLASS
-            query = channels[take[:: self.sample]].flatten()
+            query = rearrange(channels[take[:: self.sample]], "frame channel -> (frame channel)")
             best = (self.descriptor[name] - query).square().sum(1).argmin()
             retrieved = self.outputs[self.frames[name][best] + offsets]
             total.index_add_(0, take, retrieved * triangle)
@@ -117,21 +124,10 @@ class NearestEcho:
         return motion_of(item, _decoded(self.features, total / weight, item), True, {"pipeline": "nearest_echo"})
 
 
-def _outputs_of(features: EchoFeatures, track: EchoTrack) -> Float[Tensor, "time feature"]:
-    """Ground truth of a track in each frame's head-centred coordinates."""
-    batch = lambda parts: type(parts)(*(part[None] for part in parts))  # noqa: E731
-    frame = features.canonical(batch(track.points))
-    T = Rigid(track.T_world_object.R[None], track.T_world_object.t[None])
-    return torch.cat(
-        [features.encode_body(batch(track.body), frame), features.encode_object(T, frame), track.contact[None]], -1
-    )[0]
-
-
 def _decoded(features: EchoFeatures, outputs: Float[Tensor, "time feature"], item: BatchItem) -> Outputs:
     frame = features.canonical(item.conditioning.points)
-    human, scene_object, contact = outputs[None].split(
-        (features.human_size, 9, outputs.shape[1] - features.human_size - 9), -1
-    )
+    sizes = features.human_size, OBJECT_SIZE, outputs.shape[1] - features.human_size - OBJECT_SIZE
+    human, scene_object, contact = outputs[None].split(sizes, -1)
     body, T = features.decode_body(human, frame), features.decode_object(scene_object, frame)
     return Outputs(*body, T.R, T.t, contact)
 
@@ -195,7 +191,6 @@ class RigidWrist:
             wrist = int((wrists - expected[:, None]).norm(dim=-1).mean(0).argmin()) if rows.any() else 0
             t[rows] = wrists[:, wrist] + heading[rows] @ self.offset[name][wrist]
             R[rows] = heading[rows] @ self.turn[name]
-        outputs = Outputs(
-            torch.zeros(1, count, 1, 3, 3), torch.zeros(1, count, 3), R[None], t[None], torch.zeros(1, count, 1)
-        )
+        body = torch.zeros(1, count, 1, 3, 3), torch.zeros(1, count, 3)
+        outputs = Outputs(*body, R[None], t[None], torch.zeros(1, count, 1))
         return replace(motion, object_motion=object_tracks(item, outputs), provenance={"pipeline": "rigid_wrist"})

@@ -1,6 +1,8 @@
-"""ECHO's queue of frames (ECHO §3.3): conditioning enters frame by frame, final outputs leave frame by frame."""
+"""ECHO's queue of frames (ECHO §3.3): conditioning enters frame by frame, final outputs leave frame by frame; and
+overlapping windows in place of the conveyor, denoised from scratch with inpainted overlap (ECHO Fig. 3, left)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -10,10 +12,14 @@ from torch import Tensor
 from wearcap.body.skeleton import Skeleton
 from wearcap.data.features import body_size
 from wearcap.diffusion.conveyor import Conveyor, Denoise, Observation, RollingSchedule
+from wearcap.diffusion.process import posterior_step, step_levels
 from wearcap.diffusion.schedule import Schedule
 from wearcap.geometry.rigid import Rigid
 from wearcap.systems.echo.features import Body, EchoFeatures, ThreePoints
-from wearcap.systems.echo.model import EchoDenoiser
+from wearcap.systems.echo.model import MODALITIES, EchoDenoiser
+
+Correct = Callable[[Float[Tensor, "batch frame feature"]], Float[Tensor, "batch frame feature"]]
+"""Corrects x̂0, as guidance does."""
 
 
 class Conditioning(NamedTuple):
@@ -64,13 +70,6 @@ class Outputs(NamedTuple):
 
 
 @runtime_checkable
-class Correction(Protocol):
-    """Corrects x̂0, as guidance does."""
-
-    def __call__(self, x0_hat: Float[Tensor, "batch frame feature"]) -> Float[Tensor, "batch frame feature"]: ...
-
-
-@runtime_checkable
 class Model(Protocol):
     """The part of a pipeline that the queue uses."""
 
@@ -85,7 +84,7 @@ class Model(Protocol):
 
     def denoiser(
         self, queue: "EchoQueue", conditioning: Conditioning, frame: Rigid
-    ) -> tuple[Denoise, Correction | None]: ...
+    ) -> tuple[Denoise, Correct | None]: ...
 
 
 class EchoQueue:
@@ -115,14 +114,15 @@ class EchoQueue:
         any."""
         noise = self._noise(1)[:, 0]
         full = self.conveyor.push(noise)
-        self.conditioning = (
-            fresh
-            if self.conditioning is None
-            else Conditioning(*(torch.cat([a[:, int(full) :], b], 1) for a, b in zip(self.conditioning, fresh)))
-        )
+        if self.conditioning is not None:
+            fresh = Conditioning(*(torch.cat([a[:, int(full) :], b], 1) for a, b in zip(self.conditioning, fresh)))
+        self.conditioning = fresh
         frame = self.pipeline.features.canonical(self.conditioning.points)
         if self.pipeline.features.moves and full:
-            self._move(frame)
+            # The conveyor's frames are re-expressed in the window's new canonical frame.
+            assert self._frame is not None
+            change = frame.inverse() @ self._frame
+            self.conveyor.x = self._reexpressed(self.conveyor.x, change, self.conveyor.level, self.conditioning)
         self._frame = frame
         count = len(self.conveyor.age)
         noise = self._noise(self.rolling.per_frame * count).unflatten(1, (self.rolling.per_frame, count))
@@ -130,7 +130,7 @@ class EchoQueue:
         denoise, correct = self.pipeline.denoiser(self, self.conditioning, frame)
         self.conveyor.run(denoise, observation, noise.transpose(0, 1), correct)
         clean = self.conveyor.clean
-        return self._outputs(clean - 1, frame) if clean else None
+        return self._decoded(self.conveyor.x, slice(clean - 1, clean), frame) if clean else None
 
     def run(self, whole: Conditioning) -> Outputs:
         """Outputs of all frames of a batch."""
@@ -163,23 +163,14 @@ class EchoQueue:
         if conditioning.is_observed.any():
             features = self.pipeline.features
             body = features.encode_body(Body(conditioning.R_parent_joint, conditioning.t_world_root), frame)
-            scene_object = features.encode_object(
-                Rigid(conditioning.R_world_object, conditioning.t_world_object), frame
-            )
-            raw = torch.cat([body, scene_object, 2 * conditioning.contact - 1], -1)
+            T_world_object = Rigid(conditioning.R_world_object, conditioning.t_world_object)
+            raw = torch.cat([body, features.encode_object(T_world_object, frame), 2 * conditioning.contact - 1], -1)
             observed = self.pipeline.net.motion_normalizer(raw.to(self.pipeline.device)).cpu()
         never = torch.zeros_like(conditioning.has_object)
         absent = [never, ~conditioning.has_object, never if self.pipeline.contacts else ~never]
         is_observed = conditioning.is_observed.clone()
         is_observed[..., 1] &= conditioning.has_object
         return Observation(observed, is_observed, torch.stack(absent, -1) & ~is_observed)
-
-    def _move(self, frame: Rigid) -> None:
-        """Re-express the conveyor's frames in the window's new canonical frame."""
-        assert self._frame is not None
-        assert self.conditioning is not None
-        change = frame.inverse() @ self._frame
-        self.conveyor.x = self._reexpressed(self.conveyor.x, change, self.conveyor.level, self.conditioning)
 
     def _reexpressed(
         self,
@@ -204,16 +195,73 @@ class EchoQueue:
     def _turned(value: Float[Tensor, "batch frame 3"], R: Float[Tensor, "batch 1 3 3"]) -> Tensor:
         return (R @ value[..., None])[..., 0]
 
-    def _outputs(self, number: int, frame: Rigid) -> Outputs:
-        """Outputs of one frame of the window."""
-        return self._decoded(self.conveyor.x, slice(number, number + 1), frame)
-
     def _decoded(self, x: Float[Tensor, "batch frame feature"], part: slice, frame: Rigid) -> Outputs:
         """Some of a window's frames, converted from normalised space to world coordinates."""
         net, features = self.pipeline.net, self.pipeline.features
-        human, scene_object, contact = (
-            net.motion_normalizer.inverse(x[:, part].to(self.pipeline.device)).cpu().split(net.sizes, -1)
-        )
+        raw = net.motion_normalizer.inverse(x[:, part].to(self.pipeline.device)).cpu()
+        human, scene_object, contact = raw.split(net.sizes, -1)
         at = frame if frame.t.shape[1] == 1 else Rigid(frame.R[:, part], frame.t[:, part])
         body, T = features.decode_body(human, at), features.decode_object(scene_object, at)
         return Outputs(*body, T.R, T.t, ((contact + 1) / 2).clamp(0, 1))
+
+
+class Rewindow(EchoQueue):
+    """Windows that advance by `stride` frames: the last final frames (at most the context) are inpainted, the next
+    `stride` frames become final, and the rest is discarded.
+
+    With the conveyor's context and steps, a frame sees as much of the past and future as on the conveyor.
+    """
+
+    def __init__(self, pipeline: Model, skeletons: Sequence, seeds: Sequence[int], stride: int = 10):
+        super().__init__(pipeline, skeletons, seeds)
+        self.stride = stride
+
+    @torch.no_grad()
+    def window(
+        self, conditioning: Conditioning, before: Float[Tensor, "batch observed feature"]
+    ) -> Float[Tensor, "batch frame feature"]:
+        """A sampled window in normalised space, whose first frames are inpainted with `before`."""
+        frame = self.pipeline.features.canonical(conditioning.points)
+        count, observed_frames = conditioning.valid.shape[1], before.shape[1]
+        observation = self._observation(conditioning, frame)
+        denoise, correct = self.pipeline.denoiser(self, conditioning, frame)
+        levels = step_levels(self.rolling.steps, self.rolling.spacing)
+        # Always a full window's noise: a batch item's noise must not depend on the length of the others.
+        x = self._noise(self.rolling.window)[:, :count]
+        observed = observation.observed.clone()
+        observed[:, :observed_frames] = before
+        is_observed = observation.is_observed.clone()
+        is_observed[:, :observed_frames] = ~observation.is_absent[:, :observed_frames]
+        wide = self.conveyor.wide
+        for now, after in pairwise(levels):
+            level, then = (
+                torch.where(is_observed, 0.0, torch.where(observation.is_absent, 1.0, value)) for value in (now, after)
+            )
+            x = torch.where(wide(is_observed), observed, x)
+            x0_hat = denoise(x, level)
+            x0_hat = x0_hat if correct is None else correct(x0_hat)
+            noise = self._noise(self.rolling.window)[:, :count]
+            x = posterior_step(x, x0_hat, wide(level), wide(then), noise, self.pipeline.schedule, self.rolling.eta)
+        return x
+
+    @torch.no_grad()
+    def run(self, whole: Conditioning) -> Outputs:
+        """Outputs of all frames of a batch."""
+        context, count = self.rolling.context, whole.valid.shape[1]
+        outputs: list[Outputs] = []
+        before, start = torch.zeros(len(whole.valid), 0, sum(self.pipeline.net.sizes)), 0
+        while start < count:
+            first = max(0, start - context)
+            conditioning = whole.frames(slice(first, min(first + self.rolling.window, count)))
+            before = before[:, before.shape[1] - (start - first) :]
+            frame = self.pipeline.features.canonical(conditioning.points)
+            if self._frame is not None and self.pipeline.features.moves:
+                change, observed = frame.inverse() @ self._frame, conditioning.frames(slice(0, start - first))
+                before = self._reexpressed(before, change, torch.zeros(1, 1, len(MODALITIES)), observed)
+            self._frame = frame
+            x = self.window(conditioning, before)
+            stop = min(start + self.stride, count)
+            outputs.append(self._decoded(x, slice(start - first, stop - first), frame))
+            final = x[:, : stop - first]
+            before, start = final[:, -context:] if context else final[:, :0], stop
+        return Outputs(*(torch.cat(parts, 1) for parts in zip(*outputs)))

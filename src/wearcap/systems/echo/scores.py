@@ -13,15 +13,8 @@ from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate_clamped, nearest_frames, resample
+from wearcap.metrics import objects as object_metrics
 from wearcap.metrics.detection import detection_scores
-from wearcap.metrics.objects import (
-    center_error_cm,
-    foot_contact_share,
-    joint_step_error_mm,
-    quaternion_difference,
-    rotation_difference_deg,
-    vertex_error_cm,
-)
 from wearcap.metrics.physics import jitter_m_s3
 from wearcap.metrics.position import mpjpe_cm
 from wearcap.metrics.table import Row
@@ -102,13 +95,12 @@ def _poses_at(track: Trajectory, times: Float64[Tensor, "time"]) -> Rigid:
 def score_echo(motion: Motion, truth: Truth, name: str, seed: int) -> Row:
     """ECHO's metrics of one capture in world coordinates without alignment: body over all frames, object over the
     frames in which one is active."""
-    joints, true = motion.T_world_joint.t, truth.motion.T_world_joint.t
-    skeleton = motion.skeleton
+    joints, true, skeleton = motion.T_world_joint.t, truth.motion.T_world_joint.t, motion.skeleton
     scores = {
         "mpjpe_mm": 10 * mpjpe_cm(joints, true).item(),
-        "mpjve_mm": joint_step_error_mm(joints, true).item(),
-        "foot_contact": foot_contact_share(skeleton, joints, truth.floor_height).item(),
-        "true_foot_contact": foot_contact_share(skeleton, true, truth.floor_height).item(),
+        "mpjve_mm": object_metrics.joint_step_error_mm(joints, true).item(),
+        "foot_contact": object_metrics.foot_contact_share(skeleton, joints, truth.floor_height).item(),
+        "true_foot_contact": object_metrics.foot_contact_share(skeleton, true, truth.floor_height).item(),
         "jitter_m_s3": jitter_m_s3(joints, motion.fps).item(),
         "true_jitter_m_s3": jitter_m_s3(true, motion.fps).item(),
     }
@@ -134,10 +126,10 @@ def _object_scores(motion: Motion, truth: Truth) -> dict[str, float]:
         T_found = shape.centred(_poses_at(track, motion.timestamps[rows]))
         true = T_true[rows]
         for key, value in {
-            "v2v_cm": vertex_error_cm(T_found, true, shape.cloud),
-            "center_cm": center_error_cm(T_found, true, shape.cloud),
-            "rotation_deg": rotation_difference_deg(T_found, true),
-            "quaternion": quaternion_difference(T_found, true),
+            "v2v_cm": object_metrics.vertex_error_cm(T_found, true, shape.cloud),
+            "center_cm": object_metrics.center_error_cm(T_found, true, shape.cloud),
+            "rotation_deg": object_metrics.rotation_difference_deg(T_found, true),
+            "quaternion": object_metrics.quaternion_difference(T_found, true),
         }.items():
             parts.setdefault(key, []).append(value)
     return {key: torch.cat(values).mean().item() for key, values in parts.items()}
@@ -156,10 +148,8 @@ def observed_share(truth: Truth, modality: str, share: float, seed: int) -> Obse
     take = torch.from_numpy(chosen)
     times = truth.motion.timestamps[take]
     if modality == "human":
-        motion = Motion(
-            times, truth.motion.skeleton, truth.motion.R_parent_joint[take], truth.motion.t_world_root[take]
-        )
-        return Observed(motion=motion)
+        R, t = truth.motion.R_parent_joint[take], truth.motion.t_world_root[take]
+        return Observed(motion=Motion(times, truth.motion.skeleton, R, t))
     if modality == "object":
         tracks = {}
         for number, shape in enumerate(truth.objects):

@@ -16,7 +16,7 @@ FADE = 20
 """Frames over which an object that is touched again blends from its static pose to its predicted pose."""
 
 
-def is_touched(conditioning: Conditioning, outputs: Outputs, threshold: float) -> Bool[Tensor, "batch frame"]:
+def _is_touched(conditioning: Conditioning, outputs: Outputs, threshold: float) -> Bool[Tensor, "batch frame"]:
     """Whether a contact probability on the active object reaches the threshold, or the object's pose is observed."""
     touch = outputs.contact_prob[..., :BODY_POINTS].amax(-1) >= threshold
     return conditioning.has_object & (touch | conditioning.is_observed[..., 1])
@@ -47,7 +47,7 @@ def with_static_objects(conditioning: Conditioning, outputs: Outputs, threshold:
     """Outputs in which untouched objects are static: at their pose in the last contact or, before their first
     contact, at its pose, both `INSIDE` frames within the contact. At the start of the next contact an object blends
     to its predicted pose over `FADE` frames. Objects without any contact are unchanged."""
-    touched, observed = is_touched(conditioning, outputs, threshold), conditioning.is_observed[..., 1]
+    touched, observed = _is_touched(conditioning, outputs, threshold), conditioning.is_observed[..., 1]
     active = torch.where(conditioning.has_object, conditioning.object_number, -1.0)
     count = active.shape[1]
     frames = torch.arange(count).expand_as(active)
@@ -66,11 +66,11 @@ def with_static_objects(conditioning: Conditioning, outputs: Outputs, threshold:
         share = 1 - (frames - begin) / (end - begin).clamp(1, FADE)
         weight = torch.where(fades, share.clamp_min(0), weight)
     R, t = outputs.R_world_object, outputs.t_world_object
-    return _static(outputs, _taken(R, t, at), _taken(R, t, left), _taken(R, t, found), weight)
-
-
-def _taken(R: Tensor, t: Tensor, frame: Int64[Tensor, "batch frame"]) -> Rigid:
-    return Rigid(R.take_along_dim(frame[..., None, None], 1), t.take_along_dim(frame[..., None], 1))
+    predicted, left, found = (
+        Rigid(R.take_along_dim(frame[..., None, None], 1), t.take_along_dim(frame[..., None], 1))
+        for frame in (at, left, found)
+    )
+    return _static(outputs, predicted, left, found, weight)
 
 
 def _static(
@@ -101,7 +101,7 @@ class StaticObjects:
         if not conditioning.has_object.item():
             self._fading = None
             return outputs
-        if not is_touched(conditioning, outputs, self.threshold).item():
+        if not _is_touched(conditioning, outputs, self.threshold).item():
             self._fading = None
             last = self._last.get(number)
             return outputs if last is None else outputs._replace(R_world_object=last.R, t_world_object=last.t)
@@ -111,8 +111,7 @@ class StaticObjects:
             self._fading = (number, self._last.get(number, predicted), predicted, 0)
         _, left, found, ago = self._fading
         self._fading = (number, left, found, ago + 1)
-        static = _static(
-            outputs, predicted, left, found, outputs.contact_prob.new_full((1, 1), max(0.0, 1 - ago / FADE))
-        )
+        weight = outputs.contact_prob.new_full((1, 1), max(0.0, 1 - ago / FADE))
+        static = _static(outputs, predicted, left, found, weight)
         self._last[number] = Rigid(static.R_world_object, static.t_world_object)
         return static

@@ -33,19 +33,7 @@ from wearcap.runtime.snapshot import classes_of
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import check_object
 from wearcap.sensors import packets, samples
-from wearcap.sensors.packets import (
-    CONNECTED_S,
-    MAX_WAITING,
-    OFF_THE_CLOCK,
-    WRONG_TYPE,
-    Admitted,
-    Clock,
-    HeadInput,
-    connected,
-    owned_pose,
-    pose_fault,
-    time_fault,
-)
+from wearcap.sensors.packets import MAX_WAITING, Admitted, Clock, HeadInput
 from wearcap.sensors.samples import ActiveObject, HeadSample, ObjectSample, WristSample
 from wearcap.systems.echo import queue, static_objects
 from wearcap.systems.echo.features import CONTACTS
@@ -59,6 +47,8 @@ from wearcap.tracking import floor, head_path
 from wearcap.tracking.floor import FloorTracker
 from wearcap.tracking.head_path import Chunk, HeadPath, HeadTrack
 
+_STATE = skeleton, motion_types, trajectory, rigid, head_path, packets, samples, floor, conveyor, queue, static_objects
+"""Modules with the classes that a session's state consists of."""
 MAX_SEEN = 1000
 """Most object observations that are buffered; the oldest are dropped."""
 ASIDE_M, BELOW = 0.25, 0.47
@@ -167,14 +157,14 @@ class EchoStream(WearerStream):
     def _rejoin(self, joint: str, time: float | None) -> None:
         """Keep the poses of a wrist that are on the clock that starts at `time`; None: no pose is."""
         poses = self._wrists[joint]
-        kept = [] if time is None else poses[connected([pose[0] for pose in poses], time)]
+        kept = [] if time is None else poses[packets.connected([pose[0] for pose in poses], time)]
         refused = self._clocks[joint].set(kept[-1][0] if kept else None)
         self._refuse(joint, refused if time is None else refused + len(poses) - len(kept))
         self._wrists[joint] = kept
 
     def _refuse(self, stream: str, count: int) -> None:
         if count:
-            self._entry.refuse(stream, OFF_THE_CLOCK, count)
+            self._entry.refuse(stream, packets.OFF_THE_CLOCK, count)
 
     def wrist(self, joint: str, timestamp: float, T_world_joint: Rigid) -> None:
         """Add a pose of a wrist joint; duplicates are ignored.
@@ -183,11 +173,11 @@ class EchoStream(WearerStream):
         """
         if joint not in self._wrists:
             raise WearcapError(f"no tracked joint {joint!r}", expected=" or ".join(WRISTS))
-        if fault := time_fault(timestamp) or pose_fault(T_world_joint):
+        if fault := packets.time_fault(timestamp) or packets.pose_fault(T_world_joint):
             self._entry.refuse(joint, fault)
             return
         leader = self._entry.clock.newest
-        admitted = self._clocks[joint].admit(float(timestamp), owned_pose(T_world_joint), leader)
+        admitted = self._clocks[joint].admit(float(timestamp), packets.owned_pose(T_world_joint), leader)
         self._refuse(joint, admitted.refused)
         if admitted.begins:
             first = bisect_left(self._wrists[joint], admitted.packets[0][0], key=_time)
@@ -211,7 +201,7 @@ class EchoStream(WearerStream):
             case ObjectSample():
                 self.see_object(*sample)
             case _:
-                self._entry.refuse("sample", WRONG_TYPE)
+                self._entry.refuse("sample", packets.WRONG_TYPE)
 
     def activate(self, name: str | None, timestamp: float) -> None:
         """Make an object the active one from `timestamp` (s) on; None: no object is active.
@@ -219,7 +209,7 @@ class EchoStream(WearerStream):
         Frames that are not final yet are updated. Raises WearcapError for an unknown object, and for one whose mesh or
         class cannot be used.
         """
-        if fault := time_fault(timestamp):
+        if fault := packets.time_fault(timestamp):
             self._entry.refuse("activate", fault)
             return
         if name is not None:
@@ -240,12 +230,12 @@ class EchoStream(WearerStream):
         """
         self._shape(name)
         newest = self._entry.clock.newest
-        if fault := time_fault(timestamp) or pose_fault(T_world_object):
+        if fault := packets.time_fault(timestamp) or packets.pose_fault(T_world_object):
             self._entry.refuse(name, fault)
-        elif math.isfinite(newest) and abs(timestamp - newest) > CONNECTED_S:
+        elif math.isfinite(newest) and abs(timestamp - newest) > packets.CONNECTED_S:
             self._refuse(name, 1)
         else:
-            self._see(name, float(timestamp), owned_pose(T_world_object))
+            self._see(name, float(timestamp), packets.owned_pose(T_world_object))
 
     def _see(self, name: str, timestamp: float, T_world_object: Rigid) -> None:
         self._seen.append((timestamp, name, self._shape(name).centred(T_world_object)))
@@ -279,13 +269,13 @@ class EchoStream(WearerStream):
             self._chunks.append(chunk)
         motions: list[Motion] = []
         with undisturbed(self.pipeline.runtime == "onnx"):
-            while self._chunks and (ended or self._wrists_arrived(self._chunks[0])):
+            while self._chunks and (ended or self._complete(self._chunks[0])):
                 motions += self._advance(self._chunks.pop(0))
             if ended or not (self._chunks or self._track.inside):
                 motions += self._finish()
         return joined(motions)
 
-    def _wrists_arrived(self, chunk: Chunk) -> bool:
+    def _complete(self, chunk: Chunk) -> bool:
         """Whether the poses of both wrists at a frame have arrived, or count as lost."""
         time, head = chunk.timestamps[-1].item(), self._track.newest
         newest = [poses[-1][0] if poses else -math.inf for poses in self._wrists.values()]
@@ -295,33 +285,26 @@ class EchoStream(WearerStream):
         motions: list[Motion] = []
         if chunk.begins or self._queue is None:
             motions += self._finish()
-            skeleton = self.wearer.skeleton
-            self._queue = self.pipeline.queue(
-                [skeleton],
-                [stretch_seed(self.seed, chunk.first)],
-                [dict(self.wearer.shape)],
-                [list(self._shapes.values())],
-            )
+            seeds, shapes = [stretch_seed(self.seed, chunk.first)], [dict(self.wearer.shape)]
+            self._queue = self.pipeline.queue([self.wearer.skeleton], seeds, shapes, [list(self._shapes.values())])
         mount = Rigid(self.wearer.R_head_device, self.wearer.t_head_device).inverse()
         T_world_head = chunk.T_world_device @ mount
-        self._correct(chunk.corrected @ mount)
+        # The head poses of the last frames may have been corrected.
+        corrected = chunk.corrected @ mount
+        count = min(len(corrected.t), len(self._pending))
+        for k in range(-count, 0):
+            before_s, conditioning, _ = self._pending[k]
+            at = corrected[len(corrected.t) + k : len(corrected.t) + k + 1]
+            R, t = conditioning.R_world_point.clone(), conditioning.t_world_point.clone()
+            R[0, 0, 0], t[0, 0, 0] = at.R[0], at.t[0]
+            self._pending[k] = (before_s, conditioning._replace(R_world_point=R, t_world_point=t), at)
+        if count:
+            self._update_pending()
         time = chunk.timestamps[0].item()
         conditioning = self._frame(time, T_world_head)
         outputs = self._queue.push(conditioning)
         self._pending.append((time, conditioning, T_world_head))
         return motions + self._emit(outputs)
-
-    def _correct(self, T_world_head: Rigid) -> None:
-        """Replace the head poses of the last frames by corrected ones."""
-        count = min(len(T_world_head.t), len(self._pending))
-        for k in range(count):
-            time, conditioning, _ = self._pending[-count + k]
-            at = T_world_head[len(T_world_head.t) - count + k : len(T_world_head.t) - count + k + 1]
-            R, t = conditioning.R_world_point.clone(), conditioning.t_world_point.clone()
-            R[0, 0, 0], t[0, 0, 0] = at.R[0], at.t[0]
-            self._pending[-count + k] = (time, conditioning._replace(R_world_point=R, t_world_point=t), at)
-        if count:
-            self._update_pending()
 
     def _finish(self) -> list[Motion]:
         """The remaining frames of a stretch that has ended."""
@@ -334,27 +317,13 @@ class EchoStream(WearerStream):
     def _frame(self, time: float, T_world_head: Rigid) -> Conditioning:
         poses = [T_world_head, *(self._wrist_at(joint, time, T_world_head) for joint in WRISTS)]
         R, t = torch.stack([T.R for T in poses], 1), torch.stack([T.t for T in poses], 1)
-        joints = len(self.wearer.skeleton)
-        valid = torch.ones(1, dtype=torch.bool)
-        unobserved = (
-            torch.eye(3).repeat(1, joints, 1, 1),
-            torch.zeros(1, 3),
-            torch.eye(3)[None],
-            torch.zeros(1, 3),
-            torch.zeros(1, CONTACTS),
-        )
         floor = torch.full((1,), self.wearer.floor_m or 0.0)
         if self.wearer.floor_m is None:
             floor = self._floor.follow(T_world_head.t)
-        fields = (
-            R,
-            t,
-            floor,
-            *self._active(time),
-            valid,
-            *unobserved,
-            torch.zeros(1, len(MODALITIES), dtype=torch.bool),
-        )
+        valid, is_observed = torch.ones(1, dtype=torch.bool), torch.zeros(1, len(MODALITIES), dtype=torch.bool)
+        body = torch.eye(3).repeat(1, len(self.wearer.skeleton), 1, 1), torch.zeros(1, 3)
+        unobserved = *body, torch.eye(3)[None], torch.zeros(1, 3), torch.zeros(1, CONTACTS)
+        fields = R, t, floor, *self._active(time), valid, *unobserved, is_observed
         return self._with_observed_object(Conditioning(*(value[None] for value in fields)), time)
 
     def _active(self, time: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -388,35 +357,28 @@ class EchoStream(WearerStream):
         frames = [whole.frames(slice(k, k + 1)) for k in range(max(first, 0))]
         for k, (time, conditioning, head) in enumerate(self._pending):
             has, code, number = (value[None] for value in self._active(time))
-            changed = conditioning._replace(
-                has_object=has,
-                object_code=code,
-                object_number=number,
-                is_observed=torch.zeros_like(conditioning.is_observed),
-            )
+            none = torch.zeros_like(conditioning.is_observed)
+            changed = conditioning._replace(has_object=has, object_code=code, object_number=number, is_observed=none)
             changed = self._with_observed_object(changed, time)
             self._pending[k] = (time, changed, head)
             frames.append(changed)
         self._queue.conditioning = Conditioning(*(torch.cat(fields, 1) for fields in zip(*frames)))
-
-    def _arm_down(self, joint: str, T_world_head: Rigid) -> Rigid:
-        """Default pose of a wrist that was not tracked yet: beside the body, arms down."""
-        heading = rotation.about_axis("z", rotation.yaw_of(T_world_head.R))
-        aside = ASIDE_M if joint == WRISTS[0] else -ASIDE_M
-        below = torch.tensor([0.0, aside, -BELOW * self.wearer.skeleton.height_of("head")])
-        return Rigid(heading, T_world_head.t + (heading @ below[:, None])[..., 0])
 
     def _wrist_at(self, joint: str, time: float, T_world_head: Rigid) -> Rigid:
         poses = self._wrists[joint]
         if not poses or poses[-1][0] < time - MAX_GAP_S:
             self.silent += 1
         if not poses:
-            return self._arm_down(joint, T_world_head)
+            # A wrist that was not tracked yet is beside the body, with the arm down.
+            heading = rotation.about_axis("z", rotation.yaw_of(T_world_head.R))
+            aside = ASIDE_M if joint == WRISTS[0] else -ASIDE_M
+            below = torch.tensor([0.0, aside, -BELOW * self.wearer.skeleton.height_of("head")])
+            return Rigid(heading, T_world_head.t + (heading @ below[:, None])[..., 0])
         times, R, t = zip(*poses)
         track = Trajectory(torch.tensor(times, dtype=torch.float64), torch.stack(R), torch.stack(t))
         pose = wrist_poses(track, torch.tensor([time], dtype=torch.float64))
         # Only the last second is needed, and one pose before it.
-        old = bisect_left(poses, time - 1.0, key=lambda sample: sample[0]) - 1
+        old = bisect_left(poses, time - 1.0, key=_time) - 1
         self._wrists[joint] = poses[max(old, 0) :]
         return Rigid(pose.R.float(), pose.t.float())
 
@@ -424,45 +386,23 @@ class EchoStream(WearerStream):
         if outputs is None or not self._pending:
             return []
         time, conditioning, T_world_head = self._pending.pop(0)
-        path = HeadPath(
-            torch.tensor([time], dtype=torch.float64),
-            T_world_head,
-            T_world_head,
-            conditioning.floor_height[0],
-            self.wearer.skeleton,
-            ((0, 1),),
-        )
-        self._forget(time)
+        times, floor_height = torch.tensor([time], dtype=torch.float64), conditioning.floor_height[0]
+        path = HeadPath(times, T_world_head, T_world_head, floor_height, self.wearer.skeleton, ((0, 1),))
+        # Object events that no later frame needs are dropped.
+        self._seen = [row for row in self._seen if row[0] > time - 1.0]
+        past = [k for k, (start, _) in enumerate(self._acts) if start <= time]
+        self._acts = self._acts[past[-1] :] if past else self._acts
         batch_item = BatchItem(path, conditioning, list(self._shapes.values()))
         if self._static is not None:
             outputs = self._static(conditioning, outputs)
         return [motion_of(batch_item, outputs, self.pipeline.anchor, self.pipeline.settings())]
-
-    def _forget(self, time: float) -> None:
-        """Drop object events that no later frame needs."""
-        self._seen = [row for row in self._seen if row[0] > time - 1.0]
-        past = [k for k, (start, _) in enumerate(self._acts) if start <= time]
-        self._acts = self._acts[past[-1] :] if past else self._acts
 
 
 class EchoSession(Session):
     """A streaming capture of one or several wearers and the objects of one environment, each by an `EchoStream`."""
 
     stream_class = EchoStream
-    classes = classes_of(
-        skeleton,
-        motion_types,
-        trajectory,
-        rigid,
-        head_path,
-        packets,
-        samples,
-        floor,
-        conveyor,
-        queue,
-        static_objects,
-        sys.modules[__name__],
-    )
+    classes = classes_of(*_STATE, sys.modules[__name__])
 
     def __init__(
         self,
@@ -473,9 +413,8 @@ class EchoSession(Session):
     ):
         """Raises WearcapError without wearers, and for a pipeline without a conveyor."""
         seeds = [0] * len(wearers) if seeds is None else seeds
-        super().__init__(
-            pipeline, [EchoStream(pipeline, who, environment, seed) for who, seed in zip(wearers, seeds, strict=True)]
-        )
+        pairs = zip(wearers, seeds, strict=True)
+        super().__init__(pipeline, [EchoStream(pipeline, wearer, environment, seed) for wearer, seed in pairs])
 
     @classmethod
     def settings(cls, system: Echo) -> dict[str, Any]:

@@ -79,15 +79,12 @@ class EchoDiffusion(Training):
         for batch in drawn_batches(dataset, limit, 100):
             frame = self.features.canonical(batch.points)
             rows["human"].append(self.features.encode_body(batch.body, frame)[batch.valid])
-            rows["object"].append(
-                self.features.encode_object(batch.T_world_object, frame)[batch.valid & batch.has_object]
-            )
+            scene_object = self.features.encode_object(batch.T_world_object, frame)
+            rows["object"].append(scene_object[batch.valid & batch.has_object])
             rows["condition"].append(self.features.condition(batch.points, batch.floor_height, batch.size)[batch.valid])
         human, scene_object, condition = (torch.cat(part) for part in rows.values())
-        ranges = [self._range(human), self._range(scene_object)]
-        mean, scale = (torch.cat(part) for part in zip(*ranges))
-        contact = torch.zeros(CONTACTS), torch.ones(CONTACTS)
-        self.net.motion_normalizer.set(torch.cat([mean, contact[0]]), torch.cat([scale, contact[1]]))
+        ranges = [self._range(human), self._range(scene_object), (torch.zeros(CONTACTS), torch.ones(CONTACTS))]
+        self.net.motion_normalizer.set(*(torch.cat(part) for part in zip(*ranges)))
         standardize(self.net.condition_normalizer, condition)
         if self.encoder is not None and content.encoder is not None:
             self.encoder.load_state_dict(content.encoder.state_dict())
@@ -103,7 +100,7 @@ class EchoDiffusion(Training):
                 mean[part], scale[part] = 0.0, rows[:, part].square().mean().sqrt()
         return mean, scale
 
-    def _levels(self, batch: EchoWindow) -> Float[Tensor, "batch time modality"]:
+    def levels(self, batch: EchoWindow) -> Float[Tensor, "batch time modality"]:
         """Noise levels of a batch; absent modalities are at level 1, pure noise."""
         levels = self.mix.levels(batch.level_draws, batch.draws)
         human, scene_object, contact = levels.unbind(-1)
@@ -111,7 +108,7 @@ class EchoDiffusion(Training):
         contact = contact if self.contacts else torch.ones_like(contact)
         return torch.stack([human, scene_object, contact], -1)
 
-    def _truth(self, batch: EchoWindow, frame: Rigid) -> Float[Tensor, "batch time feature"]:
+    def truth(self, batch: EchoWindow, frame: Rigid) -> Float[Tensor, "batch time feature"]:
         """Ground truth x0 in normalised space."""
         human = self.features.encode_body(batch.body, frame)
         scene_object = self.features.encode_object(batch.T_world_object, frame)
@@ -131,7 +128,7 @@ class EchoDiffusion(Training):
     def terms(self, batch: EchoWindow) -> dict[str, Tensor]:
         """Every loss term of a batch, unweighted."""
         frame = self.features.canonical(batch.points)
-        x0, levels = self._truth(batch, frame), self._levels(batch)
+        x0, levels = self.truth(batch, frame), self.levels(batch)
         x_t = add_noise(x0, batch.noise, self.net.per_feature(levels), self.schedule)
         condition = self.features.condition(batch.points, batch.floor_height, batch.size, frame)
         encoded = self.net.encode(condition, self.net.object(batch.object_code), batch.has_object, batch.valid)
@@ -150,7 +147,7 @@ class EchoDiffusion(Training):
         if not self.contacts:
             terms.pop("contact")
         outputs = self.net.motion_normalizer.inverse(x0_hat)
-        terms["object_vertices"] = self._vertices(outputs, batch, frame)
+        terms["object_vertices"] = self.object_vertices(outputs, batch, frame)
         body = self.features.decode_body(outputs[..., : self.net.sizes[0]], frame)
         predicted, true = self._joints(body, batch), self._joints(batch.body, batch)
         terms["joints"] = losses.joint_position(predicted, true, weight)
@@ -163,7 +160,7 @@ class EchoDiffusion(Training):
         """Joint positions in the world (m)."""
         return forward_kinematics(self.skeleton, *body, batch.t_parent_joint[:, None]).t
 
-    def _vertices(
+    def object_vertices(
         self, outputs: Float[Tensor, "batch time feature"], batch: EchoWindow, frame: Rigid
     ) -> Float[Tensor, ""]:
         """Root mean squared distance (m) between the points of the predicted and the true surface:

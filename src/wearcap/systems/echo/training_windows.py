@@ -98,51 +98,43 @@ class EchoTrack:
         points = {key: [0, 2, 1] for key in ("R_world_point", "t_world_point")}
         return joints | points | {"contact": [*mirrored_points().tolist(), *patches]}
 
+    @classmethod
+    def read(
+        cls, recording: Recording, environment: Environment | None, reader: ObjectReader, every: int, within_m: float
+    ) -> "EchoTrack":
+        """Every `every`-th frame of a recording with ground truth; contact is a distance of at most `within_m` (m).
 
-def echo_track(
-    recording: Recording, environment: Environment | None, reader: ObjectReader, every: int, within_m: float
-) -> EchoTrack:
-    """Every `every`-th frame of a recording with ground truth; contact is a distance of at most `within_m` (m).
-
-    The head is the measured one, or without a head stream of the motion's length the ground truth; wrists are true.
-    """
-    motion, head = recording.motion, recording.head
-    assert motion is not None
-    take = torch.arange(0, len(motion), every)
-    times, body = motion.timestamps[take], motion.T_world_joint
-    chosen = motion.skeleton.indices(*POINTS)
-    points = ThreePoints(body.R[take][:, chosen].clone(), body.t[take][:, chosen].clone())
-    if head is not None and len(head.timestamps) == len(motion):
-        T_world_head = head.T_world_head[take]
-        points.R_world_point[:, 0], points.t_world_point[:, 0] = T_world_head.R, T_world_head.t
-    surface = contact_points(anny_body(motion.skeleton, recording.shape or None))
-    acts = true_acts(recording) if environment is not None and recording.object_motion else []
-    names = list(dict.fromkeys(act.object for act in acts))
-    objects = [reader(environment.by_name(name)) for name in names] if environment is not None else []
-    active = active_at(acts, names, times)
-    R, t = torch.eye(3).repeat(len(take), 1, 1), torch.zeros(len(take), 3)
-    contact = torch.zeros(len(take), CONTACTS)
-    for number, shape in enumerate(objects):
-        rows = (active == number).nonzero()[:, 0]
-        if not len(rows) or environment is None:
-            continue
-        T = object_poses(recording, environment, names[number], shape, take[rows])
-        R[rows], t[rows] = T.R, T.t
-        skin = surface.vertices(body[take[rows]])
-        contact[rows, : CONTACTS - len(FOOT_PATCHES)] = body_contact(skin, shape, T, within_m).float()
-    contact[:, CONTACTS - len(FOOT_PATCHES) :] = foot_patches(recording)[take].float()
-    floor = recording.floor.height[take] if recording.floor is not None else torch.zeros(len(take))
-    return EchoTrack(
-        points,
-        floor.float(),
-        motion.skeleton,
-        body_size(motion.skeleton),
-        Body(motion.R_parent_joint[take], motion.t_world_root[take]),
-        contact,
-        objects,
-        active,
-        Rigid(R, t),
-    )
+        The head is the measured one, or without a head stream of the motion's length the ground truth; wrists are true.
+        """
+        motion, head = recording.motion, recording.head
+        assert motion is not None
+        take = torch.arange(0, len(motion), every)
+        times, body = motion.timestamps[take], motion.T_world_joint
+        chosen = motion.skeleton.indices(*POINTS)
+        points = ThreePoints(body.R[take][:, chosen].clone(), body.t[take][:, chosen].clone())
+        if head is not None and len(head.timestamps) == len(motion):
+            T_world_head = head.T_world_head[take]
+            points.R_world_point[:, 0], points.t_world_point[:, 0] = T_world_head.R, T_world_head.t
+        surface = contact_points(anny_body(motion.skeleton, recording.shape or None))
+        acts = true_acts(recording) if environment is not None and recording.object_motion else []
+        names = list(dict.fromkeys(act.object for act in acts))
+        objects = [reader(environment.by_name(name)) for name in names] if environment is not None else []
+        active = active_at(acts, names, times)
+        R, t = torch.eye(3).repeat(len(take), 1, 1), torch.zeros(len(take), 3)
+        contact = torch.zeros(len(take), CONTACTS)
+        for number, shape in enumerate(objects):
+            rows = (active == number).nonzero()[:, 0]
+            if not len(rows) or environment is None:
+                continue
+            T = object_poses(recording, environment, names[number], shape, take[rows])
+            R[rows], t[rows] = T.R, T.t
+            skin = surface.vertices(body[take[rows]])
+            contact[rows, : CONTACTS - len(FOOT_PATCHES)] = body_contact(skin, shape, T, within_m).float()
+        contact[:, CONTACTS - len(FOOT_PATCHES) :] = foot_patches(recording)[take].float()
+        floor = recording.floor.height[take] if recording.floor is not None else torch.zeros(len(take))
+        wearer = floor.float(), motion.skeleton, body_size(motion.skeleton)
+        truth = Body(motion.R_parent_joint[take], motion.t_world_root[take])
+        return cls(points, *wearer, truth, contact, objects, active, Rigid(R, t))
 
 
 class EchoContent(Content):
@@ -176,7 +168,7 @@ class EchoContent(Content):
         recording = RecordingFile(store.path_of(name)).load()
         file = recording.environment if self.objects else None
         environment = None if file is None else _environment(store.root / file)
-        return echo_track(recording, environment, self._reader, every, self.within_m)
+        return EchoTrack.read(recording, environment, self._reader, every, self.within_m)
 
     def cut(self, track: EchoTrack, start: int, frames: int, every: int, windows: Windows) -> Cut:
         latest = max(frames // every - windows.window, 0)
@@ -184,10 +176,7 @@ class EchoContent(Content):
         return Cut(start // every, windows.window, length, windows.stride, latest=latest, stretch=windows.stretch)
 
     def read(self, track: EchoTrack, cut: Cut, random: Draws) -> Window:
-        points = {"R_world_point": track.points.R_world_point, "t_world_point": track.points.t_world_point}
-        true = {
-            "R_parent_joint": track.body.R_parent_joint,
-            "t_world_root": track.body.t_world_root,
+        true = track.body._asdict() | {
             "contact": track.contact,
             "R_world_object": track.T_world_object.R,
             "t_world_object": track.T_world_object.t,
@@ -198,7 +187,7 @@ class EchoContent(Content):
         for name in ("R_world_object", "t_world_object"):
             # Nothing is between the poses of two objects.
             values[name][changes] = true[name][cut.frames[changes]]
-        sensed = points | {"floor_height": track.floor_height}
+        sensed = track.points._asdict() | {"floor_height": track.floor_height}
         values |= {name: cut.take(name, part, sensed=True) for name, part in sensed.items()}
         values |= {"size": track.size, "t_parent_joint": track.skeleton.t_parent_joint}
         return Window(values, track.twins)
@@ -210,10 +199,7 @@ class EchoContent(Content):
         """
         active = track.active[cut.frames]
         nothing = (torch.zeros(self.features.object_condition_size), torch.zeros(3), torch.zeros(3, 3))
-        shapes = [
-            (shape.code_mirrored if window.mirrored else shape.code, shape.mean, shape.spread)
-            for shape in track.objects
-        ]
+        shapes = [(s.code_mirrored if window.mirrored else s.code, s.mean, s.spread) for s in track.objects]
         code, mean, spread = (torch.stack(rows)[active] for rows in zip(*shapes, nothing))
         if window.mirrored:
             flip = torch.tensor(MIRROR)

@@ -8,14 +8,13 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
+from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.tracking.anchor import anchor
 
 CUE_SMOOTHING = 1e-5
 """Smoothing constant of the cue distances √(d² + ε), in rad² or m²: distances within the detectors' noise act
@@ -26,6 +25,14 @@ get stuck."""
 SOLVERS = ("lbfgs", "adam")
 
 
+class Body(NamedTuple):
+    """A batch of motion windows, anchored to the measured head poses."""
+
+    R_parent_joint: Float[Tensor, "batch time joint 3 3"]
+    T_world_joint: Rigid
+    contact: Float[Tensor, "batch time foot"]
+
+
 class PixelCue(NamedTuple):
     """2D observations of one joint in the egocentric image (φ_E)."""
 
@@ -33,6 +40,17 @@ class PixelCue(NamedTuple):
     pixels: Float[Tensor, "batch time 2"]
     confidence: Float[Tensor, "batch time"]
     """Confidence of each observation; 0 where the joint was not observed."""
+
+    def error(self, body: Body, seen: "Seen") -> Float[Tensor, "batch time"]:
+        """Reprojection error ‖μ − π(C, p)‖ over the focal length (rad near the axis; eq. 5, φ_E); 0 behind the camera."""
+        assert seen.camera is not None
+        assert seen.T_head_cam is not None
+        T_world_cam = seen.T_world_head @ seen.T_head_cam
+        p_cam = (T_world_cam.R.mT @ (body.T_world_joint.t[:, :, self.joint] - T_world_cam.t)[..., None])[..., 0]
+        pixels, _ = seen.camera.project(p_cam)
+        focal = pixels.new_tensor([seen.camera.fx, seen.camera.fy])
+        ahead = p_cam[..., 2] > 0.05
+        return _norm((pixels - self.pixels) / focal) * self.confidence * ahead
 
 
 class PlaceCue(NamedTuple):
@@ -42,12 +60,22 @@ class PlaceCue(NamedTuple):
     t_world: Float[Tensor, "batch time 3"]
     confidence: Float[Tensor, "batch time"]
 
+    def error(self, body: Body) -> Float[Tensor, "batch time"]:
+        """Distance (m) between the joint and its observed position."""
+        return _norm(body.T_world_joint.t[:, :, self.joint] - self.t_world) * self.confidence
+
 
 class PoseCue(NamedTuple):
     """Local joint rotations observed by another wearer's camera (φ_T); the root is ignored."""
 
     R_parent_joint: Float[Tensor, "batch time joint 3 3"]
     confidence: Float[Tensor, "batch time joint"]
+
+    def error(self, body: Body) -> Float[Tensor, "batch time"]:
+        """Σ_j w_j ‖τ_j − q_j‖ over all joints but the root (eq. 5, φ_T), on rotation matrices."""
+        difference = body.R_parent_joint[:, :, 1:] - self.R_parent_joint[:, :, 1:]
+        distance = _norm(rearrange(difference, "batch time joint row column -> batch time joint (row column)"))
+        return (distance * self.confidence[:, :, 1:]).mean(-1)
 
 
 class Seen(NamedTuple):
@@ -61,24 +89,16 @@ class Seen(NamedTuple):
     poses: tuple[PoseCue, ...]
 
 
-class Body(NamedTuple):
-    """A batch of motion windows, anchored to the measured head poses."""
-
-    R_parent_joint: Float[Tensor, "batch time joint 3 3"]
-    T_world_joint: Rigid
-    contact: Float[Tensor, "batch time foot"]
-
-
 @dataclass(frozen=True)
 class LatentWeights:
     """Weights of the energy terms; each term is a mean over the frames that it applies to."""
 
     pixel: float = 1.0
-    """Weight of `pixel_error`, per radian of view angle."""
+    """Weight of `PixelCue.error`, per radian of view angle."""
     place: float = 1.0
-    """Weight of `place_error`, per metre."""
+    """Weight of `PlaceCue.error`, per metre."""
     pose: float = 0.3
-    """Weight of `pose_error`, per unit of distance between rotation matrices."""
+    """Weight of `PoseCue.error`, per unit of distance between rotation matrices."""
     stay: float = 1.0
     """Weight of the latents' mean squared change from their start (L_reg, which the paper does not define)."""
     contact: float = 0.1
@@ -106,37 +126,6 @@ class LatentSolution:
 
     latent: Float[Tensor, "batch channel short"]
     history: list[dict[str, float]] = field(default_factory=list)
-    evaluations: int = 0
-    """Number of evaluations of the energy and its gradient."""
-
-
-def anchored_body(skeleton: Skeleton, R_parent_joint: Tensor, contact: Tensor, T_world_head: Rigid) -> Body:
-    """The body of a motion, moved so that its head coincides with the measured head."""
-    R, T_world_joint = anchor(skeleton, R_parent_joint, T_world_head)
-    return Body(R, T_world_joint, contact)
-
-
-def pixel_error(body: Body, seen: Seen, cue: PixelCue) -> Float[Tensor, "batch time"]:
-    """Reprojection error ‖μ − π(C, p)‖ over the focal length (rad near the axis; eq. 5, φ_E); 0 behind the camera."""
-    assert seen.camera is not None
-    assert seen.T_head_cam is not None
-    T_world_cam = seen.T_world_head @ seen.T_head_cam
-    p_cam = (T_world_cam.R.mT @ (body.T_world_joint.t[:, :, cue.joint] - T_world_cam.t)[..., None])[..., 0]
-    pixels, _ = seen.camera.project(p_cam)
-    focal = pixels.new_tensor([seen.camera.fx, seen.camera.fy])
-    ahead = p_cam[..., 2] > 0.05
-    return _norm((pixels - cue.pixels) / focal) * cue.confidence * ahead
-
-
-def place_error(body: Body, cue: PlaceCue) -> Float[Tensor, "batch time"]:
-    """Distance (m) between a joint and its observed position."""
-    return _norm(body.T_world_joint.t[:, :, cue.joint] - cue.t_world) * cue.confidence
-
-
-def pose_error(body: Body, cue: PoseCue) -> Float[Tensor, "batch time"]:
-    """Σ_j w_j ‖τ_j − q_j‖ over all joints but the root (eq. 5, φ_T), on rotation matrices."""
-    difference = (body.R_parent_joint[:, :, 1:] - cue.R_parent_joint[:, :, 1:]).flatten(-2)
-    return (_norm(difference) * cue.confidence[:, :, 1:]).mean(-1)
 
 
 def contact_slip(body: Body, feet: list[int], fps: float) -> Float[Tensor, "batch time"]:
@@ -163,9 +152,9 @@ def energy_terms(
         "contact": weights.contact * contact_slip(body, feet, fps).mean(1).sum(),
     }
     for name, weight, errors in (
-        ("pixel", weights.pixel, [(pixel_error(body, seen, cue), cue.confidence) for cue in seen.pixels]),
-        ("place", weights.place, [(place_error(body, cue), cue.confidence) for cue in seen.places]),
-        ("pose", weights.pose, [(pose_error(body, cue), cue.confidence.amax(-1)) for cue in seen.poses]),
+        ("pixel", weights.pixel, [(cue.error(body, seen), cue.confidence) for cue in seen.pixels]),
+        ("place", weights.place, [(cue.error(body), cue.confidence) for cue in seen.places]),
+        ("pose", weights.pose, [(cue.error(body), cue.confidence.amax(-1)) for cue in seen.poses]),
     ):
         if errors:
             observed = torch.stack([(confidence > 0).sum(1).clamp_min(1) for _, confidence in errors])
@@ -181,7 +170,6 @@ def solve_latent(
     """Minimise the sum of the energy's terms over the latents, starting at `start`."""
     latent = start.detach().clone(memory_format=torch.contiguous_format).requires_grad_()
     history: list[dict[str, float]] = []
-    evaluations = 0
     if solver.kind == "adam":
         optimizer: torch.optim.Optimizer = torch.optim.Adam([latent], lr=solver.learning_rate)
         iterations = solver.steps
@@ -198,19 +186,17 @@ def solve_latent(
         iterations = 1
 
     def closure() -> Tensor:
-        nonlocal evaluations
         optimizer.zero_grad()
         terms = energy(latent)
         total = torch.stack(list(terms.values())).sum()
         total.backward()
-        evaluations += 1
         history.append({name: value.item() for name, value in terms.items()} | {"total": total.item()})
         return total
 
     with torch.enable_grad():
         for _ in range(iterations):
             optimizer.step(closure)
-    return LatentSolution(latent.detach(), history, evaluations)
+    return LatentSolution(latent.detach(), history)
 
 
 def _norm(value: Float[Tensor, "*batch axis"], epsilon: float = CUE_SMOOTHING) -> Float[Tensor, "*batch"]:

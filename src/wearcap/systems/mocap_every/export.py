@@ -11,10 +11,8 @@ from wearcap.errors import WearcapError
 from wearcap.runtime.describe import skeleton_from_json, skeleton_to_json
 from wearcap.runtime.graphs import Exports, Run
 from wearcap.systems.mocap_every.features import WatchFeatures
-from wearcap.systems.mocap_every.model import Estimate, WatchEstimator, estimator_graph
-from wearcap.systems.mocap_every.pipeline import MocapEvery
-
-SETTINGS = ("stride", "lookahead", "floor", "anchor", "mirror_average")
+from wearcap.systems.mocap_every.model import Estimate, WatchEstimator
+from wearcap.systems.mocap_every.pipeline import SETTINGS, MocapEvery
 
 
 def exports(pipeline: MocapEvery) -> Exports:
@@ -23,7 +21,7 @@ def exports(pipeline: MocapEvery) -> Exports:
     Raises WearcapError for a network that is exported already.
     """
     net, features = pipeline.net, pipeline.features
-    if isinstance(net, ExportedEstimator):
+    if isinstance(net, _ExportedEstimator):
         raise WearcapError("a network that is exported already", expected="one of a checkpoint")
     about = {
         "features": asdict(features),
@@ -34,10 +32,10 @@ def exports(pipeline: MocapEvery) -> Exports:
         "skeleton": skeleton_to_json(pipeline.skeleton),
         "settings": {name: getattr(pipeline, name) for name in SETTINGS},
     }
-    return Exports("mocap_every", {"network": estimator_graph(net, features.size)}, about)
+    return Exports("mocap_every", {"network": net.graph(features.size)}, about)
 
 
-class ExportedEstimator(WatchEstimator):
+class _ExportedEstimator(WatchEstimator):
     """An estimator whose weights are in an exported file, run on the CPU."""
 
     def __init__(self, run: Run, window: int):
@@ -52,7 +50,7 @@ class ExportedEstimator(WatchEstimator):
 def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], about: dict[str, Any]) -> MocapEvery:
     """The pipeline of an exported model."""
     return MocapEvery(
-        ExportedEstimator(runs["model"], about["window"]),
+        _ExportedEstimator(runs["model"], about["window"]),
         WatchFeatures(**about["features"]),
         skeleton_from_json(about["skeleton"]),
         about["fps"],

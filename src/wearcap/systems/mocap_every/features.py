@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
@@ -12,6 +13,7 @@ from wearcap.body.skeleton import FOOT_JOINTS, MIRROR, WRISTS, Skeleton
 from wearcap.data.features import LIMBS, first_repeated
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
 from wearcap.sensors.imu import acceleration
 
 ENDS = (*WRISTS, *FOOT_JOINTS)
@@ -34,29 +36,17 @@ class Sensed(NamedTuple):
     t_world_wrist: Float[Tensor, "*batch time wrist 3"]
     """Positions (m) of tracked hands (AvatarPoser's protocol 1); zeros for watches."""
 
-
-def mirrored(sensed: Sensed) -> Sensed:
-    """The inputs mirrored, left and right swapped."""
-    flip = sensed.t_world_head.new_tensor(MIRROR)
-    turn = torch.outer(flip, flip)
-    return Sensed(
-        sensed.R_world_head * turn,
-        sensed.t_world_head * flip,
-        sensed.R_world_wrist.flip(-3) * turn,
-        sensed.acc_world_wrist.flip(-2) * flip,
-        sensed.t_world_wrist.flip(-2) * flip,
-    )
-
-
-class Canonical(NamedTuple):
-    """Pose in the world of each window's canonical frame: one for the whole window, or one per time step."""
-
-    R: Float[Tensor, "batch #time 3 3"]
-    t: Float[Tensor, "batch #time 3"]
-
-    def last(self, count: int) -> "Canonical":
-        """The poses of the last `count` time steps."""
-        return Canonical(self.R[:, -count:], self.t[:, -count:])
+    def mirrored(self) -> "Sensed":
+        """The inputs mirrored, left and right swapped."""
+        flip = self.t_world_head.new_tensor(MIRROR)
+        turn = torch.outer(flip, flip)
+        return Sensed(
+            self.R_world_head * turn,
+            self.t_world_head * flip,
+            self.R_world_wrist.flip(-3) * turn,
+            self.acc_world_wrist.flip(-2) * flip,
+            self.t_world_wrist.flip(-2) * flip,
+        )
 
 
 def synthetic_wrists(
@@ -73,10 +63,11 @@ def synthetic_wrists(
     body = forward_kinematics(skeleton, R_parent_joint, t_world_root)
     wrists = skeleton.indices(*WRISTS)
     t_world_wrist = body.t[:, wrists]
-    acc = acceleration(t_world_wrist.flatten(1), fps, ACCELERATION_FRAMES * every)
+    paths = rearrange(t_world_wrist, "time wrist xyz -> time (wrist xyz)")
+    acc = acceleration(paths, fps, ACCELERATION_FRAMES * every)
     frames = torch.arange(len(acc))[:, None] + every * torch.arange(-3, 4)
     acc = acc[frames.clamp(0, len(acc) - 1)].mean(1)
-    return body.R[:, wrists], acc.unflatten(1, (-1, 3)), t_world_wrist
+    return body.R[:, wrists], rearrange(acc, "time (wrist xyz) -> time wrist xyz", xyz=3), t_world_wrist
 
 
 @dataclass(frozen=True)
@@ -122,29 +113,28 @@ class WatchFeatures:
         """Number of output features: root translation, and 6D rotations of all joints."""
         return 3 + 6 * self.joints
 
-    def canonical(self, sensed: Sensed, floor_height: Float[Tensor, "batch time"]) -> Canonical:
-        """The windows' canonical frames."""
+    def canonical(self, sensed: Sensed, floor_height: Float[Tensor, "batch time"]) -> Rigid:
+        """World poses of the windows' canonical frames, one per window or time step: R "batch #time 3 3"."""
         if self.frame == "own":
             heading = rotation.about_axis("z", rotation.yaw_of(sensed.R_world_head))
-            return Canonical(heading, sensed.t_world_head)
+            return Rigid(heading, sensed.t_world_head)
         R, t = sensed.R_world_head[:, :1], sensed.t_world_head[:, :1]
         if self.frame == "heading":
-            return Canonical(rotation.about_axis("z", rotation.yaw_of(R)), t)
+            return Rigid(rotation.about_axis("z", rotation.yaw_of(R)), t)
         if self.frame == "world":
             up = t.new_tensor([0.0, 0.0, 1.0])
-            return Canonical(torch.eye(3).to(R).expand_as(R), floor_height[:, :1, None] * up)
-        return Canonical(R, t)
+            return Rigid(torch.eye(3).to(R).expand_as(R), floor_height[:, :1, None] * up)
+        return Rigid(R, t)
 
     def encode(
         self,
         sensed: Sensed,
         floor_height: Float[Tensor, "batch time"],
         size: Float[Tensor, "batch limb"],
-        canonical: Canonical,
+        canonical: Rigid,
     ) -> Float[Tensor, "batch time feature"]:
         """Input features of windows in their canonical frames; `size` holds the wearers' `body_size` (m)."""
-        R, t = canonical
-        R_canonical_world = R.mT
+        R_canonical_world, t = canonical.R.mT, canonical.t
         R_canonical_head = R_canonical_world @ sensed.R_world_head
         R_canonical_wrist = R_canonical_world[:, :, None] @ sensed.R_world_wrist
         vectors = sensed.acc_world_wrist if self.wrists == "watches" else sensed.t_world_wrist - t[:, :, None]
@@ -163,9 +153,9 @@ class WatchFeatures:
             parts.append(size[:, None].expand(-1, sensed.t_world_head.shape[1], -1))
         return torch.cat(parts, -1)
 
-    def _path(self, sensed: Sensed, canonical: Canonical) -> Float[Tensor, "batch time value"]:
+    def _path(self, sensed: Sensed, canonical: Rigid) -> Float[Tensor, "batch time value"]:
         """Head position (m); with frame "own" its velocity (m/s) and angular velocity (rad/s, in head axes)."""
-        R, t = canonical
+        R, t = canonical.R, canonical.t
         if self.frame != "own":
             return (R.mT @ (sensed.t_world_head - t)[..., None])[..., 0]
         velocity = first_repeated(sensed.t_world_head.diff(dim=1)) * self.fps
@@ -177,34 +167,27 @@ class WatchFeatures:
         R_parent_joint: Float[Tensor, "batch time joint 3 3"],
         t_world_root: Float[Tensor, "batch time 3"],
         sensed: Sensed,
-        canonical: Canonical,
+        canonical: Rigid,
     ) -> Float[Tensor, "batch time motion"]:
         """Target features: root translation and local rotations, with the root's pose in the canonical frame."""
-        R, t = canonical
+        R, t = canonical.R, canonical.t
         root = (R.mT @ (t_world_root - t)[..., None])[..., 0] - self.origin(sensed, canonical)
         turned = torch.cat([(R.mT @ R_parent_joint[:, :, 0])[:, :, None], R_parent_joint[:, :, 1:]], 2)
         return torch.cat([root, rotation.rot6d_from_matrix(turned).flatten(-2)], -1)
 
     def decode_motion(
-        self, motion: Float[Tensor, "batch predicted motion"], sensed: Sensed, canonical: Canonical
+        self, motion: Float[Tensor, "batch predicted motion"], sensed: Sensed, canonical: Rigid
     ) -> tuple[Float[Tensor, "batch predicted joint 3 3"], Float[Tensor, "batch predicted 3"]]:
-        """Rotations and root translation (m) of the window's last frames, still in the canonical frame."""
-        R = rotation.matrix_from_rot6d(motion[..., 3:].unflatten(-1, (-1, 6)))
-        return R, motion[..., :3] + self.origin(sensed, canonical)[:, -motion.shape[1] :]
+        """Local rotations and root translation (m) of the window's last frames, in the world."""
+        count = motion.shape[1]
+        R_parent_joint = rotation.matrix_from_rot6d(motion[..., 3:].unflatten(-1, (-1, 6)))
+        t_root = motion[..., :3] + self.origin(sensed, canonical)[:, -count:]
+        R, t = canonical.R[:, -count:], canonical.t[:, -count:]
+        turned = torch.cat([(R @ R_parent_joint[:, :, 0])[:, :, None], R_parent_joint[:, :, 1:]], 2)
+        return turned, t + (R @ t_root[..., None])[..., 0]
 
-    def origin(self, sensed: Sensed, canonical: Canonical) -> Float[Tensor, "batch time 3"]:
+    def origin(self, sensed: Sensed, canonical: Rigid) -> Float[Tensor, "batch time 3"]:
         """Origin of the predicted translations, in the canonical frame (m)."""
         if self.root == "window":
             return torch.zeros_like(sensed.t_world_head)
         return (canonical.R.mT @ (sensed.t_world_head - canonical.t)[..., None])[..., 0]
-
-
-def to_world(
-    R_parent_joint: Float[Tensor, "batch predicted joint 3 3"],
-    t_root: Float[Tensor, "batch predicted 3"],
-    canonical: Canonical,
-) -> tuple[Float[Tensor, "batch predicted joint 3 3"], Float[Tensor, "batch predicted 3"]]:
-    """Transform a motion of the windows' last frames from their canonical frames to the world."""
-    R, t = canonical.last(t_root.shape[1])
-    turned = torch.cat([(R @ R_parent_joint[:, :, 0])[:, :, None], R_parent_joint[:, :, 1:]], 2)
-    return turned, t + (R @ t_root[..., None])[..., 0]

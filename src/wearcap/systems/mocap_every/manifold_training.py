@@ -9,8 +9,7 @@ from wearcap.body.skeleton import FEET, Skeleton
 from wearcap.data.statistics import drawn_batches, standardize
 from wearcap.data.windows import Windows
 from wearcap.metrics.position import mpjpe_cm
-from wearcap.systems.mocap_every.manifold import MotionManifold
-from wearcap.systems.mocap_every.manifold_features import Posed, decode_window, encode_window, origin_of
+from wearcap.systems.mocap_every.manifold import MotionManifold, Posed
 from wearcap.systems.mocap_every.training_windows import WatchWindow
 from wearcap.training.base import OptimizerOf, SchedulerOf, Training
 
@@ -37,17 +36,17 @@ class ManifoldTraining(Training):
 
     def set_statistics(self, dataset: Windows, limit: int = 1000) -> None:
         (batch,) = drawn_batches(dataset, limit)
-        window = _posed(batch)
-        standardize(self.net.normalizer, encode_window(window, origin_of(window)))
+        window = Posed(batch.R_parent_joint, batch.t_world_root, batch.foot_contact)
+        standardize(self.net.normalizer, window.encode(window.origin()))
 
     def terms(self, batch: WatchWindow) -> dict[str, Tensor]:
         """Unweighted loss terms of a batch, and the mean joint error (cm)."""
-        window = _posed(batch)
-        origin = origin_of(window)
-        X = encode_window(window, origin)
+        window = Posed(batch.R_parent_joint, batch.t_world_root, batch.foot_contact)
+        origin = window.origin()
+        X = window.encode(origin)
         reconstructed = self.net(X)
         error = (reconstructed - X).abs()
-        joints, joints_true = (self._joints(decode_window(x, origin), batch) for x in (reconstructed, X))
+        joints, joints_true = (self._joints(Posed.decode(x, origin), batch) for x in (reconstructed, X))
         error_m = joints - joints_true
         return {
             "contact": error[..., :FEET].mean(),
@@ -61,7 +60,3 @@ class ManifoldTraining(Training):
     def _joints(self, window: Posed, batch: WatchWindow) -> Tensor:
         offsets = batch.t_parent_joint[:, None]
         return forward_kinematics(self.skeleton, window.R_parent_joint, window.t_world_root, offsets).t
-
-
-def _posed(batch: WatchWindow) -> Posed:
-    return Posed(batch.R_parent_joint, batch.t_world_root, batch.foot_contact)

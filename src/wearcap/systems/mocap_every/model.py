@@ -35,6 +35,12 @@ class WatchEstimator(nn.Module):
         """Predict from raw (not normalised) features."""
         raise NotImplementedError
 
+    def graph(self, size: int) -> Graph:
+        """The network as a graph of unnormalised features, `size` per frame."""
+        normalizer, random = self.feature_normalizer, torch.Generator().manual_seed(0)
+        noise = torch.randn(2, self.window, size, generator=random)
+        return Graph(_EstimatorOutput(self), {"features": normalizer.mean.cpu() + normalizer.scale.cpu() * noise})
+
 
 class TwoStageEstimator(WatchEstimator):
     """Two transformer encoders in sequence (the paper: width 1280, 4 layers, 10 heads, MLP heads of 256).
@@ -148,7 +154,7 @@ class LastPoseEstimator(WatchEstimator):
 TrainedEstimator = TwoStageEstimator | LastPoseEstimator
 
 
-class EstimatorOutput(nn.Module):
+class _EstimatorOutput(nn.Module):
     """Motion and contact logits of an estimator's last frames, in one tensor."""
 
     def __init__(self, net: WatchEstimator):
@@ -158,10 +164,3 @@ class EstimatorOutput(nn.Module):
     def forward(self, features: Float[Tensor, "batch window feature"]) -> Float[Tensor, "batch predicted value"]:
         output = self.net(features)
         return torch.cat([output.motion, output.contact_logit], -1)
-
-
-def estimator_graph(net: WatchEstimator, size: int) -> Graph:
-    """An estimator as a graph of unnormalised features, `size` per frame."""
-    normalizer, random = net.feature_normalizer, torch.Generator().manual_seed(0)
-    noise = torch.randn(2, net.window, size, generator=random)
-    return Graph(EstimatorOutput(net), {"features": normalizer.mean.cpu() + normalizer.scale.cpu() * noise})

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
+from einops import repeat
 from jaxtyping import Float
 from torch import Tensor
 
@@ -21,7 +22,7 @@ from wearcap.scene.floor_update import FloorFixed, FloorFollow, FloorFollower, F
 from wearcap.sensors.watches import watches_at
 from wearcap.systems.mocap_every.energy import LatentSolution
 from wearcap.systems.mocap_every.features import Sensed, WatchFeatures, synthetic_wrists
-from wearcap.systems.mocap_every.model import Estimate, WatchEstimator, estimator_graph
+from wearcap.systems.mocap_every.model import Estimate, WatchEstimator
 from wearcap.systems.mocap_every.visual_cues import VisualCues
 from wearcap.systems.mocap_every.windows import EstimatorWindows, FinalPoses
 from wearcap.tracking.anchor import anchored_to_head
@@ -29,6 +30,8 @@ from wearcap.tracking.floor import floor_from_points
 from wearcap.tracking.head_path import HeadPath, head_path
 
 FLOORS = ("follow", "update", "points", "fixed")
+SETTINGS = ("stride", "lookahead", "floor", "anchor", "mirror_average")
+"""Settings that a motion depends on; an exported model carries them along."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +92,7 @@ class MocapEvery(LearnedSystem):
         """Move the network to its device and set up its runtime, compiled or exported once."""
         self.net.to(self.device).eval()
         if self._run is None and self._backend != ("eager", "float32"):
-            self._run = run_of(estimator_graph(self.net, self.features.size), *self._backend)
+            self._run = run_of(self.net.graph(self.features.size), *self._backend)
 
     @torch.inference_mode()
     def motions(self, sources: Sequence[CaptureInput], seeds: Sequence[int]) -> list[Motion]:
@@ -109,14 +112,9 @@ class MocapEvery(LearnedSystem):
         # 2. end-effectors, contacts and poses, window by window; 3. floor height from the feet in contact
         output = [self._capture_stretch(recording, path, sensed, start, stop) for start, stop in path.stretches]
         whole = _bridged(output, path)
-        motion = Motion(
-            path.timestamps,
-            path.skeleton,
-            whole.R_parent_joint,
-            whole.t_world_root,
-            whole.contact_prob.repeat_interleave(2, -1),
-            provenance=self.settings(),
-        )
+        poses = path.timestamps, path.skeleton, whole.R_parent_joint, whole.t_world_root
+        contact_prob = repeat(whole.contact_prob, "time foot -> time (foot patch)", patch=2)
+        motion = Motion(*poses, contact_prob, provenance=self.settings())
         # 4. anchor the body to the measured head
         if self.anchor:
             motion = anchored_to_head(motion, path.T_world_head)
@@ -157,32 +155,33 @@ class MocapEvery(LearnedSystem):
         self, recording: Recording, path: HeadPath, sensed: Sensed, start: int, stop: int
     ) -> FinalPoses:
         """Run the sliding windows over the path's frames from `start` to `stop`."""
-        times = path.timestamps[start:stop]
-        floor = self._follower(recording, path, times[0].item())
-        windows, parts = EstimatorWindows(self, path.skeleton, floor), []
-        floor_height = self._floor_from_points(recording, path) if self.floor == "points" else None
-        seen_until = -torch.inf
+        if (track := recording.floor) is not None:  # the measured floor, the paper's h_0
+            initial_m = interpolate_clamped(track.timestamps, track.height, path.timestamps[start : start + 1])[
+                0
+            ].item()
+        else:
+            initial_m = path.floor_height[start].item()
+        floor, floor_height = self.follower(path.skeleton, initial_m), None
+        if self.floor == "points":  # below the head; from the head path where there are too few points
+            height = floor_from_points(recording.points, path.T_world_head.t, path.stature)
+            floor_height = path.floor_height if height is None else height
+        cloud = recording.points if self.floor in ("follow", "update") else None
+        if cloud is not None and cloud.first_seen is None:
+            floor.see(cloud.points_world)
+        windows, parts, seen_until = EstimatorWindows(self, path.skeleton, floor), [], -torch.inf
         for first in range(start, stop, self.stride):
             last = min(first + self.stride, stop)
-            seen_until = self._add_points(recording, floor, seen_until, path.timestamps[last - 1].item())
+            if cloud is not None and (when := cloud.first_seen) is not None:
+                until = path.timestamps[last - 1].item()
+                fresh, seen_until = (when > seen_until) & (when <= until), until
+                if fresh.any():
+                    floor.see(cloud.points_world[fresh])
             if floor_height is not None:
                 assert isinstance(floor, FloorFixed)
                 floor.height = floor_height[first].item()
             parts.append(windows.advance(Sensed(*(part[first:last] for part in sensed))))
         parts.append(windows.finish())
         return FinalPoses(*(torch.cat(part) for part in zip(*parts)))
-
-    def _follower(self, recording: Recording, path: HeadPath, time_s: float) -> FloorFollower:
-        """Floor follower of a stretch, started at the measured floor height (the paper's h_0) or, without one, at the
-        height estimated from the head path."""
-        track = recording.floor
-        if track is not None:
-            initial = interpolate_clamped(track.timestamps, track.height, torch.tensor([time_s], dtype=torch.float64))[
-                0
-            ].item()
-        else:
-            initial = path.floor_height[int(torch.searchsorted(path.timestamps, time_s))].item()
-        return self.follower(path.skeleton, initial)
 
     def follower(self, skeleton: Skeleton, initial_m: float) -> FloorFollower:
         """Floor follower of the configured kind, with an initial height (m)."""
@@ -212,14 +211,7 @@ class MocapEvery(LearnedSystem):
 
     def settings(self) -> dict[str, str]:
         """Settings that the motion depends on, for its provenance."""
-        return {
-            "pipeline": "mocap_every",
-            "stride": str(self.stride),
-            "lookahead": str(self.lookahead),
-            "floor": self.floor,
-            "anchor": str(self.anchor),
-            "mirror_average": str(self.mirror_average),
-        }
+        return {"pipeline": "mocap_every"} | {name: str(getattr(self, name)) for name in SETTINGS}
 
 
 def _bridged(output: list[FinalPoses], path: HeadPath) -> FinalPoses:

@@ -28,20 +28,7 @@ from wearcap.runtime.snapshot import classes_of
 from wearcap.scene import floor_update
 from wearcap.sensors import packets
 from wearcap.sensors import samples as sample_types
-from wearcap.sensors.packets import (
-    MAX_ACC_M_S2,
-    MAX_WAITING,
-    OFF_THE_CLOCK,
-    WRONG_TYPE,
-    Admitted,
-    Clock,
-    HeadInput,
-    connected,
-    owned,
-    rotation_fault,
-    time_fault,
-    values_fault,
-)
+from wearcap.sensors.packets import MAX_WAITING, Admitted, Clock, HeadInput
 from wearcap.sensors.samples import HeadSample, WatchSample
 from wearcap.sensors.watches import FILTER, MAX_GAP_S, filtered
 from wearcap.systems.mocap_every import features, windows
@@ -52,6 +39,8 @@ from wearcap.tracking import head_path
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.head_path import Chunk, HeadTrack
 
+_STATE = skeleton, motion_types, rigid, head_path, packets, sample_types, floor_update, features, windows
+"""Modules with the classes that a session's state consists of."""
 MAX_POINTS = 1_000_000
 """Capacity of the buffer of points that wait for a head pose; the oldest are dropped."""
 
@@ -139,14 +128,14 @@ class MocapEveryStream(WearerStream):
     def _rejoin(self, joint: str, time: float | None) -> None:
         """Keep the samples of a watch that belong to the clock starting at a time (s); None: drop all of them."""
         samples = self._samples[joint]
-        kept = [] if time is None else samples[connected([sample.timestamp for sample in samples], time)]
+        kept = [] if time is None else samples[packets.connected([sample.timestamp for sample in samples], time)]
         refused = self._clocks[joint].set(kept[-1].timestamp if kept else None)
         self._refuse(joint, refused if time is None else refused + len(samples) - len(kept))
         self._samples[joint] = kept
 
     def _refuse(self, joint: str, count: int) -> None:
         if count:
-            self._head_input.refuse(joint, OFF_THE_CLOCK, count)
+            self._head_input.refuse(joint, packets.OFF_THE_CLOCK, count)
 
     def take(self, sample: Any) -> None:
         """Take in one sample of the head camera or of a watch."""
@@ -156,7 +145,7 @@ class MocapEveryStream(WearerStream):
             case WatchSample() if sample.joint in self._samples:
                 self.watch(sample.joint, [sample])
             case _:
-                self._head_input.refuse("sample", WRONG_TYPE)
+                self._head_input.refuse("sample", packets.WRONG_TYPE)
 
     def watch(self, joint: str, samples: Sequence[WatchSample]) -> None:
         """Take in samples of a watch; repeated samples are ignored.
@@ -167,17 +156,27 @@ class MocapEveryStream(WearerStream):
             raise WearcapError(f"no watch on {joint!r}", expected=" or ".join(WRISTS))
         clock = self._clocks[joint]
         for sample in samples:
-            if fault := _fault(sample):
+            fault = packets.WRONG_TYPE
+            if isinstance(sample, WatchSample):
+                fault = packets.time_fault(sample.timestamp) or packets.rotation_fault(sample.R_world_imu)
+                fault = fault or packets.values_fault(sample.acc_world, (3,), packets.MAX_ACC_M_S2)
+            if fault:
                 self._head_input.refuse(joint, fault)
                 continue
-            sample = WatchSample(float(sample.timestamp), owned(sample.R_world_imu), owned(sample.acc_world))
+            sample = WatchSample(
+                float(sample.timestamp), packets.owned(sample.R_world_imu), packets.owned(sample.acc_world)
+            )
             admitted = clock.admit(sample.timestamp, sample, self._head_input.clock.newest)
             self._refuse(joint, admitted.refused)
             if admitted.begins:
                 first = bisect_left(self._samples[joint], admitted.packets[0][0], key=_time)
                 self._samples[joint] = self._samples[joint][: first if admitted.again else 0]
-            for _, accepted in admitted.packets:
-                _insert(self._samples[joint], accepted)
+            for time, accepted in admitted.packets:
+                kept = self._samples[joint]
+                index = bisect_left(kept, time, key=_time)
+                if index == len(kept) or kept[index].timestamp != time:
+                    kept.insert(index, accepted)
+                    del kept[:-MAX_WAITING]
 
     def poses(self, ended: bool = False) -> Motion | None:
         """Frames that became final since the last call; `ended`: no more input will come.
@@ -233,9 +232,8 @@ class MocapEveryStream(WearerStream):
         R, acc = self._watches(chunk, end_s)
         sensed = Sensed(T_world_head.R, T_world_head.t, R, acc, torch.zeros_like(acc))
         self._times = torch.cat([self._times, chunk.timestamps])
-        self._heads = Rigid(
-            *(torch.cat(part) for part in zip((self._heads.R, self._heads.t), (T_world_head.R, T_world_head.t)))
-        )
+        R_heads, t_heads = torch.cat([self._heads.R, T_world_head.R]), torch.cat([self._heads.t, T_world_head.t])
+        self._heads = Rigid(R_heads, t_heads)
         return motions + self._to_motion(self._windows.advance(sensed))
 
     def _watches(
@@ -244,13 +242,15 @@ class MocapEveryStream(WearerStream):
         """Wrist orientations and filtered accelerations of a chunk; the filter ignores times outside the stretch."""
         step = 1 / self.pipeline.fps
         frames = torch.arange(-(FILTER // 2), len(chunk.timestamps) + FILTER // 2, dtype=torch.float64)
-        around = chunk.timestamps[0] + step * frames
-        around = around.clamp(self._begin_s, end_s)
+        around = (chunk.timestamps[0] + step * frames).clamp(self._begin_s, end_s)
         streams = []
         for joint, samples in self._samples.items():
             if not samples or samples[-1].timestamp < chunk.timestamps[-1].item() - MAX_GAP_S:
                 self.silent += len(chunk.timestamps)
-                samples = self._static(samples, chunk)
+                # A static watch with its last orientation, around the chunk.
+                R = samples[-1].R_world_imu if samples else torch.eye(3)
+                ends_s = chunk.timestamps[0].item() - 1.0, chunk.timestamps[-1].item() + 1.0
+                samples = [WatchSample(time_s, R, torch.zeros(3)) for time_s in ends_s]
             elif len(samples) == 1:
                 samples = [samples[0]._replace(timestamp=samples[0].timestamp - step), *samples]
             streams.append(
@@ -267,14 +267,6 @@ class MocapEveryStream(WearerStream):
             self._samples[joint] = [s for s in kept if s.timestamp >= oldest_s] or kept[-1:]
         return filtered(streams, chunk.timestamps, around, step)
 
-    def _static(self, samples: list[WatchSample], chunk: Chunk) -> list[WatchSample]:
-        """Samples of a static watch with its last orientation, around a chunk."""
-        R = samples[-1].R_world_imu if samples else torch.eye(3)
-        return [
-            WatchSample(time, R, torch.zeros(3))
-            for time in (chunk.timestamps[0].item() - 1.0, chunk.timestamps[-1].item() + 1.0)
-        ]
-
     def _to_motion(self, output: FinalPoses) -> list[Motion]:
         """Final frames as a motion with their times, anchored to the head; an empty list for no frames."""
         count = len(output.t_world_root)
@@ -282,14 +274,9 @@ class MocapEveryStream(WearerStream):
             return []
         times, heads = self._times[:count], self._heads[:count]
         self._times, self._heads = self._times[count:], self._heads[count:]
-        motion = Motion(
-            times,
-            self.wearing.skeleton,
-            output.R_parent_joint,
-            output.t_world_root,
-            output.contact_prob.repeat_interleave(2, -1),
-            provenance=self.pipeline.settings(),
-        )
+        poses = times, self.wearing.skeleton, output.R_parent_joint, output.t_world_root
+        contact_prob = output.contact_prob.repeat_interleave(2, -1)
+        motion = Motion(*poses, contact_prob, provenance=self.pipeline.settings())
         return [anchored_to_head(motion, heads) if self.pipeline.anchor else motion]
 
 
@@ -297,18 +284,7 @@ class MocapEverySession(Session):
     """A streaming capture of one or several wearers, each by a `MocapEveryStream`."""
 
     stream_class = MocapEveryStream
-    classes = classes_of(
-        skeleton,
-        motion_types,
-        rigid,
-        head_path,
-        packets,
-        sample_types,
-        floor_update,
-        features,
-        windows,
-        sys.modules[__name__],
-    )
+    classes = classes_of(*_STATE, sys.modules[__name__])
 
     def __init__(self, pipeline: MocapEvery, wearers: Sequence[Wearing]):
         """Raises WearcapError without wearers."""
@@ -325,22 +301,3 @@ SESSION = MocapEverySession
 
 def _time(sample: WatchSample) -> float:
     return sample.timestamp
-
-
-def _fault(sample: object) -> str | None:
-    """Why a watch's sample is invalid; None for a valid one."""
-    if not isinstance(sample, WatchSample):
-        return WRONG_TYPE
-    return (
-        time_fault(sample.timestamp)
-        or rotation_fault(sample.R_world_imu)
-        or values_fault(sample.acc_world, (3,), MAX_ACC_M_S2)
-    )
-
-
-def _insert(samples: list[WatchSample], sample: WatchSample) -> None:
-    """Insert a sample in order of time, unless there is one with the same timestamp."""
-    index = bisect_left(samples, sample.timestamp, key=_time)
-    if index == len(samples) or samples[index].timestamp != sample.timestamp:
-        samples.insert(index, sample)
-        del samples[:-MAX_WAITING]

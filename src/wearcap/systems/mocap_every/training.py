@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import torch
+from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
@@ -11,7 +12,8 @@ from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
 from wearcap.data.statistics import drawn_batches, standardize
 from wearcap.data.windows import Windows
-from wearcap.systems.mocap_every.features import ENDS, Canonical, WatchFeatures, to_world
+from wearcap.geometry.rigid import Rigid
+from wearcap.systems.mocap_every.features import ENDS, WatchFeatures
 from wearcap.systems.mocap_every.model import TrainedEstimator
 from wearcap.systems.mocap_every.pipeline import MocapEvery
 from wearcap.systems.mocap_every.training_windows import WatchWindow
@@ -57,16 +59,14 @@ class WatchRegression(Training):
     def set_statistics(self, dataset: Windows, limit: int = 1500) -> None:
         (batch,) = drawn_batches(dataset, limit)
         features, motion, canonical = self._inputs(batch)
-        ends = self._ends_from_world(
-            self._joints(motion, batch, canonical)[:, :, self._ends], batch, canonical
-        ).flatten(-2)
+        ends = self.ends_from_world(self._joints(motion, batch, canonical)[:, :, self._ends], batch, canonical)
         standardize(self.net.feature_normalizer, features)
         standardize(self.net.motion_normalizer, motion)
-        standardize(self.net.ends_normalizer, ends)
+        standardize(self.net.ends_normalizer, rearrange(ends, "batch time end xyz -> batch time (end xyz)"))
 
     def _inputs(
         self, batch: WatchWindow
-    ) -> tuple[Float[Tensor, "batch time feature"], Float[Tensor, "batch time motion"], Canonical]:
+    ) -> tuple[Float[Tensor, "batch time feature"], Float[Tensor, "batch time motion"], Rigid]:
         """Input features, ground-truth motion features, and the windows' canonical frames."""
         canonical = self.features.canonical(batch.sensed, batch.floor_height)
         features = self.features.encode(batch.sensed, batch.floor_height, batch.size, canonical)
@@ -74,23 +74,16 @@ class WatchRegression(Training):
         return features, true, canonical
 
     def _joints(
-        self, motion: Float[Tensor, "batch predicted motion"], batch: WatchWindow, canonical: Canonical
+        self, motion: Float[Tensor, "batch predicted motion"], batch: WatchWindow, canonical: Rigid
     ) -> Float[Tensor, "batch predicted joint 3"]:
         """Joint positions (m) in the world, from motion features."""
-        R, t = to_world(*self.features.decode_motion(motion, batch.sensed, canonical), canonical)
+        R, t = self.features.decode_motion(motion, batch.sensed, canonical)
         return forward_kinematics(self.skeleton, R, t, batch.t_parent_joint[:, None]).t
 
-    def _ends_to_world(
-        self, ends: Float[Tensor, "batch time end 3"], batch: WatchWindow, canonical: Canonical
+    def ends_from_world(
+        self, ends: Float[Tensor, "batch time end 3"], batch: WatchWindow, canonical: Rigid
     ) -> Float[Tensor, "batch time end 3"]:
-        """Predicted end-effectors (m), transformed to the world."""
-        origin = self.features.origin(batch.sensed, canonical)
-        return canonical.t[:, :, None] + (canonical.R[:, :, None] @ (ends + origin[:, :, None])[..., None])[..., 0]
-
-    def _ends_from_world(
-        self, ends: Float[Tensor, "batch time end 3"], batch: WatchWindow, canonical: Canonical
-    ) -> Float[Tensor, "batch time end 3"]:
-        """The inverse of `_ends_to_world`."""
+        """End-effectors (m, world) as the first stage predicts them: in the canonical frame, from its origin."""
         origin = self.features.origin(batch.sensed, canonical)
         return (canonical.R.mT[:, :, None] @ (ends - canonical.t[:, :, None])[..., None])[..., 0] - origin[:, :, None]
 
@@ -102,7 +95,8 @@ class WatchRegression(Training):
         motion, true = output.motion.float(), true[:, -last:]
         joints, joints_true = (self._joints(each, batch, canonical) for each in (motion, true))
         error = motion - true
-        rotation_error, distance = _norm(error[..., 3:].unflatten(-1, (-1, 6))), _norm(joints - joints_true)
+        rotation_error = _norm(rearrange(error[..., 3:], "batch time (joint entry) -> batch time joint entry", entry=6))
+        distance = _norm(joints - joints_true)
         terms = {
             "root": (_norm(error[..., :3]) + rotation_error[..., 0]).mean(),
             "rotation": rotation_error[..., 1:].mean(),
@@ -113,7 +107,10 @@ class WatchRegression(Training):
             velocity = _norm((joints - joints_true).diff(dim=1) * self.fps)
             terms |= {"foot_velocity": velocity[:, :, self._ends[2:]].mean(), "velocity": velocity.mean()}
         if output.ends is not None:
-            ends = self._ends_to_world(output.ends.float().unflatten(-1, (-1, 3)), batch, canonical)
+            # Predicted end-effectors (m), transformed to the world.
+            ends = rearrange(output.ends.float(), "batch time (end xyz) -> batch time end xyz", xyz=3)
+            ends = ends + self.features.origin(batch.sensed, canonical)[:, :, None]
+            ends = canonical.t[:, :, None] + (canonical.R[:, :, None] @ ends[..., None])[..., 0]
             terms["mid"] = _norm(ends - joints_true[:, :, self._ends]).mean()
             terms["consistency"] = _norm(joints[:, :, self._ends] - ends).mean()
         return terms

@@ -1,37 +1,38 @@
-"""Editing of a captured motion within the motion manifold to fit visual cues (MocapEvery §3.4)."""
+"""Editing of a captured motion within the motion manifold to fit visual cues (MocapEvery §3.4): 2D and 3D keypoints, and
+the views of other wearers' cameras, whose recordings share a session name, a clock and a world (φ_T)."""
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import permutations
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from einops import rearrange, reduce
 from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from wearcap.body.skeleton import FEET, FOOT_JOINTS, Skeleton
 from wearcap.errors import WearcapError
+from wearcap.files import atomic_path
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import nearest_frames
+from wearcap.io.formats.motion_npz import read_motion, write_motion
+from wearcap.io.formats.npz import read_npz, require
 from wearcap.models.checkpoint import load_trained
 from wearcap.recording import Motion, Recording
 from wearcap.recording.recording import Cue
-from wearcap.systems.mocap_every.energy import (
-    Body,
-    LatentSolution,
-    LatentSolver,
-    LatentWeights,
-    PixelCue,
-    PlaceCue,
-    PoseCue,
-    Seen,
-    anchored_body,
-    energy_terms,
-    solve_latent,
-)
-from wearcap.systems.mocap_every.manifold import MotionManifold
-from wearcap.systems.mocap_every.manifold_features import Posed, decode_window, encode_window, origin_of
-from wearcap.tracking.anchor import anchored_to_head
+from wearcap.sensors.keypoints import camera_path, seen_wearer
+from wearcap.systems.mocap_every import energy
+from wearcap.systems.mocap_every.energy import LatentSolution, LatentSolver, LatentWeights
+from wearcap.systems.mocap_every.manifold import MotionManifold, Posed
+from wearcap.tracking.anchor import anchor, anchored_to_head
+
+CONFIDENCE = ".confidence.npz"
+"""Suffix of the file with a view's confidence, next to the motion's .npz."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +42,31 @@ class View:
     motion: Motion
     confidence: Float[Tensor, "time joint"]
     """Confidence of each joint, 0…1; 0: not observed."""
+
+    def write(self, path: str | Path) -> None:
+        """Write the view as a motion .npz, with its confidence in a file next to it (`CONFIDENCE`)."""
+        write_motion(self.motion, path)
+        with atomic_path(_confidence_path(path)) as temporary, open(temporary, "wb") as file:
+            np.savez(file, confidence=self.confidence.numpy())
+
+    @classmethod
+    def read(cls, path: str | Path) -> "View":
+        """Read a view in the format of `write`.
+
+        Raises WearcapError when a file is missing or damaged, or when the confidence (0…1) does not match the motion.
+        """
+        motion, confidence_file = read_motion(path), _confidence_path(path)
+        arrays = read_npz(confidence_file, ["confidence"])
+        require(arrays, confidence_file, confidence=(len(motion), len(motion.skeleton)))
+        confidence = torch.from_numpy(arrays["confidence"]).float()
+        if ((confidence < 0) | (confidence > 1)).any():
+            raise WearcapError("confidence beyond its range", where=confidence_file, expected="0 to 1")
+        return cls(motion, confidence)
+
+
+def _confidence_path(path: str | Path) -> Path:
+    path = Path(path)
+    return path.with_name(path.name.removesuffix(".npz") + CONFIDENCE)
 
 
 @dataclass
@@ -69,11 +95,16 @@ class VisualCues:
         `T_world_head` holds the measured head poses at the motion's frames.
         """
         cues = [at_frames(cue, motion.timestamps) for cue in recording.cues.values() if cue.joint in motion.skeleton]
-        views = [view_at_frames(view, motion.timestamps) for view in views]
+        views = [_view_at_frames(view, motion.timestamps) for view in views]
         confidence = [cue.confidence for cue in cues] + [view.confidence.amax(-1) for view in views]
         if not confidence or not torch.stack(confidence).any():
             return motion, []
-        starts = self._starts(torch.stack(confidence).amax(0) > 0)
+        # First frames of the windows with observations, on a grid of half windows that extends past the motion.
+        observed, half = torch.stack(confidence).amax(0) > 0, self.window // 2
+        grid = torch.arange(-half, len(observed), half)
+        counted = torch.cat([torch.zeros(1, dtype=torch.int64), observed.long().cumsum(0)])
+        stop = (grid + self.window).clamp_max(len(observed))
+        starts = grid[counted[stop] > counted[grid.clamp_min(0)]]
         edited, solutions = _Blend(motion, self.window), []
         for first in starts.split(self.batch):
             frames = first[:, None] + torch.arange(self.window)
@@ -81,14 +112,6 @@ class VisualCues:
             edited.add(frames, R, root)
             solutions.append(solution)
         return anchored_to_head(edited.motion(), T_world_head), solutions
-
-    def _starts(self, observed: Tensor) -> Int64[Tensor, "window"]:
-        """First frames of the windows with observations, on a grid of half windows that extends past the motion."""
-        half = self.window // 2
-        grid = torch.arange(-half, len(observed), half)
-        counted = torch.cat([torch.zeros(1, dtype=torch.int64), observed.long().cumsum(0)])
-        stop = (grid + self.window).clamp_max(len(observed))
-        return grid[counted[stop] > counted[grid.clamp_min(0)]]
 
     def _edit_windows(
         self,
@@ -106,36 +129,30 @@ class VisualCues:
         window = Posed(motion.R_parent_joint[frames], motion.t_world_root[frames], _foot_contact(motion)[frames])
         head = Rigid(T_world_head.R[frames], T_world_head.t[frames])
         seen = _observations(recording, skeleton, head, frames, exists, cues, views)
-        origin = origin_of(window)
-        X0 = encode_window(window, origin)
+        origin = window.origin()
+        X0 = window.encode(origin)
         feet = skeleton.indices(*FOOT_JOINTS)
         with torch.no_grad():
             start = self.manifold.encode(X0)
             reconstructed = self.manifold.decode(start)
-
-        smoothing = _gaussian_filter(self.window, self.smooth)
+        # A Gaussian filter over time as a matrix; a standard deviation of 0 is the identity.
+        time = torch.arange(self.window, dtype=torch.float32)
+        smoothing = torch.exp(-0.5 * ((time[:, None] - time) / max(self.smooth, 1e-3)) ** 2)
+        smoothing = smoothing / smoothing.sum(1, keepdim=True)
 
         def edited(latent: Tensor) -> Tensor:
             decoded = self.manifold.decode(latent)
             return X0 + smoothing @ (decoded - reconstructed) if self.residual else decoded
 
-        def body(latent: Tensor) -> Body:
-            posed = decode_window(edited(latent), origin)
-            return anchored_body(skeleton, posed.R_parent_joint, window.foot_contact, head)
+        def terms(latent: Tensor) -> dict[str, Float[Tensor, ""]]:
+            posed = Posed.decode(edited(latent), origin)
+            body = energy.Body(*anchor(skeleton, posed.R_parent_joint, head), window.foot_contact)
+            return energy.energy_terms(body, seen, latent - start, feet, motion.fps, self.weights)
 
-        solution = solve_latent(
-            start, lambda z: energy_terms(body(z), seen, z - start, feet, motion.fps, self.weights), self.solver
-        )
+        solution = energy.solve_latent(start, terms, self.solver)
         with torch.no_grad():
-            posed = decode_window(edited(solution.latent), origin)
+            posed = Posed.decode(edited(solution.latent), origin)
         return posed.R_parent_joint, posed.t_world_root, solution
-
-
-def _gaussian_filter(window: int, frames: float) -> Float[Tensor, "time time"]:
-    """Matrix of a Gaussian filter over time, with a standard deviation in frames; 0: identity."""
-    time = torch.arange(window, dtype=torch.float32)
-    weight = torch.exp(-0.5 * ((time[:, None] - time) / max(frames, 1e-3)) ** 2)
-    return weight / weight.sum(1, keepdim=True)
 
 
 class _Blend:
@@ -152,8 +169,9 @@ class _Blend:
         exists = (frames >= 0) & (frames < len(self._shares))
         weight = (self._weight * exists).flatten()
         at = frames.flatten().clamp(0, len(self._shares) - 1)
-        self._rotations.index_add_(0, at, weight[:, None] * rotation.rot6d_from_matrix(R).flatten(-2).flatten(0, 1))
-        self._roots.index_add_(0, at, weight[:, None] * root.flatten(0, 1))
+        rotations = rearrange(rotation.rot6d_from_matrix(R), "window time joint entry -> (window time) (joint entry)")
+        self._rotations.index_add_(0, at, weight[:, None] * rotations)
+        self._roots.index_add_(0, at, weight[:, None] * rearrange(root, "window time xyz -> (window time) xyz"))
         self._shares.index_add_(0, at, weight)
 
     def motion(self) -> Motion:
@@ -161,8 +179,11 @@ class _Blend:
         motion = self._motion
         left = (1 - self._shares).clamp_min(0)[:, None]
         whole = self._shares[:, None] + left
-        turned = self._rotations + left * rotation.rot6d_from_matrix(motion.R_parent_joint).flatten(-2)
-        R = rotation.matrix_from_rot6d((turned / whole).unflatten(-1, (-1, 6)))
+        captured = rearrange(
+            rotation.rot6d_from_matrix(motion.R_parent_joint), "time joint entry -> time (joint entry)"
+        )
+        blended = (self._rotations + left * captured) / whole
+        R = rotation.matrix_from_rot6d(rearrange(blended, "time (joint entry) -> time joint entry", entry=6))
         return replace(motion, R_parent_joint=R, t_world_root=(self._roots + left * motion.t_world_root) / whole)
 
 
@@ -178,7 +199,7 @@ def at_frames(cue: Cue, timestamps: Float64[Tensor, "time"]) -> Cue:
     return replace(cue, timestamps=timestamps, points=points.nan_to_num(), confidence=cue.confidence[nearest] * near)
 
 
-def view_at_frames(view: View, timestamps: Float64[Tensor, "time"]) -> View:
+def _view_at_frames(view: View, timestamps: Float64[Tensor, "time"]) -> View:
     """Resample a view to a motion's frames, as `at_frames` does."""
     nearest = nearest_frames(view.motion.timestamps, timestamps)
     step = timestamps.diff().median() if len(timestamps) > 1 else 1.0
@@ -204,26 +225,27 @@ def _observations(
     exists: Tensor,
     cues: list[Cue],
     views: list[View],
-) -> Seen:
+) -> energy.Seen:
     """Observations of a batch of windows; frames outside the capture have confidence 0."""
     camera = recording.camera
-    cues_2d, cues_3d = ([cue for cue in cues if cue.points.shape[-1] == axes] for axes in (2, 3))
-    pixels = (
-        tuple(PixelCue(skeleton.index(c.joint), c.points[frames], c.confidence[frames] * exists) for c in cues_2d)
-        if camera
-        else ()
+    rows: dict[int, list[tuple[int, Tensor, Tensor]]] = {2: [], 3: []}
+    for cue in cues:
+        row = skeleton.index(cue.joint), cue.points[frames], cue.confidence[frames] * exists
+        rows.setdefault(cue.points.shape[-1], []).append(row)
+    pixels, places = tuple(energy.PixelCue(*row) for row in rows[2]), tuple(energy.PlaceCue(*row) for row in rows[3])
+    poses = tuple(
+        energy.PoseCue(v.motion.R_parent_joint[frames], v.confidence[frames] * exists[..., None]) for v in views
     )
-    places = tuple(PlaceCue(skeleton.index(c.joint), c.points[frames], c.confidence[frames] * exists) for c in cues_3d)
-    poses = tuple(PoseCue(v.motion.R_parent_joint[frames], v.confidence[frames] * exists[..., None]) for v in views)
-    mount = None if camera is None else Rigid(camera.R_head_cam, camera.t_head_cam)
-    return Seen(head, None if camera is None else camera.camera, mount, pixels, places, poses)
+    if camera is None:
+        return energy.Seen(head, None, None, (), places, poses)
+    return energy.Seen(head, camera.camera, Rigid(camera.R_head_cam, camera.t_head_cam), pixels, places, poses)
 
 
 def _foot_contact(motion: Motion) -> Float[Tensor, "time foot"]:
     """Contact probability of each foot, the maximum over its patches."""
     if motion.contact_prob is None:
         return torch.zeros(len(motion), FEET)
-    return motion.contact_prob.unflatten(-1, (FEET, -1)).amax(-1)
+    return reduce(motion.contact_prob, "time (foot patch) -> time foot", "max", foot=FEET)
 
 
 def load_visual_cues(
@@ -239,3 +261,78 @@ def load_visual_cues(
             "cues need a motion manifold", where=manifold, expected="a checkpoint of experiment=motion_manifold"
         )
     return VisualCues(net, weights or LatentWeights(), solver or LatentSolver(), **settings)
+
+
+def capture_session(
+    recordings: Sequence[Recording],
+    capture: Callable[[Recording], Motion],
+    cues: VisualCues,
+    views: Mapping[str, Sequence[View]],
+) -> dict[str, Motion]:
+    """Motion of each recording of a session, by name; `views` holds the views of a recording's wearer by the others.
+
+    `capture` must return motions anchored to the measured head, as the pipelines do. Raises WearcapError for recordings
+    that share no session or no time, for views of an unknown recording, and for views with another skeleton.
+    """
+    _require_one_session(recordings)
+    if unknown := set(views) - {recording.name for recording in recordings}:
+        raise WearcapError(f"views of {min(unknown)!r}", expected=f"of {', '.join(r.name for r in recordings)}")
+    motions = {}
+    for recording in recordings:
+        motion, own_views = capture(recording), views.get(recording.name, ())
+        for view in own_views:
+            if view.motion.skeleton.joint_names != motion.skeleton.joint_names:
+                raise WearcapError(
+                    f"a view with the joints of {view.motion.skeleton.name}",
+                    where=recording.name,
+                    expected=f"those of {motion.skeleton.name}, as captured",
+                )
+        motions[recording.name], _ = cues.edit(motion, recording, motion.joint("head"), own_views)
+    return motions
+
+
+def simulated_views(
+    recordings: Sequence[Recording], rng: np.random.Generator, noise_deg: float = 5.0
+) -> dict[str, list[View]]:
+    """Simulated pose estimates of each wearer from the others' cameras, made from the true motions (`seen_wearer`).
+
+    Raises WearcapError for recordings that share no session or no time, or lack a camera or a true motion.
+    """
+    _require_one_session(recordings)
+    for recording in recordings:
+        if recording.motion is None or recording.camera is None:
+            raise WearcapError("no true motion or no camera", where=recording.name, expected="both, as simulated")
+    views: dict[str, list[View]] = {recording.name: [] for recording in recordings}
+    for seen, observer in permutations(recordings, 2):
+        assert seen.motion is not None
+        assert observer.motion is not None
+        assert observer.camera is not None
+        path = camera_path(observer.motion, observer.camera)
+        start, stop = seen.motion.timestamps[0], seen.motion.timestamps[-1]
+        path = path[(path.timestamps >= start) & (path.timestamps <= stop)]
+        views[seen.name].append(View(*seen_wearer(seen.motion, path, observer.camera.camera, noise_deg, rng)))
+    return views
+
+
+def _require_one_session(recordings: Sequence[Recording]) -> None:
+    for recording in recordings:
+        if recording.session is None or recording.session != recordings[0].session:
+            raise WearcapError(
+                f"session {recording.session!r}",
+                where=recording.name,
+                expected=f"that of {recordings[0].name}, {recordings[0].session!r}",
+            )
+    if repeated := [name for name, count in Counter(r.name for r in recordings).items() if count > 1]:
+        raise WearcapError(f"two recordings are called {repeated[0]!r}", expected="unique names")
+    spans = []
+    for recording in recordings:
+        stream = recording.head or recording.motion
+        if stream is None or not len(stream.timestamps):
+            raise WearcapError(
+                "neither head poses nor a motion", where=recording.name, expected="at least one of the two"
+            )
+        spans.append((stream.timestamps[0].item(), stream.timestamps[-1].item()))
+    if spans and max(start for start, _ in spans) > min(stop for _, stop in spans):
+        raise WearcapError(
+            "recordings of one session at different times", where=recordings[0].session, expected="one clock"
+        )

@@ -17,7 +17,7 @@ from wearcap.data.transforms import mirrored_rotations
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.scene.floor_update import FloorFollower
-from wearcap.systems.mocap_every.features import Sensed, mirrored, to_world
+from wearcap.systems.mocap_every.features import Sensed
 
 if TYPE_CHECKING:
     from wearcap.systems.mocap_every.pipeline import MocapEvery
@@ -110,11 +110,11 @@ class EstimatorWindows:
         assert self._sensed is not None
         sensed, floor, size = Sensed(*(part[None] for part in self._sensed)), self._floors[None], self._size
         if pipeline.mirror_average:
-            sensed = Sensed(*(torch.cat(both) for both in zip(sensed, mirrored(sensed))))
+            sensed = Sensed(*(torch.cat(both) for both in zip(sensed, sensed.mirrored())))
             floor, size = floor.expand(2, -1), size.expand(2, -1)
         canonical = pipeline.features.canonical(sensed, floor)
         estimated = pipeline.estimate(pipeline.features.encode(sensed, floor, size, canonical))
-        R, t = to_world(*pipeline.features.decode_motion(estimated.motion.float(), sensed, canonical), canonical)
+        R, t = pipeline.features.decode_motion(estimated.motion.float(), sensed, canonical)
         contact = estimated.contact_logit.float().sigmoid()
         if pipeline.mirror_average:
             R = torch.stack([R[0], mirrored_rotations(R[1], skeleton)])
