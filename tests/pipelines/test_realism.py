@@ -13,7 +13,7 @@ from wearcap.body.skeleton import xsens23
 from wearcap.data.motion_features import MotionFeatures
 from wearcap.errors import WearcapError
 from wearcap.evaluation import realism
-from wearcap.evaluation.realism import Realism
+from wearcap.evaluation.evaluate import Realism
 from wearcap.geometry import rotation
 from wearcap.metrics.distribution import diversity, frechet_distance
 from wearcap.metrics.scores import score

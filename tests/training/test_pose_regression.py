@@ -12,9 +12,8 @@ from torch import nn
 from wearcap.body.skeleton import xsens23
 from wearcap.cli import evaluate, train
 from wearcap.cli.conf import compose
-from wearcap.data.statistics import collate
 from wearcap.data.transforms import Mirror, Shift
-from wearcap.data.windows import Source, Windows
+from wearcap.data.windows import Source, Windows, collate
 from wearcap.errors import WearcapError
 from wearcap.models.checkpoint import load_trained
 from wearcap.models.pose_regressor import PoseRegressor

@@ -16,7 +16,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
-from wearcap.data.statistics import MIN_SCALE
+from wearcap.data.windows import MIN_SCALE
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, parse_json
 from wearcap.geometry import rotation
@@ -140,18 +140,7 @@ class NearestWindow(Baseline):
         end = max(count - self.window, 0)
         starts = torch.unique(torch.cat([torch.arange(0, end, max(1, self.window // 2)), torch.tensor([end])]))
         found = self._nearest(_describe(path, starts, self.window, self.sample))
-        pose = self._pasted(starts, found, count)
-        return _anchored(path, rotation.matrix_from_rot6d(pose.unflatten(-1, (-1, 6))), "nearest_window")
-
-    def _nearest(self, raw: Float[Tensor, "query sample channel"]) -> Int64[Tensor, "query"]:
-        query = ((raw - self.mean) / self.scale).flatten(1)
-        half_squares = 0.5 * self.descriptor.square().sum(-1)
-        return torch.cat([(part @ self.descriptor.T - half_squares).argmax(-1) for part in query.split(QUERY_BATCH)])
-
-    def _pasted(
-        self, starts: Int64[Tensor, "query"], found: Int64[Tensor, "query"], count: int
-    ) -> Float[Tensor, "time motion"]:
-        """Cross-fade the found windows' poses, each weighed by a triangle over its window."""
+        # Poses are cross-faded, each weighted by a triangle over its window.
         offset = torch.arange(self.window)
         source = torch.minimum(self.first_frame[found, None] + offset, self.last_frame[found, None])
         target = starts[:, None] + offset
@@ -161,7 +150,13 @@ class NearestWindow(Baseline):
         blended = torch.zeros(count, self.pose.shape[1]).index_add(
             0, target[inside], self.pose[source[inside]].float() * weight[:, None]
         )
-        return blended / total[:, None]
+        pose = blended / total[:, None]
+        return _anchored(path, rotation.matrix_from_rot6d(pose.unflatten(-1, (-1, 6))), "nearest_window")
+
+    def _nearest(self, raw: Float[Tensor, "query sample channel"]) -> Int64[Tensor, "query"]:
+        query = ((raw - self.mean) / self.scale).flatten(1)
+        half_squares = 0.5 * self.descriptor.square().sum(-1)
+        return torch.cat([(part @ self.descriptor.T - half_squares).argmax(-1) for part in query.split(QUERY_BATCH)])
 
     def save(self, path: str | Path) -> None:
         """Write as .safetensors."""

@@ -1,10 +1,18 @@
-"""Scores of binary detection: average precision, precision, recall, accuracy, calibration error (thesis Table 5.3)."""
+"""Scores of binary detection (thesis Table 5.3), and errors of reconstructed voxel grids.
+
+Cells of a grid are truncated distances; one with a distance below `clip_m` is occupied.
+"""
 
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from wearcap.metrics.position import CM_PER_M
+
+_ROUNDING = 1e-3
+"""Margin below `clip_m`, as a share of it, for the rounding of half-precision files."""
 
 
 class DetectionScores(NamedTuple):
@@ -66,3 +74,29 @@ def calibration_error(prob: Float[Tensor, "sample"], truth: Bool[Tensor, "sample
 
 def _share(part: float, whole: float) -> float:
     return part / whole if whole else float("nan")
+
+
+def distance_mae_cm(grids: Float[Tensor, "*batch"], grids_true: Float[Tensor, "*batch"]) -> Float[Tensor, ""]:
+    """Mean absolute error (cm) of the truncated distances (m), over all cells."""
+    return (grids - grids_true).abs().mean() * CM_PER_M
+
+
+def occupied_distance_mae_cm(
+    grids: Float[Tensor, "*batch"], grids_true: Float[Tensor, "*batch"], clip_m: float
+) -> Float[Tensor, ""]:
+    """Mean absolute error (cm) over truly occupied cells, as empty cells would dominate the mean."""
+    occupied = grids_true < clip_m * (1 - _ROUNDING)
+    return distance_mae_cm(grids[occupied], grids_true[occupied])
+
+
+def occupancy_iou(
+    grids: Float[Tensor, "*batch"], grids_true: Float[Tensor, "*batch"], clip_m: float, border_m: float | None = None
+) -> Float[Tensor, ""]:
+    """Intersection over union of occupied cells over all grids together (1 if no cell is occupied).
+
+    A reconstructed cell is occupied below `border_m`; default: `clip_m`.
+    """
+    limit = clip_m * (1 - _ROUNDING)
+    occupied, occupied_true = grids < (limit if border_m is None else border_m), grids_true < limit
+    union = (occupied | occupied_true).sum()
+    return torch.where(union > 0, (occupied & occupied_true).sum() / union.clamp_min(1), 1.0)

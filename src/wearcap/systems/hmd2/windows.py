@@ -140,13 +140,6 @@ def advance(samplers: Sequence[WindowSampler], fresh: Sequence[Frames]) -> None:
     """
     for sampler, new in zip(samplers, fresh):
         sampler.join(new)
-    poses = _sample(samplers)
-    for item, sampler in enumerate(samplers):
-        sampler.predicted = Poses(*(part[item : item + 1, : sampler.count] for part in poses))
-
-
-def _sample(samplers: Sequence[WindowSampler]) -> Poses:
-    """Sample one window of every batch item."""
     pipeline = samplers[0].pipeline
     net, features, device = pipeline.net, pipeline.features, pipeline.device
     frames = Frames(*_padded([sampler.frames for sampler in samplers], net.window))
@@ -175,13 +168,12 @@ def _sample(samplers: Sequence[WindowSampler]) -> Poses:
     )
     x0 = blended(x0, observed, is_observed_on_device, pipeline.fade)
     motion = net.motion_normalizer.inverse(x0.float()).cpu()
-    poses = Poses(*features.decode(motion, frames.R_world_head))
-    return Poses(
-        *(
-            torch.where(is_observed.reshape(*is_observed.shape, *[1] * (old.ndim - 2)), old, new)
-            for old, new in zip(predicted, poses)
-        )
-    )
+    poses = [
+        torch.where(is_observed.reshape(*is_observed.shape, *[1] * (old.ndim - 2)), old, new)
+        for old, new in zip(predicted, features.decode(motion, frames.R_world_head))
+    ]
+    for item, sampler in enumerate(samplers):
+        sampler.predicted = Poses(*(part[item : item + 1, : sampler.count] for part in poses))
 
 
 def blended(

@@ -21,7 +21,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, finite_difference, resample
-from wearcap.optimize.hps import FootPatches, HpsData, HpsEnergy, HpsState, Solution
+from wearcap.optimize.hps import FootPatches, HpsData, HpsEnergy, HpsState, Solution, SuitSteps
 from wearcap.recording import Motion, Recording
 from wearcap.recording.growing import follow_pieces
 from wearcap.recording.recording import Localization
@@ -102,7 +102,9 @@ class HPS(StagedSystem):
             ),
             Stage(
                 "optimize",
-                lambda done: self.optimize(self._problem_of(source, done)),
+                lambda done: self.optimize(
+                    self.problem(on_one_clock(recording, done), done["align"], done["initialize"], source.read_scan())
+                ),
                 lambda: (self.energy, self.solver, self.evidence, source.scan, source.metres_per_unit, recording.shape),
                 ("synchronize", "localize", "align", "initialize"),
             ),
@@ -191,15 +193,11 @@ class HPS(StagedSystem):
             sure,
             sure * start.valid if self.evidence.confident else torch.ones_like(sure),
             believed_contact(aligned, self.evidence.max_contact_speed).double(),
-            (heading @ aligned.t_world_root.double().diff(dim=0)[..., None])[..., 0],
-            turns(root),
-            turns(head),
+            SuitSteps(
+                (heading @ aligned.t_world_root.double().diff(dim=0)[..., None])[..., 0], turns(root), turns(head)
+            ),
             scan.surface if scan else None,
         )
-
-    def _problem_of(self, source: CaptureInput, results: dict[str, Any]) -> HpsData:
-        recording = on_one_clock(source.recording, results)
-        return self.problem(recording, results["align"], results["initialize"], source.read_scan())
 
     def optimize(self, data: HpsData) -> Solution:
         """Minimise the energy (thesis eq. 4.1)."""

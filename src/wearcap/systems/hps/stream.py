@@ -4,6 +4,7 @@ A window of the newest seconds is re-solved as frames arrive; frames older than 
 that follow. Memory is bounded by the window, however long the recording.
 """
 
+import math
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -30,13 +31,16 @@ from wearcap.runtime.session import Session
 from wearcap.runtime.snapshot import classes_of
 from wearcap.scene.scan import Scan
 from wearcap.sensors.initialization import Initialization, align_suit, estimate_head_camera, initialize, inliers
-from wearcap.sensors.packets import OFF_THE_CLOCK, WRONG_TYPE
+from wearcap.sensors.packets import MAX_POSITION_M, MAX_TIME_S, OFF_THE_CLOCK, WRONG_TYPE, rotation_fault, values_fault
 from wearcap.sensors.samples import SuitPiece
-from wearcap.systems.hps.pieces import cut, follows, localization_fault, more, suit_fault
 from wearcap.systems.hps.pipeline import HPS
 
 MAX_UNALIGNED_S = 600.0
 """Length (s) of suit motion that is kept until the first alignment."""
+MAX_PAUSE_S = 10.0
+"""Longest gap (s) within a stretch. A piece after a longer one is kept aside until the next piece continues it; then a
+new stretch begins."""
+_LOCALIZED = ("timestamps", "R_world_cam", "t_world_cam", "confidence")
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,58 @@ class StreamSettings:
     """Length of final motion that a window is constrained to."""
     tie: float = 30.0
     """Weight of a final frame's position, relative to a localised frame's (1)."""
+
+
+def suit_fault(suit: object, like: Motion | None) -> str | None:
+    """Reason to refuse a piece of a suit's motion, None for a good one; it must match an earlier good piece `like`."""
+    if not isinstance(suit, Motion) or not isinstance(suit.timestamps, Tensor) or suit.timestamps.ndim != 1:
+        return WRONG_TYPE
+    times, count, joints = suit.timestamps, len(suit.timestamps), len(suit.skeleton)
+    contact, before = suit.contact_prob, None if like is None else like.contact_prob
+    patches = contact.shape[-1:] if isinstance(contact, Tensor) else ()
+    fault = (
+        _times_fault(times, MAX_PAUSE_S)
+        or rotation_fault(suit.R_parent_joint, (count, joints, 3, 3))
+        or values_fault(suit.t_world_root, (count, 3), MAX_POSITION_M)
+        or (None if contact is None else values_fault(contact, (count, *patches), 1.0))
+    )
+    if fault is None and like is not None:
+        same = like.skeleton.joint_names == suit.skeleton.joint_names and (contact is None) == (before is None)
+        return (
+            None
+            if same and (before is None or contact is None or before.shape[1:] == contact.shape[1:])
+            else WRONG_TYPE
+        )
+    return fault
+
+
+def localization_fault(seen: object, suit: Motion) -> str | None:
+    """Reason to refuse a piece's camera poses, None for good ones; poses of confidence 0 are not checked."""
+    if not isinstance(seen, Localization) or not isinstance(seen.timestamps, Tensor):
+        return WRONG_TYPE
+    count = seen.timestamps.numel()
+    if fault := _times_fault(seen.timestamps, math.inf) or values_fault(seen.confidence, (count,), 1.0):
+        return fault
+    shapes = [getattr(part, "shape", None) for part in (seen.R_world_cam, seen.t_world_cam)]
+    if shapes != [(count, 3, 3), (count, 3)]:
+        return WRONG_TYPE
+    found = seen.confidence > 0
+    R, t = seen.R_world_cam[found], seen.t_world_cam[found]
+    if seen.timestamps[-1] > suit.timestamps[-1] + MAX_PAUSE_S:
+        return OFF_THE_CLOCK
+    return rotation_fault(R, (len(R), 3, 3)) or values_fault(t, (len(R), 3), MAX_POSITION_M)
+
+
+def _times_fault(times: Tensor, max_pause_s: float) -> str | None:
+    if fault := values_fault(times, (times.numel(),), MAX_TIME_S):
+        return fault
+    steps = times.diff()
+    return None if ((steps > 0) & (steps <= max_pause_s)).all() else OFF_THE_CLOCK
+
+
+def _follows(first: Motion, then: Motion) -> bool:
+    """Whether a piece continues another, without overlap or a long gap."""
+    return 0 < (then.timestamps[0] - first.timestamps[-1]).item() <= MAX_PAUSE_S
 
 
 class HpsStream:
@@ -137,11 +193,17 @@ class HpsStream:
             return None
         self._like = self._like or suit
         localization = self._checked(localization, suit)
-        if self.suit is None or follows(self.suit, suit):
+        if self.suit is None or _follows(self.suit, suit):
             self._refuse_alone()
             self._add(suit, localization)
-            return self._solve()
-        if self._alone is None or not follows(self._alone[0], suit):
+            newest = suit.timestamps[-1].item()
+            if self.turn is None and not self._align():
+                self._forget(newest - MAX_UNALIGNED_S)
+                return None
+            if newest - self._solved_to < self.settings.advance_s:
+                return None
+            return self._advance(newest - self.settings.lag_s)
+        if self._alone is None or not _follows(self._alone[0], suit):
             self._refuse_alone()
             self._alone = suit, localization
             return None
@@ -169,25 +231,15 @@ class HpsStream:
 
     def _add(self, suit: Motion, localization: Localization | None) -> None:
         self.suit = joined([suit] if self.suit is None else [self.suit, suit])
-        if (
-            localization is not None
-            and self.seen is not None
-            and localization.timestamps[0] <= self.seen.timestamps[-1]
-        ):
+        if localization is None:
+            return
+        if self.seen is None:
+            self.seen = localization
+        elif localization.timestamps[0] <= self.seen.timestamps[-1]:
             self.refused[f"localization: {OFF_THE_CLOCK}"] += 1
-        elif localization is not None:
-            self.seen = localization if self.seen is None else more(self.seen, localization)
-
-    def _solve(self) -> Motion | None:
-        """Solve once enough is new; returns the frames that have become final."""
-        assert self.suit is not None
-        newest = self.suit.timestamps[-1].item()
-        if self.turn is None and not self._align():
-            self._forget(newest - MAX_UNALIGNED_S)
-            return None
-        if newest - self._solved_to < self.settings.advance_s:
-            return None
-        return self._advance(newest - self.settings.lag_s)
+        else:
+            both = self.seen, localization
+            self.seen = Localization(*(torch.cat([getattr(part, name) for part in both]) for name in _LOCALIZED))
 
     def finish(self) -> Motion | None:
         """Return the remaining frames at the end of the recording.
@@ -308,7 +360,8 @@ class HpsStream:
         self.suit = self.suit.sliced(first, len(self.suit))
         if self.seen is not None:  # two are kept: they determine the frame rate
             first = int(torch.searchsorted(self.seen.timestamps, before_s))
-            self.seen = cut(self.seen, max(min(first, len(self.seen.timestamps) - 2), 0))
+            kept = slice(max(min(first, len(self.seen.timestamps) - 2), 0), None)
+            self.seen = Localization(*(getattr(self.seen, name)[kept] for name in _LOCALIZED))
 
 
 class HpsSession(Session):
@@ -382,25 +435,21 @@ def follow(
         if stream is None:
             stream = HpsStream(hps, piece, scan, settings)
             stream.refused = refused
-        done = stream.push(piece.suit, _localized(hps, piece, folder, None if fresh else refused))
+        localization = piece.localization
+        if piece.camera is not None:
+            try:
+                localization = hps.localize(piece, folder)
+            except WearcapError:
+                if fresh:
+                    raise
+                refused["localization: failed"] += 1
+                localization = None
+        done = stream.push(piece.suit, localization)
         if done is not None:
             yield done
     last = stream.finish() if stream is not None else None
     if last is not None:
         yield last
-
-
-def _localized(hps: HPS, piece: Recording, folder: Path, refused: Counter[str] | None) -> Localization | None:
-    """Camera poses of a piece; a failure is counted in `refused`, or raised if there is no counter."""
-    if piece.camera is None:
-        return piece.localization
-    try:
-        return hps.localize(piece, folder)
-    except WearcapError:
-        if refused is None:
-            raise
-        refused["localization: failed"] += 1
-        return None
 
 
 def _step(timestamps: Float64[Tensor, "time"]) -> float:

@@ -47,7 +47,7 @@ class InteractionScores:
     object_chamfer_cm: float
     """Chamfer distance between captured and true object during interactions (Table 5.5)."""
     false_moves_cm: float
-    """Mean displacement of objects that were never touched."""
+    """Mean displacement of the centres of objects that were never touched, from the first to the last frame."""
 
 
 def score_interactions(motion: Motion, recording: Recording, environment: Environment) -> InteractionScores:
@@ -78,7 +78,10 @@ def score_interactions(motion: Motion, recording: Recording, environment: Enviro
     scored = [_handling(row, rows, environment, held, motion.timestamps, palms, found, real) for row in rows]
     body, objects = _chamfer(motion, true, recording, rows, environment, found, real)
     joints = mpjpe_cm(motion.T_world_joint.t, true.T_world_joint.t).item()
-    return InteractionScores(tuple(scored), joints, body, objects, _false_moves(environment, held.objects, found))
+    untouched = [scene_object for scene_object in environment.objects if scene_object.name not in held.objects]
+    ends = [object_error(found[t.name][[-1]], found[t.name][[0]], middle_of(t)).distance_cm[0] for t in untouched]
+    false_moves = float(torch.stack(ends).mean()) if ends else 0.0
+    return InteractionScores(tuple(scored), joints, body, objects, false_moves)
 
 
 def with_interactions(row: Row, motion: Motion, source: CaptureInput, environment: str | Path | None) -> Row:
@@ -148,13 +151,6 @@ def _only(held, chosen: Sequence[bool]) -> dict:
         "objects": pick(held.objects),
         "classes": pick(held.classes),
     }
-
-
-def _false_moves(environment: Environment, touched: tuple[str, ...], found: dict[str, Rigid]) -> float:
-    """Mean displacement (cm) of the centres of untouched objects from the first to the last frame."""
-    untouched = [scene_object for scene_object in environment.objects if scene_object.name not in touched]
-    ends = [object_error(found[t.name][[-1]], found[t.name][[0]], middle_of(t)).distance_cm[0] for t in untouched]
-    return float(torch.stack(ends).mean()) if ends else 0.0
 
 
 def _chamfer(

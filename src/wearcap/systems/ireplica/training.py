@@ -7,8 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from wearcap.data.statistics import drawn_batches
-from wearcap.data.windows import Windows
+from wearcap.data.windows import Windows, drawn_batches
 from wearcap.geometry import rotation
 from wearcap.metrics.detection import mean_detection_scores
 from wearcap.runtime.graphs import Exports

@@ -6,8 +6,7 @@ from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import FEET, Skeleton
-from wearcap.data.statistics import drawn_batches, standardize
-from wearcap.data.windows import Windows
+from wearcap.data.windows import Windows, drawn_batches, standardize
 from wearcap.metrics.position import mpjpe_cm
 from wearcap.systems.mocap_every.manifold import MotionManifold
 from wearcap.systems.mocap_every.manifold_features import Posed, decode_window, encode_window, origin_of

@@ -9,8 +9,7 @@ from torch.nn import functional as F
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
-from wearcap.data.statistics import drawn_batches, standardize
-from wearcap.data.windows import Windows
+from wearcap.data.windows import Windows, drawn_batches, standardize
 from wearcap.systems.mocap_every.features import ENDS, Canonical, WatchFeatures, to_world
 from wearcap.systems.mocap_every.model import TrainedEstimator
 from wearcap.systems.mocap_every.pipeline import MocapEvery

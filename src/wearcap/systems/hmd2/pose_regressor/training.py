@@ -3,13 +3,12 @@
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
-from wearcap.data.statistics import drawn_batches, standardize
-from wearcap.data.windows import Windows
+from wearcap.data.windows import Windows, drawn_batches, standardize
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, decode_pose, encode_pose, pasts
@@ -61,17 +60,14 @@ class PoseRegression(Training):
         poses = self.points.poses(self.skeleton, T_world_head, batch.R_parent_joint, batch.t_parent_joint[:, None])
         return self.points.encode(poses.R, poses.t, batch.floor_from_head, batch.stature, self.fps)
 
-    def _frame_pairs(self, batch: HeadWindow) -> Int64[Tensor, "batch end"]:
-        """Indices of pairs of neighbouring frames, spread evenly over each window, in training with a random shift."""
+    def terms(self, batch: HeadWindow) -> dict[str, Tensor]:
+        """Every loss term of a batch, unweighted."""
+        # Pairs of neighbouring frames, spread evenly over each window, in training with a random shift.
         count, time = batch.valid.shape
         places = torch.arange(self.pairs, device=batch.valid.device)
         shift = torch.rand(count, self.pairs) if self.training else torch.full((count, 1), 0.5)
-        last = ((places + shift.to(places.device)) * time / self.pairs).long().clamp(1, time - 1)
-        return torch.stack([last - 1, last], -1).flatten(1).expand(count, -1)
-
-    def terms(self, batch: HeadWindow) -> dict[str, Tensor]:
-        """Every loss term of a batch, unweighted."""
-        ends = self._frame_pairs(batch)
+        later = ((places + shift.to(places.device)) * time / self.pairs).long().clamp(1, time - 1)
+        ends = torch.stack([later - 1, later], -1).flatten(1).expand(count, -1)
         rows = torch.arange(len(ends), device=ends.device)[:, None]
         features, exists = pasts(self._features(batch), ends, self.net.window)
         motion = self.net(features.flatten(0, 1), exists.flatten(0, 1)).unflatten(0, ends.shape).float()
