@@ -11,7 +11,6 @@ from rich import print as show
 from rich.console import Console
 
 from wearcap.body.anny_body import anny_body
-from wearcap.body.model import BodyModel
 from wearcap.body.retarget import retarget
 from wearcap.body.skeletons import smplh52
 from wearcap.body.smpl_body import smpl_body
@@ -57,8 +56,14 @@ def run(config: DictConfig) -> Motion | None:
         write_text(folder / "report.json", json.dumps(report, indent=1) + "\n")
     if motion is not None:
         environment = None if motion.object_motion is None else system.objects(source)
-        if len(captures) > 1:
-            _write_samples([c.motion for c in captures if c.motion is not None], recording, environment, folder)
+        if len(captures) > 1:  # sample-0.npz, …, and samples.png: the variety from one input (thesis Fig. 6.6)
+            motions = [each.motion for each in captures if each.motion is not None]
+            draws = {f"sample {number}": draw for number, draw in enumerate(motions)}
+            for label, draw in draws.items():
+                write_motion(draw, folder / f"{label.replace(' ', '-')}.npz")
+            truth, body = with_objects(recording, environment), anny_body(motion.skeleton, recording.shape or None)
+            shown = ({} if truth is None else {"truth": truth}) | draws
+            save_png(folder / "samples.png", contact_sheet(shown, body=body, environment=environment))
         if config.checkpoint is not None:
             motion.provenance.update(checkpoint=str(config.checkpoint))
         motion.provenance.update(recording=str(config.recording))
@@ -77,7 +82,17 @@ def _write(
         R_parent_joint, root = retarget(motion.skeleton, target, motion.R_parent_joint, motion.t_world_root)
         smpl = Motion(motion.timestamps, target, R_parent_joint, root)
         write_amass(smpl, folder / "motion_smplh.npz")
-    shown, body = _with_body(motion, recording, config.body)
+    # The .glb's surface: Anny's body, none, or on its own skeleton that of the user's SMPL model file.
+    shown, body = motion, None
+    if isinstance(config.body, str):
+        arrays = read_smpl(config.body)
+        betas = [value for name, value in recording.shape.items() if name.startswith("beta_")]
+        betas = torch.tensor(betas[: arrays.shape_directions.shape[-1]])
+        body = smpl_body(arrays, betas if len(betas) else None)
+        R, root = retarget(motion.skeleton, body.skeleton, motion.R_parent_joint, motion.t_world_root)
+        shown = replace(motion, skeleton=body.skeleton, R_parent_joint=R, t_world_root=root)
+    elif config.body:
+        body = anny_body(motion.skeleton, recording.shape or None)
     write_glb(shown, folder / "motion.glb", body=body)
     if config.video:
         truth = with_objects(recording, environment)
@@ -88,29 +103,6 @@ def _write(
             environment=environment,
             max_seconds=config.video_seconds,
         )
-
-
-def _with_body(motion: Motion, recording: Recording, chosen: bool | str) -> tuple[Motion, BodyModel | None]:
-    """The .glb's motion and surface: Anny's body, none, or on its own skeleton that of the user's SMPL model file."""
-    if not isinstance(chosen, str):
-        return motion, anny_body(motion.skeleton, recording.shape or None) if chosen else None
-    arrays = read_smpl(chosen)
-    betas = [value for name, value in recording.shape.items() if name.startswith("beta_")]
-    betas = torch.tensor(betas[: arrays.shape_directions.shape[-1]])
-    body = smpl_body(arrays, betas if len(betas) else None)
-    R, root = retarget(motion.skeleton, body.skeleton, motion.R_parent_joint, motion.t_world_root)
-    return replace(motion, skeleton=body.skeleton, R_parent_joint=R, t_world_root=root), body
-
-
-def _write_samples(draws: list[Motion], recording: Recording, environment: Environment | None, folder: Path) -> None:
-    """Write sample-0.npz, …, and samples.png: the variety of motions from one input (thesis Fig. 6.6)."""
-    shown = {f"sample {number}": motion for number, motion in enumerate(draws)}
-    for label, motion in shown.items():
-        write_motion(motion, folder / f"{label.replace(' ', '-')}.npz")
-    truth = with_objects(recording, environment)
-    body = anny_body(draws[0].skeleton, recording.shape or None)
-    sheet = contact_sheet(({} if truth is None else {"truth": truth}) | shown, body=body, environment=environment)
-    save_png(folder / "samples.png", sheet)
 
 
 def _live(system: System, config: DictConfig, folder: Path) -> None:

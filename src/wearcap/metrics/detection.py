@@ -15,7 +15,7 @@ _ROUNDING = 1e-3
 """Margin below `clip_m`, as a share of it, for the rounding of half-precision files."""
 
 
-class DetectionScores(NamedTuple):
+class _DetectionScores(NamedTuple):
     """Scores in 0…1; NaN where undefined, such as recall without a positive sample."""
 
     average_precision: float
@@ -27,11 +27,11 @@ class DetectionScores(NamedTuple):
 
 def detection_scores(
     prob: Float[Tensor, "sample"], truth: Bool[Tensor, "sample"], threshold: float = 0.5
-) -> DetectionScores:
+) -> _DetectionScores:
     """Scores of one detector; precision, recall and accuracy at `threshold`."""
     found = prob > threshold
     hits = float((found & truth).sum())
-    return DetectionScores(
+    return _DetectionScores(
         average_precision(prob, truth),
         _share(hits, float(found.sum())),
         _share(hits, float(truth.sum())),
@@ -42,10 +42,10 @@ def detection_scores(
 
 def mean_detection_scores(
     prob: Float[Tensor, "sample hand"], truth: Bool[Tensor, "sample hand"], threshold: float = 0.5
-) -> DetectionScores:
+) -> _DetectionScores:
     """Mean of the hands' scores, as in the thesis; undefined scores of a hand are ignored."""
     hands = torch.tensor([detection_scores(prob[:, h], truth[:, h], threshold) for h in range(prob.shape[1])])
-    return DetectionScores(*hands.nanmean(0).tolist())
+    return _DetectionScores(*hands.nanmean(0).tolist())
 
 
 def average_precision(prob: Float[Tensor, "sample"], truth: Bool[Tensor, "sample"]) -> float:

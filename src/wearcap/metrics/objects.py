@@ -72,7 +72,7 @@ PAUSE_S = 0.5
 
 
 @dataclass(frozen=True)
-class PoseError:
+class _PoseError:
     """Error of an object's pose at one or several times."""
 
     distance_cm: Float[Tensor, "*batch"]
@@ -81,12 +81,12 @@ class PoseError:
     """Angle between the captured and the true orientation."""
 
 
-def object_error(T_found: Rigid, T_true: Rigid, center: Float[Tensor, "3"]) -> PoseError:
+def object_error(T_found: Rigid, T_true: Rigid, center: Float[Tensor, "3"]) -> _PoseError:
     """Error of an object's poses; `center` is its centre in its own axes (m)."""
     found, true = T_found.to(torch.float64), T_true.to(torch.float64)
     middles = [(T.R @ center.double()) + T.t for T in (found, true)]
     apart = (middles[0] - middles[1]).norm(dim=-1)
-    return PoseError(100 * apart, geodesic(found.R, true.R).rad2deg())
+    return _PoseError(100 * apart, geodesic(found.R, true.R).rad2deg())
 
 
 @dataclass(frozen=True)

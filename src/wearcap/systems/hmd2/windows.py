@@ -43,7 +43,7 @@ class Poses(NamedTuple):
     foot_contact: Float[Tensor, "batch time foot"]
 
 
-class FinalFrames(NamedTuple):
+class _FinalFrames(NamedTuple):
     """Final poses of a batch item's next frames, with their head poses ("time")."""
 
     poses: Poses
@@ -121,7 +121,7 @@ class WindowSampler:
         self.predicted = Poses(*_appended(self.predicted, first, no_poses(self.pipeline, new)))
         self.frames = fresh if self.frames is None else Frames(*_appended(self.frames, first, fresh))
 
-    def finalize(self, lookahead_frames: int) -> FinalFrames:
+    def finalize(self, lookahead_frames: int) -> _FinalFrames:
         """Mark all predictions but the last `lookahead_frames` as final; returns the newly final frames."""
         assert self.frames is not None
         # Frames after a recording's end are not valid and never output.
@@ -129,7 +129,7 @@ class WindowSampler:
         part = slice(self.final, until)
         self.final = until
         head = Rigid(self.frames.R_world_head[0, part], self.frames.t_world_head[0, part])
-        return FinalFrames(Poses(*(poses[:, part] for poses in self.predicted)), head)
+        return _FinalFrames(Poses(*(poses[:, part] for poses in self.predicted)), head)
 
 
 @torch.inference_mode()

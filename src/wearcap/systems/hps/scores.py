@@ -120,12 +120,12 @@ def score_hps(motion: Motion, truth: HpsTruth) -> HpsScores:
     """Score one capture. Raises WearcapError unless it has the truth's joints and timestamps, and finite poses."""
     joints = evaluate_motion(motion, truth.motion, truth.true_contact)
     literal, surface = zip(*(interval_chamfer(motion, truth.body, clouds) for clouds in truth.visits))
-    error = joint_errors_cm(motion, truth.motion)[:, 0]
+    error = _joint_errors_cm(motion, truth.motion)[:, 0]
     return HpsScores(
         literal,
         surface,
-        foot_scores(motion, truth, truth.contact),
-        foot_scores(motion, truth, truth.true_contact),
+        _foot_scores(motion, truth, truth.contact),
+        _foot_scores(motion, truth, truth.true_contact),
         drift(travelled_m(truth.motion), error),
         joints,
     )
@@ -161,7 +161,7 @@ def nearest_frames(timestamps: Float64[Tensor, "time"], at: Float64[Tensor, "ins
     return frames
 
 
-def foot_scores(motion: Motion, truth: HpsTruth, contact: Bool[Tensor, "time patch"]) -> FootSurface:
+def _foot_scores(motion: Motion, truth: HpsTruth, contact: Bool[Tensor, "time patch"]) -> FootSurface:
     """Foot-to-scan distance and foot sliding of a capture during `contact` (Table 4.3)."""
     times = truth.motion.timestamps
     examined = (times - times[0]) % FEET_EVERY_S < FEET_S
@@ -169,7 +169,7 @@ def foot_scores(motion: Motion, truth: HpsTruth, contact: Bool[Tensor, "time pat
     return foot_surface(*foot_vertices(truth.body, motion.T_world_joint, touching), truth.surface)
 
 
-def joint_errors_cm(motion: Motion, truth: Motion) -> Float[Tensor, "time joint"]:
+def _joint_errors_cm(motion: Motion, truth: Motion) -> Float[Tensor, "time joint"]:
     """Position error of each joint in the world (cm); the root comes first."""
     return 100 * (motion.T_world_joint.t - truth.T_world_joint.t).norm(dim=-1)
 
@@ -232,7 +232,7 @@ def planted_outages(intervals: Intervals, end_s: float, lengths_s: Sequence[floa
 
 
 @dataclass(frozen=True)
-class Disturbance:
+class _Disturbance:
     """Mean errors (cm) with and without localisation outages, over the same frames."""
 
     root_cm: float
@@ -251,10 +251,10 @@ class Disturbance:
         return self.joint_cm / self.undisturbed_joint_cm
 
 
-def disturbance(disturbed: Motion, undisturbed: Motion, truth: Motion, frames: Bool[Tensor, "time"]) -> Disturbance:
+def disturbance(disturbed: Motion, undisturbed: Motion, truth: Motion, frames: Bool[Tensor, "time"]) -> _Disturbance:
     """Compare captures with and without outages over the given frames."""
-    with_, without = (joint_errors_cm(motion, truth)[frames] for motion in (disturbed, undisturbed))
-    return Disturbance(*(float(e) for e in (with_[:, 0].mean(), with_.mean(), without[:, 0].mean(), without.mean())))
+    with_, without = (_joint_errors_cm(motion, truth)[frames] for motion in (disturbed, undisturbed))
+    return _Disturbance(*(float(e) for e in (with_[:, 0].mean(), with_.mean(), without[:, 0].mean(), without.mean())))
 
 
 def in_order(errors: Sequence[float]) -> bool:

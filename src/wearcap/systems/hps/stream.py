@@ -294,7 +294,15 @@ class HpsStream:
         times = aligned.timestamps
         first = int(torch.searchsorted(times, after - settings.behind_s)) if self.done is not None else 0
         data = self.hps.problem(self._recording(), aligned, start, self.scan, self.R_head_cam)[first:]
-        solution = self.hps.optimize(self._tied(data, times[first:]))
+        if self.done is not None:
+            # Final frames constrain the window: their positions replace the camera's in the `hold` term.
+            count = int((times[first:] <= self.done.timestamps[-1] + 0.5 / fps).sum())
+            final = self.done.sliced(len(self.done) - count, len(self.done))
+            t, hold = data.start.t_world_root.clone(), data.hold_confidence.clone()
+            t[:count], hold[:count] = final.t_world_root.double(), settings.tie
+            tied = HpsState(data.start.theta, data.start.R_world_root, t)
+            data = replace(data, start=tied, hold_confidence=hold)
+        solution = self.hps.optimize(data)
         part = replace(start, motion=start.motion.sliced(first, len(times)))
         motion = self.hps.motion(part, solution)
         new = (motion.timestamps > after + 0.5 / fps) & (motion.timestamps <= final_s)
@@ -338,16 +346,6 @@ class HpsStream:
             carried = replace(carried, t_world_root=carried.t_world_root + move)
         lost = torch.zeros(len(aligned), dtype=torch.bool)
         return Initialization(carried, lost, self.yaw.expand(len(aligned)))
-
-    def _tied(self, data: HpsData, times: Float64[Tensor, "time"]) -> HpsData:
-        """Constrain the window to its final frames: their positions replace the camera's in the `hold` term."""
-        if self.done is None:
-            return data
-        count = int((times <= self.done.timestamps[-1] + 0.5 / self.hps.fps).sum())
-        final = self.done.sliced(len(self.done) - count, len(self.done))
-        t, hold = data.start.t_world_root.clone(), data.hold_confidence.clone()
-        t[:count], hold[:count] = final.t_world_root.double(), self.settings.tie
-        return replace(data, start=HpsState(data.start.theta, data.start.R_world_root, t), hold_confidence=hold)
 
     def _recording(self) -> Recording:
         assert self.seen is not None

@@ -36,7 +36,7 @@ CHAMFER_EVERY_S, CHAMFER_POINTS = 1.0, 1500
 
 
 @dataclass(frozen=True)
-class InteractionScores:
+class _InteractionScores:
     """Scores of one capture."""
 
     handlings: tuple[Handling, ...]
@@ -50,7 +50,7 @@ class InteractionScores:
     """Mean displacement of the centres of objects that were never touched, from the first to the last frame."""
 
 
-def score_interactions(motion: Motion, recording: Recording, environment: Environment) -> InteractionScores:
+def score_interactions(motion: Motion, recording: Recording, environment: Environment) -> _InteractionScores:
     """Score one capture; its object motion may lack objects that never moved.
 
     Raises WearcapError when the recording lacks a true motion, interactions or object motion, or the capture objects.
@@ -79,9 +79,9 @@ def score_interactions(motion: Motion, recording: Recording, environment: Enviro
     body, objects = _chamfer(motion, true, recording, rows, environment, found, real)
     joints = mpjpe_cm(motion.T_world_joint.t, true.T_world_joint.t).item()
     untouched = [scene_object for scene_object in environment.objects if scene_object.name not in held.objects]
-    ends = [object_error(found[t.name][[-1]], found[t.name][[0]], middle_of(t)).distance_cm[0] for t in untouched]
+    ends = [object_error(found[t.name][[-1]], found[t.name][[0]], _middle_of(t)).distance_cm[0] for t in untouched]
     false_moves = float(torch.stack(ends).mean()) if ends else 0.0
-    return InteractionScores(tuple(scored), joints, body, objects, false_moves)
+    return _InteractionScores(tuple(scored), joints, body, objects, false_moves)
 
 
 def with_interactions(row: Row, motion: Motion, source: CaptureInput, environment: str | Path | None) -> Row:
@@ -102,7 +102,7 @@ def poses_at(track: Trajectory | None, scene_object: SceneObject, timestamps: Fl
     return resample(track, inside).T_world_body
 
 
-def middle_of(scene_object: SceneObject) -> Float[Tensor, "3"]:
+def _middle_of(scene_object: SceneObject) -> Float[Tensor, "3"]:
     """Centre of an object's bounding box in its own axes (m)."""
     vertices = scene_object.mesh.vertices
     return torch.from_numpy((vertices.min(0) + vertices.max(0)) / 2)
@@ -114,7 +114,7 @@ def _handling(row, rows, environment, held, timestamps, palms, found, real) -> H
     again = min((a for n, a, _ in rows if n == name and a > start), default=float("inf"))
     end = max(int(torch.searchsorted(timestamps, min(stop + SETTLED_S, again))) - 1, 0)
     begin = int(torch.searchsorted(timestamps, start).clamp(max=len(timestamps) - 1))
-    middle = middle_of(scene_object)
+    middle = _middle_of(scene_object)
     left = object_error(found[name][end], real[name][end], middle)
     own = replace(
         held, **_only(held, [o == name and start <= a < stop for o, a in zip(held.objects, held.start_s.tolist())])
