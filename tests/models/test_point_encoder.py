@@ -8,10 +8,10 @@ from wearcap.errors import WearcapError
 from wearcap.models.point_encoder import (
     PointNeXt,
     _ball_query,
+    _rows_at,
     cloud_extents,
     farthest_points,
     load_object_encoder,
-    _rows_at,
     spread_first,
 )
 

@@ -16,11 +16,11 @@ from wearcap.scene.scan import Scan
 from wearcap.systems.hps.scores import (
     HpsTruth,
     RigCloud,
+    _joint_errors_cm,
     disturbance,
     drift,
     in_order,
     interval_chamfer,
-    _joint_errors_cm,
     nearest_frames,
     planted_outages,
     score_hps,

@@ -11,6 +11,7 @@ from rich import print as show
 from rich.console import Console
 
 from wearcap.body.anny_body import anny_body
+from wearcap.body.model import BodyModel
 from wearcap.body.retarget import retarget
 from wearcap.body.skeletons import smplh52
 from wearcap.body.smpl_body import smpl_body
@@ -82,17 +83,7 @@ def _write(
         R_parent_joint, root = retarget(motion.skeleton, target, motion.R_parent_joint, motion.t_world_root)
         smpl = Motion(motion.timestamps, target, R_parent_joint, root)
         write_amass(smpl, folder / "motion_smplh.npz")
-    # The .glb's surface: Anny's body, none, or on its own skeleton that of the user's SMPL model file.
-    shown, body = motion, None
-    if isinstance(config.body, str):
-        arrays = read_smpl(config.body)
-        betas = [value for name, value in recording.shape.items() if name.startswith("beta_")]
-        betas = torch.tensor(betas[: arrays.shape_directions.shape[-1]])
-        body = smpl_body(arrays, betas if len(betas) else None)
-        R, root = retarget(motion.skeleton, body.skeleton, motion.R_parent_joint, motion.t_world_root)
-        shown = replace(motion, skeleton=body.skeleton, R_parent_joint=R, t_world_root=root)
-    elif config.body:
-        body = anny_body(motion.skeleton, recording.shape or None)
+    shown, body = _with_body(motion, recording, config.body)
     write_glb(shown, folder / "motion.glb", body=body)
     if config.video:
         truth = with_objects(recording, environment)
@@ -103,6 +94,18 @@ def _write(
             environment=environment,
             max_seconds=config.video_seconds,
         )
+
+
+def _with_body(motion: Motion, recording: Recording, chosen: bool | str) -> tuple[Motion, BodyModel | None]:
+    """The .glb's motion and surface: Anny's body, none, or on its own skeleton that of the user's SMPL model file."""
+    if not isinstance(chosen, str):
+        return motion, anny_body(motion.skeleton, recording.shape or None) if chosen else None
+    arrays = read_smpl(chosen)
+    betas = [value for name, value in recording.shape.items() if name.startswith("beta_")]
+    betas = torch.tensor(betas[: arrays.shape_directions.shape[-1]])
+    body = smpl_body(arrays, betas if len(betas) else None)
+    R, root = retarget(motion.skeleton, body.skeleton, motion.R_parent_joint, motion.t_world_root)
+    return replace(motion, skeleton=body.skeleton, R_parent_joint=R, t_world_root=root), body
 
 
 def _live(system: System, config: DictConfig, folder: Path) -> None:

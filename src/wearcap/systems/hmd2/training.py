@@ -3,10 +3,10 @@
 from collections.abc import Callable
 
 import torch
+from einops import rearrange
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import FEET, Skeleton
 from wearcap.data.windows import MIN_SCALE, Windows, drawn_batches
 from wearcap.diffusion.process import add_noise
@@ -135,18 +135,17 @@ class MotionDiffusion(Training):
         if any(self.loss_weights.get(name) for name in ("joints", "velocity", "skate")):
             motion_hat = self.net.motion_normalizer.inverse(x0_hat.float())
             R_hat, _ = self.features.decode(motion_hat, batch.R_world_head)
-            predicted, true = self._from_head(R_hat, batch), self._from_head(batch.R_parent_joint, batch)
+            # As anchoring the body to the true head gives them.
+            predicted, true = (batch.joints_from_head(self.skeleton, R) for R in (R_hat, batch.R_parent_joint))
             terms["joints"] = losses.joint_position(predicted, true, weight)
             terms["velocity"] = losses.joint_velocity(predicted, true, weight, self.fps)
-            feet = predicted[:, :, self._feet].unflatten(2, (FEET, -1)) + batch.t_world_head[:, :, None, None]
+            feet = predicted[:, :, self._feet]
+            feet = (
+                rearrange(feet, "batch time (foot point) axis -> batch time foot point axis", foot=FEET)
+                + batch.t_world_head[:, :, None, None]
+            )
             terms["skate"] = losses.foot_skate(feet, batch.foot_contact, weight, self.fps)
         return terms
-
-    def _from_head(self, R_parent_joint: Tensor, batch: HeadWindow) -> Tensor:
-        """Joint positions relative to the head joint (m), as anchoring the body to the true head gives them."""
-        origin = torch.zeros_like(batch.t_world_head)
-        joints = forward_kinematics(self.skeleton, R_parent_joint, origin, batch.t_parent_joint[:, None]).t
-        return joints - joints[:, :, self.skeleton.index("head"), None]
 
 
 def feature_statistics(dataset: Windows, features: HeadFeatures, limit: int = 2000) -> dict[str, tuple[Tensor, Tensor]]:

@@ -20,7 +20,7 @@ from wearcap.body import skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry import rigid, rotation, trajectory
 from wearcap.geometry.rigid import Rigid
-from wearcap.optimize.hps import HpsData, HpsState
+from wearcap.optimize.hps import HpsState
 from wearcap.recording import Motion, Recording
 from wearcap.recording import motion as motion_types
 from wearcap.recording import recording as recording_types

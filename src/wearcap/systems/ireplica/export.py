@@ -73,7 +73,9 @@ class _ExportedDetector(ContactDetector):
         write_text(path, "".join(",".join(row) + "\n" for row in [header, *rows]))
 
 
-def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], about: dict[str, Any]) -> _ExportedDetector:
+def from_export(
+    runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], about: dict[str, Any]
+) -> _ExportedDetector:
     """The detector of an exported model."""
     features = dict(about["features"])
     encoder = FEATURES[features.pop("name")](**features)

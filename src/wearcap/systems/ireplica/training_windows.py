@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+from einops import rearrange
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
@@ -51,7 +52,7 @@ def pose_errors(
     fixed = torch.randn(1, 3 * joints, generator=random)
     quick = torch.randn(frames, 3 * joints, generator=random)
     error = scale * (shares[0] * fixed + shares[1] * slow + shares[2] * quick)
-    return error.unflatten(-1, (joints, 3))
+    return rearrange(error, "time (joint axis) -> time joint axis", axis=3)
 
 
 @dataclass(frozen=True, eq=False)
