@@ -49,8 +49,7 @@ def mean_detection_scores(
 
 
 def average_precision(prob: Float[Tensor, "sample"], truth: Bool[Tensor, "sample"]) -> float:
-    """Average precision Σ (R_n - R_(n-1)) P_n over falling thresholds, with ties grouped (scikit-learn's
-    definition)."""
+    """Average precision Σ (R_n - R_(n-1)) P_n over falling thresholds; ties are grouped (scikit-learn's definition)."""
     order = prob.argsort(descending=True, stable=True)
     hits = truth[order].double().cumsum(0)
     if not len(hits) or not hits[-1]:
@@ -62,12 +61,12 @@ def average_precision(prob: Float[Tensor, "sample"], truth: Bool[Tensor, "sample
     return float((gained * hits / count).sum() / hits[-1])
 
 
-def calibration_error(prob: Float[Tensor, "sample"], truth: Bool[Tensor, "sample"], bins: int = 10) -> float:
-    """Expected calibration error over bins of equal width (Guo et al. 2017)."""
+def calibration_error(prob: Float[Tensor, "sample"], truth: Bool[Tensor, "sample"]) -> float:
+    """Expected calibration error over ten bins of equal width (Guo et al. 2017)."""
     if not len(prob):
         return float("nan")
-    place = (prob * bins).long().clamp(0, bins - 1)
-    excess = torch.zeros(bins, dtype=torch.float64, device=prob.device)
+    place = (prob * 10).long().clamp(0, 9)
+    excess = torch.zeros(10, dtype=torch.float64, device=prob.device)
     excess.index_add_(0, place, prob.double() - truth.double())
     return float(excess.abs().sum() / len(prob))
 

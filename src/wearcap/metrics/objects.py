@@ -128,17 +128,14 @@ def contact_mean(value: Float[Tensor, "time hand"], contact: Bool[Tensor, "time 
 
 
 def handlings(
-    start_s: Float[Tensor, "interval"],
-    stop_s: Float[Tensor, "interval"],
-    objects: tuple[str, ...],
-    pause_s: float = PAUSE_S,
+    start_s: Float[Tensor, "interval"], stop_s: Float[Tensor, "interval"], objects: tuple[str, ...]
 ) -> list[tuple[str, float, float]]:
-    """(object, start, stop) of every handling: intervals of one object with pauses of at most `pause_s` (s)."""
+    """(object, start, stop) of every handling: intervals of one object with pauses of at most `PAUSE_S`."""
     merged: list[tuple[str, float, float]] = []
     for name in sorted(set(objects)):
         rows = sorted((a, b) for a, b, o in zip(start_s.tolist(), stop_s.tolist(), objects) if o == name)
         for start, stop in rows:
-            if merged and merged[-1][0] == name and start - merged[-1][2] <= pause_s:
+            if merged and merged[-1][0] == name and start - merged[-1][2] <= PAUSE_S:
                 merged[-1] = (name, merged[-1][1], max(stop, merged[-1][2]))
             else:
                 merged.append((name, start, stop))

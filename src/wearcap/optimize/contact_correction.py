@@ -24,8 +24,7 @@ from wearcap.optimize.trajectory import BentPath
 SETTLED = 2.0717
 """x with exp(−x) (cos x + sin x) = 0.05: decay of the offset after a contact, as a function of rate · time."""
 KEEP = 10.0
-"""Weight of a bent window's end, relative to the contact's (1), so that a point out of reach does not move what
-follows."""
+"""Weight of a bent window's end relative to the contact's (1): a point out of reach does not move what follows."""
 
 
 @dataclass(frozen=True)

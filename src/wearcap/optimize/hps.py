@@ -28,8 +28,7 @@ class Term:
     inputs: tuple[str, ...]
     """Arguments of `cost`: names of `state_values`, the first one, and of `data_values`."""
     reach: int
-    """Number of consecutive frames on which a residual depends: 1, or 2 (then the first residual is that of frames 0
-    and 1)."""
+    """Number of consecutive frames on which a residual depends: 1, or 2 (the first is then that of frames 0 and 1)."""
     share: str = "ones"
     """Name in `data_values` of the factor of each residual's energy, of the residuals' shape; "ones": no factor."""
     expected: tuple[str, ...] = ()
@@ -67,8 +66,7 @@ PATCH_VERTICES = 10
 SURFACE_REACH_M = 0.5
 """Distance (m) to the nearest scanned point above which a foot has no scene below it."""
 LEAST_UPRIGHT = 0.7
-"""Least vertical component of a plane's normal that a foot may stand on (45°): excludes walls beside gaps in the
-floor."""
+"""Least vertical component of the normal of a plane to stand on (45°): no walls beside gaps in the floor."""
 
 
 @dataclass(frozen=True)
@@ -122,8 +120,7 @@ class HpsState:
 
 @dataclass(frozen=True, eq=False)
 class FootPatches:
-    """Vertices of the patches (B_k of thesis eq. 4.6), skinned without the rest of the body: 40 instead of
-    thousands."""
+    """Vertices of the patches (B_k of thesis eq. 4.6), skinned without the rest of the body: 40, not thousands."""
 
     body: BodyModel
     vertex: Int64[Tensor, "vertex"]
@@ -148,8 +145,7 @@ class FootPatches:
         return self._only.vertices(T_world_joint)
 
     def share(self, contact: Float[Tensor, "*batch patch"]) -> Float[Tensor, "*batch vertex"]:
-        """Contact of each vertex's patch, divided by its number of vertices, so that sums over vertices are patch
-        means."""
+        """Contact of each vertex's patch over its number of vertices, so that sums over vertices are patch means."""
         size = torch.bincount(self.patch, minlength=len(FOOT_REGIONS)).to(contact)
         return (contact / size)[..., self.patch]
 
@@ -246,8 +242,7 @@ class HpsData:
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """Nearest scene point v(n) of each patch vertex (eq. 4.6), and the local plane; `found` is 1 where both exist,
-    else 0."""
+    """Nearest scene point v(n) of each patch vertex (eq. 4.6), and the local plane; `found`: 1 where both exist, else 0."""
 
     point: Float[Tensor, "time vertex 3"]
     origin: Float[Tensor, "time vertex 3"]

@@ -148,10 +148,10 @@ class MotionDiffusion(Training):
         return terms
 
 
-def feature_statistics(dataset: Windows, features: HeadFeatures, limit: int = 2000) -> dict[str, tuple[Tensor, Tensor]]:
-    """(mean, scale) of "motion", "head", "points" and "image" over at most `limit` windows drawn by dataset weights."""
+def feature_statistics(dataset: Windows, features: HeadFeatures) -> dict[str, tuple[Tensor, Tensor]]:
+    """(mean, scale) of "motion", "head", "points" and "image" over at most 2000 windows drawn by dataset weights."""
     sums: dict[str, list[Tensor]] = {}
-    for batch in drawn_batches(dataset, min(limit, 4 * len(dataset)), 64):
+    for batch in drawn_batches(dataset, min(2000, 4 * len(dataset)), 64):
         motion = features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
         head = features.condition(batch.R_world_head, batch.t_world_head, batch.floor_height, batch.size, dataset.fps)
         for name, value, valid in (

@@ -56,11 +56,9 @@ class Evidence:
     """How much the optimisation trusts the suit's contacts and the localisation."""
 
     max_contact_speed: float | None = 0.6
-    """Largest speed (m/s, in the suit's own motion) at which a foot patch's contact flag is used; None: all flags are
-    used (thesis)."""
+    """Largest speed (m/s, in the suit's motion) at which a patch's contact flag is used; None: all are used (thesis)."""
     confident: bool = True
-    """Whether frames are weighted by the localisation's confidence (0 where it failed); False: all frames alike
-    (thesis)."""
+    """Whether frames are weighted by the localisation's confidence (0 where it failed); False: all alike (thesis)."""
 
 
 @dataclass(eq=False)
@@ -152,14 +150,12 @@ class HPS(StagedSystem):
         return self.localization(recording, folder)
 
     def align(self, recording: Recording) -> Motion:
-        """Resample the suit's motion to `fps`, rotate it about gravity and move it into the scene (thesis eq. 4.14,
-        4.15)."""
+        """Resample the suit's motion to `fps`, rotate it about gravity, move it into the scene (thesis eq. 4.14, 4.15)."""
         suit, localization, T_head_cam = required(recording)
         return align_suit(resampled(suit, self.fps), localization, T_head_cam)[0]
 
     def initialize(self, recording: Recording, aligned: Motion) -> Initialization:
-        """Initial state of the optimisation: the suit's pose moved along the camera's path (thesis §4.2.5, eq.
-        4.13)."""
+        """Initial state of the optimisation: the suit's pose on the camera's path (thesis §4.2.5, eq. 4.13)."""
         _, localization, T_head_cam = required(recording)
         return initialize(aligned, localization, T_head_cam.R, T_head_cam.t, self.initialization)
 

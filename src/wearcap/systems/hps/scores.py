@@ -26,8 +26,7 @@ from wearcap.recording.timing import resampled
 from wearcap.scene.scan import Scan
 
 FEET_S, FEET_EVERY_S = 2.0, 6.0
-"""Feet are scored in the first `FEET_S` of every `FEET_EVERY_S` (s): in total about the thesis's three minutes, spread
-evenly."""
+"""Feet are scored in the first `FEET_S` of every `FEET_EVERY_S` (s): in total about the thesis's three minutes."""
 BIN_M = 20.0
 """Length of path (m) over which errors are averaged before a slope is fitted."""
 MARGIN_S = 5.0
@@ -180,19 +179,19 @@ def travelled_m(motion: Motion) -> Float[Tensor, "time"]:
     return torch.cat([length.new_zeros(1), length])
 
 
-def drift(distance_m: Float[Tensor, "time"], error_cm: Float[Tensor, "time"], bin_m: float = BIN_M) -> Drift:
-    """Mean error of each bin of `bin_m` walked, and the slope of a line fitted to these means.
+def drift(distance_m: Float[Tensor, "time"], error_cm: Float[Tensor, "time"]) -> Drift:
+    """Mean error of each bin of `BIN_M` walked, and the slope of a line fitted to these means.
 
     Each bin has the same weight, however long the wearer stood in it; the last one counts only if at least half of it
     was walked.
     """
-    number = (distance_m / bin_m).floor().long().numpy()
-    whole = number < round(distance_m[-1].item() / bin_m)
+    number = (distance_m / BIN_M).floor().long().numpy()
+    whole = number < round(distance_m[-1].item() / BIN_M)
     if not whole.any():
         whole[:] = True
     count = np.bincount(number[whole])
     error = np.bincount(number[whole], error_cm.double().numpy()[whole])[count > 0] / count[count > 0]
-    middle = (np.flatnonzero(count) + 0.5) * bin_m
+    middle = (np.flatnonzero(count) + 0.5) * BIN_M
     slope = 100 * float(np.polyfit(middle, error, 1)[0]) if len(middle) > 1 else math.nan
     return Drift(tuple(middle.tolist()), tuple(error.tolist()), slope)
 

@@ -20,8 +20,7 @@ from wearcap.systems.ireplica.features import FEATURES, pose_frames
 
 
 def exports(detector: ContactDetector) -> Exports:
-    """A detector's network, from `pose` "batch 61 feature" to calibrated probabilities "batch hand class" of the middle
-    frame."""
+    """A detector's network, from `pose` "batch 61 feature" to the middle frame's probabilities "batch hand class"."""
     skeleton, random = detector.features.skeleton, torch.Generator().manual_seed(0)
     turns = 0.3 * torch.randn(3, FRAMES, len(skeleton), 3, generator=random)
     graph = Graph(Call(detector.net, "middle_probability"), {"pose": detector.features.encode(rotation.exp(turns))})

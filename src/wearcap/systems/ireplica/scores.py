@@ -170,16 +170,16 @@ def _chamfer(
     return tuple(float(np.mean(part)) if part else float("nan") for part in errors)  # pyright: ignore[reportReturnType]
 
 
-def surface_points(scene_object: SceneObject, count: int = CHAMFER_POINTS) -> Float[Tensor, "point 3"]:
-    """Points sampled uniformly by area on an object's surface (without faces: from its vertices), with a fixed seed."""
+def surface_points(scene_object: SceneObject) -> Float[Tensor, "point 3"]:
+    """`CHAMFER_POINTS` points, uniform by area on an object's surface (without faces: of its vertices), always the same."""
     vertices, faces = scene_object.mesh.vertices, scene_object.mesh.faces
     rng = np.random.default_rng(0)
     if not len(faces):
-        return torch.from_numpy(vertices[rng.permutation(len(vertices))[:count]])
+        return torch.from_numpy(vertices[rng.permutation(len(vertices))[:CHAMFER_POINTS]])
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    chosen = rng.choice(len(faces), count, p=area / area.sum())
-    u, v = rng.uniform(size=(2, count, 1)).astype(np.float32)
+    chosen = rng.choice(len(faces), CHAMFER_POINTS, p=area / area.sum())
+    u, v = rng.uniform(size=(2, CHAMFER_POINTS, 1)).astype(np.float32)
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     return torch.from_numpy(a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen])
 

@@ -62,8 +62,7 @@ class ContactDetection(Training):
         return every[0], every[1]
 
     def on_validation_epoch_end(self) -> None:
-        """Log scores per class, means over hands (thesis Table 5.3); calibration does not change the logits' order
-        or sign."""
+        """Log scores per class, means over hands (thesis Table 5.3); calibration changes no logit's order or sign."""
         logits, truth = self.validated()
         for index, name in enumerate(self.classes):
             scores = mean_detection_scores(logits[..., index].sigmoid(), truth[..., index])
