@@ -242,7 +242,7 @@ class HpsData:
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """Nearest scene point v(n) of each patch vertex (eq. 4.6), and the local plane; `found`: 1 where both exist, else 0."""
+    """Nearest scene point v(n) of each patch vertex (eq. 4.6) and local plane; `found`: 1 where both exist, else 0."""
 
     point: Float[Tensor, "time vertex 3"]
     origin: Float[Tensor, "time vertex 3"]

@@ -230,7 +230,7 @@ def bent_path(
 
 
 def bend_adam(problem: BendingProblem, iterations: int = 1000, learning_rate: float = 1e-2) -> BentPath:
-    """The thesis's solver (§5.4.2): Adam with a learning rate in rad and m; returns the best state of all iterations."""
+    """The thesis's solver (§5.4.2): Adam, its learning rate in rad and m. Returns the best state of all iterations."""
     turn = torch.zeros(len(problem.leader), dtype=torch.float64, requires_grad=True)
     shift = torch.zeros(2, dtype=torch.float64, requires_grad=problem.settings.free_start)
     unknowns = [value for value in (turn, shift) if value.requires_grad]

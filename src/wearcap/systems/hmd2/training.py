@@ -76,7 +76,7 @@ class MotionDiffusion(Training):
         self._encode = torch.compile(self.net.encode) if compile else self.net.encode
 
     def set_statistics(self, dataset: Windows) -> None:
-        """Set the normalisation from a training split. Raises WearcapError unless its windows have the model's inputs."""
+        """Set normalisation from a training split. Raises WearcapError unless its windows have the model's inputs."""
         content = dataset.content
         assert isinstance(content, HeadContent)
         net, places, images = self.net, content.surroundings.places, content.surroundings.images

@@ -56,7 +56,7 @@ class Evidence:
     """How much the optimisation trusts the suit's contacts and the localisation."""
 
     max_contact_speed: float | None = 0.6
-    """Largest speed (m/s, in the suit's motion) at which a patch's contact flag is used; None: all are used (thesis)."""
+    """Largest speed (m/s, in the suit's motion) at which a foot patch's contact is used; None: all are (thesis)."""
     confident: bool = True
     """Whether frames are weighted by the localisation's confidence (0 where it failed); False: all alike (thesis)."""
 
@@ -150,7 +150,7 @@ class HPS(StagedSystem):
         return self.localization(recording, folder)
 
     def align(self, recording: Recording) -> Motion:
-        """Resample the suit's motion to `fps`, rotate it about gravity, move it into the scene (thesis eq. 4.14, 4.15)."""
+        """The suit's motion at `fps`, rotated about gravity and moved into the scene (thesis eq. 4.14, 4.15)."""
         suit, localization, T_head_cam = required(recording)
         return align_suit(resampled(suit, self.fps), localization, T_head_cam)[0]
 

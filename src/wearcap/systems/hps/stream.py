@@ -327,7 +327,7 @@ class HpsStream:
         return motion.moved(Rigid(turn, move))
 
     def _start(self, aligned: Motion) -> Initialization:
-        """The window's initialisation; without localised frames, the suit's motion goes on from the last final frame."""
+        """The window's initialisation; without localised frames the suit's motion goes on from the last final one."""
         seen = self.seen
         if seen is not None and (_inside(seen, aligned) & inliers(seen)).any():
             start = initialize(aligned, seen, self.mount.R, self.mount.t, self.hps.initialization)

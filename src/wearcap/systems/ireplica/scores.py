@@ -171,7 +171,7 @@ def _chamfer(
 
 
 def surface_points(scene_object: SceneObject) -> Float[Tensor, "point 3"]:
-    """`CHAMFER_POINTS` points, uniform by area on an object's surface (without faces: of its vertices), always the same."""
+    """`CHAMFER_POINTS` points, uniform by area on an object's surface (without faces: its vertices); a fixed seed."""
     vertices, faces = scene_object.mesh.vertices, scene_object.mesh.faces
     rng = np.random.default_rng(0)
     if not len(faces):

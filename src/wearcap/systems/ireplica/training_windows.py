@@ -41,7 +41,7 @@ class PoseNoise:
 def pose_errors(
     frames: int, joints: int, greatest_deg: float, random: torch.Generator
 ) -> Float[Tensor, "time joint 3"]:
-    """Pose noise as rotation vectors (rad): a random mixture of constant, slow (1 s) and per-frame noise."""
+    """Pose noise as rotation vectors (rad) of random size: a mixture of constant, slow (1 s) and per-frame noise."""
     size, *shares = torch.rand(4, generator=random).tolist()
     scale = math.radians(greatest_deg * size) / math.sqrt(3 * sum(share**2 for share in shares))
     knots = torch.randn(2 + frames // 60, 3 * joints, generator=random)
