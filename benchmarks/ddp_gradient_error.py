@@ -19,8 +19,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from wearcap.cli.conf import compose
 from wearcap.data.datamodule import WindowsModule
-from wearcap.data.statistics import collate
-from wearcap.data.windows import SeededSampler
+from wearcap.data.windows import SeededSampler, collate
 from wearcap.systems.hmd2.training import MotionDiffusion
 from wearcap.systems.hmd2.training_windows import HeadWindow
 

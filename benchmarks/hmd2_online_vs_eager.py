@@ -10,8 +10,8 @@ from dataclasses import fields
 from online import Streamed, figure, pipeline_of
 
 from wearcap.diffusion.process import step_levels
+from wearcap.systems.hmd2.model import StepRunner
 from wearcap.systems.hmd2.pipeline import HMD2
-from wearcap.systems.hmd2.step_runner import StepRunner
 
 STEPS = 20
 

@@ -9,8 +9,7 @@ import torch
 from wearcap.cli.conf import compose
 from wearcap.cli.load import load_pipeline
 from wearcap.evaluation.baselines import BASELINES
-from wearcap.evaluation.evaluate import evaluate
-from wearcap.evaluation.realism import Realism
+from wearcap.evaluation.evaluate import Realism, evaluate
 from wearcap.metrics.scores import score
 from wearcap.metrics.table import Row, Summary, aggregate
 from wearcap.recording import Motion, RecordingStore

@@ -11,9 +11,8 @@ from wearcap.body.anny_body import anny_body
 from wearcap.body.contact_points import BODY_POINTS, contact_points
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
-from wearcap.data.statistics import collate
 from wearcap.data.transforms import Cut, Draws, EarlyEnd, Mirror, Shift, mirrored
-from wearcap.data.windows import Source, Windows
+from wearcap.data.windows import Source, Windows, collate
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.systems.echo.features import POINTS

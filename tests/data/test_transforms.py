@@ -8,7 +8,6 @@ from contact_motion import CLASSES, bending_dataset
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import xsens23
 from wearcap.data.motion_features import MotionFeatures, MovementContent
-from wearcap.data.statistics import collate
 from wearcap.data.transforms import (
     Draws,
     DropFrames,
@@ -24,7 +23,7 @@ from wearcap.data.transforms import (
     scaled,
     turned,
 )
-from wearcap.data.windows import Source, Windows
+from wearcap.data.windows import Source, Windows, collate
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.systems.echo.training_windows import EchoContent

@@ -5,7 +5,6 @@ import torch
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import xsens23
-from wearcap.data.statistics import collate
 from wearcap.data.transforms import (
     Cut,
     Mirror,
@@ -19,7 +18,7 @@ from wearcap.data.transforms import (
     scaled,
     turned,
 )
-from wearcap.data.windows import Source, Windows
+from wearcap.data.windows import Source, Windows, collate
 from wearcap.errors import WearcapError
 from wearcap.systems.mocap_every.features import ENDS, Sensed, WatchFeatures
 from wearcap.systems.mocap_every.training_windows import WatchContent, WatchWindow

@@ -8,9 +8,8 @@ import torch
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import xsens23
 from wearcap.data.datamodule import Loading, WindowsModule
-from wearcap.data.statistics import collate
 from wearcap.data.transforms import Mirror, Shift, mirrored
-from wearcap.data.windows import FixedSampler, SeededSampler, Source, Windows
+from wearcap.data.windows import FixedSampler, SeededSampler, Source, Windows, collate
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.systems.hmd2.features import HeadFeatures

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from wearcap.errors import WearcapError
-from wearcap.systems.hmd2.model import Conditions, MotionDenoiser
-from wearcap.systems.hmd2.step_runner import StepRunner
+from wearcap.systems.hmd2.model import Conditions, MotionDenoiser, StepRunner
 
 LEVELS = torch.tensor([1.0, 0.6, 0.2])
 

@@ -7,11 +7,11 @@ from torch.nn import functional as F
 from wearcap.errors import WearcapError
 from wearcap.models.point_encoder import (
     PointNeXt,
-    ball_query,
+    _ball_query,
+    _rows_at,
     cloud_extents,
     farthest_points,
     load_object_encoder,
-    rows_at,
     spread_first,
 )
 
@@ -65,7 +65,7 @@ def test_farthest_points_are_those_of_a_plain_loop():
     order = spread_first(points, 20)
     assert torch.equal(order[:, :20], found)
     assert torch.equal(order.sort(1).values, torch.arange(60).expand(3, 60))
-    kept = rows_at(points, found)
+    kept = _rows_at(points, found)
     # the farthest of the farthest are the first of them: what later stages rely on
     assert torch.equal(farthest_points(kept, 10), torch.arange(10).expand(3, 10))
 
@@ -77,7 +77,7 @@ def test_repeated_points_are_taken_last():
 
 def test_a_ball_holds_the_nearest_within_its_radius():
     points = torch.randn(2, 50, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    found = ball_query(points[:, :7], points, 0.8, 6)
+    found = _ball_query(points[:, :7], points, 0.8, 6)
     for cloud, rows in zip(points, found):
         for center, row in zip(cloud[:7], rows.tolist()):
             apart = (cloud - center).norm(dim=-1)

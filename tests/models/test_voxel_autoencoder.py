@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from wearcap.errors import WearcapError
-from wearcap.metrics.occupancy import distance_mae_cm, occupancy_iou, occupied_distance_mae_cm
+from wearcap.metrics.detection import distance_mae_cm, occupancy_iou, occupied_distance_mae_cm
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.scene.voxels import VoxelGrid
 

@@ -113,20 +113,6 @@ def test_recordings_shorter_than_a_window(store):
         assert motion.R_parent_joint.isfinite().all()
 
 
-@pytest.mark.parametrize("baseline", [MeanPose, NearestWindow])
-def test_saved_and_loaded_is_the_same(store, baseline, tmp_path):
-    fitted, query = baseline.fit([store]), recorded("query", 0.9)
-    fitted.save(tmp_path / "b.safetensors")
-    again = baseline.load(tmp_path / "b.safetensors")
-    assert torch.equal(again(query).R_parent_joint, fitted(query).R_parent_joint)
-    other = NearestWindow if baseline is MeanPose else MeanPose
-    with pytest.raises(WearcapError, match="holds"):
-        other.load(tmp_path / "b.safetensors")
-    (tmp_path / "b.safetensors").write_bytes(b"nonsense")
-    with pytest.raises(WearcapError, match="not a readable baseline"):
-        baseline.load(tmp_path / "b.safetensors")
-
-
 def test_capture_takes_many(store):
     queries = [recorded("a", 0.7), recorded("b", 1.5, frames=40)]
     captures = MeanPose.fit([store]).capture(queries, [0, 1])

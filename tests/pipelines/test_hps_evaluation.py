@@ -16,11 +16,11 @@ from wearcap.scene.scan import Scan
 from wearcap.systems.hps.scores import (
     HpsTruth,
     RigCloud,
+    _joint_errors_cm,
     disturbance,
     drift,
     in_order,
     interval_chamfer,
-    joint_errors_cm,
     nearest_frames,
     planted_outages,
     score_hps,
@@ -116,7 +116,7 @@ def test_clouds_are_met_at_their_own_time(truth: HpsTruth):
 def test_a_captured_turn_leaves_the_root_where_it_is_and_moves_the_joints(truth: HpsTruth):
     R = truth.motion.R_parent_joint.clone()
     R[:, 0] = about_axis("z", torch.tensor(np.pi))
-    error = joint_errors_cm(replace(truth.motion, R_parent_joint=R), truth.motion)
+    error = _joint_errors_cm(replace(truth.motion, R_parent_joint=R), truth.motion)
     wrist = truth.motion.skeleton.index("left_wrist")
     reach = truth.motion.skeleton.rest_joints[wrist] - truth.motion.skeleton.rest_joints[0]
     assert error[:, 0].abs().max() < 1e-4

@@ -12,8 +12,8 @@ import torch
 from wearcap.body.skeleton import xsens23
 from wearcap.data.motion_features import MotionFeatures
 from wearcap.errors import WearcapError
-from wearcap.evaluation import realism
-from wearcap.evaluation.realism import Realism
+from wearcap.evaluation import evaluate as evaluation
+from wearcap.evaluation.evaluate import Realism
 from wearcap.geometry import rotation
 from wearcap.metrics.distribution import diversity, frechet_distance
 from wearcap.metrics.scores import score
@@ -29,7 +29,7 @@ FEATURES = MotionFeatures(xsens23())
 @pytest.fixture
 def gathering(monkeypatch) -> Realism:
     """Windows of 1.2 s, a fifth of a second apart, of which 600 are enough."""
-    monkeypatch.setattr(realism, "MIN_WINDOWS", 600)
+    monkeypatch.setattr(evaluation, "MIN_WINDOWS", 600)
     torch.manual_seed(0)
     net = MotionAutoencoder(FEATURES.size, 24, (32, 32), latent=16)
     net.normalizer.set(torch.zeros(143), torch.cat([torch.ones(4), torch.full((66,), 0.5), torch.ones(73)]))

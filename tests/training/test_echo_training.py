@@ -11,8 +11,7 @@ import torch
 from carried_box import WINDOW, carried_dataset, carrying, small_features, small_net
 from wearcap.body.skeleton import xsens23
 from wearcap.cli import capture, evaluate, train
-from wearcap.data.statistics import collate
-from wearcap.data.windows import Source, Windows
+from wearcap.data.windows import Source, Windows, collate
 from wearcap.diffusion.levels import LevelMix
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError

@@ -11,7 +11,7 @@ from wearcap.cli import evaluate, train
 from wearcap.cli.conf import compose
 from wearcap.cli.load import load_pipeline
 from wearcap.errors import WearcapError
-from wearcap.evaluation.realism import Realism
+from wearcap.evaluation.evaluate import Realism
 from wearcap.models.checkpoint import load_trained
 from wearcap.training.motion_autoencoder import MotionEncoding
 from wearcap_testing import small_dataset

@@ -5,8 +5,7 @@ import torch
 from torch import nn
 
 from wearcap.body.skeleton import xsens23
-from wearcap.data.statistics import collate
-from wearcap.data.windows import Source, Windows
+from wearcap.data.windows import Source, Windows, collate
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser

@@ -12,9 +12,8 @@ from torch import nn
 from wearcap.body.skeleton import xsens23
 from wearcap.cli import evaluate, train
 from wearcap.cli.conf import compose
-from wearcap.data.statistics import collate
 from wearcap.data.transforms import Mirror, Shift
-from wearcap.data.windows import Source, Windows
+from wearcap.data.windows import Source, Windows, collate
 from wearcap.errors import WearcapError
 from wearcap.models.checkpoint import load_trained
 from wearcap.models.pose_regressor import PoseRegressor
@@ -90,7 +89,7 @@ class Oracle(nn.Module):
 @pytest.mark.parametrize("mirror", [False, True])
 def test_the_truth_costs_nothing_and_another_pose_does(data, mirror):
     module, windows = system(net=Oracle).eval(), batch(data, mirror=mirror)
-    ends = module._frame_pairs(windows)
+    ends = module.frame_pairs(windows)
     assert ends[0].tolist() == [14, 15, 44, 45]
     rows = torch.arange(16)[:, None]
     truth = encode_pose(windows.R_parent_joint[rows, ends], windows.R_world_head[rows, ends]).flatten(0, 1)
@@ -106,7 +105,7 @@ def test_padding_is_no_lesson(data):
     short = next(i for i, row in enumerate(windows.starts.tolist()) if row[2] == 90)
     one = collate([windows[(short, 0)]])
     module = system(net=Oracle).eval()
-    ends = module._frame_pairs(one)
+    ends = module.frame_pairs(one)
     assert one.valid[0, ends[0]].tolist() == [True, True, True, False]
     answer = encode_pose(one.R_parent_joint[:, ends[0]], one.R_world_head[:, ends[0]])[0]
     answer[3] += 1.0

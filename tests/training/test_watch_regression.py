@@ -11,8 +11,7 @@ from torch import nn
 from wearcap.body.skeleton import xsens23
 from wearcap.cli import capture, evaluate, train
 from wearcap.cli.conf import compose
-from wearcap.data.statistics import collate
-from wearcap.data.windows import Source, Windows
+from wearcap.data.windows import Source, Windows, collate
 from wearcap.errors import WearcapError
 from wearcap.io.datasets.amass import read_amass
 from wearcap.io.formats.motion_npz import read_motion

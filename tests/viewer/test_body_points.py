@@ -11,8 +11,8 @@ from boxes import box_mesh
 from wearcap.body.anny_body import anny_body
 from wearcap.body.contact_points import BODY_POINTS, HAND_POINTS, contact_points
 from wearcap.cli import render as render_verb
-from wearcap.cli.motions import read_motions
 from wearcap.cli.view import main as view
+from wearcap.cli.view import read_motions
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.environment import write_environment

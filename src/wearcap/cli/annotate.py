@@ -43,10 +43,7 @@ def main(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     if options.video_start is not None and options.video is None:
         raise WearcapError("--video-start without a video", expected="--video FILE with it")
-    return _annotate(options)
 
-
-def _annotate(options: argparse.Namespace) -> None:
     from wearcap.io.formats.motion_npz import read_motion
     from wearcap.viewer.annotate import Desk
     from wearcap.viewer.annotate_server import AnnotationServer

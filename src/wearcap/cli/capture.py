@@ -57,8 +57,14 @@ def run(config: DictConfig) -> Motion | None:
         write_text(folder / "report.json", json.dumps(report, indent=1) + "\n")
     if motion is not None:
         environment = None if motion.object_motion is None else system.objects(source)
-        if len(captures) > 1:
-            _write_samples([c.motion for c in captures if c.motion is not None], recording, environment, folder)
+        if len(captures) > 1:  # sample-0.npz, …, and samples.png: the variety from one input (thesis Fig. 6.6)
+            motions = [each.motion for each in captures if each.motion is not None]
+            draws = {f"sample {number}": draw for number, draw in enumerate(motions)}
+            for label, draw in draws.items():
+                write_motion(draw, folder / f"{label.replace(' ', '-')}.npz")
+            truth, body = with_objects(recording, environment), anny_body(motion.skeleton, recording.shape or None)
+            shown = ({} if truth is None else {"truth": truth}) | draws
+            save_png(folder / "samples.png", contact_sheet(shown, body=body, environment=environment))
         if config.checkpoint is not None:
             motion.provenance.update(checkpoint=str(config.checkpoint))
         motion.provenance.update(recording=str(config.recording))
@@ -100,17 +106,6 @@ def _with_body(motion: Motion, recording: Recording, chosen: bool | str) -> tupl
     body = smpl_body(arrays, betas if len(betas) else None)
     R, root = retarget(motion.skeleton, body.skeleton, motion.R_parent_joint, motion.t_world_root)
     return replace(motion, skeleton=body.skeleton, R_parent_joint=R, t_world_root=root), body
-
-
-def _write_samples(draws: list[Motion], recording: Recording, environment: Environment | None, folder: Path) -> None:
-    """Write sample-0.npz, …, and samples.png: the variety of motions from one input (thesis Fig. 6.6)."""
-    shown = {f"sample {number}": motion for number, motion in enumerate(draws)}
-    for label, motion in shown.items():
-        write_motion(motion, folder / f"{label.replace(' ', '-')}.npz")
-    truth = with_objects(recording, environment)
-    body = anny_body(draws[0].skeleton, recording.shape or None)
-    sheet = contact_sheet(({} if truth is None else {"truth": truth}) | shown, body=body, environment=environment)
-    save_png(folder / "samples.png", sheet)
 
 
 def _live(system: System, config: DictConfig, folder: Path) -> None:

@@ -5,7 +5,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +54,18 @@ def hydra_main(config_name: str, task: Callable[[DictConfig], Any], arguments: l
     guarded = _Guarded(task)
     application = hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)
     with explained(config_name, arguments):
-        with _command_line(arguments):
+        # Hydra reads sys.argv, and with HYDRA_FULL_ERROR it raises errors instead of exiting.
+        before, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
+        sys.argv = [sys.argv[0], *arguments]
+        os.environ["HYDRA_FULL_ERROR"] = "1"
+        try:
             application(guarded)()
+        finally:
+            sys.argv = before
+            if full_error is None:
+                os.environ.pop("HYDRA_FULL_ERROR", None)
+            else:
+                os.environ["HYDRA_FULL_ERROR"] = full_error
         if guarded.refused is not None:
             raise guarded.refused
 
@@ -81,22 +91,6 @@ class _Guarded:
             self.refused = error
 
 
-@contextmanager
-def _command_line(arguments: list[str]) -> Iterator[None]:
-    """Set sys.argv, which Hydra reads, and HYDRA_FULL_ERROR, with which it raises errors instead of exiting."""
-    before, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
-    sys.argv = [sys.argv[0], *arguments]
-    os.environ["HYDRA_FULL_ERROR"] = "1"
-    try:
-        yield
-    finally:
-        sys.argv = before
-        if full_error is None:
-            os.environ.pop("HYDRA_FULL_ERROR", None)
-        else:
-            os.environ["HYDRA_FULL_ERROR"] = full_error
-
-
 def _compose(config_name: str, overrides: list[str]) -> DictConfig:
     with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
         return hydra.compose(config_name, overrides)
@@ -108,17 +102,12 @@ def explained(config_name: str, arguments: list[str]) -> Iterator[None]:
     try:
         yield
     except (HydraException, OmegaConfBaseException) as error:
-        ours = _cause(error, WearcapError)
+        ours: BaseException | None = error  # the first WearcapError along the chain of causes, if there is one
+        while ours is not None and not isinstance(ours, WearcapError):
+            ours = ours.__cause__
         if ours is not None:
             raise ours from error
         raise _explanation(error, config_name, arguments) from error
-
-
-def _cause(error: BaseException | None, kind: type[BaseException]):
-    """First exception of a type along the chain of causes."""
-    while error is not None and not isinstance(error, kind):
-        error = error.__cause__
-    return error
 
 
 def _explanation(error: Exception, config_name: str, arguments: list[str]) -> WearcapError:
@@ -147,10 +136,12 @@ def _explanation(error: Exception, config_name: str, arguments: list[str]) -> We
         )
     if key is None:
         return WearcapError(" ".join(str(error).split()), where=f"config {config_name!r}")
-    wrong = key.group(1).split("@")[0]
-    return WearcapError(
-        f"config {config_name!r} has no key {wrong!r}", fix=nearest(wrong, _valid_keys(config_name, arguments, wrong))
-    )
+    # What would be valid: config groups, and dotted keys of the config without the override that failed.
+    wrong, valid = key.group(1).split("@")[0], set(_groups())
+    rest = [a for a in arguments if "=" in a and not a.startswith("-") and wrong not in a and "," not in a]
+    with suppress(HydraException, OmegaConfBaseException):
+        valid |= set(_dotted(_compose(config_name, rest)))
+    return WearcapError(f"config {config_name!r} has no key {wrong!r}", fix=nearest(wrong, valid))
 
 
 def _refused(error: InstantiationException) -> WearcapError:
@@ -180,16 +171,6 @@ def _missing_choice(error: MissingConfigException) -> WearcapError:
 def _groups() -> list[str]:
     root = conf_dir()
     return sorted({path.parent.relative_to(root).as_posix() for path in root.rglob("*.yaml")} - {".", "hydra"})
-
-
-def _valid_keys(config_name: str, arguments: list[str], wrong: str) -> set[str]:
-    """Config groups and dotted keys of the config without the override that failed."""
-    rest = [a for a in arguments if "=" in a and not a.startswith("-") and wrong not in a and "," not in a]
-    keys = set(_groups())
-    try:
-        return keys | set(_dotted(_compose(config_name, rest)))
-    except (HydraException, OmegaConfBaseException):
-        return keys
 
 
 def _dotted(config: Any, prefix: str = "") -> Iterator[str]:

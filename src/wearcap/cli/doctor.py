@@ -34,7 +34,11 @@ def main(arguments: list[str]) -> None:
             task = progress.add_task("examining", total=None)
             report = examine(options.path, lambda done, total: progress.update(task, completed=done, total=total))
         console.print(_table(report, options.quiet))
-        console.print(_summary(report))
+        counts = {severity: len(report.of_severity(severity)) for severity in ("error", "warning", "note")}
+        listed = ", ".join(f"{count} {severity}{'s' if count != 1 else ''}" for severity, count in counts.items())
+        verdict = "[green]sound[/]" if report.sound else "[bold red]not sound[/]"
+        count = len(report.findings)
+        console.print(f"{count} recording{'s' if count != 1 else ''}: {verdict} ({listed})")
     if not report.sound:
         sys.exit(1)
 
@@ -56,10 +60,3 @@ def _table(report: Report, quiet: bool) -> Table:
             cell.append(f"\n{len(names)}: {', '.join(names[:3])}{' …' if len(names) > 3 else ''}", style="italic")
         table.add_row(Text(finding.severity, style=color), Text(finding.check), cell)
     return table
-
-
-def _summary(report: Report) -> str:
-    counts = {severity: len(report.of_severity(severity)) for severity in ("error", "warning", "note")}
-    listed = ", ".join(f"{count} {severity}{'s' if count != 1 else ''}" for severity, count in counts.items())
-    verdict = "[green]sound[/]" if report.sound else "[bold red]not sound[/]"
-    return f"{len(report.findings)} recording{'s' if len(report.findings) != 1 else ''}: {verdict} ({listed})"

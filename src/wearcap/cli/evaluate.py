@@ -11,8 +11,7 @@ from wearcap.cli.conf import hydra_main
 from wearcap.cli.load import load_systems, trained_on
 from wearcap.errors import WearcapError
 from wearcap.evaluation.baselines import BASELINES
-from wearcap.evaluation.evaluate import evaluate
-from wearcap.evaluation.realism import Realism
+from wearcap.evaluation.evaluate import Realism, evaluate
 from wearcap.metrics.table import Row, Scores, Summary, aggregate, rich_table, write_scores
 from wearcap.recording import RecordingStore
 from wearcap.runtime.system import StageOptions, System

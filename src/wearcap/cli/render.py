@@ -7,7 +7,7 @@ import numpy as np
 from rich import print as show
 
 from wearcap.body.anny_body import anny_body
-from wearcap.cli.motions import read_motions
+from wearcap.cli.view import read_motions
 from wearcap.errors import WearcapError
 from wearcap.recording.motion import Motion
 from wearcap.recording.store import dataset_folder, load_recording

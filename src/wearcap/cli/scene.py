@@ -3,7 +3,9 @@
 `wearcap scene edit` opens the page that makes an interactive environment of it.
 """
 
+import argparse
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from hydra.utils import instantiate
@@ -14,6 +16,7 @@ from rich.progress import track
 from rich.table import Table
 
 from wearcap.cli.conf import hydra_main
+from wearcap.cli.main import port_number
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.formats.colmap import Tracks
@@ -97,10 +100,42 @@ def _check(localizer: Localizer, photos: Sequence[Photo]) -> None:
     show("")
 
 
+def edit(arguments: list[str]) -> None:
+    """`wearcap scene edit`: the page on which objects are cut out of a scan and their degrees of freedom are set."""
+    parser = argparse.ArgumentParser(
+        prog="wearcap scene edit",
+        description="Make an interactive environment of a scan, in the browser: cut objects out, set how they "
+        "move, try it. It saves automatically; opened again, it continues.",
+    )
+    parser.add_argument("scene", help="the scene's folder with pointcloud.ply, or a .ply or .pcd file")
+    parser.add_argument(
+        "--environment", help="the file to make or to go on with (default: environment.json beside the scan)"
+    )
+    parser.add_argument("--metres-per-unit", type=float, help="of a scan in another unit (0.001 for millimetres)")
+    parser.add_argument(
+        "--port", type=port_number, default=8080, help="port of the page (default 8080, else the next free)"
+    )
+    parser.add_argument("--host", default="127.0.0.1", help="address to serve on (default: this machine only)")
+    options = parser.parse_args(arguments)
+
+    from wearcap.io.formats.environment import FILE_NAME
+    from wearcap.io.formats.scene_folder import cloud_file, read_scan
+    from wearcap.viewer.object_editor import ObjectEditor
+
+    cloud = cloud_file(options.scene)
+    file = Path(options.environment) if options.environment else cloud.parent / FILE_NAME
+    if file.is_dir():
+        file /= FILE_NAME
+    if file.suffix != ".json":
+        raise WearcapError("an environment is a .json file", where=file, expected="environment.json or a folder")
+    scan = read_scan(cloud, metres_per_unit=options.metres_per_unit)
+    page = ObjectEditor(scan, file, title=cloud.parent.resolve().name, host=options.host, port=options.port)
+    print(f"{cloud}: open {page.url} (Ctrl+C ends; objects are saved in {file})")
+    page.serve()
+
+
 def main(arguments: list[str]) -> None:
     if arguments[:1] == ["edit"]:
-        from wearcap.cli.scene_edit import main as edit
-
         edit(arguments[1:])
     else:
         hydra_main("scene", run, arguments)

@@ -1,7 +1,5 @@
 """`wearcap track VIDEO`: a plain video goes in; the camera's path and points of its surroundings come out."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from hydra.utils import instantiate
@@ -14,8 +12,7 @@ from wearcap.cli.conf import hydra_main
 from wearcap.errors import WearcapError
 from wearcap.io.formats.camera_json import read_camera
 from wearcap.io.formats.colmap import read_colmap
-from wearcap.localization.structure import Advance
-from wearcap.localization.tracking import Pictures, Track, TrackSettings, track_pictures
+from wearcap.localization.tracking import Pictures, Track, track_pictures
 
 HELP = "a camera's path and points from its video: wearcap track VIDEO, or wearcap track --from-model COLMAP_MODEL"
 _WITH_VALUE = ("--cfg", "-c", "--info", "-i", "--package", "-p", "--config-name", "-cn", "--config-dir", "-cd")
@@ -32,37 +29,26 @@ def run(config: DictConfig) -> Track:
     named = config.from_model or config.source
     output = Path(config.output or Path(config.paths.outputs) / "track" / Path(named).stem)
     if config.from_model is not None:
-        found = _from_model(config, settings)
+        model = read_colmap(config.from_model, config.source)
+        pictures = (
+            Pictures.of_model(model, settings.fps)
+            if config.source is None
+            else Pictures.of_folder(config.source, settings.fps)
+        )
+        found = Track.of_model(model, pictures, settings.max_gap_s, where=config.from_model)
     else:
-        camera = None if config.camera is None else read_camera(config.camera)
-        with _progress() as advance:
+        camera, tasks = None if config.camera is None else read_camera(config.camera), {}
+        with Progress(console=Console(stderr=True)) as progress:
+
+            def advance(step: str, done: int, total: int) -> None:
+                if step not in tasks:
+                    tasks[step] = progress.add_task(step, total=total)
+                progress.update(tasks[step], completed=done, total=total)
+
             found = track_pictures(config.source, output, settings, camera, advance)
     found.write(output, Path(named).name)
     _show_report(found, output)
     return found
-
-
-def _from_model(config: DictConfig, settings: TrackSettings) -> Track:
-    model = read_colmap(config.from_model, config.source)
-    pictures = (
-        Pictures.of_model(model, settings.fps)
-        if config.source is None
-        else Pictures.of_folder(config.source, settings.fps)
-    )
-    return Track.of_model(model, pictures, settings.max_gap_s, where=config.from_model)
-
-
-@contextmanager
-def _progress() -> Iterator[Advance]:
-    with Progress(console=Console(stderr=True)) as progress:
-        tasks = {}
-
-        def advance(step: str, done: int, total: int) -> None:
-            if step not in tasks:
-                tasks[step] = progress.add_task(step, total=total)
-            progress.update(tasks[step], completed=done, total=total)
-
-        yield advance
 
 
 def _show_report(found: Track, output: Path) -> None:

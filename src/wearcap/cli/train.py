@@ -27,49 +27,41 @@ def train(config: DictConfig) -> float:
     """
     run = Path(config.paths.run)
     with folder_lock(run, "train") if rank_zero_only.rank == 0 else nullcontext():
-        return _train(config, run)
-
-
-def _train(config: DictConfig, run: Path) -> float:
-    lightning.seed_everything(config.seed, workers=True, verbose=False)
-    keep_freed_memory()
-    _name_embeddings(config)
-    # Each run has its own folder; users cannot fix Lightning's internal deprecations.
-    warnings.filterwarnings("ignore", "Experiment logs directory")
-    warnings.filterwarnings("ignore", ".*LeafSpec")
-    record_run(run, OmegaConf.to_yaml(config, resolve=True))
-    resume = resume_path(config.resume, run, Path(config.paths.outputs) / "train" / config.name)
-    data, system = instantiate(config.data, _convert_="all"), instantiate(config.model, _convert_="all")
-    callbacks = [
-        instantiate(callback, _convert_="all")
-        for callback in config.callbacks.values()
-        if callback and "_target_" in callback
-    ]
-    callbacks.insert(0, ConfigInCheckpoint(OmegaConf.to_container(config, resolve=True)))
-    if config.early_stop:
-        callbacks.append(EarlyStopping("val/loss", patience=config.early_stop))
-    loggers = [instantiate(logger, _convert_="all") for logger in (config.logger or {}).values() if logger]
-    trainer: lightning.Trainer = instantiate(
-        config.trainer, callbacks=callbacks, logger=loggers or False, plugins=[RunCheckpointIO(run)]
-    )
-    show(f"[bold]{config.name}[/bold] in {run}" + (f", going on from {resume}" if resume else ""))
-    fit(system, data, trainer, resume)
-    last = run / "checkpoints" / "last.ckpt"
-    if trainer.is_global_zero:
-        show(
-            f"checkpoint: {last}"
-            if last.is_file()
-            else f"no step was left to make: {resume} has made {trainer.global_step}"
+        lightning.seed_everything(config.seed, workers=True, verbose=False)
+        keep_freed_memory()
+        surroundings = config.get("surroundings")
+        if surroundings and surroundings.images and "surroundings" in config.data.dataset.get("content", {}):
+            # The name and the dimension of the image embeddings are those in the data (`surroundings.images=clip`).
+            stores = [RecordingStore.open(source.root) for source in config.data.sources.values() if source]
+            surroundings.images, surroundings.image_size = embeddings_of(surroundings.images, stores)
+        # Each run has its own folder; users cannot fix Lightning's internal deprecations.
+        warnings.filterwarnings("ignore", "Experiment logs directory")
+        warnings.filterwarnings("ignore", ".*LeafSpec")
+        record_run(run, OmegaConf.to_yaml(config, resolve=True))
+        resume = resume_path(config.resume, run, Path(config.paths.outputs) / "train" / config.name)
+        data, system = instantiate(config.data, _convert_="all"), instantiate(config.model, _convert_="all")
+        callbacks = [
+            instantiate(callback, _convert_="all")
+            for callback in config.callbacks.values()
+            if callback and "_target_" in callback
+        ]
+        callbacks.insert(0, ConfigInCheckpoint(OmegaConf.to_container(config, resolve=True)))
+        if config.early_stop:
+            callbacks.append(EarlyStopping("val/loss", patience=config.early_stop))
+        loggers = [instantiate(logger, _convert_="all") for logger in (config.logger or {}).values() if logger]
+        trainer: lightning.Trainer = instantiate(
+            config.trainer, callbacks=callbacks, logger=loggers or False, plugins=[RunCheckpointIO(run)]
         )
-    return float(trainer.callback_metrics.get("val/loss", float("nan")))
-
-
-def _name_embeddings(config: DictConfig) -> None:
-    """Set the name and the dimension of the image embeddings to those in the data (`surroundings.images=clip`)."""
-    surroundings = config.get("surroundings")
-    if surroundings and surroundings.images and "surroundings" in config.data.dataset.get("content", {}):
-        stores = [RecordingStore.open(source.root) for source in config.data.sources.values() if source]
-        surroundings.images, surroundings.image_size = embeddings_of(surroundings.images, stores)
+        show(f"[bold]{config.name}[/bold] in {run}" + (f", going on from {resume}" if resume else ""))
+        fit(system, data, trainer, resume)
+        last = run / "checkpoints" / "last.ckpt"
+        if trainer.is_global_zero:
+            show(
+                f"checkpoint: {last}"
+                if last.is_file()
+                else f"no step was left to make: {resume} has made {trainer.global_step}"
+            )
+        return float(trainer.callback_metrics.get("val/loss", float("nan")))
 
 
 def main(arguments: list[str]) -> None:

@@ -9,8 +9,7 @@ import lightning
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from wearcap.data.statistics import collate
-from wearcap.data.windows import FixedSampler, SeededSampler, Source
+from wearcap.data.windows import FixedSampler, SeededSampler, Source, collate
 
 
 @runtime_checkable

@@ -61,10 +61,9 @@ class Cut:
     stretch: float = 1.0
     """Largest speed that a transform may set."""
     speed: float | None = None
-    first: int = 0
-    """Frame of the window that all earlier ones repeat."""
-    shown: int | None = None
-    """Number of frames before the padding, which repeats the last of them (default: all)."""
+    shown: tuple[int, int | None] = (0, None)
+    """Frame of the window that all earlier ones repeat, and number of frames before the padding, which repeats the
+    last of them (None: all)."""
     kept: Bool[Tensor, "section"] | None = None
     """Which frames of `section` were not dropped; sensed values are interpolated between them."""
 
@@ -87,19 +86,18 @@ class Cut:
     @cached_property
     def place(self) -> tuple[int, Tensor]:
         """Origin and positions of the frames, within the recording and without padding."""
-        origin, place = self._places()
-        if self.first:
-            place = place.clamp_min(place[self.first].item())
-        if self.shown is not None:
-            place = place.clamp_max(place[self.shown - 1].item())
+        (origin, place), (first, shown) = self._places(), self.shown
+        if first:
+            place = place.clamp_min(place[first].item())
+        if shown is not None:
+            place = place.clamp_max(place[shown - 1].item())
         return origin, place.clamp_max(self.length - 1 - origin)
 
     @property
     def valid(self) -> Bool[Tensor, "time"]:
         """False for padding: frames after those that are shown, or after the recording's end."""
-        origin, place = self._places()
-        shown = torch.arange(self.count) < (self.count if self.shown is None else self.shown)
-        return shown & (place < self.length - origin)
+        (origin, place), (_, shown) = self._places(), self.shown
+        return (torch.arange(self.count) < (self.count if shown is None else shown)) & (place < self.length - origin)
 
     @cached_property
     def frames(self) -> Int64[Tensor, "time"]:
@@ -220,7 +218,8 @@ class EarlyEnd:
 
     def retimed(self, cut: Cut, random: Draws) -> Cut:
         share, end = random.uniform("ends"), random.uniform("end")
-        return replace(cut, shown=self.least + int(end * (cut.count - self.least))) if share < self.share else cut
+        shown = cut.shown[0], self.least + int(end * (cut.count - self.least))
+        return replace(cut, shown=shown) if share < self.share else cut
 
 
 @dataclass(frozen=True)
@@ -231,7 +230,8 @@ class StillStart:
 
     def retimed(self, cut: Cut, random: Draws) -> Cut:
         share, until = random.uniform("begins"), random.uniform("begin")
-        return replace(cut, first=int(until * (cut.count - 2))) if share < self.share else cut
+        shown = int(until * (cut.count - 2)), cut.shown[1]
+        return replace(cut, shown=shown) if share < self.share else cut
 
 
 @dataclass(frozen=True)

@@ -1,22 +1,30 @@
 """Windows of recordings for training; content and order are functions of seed and step.
 
 A `Windows` data set cuts windows out of the recordings of stores. A system's `Content` says what is read of them and what
-a batch holds; the augmentations of `transforms.py` stand between the two.
+a batch holds; the augmentations of `transforms.py` stand between the two. Mean and scale of features over a training
+split are computed of windows drawn from it, and saved with the weights.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
 from wearcap.data.transforms import Cut, Draws, TimeStretch, TimeTransform, Transform, Window
 from wearcap.errors import WearcapError
+from wearcap.models.layers import Normalizer
 from wearcap.recording.store import RecordingFile, RecordingStore
+
+W = TypeVar("W", bound=tuple)
+
+MIN_SCALE = 0.05
+"""Smallest standard deviation that features are divided by: rotations that hardly vary would become mostly noise."""
 
 
 @dataclass(frozen=True)
@@ -223,3 +231,23 @@ class FixedSampler(Sampler):
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
         return iter(self.items)
+
+
+def collate(windows: Sequence[W]) -> W:
+    """Stacks windows (named tuples of tensors) along a leading batch axis."""
+    return type(windows[0])(*(torch.stack(field) for field in zip(*windows)))
+
+
+def drawn_batches(dataset: Any, limit: int, size: int | None = None) -> Iterator[Any]:
+    """Batches of `size` (default: one batch) of `limit` windows, drawn by the data set's weights from a fixed seed."""
+    random = torch.Generator().manual_seed(0)
+    drawn = torch.multinomial(dataset.weights, limit, replacement=True, generator=random).tolist()
+    items, size = [*zip(drawn, range(limit))], size or limit
+    for first in range(0, limit, size):
+        yield collate([dataset[item] for item in items[first : first + size]])
+
+
+def standardize(normalizer: Normalizer, rows: Float[Tensor, "*batch feature"], min_scale: float = MIN_SCALE) -> None:
+    """Set a normaliser to mean and standard deviation over all rows."""
+    rows = rows.flatten(0, -2)
+    normalizer.set(rows.mean(0), rows.std(0).clamp_min(min_scale))

@@ -3,22 +3,17 @@
 Both have HMD²'s inputs (the head's path, the floor, the body's size) and are anchored to the measured head.
 """
 
-import json
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
-import safetensors
 import torch
 from jaxtyping import Float, Int64
-from safetensors.torch import save
 from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
-from wearcap.data.statistics import MIN_SCALE
+from wearcap.data.windows import MIN_SCALE
 from wearcap.errors import WearcapError
-from wearcap.files import atomic_path, parse_json
 from wearcap.geometry import rotation
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.runtime.system import Captured, CaptureInput, StageOptions, System
@@ -72,15 +67,6 @@ class MeanPose(Baseline):
         path = _query_path(recording, self.joint_names, self.fps)
         R = self.R_parent_joint.repeat(len(path.timestamps), 1, 1, 1)
         return _anchored(path, R, "mean_pose")
-
-    def save(self, path: str | Path) -> None:
-        """Write as .safetensors."""
-        _save(path, "mean_pose", self.joint_names, self.fps, {"R_parent_joint": self.R_parent_joint})
-
-    @classmethod
-    def load(cls, path: str | Path) -> "MeanPose":
-        names, fps, tensors = _load(path, "mean_pose")
-        return cls(names, fps, **tensors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,18 +126,7 @@ class NearestWindow(Baseline):
         end = max(count - self.window, 0)
         starts = torch.unique(torch.cat([torch.arange(0, end, max(1, self.window // 2)), torch.tensor([end])]))
         found = self._nearest(_describe(path, starts, self.window, self.sample))
-        pose = self._pasted(starts, found, count)
-        return _anchored(path, rotation.matrix_from_rot6d(pose.unflatten(-1, (-1, 6))), "nearest_window")
-
-    def _nearest(self, raw: Float[Tensor, "query sample channel"]) -> Int64[Tensor, "query"]:
-        query = ((raw - self.mean) / self.scale).flatten(1)
-        half_squares = 0.5 * self.descriptor.square().sum(-1)
-        return torch.cat([(part @ self.descriptor.T - half_squares).argmax(-1) for part in query.split(QUERY_BATCH)])
-
-    def _pasted(
-        self, starts: Int64[Tensor, "query"], found: Int64[Tensor, "query"], count: int
-    ) -> Float[Tensor, "time motion"]:
-        """Cross-fade the found windows' poses, each weighed by a triangle over its window."""
+        # Poses are cross-faded, each weighted by a triangle over its window.
         offset = torch.arange(self.window)
         source = torch.minimum(self.first_frame[found, None] + offset, self.last_frame[found, None])
         target = starts[:, None] + offset
@@ -161,20 +136,13 @@ class NearestWindow(Baseline):
         blended = torch.zeros(count, self.pose.shape[1]).index_add(
             0, target[inside], self.pose[source[inside]].float() * weight[:, None]
         )
-        return blended / total[:, None]
+        pose = blended / total[:, None]
+        return _anchored(path, rotation.matrix_from_rot6d(pose.unflatten(-1, (-1, 6))), "nearest_window")
 
-    def save(self, path: str | Path) -> None:
-        """Write as .safetensors."""
-        names = ("mean", "scale", "descriptor", "first_frame", "last_frame", "pose")
-        tensors = {name: getattr(self, name) for name in names}
-        shape = torch.tensor([self.window, self.sample])
-        _save(path, "nearest_window", self.joint_names, self.fps, {**tensors, "shape": shape})
-
-    @classmethod
-    def load(cls, path: str | Path) -> "NearestWindow":
-        names, fps, tensors = _load(path, "nearest_window")
-        window, sample = tensors.pop("shape").tolist()
-        return cls(names, fps, window, sample, **tensors)
+    def _nearest(self, raw: Float[Tensor, "query sample channel"]) -> Int64[Tensor, "query"]:
+        query = ((raw - self.mean) / self.scale).flatten(1)
+        half_squares = 0.5 * self.descriptor.square().sum(-1)
+        return torch.cat([(part @ self.descriptor.T - half_squares).argmax(-1) for part in query.split(QUERY_BATCH)])
 
 
 def _training_motions(stores: Sequence[RecordingStore]) -> Iterator[tuple[HeadPath, Tensor]]:
@@ -254,27 +222,6 @@ def _anchored(path: HeadPath, R_heading: Float[Tensor, "time joint 3 3"], name: 
     origin = torch.zeros(len(path.timestamps), 3)
     motion = Motion(path.timestamps, path.skeleton, R, origin, provenance={"pipeline": name})
     return anchored_to_head(motion, path.T_world_head)
-
-
-def _save(path: str | Path, kind: str, joint_names: tuple[str, ...], fps: float, tensors: dict[str, Tensor]) -> None:
-    about = json.dumps({"kind": kind, "joint_names": joint_names, "fps": fps}, sort_keys=True)
-    content = save({name: value.contiguous() for name, value in tensors.items()}, {"baseline": about})
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
-
-
-def _load(path: str | Path, kind: str) -> tuple[tuple[str, ...], float, dict[str, Tensor]]:
-    try:
-        with safetensors.safe_open(str(path), framework="pt") as file:
-            about = parse_json((file.metadata() or {}).get("baseline", "{}"), path)
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (OSError, safetensors.SafetensorError) as error:
-        raise WearcapError(
-            f"not a readable baseline ({error})", where=path, expected="what `save` of one wrote"
-        ) from error
-    if about.get("kind") != kind:
-        raise WearcapError(f"holds {about.get('kind', 'no baseline')}", where=path, expected=kind)
-    return tuple(about["joint_names"]), about["fps"], tensors
 
 
 BASELINES: dict[str, type[Baseline]] = {"mean pose": MeanPose, "nearest window": NearestWindow}

@@ -19,20 +19,17 @@ def frechet_distance(
     matrices and is valid for rank-deficient covariances. Raises WearcapError for sets of fewer than two samples and for
     values that are not finite.
     """
-    (mean, root), (mean_true, root_true) = (_gaussian(value) for value in (latent, latent_true))
+    fitted = []
+    for each in (latent, latent_true):
+        if len(each) < 2 or not each.isfinite().all():
+            raise WearcapError(f"no distribution in {len(each)} samples", expected="two at least, all finite")
+        values, vectors = torch.linalg.eigh(torch.cov(each.double().T).reshape(each.shape[1], -1))
+        # Mean and symmetric square root of the (unbiased) covariance.
+        fitted.append((each.double().mean(0), (vectors * values.clamp(min=0).sqrt()) @ vectors.T))
+    (mean, root), (mean_true, root_true) = fitted
     cross = torch.linalg.svdvals(root @ root_true).sum()
     spread = root.square().sum() + root_true.square().sum()
     return ((mean - mean_true).square().sum() + spread - 2 * cross).clamp(min=0)
-
-
-def _gaussian(
-    latent: Float[Tensor, "sample feature"],
-) -> tuple[Float[Tensor, "feature"], Float[Tensor, "feature feature"]]:
-    """Mean and symmetric square root of the (unbiased) covariance."""
-    if len(latent) < 2 or not latent.isfinite().all():
-        raise WearcapError(f"no distribution in {len(latent)} samples", expected="two at least, all finite")
-    values, vectors = torch.linalg.eigh(torch.cov(latent.double().T).reshape(latent.shape[1], -1))
-    return latent.double().mean(0), (vectors * values.clamp(min=0).sqrt()) @ vectors.T
 
 
 def diversity(

@@ -72,7 +72,7 @@ PAUSE_S = 0.5
 
 
 @dataclass(frozen=True)
-class PoseError:
+class _PoseError:
     """Error of an object's pose at one or several times."""
 
     distance_cm: Float[Tensor, "*batch"]
@@ -81,12 +81,12 @@ class PoseError:
     """Angle between the captured and the true orientation."""
 
 
-def object_error(T_found: Rigid, T_true: Rigid, center: Float[Tensor, "3"]) -> PoseError:
+def object_error(T_found: Rigid, T_true: Rigid, center: Float[Tensor, "3"]) -> _PoseError:
     """Error of an object's poses; `center` is its centre in its own axes (m)."""
     found, true = T_found.to(torch.float64), T_true.to(torch.float64)
     middles = [(T.R @ center.double()) + T.t for T in (found, true)]
     apart = (middles[0] - middles[1]).norm(dim=-1)
-    return PoseError(100 * apart, geodesic(found.R, true.R).rad2deg())
+    return _PoseError(100 * apart, geodesic(found.R, true.R).rad2deg())
 
 
 @dataclass(frozen=True)
@@ -128,17 +128,14 @@ def contact_mean(value: Float[Tensor, "time hand"], contact: Bool[Tensor, "time 
 
 
 def handlings(
-    start_s: Float[Tensor, "interval"],
-    stop_s: Float[Tensor, "interval"],
-    objects: tuple[str, ...],
-    pause_s: float = PAUSE_S,
+    start_s: Float[Tensor, "interval"], stop_s: Float[Tensor, "interval"], objects: tuple[str, ...]
 ) -> list[tuple[str, float, float]]:
-    """(object, start, stop) of every handling: intervals of one object with pauses of at most `pause_s` (s)."""
+    """(object, start, stop) of every handling: intervals of one object with pauses of at most `PAUSE_S`."""
     merged: list[tuple[str, float, float]] = []
     for name in sorted(set(objects)):
         rows = sorted((a, b) for a, b, o in zip(start_s.tolist(), stop_s.tolist(), objects) if o == name)
         for start, stop in rows:
-            if merged and merged[-1][0] == name and start - merged[-1][2] <= pause_s:
+            if merged and merged[-1][0] == name and start - merged[-1][2] <= PAUSE_S:
                 merged[-1] = (name, merged[-1][1], max(stop, merged[-1][2]))
             else:
                 merged.append((name, start, stop))

@@ -14,8 +14,7 @@ from wearcap.geometry.rigid import Rigid
 
 SIDES = ("left", "right")
 FLOOR_WINDOW_S = 10.0
-"""Time to either side of a frame in which the lowest true joint defines the local floor (thesis §6.4: 20 s in
-total)."""
+"""Time to either side of a frame in which the lowest true joint is the local floor (thesis §6.4: 20 s in total)."""
 CONTACT_HEIGHT_M = 0.05
 CONTACT_SPEED_M_S = 0.3
 """Speed below which EDGE takes a foot joint to be in contact: 0.01 m per frame at 30 Hz."""
@@ -30,8 +29,7 @@ def jitter_m_s3(joints: Float[Tensor, "time joint 3"], fps: float) -> Float[Tens
 
 
 def foot_points(skeleton: Skeleton, T_world_joint: Rigid) -> Float[Tensor, "time foot point 3"]:
-    """Two points (m) per foot, left foot first: heel and toe tip, or ankle and toe where a skeleton has no
-    such sites."""
+    """Two points (m) per foot, left foot first: heel and toe tip, or ankle and toe of a skeleton without such sites."""
     if all(patch in skeleton.sites for patch in FOOT_PATCHES):
         return site_positions(skeleton, T_world_joint, FOOT_PATCHES).unflatten(-2, (2, 2))
     return foot_joints(skeleton, T_world_joint)

@@ -144,18 +144,16 @@ def aggregate(rows: list[Row]) -> dict[str, Summary]:
     seen = {frozenset(recordings) for recordings in by_seed.values()}
     if len(seen) != 1:
         raise WearcapError("the seeds were not scored on the same recordings" if seen else "nothing was scored")
-    names = list(rows[0].scores)
-    per_seed = {
-        name: [_weighted_mean(name, list(recordings.values())) for recordings in by_seed.values()] for name in names
-    }
-    return {name: summarize(values) for name, values in per_seed.items()}
-
-
-def _weighted_mean(name: str, rows: list[Row]) -> float:
-    weighted = [(row.scores[name], 1 if name in PER_SEQUENCE else row.frames) for row in rows]
-    weighted = [(score, weight) for score, weight in weighted if not math.isnan(score)]
-    total = sum(weight for _, weight in weighted)
-    return sum(score * weight for score, weight in weighted) / total if total else math.nan
+    summaries = {}
+    for name in rows[0].scores:
+        means = []
+        for recordings in by_seed.values():
+            weighted = [(row.scores[name], 1 if name in PER_SEQUENCE else row.frames) for row in recordings.values()]
+            weighted = [(score, weight) for score, weight in weighted if not math.isnan(score)]
+            total = sum(weight for _, weight in weighted)
+            means.append(sum(score * weight for score, weight in weighted) / total if total else math.nan)
+        summaries[name] = summarize(means)
+    return summaries
 
 
 def summarize(values: list[float]) -> Summary:

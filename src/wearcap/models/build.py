@@ -104,35 +104,27 @@ def check_config(config: Any, where: str | Path) -> None:
         if count > MAX_VALUES:
             raise _refused(f"more than {MAX_VALUES} values", where)
         if isinstance(value, dict):
-            _check_keys(value, where)
+            for name in value:
+                if "${" in name or (name.startswith("_") and name not in (_TARGET, _PARTIAL)):
+                    raise _refused(f"the key {name[:80]!r}", where)
+            if _PARTIAL in value and not (isinstance(value[_PARTIAL], bool) and _TARGET in value):
+                raise _refused(f"{_PARTIAL}: {str(value[_PARTIAL])[:80]!r}", where)
+            target = value.get(_TARGET)
+            if _TARGET in value and target not in (_BY_NAME if isinstance(target, str) else ()):
+                raise WearcapError(
+                    f"the model is to be made of {str(target)[:80]!r}, which is no part of wearcap's models",
+                    where=where,
+                    expected="networks, features and optimisers of wearcap and PyTorch alone",
+                )
             rest += [(key if key in _ANY_SIZE else inner, item) for inner, item in value.items()]
         elif isinstance(value, list):
             rest += [(key, item) for item in value]
-        else:
-            _check_value(key, value, where)
-
-
-def _check_keys(part: dict[str, Any], where: str | Path) -> None:
-    for key in part:
-        if "${" in key or (key.startswith("_") and key not in (_TARGET, _PARTIAL)):
-            raise _refused(f"the key {key[:80]!r}", where)
-    if _PARTIAL in part and not (isinstance(part[_PARTIAL], bool) and _TARGET in part):
-        raise _refused(f"{_PARTIAL}: {str(part[_PARTIAL])[:80]!r}", where)
-    if _TARGET in part and part[_TARGET] not in (_BY_NAME if isinstance(part[_TARGET], str) else ()):
-        raise WearcapError(
-            f"the model is to be made of {str(part[_TARGET])[:80]!r}, which is no part of wearcap's models",
-            where=where,
-            expected="networks, features and optimisers of wearcap and PyTorch alone",
-        )
-
-
-def _check_value(key: str, value: Any, where: str | Path) -> None:
-    if isinstance(value, str) and ("${" in value or len(value) > MAX_TEXT):
-        raise _refused(f"{key}: {value[:80]!r}", where)
-    if isinstance(value, int) and abs(value) > (1 << 63 if key in _ANY_SIZE else MAX_SIZE):
-        raise _refused(f"{key}: {str(value)[:80]}", where)
-    if isinstance(value, float) and not math.isfinite(value):
-        raise _refused(f"{key}: {value}", where)
+        elif isinstance(value, str) and ("${" in value or len(value) > MAX_TEXT):
+            raise _refused(f"{key}: {value[:80]!r}", where)
+        elif isinstance(value, int) and abs(value) > (1 << 63 if key in _ANY_SIZE else MAX_SIZE):
+            raise _refused(f"{key}: {str(value)[:80]}", where)
+        elif isinstance(value, float) and not math.isfinite(value):
+            raise _refused(f"{key}: {value}", where)
 
 
 def _refused(what: str, where: str | Path) -> WearcapError:

@@ -128,21 +128,19 @@ def _read_run(path: Path) -> tuple[str, dict[str, Tensor]]:
         text, state = saved["wearcap"]["config"], dict(saved["state_dict"])
     except (KeyError, TypeError, ValueError) as error:
         raise _foreign(path) from error
-    if not isinstance(text, str) or not all(_is_plain(name, value) for name, value in state.items()):
-        raise _foreign(path)
-    return text, state
-
-
-def _is_plain(name: Any, value: Any) -> bool:
-    """Whether a weight is a tensor whose memory is in the file, not an expansion of a few numbers to any size."""
-    return (
+    # A weight's memory is in the file: no expansion of a few numbers to any size.
+    plain = all(
         isinstance(name, str)
         and isinstance(value, Tensor)
         and value.device.type == "cpu"
         and value.layout == torch.strided
         and not value.is_quantized
         and value.numel() * value.element_size() <= value.untyped_storage().nbytes()
+        for name, value in state.items()
     )
+    if not isinstance(text, str) or not plain:
+        raise _foreign(path)
+    return text, state
 
 
 def _foreign(path: Path) -> WearcapError:
@@ -224,22 +222,16 @@ def share_checkpoint(source: str | Path, target: str | Path, dtype: str = "float
                 expected="a trained model",
                 fix="Choose dtype=float32, or another checkpoint.",
             )
-    shared = _shareable(config)
-    about = json.dumps(shared | {_DIGEST: _digest(shared, narrow)}, sort_keys=True)
-    with atomic_path(target) as temporary:
-        tensors = {name: value.contiguous().clone() for name, value in narrow.items()}
-        temporary.write_bytes(save(tensors, {_KEY: about}))
-
-
-def _shareable(config: dict[str, Any]) -> dict[str, Any]:
-    """Name and model of a config, and the data sets that are named relative to the working folder."""
-    kept = {name: config[name] for name in ("name", "model") if name in config}
+    shared = {name: config[name] for name in ("name", "model") if name in config}
     data = config.get("data") or {}
     for key in ("sources", "val_sources"):
         roots = {name: {"root": source["root"]} for name, source in (data.get(key) or {}).items() if source}
         if roots and not any(Path(source["root"]).is_absolute() for source in roots.values()):
-            kept.setdefault("data", {})[key] = roots
-    return kept
+            shared.setdefault("data", {})[key] = roots
+    about = json.dumps(shared | {_DIGEST: _digest(shared, narrow)}, sort_keys=True)
+    with atomic_path(target) as temporary:
+        tensors = {name: value.contiguous().clone() for name, value in narrow.items()}
+        temporary.write_bytes(save(tensors, {_KEY: about}))
 
 
 def load_trained(checkpoint: str | Path) -> tuple[nn.Module, dict[str, Any]]:

@@ -140,7 +140,7 @@ class EgoViewEncoder(nn.Module):
         return load_network(checkpoint, cls, "egoview")
 
 
-class PretrainedEncoder:
+class _PretrainedEncoder:
     """An `ImageEncoder` around a published network; images are fitted uncropped into its square."""
 
     name: ClassVar[str]
@@ -239,7 +239,7 @@ class PretrainedEncoder:
         )
 
 
-class Clip(PretrainedEncoder):
+class Clip(_PretrainedEncoder):
     """CLIP ViT-L/14 as OpenAI published it (768-d, the thesis's choice)."""
 
     name, title, size = "clip-vit-l14", "CLIP ViT-L/14", 768
@@ -259,7 +259,7 @@ class Clip(PretrainedEncoder):
         return part or tensors
 
 
-class DinoV2(PretrainedEncoder):
+class DinoV2(_PretrainedEncoder):
     """DINOv2 ViT-L/14 (1024-d, the class token)."""
 
     name, title, size = "dinov2-vit-l14", "DINOv2 ViT-L/14", 1024

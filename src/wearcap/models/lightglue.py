@@ -176,15 +176,6 @@ class LightGlue(nn.Module):
         self.log_assignment = nn.ModuleList(MatchAssignment(width) for _ in range(layers))
         self.token_confidence = nn.ModuleList(_TokenConfidence(width) for _ in range(layers - 1))
 
-    def _settled(
-        self, layer: int, x0: Float[Tensor, "batch keypoint0 width"], x1: Float[Tensor, "batch keypoint1 width"]
-    ) -> bool:
-        if self.stop_confidence is None or layer == len(self.token_confidence):
-            return False
-        confidence = torch.cat([self.token_confidence[layer](x) for x in (x0, x1)], 1)
-        needed = 0.8 + 0.1 * math.exp(-4 * layer / len(self.transformers))
-        return bool((confidence >= needed).float().mean() > self.stop_confidence)
-
     def forward(
         self,
         keypoints0: Float[Tensor, "batch keypoint0 2"],
@@ -200,7 +191,11 @@ class LightGlue(nn.Module):
         depth = 0
         for depth, layer in enumerate(self.transformers):
             x0, x1 = layer(x0, x1, turn0, turn1)
-            if self._settled(depth, x0, x1):
+            if self.stop_confidence is None or depth == len(self.token_confidence):
+                continue
+            confidence = torch.cat([self.token_confidence[depth](x) for x in (x0, x1)], 1)
+            needed = 0.8 + 0.1 * math.exp(-4 * depth / len(self.transformers))
+            if bool((confidence >= needed).float().mean() > self.stop_confidence):
                 break
         return self.log_assignment[depth](x0, x1)
 

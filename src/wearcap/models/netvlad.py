@@ -8,20 +8,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-# VGG16 up to conv5_3, without the last ReLU and pooling: channels of each convolution, 0 for a pooling.
+# VGG16 (Simonyan & Zisserman 2015) up to conv5_3: channels of each convolution, 0 for a pooling.
 _VGG16 = (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512)
-
-
-def _vgg16_trunk() -> nn.Sequential:
-    """Convolutions 1_1 to 5_3 of VGG16 (Simonyan & Zisserman 2015); layers stand where torchvision numbers them."""
-    layers, channels = [], 3
-    for width in _VGG16:
-        if width:
-            layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU()]
-            channels = width
-        else:
-            layers.append(nn.MaxPool2d(2))
-    return nn.Sequential(*layers[:-1])
 
 
 class VladPooling(nn.Module):
@@ -48,7 +36,14 @@ class NetVLAD(nn.Module):
 
     def __init__(self, clusters: int = 64, whitened: int = 0, bias: bool = False):
         super().__init__()
-        self.encoder = _vgg16_trunk()
+        layers, channels = [], 3
+        for width in _VGG16:
+            if width:
+                layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU()]
+                channels = width
+            else:
+                layers.append(nn.MaxPool2d(2))
+        self.encoder = nn.Sequential(*layers[:-1])  # numbered as in torchvision, without the last ReLU
         self.pool = VladPooling(clusters, 512, bias)
         self.WPCA = nn.Sequential(nn.Conv2d(clusters * 512, whitened, 1)) if whitened else None
         # ImageNet's colours, in which VGG16 was trained.

@@ -77,7 +77,7 @@ def spread_first(points: Float[Tensor, "batch point 3"], count: int) -> Int64[Te
 
 
 @torch.no_grad()
-def ball_query(
+def _ball_query(
     centers: Float[Tensor, "batch center 3"], points: Float[Tensor, "batch point 3"], radius: float, neighbours: int
 ) -> Int64[Tensor, "batch center neighbour"]:
     """Indices of the `neighbours` points nearest to each centre within a radius, filled up by the nearest one.
@@ -89,7 +89,7 @@ def ball_query(
     return torch.where(near <= radius, index, index[..., :1])
 
 
-def rows_at(
+def _rows_at(
     values: Float[Tensor, "batch point feature"], index: Int64[Tensor, "batch *at"]
 ) -> Float[Tensor, "batch *at feature"]:
     """Gathers rows of a batch of tables by index."""
@@ -163,7 +163,7 @@ class PointNeXt(nn.Module):
         if self.y_up:
             unit = torch.stack([unit[..., 0], unit[..., 2], -unit[..., 1]], -1)
         # A prefix of a farthest-point sample is one itself: later stages keep the first points.
-        p = rows_at(unit, spread_first(unit, unit.shape[1] // self.strides[0]))
+        p = _rows_at(unit, spread_first(unit, unit.shape[1] // self.strides[0]))
         f = self.stem(p)
         for stage in self.stages:
             p, f = stage(p, f)
@@ -188,7 +188,7 @@ class _SetAbstraction(nn.Module):
     ) -> tuple[Float[Tensor, "batch center 3"], Float[Tensor, "batch center wide"]]:
         """Positions, farthest from each other first, and features, of fewer points."""
         count = p.shape[1] // self.stride
-        index = ball_query(p[:, :count], p, self.radius, self.neighbours)
+        index = _ball_query(p[:, :count], p, self.radius, self.neighbours)
         inside = self.second(F.relu(self.first(p, f, index)))
         return p[:, :count], F.relu(inside.max(2).values + self.skip(f[:, :count]))
 
@@ -206,7 +206,7 @@ class _InvResMLP(nn.Module):
         self, p: Float[Tensor, "batch point 3"], f: Float[Tensor, "batch point feature"]
     ) -> tuple[Float[Tensor, "batch point 3"], Float[Tensor, "batch point feature"]]:
         """The same positions with new features."""
-        index = ball_query(p, p, self.radius, self.neighbours)
+        index = _ball_query(p, p, self.radius, self.neighbours)
         most = F.relu(self.ball(p, f, index)).max(2).values
         return p, F.relu(f + self.narrow(F.relu(self.widen(most))))
 
@@ -255,7 +255,7 @@ class _BallLayer(_Layer):
         """Features of the first points' neighbours."""
         where = F.linear(p / self.unit, self.linear.weight[:, :3])
         what = where + F.linear(f, self.linear.weight[:, 3:])
-        y = rows_at(what, index) - where[:, : index.shape[1], None]
+        y = _rows_at(what, index) - where[:, : index.shape[1], None]
         return self.norm(y.flatten(0, -2)).reshape(y.shape)
 
 

@@ -21,8 +21,7 @@ class AdamSettings:
     steps: int = 500
     learning_rate: float = 1e-3
     full_mesh: bool = True
-    """Whether the whole body is skinned at each step, as in the thesis; False: only the patches, with the same
-    result."""
+    """Whether the whole body is skinned at each step (thesis); False: only the patches, with the same result."""
     dtype: torch.dtype = torch.float32
 
     def __post_init__(self):

@@ -152,16 +152,8 @@ class Stretch:
         every = len(joints) + 1
         shapes = ((every, 3, 3), (every, 3), (every, 3, 3), (len(self.body.patch), 3), (2, 12, leg))
         self.kin = Kinematics(*(np.empty((length, *shape)) for shape in shapes))
-        self.forms = Forms(
-            np.empty((length, 3)),
-            np.empty((pairs, 3, 3, 3)),
-            np.empty((length, 3, 3)),
-            np.empty((length, 2, 12, 12)),
-            np.empty((pairs, 2, 12, 12)),
-            np.empty((length, 2, 12)),
-            np.empty(length),
-            np.empty(pairs),
-        )
+        small, feet = ((length, 3), (pairs, 3, 3, 3), (length, 3, 3)), ((length, 2, 12, 12), (pairs, 2, 12, 12))
+        self.forms = Forms(*(np.empty(shape) for shape in (*small, *feet, (length, 2, 12), length, pairs)))
         self.system = np.empty((length, n, n)), np.empty((pairs, n, n)), np.empty((length, n))
         self.terms = sorted((name for name in TERMS if energy.weight(name) > 0), key=lambda name: TERMS[name].reach)
         """The weighted terms in the order of `rows`."""

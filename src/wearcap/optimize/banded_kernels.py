@@ -45,8 +45,7 @@ class Body(NamedTuple):
 
 
 class Kinematics(NamedTuple):
-    """Kinematics of all frames at the current state: joint rotations R and origins c, perturbation axes, patch
-    vertices."""
+    """Kinematics of all frames: joint rotations R and origins c, perturbation axes, patch vertices."""
 
     R: np.ndarray
     c: np.ndarray
@@ -57,8 +56,7 @@ class Kinematics(NamedTuple):
 
 
 class Forms(NamedTuple):
-    """Quadratic forms in the variables that the terms act on; `small`: translation, root and head, whose forms are w
-    I."""
+    """Quadratic forms in the values that terms act on; `small`: translation, root and head, whose forms are w I."""
 
     small: np.ndarray
     """(time, 3) weights w of translation, root and head."""
@@ -76,8 +74,7 @@ class Forms(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """The weighted terms, sorted by reach: what `gather` needs of `hps.TERMS`. Arrays over pairs have a last, unused
-    frame."""
+    """The weighted terms, by reach: what `gather` needs of `hps.TERMS`. Arrays over pairs have a last, unused frame."""
 
     number: np.ndarray
     """Index of each term in `hps.TERMS`."""

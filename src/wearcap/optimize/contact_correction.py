@@ -24,8 +24,7 @@ from wearcap.optimize.trajectory import BentPath
 SETTLED = 2.0717
 """x with exp(−x) (cos x + sin x) = 0.05: decay of the offset after a contact, as a function of rate · time."""
 KEEP = 10.0
-"""Weight of a bent window's end, relative to the contact's (1), so that a point out of reach does not move what
-follows."""
+"""Weight of a bent window's end relative to the contact's (1): a point out of reach does not move what follows."""
 
 
 @dataclass(frozen=True)
@@ -76,24 +75,20 @@ def offset_for(
     wanted = torch.where(weights[:, None] > 0, targets, 0.0).double().numpy()
     if len(targets) < 3:
         return torch.from_numpy(wanted)
-    return torch.from_numpy(solveh_banded(_form(timestamps.numpy(), pull, settings.stiffness), pull[:, None] * wanted))
-
-
-def _form(times: np.ndarray, pull: np.ndarray, stiffness: float) -> np.ndarray:
-    """Upper bands of the pentadiagonal system, for solveh_banded."""
+    times = timestamps.numpy()
     before, after = np.diff(times)[:-1], np.diff(times)[1:]
     around = (before + after) / 2
     # second differences of neighbours at uneven times: left · δ₋ + middle · δ + right · δ₊
     left, right = 1 / (before * around), 1 / (after * around)
-    middle, weight = -left - right, stiffness * around
-    bands = np.zeros((3, len(times)))
+    middle, weight = -left - right, settings.stiffness * around
+    bands = np.zeros((3, len(times)))  # upper bands of the pentadiagonal system
     bands[2] = pull + np.where(pull > 0, 0.0, np.gradient(times))
     for shift, coefficient in enumerate((left, middle, right)):
         bands[2, shift : shift + len(around)] += weight * coefficient**2
     bands[1, 1:-1] += weight * left * middle
     bands[1, 2:] += weight * middle * right
     bands[0, 2:] += weight * left * right
-    return bands
+    return torch.from_numpy(solveh_banded(bands, pull[:, None] * wanted))
 
 
 def bend_contacts(

@@ -65,8 +65,7 @@ def plane_distance(
     origin: Float[Tensor, "time vertex 3"],
     normal: Float[Tensor, "time vertex 3"],
 ) -> Float[Tensor, "time vertex 1"]:
-    """Signed distance (m) of patch vertices from the scan's local plane (ours): eq. 4.6, insensitive to point
-    spacing."""
+    """Signed distance (m) of patch vertices from the scan's local plane (ours): eq. 4.6, insensitive to spacing."""
     return ((position - origin) * normal).sum(-1, keepdim=True)
 
 

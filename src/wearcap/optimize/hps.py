@@ -28,8 +28,7 @@ class Term:
     inputs: tuple[str, ...]
     """Arguments of `cost`: names of `state_values`, the first one, and of `data_values`."""
     reach: int
-    """Number of consecutive frames on which a residual depends: 1, or 2 (then the first residual is that of frames 0
-    and 1)."""
+    """Number of consecutive frames on which a residual depends: 1, or 2 (the first is then that of frames 0 and 1)."""
     share: str = "ones"
     """Name in `data_values` of the factor of each residual's energy, of the residuals' shape; "ones": no factor."""
     expected: tuple[str, ...] = ()
@@ -67,8 +66,7 @@ PATCH_VERTICES = 10
 SURFACE_REACH_M = 0.5
 """Distance (m) to the nearest scanned point above which a foot has no scene below it."""
 LEAST_UPRIGHT = 0.7
-"""Least vertical component of a plane's normal that a foot may stand on (45°): excludes walls beside gaps in the
-floor."""
+"""Least vertical component of the normal of a plane to stand on (45°): no walls beside gaps in the floor."""
 
 
 @dataclass(frozen=True)
@@ -122,8 +120,7 @@ class HpsState:
 
 @dataclass(frozen=True, eq=False)
 class FootPatches:
-    """Vertices of the patches (B_k of thesis eq. 4.6), skinned without the rest of the body: 40 instead of
-    thousands."""
+    """Vertices of the patches (B_k of thesis eq. 4.6), skinned without the rest of the body: 40, not thousands."""
 
     body: BodyModel
     vertex: Int64[Tensor, "vertex"]
@@ -148,8 +145,7 @@ class FootPatches:
         return self._only.vertices(T_world_joint)
 
     def share(self, contact: Float[Tensor, "*batch patch"]) -> Float[Tensor, "*batch vertex"]:
-        """Contact of each vertex's patch, divided by its number of vertices, so that sums over vertices are patch
-        means."""
+        """Contact of each vertex's patch over its number of vertices, so that sums over vertices are patch means."""
         size = torch.bincount(self.patch, minlength=len(FOOT_REGIONS)).to(contact)
         return (contact / size)[..., self.patch]
 
@@ -192,6 +188,16 @@ def _spread(body: BodyModel, region: Int64[Tensor, "all"], count: int) -> Int64[
 
 
 @dataclass(frozen=True, eq=False)
+class SuitSteps:
+    """Motion from each frame to the next as the suit measured it, in world axes (float64)."""
+
+    t_step: Float[Tensor, "pair 3"]
+    """Displacements of the root, rotated into the scene (m)."""
+    R_root_step: Float[Tensor, "pair 3 3"]
+    R_head_step: Float[Tensor, "pair 3 3"]
+
+
+@dataclass(frozen=True, eq=False)
 class HpsData:
     """Sensor data and initialisation, frame by frame at one rate (float64; m, rad)."""
 
@@ -206,12 +212,7 @@ class HpsData:
     hold_confidence: Float[Tensor, "time"]
     """Weight of each frame's `hold` term, which attracts the root to its initial translation."""
     contact: Float[Tensor, "time patch"]
-    t_step: Float[Tensor, "pair 3"]
-    """Root displacements per frame measured by the suit, rotated into the scene (m)."""
-    R_root_step: Float[Tensor, "pair 3 3"]
-    """Root rotations per frame measured by the suit, in world axes."""
-    R_head_step: Float[Tensor, "pair 3 3"]
-    """Head rotations per frame measured by the suit, in world axes."""
+    steps: SuitSteps
     surface: SurfaceIndex | None = None
     """Surface of the scan; None: without scene."""
 
@@ -229,21 +230,19 @@ class HpsData:
             cam_confidence=self.cam_confidence[frames],
             hold_confidence=self.hold_confidence[frames],
             contact=self.contact[frames],
-            t_step=self.t_step[pairs],
-            R_root_step=self.R_root_step[pairs],
-            R_head_step=self.R_head_step[pairs],
+            steps=SuitSteps(*(part[pairs] for part in vars(self.steps).values())),
         )
 
     def to(self, dtype: torch.dtype) -> "HpsData":
         """All tensors in another precision; the surface is unchanged."""
         tensors = {name: value.to(dtype) for name, value in vars(self).items() if isinstance(value, Tensor)}
-        return replace(self, start=HpsState(*(part.to(dtype) for part in vars(self.start).values())), **tensors)
+        start, steps = ([part.to(dtype) for part in vars(group).values()] for group in (self.start, self.steps))
+        return replace(self, start=HpsState(*start), steps=SuitSteps(*steps), **tensors)
 
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """Nearest scene point v(n) of each patch vertex (eq. 4.6), and the local plane; `found` is 1 where both exist,
-    else 0."""
+    """Nearest scene point v(n) of each patch vertex (eq. 4.6) and local plane; `found`: 1 where both exist, else 0."""
 
     point: Float[Tensor, "time vertex 3"]
     origin: Float[Tensor, "time vertex 3"]
@@ -279,7 +278,7 @@ def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: H
 
 
 def data_values(data: HpsData, ground: Ground) -> dict[str, Tensor]:
-    """Values by name that do not depend on the state: the fields of `HpsData`, and what the terms derive from them."""
+    """Values by name that do not depend on the state: those of `HpsData`, and what the terms derive from them."""
     contact, patches = data.contact, data.patches
     t, theta_imu, soles = data.start.t_world_root, data.start.theta, ground.point
     derived = {
@@ -297,7 +296,7 @@ def data_values(data: HpsData, ground: Ground) -> dict[str, Tensor]:
         "no_step": torch.zeros_like(t[1:]),
         "no_turn": torch.eye(3).to(t).expand(len(data) - 1, 3, 3),
     }
-    return {name: value for name, value in vars(data).items() if isinstance(value, Tensor)} | derived
+    return {name: value for name, value in vars(data).items() if isinstance(value, Tensor)} | vars(data.steps) | derived
 
 
 def state_values(data: HpsData, state: HpsState, full_mesh: bool = False) -> dict[str, Tensor]:

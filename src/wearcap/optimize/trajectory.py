@@ -166,8 +166,7 @@ def bending_problem(
 
 
 def headings(path: Float64[Tensor, "time 2"]) -> Float64[Tensor, "step"]:
-    """Heading α of each step (rad, within ±π; atan2 of eq. 5.1); a step of zero length takes that of the last moving
-    step."""
+    """Heading α of each step (rad, within ±π; atan2 of eq. 5.1); one of zero length takes the last moving step's."""
     step = path.diff(dim=0)[_leaders(path)]
     return torch.atan2(step[:, 1], step[:, 0])
 
@@ -202,8 +201,7 @@ def heading_change(
 def energy_terms(
     problem: BendingProblem, turn: Float64[Tensor, "step"], shift: Float64[Tensor, "2"]
 ) -> dict[str, Float64[Tensor, ""]]:
-    """Terms of eq. 5.2, differentiable in φ (rad) and in the shift of the first point (m); the path is linear within
-    steps."""
+    """Terms of eq. 5.2, differentiable in φ (rad) and the first point's shift (m); the path is linear within steps."""
     settings, path = problem.settings, bent(problem, turn, shift)
     at, share = problem.control_step, problem.control_share[:, None]
     offset = torch.lerp(path[at], path[at + 1], share) - problem.control_points
@@ -232,8 +230,7 @@ def bent_path(
 
 
 def bend_adam(problem: BendingProblem, iterations: int = 1000, learning_rate: float = 3e-3) -> BentPath:
-    """The thesis's solver (§5.4.2), Adam with a learning rate in rad and m. Returns the best state of all
-    iterations."""
+    """The thesis's solver (§5.4.2): Adam, its learning rate in rad and m. Returns the best state of all iterations."""
     turn = torch.zeros(len(problem.leader), dtype=torch.float64, requires_grad=True)
     shift = torch.zeros(2, dtype=torch.float64, requires_grad=problem.settings.free_start)
     unknowns = [value for value in (turn, shift) if value.requires_grad]

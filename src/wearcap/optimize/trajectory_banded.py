@@ -217,6 +217,7 @@ class _Path:
         )
         loss = settings.loss
         self.kinds = (NORMS.index(settings.norm), LOSSES.index(loss.kind), float(loss.delta))
+        self.fixed = (self.link, self.last_link, *self.controls, self.kinds)
         self.turn, self.place = np.zeros(steps), (problem.path - problem.path[0]).numpy().copy()
         self.new_turn, self.new_place = np.empty_like(self.turn), np.empty_like(self.place)
         self.gains = np.empty((steps, 4))
@@ -228,7 +229,7 @@ class _Path:
     def terms(self, smooth: float, turn: np.ndarray | None = None, place: np.ndarray | None = None) -> dict:
         """Energy by term of a path (default: the current one), with norms smoothed by `smooth`."""
         turn, place = self.turn if turn is None else turn, self.place if place is None else place
-        control, bending = _energy(turn, place, self.link, self.last_link, *self.controls, self.kinds, smooth)
+        control, bending = _energy(turn, place, *self.fixed, smooth)
         return {"control": control, "bending": bending, "total": control + bending}
 
     def begin(self) -> None:
@@ -256,17 +257,8 @@ class _Path:
     def improve(self, smooth: float, damping: float, before: float) -> tuple[float, float]:
         """One Gauss-Newton step; returns the decrease of the smoothed energy, and the damping for the next step."""
         for _ in range(8):
-            xx, xy, yy, x, y = _value_pass(
-                self.turn,
-                self.place,
-                self.link,
-                self.last_link,
-                *self.controls,
-                self.kinds,
-                smooth,
-                damping,
-                self.gains,
-            )
+            path = self.turn, self.place, *self.fixed
+            xx, xy, yy, x, y = _value_pass(*path, smooth, damping, self.gains)
             shift = np.zeros(2)
             if self.free:
                 ridge = 1e-9 * (xx + yy) + 1e-12

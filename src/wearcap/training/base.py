@@ -59,8 +59,7 @@ class Training(lightning.LightningModule):
         return self
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
-        """Make the step's randomness (dropout, augmentation) a function of seed and step, so that resumed runs repeat
-        it."""
+        """Make dropout and augmentation of a step a function of seed and step, so that resumed runs repeat it."""
         torch.manual_seed((self.seed + 1) * 1_000_003 + self.global_step * 64 + self.global_rank)
 
     def _step(self, batch: tuple[Tensor, ...], stage: str) -> Tensor:

@@ -46,7 +46,11 @@ class CaptureValidation(Callback):
         if not is_due(trainer, self.every_n_epochs):
             return
         pipeline = self.pipeline(**pl_module.pipeline_parts(), device=str(pl_module.device))
-        recordings = self._recordings(trainer.datamodule.val_sources[0].root)  # pyright: ignore[reportAttributeAccessIssue]
+        store = RecordingStore.open(trainer.datamodule.val_sources[0].root)  # pyright: ignore[reportAttributeAccessIssue]
+        # Some, evenly chosen, and their first seconds only: this does not replace an evaluation.
+        names = store.names("val")
+        chosen = names[:: max(1, len(names) // self.recordings)][: self.recordings]
+        recordings = [_first_seconds(store.load(name), self.max_seconds) for name in chosen]
         motions = [captured.motion for captured in pipeline.capture(recordings, [0] * len(recordings))]
         rows = [score(m, r, r.name, 0) for m, r in zip(motions, recordings)]
         for key, summary in aggregate(rows).items():
@@ -56,15 +60,8 @@ class CaptureValidation(Callback):
             path = self.folder / f"step_{trainer.global_step:06d}_{recordings[0].name}.png"
             self.draw(path, {"truth": recordings[0].motion, "capture": motions[0]})
 
-    def _recordings(self, root: str) -> list[Recording]:
-        """Evenly chosen validation recordings, cut to their first seconds; this does not replace an evaluation."""
-        store = RecordingStore.open(root)
-        names = store.names("val")
-        chosen = names[:: max(1, len(names) // self.recordings)][: self.recordings]
-        return [first_seconds(store.load(name), self.max_seconds) for name in chosen]
 
-
-def first_seconds(recording: Recording, seconds: float) -> Recording:
+def _first_seconds(recording: Recording, seconds: float) -> Recording:
     """The beginning of a recording's head path, motion and contacts."""
     assert recording.head is not None
     assert recording.motion is not None

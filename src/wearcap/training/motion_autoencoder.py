@@ -6,8 +6,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from wearcap.data.motion_features import MotionFeatures, Movement
-from wearcap.data.statistics import drawn_batches, standardize
-from wearcap.data.windows import Windows
+from wearcap.data.windows import Windows, drawn_batches, standardize
 from wearcap.metrics.position import mpjpe_cm
 from wearcap.models.motion_autoencoder import MotionAutoencoder
 from wearcap.training.base import OptimizerOf, SchedulerOf, Training

@@ -108,8 +108,7 @@ def keep_freed_memory() -> None:
 
 
 def resume_path(resume: str | None, own: Path, runs: Path) -> Path | None:
-    """The checkpoint to resume from: none, a path, or with "auto" the `last.ckpt` of the run's own folder, else the
-    newest in `runs`."""
+    """The checkpoint to resume from: none, a path, or ("auto") the run's own `last.ckpt`, else the newest in `runs`."""
     if resume is None:
         return None
     if resume != "auto":

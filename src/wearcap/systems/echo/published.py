@@ -10,8 +10,7 @@ from torch import Tensor
 
 from wearcap.body.contact_points import BODY_POINTS
 from wearcap.data.features import body_size
-from wearcap.data.statistics import MIN_SCALE
-from wearcap.data.windows import Windows
+from wearcap.data.windows import MIN_SCALE, Windows
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid

@@ -9,8 +9,7 @@ from torch import Tensor
 from wearcap.body.contact_points import BODY_POINTS
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
-from wearcap.data.statistics import MIN_SCALE, drawn_batches, standardize
-from wearcap.data.windows import Windows
+from wearcap.data.windows import MIN_SCALE, Windows, drawn_batches, standardize
 from wearcap.diffusion.levels import LevelMix
 from wearcap.diffusion.process import add_noise
 from wearcap.diffusion.schedule import Schedule

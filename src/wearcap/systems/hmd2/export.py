@@ -57,7 +57,7 @@ def exports(pipeline: HMD2) -> Exports:
     Raises WearcapError for a network that is exported already, and for an unknown schedule.
     """
     net, features, random = pipeline.net, pipeline.features, torch.Generator().manual_seed(0)
-    if isinstance(net, ExportedDenoiser):
+    if isinstance(net, _ExportedDenoiser):
         raise WearcapError("a network that is exported already", expected="one of a checkpoint")
     shape = 2, net.window
     graphs = net.graphs()
@@ -83,10 +83,7 @@ def exports(pipeline: HMD2) -> Exports:
         "motion_channels": motion_channels(features, pipeline.skeleton),
         "motion_mean": net.motion_normalizer.mean.tolist(),
         "motion_scale": net.motion_normalizer.scale.tolist(),
-        "condition_size": net.condition_size,
-        "points_size": net.points_size,
-        "image_size": net.image_size,
-        "self_conditioning": net.self_conditioning,
+        **{name: getattr(net, name) for name in ("condition_size", "points_size", "image_size", "self_conditioning")},
         "image_encoder": pipeline.image_encoder,
         "grid": None if pipeline.place_encoder is None else asdict(pipeline.place_encoder.grid),
         "skeleton": skeleton_to_json(pipeline.skeleton),
@@ -113,7 +110,7 @@ def motion_channels(features: HeadFeatures, skeleton: Skeleton) -> list[str]:
     return [*(f"{joint}.{entry}" for joint in skeleton.joint_names for entry in ROT6D), *feet]
 
 
-class ExportedDenoiser(MotionDenoiser):
+class _ExportedDenoiser(MotionDenoiser):
     """A `MotionDenoiser` whose weights are in exported files, run on the CPU."""
 
     def __init__(self, runs: dict[str, Run], about: dict[str, Any]):
@@ -140,7 +137,7 @@ class ExportedDenoiser(MotionDenoiser):
         return {"step": Graph(self._runs[0]["model"], {}), "plan": Graph(self._runs[0]["plan"], {})}
 
 
-class ExportedPlaces(VoxelAutoencoder):
+class _ExportedPlaces(VoxelAutoencoder):
     """The encoder of the points around the body, with its weights in an exported file."""
 
     def __init__(self, run: Run, grid: VoxelGrid, size: int):
@@ -156,9 +153,9 @@ def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], abo
     """The pipeline of an exported model."""
     places = None
     if "places" in runs:
-        places = ExportedPlaces(runs["places"], VoxelGrid(**about["grid"]), about["points_size"])
+        places = _ExportedPlaces(runs["places"], VoxelGrid(**about["grid"]), about["points_size"])
     return HMD2(
-        net=ExportedDenoiser(runs, about),
+        net=_ExportedDenoiser(runs, about),
         features=HeadFeatures(**about["features"]),
         schedule=schedule_from_json(about["schedule"]),
         skeleton=skeleton_from_json(about["skeleton"]),

@@ -1,5 +1,9 @@
-"""The conditional motion denoiser of HMD² (thesis §6.2): a DiT/EDGE-like transformer that predicts x0."""
+"""The conditional motion denoiser of HMD² (thesis §6.2): a DiT/EDGE-like transformer that predicts x0.
 
+`StepRunner` runs its steps at a fixed sequence of levels, in any runtime.
+"""
+
+from contextlib import AbstractContextManager
 from typing import NamedTuple
 
 import torch
@@ -17,7 +21,7 @@ from wearcap.models.layers import (
     attention_mask,
 )
 from wearcap.runtime.denoising import LevelPlan, PlanGraph, StepGraph
-from wearcap.runtime.graphs import Graph
+from wearcap.runtime.graphs import Graph, chosen, run_of, undisturbed
 
 
 class Conditions(NamedTuple):
@@ -193,3 +197,34 @@ class MotionDenoiser(nn.Module):
         }
         inputs |= {"last": last} if self.self_conditioning else {}
         return {"step": Graph(step, inputs, shared=("plan",)), "plan": Graph(PlanGraph(self), {"level": level})}
+
+
+class StepRunner:
+    """x̂0 at a fixed sequence of levels, for any batch size. The network's weights must not change while it is used."""
+
+    def __init__(
+        self, net: MotionDenoiser, levels: Float[Tensor, "step"], runtime: str = "eager", precision: str = "float32"
+    ):
+        """Raises WearcapError for a runtime or precision that is unknown, not installed, or that do not go together."""
+        device = net.motion_normalizer.mean.device
+        self.net, (self.runtime, precision) = net, chosen(runtime, precision, device)
+        with torch.inference_mode():
+            plan = run_of(net.graphs()["plan"])
+            self._plans = [plan(level=level.reshape(1, 1)) for level in levels.to(device)]
+        self._step = run_of(net.graphs()["step"], self.runtime, precision)
+
+    def __call__(
+        self,
+        number: int,
+        x_t: Float[Tensor, "batch time motion"],
+        encoded: Float[Tensor, "batch token width"],
+        valid: Bool[Tensor, "batch time"],
+        last: Float[Tensor, "batch time motion"] | None = None,
+    ) -> Float[Tensor, "batch time motion"]:
+        """x̂0 at level `number` of the sequence."""
+        more = {"last": torch.zeros_like(x_t) if last is None else last} if self.net.self_conditioning else {}
+        return self._step(x_t=x_t, plan=self._plans[number], encoded=encoded, valid=valid, **more)
+
+    def undisturbed(self) -> AbstractContextManager[None]:
+        """A context for small batches in which PyTorch's threads leave the cores to ONNX Runtime's."""
+        return undisturbed(self.runtime == "onnx")

@@ -22,8 +22,7 @@ from wearcap.recording import Motion, Recording
 from wearcap.runtime.system import CaptureInput, LearnedSystem
 from wearcap.scene.voxels import voxelize
 from wearcap.systems.hmd2.features import HeadFeatures
-from wearcap.systems.hmd2.model import Conditions, MotionDenoiser
-from wearcap.systems.hmd2.step_runner import StepRunner
+from wearcap.systems.hmd2.model import Conditions, MotionDenoiser, StepRunner
 from wearcap.systems.hmd2.windows import Frames, Poses, WindowSampler, advance, no_poses
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.floor import floor_from_points, tracked_floor
@@ -226,10 +225,12 @@ class HMD2(LearnedSystem):
             for start, stop in path.stretches
         ]
         while items:
-            advance(
-                [sampler for *_, sampler in items],
-                [_cut(frames[i], start + passed, stop, stride) for i, start, stop, _ in items],
-            )
+            fresh = []
+            for i, start, stop, _ in items:  # from `stop` on the last frame is repeated and marked as not valid
+                take = torch.arange(start + passed, start + passed + stride)
+                cut = Frames(*(part[:, take.clamp_max(stop - 1)] for part in frames[i]))
+                fresh.append(cut._replace(valid=cut.valid & (take < stop)))
+            advance([sampler for *_, sampler in items], fresh)
             passed += stride
             for i, start, stop, sampler in items:
                 ended = start + passed >= stop
@@ -260,14 +261,6 @@ class HMD2(LearnedSystem):
             timestamps, skeleton, poses.R_parent_joint, torch.zeros(len(timestamps), 3), contact, provenance=settings
         )
         return anchored_to_head(motion, T_world_head)
-
-
-def _cut(frames: Frames, start: int, stop: int, length: int) -> Frames:
-    """`length` frames from `start`; from `stop` on the last frame is repeated and marked as not valid."""
-    take = torch.arange(start, start + length)
-    there = take < stop
-    cut = Frames(*(part[:, take.clamp_max(stop - 1)] for part in frames))
-    return cut._replace(valid=cut.valid & there)
 
 
 def _bridged(poses: Poses, stretches: tuple[tuple[int, int], ...]) -> Poses:

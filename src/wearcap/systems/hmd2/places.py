@@ -65,11 +65,9 @@ class Places:
         self.mapped = True
         self._map.add(points, seen)
         self._new.append((points, seen))
-        if len(self._map) > MANY * self.memory.max_points:
-            self._drop_oldest()
-
-    def _drop_oldest(self) -> None:
-        """Keep only the newest packets of new points, for when no frame arrives that would drop distant ones."""
+        if len(self._map) <= MANY * self.memory.max_points:
+            return
+        # No frame arrives that would drop distant points: only the newest packets of new ones are kept.
         kept, count = [], 0
         while self._new and (not kept or count + len(self._new[-1][0]) <= self.memory.max_points):
             kept.append(self._new.pop())
@@ -90,23 +88,20 @@ class Places:
         """Floor height (m) below the head at the next frames, updated as in `tracking.floor.tracked_floor`."""
         parts, done = [], 0
         while done < len(timestamps):
-            if self._floor.frames % LOOK_FRAMES == 0:
-                self._show(timestamps[done].item())
+            if self._floor.frames % LOOK_FRAMES == 0:  # the tracker gets the points that were seen by now
+                until = timestamps[done].item()
+                shown = [part for part in self._new if len(part[1]) and part[1][0] <= until]
+                if shown:
+                    self._new = [part for part in self._new if len(part[1]) and part[1][0] > until]
+                    self._tracked.append(_joined(shown))
+                    self._floor.see(self._tracked[-1][0])
+                if len(self._tracked) > 1000:
+                    self._tracked = [_joined(self._tracked)]
             ready = LOOK_FRAMES - self._floor.frames % LOOK_FRAMES
             parts.append(self._floor.follow(t_world_head[done : done + ready]))
             done += ready
         self._forget(t_world_head[-1])
         return torch.cat(parts)
-
-    def _show(self, until: float) -> None:
-        """Give the floor tracker the points that were seen by the time `until` (s)."""
-        shown = [part for part in self._new if len(part[1]) and part[1][0] <= until]
-        if shown:
-            self._new = [part for part in self._new if len(part[1]) and part[1][0] > until]
-            self._tracked.append(_joined(shown))
-            self._floor.see(self._tracked[-1][0])
-        if len(self._tracked) > 1000:
-            self._tracked = [_joined(self._tracked)]
 
     def _forget(self, t_world_head: Float[Tensor, "3"]) -> None:
         """Drop distant and old points once the wearer has walked far or there are too many points."""

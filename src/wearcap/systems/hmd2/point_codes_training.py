@@ -7,11 +7,10 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from wearcap.data.statistics import drawn_batches
 from wearcap.data.transforms import Cut, Draws, Window
-from wearcap.data.windows import Content, Windows
+from wearcap.data.windows import Content, Windows, drawn_batches
 from wearcap.geometry.rigid import Rigid
-from wearcap.metrics.occupancy import distance_mae_cm, occupancy_iou, occupied_distance_mae_cm
+from wearcap.metrics.detection import distance_mae_cm, occupancy_iou, occupied_distance_mae_cm
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording.store import RecordingFile, RecordingStore
 from wearcap.scene.voxels import VoxelGrid, VoxelMap, mirrored

@@ -154,16 +154,10 @@ class HMD2Session(Session):
         return {
             "window": net.window,
             "stride": system.advance,
-            "steps": system.steps,
-            "fps": system.fps,
-            "inpaint": system.inpaint,
-            "fade": system.fade,
+            **{name: getattr(system, name) for name in ("steps", "fps", "inpaint", "fade")},
             "lookahead": system.lookahead_frames,
-            "eta": system.eta,
-            "spacing": system.spacing,
-            "motion_size": net.motion_size,
-            "points_size": net.points_size,
-            "image_size": net.image_size,
+            **{name: getattr(system, name) for name in ("eta", "spacing")},
+            **{name: getattr(net, name) for name in ("motion_size", "points_size", "image_size")},
             "features": str(system.features),
         }
 

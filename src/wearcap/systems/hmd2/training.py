@@ -3,13 +3,12 @@
 from collections.abc import Callable
 
 import torch
+from einops import rearrange
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import FEET, Skeleton
-from wearcap.data.statistics import MIN_SCALE, drawn_batches
-from wearcap.data.windows import Windows
+from wearcap.data.windows import MIN_SCALE, Windows, drawn_batches
 from wearcap.diffusion.process import add_noise
 from wearcap.diffusion.schedule import Schedule
 from wearcap.errors import WearcapError
@@ -77,18 +76,28 @@ class MotionDiffusion(Training):
         self._encode = torch.compile(self.net.encode) if compile else self.net.encode
 
     def set_statistics(self, dataset: Windows) -> None:
+        """Set normalisation from a training split. Raises WearcapError unless its windows have the model's inputs."""
         content = dataset.content
         assert isinstance(content, HeadContent)
-        _require_same_inputs(self, content)
+        net, places, images = self.net, content.surroundings.places, content.surroundings.images
+        points_size = 0 if places is None else places.size
+        if (net.points_size, net.image_size) != (points_size, content.image_size):
+            raise WearcapError(
+                f"windows with points of {points_size} and images of {content.image_size} features",
+                expected=f"{net.points_size} and {net.image_size}, as the model has",
+                fix="Set data.dataset.content.surroundings and model.{place_encoder,image_encoder,image_size} alike.",
+            )
+        if self.image_encoder != images and net.image_size:
+            raise WearcapError(f"embeddings of {images!r}", expected=self.image_encoder)
         statistics = feature_statistics(dataset, self.features)
-        self.net.motion_normalizer.set(*statistics["motion"])
-        encoder = self.net.condition_encoder
+        net.motion_normalizer.set(*statistics["motion"])
+        encoder = net.condition_encoder
         encoder.normalizer.set(*statistics["head"])
         for name, optional in (("points", encoder.points), ("image", encoder.image)):
             if optional is not None:
                 optional.normalizer.set(*statistics[name])
-        if self.place_encoder is not None and content.surroundings.places is not None:
-            self.place_encoder.load_state_dict(content.surroundings.places.encoder.state_dict())
+        if self.place_encoder is not None and places is not None:
+            self.place_encoder.load_state_dict(places.encoder.state_dict())
 
     def conditions(self, batch: HeadWindow) -> Conditions:
         """Conditioning of a batch, with modalities dropped by the windows' random numbers."""
@@ -126,38 +135,23 @@ class MotionDiffusion(Training):
         if any(self.loss_weights.get(name) for name in ("joints", "velocity", "skate")):
             motion_hat = self.net.motion_normalizer.inverse(x0_hat.float())
             R_hat, _ = self.features.decode(motion_hat, batch.R_world_head)
-            predicted, true = self._from_head(R_hat, batch), self._from_head(batch.R_parent_joint, batch)
+            # As anchoring the body to the true head gives them.
+            predicted, true = (batch.joints_from_head(self.skeleton, R) for R in (R_hat, batch.R_parent_joint))
             terms["joints"] = losses.joint_position(predicted, true, weight)
             terms["velocity"] = losses.joint_velocity(predicted, true, weight, self.fps)
-            feet = predicted[:, :, self._feet].unflatten(2, (FEET, -1)) + batch.t_world_head[:, :, None, None]
+            feet = predicted[:, :, self._feet]
+            feet = (
+                rearrange(feet, "batch time (foot point) axis -> batch time foot point axis", foot=FEET)
+                + batch.t_world_head[:, :, None, None]
+            )
             terms["skate"] = losses.foot_skate(feet, batch.foot_contact, weight, self.fps)
         return terms
 
-    def _from_head(self, R_parent_joint: Tensor, batch: HeadWindow) -> Tensor:
-        """Joint positions relative to the head joint (m), as anchoring the body to the true head gives them."""
-        origin = torch.zeros_like(batch.t_world_head)
-        joints = forward_kinematics(self.skeleton, R_parent_joint, origin, batch.t_parent_joint[:, None]).t
-        return joints - joints[:, :, self.skeleton.index("head"), None]
 
-
-def _require_same_inputs(system: MotionDiffusion, content: HeadContent) -> None:
-    """Raise WearcapError unless the windows contain the inputs of the model."""
-    net, places, images = system.net, content.surroundings.places, content.surroundings.images
-    points_size = 0 if places is None else places.size
-    if (net.points_size, net.image_size) != (points_size, content.image_size):
-        raise WearcapError(
-            f"windows with points of {points_size} and images of {content.image_size} features",
-            expected=f"{net.points_size} and {net.image_size}, as the model has",
-            fix="Set data.dataset.content.surroundings and model.{place_encoder,image_encoder,image_size} alike.",
-        )
-    if system.image_encoder != images and net.image_size:
-        raise WearcapError(f"embeddings of {images!r}", expected=system.image_encoder)
-
-
-def feature_statistics(dataset: Windows, features: HeadFeatures, limit: int = 2000) -> dict[str, tuple[Tensor, Tensor]]:
-    """(mean, scale) of "motion", "head", "points" and "image" over at most `limit` windows drawn by dataset weights."""
+def feature_statistics(dataset: Windows, features: HeadFeatures) -> dict[str, tuple[Tensor, Tensor]]:
+    """(mean, scale) of "motion", "head", "points" and "image" over at most 2000 windows drawn by dataset weights."""
     sums: dict[str, list[Tensor]] = {}
-    for batch in drawn_batches(dataset, min(limit, 4 * len(dataset)), 64):
+    for batch in drawn_batches(dataset, min(2000, 4 * len(dataset)), 64):
         motion = features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
         head = features.condition(batch.R_world_head, batch.t_world_head, batch.floor_height, batch.size, dataset.fps)
         for name, value, valid in (

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import FEET, Skeleton
 from wearcap.data.features import body_size, true_foot_contact
 from wearcap.data.surroundings import NOTHING, Surroundings
@@ -53,6 +54,14 @@ class HeadWindow(NamedTuple):
     def stature(self) -> Float[Tensor, "*batch"]:
         """Height of the head joint in the rest pose (m)."""
         return self.size[..., 0]
+
+    def joints_from_head(
+        self, skeleton: Skeleton, R_parent_joint: Float[Tensor, "batch frame joint 3 3"]
+    ) -> Float[Tensor, "batch frame joint 3"]:
+        """Joint positions relative to the head joint (m) of the wearers of a batch, in poses such as predicted ones."""
+        origin = torch.zeros_like(R_parent_joint[:, :, 0, 0])
+        joints = forward_kinematics(skeleton, R_parent_joint, origin, self.t_parent_joint[:, None]).t
+        return joints - joints[:, :, skeleton.index("head"), None]
 
 
 @dataclass(frozen=True, eq=False)

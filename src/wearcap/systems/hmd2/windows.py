@@ -43,7 +43,7 @@ class Poses(NamedTuple):
     foot_contact: Float[Tensor, "batch time foot"]
 
 
-class FinalFrames(NamedTuple):
+class _FinalFrames(NamedTuple):
     """Final poses of a batch item's next frames, with their head poses ("time")."""
 
     poses: Poses
@@ -121,7 +121,7 @@ class WindowSampler:
         self.predicted = Poses(*_appended(self.predicted, first, no_poses(self.pipeline, new)))
         self.frames = fresh if self.frames is None else Frames(*_appended(self.frames, first, fresh))
 
-    def finalize(self, lookahead_frames: int) -> FinalFrames:
+    def finalize(self, lookahead_frames: int) -> _FinalFrames:
         """Mark all predictions but the last `lookahead_frames` as final; returns the newly final frames."""
         assert self.frames is not None
         # Frames after a recording's end are not valid and never output.
@@ -129,7 +129,7 @@ class WindowSampler:
         part = slice(self.final, until)
         self.final = until
         head = Rigid(self.frames.R_world_head[0, part], self.frames.t_world_head[0, part])
-        return FinalFrames(Poses(*(poses[:, part] for poses in self.predicted)), head)
+        return _FinalFrames(Poses(*(poses[:, part] for poses in self.predicted)), head)
 
 
 @torch.inference_mode()
@@ -140,13 +140,6 @@ def advance(samplers: Sequence[WindowSampler], fresh: Sequence[Frames]) -> None:
     """
     for sampler, new in zip(samplers, fresh):
         sampler.join(new)
-    poses = _sample(samplers)
-    for item, sampler in enumerate(samplers):
-        sampler.predicted = Poses(*(part[item : item + 1, : sampler.count] for part in poses))
-
-
-def _sample(samplers: Sequence[WindowSampler]) -> Poses:
-    """Sample one window of every batch item."""
     pipeline = samplers[0].pipeline
     net, features, device = pipeline.net, pipeline.features, pipeline.device
     frames = Frames(*_padded([sampler.frames for sampler in samplers], net.window))
@@ -175,13 +168,12 @@ def _sample(samplers: Sequence[WindowSampler]) -> Poses:
     )
     x0 = blended(x0, observed, is_observed_on_device, pipeline.fade)
     motion = net.motion_normalizer.inverse(x0.float()).cpu()
-    poses = Poses(*features.decode(motion, frames.R_world_head))
-    return Poses(
-        *(
-            torch.where(is_observed.reshape(*is_observed.shape, *[1] * (old.ndim - 2)), old, new)
-            for old, new in zip(predicted, poses)
-        )
-    )
+    poses = [
+        torch.where(is_observed.reshape(*is_observed.shape, *[1] * (old.ndim - 2)), old, new)
+        for old, new in zip(predicted, features.decode(motion, frames.R_world_head))
+    ]
+    for item, sampler in enumerate(samplers):
+        sampler.predicted = Poses(*(part[item : item + 1, : sampler.count] for part in poses))
 
 
 def blended(

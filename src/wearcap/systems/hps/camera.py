@@ -45,8 +45,7 @@ class Synchronization:
     """Synchronisation of camera and suit."""
 
     clock: str = "auto"
-    """"shared": both use the same clock. "claps": by claps detected in both. "auto": by claps where a wrist wears a
-    sensor, else shared."""
+    """"shared": one clock. "claps": by claps in both. "auto": by claps where a wrist wears a sensor, else shared."""
     camera_claps_s: list[float] | None = None
     """Times of the claps (s from the video's first image); None: detected in the video's sound."""
     max_offset_s: float | int = 600.0
@@ -141,8 +140,7 @@ class MapLocalization:
         return own
 
     def reads(self, recording: Recording, folder: Path) -> list[Any]:
-        """Inputs that determine the result, for its cache key. Raises WearcapError without localisation and map, or
-        images."""
+        """What decides the result, for its cache key. Raises WearcapError without localisation and map, or images."""
         file, stream = self.map_file(recording, folder), recording.camera
         if file is None or stream is None:
             return [recording.localization]

@@ -21,7 +21,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, finite_difference, resample
-from wearcap.optimize.hps import FootPatches, HpsData, HpsEnergy, HpsState, Solution
+from wearcap.optimize.hps import FootPatches, HpsData, HpsEnergy, HpsState, Solution, SuitSteps
 from wearcap.recording import Motion, Recording
 from wearcap.recording.growing import follow_pieces
 from wearcap.recording.recording import Localization
@@ -56,11 +56,9 @@ class Evidence:
     """How much the optimisation trusts the suit's contacts and the localisation."""
 
     max_contact_speed: float | None = 0.35
-    """Largest speed (m/s, in the suit's own motion) at which a foot patch's contact flag is used; None: all flags are
-    used (thesis)."""
+    """Largest speed (m/s, in the suit's motion) at which a foot patch's contact is used; None: all are (thesis)."""
     confident: bool = True
-    """Whether frames are weighted by the localisation's confidence (0 where it failed); False: all frames alike
-    (thesis)."""
+    """Whether frames are weighted by the localisation's confidence (0 where it failed); False: all alike (thesis)."""
 
 
 @dataclass(eq=False)
@@ -102,7 +100,9 @@ class HPS(StagedSystem):
             ),
             Stage(
                 "optimize",
-                lambda done: self.optimize(self._problem_of(source, done)),
+                lambda done: self.optimize(
+                    self.problem(on_one_clock(recording, done), done["align"], done["initialize"], source.read_scan())
+                ),
                 lambda: (self.energy, self.solver, self.evidence, source.scan, source.metres_per_unit, recording.shape),
                 ("synchronize", "localize", "align", "initialize"),
             ),
@@ -150,14 +150,12 @@ class HPS(StagedSystem):
         return self.localization(recording, folder)
 
     def align(self, recording: Recording) -> Motion:
-        """Resample the suit's motion to `fps`, rotate it about gravity and move it into the scene (thesis eq. 4.14,
-        4.15)."""
+        """The suit's motion at `fps`, rotated about gravity and moved into the scene (thesis eq. 4.14, 4.15)."""
         suit, localization, T_head_cam = required(recording)
         return align_suit(resampled(suit, self.fps), localization, T_head_cam)[0]
 
     def initialize(self, recording: Recording, aligned: Motion) -> Initialization:
-        """Initial state of the optimisation: the suit's pose moved along the camera's path (thesis §4.2.5, eq.
-        4.13)."""
+        """Initial state of the optimisation: the suit's pose on the camera's path (thesis §4.2.5, eq. 4.13)."""
         _, localization, T_head_cam = required(recording)
         return initialize(aligned, localization, T_head_cam.R, T_head_cam.t, self.initialization)
 
@@ -191,15 +189,11 @@ class HPS(StagedSystem):
             sure,
             sure * start.valid if self.evidence.confident else torch.ones_like(sure),
             believed_contact(aligned, self.evidence.max_contact_speed).double(),
-            (heading @ aligned.t_world_root.double().diff(dim=0)[..., None])[..., 0],
-            turns(root),
-            turns(head),
+            SuitSteps(
+                (heading @ aligned.t_world_root.double().diff(dim=0)[..., None])[..., 0], turns(root), turns(head)
+            ),
             scan.surface if scan else None,
         )
-
-    def _problem_of(self, source: CaptureInput, results: dict[str, Any]) -> HpsData:
-        recording = on_one_clock(source.recording, results)
-        return self.problem(recording, results["align"], results["initialize"], source.read_scan())
 
     def optimize(self, data: HpsData) -> Solution:
         """Minimise the energy (thesis eq. 4.1)."""

@@ -65,8 +65,7 @@ class PlacedSuit(StagedSystem):
 
 @dataclass(frozen=True)
 class HpsBaseline(PlacedSuit):
-    """A baseline row of thesis Tables 4.1 to 4.3: "imu", "imu_cam" or "imu_cam_filtered"; all are aligned at the
-    start."""
+    """A baseline row of thesis Tables 4.1–4.3: "imu", "imu_cam" or "imu_cam_filtered", all aligned at the start."""
 
     kind: str
     fps: float = 30.0

@@ -26,8 +26,7 @@ from wearcap.recording.timing import resampled
 from wearcap.scene.scan import Scan
 
 FEET_S, FEET_EVERY_S = 2.0, 6.0
-"""Feet are scored in the first `FEET_S` of every `FEET_EVERY_S` (s): in total about the thesis's three minutes, spread
-evenly."""
+"""Feet are scored in the first `FEET_S` of every `FEET_EVERY_S` (s): in total about the thesis's three minutes."""
 BIN_M = 20.0
 """Length of path (m) over which errors are averaged before a slope is fitted."""
 MARGIN_S = 5.0
@@ -120,12 +119,12 @@ def score_hps(motion: Motion, truth: HpsTruth) -> HpsScores:
     """Score one capture. Raises WearcapError unless it has the truth's joints and timestamps, and finite poses."""
     joints = evaluate_motion(motion, truth.motion, truth.true_contact)
     literal, surface = zip(*(interval_chamfer(motion, truth.body, clouds) for clouds in truth.visits))
-    error = joint_errors_cm(motion, truth.motion)[:, 0]
+    error = _joint_errors_cm(motion, truth.motion)[:, 0]
     return HpsScores(
         literal,
         surface,
-        foot_scores(motion, truth, truth.contact),
-        foot_scores(motion, truth, truth.true_contact),
+        _foot_scores(motion, truth, truth.contact),
+        _foot_scores(motion, truth, truth.true_contact),
         drift(travelled_m(truth.motion), error),
         joints,
     )
@@ -161,7 +160,7 @@ def nearest_frames(timestamps: Float64[Tensor, "time"], at: Float64[Tensor, "ins
     return frames
 
 
-def foot_scores(motion: Motion, truth: HpsTruth, contact: Bool[Tensor, "time patch"]) -> FootSurface:
+def _foot_scores(motion: Motion, truth: HpsTruth, contact: Bool[Tensor, "time patch"]) -> FootSurface:
     """Foot-to-scan distance and foot sliding of a capture during `contact` (Table 4.3)."""
     times = truth.motion.timestamps
     examined = (times - times[0]) % FEET_EVERY_S < FEET_S
@@ -169,7 +168,7 @@ def foot_scores(motion: Motion, truth: HpsTruth, contact: Bool[Tensor, "time pat
     return foot_surface(*foot_vertices(truth.body, motion.T_world_joint, touching), truth.surface)
 
 
-def joint_errors_cm(motion: Motion, truth: Motion) -> Float[Tensor, "time joint"]:
+def _joint_errors_cm(motion: Motion, truth: Motion) -> Float[Tensor, "time joint"]:
     """Position error of each joint in the world (cm); the root comes first."""
     return 100 * (motion.T_world_joint.t - truth.T_world_joint.t).norm(dim=-1)
 
@@ -180,19 +179,19 @@ def travelled_m(motion: Motion) -> Float[Tensor, "time"]:
     return torch.cat([length.new_zeros(1), length])
 
 
-def drift(distance_m: Float[Tensor, "time"], error_cm: Float[Tensor, "time"], bin_m: float = BIN_M) -> Drift:
-    """Mean error of each bin of `bin_m` walked, and the slope of a line fitted to these means.
+def drift(distance_m: Float[Tensor, "time"], error_cm: Float[Tensor, "time"]) -> Drift:
+    """Mean error of each bin of `BIN_M` walked, and the slope of a line fitted to these means.
 
     Each bin has the same weight, however long the wearer stood in it; the last one counts only if at least half of it
     was walked.
     """
-    number = (distance_m / bin_m).floor().long().numpy()
-    whole = number < round(distance_m[-1].item() / bin_m)
+    number = (distance_m / BIN_M).floor().long().numpy()
+    whole = number < round(distance_m[-1].item() / BIN_M)
     if not whole.any():
         whole[:] = True
     count = np.bincount(number[whole])
     error = np.bincount(number[whole], error_cm.double().numpy()[whole])[count > 0] / count[count > 0]
-    middle = (np.flatnonzero(count) + 0.5) * bin_m
+    middle = (np.flatnonzero(count) + 0.5) * BIN_M
     slope = 100 * float(np.polyfit(middle, error, 1)[0]) if len(middle) > 1 else math.nan
     return Drift(tuple(middle.tolist()), tuple(error.tolist()), slope)
 
@@ -232,7 +231,7 @@ def planted_outages(intervals: Intervals, end_s: float, lengths_s: Sequence[floa
 
 
 @dataclass(frozen=True)
-class Disturbance:
+class _Disturbance:
     """Mean errors (cm) with and without localisation outages, over the same frames."""
 
     root_cm: float
@@ -251,10 +250,10 @@ class Disturbance:
         return self.joint_cm / self.undisturbed_joint_cm
 
 
-def disturbance(disturbed: Motion, undisturbed: Motion, truth: Motion, frames: Bool[Tensor, "time"]) -> Disturbance:
+def disturbance(disturbed: Motion, undisturbed: Motion, truth: Motion, frames: Bool[Tensor, "time"]) -> _Disturbance:
     """Compare captures with and without outages over the given frames."""
-    with_, without = (joint_errors_cm(motion, truth)[frames] for motion in (disturbed, undisturbed))
-    return Disturbance(*(float(e) for e in (with_[:, 0].mean(), with_.mean(), without[:, 0].mean(), without.mean())))
+    with_, without = (_joint_errors_cm(motion, truth)[frames] for motion in (disturbed, undisturbed))
+    return _Disturbance(*(float(e) for e in (with_[:, 0].mean(), with_.mean(), without[:, 0].mean(), without.mean())))
 
 
 def in_order(errors: Sequence[float]) -> bool:

@@ -4,6 +4,7 @@ A window of the newest seconds is re-solved as frames arrive; frames older than 
 that follow. Memory is bounded by the window, however long the recording.
 """
 
+import math
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -19,7 +20,7 @@ from wearcap.body import skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry import rigid, rotation, trajectory
 from wearcap.geometry.rigid import Rigid
-from wearcap.optimize.hps import HpsData, HpsState
+from wearcap.optimize.hps import HpsState
 from wearcap.recording import Motion, Recording
 from wearcap.recording import motion as motion_types
 from wearcap.recording import recording as recording_types
@@ -30,13 +31,16 @@ from wearcap.runtime.session import Session
 from wearcap.runtime.snapshot import classes_of
 from wearcap.scene.scan import Scan
 from wearcap.sensors.initialization import Initialization, align_suit, estimate_head_camera, initialize, inliers
-from wearcap.sensors.packets import OFF_THE_CLOCK, WRONG_TYPE
+from wearcap.sensors.packets import MAX_POSITION_M, MAX_TIME_S, OFF_THE_CLOCK, WRONG_TYPE, rotation_fault, values_fault
 from wearcap.sensors.samples import SuitPiece
-from wearcap.systems.hps.pieces import cut, follows, localization_fault, more, suit_fault
 from wearcap.systems.hps.pipeline import HPS
 
 MAX_UNALIGNED_S = 600.0
 """Length (s) of suit motion that is kept until the first alignment."""
+MAX_PAUSE_S = 10.0
+"""Longest gap (s) within a stretch. A piece after a longer one is kept aside until the next piece continues it; then a
+new stretch begins."""
+_LOCALIZED = ("timestamps", "R_world_cam", "t_world_cam", "confidence")
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,58 @@ class StreamSettings:
     """Length of final motion that a window is constrained to."""
     tie: float = 30.0
     """Weight of a final frame's position, relative to a localised frame's (1)."""
+
+
+def suit_fault(suit: object, like: Motion | None) -> str | None:
+    """Reason to refuse a piece of a suit's motion, None for a good one; it must match an earlier good piece `like`."""
+    if not isinstance(suit, Motion) or not isinstance(suit.timestamps, Tensor) or suit.timestamps.ndim != 1:
+        return WRONG_TYPE
+    times, count, joints = suit.timestamps, len(suit.timestamps), len(suit.skeleton)
+    contact, before = suit.contact_prob, None if like is None else like.contact_prob
+    patches = contact.shape[-1:] if isinstance(contact, Tensor) else ()
+    fault = (
+        _times_fault(times, MAX_PAUSE_S)
+        or rotation_fault(suit.R_parent_joint, (count, joints, 3, 3))
+        or values_fault(suit.t_world_root, (count, 3), MAX_POSITION_M)
+        or (None if contact is None else values_fault(contact, (count, *patches), 1.0))
+    )
+    if fault is None and like is not None:
+        same = like.skeleton.joint_names == suit.skeleton.joint_names and (contact is None) == (before is None)
+        return (
+            None
+            if same and (before is None or contact is None or before.shape[1:] == contact.shape[1:])
+            else WRONG_TYPE
+        )
+    return fault
+
+
+def localization_fault(seen: object, suit: Motion) -> str | None:
+    """Reason to refuse a piece's camera poses, None for good ones; poses of confidence 0 are not checked."""
+    if not isinstance(seen, Localization) or not isinstance(seen.timestamps, Tensor):
+        return WRONG_TYPE
+    count = seen.timestamps.numel()
+    if fault := _times_fault(seen.timestamps, math.inf) or values_fault(seen.confidence, (count,), 1.0):
+        return fault
+    shapes = [getattr(part, "shape", None) for part in (seen.R_world_cam, seen.t_world_cam)]
+    if shapes != [(count, 3, 3), (count, 3)]:
+        return WRONG_TYPE
+    found = seen.confidence > 0
+    R, t = seen.R_world_cam[found], seen.t_world_cam[found]
+    if seen.timestamps[-1] > suit.timestamps[-1] + MAX_PAUSE_S:
+        return OFF_THE_CLOCK
+    return rotation_fault(R, (len(R), 3, 3)) or values_fault(t, (len(R), 3), MAX_POSITION_M)
+
+
+def _times_fault(times: Tensor, max_pause_s: float) -> str | None:
+    if fault := values_fault(times, (times.numel(),), MAX_TIME_S):
+        return fault
+    steps = times.diff()
+    return None if ((steps > 0) & (steps <= max_pause_s)).all() else OFF_THE_CLOCK
+
+
+def _follows(first: Motion, then: Motion) -> bool:
+    """Whether a piece continues another, without overlap or a long gap."""
+    return 0 < (then.timestamps[0] - first.timestamps[-1]).item() <= MAX_PAUSE_S
 
 
 class HpsStream:
@@ -137,11 +193,17 @@ class HpsStream:
             return None
         self._like = self._like or suit
         localization = self._checked(localization, suit)
-        if self.suit is None or follows(self.suit, suit):
+        if self.suit is None or _follows(self.suit, suit):
             self._refuse_alone()
             self._add(suit, localization)
-            return self._solve()
-        if self._alone is None or not follows(self._alone[0], suit):
+            newest = suit.timestamps[-1].item()
+            if self.turn is None and not self._align():
+                self._forget(newest - MAX_UNALIGNED_S)
+                return None
+            if newest - self._solved_to < self.settings.advance_s:
+                return None
+            return self._advance(newest - self.settings.lag_s)
+        if self._alone is None or not _follows(self._alone[0], suit):
             self._refuse_alone()
             self._alone = suit, localization
             return None
@@ -169,25 +231,15 @@ class HpsStream:
 
     def _add(self, suit: Motion, localization: Localization | None) -> None:
         self.suit = joined([suit] if self.suit is None else [self.suit, suit])
-        if (
-            localization is not None
-            and self.seen is not None
-            and localization.timestamps[0] <= self.seen.timestamps[-1]
-        ):
+        if localization is None:
+            return
+        if self.seen is None:
+            self.seen = localization
+        elif localization.timestamps[0] <= self.seen.timestamps[-1]:
             self.refused[f"localization: {OFF_THE_CLOCK}"] += 1
-        elif localization is not None:
-            self.seen = localization if self.seen is None else more(self.seen, localization)
-
-    def _solve(self) -> Motion | None:
-        """Solve once enough is new; returns the frames that have become final."""
-        assert self.suit is not None
-        newest = self.suit.timestamps[-1].item()
-        if self.turn is None and not self._align():
-            self._forget(newest - MAX_UNALIGNED_S)
-            return None
-        if newest - self._solved_to < self.settings.advance_s:
-            return None
-        return self._advance(newest - self.settings.lag_s)
+        else:
+            both = self.seen, localization
+            self.seen = Localization(*(torch.cat([getattr(part, name) for part in both]) for name in _LOCALIZED))
 
     def finish(self) -> Motion | None:
         """Return the remaining frames at the end of the recording.
@@ -242,7 +294,15 @@ class HpsStream:
         times = aligned.timestamps
         first = int(torch.searchsorted(times, after - settings.behind_s)) if self.done is not None else 0
         data = self.hps.problem(self._recording(), aligned, start, self.scan, self.R_head_cam)[first:]
-        solution = self.hps.optimize(self._tied(data, times[first:]))
+        if self.done is not None:
+            # Final frames constrain the window: their positions replace the camera's in the `hold` term.
+            count = int((times[first:] <= self.done.timestamps[-1] + 0.5 / fps).sum())
+            final = self.done.sliced(len(self.done) - count, len(self.done))
+            t, hold = data.start.t_world_root.clone(), data.hold_confidence.clone()
+            t[:count], hold[:count] = final.t_world_root.double(), settings.tie
+            tied = HpsState(data.start.theta, data.start.R_world_root, t)
+            data = replace(data, start=tied, hold_confidence=hold)
+        solution = self.hps.optimize(data)
         part = replace(start, motion=start.motion.sliced(first, len(times)))
         motion = self.hps.motion(part, solution)
         new = (motion.timestamps > after + 0.5 / fps) & (motion.timestamps <= final_s)
@@ -267,8 +327,7 @@ class HpsStream:
         return motion.moved(Rigid(turn, move))
 
     def _start(self, aligned: Motion) -> Initialization:
-        """The window's initialisation; without localised frames, the suit's motion continues from the last final
-        frame."""
+        """The window's initialisation; without localised frames the suit's motion goes on from the last final one."""
         seen = self.seen
         if seen is not None and (_inside(seen, aligned) & inliers(seen)).any():
             start = initialize(aligned, seen, self.mount.R, self.mount.t, self.hps.initialization)
@@ -287,16 +346,6 @@ class HpsStream:
         lost = torch.zeros(len(aligned), dtype=torch.bool)
         return Initialization(carried, lost, self.yaw.expand(len(aligned)))
 
-    def _tied(self, data: HpsData, times: Float64[Tensor, "time"]) -> HpsData:
-        """Constrain the window to its final frames: their positions replace the camera's in the `hold` term."""
-        if self.done is None:
-            return data
-        count = int((times <= self.done.timestamps[-1] + 0.5 / self.hps.fps).sum())
-        final = self.done.sliced(len(self.done) - count, len(self.done))
-        t, hold = data.start.t_world_root.clone(), data.hold_confidence.clone()
-        t[:count], hold[:count] = final.t_world_root.double(), self.settings.tie
-        return replace(data, start=HpsState(data.start.theta, data.start.R_world_root, t), hold_confidence=hold)
-
     def _recording(self) -> Recording:
         assert self.seen is not None
         return replace(self.about, suit=self.suit, localization=self.seen)
@@ -308,7 +357,8 @@ class HpsStream:
         self.suit = self.suit.sliced(first, len(self.suit))
         if self.seen is not None:  # two are kept: they determine the frame rate
             first = int(torch.searchsorted(self.seen.timestamps, before_s))
-            self.seen = cut(self.seen, max(min(first, len(self.seen.timestamps) - 2), 0))
+            kept = slice(max(min(first, len(self.seen.timestamps) - 2), 0), None)
+            self.seen = Localization(*(getattr(self.seen, name)[kept] for name in _LOCALIZED))
 
 
 class HpsSession(Session):
@@ -382,25 +432,21 @@ def follow(
         if stream is None:
             stream = HpsStream(hps, piece, scan, settings)
             stream.refused = refused
-        done = stream.push(piece.suit, _localized(hps, piece, folder, None if fresh else refused))
+        localization = piece.localization
+        if piece.camera is not None:
+            try:
+                localization = hps.localize(piece, folder)
+            except WearcapError:
+                if fresh:
+                    raise
+                refused["localization: failed"] += 1
+                localization = None
+        done = stream.push(piece.suit, localization)
         if done is not None:
             yield done
     last = stream.finish() if stream is not None else None
     if last is not None:
         yield last
-
-
-def _localized(hps: HPS, piece: Recording, folder: Path, refused: Counter[str] | None) -> Localization | None:
-    """Camera poses of a piece; a failure is counted in `refused`, or raised if there is no counter."""
-    if piece.camera is None:
-        return piece.localization
-    try:
-        return hps.localize(piece, folder)
-    except WearcapError:
-        if refused is None:
-            raise
-        refused["localization: failed"] += 1
-        return None
 
 
 def _step(timestamps: Float64[Tensor, "time"]) -> float:

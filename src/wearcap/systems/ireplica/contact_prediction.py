@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -29,6 +28,31 @@ class ContactDetector:
     features: PoseFeatures
     classes: tuple[str, ...]
     fps: float = 60.0
+
+    @classmethod
+    def load(cls, path: str | Path) -> "ContactDetector":
+        """Load the detector of a checkpoint of `wearcap train`. Raises WearcapError when it holds another model."""
+        config, state = read_checkpoint(path)
+        model = config["model"]
+        net, features, classes, fps = (model.get(key) for key in ("net", "features", "classes", "fps"))
+        kinds = [
+            str(part.get("_target_", "")).rpartition(".")[2] if isinstance(part, dict) else ""
+            for part in (net, features)
+        ]
+        if (
+            kinds[0] not in NETWORKS
+            or kinds[1] not in FEATURES
+            or not (isinstance(classes, list) and isinstance(fps, int | float))
+        ):
+            raise WearcapError(
+                f"a checkpoint of {kinds[0] or 'another model'}",
+                where=path,
+                expected=f"a contact network: {' or '.join(NETWORKS)}",
+            )
+        encoder = FEATURES[kinds[1]](**{key: value for key, value in features.items() if key != "_target_"})
+        net = {key: value for key, value in net.items() if key != "_partial_"}
+        network = build(net | {"inputs": encoder.size, "classes": len(classes)}, state, path, prefix="net.")
+        return cls(network, encoder, tuple(classes), fps)
 
     def probability(self, feature: Float[Tensor, "time feature"]) -> Float[Tensor, "out hand class"]:
         """Probabilities of all frames but the first and last `REACH`, in passes of `frames_per_pass` frames."""
@@ -61,7 +85,7 @@ class ContactPredictor:
     @classmethod
     def load(cls, *checkpoints: str | Path) -> "ContactPredictor":
         """Load detectors from checkpoints of `wearcap train`. Raises WearcapError for any other file."""
-        return cls(*(load_detector(path) for path in checkpoints))
+        return cls(*(ContactDetector.load(path) for path in checkpoints))
 
     @torch.inference_mode()
     def __call__(self, motion: Motion) -> dict[str, Float[Tensor, "time hand"]]:
@@ -128,30 +152,3 @@ class ContactStream:
         for detector, state in zip(self._detectors, self._state):
             prediction |= dict(zip(detector.classes, detector.probability(state)[0].unbind(-1)))
         return prediction
-
-
-def load_detector(path: str | Path) -> ContactDetector:
-    """Load the detector of a checkpoint of `wearcap train`. Raises WearcapError when it holds another model."""
-    config, state = read_checkpoint(path)
-    model = config["model"]
-    net, features, classes, fps = (model.get(key) for key in ("net", "features", "classes", "fps"))
-    kinds = [_class_name(part) for part in (net, features)]
-    if (
-        kinds[0] not in NETWORKS
-        or kinds[1] not in FEATURES
-        or not (isinstance(classes, list) and isinstance(fps, int | float))
-    ):
-        raise WearcapError(
-            f"a checkpoint of {kinds[0] or 'another model'}",
-            where=path,
-            expected=f"a contact network: {' or '.join(NETWORKS)}",
-        )
-    encoder = FEATURES[kinds[1]](**{key: value for key, value in features.items() if key != "_target_"})
-    net = {key: value for key, value in net.items() if key != "_partial_"}
-    network = build(net | {"inputs": encoder.size, "classes": len(classes)}, state, path, prefix="net.")
-    return ContactDetector(network, encoder, tuple(classes), fps)
-
-
-def _class_name(part: Any) -> str:
-    """Class name in the `_target_` of a part of a config, "" if there is none."""
-    return str(part.get("_target_", "")).rpartition(".")[2] if isinstance(part, dict) else ""

@@ -20,8 +20,7 @@ from wearcap.systems.ireplica.features import FEATURES, pose_frames
 
 
 def exports(detector: ContactDetector) -> Exports:
-    """A detector's network, from `pose` "batch 61 feature" to calibrated probabilities "batch hand class" of the middle
-    frame."""
+    """A detector's network, from `pose` "batch 61 feature" to the middle frame's probabilities "batch hand class"."""
     skeleton, random = detector.features.skeleton, torch.Generator().manual_seed(0)
     turns = 0.3 * torch.randn(3, FRAMES, len(skeleton), 3, generator=random)
     graph = Graph(Call(detector.net, "middle_probability"), {"pose": detector.features.encode(rotation.exp(turns))})
@@ -37,7 +36,7 @@ def exports(detector: ContactDetector) -> Exports:
     return Exports("ireplica", {"network": graph}, about, max_error=1e-5)
 
 
-class ExportedContact(ContactNetwork):
+class _ExportedContact(ContactNetwork):
     """A contact network whose weights are in an exported file, run on the CPU: 61 frames in, one prediction out."""
 
     frames_per_pass = 1000
@@ -51,7 +50,7 @@ class ExportedContact(ContactNetwork):
         return self._run[0](pose=windows.flatten(0, 1)).unflatten(0, windows.shape[:2])
 
 
-class ExportedDetector(ContactDetector):
+class _ExportedDetector(ContactDetector):
     """The detector of an exported model."""
 
     def write(self, recording: Recording, path: str | Path) -> None:
@@ -73,9 +72,11 @@ class ExportedDetector(ContactDetector):
         write_text(path, "".join(",".join(row) + "\n" for row in [header, *rows]))
 
 
-def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], about: dict[str, Any]) -> ExportedDetector:
+def from_export(
+    runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], about: dict[str, Any]
+) -> _ExportedDetector:
     """The detector of an exported model."""
     features = dict(about["features"])
     encoder = FEATURES[features.pop("name")](**features)
-    net = ExportedContact(runs["model"], len(about["classes"]))
-    return ExportedDetector(net, encoder, tuple(about["classes"]), about["fps"])
+    net = _ExportedContact(runs["model"], len(about["classes"]))
+    return _ExportedDetector(net, encoder, tuple(about["classes"]), about["fps"])

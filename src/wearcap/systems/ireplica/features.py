@@ -82,8 +82,7 @@ class HandViews:
         return self.encode(torch.eye(3).expand(len(self.skeleton), 3, 3)).shape[-1]
 
     def encode(self, R_parent_joint: Float[Tensor, "*batch joint 3 3"]) -> Float[Tensor, "*batch feature"]:
-        """Encode poses of `skeleton`: the left hand's view (its side, the other side, the middle), then the right
-        hand's."""
+        """Encode poses of `skeleton`: the left hand's view (its side, other side, middle), then the right hand's."""
         sides, middle = self._seen(R_parent_joint)
         mirror = lambda x, signs: x * x.new_tensor(signs)  # noqa: E731
         own, other = sides.unbind(-2)

@@ -39,11 +39,9 @@ class AttachmentSettings:
     one_class: bool = True
     """Whether a hand can hold by its more probable class only; False: both networks work independently (thesis)."""
     settle_s: float = 0.4
-    """Longest approach and retreat (s) at an interval's beginning and end, cut off where the hands are slowest; 0: none
-    is cut off (thesis)."""
+    """Longest approach and retreat (s) at an interval's ends, cut off where the hands are slowest; 0: none (thesis)."""
     keep_object: bool = True
-    """Whether the object stays the same when hands join or leave without a pause; False: it is searched again
-    (thesis)."""
+    """Whether the object stays when hands join or leave without a pause; False: it is searched again (thesis)."""
 
     def __post_init__(self):
         if self.anchor not in ANCHORS or not self.reach_m > 0:

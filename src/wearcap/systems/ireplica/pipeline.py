@@ -51,8 +51,7 @@ class IReplica(StagedSystem):
         return make(predictor=ContactPredictor.load(*checkpoints))
 
     def stages(self, source: CaptureInput) -> list[Stage]:
-        """The registration's stages, then `contacts` and `interact`. Raises WearcapError as those, and without
-        environment."""
+        """The registration's stages, `contacts`, `interact`. Raises WearcapError as those, or without environment."""
         environment = read_environment(self.environment_file(source))
         suit = source.recording.suit
         before = self.registration.stages(source)

@@ -1,5 +1,4 @@
-"""Baselines of iReplica (thesis §5.4.3): static objects, objects interpolated between true poses, contact by
-proximity."""
+"""Baselines of iReplica (thesis §5.4.3): static objects, interpolated true poses of objects, contact by proximity."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

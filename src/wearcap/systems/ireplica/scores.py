@@ -36,7 +36,7 @@ CHAMFER_EVERY_S, CHAMFER_POINTS = 1.0, 1500
 
 
 @dataclass(frozen=True)
-class InteractionScores:
+class _InteractionScores:
     """Scores of one capture."""
 
     handlings: tuple[Handling, ...]
@@ -47,10 +47,10 @@ class InteractionScores:
     object_chamfer_cm: float
     """Chamfer distance between captured and true object during interactions (Table 5.5)."""
     false_moves_cm: float
-    """Mean displacement of objects that were never touched."""
+    """Mean displacement of the centres of objects that were never touched, from the first to the last frame."""
 
 
-def score_interactions(motion: Motion, recording: Recording, environment: Environment) -> InteractionScores:
+def score_interactions(motion: Motion, recording: Recording, environment: Environment) -> _InteractionScores:
     """Score one capture; its object motion may lack objects that never moved.
 
     Raises WearcapError when the recording lacks a true motion, interactions or object motion, or the capture objects.
@@ -78,7 +78,10 @@ def score_interactions(motion: Motion, recording: Recording, environment: Enviro
     scored = [_handling(row, rows, environment, held, motion.timestamps, palms, found, real) for row in rows]
     body, objects = _chamfer(motion, true, recording, rows, environment, found, real)
     joints = mpjpe_cm(motion.T_world_joint.t, true.T_world_joint.t).item()
-    return InteractionScores(tuple(scored), joints, body, objects, _false_moves(environment, held.objects, found))
+    untouched = [scene_object for scene_object in environment.objects if scene_object.name not in held.objects]
+    ends = [object_error(found[t.name][[-1]], found[t.name][[0]], _middle_of(t)).distance_cm[0] for t in untouched]
+    false_moves = float(torch.stack(ends).mean()) if ends else 0.0
+    return _InteractionScores(tuple(scored), joints, body, objects, false_moves)
 
 
 def with_interactions(row: Row, motion: Motion, source: CaptureInput, environment: str | Path | None) -> Row:
@@ -99,7 +102,7 @@ def poses_at(track: Trajectory | None, scene_object: SceneObject, timestamps: Fl
     return resample(track, inside).T_world_body
 
 
-def middle_of(scene_object: SceneObject) -> Float[Tensor, "3"]:
+def _middle_of(scene_object: SceneObject) -> Float[Tensor, "3"]:
     """Centre of an object's bounding box in its own axes (m)."""
     vertices = scene_object.mesh.vertices
     return torch.from_numpy((vertices.min(0) + vertices.max(0)) / 2)
@@ -111,7 +114,7 @@ def _handling(row, rows, environment, held, timestamps, palms, found, real) -> H
     again = min((a for n, a, _ in rows if n == name and a > start), default=float("inf"))
     end = max(int(torch.searchsorted(timestamps, min(stop + SETTLED_S, again))) - 1, 0)
     begin = int(torch.searchsorted(timestamps, start).clamp(max=len(timestamps) - 1))
-    middle = middle_of(scene_object)
+    middle = _middle_of(scene_object)
     left = object_error(found[name][end], real[name][end], middle)
     own = replace(
         held, **_only(held, [o == name and start <= a < stop for o, a in zip(held.objects, held.start_s.tolist())])
@@ -150,13 +153,6 @@ def _only(held, chosen: Sequence[bool]) -> dict:
     }
 
 
-def _false_moves(environment: Environment, touched: tuple[str, ...], found: dict[str, Rigid]) -> float:
-    """Mean displacement (cm) of the centres of untouched objects from the first to the last frame."""
-    untouched = [scene_object for scene_object in environment.objects if scene_object.name not in touched]
-    ends = [object_error(found[t.name][[-1]], found[t.name][[0]], middle_of(t)).distance_cm[0] for t in untouched]
-    return float(torch.stack(ends).mean()) if ends else 0.0
-
-
 def _chamfer(
     motion: Motion, true: Motion, recording: Recording, rows, environment: Environment, found, real
 ) -> tuple[float, float]:
@@ -174,16 +170,16 @@ def _chamfer(
     return tuple(float(np.mean(part)) if part else float("nan") for part in errors)  # pyright: ignore[reportReturnType]
 
 
-def surface_points(scene_object: SceneObject, count: int = CHAMFER_POINTS) -> Float[Tensor, "point 3"]:
-    """Points sampled uniformly by area on an object's surface (without faces: from its vertices), with a fixed seed."""
+def surface_points(scene_object: SceneObject) -> Float[Tensor, "point 3"]:
+    """`CHAMFER_POINTS` points, uniform by area on an object's surface (without faces: its vertices); a fixed seed."""
     vertices, faces = scene_object.mesh.vertices, scene_object.mesh.faces
     rng = np.random.default_rng(0)
     if not len(faces):
-        return torch.from_numpy(vertices[rng.permutation(len(vertices))[:count]])
+        return torch.from_numpy(vertices[rng.permutation(len(vertices))[:CHAMFER_POINTS]])
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    chosen = rng.choice(len(faces), count, p=area / area.sum())
-    u, v = rng.uniform(size=(2, count, 1)).astype(np.float32)
+    chosen = rng.choice(len(faces), CHAMFER_POINTS, p=area / area.sum())
+    u, v = rng.uniform(size=(2, CHAMFER_POINTS, 1)).astype(np.float32)
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     return torch.from_numpy(a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen])
 

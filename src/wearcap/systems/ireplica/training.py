@@ -7,8 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from wearcap.data.statistics import drawn_batches
-from wearcap.data.windows import Windows
+from wearcap.data.windows import Windows, drawn_batches
 from wearcap.geometry import rotation
 from wearcap.metrics.detection import mean_detection_scores
 from wearcap.runtime.graphs import Exports
@@ -63,8 +62,7 @@ class ContactDetection(Training):
         return every[0], every[1]
 
     def on_validation_epoch_end(self) -> None:
-        """Log scores per class, means over hands (thesis Table 5.3); calibration does not change the logits' order
-        or sign."""
+        """Log scores per class, means over hands (thesis Table 5.3); calibration changes no logit's order or sign."""
         logits, truth = self.validated()
         for index, name in enumerate(self.classes):
             scores = mean_detection_scores(logits[..., index].sigmoid(), truth[..., index])

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+from einops import rearrange
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
@@ -40,8 +41,7 @@ class PoseNoise:
 def pose_errors(
     frames: int, joints: int, greatest_deg: float, random: torch.Generator
 ) -> Float[Tensor, "time joint 3"]:
-    """Pose noise as rotation vectors (rad): a random mixture of constant, slow (1 s) and per-frame noise of random
-    size."""
+    """Pose noise as rotation vectors (rad) of random size: a mixture of constant, slow (1 s) and per-frame noise."""
     size, *shares = torch.rand(4, generator=random).tolist()
     scale = math.radians(greatest_deg * size) / math.sqrt(3 * sum(share**2 for share in shares))
     knots = torch.randn(2 + frames // 60, 3 * joints, generator=random)
@@ -51,7 +51,7 @@ def pose_errors(
     fixed = torch.randn(1, 3 * joints, generator=random)
     quick = torch.randn(frames, 3 * joints, generator=random)
     error = scale * (shares[0] * fixed + shares[1] * slow + shares[2] * quick)
-    return error.unflatten(-1, (joints, 3))
+    return rearrange(error, "time (joint axis) -> time joint axis", axis=3)
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,6 +42,7 @@ class IReplicaValidation(Callback):
         """`pipeline` builds iReplica for a `predictor`."""
         self.pipeline, self.recordings, self.every_n_epochs = pipeline, recordings, every_n_epochs
         self._registered: list[tuple[Recording, CaptureInput, Motion]] | None = None
+        """The first recordings of the validation split, registered by HPS."""
 
     def on_validation_epoch_end(self, trainer: lightning.Trainer, pl_module: ContactDetection) -> None:
         if not is_due(trainer, self.every_n_epochs):
@@ -50,29 +51,24 @@ class IReplicaValidation(Callback):
         detector = ContactDetector(pl_module.net, pl_module.features, pl_module.classes, pl_module.fps)
         pipeline = self.pipeline(predictor=ContactPredictor(detector))
         with torch.no_grad():
-            root = trainer.datamodule.val_sources[0].root  # pyright: ignore[reportAttributeAccessIssue]
+            store = RecordingStore.open(trainer.datamodule.val_sources[0].root)  # pyright: ignore[reportAttributeAccessIssue]
+            if self._registered is None:
+                self._registered = []
+                for name in store.names("val"):
+                    if len(self._registered) == self.recordings:
+                        break
+                    recording = store.load(name)
+                    if fit(recording, store.root):
+                        source = CaptureInput.in_dataset(recording, store.root)
+                        self._registered.append((recording, source, pipeline.registered(source)))
             rows = [
                 handling
-                for recording, source, motion in self._motions(pipeline, RecordingStore.open(root))
+                for recording, source, motion in self._registered
                 for handling in self._tracked(pipeline, recording, source, motion)
             ]
         pl_module.train(training)
         for name, value in summary(rows).items() if rows else ():
             pl_module.log(f"ireplica/{name}", value, rank_zero_only=True)
-
-    def _motions(self, pipeline: IReplica, store: RecordingStore) -> list[tuple[Recording, CaptureInput, Motion]]:
-        """The first recordings of the validation split, registered by HPS."""
-        if self._registered is None:
-            self._registered = []
-            for name in store.names("val"):
-                if len(self._registered) == self.recordings:
-                    break
-                recording = store.load(name)
-                if not fit(recording, store.root):
-                    continue
-                source = CaptureInput.in_dataset(recording, store.root)
-                self._registered.append((recording, source, pipeline.registered(source)))
-        return self._registered
 
     @staticmethod
     def _tracked(pipeline: IReplica, recording: Recording, source: CaptureInput, motion: Motion):

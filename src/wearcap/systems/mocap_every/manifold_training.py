@@ -6,8 +6,7 @@ from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import FEET, Skeleton
-from wearcap.data.statistics import drawn_batches, standardize
-from wearcap.data.windows import Windows
+from wearcap.data.windows import Windows, drawn_batches, standardize
 from wearcap.metrics.position import mpjpe_cm
 from wearcap.systems.mocap_every.manifold import MotionManifold, Posed
 from wearcap.systems.mocap_every.training_windows import WatchWindow

@@ -10,8 +10,7 @@ from torch.nn import functional as F
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
-from wearcap.data.statistics import drawn_batches, standardize
-from wearcap.data.windows import Windows
+from wearcap.data.windows import Windows, drawn_batches, standardize
 from wearcap.geometry.rigid import Rigid
 from wearcap.systems.mocap_every.features import ENDS, WatchFeatures
 from wearcap.systems.mocap_every.model import TrainedEstimator

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
@@ -54,18 +52,24 @@ class PoseRegressorCapture(LearnedSystem):
         # After a gap or a jump of the tracking the past starts empty.
         count = len(path.timestamps)
         begins = [0, *(start for start, _ in path.stretches[1:]), count]
-        features = (
-            self.points.encode(
+        predicted = []
+        for a, b in pairwise(begins):
+            features = self.points.encode(
                 tracked.R[None, a:b], tracked.t[None, a:b], path.floor_height[None, a:b], stature, self.fps
             )
-            for a, b in pairwise(begins)
-        )
-        motion = torch.cat([self._regressed(part) for part in features])
-        R_parent_joint = decode_pose(motion, path.T_world_head.R)
-        origin = torch.zeros(count, 3)
-        captured = Motion(path.timestamps, path.skeleton, R_parent_joint, origin, provenance=self._settings())
-        anchored = anchored_to_head(captured, path.T_world_head)
-        return self._reaching(anchored, tracked) if self.reach else anchored
+            for ends in torch.arange(b - a).split(self.frames_per_pass):
+                past, exists = pasts(features, ends[None], self.net.window)
+                predicted.append(self.net(past[0].to(self.device), exists[0].to(self.device)))
+        R_parent_joint = decode_pose(torch.cat(predicted).float().cpu(), path.T_world_head.R)
+        names = self.points.points
+        about = {"pipeline": "pose_regressor", "points": ",".join(names), "reach": str(self.reach)}
+        motion = Motion(path.timestamps, path.skeleton, R_parent_joint, torch.zeros(count, 3), provenance=about)
+        motion = anchored_to_head(motion, path.T_world_head)
+        for index, name in enumerate(names if self.reach else ()):
+            side, _, joint = name.partition("_")
+            if joint == "wrist":
+                motion = with_hand_moved(motion, side, tracked.t[:, index] - motion.joint(name).t)
+        return motion
 
     def _tracked(self, recording: Recording, path: HeadPath) -> Rigid:
         """World poses "time point" of the tracked points; those of the hands come from the true motion."""
@@ -81,21 +85,3 @@ class PoseRegressorCapture(LearnedSystem):
         if len(truth) != len(path.timestamps) or (truth.timestamps - path.timestamps).abs().max() > 1e-6:
             truth = at_times(truth, path.timestamps)
         return self.points.poses(path.skeleton, path.T_world_head, truth.R_parent_joint)
-
-    def _regressed(self, features: Float[Tensor, "1 time feature"]) -> Float[Tensor, "time motion"]:
-        passes = torch.arange(features.shape[1]).split(self.frames_per_pass)
-        windows = (pasts(features, ends[None], self.net.window) for ends in passes)
-        predicted = [self.net(past[0].to(self.device), exists[0].to(self.device)) for past, exists in windows]
-        return torch.cat(predicted).float().cpu()
-
-    def _reaching(self, motion: Motion, tracked: Rigid) -> Motion:
-        """The motion with its tracked wrists moved to their measured positions, as far as the arms reach."""
-        for index, name in enumerate(self.points.points):
-            side, _, joint = name.partition("_")
-            if joint == "wrist":
-                offset = tracked.t[:, index] - motion.joint(name).t
-                motion = with_hand_moved(motion, side, offset)
-        return motion
-
-    def _settings(self) -> dict[str, str]:
-        return {"pipeline": "pose_regressor", "points": ",".join(self.points.points), "reach": str(self.reach)}

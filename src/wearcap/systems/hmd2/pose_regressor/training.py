@@ -3,13 +3,12 @@
 from collections.abc import Callable
 
 import torch
+from einops import rearrange
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
-from wearcap.data.statistics import drawn_batches, standardize
-from wearcap.data.windows import Windows
+from wearcap.data.windows import Windows, drawn_batches, standardize
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, decode_pose, encode_pose, pasts
@@ -61,7 +60,7 @@ class PoseRegression(Training):
         poses = self.points.poses(self.skeleton, T_world_head, batch.R_parent_joint, batch.t_parent_joint[:, None])
         return self.points.encode(poses.R, poses.t, batch.floor_from_head, batch.stature, self.fps)
 
-    def _frame_pairs(self, batch: HeadWindow) -> Int64[Tensor, "batch end"]:
+    def frame_pairs(self, batch: HeadWindow) -> Int64[Tensor, "batch end"]:
         """Indices of pairs of neighbouring frames, spread evenly over each window, in training with a random shift."""
         count, time = batch.valid.shape
         places = torch.arange(self.pairs, device=batch.valid.device)
@@ -71,25 +70,21 @@ class PoseRegression(Training):
 
     def terms(self, batch: HeadWindow) -> dict[str, Tensor]:
         """Every loss term of a batch, unweighted."""
-        ends = self._frame_pairs(batch)
+        ends = self.frame_pairs(batch)
         rows = torch.arange(len(ends), device=ends.device)[:, None]
         features, exists = pasts(self._features(batch), ends, self.net.window)
         motion = self.net(features.flatten(0, 1), exists.flatten(0, 1)).unflatten(0, ends.shape).float()
         R_true, R_head = batch.R_parent_joint[rows, ends], batch.R_world_head[rows, ends]
         valid = batch.valid[rows, ends].float()
         error = (motion - encode_pose(R_true, R_head)).abs()
-        predicted, true = self._from_head(decode_pose(motion, R_head), batch), self._from_head(R_true, batch)
+        poses = decode_pose(motion, R_head), R_true
+        predicted, true = (batch.joints_from_head(self.skeleton, R) for R in poses)
+        in_pairs = (
+            rearrange(x, "batch (pair two) ... -> (batch pair) two ...", two=2) for x in (predicted, true, valid)
+        )
         return {
             "root": masked_mean(error[..., :6].mean(-1), valid),
             "rotation": masked_mean(error[..., 6:].mean(-1), valid),
             "joints": masked_mean((predicted - true).abs().mean((-1, -2)), valid),
-            "velocity": joint_velocity(*(x.reshape(-1, 2, *x.shape[2:]) for x in (predicted, true, valid)), self.fps),
+            "velocity": joint_velocity(*in_pairs, self.fps),
         }
-
-    def _from_head(
-        self, R_parent_joint: Float[Tensor, "batch end joint 3 3"], batch: HeadWindow
-    ) -> Float[Tensor, "batch end joint 3"]:
-        """Joint positions relative to the head joint (m)."""
-        origin = torch.zeros_like(R_parent_joint[:, :, 0, 0])
-        joints = forward_kinematics(self.skeleton, R_parent_joint, origin, batch.t_parent_joint[:, None]).t
-        return joints - joints[:, :, self.skeleton.index("head"), None]
