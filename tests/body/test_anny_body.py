@@ -5,9 +5,8 @@ import pytest
 import torch
 
 from wearcap.body import anny_assets
-from wearcap.body.anny_assets import coefficients, joint_positions, load_assets, shaped
+from wearcap.body.anny_assets import coefficients, decimate, joint_positions, load_assets, shaped
 from wearcap.body.anny_body import DENSITY, anny_body
-from wearcap.body.decimate import decimate
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.retarget import fit_offsets
 from wearcap.body.skeleton import skeleton_of_height, stature, xsens23

@@ -19,9 +19,8 @@ from wearcap.io.formats.motion_npz import write_motion
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
-from wearcap.viewer.annotate import Take
+from wearcap.viewer.annotate import AnnotationFile, Conflict, Take, starting_labels
 from wearcap.viewer.annotate_server import AnnotationServer, byte_range
-from wearcap.viewer.annotation_file import AnnotationFile, Conflict, starting_labels
 from wearcap_testing import recording_of, swaying_motion
 
 

@@ -18,10 +18,11 @@ from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.environment import write_environment
 from wearcap.io.formats.motion_npz import write_motion
 from wearcap.recording import Motion, Recording, RecordingStore
-from wearcap.recording.interactions import Interactions
+from wearcap.recording.motion import Interactions
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
-from wearcap.viewer.objects import (
+from wearcap.viewer.page import FLESH_M, Page, spacing_m
+from wearcap.viewer.page_layers import (
     BALL_M,
     BRIGHT,
     DIM,
@@ -29,11 +30,10 @@ from wearcap.viewer.objects import (
     lit_color,
     lit_points,
     poses_at,
+    stick_body,
     true_body_contact,
     with_objects,
 )
-from wearcap.viewer.page import FLESH_M, Page, spacing_m
-from wearcap.viewer.page_layers import stick_body
 from wearcap.viewer.picture import actors, contact_sheet
 from wearcap_testing import swaying_motion
 

@@ -19,8 +19,7 @@ from wearcap.scene.editing import hinge_places, points_world
 from wearcap.scene.environment import Environment
 from wearcap.scene.scan import Box, Scan
 from wearcap.viewer.object_editor import ObjectEditor
-from wearcap.viewer.object_editor_panels import HINTS, TOOLS
-from wearcap.viewer.object_editor_view import typical_spacing
+from wearcap.viewer.object_editor_view import HINTS, TOOLS, typical_spacing
 from wearcap.viewer.page_layers import by_height
 from wearcap_browser import CONTROL, Chromium, chromium
 

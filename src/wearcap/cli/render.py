@@ -12,7 +12,7 @@ from wearcap.errors import WearcapError
 from wearcap.recording.motion import Motion
 from wearcap.recording.store import dataset_folder, load_recording
 from wearcap.runtime.system import CaptureInput
-from wearcap.viewer.objects import with_objects
+from wearcap.viewer.page_layers import with_objects
 from wearcap.viewer.picture import contact_sheet, draw_head_path, save_png, shared_frames, write_video
 
 HELP = "pictures without a screen: wearcap render DATASET/NAME --out sheet.png|motion.mp4"

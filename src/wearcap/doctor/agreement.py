@@ -7,8 +7,7 @@ import torch
 
 from wearcap.doctor.inertial import check_offset
 from wearcap.doctor.report import Check, Finding, has_error, refusal
-from wearcap.doctor.signals import lag_between, quantile, spin_of
-from wearcap.doctor.streams import check_rotations
+from wearcap.doctor.streams import check_rotations, lag_between, quantile, spin_of
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid

@@ -8,8 +8,7 @@ from wearcap.body.kinematics import site_positions
 from wearcap.body.landmarks import Landmarks, landmarks
 from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
 from wearcap.doctor.report import Check, Finding, has_error
-from wearcap.doctor.signals import quantile
-from wearcap.doctor.streams import check_rotations, check_speed
+from wearcap.doctor.streams import check_rotations, check_speed, quantile
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory, interpolate, linear_velocity

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from wearcap.doctor.report import Check, Finding, has_error
-from wearcap.doctor.signals import acceleration_of, lag_between, quantile, spin_of
-from wearcap.doctor.streams import check_rotations
+from wearcap.doctor.streams import acceleration_of, check_rotations, lag_between, quantile, spin_of
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory, interpolate, resample
 from wearcap.recording import ImuStream

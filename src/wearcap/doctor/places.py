@@ -19,10 +19,9 @@ from wearcap.io.formats.scene_folder import read_scan
 from wearcap.io.formats.video import open_image
 from wearcap.localization.visual_map import VisualMap
 from wearcap.recording import PointCloud, Recording
-from wearcap.recording.photo import Photo
 from wearcap.scene.environment import Environment, box_in_world, hinge_gap_m, surface_index
 from wearcap.scene.objects import SceneObject
-from wearcap.scene.scan import Scan
+from wearcap.scene.scan import Photo, Scan
 
 SPARSE_M = 0.03
 """Spacing (m) beyond which pictures rendered from a scan have holes at arm's length."""

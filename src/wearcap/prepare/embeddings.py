@@ -12,8 +12,7 @@ from wearcap.errors import WearcapError
 from wearcap.files import remove_leftovers
 from wearcap.locks import folder_lock
 from wearcap.models.image_encoder import ImageEncoder
-from wearcap.prepare.check import check_recording
-from wearcap.prepare.engine import REGISTER_EVERY_S, Report, progress_bar
+from wearcap.prepare.engine import REGISTER_EVERY_S, Report, check_recording, progress_bar
 from wearcap.recording.recording import CameraStream
 from wearcap.recording.store import Entry, RecordingFile, RecordingStore, entry_for, save_recording
 

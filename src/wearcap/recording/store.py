@@ -13,9 +13,8 @@ import safetensors
 from safetensors.torch import save
 from torch import Tensor
 
-from wearcap.checksums import remembered_sha256
 from wearcap.errors import WearcapError
-from wearcap.files import atomic_path, parse_json, sha256_of, write_text
+from wearcap.files import atomic_path, parse_json, remembered_sha256, sha256_of, write_text
 from wearcap.recording.recording import Recording
 from wearcap.recording.serialize import dumps, flatten, require_part, unflatten
 
@@ -52,7 +51,7 @@ class RecordingFile:
     """One recording on disk, opened without reading its tensors; slices read only their own rows.
 
     A file in a data set is verified against the manifest's checksum when it is opened, once while it is unchanged
-    (`wearcap.checksums`).
+    (`wearcap.files`).
     """
 
     def __init__(self, path: str | Path, *, verify: bool = True):

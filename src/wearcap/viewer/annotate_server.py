@@ -17,8 +17,7 @@ from typing import Any
 
 from wearcap.errors import WearcapError
 from wearcap.io.formats.contact_labels import annotation_of, hcontact_text
-from wearcap.viewer.annotate import Desk
-from wearcap.viewer.annotation_file import Conflict
+from wearcap.viewer.annotate import Conflict, Desk
 from wearcap.viewer.guard import Guard, Refused
 
 PAGE = Path(__file__).parent / "annotator"

@@ -22,8 +22,7 @@ from wearcap.scene.editing import ObjectEditing, hinge_places, points_world, sna
 from wearcap.scene.environment import hinge_gap_m
 from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.scene.scan import Scan
-from wearcap.viewer.object_editor_panels import HINTS, TOOLS, ObjectPanel, SelectPanel
-from wearcap.viewer.object_editor_view import EditorView
+from wearcap.viewer.object_editor_view import HINTS, TOOLS, EditorView, ObjectPanel, SelectPanel
 from wearcap.viewer.page_server import ServedPage
 
 SNAP_M = 0.12

@@ -20,17 +20,20 @@ from wearcap.geometry.trajectory import Trajectory, nearest_frames
 from wearcap.recording import Motion, Recording
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
-from wearcap.viewer.objects import BodyPointsLayer, ObjectsLayer, poses_at, with_objects
 from wearcap.viewer.page_layers import (
     BodyLayer,
+    BodyPointsLayer,
     FeetLayer,
     HeadLayer,
     LabelLayer,
     Layer,
     MotionLayer,
+    ObjectsLayer,
     add_points,
+    poses_at,
     read_scene,
     surface_or_sticks,
+    with_objects,
 )
 from wearcap.viewer.page_server import ServedPage
 

@@ -24,12 +24,10 @@ from wearcap.geometry.camera import Camera
 from wearcap.geometry.mesh import Mesh, capsules, checker_floor
 from wearcap.geometry.render import Light, Splats, render
 from wearcap.geometry.rigid import Rigid
-from wearcap.recording.interactions import HANDS
-from wearcap.recording.motion import Motion
+from wearcap.recording.motion import HANDS, Motion
 from wearcap.recording.recording import Recording
 from wearcap.scene.environment import Environment
-from wearcap.viewer.objects import lit_points, posed_meshes
-from wearcap.viewer.page_layers import by_height, stick_body
+from wearcap.viewer.page_layers import by_height, lit_points, posed_meshes, stick_body
 
 PALETTE = np.array([[0.45, 0.55, 0.66], [0.86, 0.55, 0.30], [0.44, 0.62, 0.42], [0.62, 0.45, 0.62]])
 """Colours of the motions, in order."""

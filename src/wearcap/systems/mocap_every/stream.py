@@ -25,7 +25,7 @@ from wearcap.recording import motion as motion_types
 from wearcap.recording.timing import joined
 from wearcap.runtime.session import Session, WearerStream
 from wearcap.runtime.snapshot import classes_of
-from wearcap.scene import floor_update
+from wearcap.scene import floor as floor_types
 from wearcap.sensors import packets
 from wearcap.sensors import samples as sample_types
 from wearcap.sensors.packets import (
@@ -304,7 +304,7 @@ class MocapEverySession(Session):
         head_path,
         packets,
         sample_types,
-        floor_update,
+        floor_types,
         features,
         windows,
         sys.modules[__name__],
