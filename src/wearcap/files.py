@@ -125,8 +125,19 @@ def remove_leftovers(folder: str | Path, *, below: bool = False) -> None:
     """
     for where, _, names in os.walk(folder):
         for name in names:
-            if _TEMPORARY.fullmatch(name):
-                _remove_unless_locked(Path(where, name))
+            if not _TEMPORARY.fullmatch(name):
+                continue
+            path = Path(where, name)
+            with suppress(OSError):  # locked, removed by another process, or without permission to remove
+                if fcntl is None:
+                    path.unlink()  # Windows refuses this while a writer has it open
+                    continue
+                descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
+                try:
+                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    path.unlink()
+                finally:
+                    os.close(descriptor)
         if not below:
             return
 
@@ -134,19 +145,6 @@ def remove_leftovers(folder: str | Path, *, below: bool = False) -> None:
 @lru_cache(maxsize=1024)
 def _remove_leftovers_once(folder: str) -> None:
     remove_leftovers(folder)
-
-
-def _remove_unless_locked(path: Path) -> None:
-    with suppress(OSError):  # locked, removed by another process, or without permission to remove
-        if fcntl is None:
-            path.unlink()  # Windows refuses this while a writer has it open
-            return
-        descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            path.unlink()
-        finally:
-            os.close(descriptor)
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -161,8 +159,15 @@ def parse_json(text: str | bytes, where: str | Path) -> Any:
     Raises WearcapError for text that is no JSON, not UTF-8, nested deeper than `MAX_JSON_DEPTH`, or with whole numbers
     beyond 64 bits.
     """
+
+    def whole_number(digits: str) -> int:
+        value = int(digits)
+        if not -(1 << 63) <= value < 1 << 64:
+            raise ValueError(f"the whole number {digits[:30]}… has more than 64 bits")
+        return value
+
     try:
-        content = json.loads(text, parse_int=_whole_number)
+        content = json.loads(text, parse_int=whole_number)
     except RecursionError as error:
         raise _too_deep(where) from error
     except ValueError as error:  # JSONDecodeError and UnicodeDecodeError are ValueErrors
@@ -179,13 +184,6 @@ def parse_json(text: str | bytes, where: str | Path) -> Any:
         if not level:
             return content
     raise _too_deep(where)
-
-
-def _whole_number(text: str) -> int:
-    value = int(text)
-    if not -(1 << 63) <= value < 1 << 64:
-        raise ValueError(f"the whole number {text[:30]}… has more than 64 bits")
-    return value
 
 
 def _too_deep(where: str | Path) -> WearcapError:
@@ -227,15 +225,12 @@ def remembered_sha256(path: str | Path) -> str:
     digest = sha256_of(path)
     if key == _key(Path(path)) and time.time() - key[2] / 1e9 > SETTLED_S:
         known[key] = digest
-        _append(key, digest)
+        with suppress(OSError):  # without a cache folder, only in memory
+            ledger = _ledger_path()
+            ledger.parent.mkdir(parents=True, exist_ok=True)
+            with open(ledger, "ab") as file:  # one write, so that lines of other processes do not mix with it
+                file.write((json.dumps([*key, digest]) + "\n").encode())
     return digest
-
-
-def cache_folder() -> Path:
-    """Folder of data that can be recomputed: $WEARCAP_CACHE, else `wearcap` in the user's cache folder."""
-    if chosen := os.environ.get("WEARCAP_CACHE"):
-        return Path(chosen)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "wearcap"
 
 
 def _key(path: Path) -> Key:
@@ -244,7 +239,10 @@ def _key(path: Path) -> Key:
 
 
 def _ledger_path() -> Path:
-    return cache_folder() / "sha256.jsonl"
+    """Cache of checksums in $WEARCAP_CACHE, else in `wearcap` in the user's cache folder."""
+    if chosen := os.environ.get("WEARCAP_CACHE"):
+        return Path(chosen) / "sha256.jsonl"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "wearcap" / "sha256.jsonl"
 
 
 @cache
@@ -264,14 +262,3 @@ def _ledger() -> dict[Key, str]:
     except (OSError, UnicodeDecodeError):
         return known
     return known
-
-
-def _append(key: Key, digest: str) -> None:
-    """Append a line in one write, so that lines of other processes do not mix with it; without a cache folder, only memory."""
-    try:
-        path = _ledger_path()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(path, "ab") as file:
-            file.write((json.dumps([*key, digest]) + "\n").encode())
-    except OSError:
-        return

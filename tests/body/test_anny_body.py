@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from wearcap.body import anny_assets
-from wearcap.body.anny_assets import coefficients, decimate, joint_positions, load_assets, shaped
+from wearcap.body.anny_assets import _decimate, coefficients, joint_positions, load_assets, shaped
 from wearcap.body.anny_body import DENSITY, anny_body
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.retarget import fit_offsets
@@ -134,7 +134,7 @@ def test_decimation_keeps_a_sphere():
     import trimesh
 
     sphere = trimesh.creation.icosphere(4)
-    kept, faces = decimate(np.asarray(sphere.vertices), np.asarray(sphere.faces), 400)
+    kept, faces = _decimate(np.asarray(sphere.vertices), np.asarray(sphere.faces), 400)
     assert len(kept) == 400
     smaller = trimesh.Trimesh(np.asarray(sphere.vertices)[kept], faces)
     assert smaller.is_watertight

@@ -9,7 +9,7 @@ import captured_motion as captured
 from wearcap.cli.conf import compose
 from wearcap.cli.prepare import run
 from wearcap.prepare import simulated
-from wearcap.prepare.mocap import nominal_head
+from wearcap.prepare.mocap import _nominal_head
 from wearcap.recording import Recording, RecordingStore
 from wearcap.recording.recording import CameraStream
 from wearcap.recording.serialize import flatten
@@ -27,7 +27,7 @@ def source(root, **changed) -> RecordingStore:
         recording = replace(
             Recording(
                 name,
-                head=nominal_head(motion, [0.09, 0.0, 0.09]),
+                head=_nominal_head(motion, [0.09, 0.0, 0.09]),
                 motion=motion,
                 skeleton=motion.skeleton,
                 subject=subject,

@@ -16,7 +16,7 @@ from wearcap.io.datasets.amass import write_amass
 from wearcap.io.formats.text import read_bytes
 from wearcap.prepare import check_recording, read_splits
 from wearcap.prepare.mocap import About, CleaningLimits, MocapSettings, mocap_recording, without_glitches
-from wearcap.prepare.mocap_sources import BvhSettings, amass_tasks, cmu_recording, cmu_tasks
+from wearcap.prepare.mocap_sources import BvhSettings, _cmu_recording, amass_tasks, cmu_tasks
 from wearcap.recording import Motion, RecordingStore
 from wearcap.recording.timing import resampled
 
@@ -331,7 +331,7 @@ def test_xz_and_plain_give_the_same_recording(real_data, tmp_path):
     plain = tmp_path / "35_20.amc"
     plain.write_bytes(read_bytes(folder / "35_20.amc.xz"))
     first, second = (
-        cmu_recording(path, folder / "35.asf", ABOUT, 120, BvhSettings(0.01, "y", "z"), SETTINGS).motion
+        _cmu_recording(path, folder / "35.asf", ABOUT, 120, BvhSettings(0.01, "y", "z"), SETTINGS).motion
         for path in (folder / "35_20.amc.xz", plain)
     )
     assert first is not None

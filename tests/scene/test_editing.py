@@ -13,12 +13,12 @@ from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rotation import about_axis
 from wearcap.scene.editing import (
     ObjectEditing,
+    _usual_freedom,
     floor_below,
     footprint,
     hinge_places,
     points_world,
     snapped,
-    usual_freedom,
 )
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
@@ -232,8 +232,8 @@ def test_the_floor_is_not_a_stray_point_below_it(scan):
 
 def test_usual_freedoms(scan):
     leaf = scan.points[DOOR.contains(scan.points)]
-    slide = usual_freedom("axis", leaf, FLOOR_M)
+    slide = _usual_freedom("axis", leaf, FLOOR_M)
     assert abs(slide.axis[0]) == pytest.approx(1.0), "across the leaf"
-    assert usual_freedom("plane", leaf, FLOOR_M) == Freedom("plane")
+    assert _usual_freedom("plane", leaf, FLOOR_M) == Freedom("plane")
     line = np.stack([np.linspace(0, 1, 30), np.zeros(30), np.zeros(30)], 1)
     assert footprint(line).half_length == pytest.approx(0.5)

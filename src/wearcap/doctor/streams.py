@@ -140,7 +140,32 @@ def check_track(stream: str, track: Trajectory) -> list[Finding]:
     if any("NaN" in f.what or "no rotations" in f.what for f in findings):
         return findings
     findings.append(_check_upright(stream, track))
-    return findings if has_error(findings) else [*findings, *_check_facing(stream, track)]
+    if has_error(findings):
+        return findings
+    # Whether the body's x axis points where it walks; only while it walks.
+    check = Check(f"{stream}: forward axis")
+    velocity = linear_velocity(track).double()[:, :2]
+    walking = (velocity.norm(dim=-1) > 0.5) & (velocity.norm(dim=-1) < FASTEST_M_S)
+    walked_s = walking.double().mean().item() * (track.timestamps[-1] - track.timestamps[0]).item()
+    if walked_s < 3:
+        return findings
+    R = track.R_world_body.double()
+    course = torch.atan2(velocity[:, 1], velocity[:, 0])[walking]
+    offset, strength = _mean_angle(rotation.yaw_of(R)[walking] - course)
+    evidence = f"x axis {math.degrees(offset):+.0f}° off the walking direction (agreement {strength:.2f}, {walked_s:.0f} s of walking)"
+    if abs(offset) < math.radians(60) and strength > 0.5:
+        return [*findings, check.ok("x is forward", evidence)]
+    inverse_offset, inverse_strength = _mean_angle(rotation.yaw_of(R.mT)[walking] - course)
+    if inverse_strength > max(0.8, strength) and abs(inverse_offset) < math.radians(45):
+        evidence += f"; transposed they fit ({inverse_strength:.2f})"
+        fix = "Store the pose of the body in the world (R_world_body), not its inverse."
+        return [*findings, check.error("rotations are inverted", evidence, fix)]
+    if strength < 0.5:
+        fix = "The wearer may walk sideways or look around."
+        return [*findings, check.note("facing and walking direction hardly agree", evidence, fix)]
+    severity = "warning" if walked_s < 15 or abs(offset) < math.radians(75) else "error"
+    fix = f"Turn the body's axes by {-math.degrees(offset):+.0f}° about z, if the wearer did walk ahead."
+    return [*findings, check.found(severity, "x does not point forward", evidence, fix)]
 
 
 def check_rotations(stream: str, R: Float[Tensor, "*batch 3 3"]) -> list[Finding]:
@@ -222,33 +247,6 @@ def _check_upright(stream: str, track: Trajectory) -> Finding:
         return check.error(f"the body's {name} axis points up, not z", f"{evidence}; its {name} axis does", fix)
     fix = "Check axes and quaternion order; lying and crawling look like this too."
     return check.found("error" if up_world[2] < 0.3 else "warning", "is not upright", evidence, fix)
-
-
-def _check_facing(stream: str, track: Trajectory) -> list[Finding]:
-    """Whether the body's x axis points where it walks; only while it walks."""
-    check = Check(f"{stream}: forward axis")
-    velocity = linear_velocity(track).double()[:, :2]
-    walking = (velocity.norm(dim=-1) > 0.5) & (velocity.norm(dim=-1) < FASTEST_M_S)
-    walked_s = walking.double().mean().item() * (track.timestamps[-1] - track.timestamps[0]).item()
-    if walked_s < 3:
-        return []
-    R = track.R_world_body.double()
-    course = torch.atan2(velocity[:, 1], velocity[:, 0])[walking]
-    offset, strength = _mean_angle(rotation.yaw_of(R)[walking] - course)
-    evidence = f"x axis {math.degrees(offset):+.0f}° off the walking direction (agreement {strength:.2f}, {walked_s:.0f} s of walking)"
-    if abs(offset) < math.radians(60) and strength > 0.5:
-        return [check.ok("x is forward", evidence)]
-    inverse_offset, inverse_strength = _mean_angle(rotation.yaw_of(R.mT)[walking] - course)
-    if inverse_strength > max(0.8, strength) and abs(inverse_offset) < math.radians(45):
-        evidence += f"; transposed they fit ({inverse_strength:.2f})"
-        fix = "Store the pose of the body in the world (R_world_body), not its inverse."
-        return [check.error("rotations are inverted", evidence, fix)]
-    if strength < 0.5:
-        fix = "The wearer may walk sideways or look around."
-        return [check.note("facing and walking direction hardly agree", evidence, fix)]
-    severity = "warning" if walked_s < 15 or abs(offset) < math.radians(75) else "error"
-    fix = f"Turn the body's axes by {-math.degrees(offset):+.0f}° about z, if the wearer did walk ahead."
-    return [check.found(severity, "x does not point forward", evidence, fix)]
 
 
 def _mean_angle(angle: Tensor) -> tuple[float, float]:

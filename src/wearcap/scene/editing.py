@@ -143,7 +143,7 @@ class ObjectEditing:
         mesh = Mesh((points - origin).astype(np.float32), np.empty((0, 3), np.int32), colors)
         kind = kind or USUAL_KIND.get(category, "plane")
         item = SceneObject(
-            name, category, mesh, torch.eye(3), torch.from_numpy(origin).float(), usual_freedom(kind, points, floor)
+            name, category, mesh, torch.eye(3), torch.from_numpy(origin).float(), _usual_freedom(kind, points, floor)
         )
         self._step(_State((*self._state.cuts, _Cut(item, self.selected)), np.empty(0, np.int64)))
         return item
@@ -167,7 +167,7 @@ class ObjectEditing:
         item = self._find(name).item
         if kind != item.freedom.kind:
             points, floor = points_world(item), float(item.t_world_object[2])
-            self.set_freedom(name, usual_freedom(kind, points, floor))
+            self.set_freedom(name, _usual_freedom(kind, points, floor))
 
     def delete(self, name: str) -> None:
         """Give the object's points back to the scan."""
@@ -310,7 +310,7 @@ def snapped(
     return np.array([place[0], place[1], places[0, 2]])
 
 
-def usual_freedom(kind: str, points: Float[np.ndarray, "point 3"], floor: float) -> Freedom:
+def _usual_freedom(kind: str, points: Float[np.ndarray, "point 3"], floor: float) -> Freedom:
     """Default freedom: a hinge at one end, opening to 90°; a slide of 40 cm across the longer side."""
     if kind == "hinge":
         x, y, z = hinge_places(points, floor)[0].tolist()

@@ -43,7 +43,7 @@ _CHANGE_COST = 20.0
 
 
 @dataclass(frozen=True)
-class FloorEstimate:
+class _FloorEstimate:
     """Floor height below each head position."""
 
     height: Float[Tensor, "time"]
@@ -54,7 +54,7 @@ class FloorEstimate:
 
 def estimate_floor(
     points_world: Float[Tensor, "point 3"], t_world_head: Float[Tensor, "time 3"], standing_m: float | None = None
-) -> FloorEstimate:
+) -> _FloorEstimate:
     """Floor below a moving head: everywhere the lowest strong horizontal layer, with as little change as possible.
 
     The path is cut into steps of 0.15 m; each step votes for heights with the points within 0.8 m (2.4 m
@@ -96,7 +96,7 @@ def estimate_floor(
     chosen = _cheapest_path(evidence + _posture_cost(clearance, standing_m + 0.03, 40.0), _CHANGE_COST * _BIN_M)
     support = layer[np.arange(len(keys)), chosen] * (1.5 * np.sqrt(2 * np.pi))
     refined = _centre_of_layer(votes, chosen, heights)
-    return FloorEstimate(
+    return _FloorEstimate(
         torch.tensor(refined[key_of_frame], dtype=torch.float32),
         torch.tensor((support / (support + 10))[key_of_frame], dtype=torch.float32),
     )
@@ -312,14 +312,36 @@ class FloorFollow:
         self._cloud.add(points_world)
 
     def ahead(self, t_world_head: Float[Tensor, "time 3"]) -> Float[Tensor, "time"]:
-        rise = [self._rise(head) for head in t_world_head.detach().cpu().double().numpy()]
+        # The rise of the floor (m) within a frame follows from the head's smoothed height (Holt's linear trend).
+        rise, (low, high) = [], self.WALKING_M_S
+        for head in t_world_head.detach().cpu().double().numpy():
+            if self._head is None:
+                self._head, self._level = head, float(head[2])
+            velocity = (head[:2] - self._head[:2]) * self._fps
+            self._velocity += self.LEVEL * (velocity - self._velocity)
+            self._head = head
+            before, innovation = self._level, float(head[2]) - self._level - self._trend
+            self._level += self._trend + self.LEVEL * innovation
+            self._trend += self.TREND * innovation
+            walking = float(np.clip((np.hypot(*self._velocity) - low) / (high - low), 0, 1))
+            rise.append(walking * (self._level - before))
         self._floors = self._floors[-1] + np.cumsum(rise)
         return torch.from_numpy(self._floors).float()
 
     def follow(self, contact_prob: Float[Tensor, "time foot"], t_world_foot: Float[Tensor, "time foot 3"]) -> None:
         correction = 0.0
         weight = (contact_prob.detach().cpu().numpy() - self.CONTACT).clip(0) / (1 - self.CONTACT)
-        height, from_points = self._floor_at(t_world_foot.detach().cpu().double().numpy())
+        # Floor height (m) at the feet, from points where there are enough, else from the soles.
+        feet = t_world_foot.detach().cpu().double().numpy()
+        height = feet[..., 2] - self._sole
+        from_points = np.zeros(height.shape, bool)
+        if not self._cloud.empty:
+            positions = np.concatenate([feet[..., :2], height[..., None]], -1).reshape(-1, 3)
+            heights = self._cloud.nearest(positions, float(np.hypot(self.RADIUS_M, self.REACH_M)), self.POINTS)
+            heights[np.abs(heights - positions[:, 2:]) > self.REACH_M] = np.nan
+            few = np.isfinite(heights).sum(1, keepdims=True) < self.MIN_POINTS
+            heights = np.where(few, positions[:, 2:], heights)
+            height, from_points = np.nanmedian(heights, 1).reshape(height.shape), ~few.reshape(height.shape)
         weight = weight * np.where(from_points, self.GAIN_POINTS, self.GAIN)
         total = weight.sum(1)
         target = (weight * height).sum(1) / np.where(total > 0, total, 1)
@@ -327,33 +349,6 @@ class FloorFollow:
         for frame in np.flatnonzero(total):
             correction += share[frame] * (target[frame] - self._floors[frame] - correction)
         self._floors = self._floors + correction
-
-    def _rise(self, head: np.ndarray) -> float:
-        """Rise of the floor (m) within a frame, from the head's smoothed height (Holt's linear trend)."""
-        if self._head is None:
-            self._head, self._level = head, float(head[2])
-        velocity = (head[:2] - self._head[:2]) * self._fps
-        self._velocity += self.LEVEL * (velocity - self._velocity)
-        self._head = head
-        before, innovation = self._level, float(head[2]) - self._level - self._trend
-        self._level += self._trend + self.LEVEL * innovation
-        self._trend += self.TREND * innovation
-        low, high = self.WALKING_M_S
-        walking = float(np.clip((np.hypot(*self._velocity) - low) / (high - low), 0, 1))
-        return walking * (self._level - before)
-
-    def _floor_at(self, feet: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Floor height (m) at feet "time foot 3", from points where there are enough, else from the soles; and whether
-        it is from points."""
-        soles = feet[..., 2] - self._sole
-        if self._cloud.empty:
-            return soles, np.zeros(soles.shape, bool)
-        positions = np.concatenate([feet[..., :2], soles[..., None]], -1).reshape(-1, 3)
-        heights = self._cloud.nearest(positions, float(np.hypot(self.RADIUS_M, self.REACH_M)), self.POINTS)
-        heights[np.abs(heights - positions[:, 2:]) > self.REACH_M] = np.nan
-        few = np.isfinite(heights).sum(1, keepdims=True) < self.MIN_POINTS
-        heights = np.where(few, positions[:, 2:], heights)
-        return np.nanmedian(heights, 1).reshape(soles.shape), ~few.reshape(soles.shape)
 
 
 class FloorFixed:

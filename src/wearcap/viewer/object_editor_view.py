@@ -45,7 +45,7 @@ class EditorView:
         low, high = np.quantile(scan.points[:: max(1, len(scan.points) // 10_000), 2], [0.02, 0.98])
         colors = scan.colors
         self._colors = by_height(scan.points, low, high).astype(np.uint8) if colors is None else colors
-        self.point_m = 1.9 * typical_spacing(scan.points[self._thinned])
+        self.point_m = 1.9 * _typical_spacing(scan.points[self._thinned])
         self._center = scan.points.mean(0, dtype=np.float64)
         self.visible = scan.points[:0]
         """Indices of the scan's points that are drawn."""
@@ -113,10 +113,11 @@ class EditorView:
                 del self._objects[name]
         for name, (item, tinted) in wanted.items():
             if name not in self._objects:
-                self._objects[name] = self._add_object(item, tinted)
+                self._objects[name] = self.added(item, tinted)
             self.place(name, item.T_world_object)
 
-    def _add_object(self, item: SceneObject, tinted: tuple[int, bool]) -> _Shown:
+    def added(self, item: SceneObject, tinted: tuple[int, bool]) -> _Shown:
+        """Draw one object, with its name above it."""
         node, mesh = f"/objects/{item.name}", item.mesh
         tint = CURRENT_TINT if tinted[1] else TINTS[tinted[0]]
         every = max(1, -(-len(mesh.vertices) // SHOWN_OF_OBJECT))
@@ -192,7 +193,7 @@ class EditorView:
         return best
 
 
-def typical_spacing(points: Float[np.ndarray, "point 3"]) -> float:
+def _typical_spacing(points: Float[np.ndarray, "point 3"]) -> float:
     """Median distance (m) of neighbours in a cloud, over a sample."""
     sample = points[:: max(1, len(points) // 500)]
     distance, _ = KDTree(points).query(sample, k=2)

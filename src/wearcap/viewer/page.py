@@ -54,7 +54,7 @@ SPEEDS = ("0.1×", "0.25×", "0.5×", "1×", "2×", "4×")
 
 
 @dataclass
-class Timeline:
+class _Timeline:
     """A time that runs between start and stop (s) when playing, at `speed` times real time."""
 
     start: float
@@ -168,7 +168,7 @@ class Page(ServedPage):
         truth = with_objects(recording, environment)
         shown = ({} if truth is None else {TRUTH: truth}) | (captures or {})
         motions = {name: motion for name, motion in shown.items() if len(motion)}
-        self.timeline = Timeline.of(recording, motions)
+        self.timeline = _Timeline.of(recording, motions)
         scene = read_scene(folder / recording.scene) if recording.scene and folder is not None else None
         super().__init__("wearcap", host, port, "medium")
         moving, tracks = [], [motion.object_motion or {} for motion in motions.values()]
@@ -340,7 +340,8 @@ def _span(
     low, high = joints[..., 1].amin(1) - FLESH_M, joints[..., 1].amax(1) + FLESH_M
     for item in items if motion.object_motion else ():
         T = poses_at((motion.object_motion or {}).get(item.name), item, times)
-        corners = torch.from_numpy(_corners(item)).to(T.t)
+        box = zip(item.mesh.vertices.min(0), item.mesh.vertices.max(0), strict=True)
+        corners = torch.from_numpy(np.array(list(product(*box)))).to(T.t)  # of its bounding box, in its own axes
         placed = (corners @ T.R.mT + T.t[:, None]).double()
         y, middle = placed[..., 1], placed.mean(1)
         radius = (corners - corners.mean(0)).norm(dim=1).max()
@@ -348,9 +349,3 @@ def _span(
         low = torch.where(near, torch.minimum(low, y.amin(1)), low)
         high = torch.where(near, torch.maximum(high, y.amax(1)), high)
     return low, high
-
-
-def _corners(item: SceneObject) -> Float[np.ndarray, "8 3"]:
-    """Corners of an object's bounding box in its own axes (m)."""
-    low, high = item.mesh.vertices.min(0), item.mesh.vertices.max(0)
-    return np.array(list(product(*zip(low, high, strict=True))))

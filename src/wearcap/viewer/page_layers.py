@@ -283,13 +283,13 @@ def with_objects(recording: Recording, environment: Environment | None = None) -
         return None
     labels = recording.interactions
     hands = None if labels is None else labels.hand_contact(truth.timestamps).to(truth.t_world_root.dtype)
-    points = None if environment is None else true_body_contact(recording, truth, environment)
+    points = None if environment is None else _true_body_contact(recording, truth, environment)
     return replace(
         truth, object_motion=recording.object_motion or None, hand_contact_prob=hands, body_contact_prob=points
     )
 
 
-def true_body_contact(
+def _true_body_contact(
     recording: Recording, truth: Motion, environment: Environment
 ) -> Float[Tensor, "time point"] | None:
     """1 where a contact point of the body is within `TOUCH_M` of the active object's surface, else 0.
@@ -322,7 +322,7 @@ def true_body_contact(
     return touches
 
 
-def lit_color(prob: Float[Tensor, "point"]) -> Float[np.ndarray, "point 3"]:
+def _lit_color(prob: Float[Tensor, "point"]) -> Float[np.ndarray, "point 3"]:
     """Colours (RGB, 0…1) of points by their probability of contact."""
     share = ((prob.double().numpy() - LIT_PROB) / (1 - LIT_PROB)).clip(0.0, 1.0)
     return DIM + share[:, None] * (BRIGHT - DIM)
@@ -338,7 +338,7 @@ def lit_points(points: BodyModel, motion: Motion, frame: int) -> Mesh | None:
         return None
     places = points.vertices(motion.T_world_joint[frame])[lit].double().numpy()
     size = np.full(len(places), BALL_M)
-    return capsules(places, places, size, size, lit_color(prob[lit]), 8)
+    return capsules(places, places, size, size, _lit_color(prob[lit]), 8)
 
 
 class BodyPointsLayer(MotionLayer):
@@ -373,7 +373,7 @@ class BodyPointsLayer(MotionLayer):
         self.handle.position = root + self.offset
         self.handle.batched_positions = (self.points.vertices(pose).double().numpy() - root).astype(np.float32)
         self.handle.batched_scales = size
-        self.handle.batched_colors = (255 * lit_color(prob)).round().astype(np.uint8)
+        self.handle.batched_colors = (255 * _lit_color(prob)).round().astype(np.uint8)
 
 
 class ObjectsLayer(MotionLayer):

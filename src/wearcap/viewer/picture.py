@@ -46,7 +46,7 @@ HEIGHT_COLORS = ((0.35, 0.45, 0.55), (0.80, 0.68, 0.45))
 
 
 @dataclass(frozen=True)
-class Actor:
+class _Actor:
     """A motion with the body surface that shows it."""
 
     label: str
@@ -98,9 +98,9 @@ class Actor:
         return [capsules(places, places, size, size, np.tile(color, (len(places), 1)), 8)]
 
 
-def actors(
+def _actors(
     motions: dict[str, Motion], body: BodyModel | None = None, environment: Environment | None = None
-) -> list[Actor]:
+) -> list[_Actor]:
     """One actor per motion, in sticks unless a body is given for them all. Raises WearcapError for none."""
     if not motions:
         raise WearcapError("no motion to draw", expected="at least one")
@@ -109,7 +109,7 @@ def actors(
         lowest = motion.T_world_joint.t[..., 2].amin(1)
         floor_z = float(torch.quantile(lowest[:: max(1, len(lowest) // 5000)], 0.05)) - 0.02
         color = PALETTE[number % len(PALETTE)]
-        shown.append(Actor(label, motion, body or stick_body(motion.skeleton), color, floor_z, environment))
+        shown.append(_Actor(label, motion, body or stick_body(motion.skeleton), color, floor_z, environment))
     return shown
 
 
@@ -127,7 +127,7 @@ def _looking(
 
 
 def panel(
-    actor: Actor,
+    actor: _Actor,
     frame: int,
     target: Float[np.ndarray, "3"],
     size: tuple[int, int],
@@ -163,7 +163,7 @@ def contact_sheet(
     `environment` are drawn where each motion has them. Raises WearcapError for missing frames, and for
     motions that share no time.
     """
-    shown = actors(motions, body, environment)
+    shown = _actors(motions, body, environment)
     length = len(shown[0].motion)
     frames = shared_frames(motions, columns) if frames is None else list(frames)
     if not frames or max(frames) >= length or min(frames) < 0:
@@ -184,7 +184,7 @@ def contact_sheet(
     return np.asarray(sheet)
 
 
-def shared_time(motions: Iterable[Motion]) -> tuple[float, float]:
+def _shared_time(motions: Iterable[Motion]) -> tuple[float, float]:
     """First and last time (s) that all motions share. Raises WearcapError if there is none."""
     clocks = [motion.timestamps for motion in motions]
     start, stop = max(clock[0].item() for clock in clocks), min(clock[-1].item() for clock in clocks)
@@ -195,7 +195,7 @@ def shared_time(motions: Iterable[Motion]) -> tuple[float, float]:
 
 def shared_frames(motions: dict[str, Motion], count: int) -> list[int]:
     """`count` frames of the first motion (or all, if it has fewer), spread over the time that all motions share."""
-    start, stop = shared_time(motions.values())
+    start, stop = _shared_time(motions.values())
     clock = next(iter(motions.values())).timestamps.numpy()
     first = int(np.searchsorted(clock, start))
     last = max(int(np.searchsorted(clock, stop, side="right")) - 1, first)
@@ -271,8 +271,8 @@ def write_video(
     """
     if size[0] % 2 or size[1] % 2 or fps <= 0:
         raise WearcapError(f"a video of {size[0]}x{size[1]} at {fps} fps", expected="even sizes, a positive rate")
-    shown = actors(motions, body, environment)
-    start, stop = shared_time(motions.values())
+    shown = _actors(motions, body, environment)
+    start, stop = _shared_time(motions.values())
     if max_seconds is not None:
         stop = min(stop, start + max_seconds)
     times = start + np.arange(int((stop - start) * fps) + 1) / fps
