@@ -81,23 +81,20 @@ class AnnyAssets:
             weights=self.weights[:0],
         )
 
+    def coefficients(self, phenotype: dict[str, float]) -> Float[np.ndarray, "target"]:
+        """Weight of each target for phenotypes in 0…1 (absent ones: 0.5), races mixed evenly."""
+        weight = dict.fromkeys(_RACES, 1 / 3) | {"young": 1.0}
+        for name, levels in LEVELS.items():
+            place = np.clip(phenotype.get(name, 0.5), 0, 1) * (len(levels) - 1)
+            weight |= {level: max(0.0, 1 - abs(place - number)) for number, level in enumerate(levels)}
+        return np.array([np.prod([weight[word] for word in words]) for words in self.components])
 
-def coefficients(assets: AnnyAssets, phenotype: dict[str, float]) -> Float[np.ndarray, "target"]:
-    """Weight of each target for phenotypes in 0…1 (absent ones: 0.5), races mixed evenly."""
-    weight = dict.fromkeys(_RACES, 1 / 3) | {"young": 1.0}
-    for name, levels in LEVELS.items():
-        place = np.clip(phenotype.get(name, 0.5), 0, 1) * (len(levels) - 1)
-        weight |= {level: max(0.0, 1 - abs(place - number)) for number, level in enumerate(levels)}
-    return np.array([np.prod([weight[word] for word in words]) for words in assets.components])
+    def shaped(self, phenotype: dict[str, float]) -> Float[np.ndarray, "vertex 3"]:
+        """All vertices of the person in rest pose (A-pose)."""
+        return self.template + np.einsum("t,tvc->vc", self.coefficients(phenotype), self.targets)
 
-
-def shaped(assets: AnnyAssets, phenotype: dict[str, float]) -> Float[np.ndarray, "vertex 3"]:
-    """All vertices of the person in rest pose (A-pose)."""
-    return assets.template + np.einsum("t,tvc->vc", coefficients(assets, phenotype), assets.targets)
-
-
-def joint_positions(assets: AnnyAssets, vertices: Float[np.ndarray, "vertex 3"]) -> dict[str, Float[np.ndarray, "3"]]:
-    return {name: vertices[corners].mean(0) for name, corners in assets.joints.items()}
+    def joint_positions(self, vertices: Float[np.ndarray, "vertex 3"]) -> dict[str, Float[np.ndarray, "3"]]:
+        return {name: vertices[corners].mean(0) for name, corners in self.joints.items()}
 
 
 @lru_cache(maxsize=2)

@@ -51,7 +51,7 @@ def examine(source: Recording | str | Path, progress: Callable[[int, int], None]
     """
     if isinstance(source, Recording):
         return Report(source.name, {source.name: tuple(examine_recording(source))})
-    found = patients(Path(source))
+    found = _patients(Path(source))
     findings: dict[str, tuple[Finding, ...]] = {}
     for done, (name, load) in enumerate(found.items(), 1):
         try:
@@ -136,7 +136,7 @@ def _streams(recording: Recording, usable: set[str]) -> list[Finding]:
 Loaded = tuple[Recording, list[Finding]]
 
 
-def patients(path: Path) -> dict[str, Callable[[], Loaded]]:
+def _patients(path: Path) -> dict[str, Callable[[], Loaded]]:
     """What loads each recording in a path, by name; it returns the reader's findings, too (of a file's raw clock, say).
 
     Raises WearcapError when there is nothing to examine.

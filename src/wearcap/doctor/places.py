@@ -10,6 +10,7 @@ from jaxtyping import Float32, Float64
 
 from wearcap.doctor.report import Check, Finding, refusal
 from wearcap.errors import WearcapError
+from wearcap.geometry.triangle_distance import TriangleIndex
 from wearcap.io.datasets.hps import CLOUD, is_hps_scene, read_hps_scene
 from wearcap.io.formats.camera_json import PHOTOS_FILE as PHOTOS
 from wearcap.io.formats.camera_json import read_photos
@@ -19,7 +20,7 @@ from wearcap.io.formats.scene_folder import read_scan
 from wearcap.io.formats.video import open_image
 from wearcap.localization.visual_map import VisualMap
 from wearcap.recording import PointCloud, Recording
-from wearcap.scene.environment import Environment, box_in_world, hinge_gap_m, surface_index
+from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
 from wearcap.scene.scan import Photo, Scan
 
@@ -217,7 +218,7 @@ def _check_environment(environment: Environment) -> list[Finding]:
             low, high = item.freedom.limits
             degrees = f"{math.degrees(low):.0f}° to {math.degrees(high):.0f}°"
             moves += f", {degrees if item.freedom.kind == 'hinge' else f'{low:.2f} to {high:.2f} m'}"
-        size = " x ".join(f"{side:.2f}" for side in np.ptp(box_in_world(item), axis=0))
+        size = " x ".join(f"{side:.2f}" for side in np.ptp(item.box_world, axis=0))
         at = ", ".join(f"{v:.2f}" for v in item.t_world_object.tolist())
         triangles = len(item.mesh.faces)
         shape = f"{triangles} triangles" if triangles else f"a cloud of {len(item.mesh.vertices)} points"
@@ -229,7 +230,7 @@ def _check_environment(environment: Environment) -> list[Finding]:
 
 
 def _check_size(item: SceneObject) -> list[Finding]:
-    check, longest = Check(f"object {item.name}: size"), float(np.ptp(box_in_world(item), axis=0).max())
+    check, longest = Check(f"object {item.name}: size"), float(np.ptp(item.box_world, axis=0).max())
     if longest < TINY_M:
         fix = "Is it in another unit? Meshes are in metres."
         return [check.warning("the mesh is tiny", f"{100 * longest:.2g} cm at most", fix)]
@@ -243,8 +244,8 @@ def _check_freedom(item: SceneObject) -> list[Finding]:
     """The hinge is at an edge of the mesh, and limits are set."""
     check, found = Check(f"object {item.name}: freedom"), []
     if item.freedom.pivot is not None:
-        gap = hinge_gap_m(item)
-        low, high = box_in_world(item)[:, :2]
+        gap = item.hinge_gap_m
+        low, high = item.box_world[:, :2]
         side = int((high - low).argmax())
         along = (item.freedom.pivot[side] - low[side]) / max(high[side] - low[side], 1e-9)
         if gap > HINGE_GAP_M:
@@ -261,7 +262,7 @@ def _check_freedom(item: SceneObject) -> list[Finding]:
 
 def _check_floor(objects: tuple[SceneObject, ...]) -> list[Finding]:
     """Sliding objects stand on one floor, and nothing is below it."""
-    lowest = {item.name: float(box_in_world(item)[0, 2]) for item in objects}
+    lowest = {item.name: float(item.box_world[0, 2]) for item in objects}
     standing = [lowest[item.name] for item in objects if item.freedom.kind == "plane"]
     if not standing:
         return []
@@ -281,7 +282,7 @@ def _check_floor(objects: tuple[SceneObject, ...]) -> list[Finding]:
 
 def _check_overlaps(objects: tuple[SceneObject, ...]) -> list[Finding]:
     """Pairs of objects with overlapping surfaces, or with one inside the other's bounding box."""
-    boxes = np.array([box_in_world(item) for item in objects])
+    boxes = np.array([item.box_world for item in objects])
     low, high = boxes[:, 0], boxes[:, 1]
     shared = np.maximum(
         np.minimum(high[:, None], high[None]) - np.maximum(low[:, None], low[None]) + SAME_SURFACE_M, 0
@@ -294,7 +295,7 @@ def _check_overlaps(objects: tuple[SceneObject, ...]) -> list[Finding]:
         # The share of the inner object's surface that coincides with the outer's.
         points = _surface(inner) @ inner.R_world_object.double().numpy().T + inner.t_world_object.double().numpy()
         local = (points - outer.t_world_object.double().numpy()) @ outer.R_world_object.double().numpy()
-        distance, _ = surface_index(outer.mesh).nearest(np.ascontiguousarray(local))
+        distance, _ = TriangleIndex.of(outer.mesh).nearest(np.ascontiguousarray(local))
         same = float((distance < SAME_SURFACE_M).mean())
         inside = float(shared[a, b] / min(volume[a], volume[b]))
         if same > _SAME_SHARE:

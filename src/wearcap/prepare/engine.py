@@ -27,7 +27,7 @@ from wearcap.files import remove_leftovers, sha256_of
 from wearcap.locks import folder_lock
 from wearcap.recording.recording import MIN_DURATION_S, Recording
 from wearcap.recording.serialize import flatten
-from wearcap.recording.store import Entry, RecordingStore, entry_for, recording_path, save_recording
+from wearcap.recording.store import Entry, RecordingStore, recording_path, save_recording
 from wearcap.workers import bound_to_this_process
 
 BACKENDS = ("loky", "threading", "dask", "ray")
@@ -180,7 +180,7 @@ def _run(task: Task, root: Path) -> tuple[str, Entry | str, str]:
             return task.name, " ".join(reason.split())[:MAX_REASON], ""
         save_recording(recording, recording_path(root, task.name))
         note = recording.motion.provenance.get(NOTE, "") if recording.motion else ""
-        return task.name, entry_for(recording, root, task.split, task.hash), note
+        return task.name, Entry.of(recording, root, task.split, task.hash), note
     finally:
         torch.set_num_threads(threads[0])
         numba.set_num_threads(threads[1])

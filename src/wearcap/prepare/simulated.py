@@ -123,7 +123,7 @@ def simulated_tasks(
 
 
 @dataclass(frozen=True)
-class Video:
+class _Video:
     """Settings of the head camera's rendered video."""
 
     seconds: float | None
@@ -134,7 +134,7 @@ class Video:
 
 
 def _hps(
-    config: HpsConfig, scene: SceneSettings | None, video: Video, name: str, split: str, seed: int, root: Path
+    config: HpsConfig, scene: SceneSettings | None, video: _Video, name: str, split: str, seed: int, root: Path
 ) -> Recording:
     """One session, the missing files of its scene, and its video; the camera's timestamps become those of the frames."""
     simulated = simulate_hps(config, name, split, seed)
@@ -186,7 +186,7 @@ def simulated_hps_tasks(
     protocol = Protocol(returns_m=tuple(distances[1:-1]), end_m=distances[-1])
     config = HpsConfig(fps=float(fps), camera_fps=float(camera_fps), protocol=protocol)
     scene = None if spacing_m is None else SceneSettings(spacing_m=float(spacing_m), photo_m=float(photo_m))
-    video = Video(None if video_s is None else float(video_s), float(video_fps), float(changed))
+    video = _Video(None if video_s is None else float(video_s), float(video_fps), float(changed))
     made = [asdict(part) if part else None for part in (config, scene, video)]
     return _tasks("hps", recordings, seed, splits, output, partial(_hps, config, scene, video), *made)
 

@@ -96,6 +96,31 @@ class SceneObject:
     def T_world_object(self) -> Rigid:
         return Rigid(self.R_world_object, self.t_world_object)
 
+    @property
+    def points_world(self) -> Float64[np.ndarray, "vertex 3"]:
+        """Vertices in the world (m) at the initial pose."""
+        R, t = self.R_world_object.double().numpy(), self.t_world_object.double().numpy()
+        return self.mesh.vertices.astype(np.float64) @ R.T + t
+
+    @property
+    def box_world(self) -> Float64[np.ndarray, "2 3"]:
+        """Minimum and maximum corner (m) of the bounding box at the initial pose, in the world."""
+        points = self.points_world
+        return np.stack([points.min(0), points.max(0)])
+
+    @property
+    def hinge_gap_m(self) -> float:
+        """Horizontal distance of the hinge from the bounding box; 0 for objects without a hinge."""
+        if self.freedom.pivot is None:
+            return 0.0
+        low, high = self.box_world[:, :2]
+        pivot = np.array(self.freedom.pivot[:2])
+        return float(np.linalg.norm(np.maximum(np.maximum(low - pivot, pivot - high), 0.0)))
+
+    def check(self, where: str | Path) -> None:
+        """`check_object_mesh` of an environment's object; one on a hinge or axis may be in the axes of its mount."""
+        check_object_mesh(self.mesh, where, self.freedom.kind not in ("hinge", "axis"))
+
 
 def centered(mesh: Mesh) -> tuple[Mesh, Float64[np.ndarray, "3"]]:
     """The mesh with the mean of its vertices at the origin, and where that mean was in its former axes.
@@ -106,11 +131,6 @@ def centered(mesh: Mesh) -> tuple[Mesh, Float64[np.ndarray, "3"]]:
         raise WearcapError("a mesh without vertices", expected="at least one triangle")
     center = mesh.vertices.astype(np.float64).mean(0)
     return replace(mesh, vertices=(mesh.vertices - center).astype(np.float32)), center
-
-
-def check_object(item: SceneObject, where: str | Path) -> None:
-    """`check_object_mesh` of an environment's object; one on a hinge or axis may be in the axes of its mount."""
-    check_object_mesh(item.mesh, where, item.freedom.kind not in ("hinge", "axis"))
 
 
 def check_object_mesh(mesh: Mesh, where: str | Path, own_axes: bool = True) -> None:

@@ -30,7 +30,7 @@ from wearcap.recording.store import RecordingStore, dataset_folder, load_recordi
 from wearcap.systems.ireplica.contact_intervals import ContactSettings, active, contact_intervals
 
 
-def label_path(output: str | Path, name: str) -> Path:
+def _label_path(output: str | Path, name: str) -> Path:
     """OUTPUT/<recording>.contacts.json. Raises WearcapError for a name that is no plain file name."""
     if not name or Path(name).name != name or name.startswith("."):
         raise WearcapError(f"{name!r} cannot name a file of labels", expected="a plain file name")
@@ -45,7 +45,7 @@ class AnnotationFile:
     """The file at `label_path`. Each of its states has a revision; "" if there is no file."""
 
     def __init__(self, output: str | Path, clock: LabelClock):
-        self.path, self.clock = label_path(output, clock.name), clock
+        self.path, self.clock = _label_path(output, clock.name), clock
         self._lock = threading.Lock()
         self._writer = ("", "")
         self._ours: set[str] = set()
@@ -332,7 +332,7 @@ class Desk:
 
     def path(self, name: str) -> Path:
         """Path of the labels of a recording of that name, which need not exist yet."""
-        return label_path(self.output, name)
+        return _label_path(self.output, name)
 
     def file(self, index: int) -> AnnotationFile:
         """The recording's file of labels."""

@@ -18,8 +18,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import matrix_from_quat_wxyz
 from wearcap.io.formats.environment import MAX_HINGE_GAP_M, read_environment, write_environment
-from wearcap.scene.editing import ObjectEditing, hinge_places, points_world, snapped
-from wearcap.scene.environment import hinge_gap_m
+from wearcap.scene.editing import ObjectEditing, hinge_places, snapped
 from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.scene.scan import Scan
 from wearcap.viewer.object_editor_view import HINTS, TOOLS, EditorView, ObjectPanel, SelectPanel
@@ -221,7 +220,7 @@ class ObjectEditor(ServedPage):
     def next_hinge(self) -> None:
         """Place the hinge at the next likely position around the object's footprint."""
         item = self._item()
-        places = hinge_places(points_world(item), float(item.t_world_object[2]))
+        places = hinge_places(item.points_world, float(item.t_world_object[2]))
         nearest = np.linalg.norm(places - np.array(item.freedom.pivot), axis=1).argmin()
         self._set_pivot(item, places[(nearest + 1) % len(places)])
 
@@ -264,10 +263,10 @@ class ObjectEditor(ServedPage):
         """Place the hinge at a position (snapped to a near edge of the object), or point the slide's axis toward it."""
         item = self._item()
         if item.freedom.kind == "hinge":
-            places = hinge_places(points_world(item), float(item.t_world_object[2]))
+            places = hinge_places(item.points_world, float(item.t_world_object[2]))
             self._set_pivot(item, snapped(place, places, SNAP_M))
         elif item.freedom.kind == "axis":
-            box = points_world(item)
+            box = item.points_world
             height = (box[:, 2].min() + box[:, 2].max()) / 2
             direction = np.array([*place[:2], height if level else place[2]]) - (box.min(0) + box.max(0)) / 2
             length = float(np.linalg.norm(direction))
@@ -285,7 +284,7 @@ class ObjectEditor(ServedPage):
     def _set_pivot(self, item: SceneObject, pivot: Float[np.ndarray, "3"]) -> None:
         x, y, z = pivot.tolist()
         freedom = Freedom("hinge", pivot=(x, y, z), limits=item.freedom.limits)
-        gap = hinge_gap_m(replace(item, freedom=freedom))
+        gap = replace(item, freedom=freedom).hinge_gap_m
         if gap > MAX_HINGE_GAP_M:
             self._show_objects()
             raise WearcapError(

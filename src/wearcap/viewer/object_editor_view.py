@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import quat_wxyz_from_matrix
-from wearcap.scene.editing import USUAL_KIND, points_world
+from wearcap.scene.editing import USUAL_KIND
 from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.scene.scan import Box, Scan, first_hit
 from wearcap.viewer.page_layers import by_height
@@ -141,7 +141,7 @@ class EditorView:
             )
         top = mesh.vertices[:, 2].max() + 0.1
         label = self.scene.add_label(f"{node}/name", item.name, position=(0.0, 0.0, float(top)), anchor="bottom-center")
-        return _Shown(item, tinted, handle, label, points_world(item)[::every])
+        return _Shown(item, tinted, handle, label, item.points_world[::every])
 
     def place(self, name: str, T_world_object: Rigid) -> None:
         """Show an object at a pose (to try how it moves)."""
@@ -156,7 +156,7 @@ class EditorView:
         self.freedom_handle.visible = handled and kind in ("hinge", "axis")
         if item is None or kind not in ("hinge", "axis"):
             return
-        points = points_world(item)
+        points = item.points_world
         if item.freedom.pivot is not None:
             foot = np.array(item.freedom.pivot)
             line = np.array([[foot, [*foot[:2], points[:, 2].max() + 0.15]]])

@@ -180,7 +180,7 @@ class Page(ServedPage):
             color = TRUTH_COLOR if name == TRUTH else COLORS[number % len(COLORS)]
             self.bodies[name] = _Placed.of(self.server, name, motion, recording, moving, color, len(motions) > 1)
         self.layers: list[Layer] = list(self.bodies.values())
-        self.aside_m = spacing_m(list(motions.values()), moving) if len(motions) > 1 else 0.0
+        self.aside_m = _spacing_m(list(motions.values()), moving) if len(motions) > 1 else 0.0
         if recording.head is not None and len(recording.head.timestamps):
             self.layers.append(HeadLayer(self.server, recording.head))
         self._surroundings = self.server.scene.add_frame("/surroundings", show_axes=False)
@@ -319,7 +319,7 @@ def _moves(track: Trajectory | None, item: SceneObject) -> bool:
     return float(shifted) > STILL_M or float(turned) > 2**0.5 * STILL_RAD
 
 
-def spacing_m(motions: Sequence[Motion], items: Sequence[SceneObject] = ()) -> float:
+def _spacing_m(motions: Sequence[Motion], items: Sequence[SceneObject] = ()) -> float:
     """Distance (m, along y) of neighbours at which none covers the next one at any time.
 
     The first has the greatest y. A motion occupies its body and the objects near it.

@@ -126,7 +126,7 @@ def _looking(
     return camera, Rigid(torch.from_numpy(R).float(), torch.from_numpy(target - distance * forward).float())
 
 
-def panel(
+def _panel(
     actor: _Actor,
     frame: int,
     target: Float[np.ndarray, "3"],
@@ -174,10 +174,10 @@ def contact_sheet(
     sheet = Image.new("RGB", (width * min(columns, len(frames)), height * len(shown) * len(bands)), "white")
     for band, chosen in enumerate(bands):
         for column, frame in enumerate(chosen):
-            target = focus(shown[0].motion, frame)
+            target = _focus(shown[0].motion, frame)
             for row, (actor, clock) in enumerate(zip(shown, clocks)):
                 nearest = frame if row == 0 else int(np.abs(clock - clocks[0][frame]).argmin())
-                image = panel(actor, nearest, target, size, distance=distance)
+                image = _panel(actor, nearest, target, size, distance=distance)
                 seconds = clock[nearest] - clocks[0][0]
                 text = f"{actor.label}  {seconds:.2f} s" if column == 0 else f"{seconds:.2f} s"
                 sheet.paste(captioned(image, text), (column * width, (band * len(shown) + row) * height))
@@ -202,7 +202,7 @@ def shared_frames(motions: dict[str, Motion], count: int) -> list[int]:
     return np.linspace(first, last, min(count, last - first + 1)).round().astype(int).tolist()
 
 
-def focus(motion: Motion, frame: int) -> Float[np.ndarray, "3"]:
+def _focus(motion: Motion, frame: int) -> Float[np.ndarray, "3"]:
     """Target of the camera: a point slightly below the root (m)."""
     return motion.t_world_root[frame].double().numpy() - np.array([0.0, 0.0, 0.08])
 
@@ -284,9 +284,9 @@ def write_video(
         stream.width, stream.height, stream.pix_fmt = size[0] * len(shown), size[1], "yuv420p"
         for time in track(times, f"video {Path(path).name}", console=Console(stderr=True), disable=not progress):
             frames = [int(np.abs(clock - time).argmin()) for clock in clocks]
-            target = focus(shown[0].motion, frames[0])
+            target = _focus(shown[0].motion, frames[0])
             panels = [
-                np.asarray(captioned(panel(actor, frame, target, size, supersample=1), actor.label))
+                np.asarray(captioned(_panel(actor, frame, target, size, supersample=1), actor.label))
                 for actor, frame in zip(shown, frames)
             ]
             picture = av.VideoFrame.from_ndarray(np.concatenate(panels, 1), format="rgb24")
