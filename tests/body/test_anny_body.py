@@ -9,7 +9,7 @@ from wearcap.body.anny_assets import _decimate, load_assets
 from wearcap.body.anny_body import DENSITY, anny_body
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.retarget import fit_offsets
-from wearcap.body.skeleton import skeleton_of_height, stature, xsens23
+from wearcap.body.skeleton import skeleton_of_height, xsens23
 from wearcap.body.skeletons import skeleton_by_name
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
@@ -122,7 +122,7 @@ def test_weight_is_met(kilograms):
 
 
 def test_shape_and_height():
-    assert stature(skeleton_of_height(1.6)) == pytest.approx(1.6, abs=1e-3)
+    assert skeleton_of_height(1.6).stature == pytest.approx(1.6, abs=1e-3)
     with pytest.raises(WearcapError, match="height of 17"):
         skeleton_of_height(17.0)
     with pytest.raises(WearcapError, match="kilograms"):

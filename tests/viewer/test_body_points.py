@@ -21,7 +21,7 @@ from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.recording.motion import Interactions
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
-from wearcap.viewer.page import FLESH_M, Page, spacing_m
+from wearcap.viewer.page import FLESH_M, Page, _spacing_m
 from wearcap.viewer.page_layers import (
     BALL_M,
     BRIGHT,
@@ -207,9 +207,9 @@ def test_wide_motions_stand_further_apart():
     """A drift of 3 m towards the neighbour, on another clock."""
     first, second = carrying(), carrying(3.0)
     late = replace(second, timestamps=second.timestamps + 0.2)
-    assert spacing_m([first, second]) > 3.0 + 2 * FLESH_M
-    assert spacing_m([first, late]) > 3.0
-    assert spacing_m([second, first]) < spacing_m([first, first]) + 0.1
+    assert _spacing_m([first, second]) > 3.0 + 2 * FLESH_M
+    assert _spacing_m([first, late]) > 3.0
+    assert _spacing_m([second, first]) < _spacing_m([first, first]) + 0.1
 
 
 def test_a_row_of_the_sheet_has_its_own_objects():

@@ -83,7 +83,7 @@ def _cmu_side(letter: str) -> list[tuple[str, str, tuple[float, float, float]]]:
     ]  # fmt: skip
 
 
-def _cmu31() -> Skeleton:
+def cmu31() -> Skeleton:
     """The 31 nodes of CMU's .asf files, each joint a node's start, in their bind pose: legs 20° astride."""
     spine = [
         ("root", "", (0.0, 0.0, 0.0)), ("lowerback", "root", (0.0, 0.0, 0.0)),
@@ -101,7 +101,7 @@ def _cmu31() -> Skeleton:
     return replace(upright, t_parent_joint=t - t[[max(parent, 0) for parent in upright.parents]])
 
 
-_BY_NAME = {"xsens23": xsens23, "smpl24": smpl24, "smplh52": smplh52, "smplx22": smplx22, "cmu31": _cmu31}
+_BY_NAME = {"xsens23": xsens23, "smpl24": smpl24, "smplh52": smplh52, "smplx22": smplx22, "cmu31": cmu31}
 
 
 def skeleton_by_name(name: str) -> Skeleton:

@@ -77,29 +77,12 @@ def examine_recording(recording: Recording) -> list[Finding]:
     broken = {f.check.split(":")[0] for f in findings if f.severity == "error" and f.what != "dropped frames"}
     usable = {name for name, times in clocks.items() if name not in broken and len(times) > 1}
     findings += check_spans({name: times for name, times in clocks.items() if name in usable})
-    findings += _streams(recording, usable)
-    return sorted(findings, key=lambda finding: -SEVERITIES.index(finding.severity))
-
-
-def _clocks(recording: Recording) -> dict[str, Float64[Tensor, "_"]]:
-    streams = {
-        "head": recording.head,
-        "motion": recording.motion,
-        "suit": recording.suit,
-        "camera": recording.camera,
-        "localization": recording.localization,
-    }
-    streams |= {f"imu {name}": imu for name, imu in recording.imu.items()}
-    return {name: stream.timestamps for name, stream in streams.items() if stream is not None}
-
-
-def _streams(recording: Recording, usable: set[str]) -> list[Finding]:
-    """Findings about each usable stream, then about pairs of streams; streams with errors are not compared."""
-    findings: list[Finding] = []
+    # Each usable stream, then pairs of streams; streams with errors are not compared.
     head = recording.head if "head" in usable else None
     if head is not None:
-        findings += check_track("head", Trajectory(head.timestamps, head.R_world_device, head.t_world_device))
-        head = None if has_error(findings) else head
+        found = check_track("head", Trajectory(head.timestamps, head.R_world_device, head.t_world_device))
+        findings += found
+        head = None if has_error(found) else head
     floor = recording.floor
     if floor is None and recording.points is not None and head is not None:
         floor = floor_below(recording.points, head)
@@ -130,7 +113,20 @@ def _streams(recording: Recording, usable: set[str]) -> list[Finding]:
         findings += check_camera(recording.camera)
     if recording.localization is not None and "localization" in usable:
         findings += check_localization(recording.localization, bodies.get("suit", body))
-    return [*findings, *check_claps(recording)]
+    findings += check_claps(recording)
+    return sorted(findings, key=lambda finding: -SEVERITIES.index(finding.severity))
+
+
+def _clocks(recording: Recording) -> dict[str, Float64[Tensor, "_"]]:
+    streams = {
+        "head": recording.head,
+        "motion": recording.motion,
+        "suit": recording.suit,
+        "camera": recording.camera,
+        "localization": recording.localization,
+    }
+    streams |= {f"imu {name}": imu for name, imu in recording.imu.items()}
+    return {name: stream.timestamps for name, stream in streams.items() if stream is not None}
 
 
 Loaded = tuple[Recording, list[Finding]]

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import safetensors
 import torch
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32
 
 from wearcap.doctor.report import Check, Finding, refusal
 from wearcap.errors import WearcapError
@@ -21,7 +21,7 @@ from wearcap.io.formats.video import open_image
 from wearcap.localization.visual_map import VisualMap
 from wearcap.recording import PointCloud, Recording
 from wearcap.scene.environment import Environment
-from wearcap.scene.objects import SceneObject
+from wearcap.scene.objects import FREEDOMS, SceneObject
 from wearcap.scene.scan import Photo, Scan
 
 SPARSE_M = 0.03
@@ -42,12 +42,6 @@ _MARGIN_M = 1.0
 """Largest distance (m) of photos from the scan's bounding box."""
 _POINTS = 50_000
 """Number of points of the scan that are projected into photos."""
-_MOVES = {
-    "plane": "slides on the floor",
-    "free": "is carried",
-    "axis": "slides along an axis",
-    "hinge": "turns about a hinge",
-}
 
 
 def is_place(folder: Path) -> bool:
@@ -213,7 +207,7 @@ def _check_environment(environment: Environment) -> list[Finding]:
     counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in sorted(set(kinds)))
     findings = [check.ok(f"{len(objects)} objects", counts)]
     for item in objects:
-        moves = _MOVES[item.freedom.kind]
+        moves = FREEDOMS[item.freedom.kind]
         if item.freedom.limits is not None:
             low, high = item.freedom.limits
             degrees = f"{math.degrees(low):.0f}° to {math.degrees(high):.0f}°"
@@ -293,7 +287,18 @@ def _check_overlaps(objects: tuple[SceneObject, ...]) -> list[Finding]:
         inner, outer = (objects[k] for k in ((a, b) if volume[a] <= volume[b] else (b, a)))
         check = Check(f"objects {inner.name} and {outer.name}")
         # The share of the inner object's surface that coincides with the outer's.
-        points = _surface(inner) @ inner.R_world_object.double().numpy().T + inner.t_world_object.double().numpy()
+        rng = np.random.default_rng(0)
+        vertices, faces = inner.mesh.vertices.astype(np.float64), inner.mesh.faces
+        if len(faces):
+            first, second, third = (vertices[faces[:, corner]] for corner in range(3))
+            area = np.linalg.norm(np.cross(second - first, third - first), axis=1) + 1e-12
+            face = rng.choice(len(faces), _SAMPLES, p=area / area.sum())
+            u, v = rng.random((2, _SAMPLES, 1))
+            u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+            sample = first[face] + u * (second - first)[face] + v * (third - first)[face]
+        else:
+            sample = vertices[:: len(vertices) // _SAMPLES + 1]
+        points = sample @ inner.R_world_object.double().numpy().T + inner.t_world_object.double().numpy()
         local = (points - outer.t_world_object.double().numpy()) @ outer.R_world_object.double().numpy()
         distance, _ = TriangleIndex.of(outer.mesh).nearest(np.ascontiguousarray(local))
         same = float((distance < SAME_SURFACE_M).mean())
@@ -307,17 +312,3 @@ def _check_overlaps(objects: tuple[SceneObject, ...]) -> list[Finding]:
             fix = "A chair under a table does; a sofa in a wardrobe does not."
             found.append(check.note("the first stands within the second's box", evidence, fix))
     return found
-
-
-def _surface(item: SceneObject) -> Float64[np.ndarray, "sample 3"]:
-    """Points sampled on an object's surface (a cloud's own points), in its axes."""
-    rng = np.random.default_rng(0)
-    vertices, faces = item.mesh.vertices.astype(np.float64), item.mesh.faces
-    if not len(faces):
-        return vertices[:: len(vertices) // _SAMPLES + 1]
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) + 1e-12
-    face = rng.choice(len(faces), _SAMPLES, p=area / area.sum())
-    u, v = rng.random((2, _SAMPLES, 1))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    return a[face] + u * (b - a)[face] + v * (c - a)[face]

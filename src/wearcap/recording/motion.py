@@ -3,12 +3,14 @@
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
+from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 
@@ -99,6 +101,20 @@ class Motion:
             last = int(torch.searchsorted(track.timestamps, cut.timestamps[-1].item(), right=True))
             objects[name] = track[first:last]
         return replace(cut, object_motion=objects)
+
+    def between(self, start_s: float, stop_s: float | None) -> "Motion":
+        """The frames from one second to another (None: to the end), counted from the first frame.
+
+        Raises WearcapError where there are none.
+        """
+        since = (self.timestamps - self.timestamps[0]).numpy()
+        first = int(np.searchsorted(since, start_s))
+        stop = len(since) if stop_s is None else int(np.searchsorted(since, stop_s, side="right"))
+        if stop <= first:
+            raise WearcapError(
+                f"no frames from {start_s} s to {stop_s} s", expected=f"times from 0 to {since[-1]:.1f} s"
+            )
+        return self.sliced(first, stop)
 
     def moved(self, T_new_world: Rigid) -> "Motion":
         """The motion and its objects in the coordinates of another world frame."""

@@ -95,7 +95,14 @@ def estimate_floor(
     # With the wearer's height, a ceiling below an upper floor is no longer mistaken for that floor.
     chosen = _cheapest_path(evidence + _posture_cost(clearance, standing_m + 0.03, 40.0), _CHANGE_COST * _BIN_M)
     support = layer[np.arange(len(keys)), chosen] * (1.5 * np.sqrt(2 * np.pi))
-    refined = _centre_of_layer(votes, chosen, heights)
+    # The mean height of the points within two bins of the chosen one (the bin's middle where there are none).
+    around = chosen[:, None] + np.arange(-2, 3)
+    exists = (around >= 0) & (around < bins)
+    around = around.clip(0, bins - 1)
+    weight = np.take_along_axis(votes, around, 1) * exists
+    total = weight.sum(1)
+    mean = (weight * heights[around]).sum(1) / np.where(total > 0, total, 1)
+    refined = np.where(total > 0, mean, heights[chosen])
     return _FloorEstimate(
         torch.tensor(refined[key_of_frame], dtype=torch.float32),
         torch.tensor((support / (support + 10))[key_of_frame], dtype=torch.float32),
@@ -155,17 +162,6 @@ def _cheapest_path(cost: np.ndarray, change_cost: float) -> np.ndarray:
     for row in best[-2::-1]:
         chosen.append(int((row + np.abs(ramp - ramp[chosen[-1]])).argmin()))
     return np.array(chosen[::-1])
-
-
-def _centre_of_layer(votes: np.ndarray, chosen: np.ndarray, heights: np.ndarray) -> np.ndarray:
-    """Mean height of the points within two bins of the chosen one (the bin's middle where there are none)."""
-    around = chosen[:, None] + np.arange(-2, 3)
-    exists = (around >= 0) & (around < votes.shape[1])
-    around = around.clip(0, votes.shape[1] - 1)
-    weight = np.take_along_axis(votes, around, 1) * exists
-    total = weight.sum(1)
-    mean = (weight * heights[around]).sum(1) / np.where(total > 0, total, 1)
-    return np.where(total > 0, mean, heights[chosen])
 
 
 @runtime_checkable

@@ -14,7 +14,13 @@ from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
 
-FREEDOMS = ("plane", "axis", "hinge", "free")
+FREEDOMS = {
+    "plane": "slides on the floor",
+    "axis": "slides along an axis",
+    "hinge": "turns about a hinge",
+    "free": "is carried",
+}
+"""Kinds of freedom, in words."""
 CONTACT_CLASSES = ("sliding", "hinged")
 """Kinds of interaction that have a contact network each (thesis §5.3.2)."""
 EXTENTS_M = (0.01, 5.0)

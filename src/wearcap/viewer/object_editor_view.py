@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import quat_wxyz_from_matrix
 from wearcap.scene.editing import USUAL_KIND
-from wearcap.scene.objects import Freedom, SceneObject
+from wearcap.scene.objects import FREEDOMS, Freedom, SceneObject
 from wearcap.scene.scan import Box, Scan, first_hit
 from wearcap.viewer.page_layers import by_height
 
@@ -210,12 +210,6 @@ HINTS = {
     "try": "Move the current object as a hand would; it goes back to its place afterwards.",
 }
 _NONE: str = "none yet"
-_NAMES_OF_KINDS = {
-    "plane": "slides on the floor",
-    "axis": "slides along an axis",
-    "hinge": "turns about a hinge",
-    "free": "is carried",
-}
 
 
 class SelectPanel:
@@ -252,7 +246,7 @@ class ObjectPanel:
         self.choice: viser.GuiDropdownHandle[str] = gui.add_dropdown("Object", (_NONE,))
         self.name = gui.add_text("Name", "")
         self.rename = gui.add_button("Rename")
-        self.kind = gui.add_dropdown("It", tuple(_NAMES_OF_KINDS.values()))
+        self.kind = gui.add_dropdown("It", tuple(FREEDOMS.values()))
         self.next_end = gui.add_button("Hinge at another edge")
         self.direction = gui.add_slider("Direction (deg)", -180, 180, 1, 0)
         self.least_deg = gui.add_slider("Least (deg)", -180, 0, 1, 0)
@@ -271,7 +265,7 @@ class ObjectPanel:
 
     @property
     def chosen_kind(self) -> str:
-        return next(kind for kind, name in _NAMES_OF_KINDS.items() if name == self.kind.value)
+        return next(kind for kind, name in FREEDOMS.items() if name == self.kind.value)
 
     @property
     def limit_sliders(self) -> tuple[viser.GuiSliderHandle, ...]:
@@ -307,7 +301,7 @@ class ObjectPanel:
             return
         freedom = current.freedom
         _write(self.name, current.name)
-        _write(self.kind, _NAMES_OF_KINDS[freedom.kind])
+        _write(self.kind, FREEDOMS[freedom.kind])
         if freedom.kind == "hinge":
             low, high = np.rad2deg(_limits(freedom, np.pi))
             _write(self.least_deg, round(low))
