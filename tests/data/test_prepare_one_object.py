@@ -13,7 +13,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.datasets.omomo import read_omomo
 from wearcap.io.formats.environment import read_environment
-from wearcap.prepare import check_recording, read_splits
+from wearcap.prepare import Splits, check_recording
 from wearcap.prepare.one_object import _check_rate, _ground_rotation
 from wearcap.recording.store import RecordingStore
 
@@ -211,6 +211,6 @@ def test_a_folder_without_sequences_is_one_error(tmp_path, name, capsys):
 
 
 def test_the_official_splits():
-    behave, omomo = (read_splits(splits_dir() / f"{name}.csv") for name in ("behave", "omomo"))
+    behave, omomo = (Splits.read(splits_dir() / f"{name}.csv") for name in ("behave", "omomo"))
     assert [behave.of(name) for name in ("Date03_Sub05_stool", "Date04_Sub05_stool")] == ["test", "train"]
     assert [number for number in range(1, 18) if omomo.of(f"sub{number}") == "test"] == [16, 17]

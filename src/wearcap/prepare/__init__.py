@@ -5,6 +5,6 @@ object), `simulated.py`; `embeddings.py` and `keypoints.py` add to a data set. `
 """
 
 from wearcap.prepare.engine import Report, Task, check_recording, content_hash, prepare
-from wearcap.prepare.splits import Splits, read_splits
+from wearcap.prepare.splits import Splits
 
-__all__ = ["Report", "Splits", "Task", "check_recording", "content_hash", "prepare", "read_splits"]
+__all__ = ["Report", "Splits", "Task", "check_recording", "content_hash", "prepare"]

@@ -64,7 +64,7 @@ class _Timeline:
     speed: float = 1.0
 
     @classmethod
-    def of(cls, recording: Recording, motions: dict[str, Motion]) -> "Timeline":
+    def of(cls, recording: Recording, motions: dict[str, Motion]) -> "_Timeline":
         """A timeline over all moving layers. Raises WearcapError if there is nothing to show."""
         head = recording.head
         streams = [motion.timestamps for motion in motions.values()]

@@ -100,7 +100,7 @@ def _object(row: Any, number: int, path: Path) -> SceneObject:
 
 def _freedom(row: Any, where: str) -> Freedom:
     kind = row.get("kind") if isinstance(row, dict) else None
-    if kind not in FREEDOMS:
+    if kind not in tuple(FREEDOMS):  # a file may say anything, lists too
         raise WearcapError(f"no degree of freedom {kind!r}", where=where, expected=f"one of {', '.join(FREEDOMS)}")
     _require_keys(row, _FREEDOM_KEYS[kind], f"{where}, freedom")
     pivot = None if kind != "hinge" else tuple(_numbers(row["pivot"], (3,), "pivot", where).tolist())
