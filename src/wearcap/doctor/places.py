@@ -219,19 +219,15 @@ def _check_environment(environment: Environment) -> list[Finding]:
         check = Check(f"object {item.name}")
         findings.append(check.ok(f"{item.category or 'object'}: {moves}", f"{size} m, {shape}, at ({at}) m"))
     for item in objects:
-        findings += _check_size(item) + _check_freedom(item)
+        check, longest = Check(f"object {item.name}: size"), float(np.ptp(item.box_world, axis=0).max())
+        if longest < TINY_M:
+            fix = "Is it in another unit? Meshes are in metres."
+            findings.append(check.warning("the mesh is tiny", f"{100 * longest:.2g} cm at most", fix))
+        elif longest > HUGE_M:
+            fix = "Is it in millimetres, or the whole scan?"
+            findings.append(check.warning("the mesh is larger than an object", f"{longest:.3g} m", fix))
+        findings += _check_freedom(item)
     return findings + _check_floor(objects) + _check_overlaps(objects)
-
-
-def _check_size(item: SceneObject) -> list[Finding]:
-    check, longest = Check(f"object {item.name}: size"), float(np.ptp(item.box_world, axis=0).max())
-    if longest < TINY_M:
-        fix = "Is it in another unit? Meshes are in metres."
-        return [check.warning("the mesh is tiny", f"{100 * longest:.2g} cm at most", fix)]
-    if longest > HUGE_M:
-        fix = "Is it in millimetres, or the whole scan?"
-        return [check.warning("the mesh is larger than an object", f"{longest:.3g} m", fix)]
-    return []
 
 
 def _check_freedom(item: SceneObject) -> list[Finding]:

@@ -75,7 +75,7 @@ class RecordingFile:
     """One recording on disk, opened without reading its tensors; slices read only their own rows.
 
     A file in a data set is verified against the manifest's checksum when it is opened, once while it is unchanged
-    (`wearcap.files`).
+    (`wearcap.files.remembered_sha256`).
     """
 
     def __init__(self, path: str | Path, *, verify: bool = True):
