@@ -112,7 +112,7 @@ class ObjectEditor(ServedPage):
     def _wire(self) -> None:
         """Let controls and view call their actions."""
         select, objects, view, act = self.select, self.objects, self.view, self._acting
-        for slider in select.shape_sliders:
+        for slider in (select.length, select.width, select.height, select.turn):
             slider.on_update(act(self._show_box))
         select.take.on_click(act(lambda: self.editing.select_box(self.box)))
         select.leave.on_click(act(lambda: self.editing.select_box(self.box, add=False)))
@@ -125,7 +125,7 @@ class ObjectEditor(ServedPage):
         objects.kind.on_update(act(lambda: self.editing.set_kind(self._item().name, objects.chosen_kind)))
         objects.next_end.on_click(act(self.next_hinge))
         objects.direction.on_update(act(self.turn_axis))
-        for slider in objects.limit_sliders:
+        for slider in (objects.least_deg, objects.greatest_deg, objects.least_m, objects.greatest_m):
             slider.on_update(act(self.set_limits))
         for slider in (objects.try_deg, objects.try_m):
             slider.on_update(act(self.try_value))
@@ -228,7 +228,9 @@ class ObjectEditor(ServedPage):
         """Show the current object at the slider's value, within its limits; its pose in the file stays."""
         item = self._item()
         if item.freedom.kind in ("hinge", "axis"):
-            value = item.freedom.clamped(torch.tensor(self.objects.tried(item.freedom.kind)))
+            panel = self.objects
+            tried = np.deg2rad(panel.try_deg.value) if item.freedom.kind == "hinge" else panel.try_m.value
+            value = item.freedom.clamped(torch.tensor(float(tried)))
             self._tried = item.freedom.moved(item.T_world_object, value)
             self.view.place(item.name, self._tried)
 

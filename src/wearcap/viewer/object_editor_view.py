@@ -234,10 +234,6 @@ class SelectPanel:
         size = (self.length.value, self.width.value, self.height.value)
         return Box(center, size, float(np.deg2rad(self.turn.value)))
 
-    @property
-    def shape_sliders(self) -> tuple[viser.GuiSliderHandle, ...]:
-        return self.length, self.width, self.height, self.turn
-
 
 class ObjectPanel:
     """Controls of the current object: its name, its degrees of freedom, its limits, and a slider to try it."""
@@ -267,19 +263,11 @@ class ObjectPanel:
     def chosen_kind(self) -> str:
         return next(kind for kind, name in FREEDOMS.items() if name == self.kind.value)
 
-    @property
-    def limit_sliders(self) -> tuple[viser.GuiSliderHandle, ...]:
-        return self.least_deg, self.greatest_deg, self.least_m, self.greatest_m
-
     def limits(self, kind: str) -> tuple[float, float]:
         """Limits set by the sliders: rad or m."""
         if kind == "hinge":
             return float(np.deg2rad(self.least_deg.value)), float(np.deg2rad(self.greatest_deg.value))
         return float(self.least_m.value), float(self.greatest_m.value)
-
-    def tried(self, kind: str) -> float:
-        """Value of the slider: rad or m."""
-        return float(np.deg2rad(self.try_deg.value)) if kind == "hinge" else float(self.try_m.value)
 
     def show(self, items: tuple[SceneObject, ...], current: SceneObject | None) -> None:
         """Show all objects' names, and the current one's properties."""
