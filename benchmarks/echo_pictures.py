@@ -19,7 +19,7 @@ from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
 from wearcap.systems.echo.objects import ObjectShape
 from wearcap.systems.echo.pipeline import Echo
-from wearcap.viewer.objects import with_objects
+from wearcap.viewer.page_layers import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png
 
 FRAMES, LONGEST_S = 6, 14.0

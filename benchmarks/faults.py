@@ -42,7 +42,7 @@ from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.stream import HeadSample, HMD2Session, Wearer
 from wearcap.training.loggers import read_metrics
 from wearcap.training.run import RunCheckpointIO
-from wearcap.viewer.annotation_file import AnnotationFile
+from wearcap.viewer.annotate import AnnotationFile
 from wearcap_testing import recording_of, small_dataset, swaying_motion
 
 FORK = multiprocessing.get_context("fork")

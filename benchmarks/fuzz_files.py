@@ -73,7 +73,7 @@ from wearcap.io.formats import (  # noqa: E402
     wavefront,
 )
 from wearcap.recording import Cue  # noqa: E402
-from wearcap.recording.photo import Photo  # noqa: E402
+from wearcap.scene.scan import Photo  # noqa: E402
 from wearcap_testing import swaying_motion  # noqa: E402
 
 

@@ -16,7 +16,7 @@ from wearcap.metrics.objects import handlings
 from wearcap.recording import Motion, RecordingStore
 from wearcap.recording.timing import at_times
 from wearcap.scene.environment import Environment
-from wearcap.viewer.objects import with_objects
+from wearcap.viewer.page_layers import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png
 
 FRAMES, AROUND_S = 5, 0.5

@@ -15,7 +15,7 @@ from wearcap.cli.conf import compose
 from wearcap.geometry import rotation
 from wearcap.io.formats.environment import read_environment
 from wearcap.recording import Motion, Recording, RecordingStore
-from wearcap.recording.interactions import Interactions
+from wearcap.recording.motion import Interactions
 from wearcap.recording.timing import resampled
 from wearcap.runtime.system import CaptureInput
 from wearcap.scene.environment import Environment

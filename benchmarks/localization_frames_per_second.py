@@ -26,8 +26,7 @@ from wearcap.localization.localizer import Localizer, localize_video
 from wearcap.localization.map_builder import MapSettings, build_map
 from wearcap.localization.point_map import PointMapper
 from wearcap.localization.visual_map import VisualMap
-from wearcap.recording.photo import Photo
-from wearcap.scene.scan import Scan
+from wearcap.scene.scan import Photo, Scan
 
 ROOM_M = np.array([6.0, 5.0, 2.6])
 ROOMS, PER_ROOM, SPACING_M = 9, 56, 0.015

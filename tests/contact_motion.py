@@ -8,7 +8,7 @@ import torch
 from wearcap.body.skeleton import Skeleton, xsens23
 from wearcap.geometry import rotation
 from wearcap.recording import Motion, Recording, RecordingStore
-from wearcap.recording.interactions import Interactions
+from wearcap.recording.motion import Interactions
 from wearcap_testing import recording_of, swaying_motion
 
 CLASSES = ("sliding", "hinged")

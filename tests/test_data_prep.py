@@ -7,7 +7,7 @@ import pytest
 
 from wearcap.cli.conf import compose, splits_dir
 from wearcap.cli.prepare import sources, usage
-from wearcap.prepare import read_splits
+from wearcap.prepare import Splits
 
 DATA_PREP = Path(__file__).parents[1] / "data_prep"
 PAGE = (DATA_PREP / "README.md").read_text(encoding="utf-8")
@@ -28,7 +28,7 @@ def test_the_page_tells_what_a_source_needs(source):
         listed = re.search(r"^splits: (\S+)", config, re.MULTILINE)
         name = listed[1] if listed else f"{source}.csv"
         assert f"`{name}`" in cells[5]
-        assert read_splits(splits_dir() / name).rows
+        assert Splits.read(splits_dir() / name).rows
 
 
 def test_every_source_has_its_script_and_every_list_its_source():

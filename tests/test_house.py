@@ -9,7 +9,7 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "wearcap"
 ROOT = SOURCE.parents[1]
 FLOORS = (
-    ("errors", "files", "locks", "checksums", "workers"),
+    ("errors", "files", "locks", "workers"),
     ("geometry",),
     ("body", "scene"),
     ("recording",),

@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 
 
@@ -22,11 +23,7 @@ class WearcapError(Exception):
 
     def __reduce__(self):
         """Survive the trip back from a worker process."""
-        return _rebuild, (type(self), self.what, self.where, self.expected, self.fix)
-
-
-def _rebuild(cls: type[WearcapError], what: str, where, expected: str, fix: str) -> WearcapError:
-    return cls(what, where=where, expected=expected, fix=fix)
+        return partial(type(self), self.what, where=self.where, expected=self.expected, fix=self.fix), ()
 
 
 def nearest(wrong: str, valid: Iterable[str]) -> str:

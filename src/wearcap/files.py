@@ -1,14 +1,21 @@
-"""Writing files so that a reader sees the old one or the new one, never half of one; files that come with the package."""
+"""Writing files so that a reader sees the old one or the new one, never half of one; files that come with the package;
+SHA-256 of files, remembered by their size, time and inode.
+
+The cache of checksums is in the user's cache folder, so that a data set is hashed when it is first used and not again by
+every process that opens it. A file whose bytes change without its time changing (a failing disk) is detected by
+`wearcap doctor`, which rehashes every file.
+"""
 
 import errno
 import hashlib
 import json
 import os
 import re
+import time
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -118,8 +125,19 @@ def remove_leftovers(folder: str | Path, *, below: bool = False) -> None:
     """
     for where, _, names in os.walk(folder):
         for name in names:
-            if _TEMPORARY.fullmatch(name):
-                _remove_unless_locked(Path(where, name))
+            if not _TEMPORARY.fullmatch(name):
+                continue
+            path = Path(where, name)
+            with suppress(OSError):  # locked, removed by another process, or without permission to remove
+                if fcntl is None:
+                    path.unlink()  # Windows refuses this while a writer has it open
+                    continue
+                descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
+                try:
+                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    path.unlink()
+                finally:
+                    os.close(descriptor)
         if not below:
             return
 
@@ -127,19 +145,6 @@ def remove_leftovers(folder: str | Path, *, below: bool = False) -> None:
 @lru_cache(maxsize=1024)
 def _remove_leftovers_once(folder: str) -> None:
     remove_leftovers(folder)
-
-
-def _remove_unless_locked(path: Path) -> None:
-    with suppress(OSError):  # locked, removed by another process, or without permission to remove
-        if fcntl is None:
-            path.unlink()  # Windows refuses this while a writer has it open
-            return
-        descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            path.unlink()
-        finally:
-            os.close(descriptor)
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -154,8 +159,15 @@ def parse_json(text: str | bytes, where: str | Path) -> Any:
     Raises WearcapError for text that is no JSON, not UTF-8, nested deeper than `MAX_JSON_DEPTH`, or with whole numbers
     beyond 64 bits.
     """
+
+    def whole_number(digits: str) -> int:
+        value = int(digits)
+        if not -(1 << 63) <= value < 1 << 64:
+            raise ValueError(f"the whole number {digits[:30]}… has more than 64 bits")
+        return value
+
     try:
-        content = json.loads(text, parse_int=_whole_number)
+        content = json.loads(text, parse_int=whole_number)
     except RecursionError as error:
         raise _too_deep(where) from error
     except ValueError as error:  # JSONDecodeError and UnicodeDecodeError are ValueErrors
@@ -172,13 +184,6 @@ def parse_json(text: str | bytes, where: str | Path) -> Any:
         if not level:
             return content
     raise _too_deep(where)
-
-
-def _whole_number(text: str) -> int:
-    value = int(text)
-    if not -(1 << 63) <= value < 1 << 64:
-        raise ValueError(f"the whole number {text[:30]}… has more than 64 bits")
-    return value
 
 
 def _too_deep(where: str | Path) -> WearcapError:
@@ -198,3 +203,62 @@ def resource(in_checkout: str, in_wheel: str) -> Path:
     if (checkout / "pyproject.toml").is_file() and (checkout / in_checkout).is_dir():
         return checkout / in_checkout
     return package / "_resources" / in_wheel
+
+
+SETTLED_S = 2.0
+"""Age (s) below which files are hashed every time: a file system's clock may not separate two writes."""
+MAX_LEDGER_BYTES = 1 << 26
+"""Size (64 MiB, some 300,000 files) beyond which the cache is cleared."""
+
+Key = tuple[str, int, int, int]
+
+
+def remembered_sha256(path: str | Path) -> str:
+    """Hex digest of a file's bytes, from the cache if the file has been hashed before and looks the same.
+
+    Raises OSError when it cannot be read.
+    """
+    key = _key(Path(path))
+    known = _ledger()
+    if key in known:
+        return known[key]
+    digest = sha256_of(path)
+    if key == _key(Path(path)) and time.time() - key[2] / 1e9 > SETTLED_S:
+        known[key] = digest
+        with suppress(OSError):  # without a cache folder, only in memory
+            ledger = _ledger_path()
+            ledger.parent.mkdir(parents=True, exist_ok=True)
+            with open(ledger, "ab") as file:  # one write, so that lines of other processes do not mix with it
+                file.write((json.dumps([*key, digest]) + "\n").encode())
+    return digest
+
+
+def _key(path: Path) -> Key:
+    found = path.stat()
+    return str(path.resolve()), found.st_size, found.st_mtime_ns, found.st_ino
+
+
+def _ledger_path() -> Path:
+    """Cache of checksums in $WEARCAP_CACHE, else in `wearcap` in the user's cache folder."""
+    if chosen := os.environ.get("WEARCAP_CACHE"):
+        return Path(chosen) / "sha256.jsonl"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "wearcap" / "sha256.jsonl"
+
+
+@cache
+def _ledger() -> dict[Key, str]:
+    """Digests cached by earlier processes; truncated or foreign lines are ignored."""
+    known: dict[Key, str] = {}
+    path = _ledger_path()
+    try:
+        if path.stat().st_size > MAX_LEDGER_BYTES:
+            path.unlink()
+        for line in path.read_text(encoding="utf-8").splitlines():
+            try:
+                name, size, mtime_ns, inode, digest = json.loads(line)
+                known[(name, size, mtime_ns, inode)] = digest
+            except (ValueError, TypeError):
+                continue
+    except (OSError, UnicodeDecodeError):
+        return known
+    return known

@@ -94,7 +94,12 @@ def _wait_for_lock(path: Path) -> int | None:
             )
             return None
         os.close(descriptor)
-        holder = _holder(path)
+        try:
+            holder = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            holder = {}
+        if not isinstance(holder, dict) or not isinstance(holder.get("pid"), int):
+            holder = {}  # the lock's file is being written
         if time.monotonic() - start > (ORPHANS_PATIENCE_S if _has_ended(holder) else LOCK_PATIENCE_S):
             raise _held_by(holder, path.parent)
         time.sleep(0.05)
@@ -130,15 +135,6 @@ def _unlock(path: Path, descriptor: int) -> None:
 def _lock_on_windows(descriptor: int, mode: int) -> None:
     os.lseek(descriptor, 1 << 20, os.SEEK_SET)  # a byte beyond the text, which others must be able to read
     msvcrt.locking(descriptor, mode, 1)
-
-
-def _holder(path: Path) -> dict[str, Any]:
-    """Content of a lock's file about its holder; empty while it is being written."""
-    try:
-        holder = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return holder if isinstance(holder, dict) and isinstance(holder.get("pid"), int) else {}
 
 
 def _has_ended(holder: dict[str, Any]) -> bool:

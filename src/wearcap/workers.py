@@ -20,7 +20,7 @@ _PR_SET_PDEATHSIG = 1
 """Constant of linux/prctl.h."""
 
 
-class Inherited:
+class _Inherited:
     """A file descriptor that a worker process inherits if this object is among its start arguments."""
 
     def __init__(self, descriptor: int | None):
@@ -31,8 +31,8 @@ class Inherited:
         return _inherited, (shared,)
 
 
-def _inherited(shared: Any) -> Inherited:
-    return Inherited(None if shared is None else shared.detach())
+def _inherited(shared: Any) -> _Inherited:
+    return _Inherited(None if shared is None else shared.detach())
 
 
 def bound_to_this_process(lock: int | None) -> dict[str, Any]:
@@ -41,10 +41,10 @@ def bound_to_this_process(lock: int | None) -> dict[str, Any]:
     Until they end, they hold `lock` (`wearcap.locks.folder_lock`). The pool must be shut down before the thread
     that uses it ends: Linux ends a worker with the thread that started it.
     """
-    return {"initializer": end_with_parent, "initargs": (os.getpid(), Inherited(lock))}
+    return {"initializer": _end_with_parent, "initargs": (os.getpid(), _Inherited(lock))}
 
 
-def end_with_parent(parent: int, lock: Inherited | None = None) -> None:
+def _end_with_parent(parent: int, lock: _Inherited | None = None) -> None:
     """In a worker: end at once when the parent has ended, whatever this process is doing.
 
     Linux kills it, even within native code. Elsewhere a thread checks for the parent every `POLL_S`; native code that

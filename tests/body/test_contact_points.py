@@ -7,7 +7,7 @@ import torch
 
 from walking_person import walk
 from wearcap.body.anny_body import anny_body
-from wearcap.body.contact_points import BODY_POINTS, HAND_POINTS, contact_points, in_t_pose, mirrored_points
+from wearcap.body.contact_points import BODY_POINTS, HAND_POINTS, _in_t_pose, contact_points, mirrored_points
 from wearcap.body.skeleton import xsens23
 from wearcap.body.skeletons import skeleton_by_name
 
@@ -34,7 +34,7 @@ def test_there_are_64_and_all_are_different(points):
 def test_twins_are_each_others_and_mirror_images(points):
     twins = mirrored_points()
     assert torch.equal(twins[twins], torch.arange(BODY_POINTS))
-    at = in_t_pose(points)
+    at = _in_t_pose(points)
     flipped = at[twins] * torch.tensor([1.0, -1.0, 1.0])
     assert (flipped - at).norm(dim=-1).max() < 0.04
     assert (at[: BODY_POINTS // 2, 1] > 0).all(), "the left half comes first"
@@ -51,12 +51,12 @@ def test_hands_have_points_of_their_own(points):
 
 
 def test_points_are_spread_over_the_body(points):
-    at = in_t_pose(points)
+    at = _in_t_pose(points)
     hand = torch.arange(HAND_POINTS)
     rest = torch.arange(len(hand), BODY_POINTS // 2)
     for rows, least in ((hand, 0.02), (rest, 0.1)):
         assert torch.pdist(at[rows]).min() > least
-    surface = in_t_pose(anny_body(SKELETON))
+    surface = _in_t_pose(anny_body(SKELETON))
     assert torch.cdist(surface, at).min(1).values.max() < 0.25, "nobody's skin is far from all points"
 
 
@@ -75,8 +75,8 @@ def test_points_follow_the_surface(points):
 
 def test_a_body_on_another_skeleton_has_points_at_the_same_places(points):
     other = contact_points(anny_body(skeleton_by_name("smpl24")))
-    scale = in_t_pose(points).amax(0) - in_t_pose(points).amin(0)
-    away = (in_t_pose(other) - in_t_pose(points)) / scale.max()
+    scale = _in_t_pose(points).amax(0) - _in_t_pose(points).amin(0)
+    away = (_in_t_pose(other) - _in_t_pose(points)) / scale.max()
     assert away.norm(dim=-1).max() < 0.25
 
 

@@ -8,9 +8,9 @@ import torch
 
 from wearcap.body import kinematics
 from wearcap.body.kinematics import (
-    can_fuse,
+    _can_fuse,
+    _fused_forward_kinematics,
     forward_kinematics,
-    fused_forward_kinematics,
     level_forward_kinematics,
     local_rotations,
 )
@@ -34,7 +34,7 @@ def sample(skeleton, batch, dtype, per_sample_offsets=False):
 def test_equals_the_level_version(name, batch, per_sample, dtype):
     skeleton = skeleton_by_name(name)
     R, t, offsets = sample(skeleton, batch, dtype, per_sample)
-    fused = fused_forward_kinematics(skeleton, R, t, offsets)
+    fused = _fused_forward_kinematics(skeleton, R, t, offsets)
     level = level_forward_kinematics(skeleton, R, t, offsets)
     torch.testing.assert_close(fused[0], level.R)
     torch.testing.assert_close(fused[1], level.t)
@@ -45,7 +45,7 @@ def test_equals_the_level_version(name, batch, per_sample, dtype):
 def test_gradient_is_that_of_finite_differences(per_sample):
     skeleton = skeleton_by_name("xsens23")
     inputs = [x.requires_grad_() for x in sample(skeleton, (2,), torch.float64, per_sample)]
-    assert torch.autograd.gradcheck(lambda *x: fused_forward_kinematics(skeleton, *x), inputs)
+    assert torch.autograd.gradcheck(lambda *x: _fused_forward_kinematics(skeleton, *x), inputs)
 
 
 def test_gradient_equals_the_level_versions_for_strided_inputs():
@@ -53,7 +53,7 @@ def test_gradient_equals_the_level_versions_for_strided_inputs():
     R, t, offsets = sample(skeleton, (6,), torch.float64, True)
     seeds = torch.randn(6, 24, 3, 3, dtype=torch.float64), torch.randn(6, 24, 3, dtype=torch.float64)
     gradients = []
-    for version in (fused_forward_kinematics, lambda *x: vars(level_forward_kinematics(*x)).values()):
+    for version in (_fused_forward_kinematics, lambda *x: vars(level_forward_kinematics(*x)).values()):
         leaves = [x.transpose(0, -1).contiguous().transpose(0, -1).requires_grad_() for x in (R, t, offsets)]
         gradients.append(torch.autograd.grad(tuple(version(skeleton, *leaves)), leaves, seeds))
     for fused, level in zip(*gradients):
@@ -70,7 +70,7 @@ def test_threads_share_the_work_exactly(per_sample, monkeypatch):
         for count in (1, 3):
             torch.set_num_threads(count)
             leaves = [x.clone().requires_grad_() for x in inputs]
-            R, t = fused_forward_kinematics(skeleton, *leaves)
+            R, t = _fused_forward_kinematics(skeleton, *leaves)
             results.append((R, t, *torch.autograd.grad((R.square().sum() + t.square().sum()), leaves)))
     finally:
         torch.set_num_threads(threads)
@@ -79,7 +79,7 @@ def test_threads_share_the_work_exactly(per_sample, monkeypatch):
 
 
 def joints_in_threads(inputs, results):
-    results.put(fused_forward_kinematics(*inputs)[1].sum().item())
+    results.put(_fused_forward_kinematics(*inputs)[1].sum().item())
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs fork")
@@ -89,7 +89,7 @@ def test_a_forked_process_has_threads_of_its_own(monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     skeleton = skeleton_by_name("xsens23")
     inputs = skeleton, *sample(skeleton, (9,), torch.float64)
-    expected = fused_forward_kinematics(*inputs)[1].sum().item()
+    expected = _fused_forward_kinematics(*inputs)[1].sum().item()
     context = multiprocessing.get_context("fork")
     results = context.SimpleQueue()
     child = context.Process(target=joints_in_threads, args=(inputs, results))
@@ -104,7 +104,7 @@ def test_what_does_not_fit_is_refused():
     R, t, offsets = sample(skeleton, (4,), torch.float32)
     for wrong in ((R[:, 1:], t, offsets), (R, t[:3], offsets), (R, t, offsets[1:])):
         with pytest.raises((RuntimeError, TypeError)):
-            fused_forward_kinematics(skeleton, *wrong)
+            _fused_forward_kinematics(skeleton, *wrong)
 
 
 def test_unused_outputs_and_repeated_backward():
@@ -126,9 +126,9 @@ def test_transforms_and_compilers_take_the_level_version():
     jacobian = torch.func.vmap(torch.func.jacrev(positions))(R, t)
     assert jacobian.shape == (3, 23, 3, 23, 3, 3)
     assert torch.func.jacfwd(positions)(R[0], t[0]).shape == (23, 3, 23, 3, 3)
-    assert can_fuse(R, t)
-    assert not can_fuse(R, t.float())
-    assert not can_fuse(R.to("meta"), t.to("meta"))
+    assert _can_fuse(R, t)
+    assert not _can_fuse(R, t.float())
+    assert not _can_fuse(R.to("meta"), t.to("meta"))
 
     class Positions(torch.nn.Module):
         def forward(self, R, t):

@@ -15,7 +15,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.camera_json import write_photos
 from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.localization.visual_map import VisualMap
-from wearcap.recording.photo import Photo
+from wearcap.scene.scan import Photo
 
 CAMERA = Camera.pinhole(240, 180, 60.0)
 FACING_WALL = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

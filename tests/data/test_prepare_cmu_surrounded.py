@@ -9,11 +9,11 @@ import captured_motion as captured
 from wearcap.cli.conf import compose
 from wearcap.cli.prepare import run
 from wearcap.prepare import simulated
-from wearcap.prepare.mocap import nominal_head
+from wearcap.prepare.mocap import _nominal_head
 from wearcap.recording import Recording, RecordingStore
 from wearcap.recording.recording import CameraStream
 from wearcap.recording.serialize import flatten
-from wearcap.recording.store import entry_for, recording_path, save_recording
+from wearcap.recording.store import Entry, recording_path, save_recording
 from wearcap.simulation.rendering.ego_view import EGO_CAMERA
 
 MOTIONS = {"7_01": captured.walk(1.0), "35_02": captured.sit(0.5).sliced(60, 200)}
@@ -27,7 +27,7 @@ def source(root, **changed) -> RecordingStore:
         recording = replace(
             Recording(
                 name,
-                head=nominal_head(motion, [0.09, 0.0, 0.09]),
+                head=_nominal_head(motion, [0.09, 0.0, 0.09]),
                 motion=motion,
                 skeleton=motion.skeleton,
                 subject=subject,
@@ -36,7 +36,7 @@ def source(root, **changed) -> RecordingStore:
             **changed,
         )
         save_recording(recording, recording_path(root, name))
-        store.register({name: entry_for(recording, root, "train" if subject == "7" else "test", "0")})
+        store.register({name: Entry.of(recording, root, "train" if subject == "7" else "test", "0")})
     return store
 
 

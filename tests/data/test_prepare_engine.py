@@ -15,7 +15,7 @@ from prepare_tasks import tasks
 
 from wearcap.errors import WearcapError
 from wearcap.files import sha256_of
-from wearcap.prepare import content_hash, prepare, read_splits
+from wearcap.prepare import Splits, content_hash, prepare
 from wearcap.recording import RecordingStore
 
 
@@ -167,12 +167,12 @@ def test_wrong_requests_are_refused(tmp_path):
 def test_split_lists(tmp_path):
     path = tmp_path / "splits.csv"
     path.write_text("# a comment\nsubject,split\n14,train\nHumanEva/*,val\n9,test\n")
-    splits = read_splits(path)
+    splits = Splits.read(path)
     assert [splits.of(subject) for subject in ("14", "HumanEva/S1", "9")] == ["train", "val", "test"]
     with pytest.raises(WearcapError, match="subject '10' is in no split"):
         splits.of("10")
     path.write_text("subject,split\n*,hash\n")
-    shares = [read_splits(path).of(f"person_{number}") for number in range(2000)]
+    shares = [Splits.read(path).of(f"person_{number}") for number in range(2000)]
     assert shares.count("test") / 2000 == pytest.approx(0.15, abs=0.03)
     assert shares.count("val") / 2000 == pytest.approx(0.05, abs=0.02)
 
@@ -183,4 +183,4 @@ def test_split_lists(tmp_path):
 def test_broken_split_lists_are_refused(tmp_path, text):
     (tmp_path / "s.csv").write_text(text)
     with pytest.raises(WearcapError, match=r"s\.csv"):
-        read_splits(tmp_path / "s.csv")
+        Splits.read(tmp_path / "s.csv")

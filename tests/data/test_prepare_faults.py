@@ -30,7 +30,7 @@ UNBOUND_WORKER = """
 import sys, time
 from joblib.externals.loky import get_reusable_executor
 from wearcap.locks import folder_lock
-from wearcap.workers import Inherited
+from wearcap.workers import _Inherited
 
 def nothing(lock):
     pass
@@ -41,7 +41,7 @@ def work():
     time.sleep(60)
 
 with folder_lock(sys.argv[1], "prepare") as lock:
-    get_reusable_executor(1, initializer=nothing, initargs=(Inherited(lock),)).submit(work).result()
+    get_reusable_executor(1, initializer=nothing, initargs=(_Inherited(lock),)).submit(work).result()
 """
 
 

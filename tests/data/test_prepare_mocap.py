@@ -14,9 +14,9 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.datasets.amass import write_amass
 from wearcap.io.formats.text import read_bytes
-from wearcap.prepare import check_recording, read_splits
+from wearcap.prepare import Splits, check_recording
 from wearcap.prepare.mocap import About, CleaningLimits, MocapSettings, mocap_recording, without_glitches
-from wearcap.prepare.mocap_sources import BvhSettings, amass_tasks, cmu_recording, cmu_tasks
+from wearcap.prepare.mocap_sources import BvhSettings, _cmu_recording, amass_tasks, cmu_tasks
 from wearcap.recording import Motion, RecordingStore
 from wearcap.recording.timing import resampled
 
@@ -239,7 +239,7 @@ def test_amass_by_data_set_and_by_files(tmp_path):
         path.write_bytes(b"")
     listed = tmp_path / "mine.csv"
     listed.write_text("subject,split\nCMU/14/b_poses,test\nCMU/14,val\n*,train\n")
-    splits = read_splits(listed)
+    splits = Splits.read(listed)
     license = compose("prepare", ["prepare=amass"]).license
     tasks = amass_tasks(tmp_path / "in", splits, SETTINGS, license, ["CMU", "BMLmovi"])
     assert {task.name: task.split for task in tasks} == {
@@ -285,12 +285,12 @@ def test_help_tells_what_there_is(capsys):
 def test_every_source_composes_and_has_a_split_list(source):
     config = compose("prepare", [f"prepare={source}"])
     assert config.output == f"datasets/{source}"
-    splits = read_splits(splits_dir() / config.splits)
+    splits = Splits.read(splits_dir() / config.splits)
     assert splits.of("someone/new") in ("train", "val", "test")
 
 
 def test_cmus_split_covers_every_subject_and_keeps_its_largest_for_training():
-    splits = read_splits(splits_dir() / "cmu.csv")
+    splits = Splits.read(splits_dir() / "cmu.csv")
     places = {number: splits.of(str(number)) for number in range(1, 145)}
     assert places[14] == "train"
     assert [number for number in places if places[number] == "test" and number in (5, 26, 35, 127)] == [5, 26, 35, 127]
@@ -301,7 +301,7 @@ def test_cmus_split_covers_every_subject_and_keeps_its_largest_for_training():
 @pytest.mark.slow
 def test_every_kind_of_cmu_trial_becomes_a_recording(real_data):
     config = compose("prepare", ["prepare=cmu"])
-    splits = read_splits(splits_dir() / "cmu.csv")
+    splits = Splits.read(splits_dir() / "cmu.csv")
     tasks = cmu_tasks(real_data / "cmu_mocap", splits, SETTINGS, BvhSettings(0.01, "y", "z"), config.amc_fps, "CMU")
     indices = [path.read_text(encoding="utf-8") for path in (real_data / "cmu_mocap").glob("index*.csv")]
     assert len(tasks) == sum(len(text.splitlines()) - 1 for text in indices) >= 240
@@ -331,7 +331,7 @@ def test_xz_and_plain_give_the_same_recording(real_data, tmp_path):
     plain = tmp_path / "35_20.amc"
     plain.write_bytes(read_bytes(folder / "35_20.amc.xz"))
     first, second = (
-        cmu_recording(path, folder / "35.asf", ABOUT, 120, BvhSettings(0.01, "y", "z"), SETTINGS).motion
+        _cmu_recording(path, folder / "35.asf", ABOUT, 120, BvhSettings(0.01, "y", "z"), SETTINGS).motion
         for path in (folder / "35_20.amc.xz", plain)
     )
     assert first is not None

@@ -13,8 +13,8 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.datasets.omomo import read_omomo
 from wearcap.io.formats.environment import read_environment
-from wearcap.prepare import check_recording, read_splits
-from wearcap.prepare.one_object import check_rate, ground_rotation
+from wearcap.prepare import Splits, check_recording
+from wearcap.prepare.one_object import _check_rate, _ground_rotation
 from wearcap.recording.store import RecordingStore
 
 
@@ -107,11 +107,11 @@ def test_the_ground_is_found_among_steps_that_are_off_it():
     )
     points[:90, 2] += 0.35  # feet on a chair's rung
     tilted = rotation.exp(torch.tensor([0.1, -0.15, 0.0]))
-    level = ground_rotation(points @ tilted.T) @ tilted
+    level = _ground_rotation(points @ tilted.T) @ tilted
     assert torch.rad2deg(torch.arccos(level[2, 2].clamp(max=1.0))) < 0.5
-    assert torch.equal(ground_rotation(points[:3]), torch.eye(3))
+    assert torch.equal(_ground_rotation(points[:3]), torch.eye(3))
     one_place = torch.tensor([[0.0, 0.0, 0.0]]).repeat(50, 1)
-    torch.testing.assert_close(ground_rotation(one_place), torch.eye(3))
+    torch.testing.assert_close(_ground_rotation(one_place), torch.eye(3))
 
 
 def test_long_gaps_are_cut_and_short_ones_bridged(tmp_path, files, capsys):
@@ -167,9 +167,9 @@ def walker(files, fps: float) -> dict:
 def test_a_rate_at_which_nobody_walks_is_refused(tmp_path, files, true, stated, advice):
     files.write_omomo(tmp_path, walker(files, true))
     sequences = read_omomo(tmp_path)
-    check_rate(sequences, tmp_path, true)
+    _check_rate(sequences, tmp_path, true)
     with pytest.raises(WearcapError, match=f"at {stated} frames per second people walk at .*{advice}"):
-        check_rate(sequences, tmp_path, stated)
+        _check_rate(sequences, tmp_path, stated)
 
 
 def test_rates_that_are_none_and_sequences_that_fail_alone(tmp_path, files, capsys):
@@ -211,6 +211,6 @@ def test_a_folder_without_sequences_is_one_error(tmp_path, name, capsys):
 
 
 def test_the_official_splits():
-    behave, omomo = (read_splits(splits_dir() / f"{name}.csv") for name in ("behave", "omomo"))
+    behave, omomo = (Splits.read(splits_dir() / f"{name}.csv") for name in ("behave", "omomo"))
     assert [behave.of(name) for name in ("Date03_Sub05_stool", "Date04_Sub05_stool")] == ["test", "train"]
     assert [number for number in range(1, 18) if omomo.of(f"sub{number}") == "test"] == [16, 17]

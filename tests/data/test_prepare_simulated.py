@@ -10,7 +10,7 @@ from command_line import exit_code
 from wearcap.cli.conf import compose, splits_dir
 from wearcap.errors import WearcapError
 from wearcap.files import sha256_of
-from wearcap.prepare import read_splits
+from wearcap.prepare import Splits
 from wearcap.prepare.simulated import simulated_tasks
 from wearcap.recording import RecordingStore
 
@@ -56,7 +56,7 @@ def test_a_small_set(tmp_path):
 
 
 def test_wrong_settings_are_refused():
-    splits = read_splits(splits_dir() / "simulated.csv")
+    splits = Splits.read(splits_dir() / "simulated.csv")
     for wrong in ({"fps": 0}, {"duration_s": -1}, {"recordings": {"trian": 1}}):
         right = {"recordings": {"train": 1}, "duration_s": 3, "fps": 60, "points": False, "activities": None, "seed": 0}
         with pytest.raises(WearcapError):
@@ -74,4 +74,4 @@ def test_presets_say_how_much_they_make():
 def test_splits_that_disagree_with_the_simulator_are_refused(tmp_path):
     (tmp_path / "s.csv").write_text("subject,split\n*,train\n")
     with pytest.raises(WearcapError, match="simulated val split are listed elsewhere"):
-        simulated_tasks(read_splits(tmp_path / "s.csv"), {"val": 1}, 3, 60, False, None, 0)
+        simulated_tasks(Splits.read(tmp_path / "s.csv"), {"val": 1}, 3, 60, False, None, 0)

@@ -10,7 +10,7 @@ from wearcap.errors import WearcapError
 from wearcap.io.formats.camera_json import read_photos
 from wearcap.prepare.engine import prepare
 from wearcap.prepare.simulated import simulated_hps_tasks
-from wearcap.prepare.splits import read_splits
+from wearcap.prepare.splits import Splits
 from wearcap.recording.store import RecordingStore
 
 
@@ -28,7 +28,7 @@ def tasks_of(root: Path, **changes):
         "changed": 0.3,
         "seed": 0,
     }
-    return simulated_hps_tasks(read_splits(splits_dir() / "simulated.csv"), str(root), **(settings | changes))
+    return simulated_hps_tasks(Splits.read(splits_dir() / "simulated.csv"), str(root), **(settings | changes))
 
 
 def test_a_data_set_is_made_and_then_left_alone(tmp_path):
@@ -73,6 +73,6 @@ def test_wrong_settings_are_refused(tmp_path, change, message):
 @pytest.mark.parametrize("preset", ["quick", "standard"])
 def test_the_presets_make_tasks(preset, tmp_path):
     config = compose("prepare", ["prepare=simulated_hps", f"preset={preset}", f"output={tmp_path}"])
-    tasks = instantiate(config.tasks, _convert_="all", _partial_=True)(splits=read_splits(splits_dir() / config.splits))
+    tasks = instantiate(config.tasks, _convert_="all", _partial_=True)(splits=Splits.read(splits_dir() / config.splits))
     assert {task.split for task in tasks} <= {"train", "val", "test"}
     assert len({task.name for task in tasks}) == len(tasks) >= 1

@@ -9,10 +9,10 @@ from wearcap.io.formats.environment import read_environment
 from wearcap.io.formats.ply import read_ply
 from wearcap.prepare.engine import prepare
 from wearcap.prepare.simulated import simulated_interactions_tasks
-from wearcap.prepare.splits import read_splits
+from wearcap.prepare.splits import Splits
 from wearcap.recording.store import RecordingStore
 
-SPLITS = read_splits(Path(__file__).parents[2] / "data_prep/splits/simulated.csv")
+SPLITS = Splits.read(Path(__file__).parents[2] / "data_prep/splits/simulated.csv")
 
 
 def tasks(output, recordings, **how):

@@ -7,7 +7,7 @@ import torch
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.mesh import Mesh, capsules, checker_floor, merged
-from wearcap.geometry.render import Light, Splats, orthographic_map, render
+from wearcap.geometry.render import Light, Splats, _orthographic_map, render
 from wearcap.geometry.rigid import Rigid
 
 CAMERA = Camera.pinhole(96, 72, 60.0)
@@ -149,7 +149,7 @@ def test_shadows_fall_away_from_the_light_and_darken_where_things_touch():
 
 
 def test_orthographic_map_holds_heights():
-    height, axes = orthographic_map([ball((0.5, 0.0, 1.0), 0.25)], (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 1.0, 200)
+    height, axes = _orthographic_map([ball((0.5, 0.0, 1.0), 0.25)], (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 1.0, 200)
     assert height.max() == pytest.approx(1.25, abs=1e-3)
     place = axes @ [0.5, 0.0, 1.25, 1.0]
     column, row = (place[:2] * 100).astype(int)

@@ -7,7 +7,7 @@ import torch
 from wearcap.errors import WearcapError
 from wearcap.geometry import raster, rotation
 from wearcap.geometry.camera import Camera
-from wearcap.geometry.render import SplatCloud, lens_numbers, view_planes
+from wearcap.geometry.render import SplatCloud, _view_planes, lens_numbers
 from wearcap.geometry.rigid import Rigid
 
 CAMERAS = [
@@ -31,7 +31,7 @@ def test_the_compiled_projection_is_the_cameras(camera):
     points = cloud_around(3000).astype(np.float64)
     pixels, valid = camera.project(torch.from_numpy(points))
     lens = lens_numbers(camera)
-    found = np.array([raster.project_point(*point, lens) for point in points])
+    found = np.array([raster._project_point(*point, lens) for point in points])
     inside = (found[:, 2] > 0) & (found[:, 0] >= -0.5) & (found[:, 0] < camera.width - 0.5)
     inside &= (found[:, 1] >= -0.5) & (found[:, 1] < camera.height - 0.5)
     assert 100 < valid.sum() < 2900
@@ -70,15 +70,15 @@ def test_the_number_in_a_pixel_is_that_of_the_nearest_point_there():
 
 def test_blocks_behind_and_beside_are_not_projected():
     camera = CAMERAS[0]
-    assert len(view_planes(camera)) == 4
-    assert not len(view_planes(CAMERAS[3]))  # sees more than a half-space
+    assert len(_view_planes(camera)) == 4
+    assert not len(_view_planes(CAMERAS[3]))  # sees more than a half-space
     cloud = SplatCloud.build(cloud_around(20000), block=64)
     pose = np.concatenate([np.eye(3), np.zeros((3, 1))], 1)
     picture = np.full((48, 64), -np.inf, np.float32), np.full((48, 64), -1, np.int32)
     projected = raster.draw_splats(
         (cloud.points, cloud.first, cloud.centers, cloud.radii),
         pose,
-        view_planes(camera),
+        _view_planes(camera),
         lens_numbers(camera),
         0.01,
         True,

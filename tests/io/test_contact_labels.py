@@ -18,7 +18,7 @@ from wearcap.io.formats.contact_labels import (
     parse_labels,
     read_contact_labels,
 )
-from wearcap.recording.interactions import Interactions
+from wearcap.recording.motion import Interactions
 
 TIMES = torch.arange(600, dtype=torch.float64) / 60
 CLOCK = LabelClock.of("flat_1", TIMES)

@@ -19,7 +19,7 @@ from wearcap.io.datasets.hcontact import (
     read_hcontact_split,
     read_smpl_json,
 )
-from wearcap.prepare.splits import read_splits
+from wearcap.prepare.splits import Splits
 from wearcap.prepare.worn import hcontact_tasks
 from wearcap.recording.store import RecordingStore
 
@@ -217,7 +217,7 @@ def test_the_command_makes_a_data_set(tmp_path, capsys):
 def test_what_no_pattern_matches_is_refused(tmp_path):
     write_set(tmp_path / "set")
     (tmp_path / "list.csv").write_text("subject,split\n*,train\n")
-    splits = read_splits(tmp_path / "list.csv")
+    splits = Splits.read(tmp_path / "list.csv")
     with pytest.raises(WearcapError, match="no contact class for sequence"):
         hcontact_tasks(tmp_path / "set", splits, {"*sofa*": "sliding"}, 60, "")
     with pytest.raises(WearcapError, match="no sequences"):

@@ -19,7 +19,7 @@ from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.motion_npz import read_motion, write_motion
 from wearcap.io.formats.npz import read_npz, require
 from wearcap.recording import Motion
-from wearcap.recording.interactions import Interactions
+from wearcap.recording.motion import Interactions
 
 HELD = Interactions(
     torch.tensor([1e3, 1e3 + 0.1]).double(),

@@ -10,7 +10,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.camera_json import read_photos, write_photos
-from wearcap.recording.photo import Photo
+from wearcap.scene.scan import Photo
 
 FISHEYE = Camera("fisheye", 640, 640, 230.0, 231.0, 319.5, 320.5, (0.01, -0.002, 0.0, 0.001))
 

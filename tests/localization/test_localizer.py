@@ -17,8 +17,7 @@ from wearcap.localization.localizer import Localizer, LocalizerSettings, localiz
 from wearcap.localization.map_builder import MapSettings, build_map, extended
 from wearcap.localization.point_map import PointMapper
 from wearcap.localization.visual_map import Observations, VisualMap
-from wearcap.recording.photo import Photo
-from wearcap.scene.scan import Scan
+from wearcap.scene.scan import Photo, Scan
 
 EXTRACTOR = RootSift(600)
 SETTINGS = MapSettings(splat_m=0.01, words=16)

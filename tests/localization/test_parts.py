@@ -20,8 +20,7 @@ from wearcap.localization.map_builder import MapSettings, _lift
 from wearcap.localization.matching import match_landmarks, match_nearby
 from wearcap.localization.point_map import PointMap, PointMapper, undistortion
 from wearcap.localization.visual_map import from_bytes, merge, to_bytes
-from wearcap.recording.photo import Photo
-from wearcap.scene.scan import Scan
+from wearcap.scene.scan import Photo, Scan
 
 FISHEYE = Camera("fisheye", 300, 300, 95.0, 95.0, 150.0, 149.0, (0.01, -0.004, 0.001, 0.0))
 

@@ -10,8 +10,7 @@ from PIL import Image
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.localization.point_map import PointMapper
-from wearcap.recording.photo import Photo
-from wearcap.scene.scan import Scan
+from wearcap.scene.scan import Photo, Scan
 
 SIZE = np.array([5.0, 4.0, 2.6])
 CAMERA = Camera("opencv", 400, 300, 260.0, 262.0, 198.0, 151.0, (-0.04, 0.01, 0.001, -0.0008))

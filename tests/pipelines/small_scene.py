@@ -12,7 +12,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import about_axis
 from wearcap.io.formats.camera_json import write_photos
 from wearcap.io.formats.ply import Ply, write_ply
-from wearcap.recording.photo import Photo
+from wearcap.scene.scan import Photo
 
 LEVEL = torch.tensor([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 """An OpenCV camera that looks along the world's x."""

@@ -10,7 +10,7 @@ import torch
 from boxes import box_mesh
 from wearcap.cli.main import run_verb
 from wearcap.doctor import Finding, examine
-from wearcap.doctor.places import check_environment
+from wearcap.doctor.places import _check_environment
 from wearcap.io.formats.environment import write_environment
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
@@ -35,7 +35,7 @@ SOUND = (scene_object("sofa_1"), scene_object("table_1", at=(3.0, 0.0, 0.0)), do
 
 
 def found(*objects, severity=("error", "warning", "note")) -> list[Finding]:
-    return [finding for finding in check_environment(Environment(objects)) if finding.severity in severity]
+    return [finding for finding in _check_environment(Environment(objects)) if finding.severity in severity]
 
 
 def test_a_sound_environment_is_listed():

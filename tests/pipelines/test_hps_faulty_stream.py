@@ -15,7 +15,7 @@ from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
 from wearcap.optimize.hps import Solution
 from wearcap.recording import Motion, Recording
-from wearcap.recording.growing import close_pieces, follow_pieces, piece_path, write_piece
+from wearcap.recording.growing import _piece_path, close_pieces, follow_pieces, write_piece
 from wearcap.systems.hps import stream as hps_stream
 from wearcap.systems.hps.pipeline import HPS
 from wearcap.systems.hps.stream import HpsStream, StreamSettings, follow
@@ -161,7 +161,7 @@ def test_pieces_without_a_suit_or_a_readable_file_are_passed_over(hps, parts, tm
     for number, part in enumerate(parts):
         write_piece(replace(part, suit=None) if number == 3 else part, tmp_path, number)
     close_pieces(tmp_path)
-    piece_path(tmp_path, 5).write_bytes(b"nothing")
+    _piece_path(tmp_path, 5).write_bytes(b"nothing")
     refused = Counter()
     found = list(follow(hps, follow_pieces(tmp_path, refused=refused), None, settings=SETTINGS, refused=refused))
     assert refused == {"piece: damaged file": 1, "suit: wrong type or shape": 1}

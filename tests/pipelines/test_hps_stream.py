@@ -10,7 +10,7 @@ from hydra.utils import instantiate
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
 from wearcap.recording import Recording
-from wearcap.recording.growing import close_pieces, follow_pieces, piece_path, write_piece
+from wearcap.recording.growing import _piece_path, close_pieces, follow_pieces, write_piece
 from wearcap.runtime.system import CaptureInput
 from wearcap.scene.scan import Scan
 from wearcap.systems.hps.pipeline import HPS
@@ -119,7 +119,7 @@ def test_pieces_are_followed_until_the_end(tmp_path):
     close_pieces(tmp_path)
     found = list(follow_pieces(tmp_path))
     assert [len(part.suit) for part in found] == [len(part.suit) for part in parts]
-    piece_path(tmp_path, 2).unlink()
+    _piece_path(tmp_path, 2).unlink()
     (tmp_path / "end").unlink()
     with pytest.raises(WearcapError, match="no piece 2 after"):
         list(follow_pieces(tmp_path, patience_s=0.2, poll_s=0.05))

@@ -18,7 +18,7 @@ from wearcap.optimize.contact_correction import OffsetSettings
 from wearcap.optimize.trajectory import Bending, bend
 from wearcap.optimize.trajectory_banded import bend_banded
 from wearcap.recording import Motion, Recording
-from wearcap.recording.interactions import Interactions
+from wearcap.recording.motion import Interactions
 from wearcap.runtime.digest import digest
 from wearcap.runtime.stages import StagedSystem
 from wearcap.runtime.system import CaptureInput

@@ -9,7 +9,7 @@ import torch
 from carried_box import carrying
 from wearcap.errors import WearcapError
 from wearcap.recording.acts import NO_OBJECT, Act, active_at, spread_acts, true_acts
-from wearcap.recording.interactions import Interactions
+from wearcap.recording.motion import Interactions
 
 TIMES = torch.arange(0, 20, 0.5, dtype=torch.float64)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from command_line import exit_code
-from wearcap import checksums
+from wearcap import files
 from wearcap.errors import WearcapError
 from wearcap.recording import RecordingStore
 from wearcap.recording.store import RecordingFile
@@ -18,7 +18,7 @@ from wearcap_testing import small_dataset
 def memory(tmp_path, monkeypatch):
     """What is remembered lies in a folder of the test; `forget` is a new process."""
     monkeypatch.setenv("WEARCAP_CACHE", str(tmp_path / "cache"))
-    forget = checksums._ledger.cache_clear
+    forget = files._ledger.cache_clear
     forget()
     yield forget
     forget()
@@ -79,8 +79,8 @@ def test_a_file_is_hashed_once_and_again_when_it_changes(dataset, memory, monkey
     path, counted = RecordingStore.open(dataset).path_of("r1"), []
     old = time.time() - 60
     os.utime(path, (old, old))
-    honest = checksums.sha256_of
-    monkeypatch.setattr(checksums, "sha256_of", lambda file: counted.append(file) or honest(file))
+    honest = files.sha256_of
+    monkeypatch.setattr(files, "sha256_of", lambda file: counted.append(file) or honest(file))
     for _ in range(3):
         RecordingFile(path)
         memory()

@@ -33,7 +33,7 @@ from wearcap.recording import (
     RecordingStore,
 )
 from wearcap.recording import store as store_module
-from wearcap.recording.interactions import Interactions
+from wearcap.recording.motion import Interactions
 from wearcap.recording.serialize import dumps, flatten, unflatten
 from wearcap.recording.store import RecordingFile, save_recording
 

@@ -11,15 +11,7 @@ from hypothesis import strategies as st
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rotation import about_axis
-from wearcap.scene.editing import (
-    ObjectEditing,
-    floor_below,
-    footprint,
-    hinge_places,
-    points_world,
-    snapped,
-    usual_freedom,
-)
+from wearcap.scene.editing import Footprint, ObjectEditing, _floor_below, _usual_freedom, hinge_places, snapped
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.scene.scan import Box, Scan, SlicedCloud, first_hit
@@ -85,7 +77,7 @@ def test_a_cut_object_takes_its_points_and_stands_on_the_floor(scan):
     assert door.mesh.faces.shape == (0, 3)
     assert door.t_world_object.tolist() == pytest.approx([2.0, 1.0, FLOOR_M], abs=1e-3)
     taken = np.setdiff1d(np.arange(len(scan.points)), np.flatnonzero(editing.left()))
-    np.testing.assert_allclose(points_world(door), scan.points[taken], atol=1e-5)
+    np.testing.assert_allclose(door.points_world, scan.points[taken], atol=1e-5)
     assert len(editing.selected) == 0
     assert door.freedom.kind == "hinge"
     assert abs(door.freedom.pivot[1] - 1.0) == pytest.approx(0.45, abs=0.01), "at an end of the leaf"
@@ -199,7 +191,7 @@ def test_a_footprint_is_the_rectangle_it_came_from(yaw, seed):
     local = np.concatenate([rng.uniform(-1, 1, (60, 2)), [[-1, -1], [1, -1], [1, 1], [-1, 1]]]) * [0.6, 0.2]
     turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
     points = np.concatenate([local @ turn.T + [3.0, -2.0], rng.uniform(0, 2, (64, 1))], 1)
-    plan = footprint(points)
+    plan = Footprint.of(points)
     assert (plan.half_length, plan.half_width) == pytest.approx((0.6, 0.2))
     np.testing.assert_allclose(plan.center, [3.0, -2.0], atol=1e-9)
     assert abs(plan.long @ turn[:, 0]) == pytest.approx(1.0)
@@ -225,15 +217,15 @@ def test_places_snap_within_reach_only():
 def test_the_floor_is_not_a_stray_point_below_it(scan):
     stray = np.concatenate([scan.points, [[2.0, 1.0, -1.0]]]).astype(np.float32)
     leaf = scan.points[DOOR.contains(scan.points)]
-    assert floor_below(leaf, stray) == pytest.approx(FLOOR_M, abs=1e-3)
-    assert floor_below(leaf, leaf[:0]) == pytest.approx(FLOOR_M + 0.04, abs=1e-3)
-    assert floor_below(leaf, stray[stray[:, 0] > 4]) == pytest.approx(FLOOR_M + 0.04, abs=1e-3)
+    assert _floor_below(leaf, stray) == pytest.approx(FLOOR_M, abs=1e-3)
+    assert _floor_below(leaf, leaf[:0]) == pytest.approx(FLOOR_M + 0.04, abs=1e-3)
+    assert _floor_below(leaf, stray[stray[:, 0] > 4]) == pytest.approx(FLOOR_M + 0.04, abs=1e-3)
 
 
 def test_usual_freedoms(scan):
     leaf = scan.points[DOOR.contains(scan.points)]
-    slide = usual_freedom("axis", leaf, FLOOR_M)
+    slide = _usual_freedom("axis", leaf, FLOOR_M)
     assert abs(slide.axis[0]) == pytest.approx(1.0), "across the leaf"
-    assert usual_freedom("plane", leaf, FLOOR_M) == Freedom("plane")
+    assert _usual_freedom("plane", leaf, FLOOR_M) == Freedom("plane")
     line = np.stack([np.linspace(0, 1, 30), np.zeros(30), np.zeros(30)], 1)
-    assert footprint(line).half_length == pytest.approx(0.5)
+    assert Footprint.of(line).half_length == pytest.approx(0.5)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from wearcap.scene.floor_update import FloorFixed, FloorFollow, FloorFollower, FloorUpdate
+from wearcap.scene.floor import FloorFixed, FloorFollow, FloorFollower, FloorUpdate
 
 SOLE = 0.02
 

@@ -7,8 +7,7 @@ import torch
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
-from wearcap.scene.object_motion import ObjectState, follow_hands
-from wearcap.scene.objects import Freedom, SceneObject
+from wearcap.scene.objects import Freedom, ObjectState, SceneObject, follow_hands
 
 BOTH, LEFT, RIGHT = torch.tensor([True, True]), torch.tensor([True, False]), torch.tensor([False, True])
 

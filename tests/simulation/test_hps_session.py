@@ -10,7 +10,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
-from wearcap.prepare.check import check_recording
+from wearcap.prepare.engine import check_recording
 from wearcap.recording.serialize import flatten, unflatten
 from wearcap.sensors.claps import detect_claps
 from wearcap.sensors.slam import R_DEVICE_CAM

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from wearcap.body.kinematics import site_positions
-from wearcap.recording.interactions import HANDS
+from wearcap.recording.motion import HANDS
 from wearcap.simulation.handling.house import House
 from wearcap.simulation.handling.opening import operate
 from wearcap.simulation.people.plan import Plan

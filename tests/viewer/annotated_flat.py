@@ -14,7 +14,7 @@ import torch
 from wearcap.geometry.camera import Camera
 from wearcap.io.formats.contact_labels import Label, LabelClock, annotation_of
 from wearcap.recording import CameraStream, RecordingStore
-from wearcap.recording.interactions import Interactions
+from wearcap.recording.motion import Interactions
 from wearcap.viewer.annotate import Desk
 from wearcap.viewer.annotate_server import AnnotationServer
 from wearcap_testing import recording_of, swaying_motion

@@ -19,9 +19,8 @@ from wearcap.io.formats.motion_npz import write_motion
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
-from wearcap.viewer.annotate import Take
-from wearcap.viewer.annotate_server import AnnotationServer, byte_range
-from wearcap.viewer.annotation_file import AnnotationFile, Conflict, starting_labels
+from wearcap.viewer.annotate import AnnotationFile, Conflict, Take, starting_labels
+from wearcap.viewer.annotate_server import AnnotationServer, _byte_range
 from wearcap_testing import recording_of, swaying_motion
 
 
@@ -87,7 +86,7 @@ def test_video_in_ranges(dataset, tmp_path):
         ("bytes=4-2", (0, 9, False)),
         ("bytes=-", (0, 9, False)),
     ):
-        assert byte_range(header, 9) == wanted
+        assert _byte_range(header, 9) == wanted
 
 
 def test_a_save_is_checked_written_and_given_back(dataset, tmp_path):

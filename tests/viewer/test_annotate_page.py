@@ -10,9 +10,8 @@ import pytest
 from annotated_flat import CLOCK, FPS, TIMES, labels, served, write_flat
 
 from wearcap.io.formats.contact_labels import LabelClock, read_contact_labels
-from wearcap.viewer.annotate import Desk
+from wearcap.viewer.annotate import AnnotationFile, Desk
 from wearcap.viewer.annotate_server import AnnotationServer
-from wearcap.viewer.annotation_file import AnnotationFile
 from wearcap_browser import SHIFT, Chromium, chromium
 
 

@@ -18,23 +18,23 @@ from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.environment import write_environment
 from wearcap.io.formats.motion_npz import write_motion
 from wearcap.recording import Motion, Recording, RecordingStore
-from wearcap.recording.interactions import Interactions
+from wearcap.recording.motion import Interactions
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
-from wearcap.viewer.objects import (
+from wearcap.viewer.page import FLESH_M, Page, _spacing_m
+from wearcap.viewer.page_layers import (
     BALL_M,
     BRIGHT,
     DIM,
     TOUCH_M,
-    lit_color,
+    _lit_color,
+    _true_body_contact,
     lit_points,
     poses_at,
-    true_body_contact,
+    stick_body,
     with_objects,
 )
-from wearcap.viewer.page import FLESH_M, Page, spacing_m
-from wearcap.viewer.page_layers import stick_body
-from wearcap.viewer.picture import actors, contact_sheet
+from wearcap.viewer.picture import _actors, contact_sheet
 from wearcap_testing import swaying_motion
 
 FRAMES = 30
@@ -105,7 +105,7 @@ def test_only_what_is_likelier_than_not_is_lit_and_the_surer_the_brighter():
     assert len(lit_points(points, motion, 0).vertices) % 7 == 0
     assert lit_points(points, touching(motion, prob=0.5), 0) is None
     assert lit_points(points, swaying_motion(2), 0) is None
-    colors = lit_color(torch.tensor([0.5, 0.75, 1.0]))
+    colors = _lit_color(torch.tensor([0.5, 0.75, 1.0]))
     np.testing.assert_allclose(colors, [DIM, (DIM + BRIGHT) / 2, BRIGHT])
 
 
@@ -142,11 +142,11 @@ def test_truth_touches_what_it_holds():
     assert not (truth.body_contact_prob > 0.5)[:, right].any()
     assert with_objects(recording).body_contact_prob is None
     untold = replace(recording, interactions=None, object_motion={})
-    assert true_body_contact(untold, truth, HOUSE) is None
+    assert _true_body_contact(untold, truth, HOUSE) is None
     held = replace(recording.interactions, objects=("left alone",))
-    assert not true_body_contact(replace(recording, interactions=held), truth, HOUSE).any()
+    assert not _true_body_contact(replace(recording, interactions=held), truth, HOUSE).any()
     elsewhere = Environment((crate("another"),))
-    assert not true_body_contact(recording, truth, elsewhere).any()
+    assert not _true_body_contact(recording, truth, elsewhere).any()
 
 
 def test_an_object_has_the_pose_of_the_nearest_moment():
@@ -207,15 +207,15 @@ def test_wide_motions_stand_further_apart():
     """A drift of 3 m towards the neighbour, on another clock."""
     first, second = carrying(), carrying(3.0)
     late = replace(second, timestamps=second.timestamps + 0.2)
-    assert spacing_m([first, second]) > 3.0 + 2 * FLESH_M
-    assert spacing_m([first, late]) > 3.0
-    assert spacing_m([second, first]) < spacing_m([first, first]) + 0.1
+    assert _spacing_m([first, second]) > 3.0 + 2 * FLESH_M
+    assert _spacing_m([first, late]) > 3.0
+    assert _spacing_m([second, first]) < _spacing_m([first, first]) + 0.1
 
 
 def test_a_row_of_the_sheet_has_its_own_objects():
     motion = carrying()
     away = replace(motion, object_motion=None)
-    first, second = actors({"a": motion, "b": away}, anny_body(motion.skeleton), HOUSE)
+    first, second = _actors({"a": motion, "b": away}, anny_body(motion.skeleton), HOUSE)
     places = [actor.meshes(12)[-2].vertices.mean(0) for actor in (first, second)]
     np.testing.assert_allclose(places[0], motion.joint("left_wrist").t[12], atol=1e-4)
     np.testing.assert_allclose(places[1], [3.0, 3.0, 0.2], atol=1e-4)

@@ -33,7 +33,7 @@ from wearcap.viewer.annotate_server import MAX_CONNECTIONS, AnnotationServer
 from wearcap.viewer.guard import Guard, Refused
 from wearcap.viewer.object_editor import ObjectEditor
 from wearcap.viewer.page import Page
-from wearcap.viewer.page_server import start_server
+from wearcap.viewer.page_server import _start_server
 from wearcap_browser import chromium
 from wearcap_testing import recording_of, swaying_motion
 
@@ -318,7 +318,7 @@ def test_a_viser_that_cannot_be_guarded_is_not_served(monkeypatch, capsys):
     bypass = SimpleNamespace(asyncio=SimpleNamespace(server=SimpleNamespace(serve=real)))
     monkeypatch.setattr(viser.infra._infra, "websockets", bypass)
     with pytest.raises(WearcapError, match=r"viser.*guarded.*Install the version"):
-        start_server(Guard("127.0.0.1"), 18760, "page")
+        _start_server(Guard("127.0.0.1"), 18760, "page")
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.1", 18760), timeout=5)
     assert websockets.asyncio.server.serve is real

@@ -15,12 +15,11 @@ from scanned_room import CHAIR, DOOR_X, DOOR_Y, SOFA, scanned_room
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.formats.environment import read_environment, write_environment
-from wearcap.scene.editing import hinge_places, points_world
+from wearcap.scene.editing import hinge_places
 from wearcap.scene.environment import Environment
 from wearcap.scene.scan import Box, Scan
 from wearcap.viewer.object_editor import ObjectEditor
-from wearcap.viewer.object_editor_panels import HINTS, TOOLS
-from wearcap.viewer.object_editor_view import typical_spacing
+from wearcap.viewer.object_editor_view import HINTS, TOOLS, _typical_spacing
 from wearcap.viewer.page_layers import by_height
 from wearcap_browser import CONTROL, Chromium, chromium
 
@@ -195,8 +194,8 @@ def test_a_scan_without_colour_is_coloured_by_height(scan):
     low, high = colors[scan.points[:, 2] < 0.02].mean(0), colors[scan.points[:, 2] > 2.0].mean(0)
     assert low[2] > low[0]
     assert high[0] > high[2]
-    assert 0.005 < typical_spacing(scan.points) < 0.04
-    assert typical_spacing(scan.points[:1]) == 0.02
+    assert 0.005 < _typical_spacing(scan.points) < 0.04
+    assert _typical_spacing(scan.points[:1]) == 0.02
 
 
 def field(browser: Chromium, label: str) -> tuple[float, float]:
@@ -288,7 +287,7 @@ def check_door(file: Path) -> None:
     assert door.freedom.limits == pytest.approx((0.0, np.deg2rad(120)))
     assert abs(abs(door.freedom.pivot[0] - DOOR_X) - 0.43) < 0.13, "at one end of the leaf"
     assert door.freedom.pivot[1] == pytest.approx(DOOR_Y, abs=0.08)
-    points = points_world(door)
+    points = door.points_world
     leaf = (abs(points - [DOOR_X, DOOR_Y, 1.02]) < [0.44, 0.03, 1.01]).all(1)
     assert leaf.mean() > 0.8
     assert points[leaf].max(0) - points[leaf].min(0) == pytest.approx([0.86, 0.04, 2.0], abs=0.08)
@@ -307,7 +306,7 @@ def drag_hinge(browser: Chromium, page: ObjectEditor, size: tuple[int, int]) -> 
     browser.drag(path, pause_s=0.3)
     browser.poll(lambda: page._item().freedom.pivot != before)
     assert page._item().freedom.pivot[0] == pytest.approx(before[0] + 0.9 * to_the_other_end, abs=0.06)
-    places = hinge_places(points_world(page._item()), 0.0)
+    places = hinge_places(page._item().points_world, 0.0)
     assert np.linalg.norm(places[:, :2] - page._item().freedom.pivot[:2], axis=1).min() < 1e-6, "snapped"
 
 

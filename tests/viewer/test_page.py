@@ -14,7 +14,7 @@ from wearcap.geometry import rotation
 from wearcap.io.formats.motion_npz import write_motion
 from wearcap.recording import ContactTrack, HeadStream, Motion, PointCloud, Recording, RecordingStore
 from wearcap.recording.store import dataset_folder
-from wearcap.viewer.page import CAPTURE_COLOR, Page, Timeline
+from wearcap.viewer.page import CAPTURE_COLOR, Page, _Timeline
 from wearcap.viewer.page_layers import AIR_COLOR, CONTACT_COLOR, nearest_frame, stick_body, surface_or_sticks
 from wearcap_browser import chromium
 
@@ -56,7 +56,7 @@ def page():
 
 
 def test_timeline_plays_loops_and_stays_inside():
-    clock = Timeline(2.0, 5.0, 2.0)
+    clock = _Timeline(2.0, 5.0, 2.0)
     assert not clock.advance(1.0)
     clock.playing, clock.speed = True, 2.0
     assert clock.advance(1.0)

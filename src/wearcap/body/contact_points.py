@@ -32,7 +32,7 @@ def _rows() -> Int64[Tensor, "point"]:
     Farthest points of the surface in the T-pose, on the left half, and the nearest vertex to each one's mirror image.
     """
     body = _reference()
-    at, main_joint = in_t_pose(body), body.skin_joints[:, 0]
+    at, main_joint = _in_t_pose(body), body.skin_joints[:, 0]
     hand = body.skeleton.index("left_wrist")
     left = at[:, 1] > 0.01
     wrist = _farthest(at, (main_joint == hand).nonzero()[:, 0], HAND_POINTS)
@@ -55,9 +55,9 @@ def contact_points(body: BodyModel) -> BodyModel:
     """
     reference, rows = _reference(), _rows()
     if body.faces.shape != reference.faces.shape or not torch.equal(body.faces, reference.faces):
-        wanted, given = in_t_pose(reference)[rows], in_t_pose(body)
+        wanted, given = _in_t_pose(reference)[rows], _in_t_pose(body)
         low, high = given.min(0).values, given.max(0).values
-        first, last = (in_t_pose(reference).min(0).values, in_t_pose(reference).max(0).values)
+        first, last = (_in_t_pose(reference).min(0).values, _in_t_pose(reference).max(0).values)
         rows = torch.cdist((wanted - first) / (last - first) * (high - low) + low, given).argmin(1)
     blend = None if body.pose_blend is None else body.pose_blend[:, rows]
     return BodyModel(
@@ -71,7 +71,7 @@ def contact_points(body: BodyModel) -> BodyModel:
     )
 
 
-def in_t_pose(body: BodyModel) -> Float[Tensor, "vertex 3"]:
+def _in_t_pose(body: BodyModel) -> Float[Tensor, "vertex 3"]:
     """The surface with legs straight down and arms straight sideways, the root at the origin (m)."""
     pose = t_pose(body.skeleton)
     R_parent_joint = pose.R.clone()

@@ -37,8 +37,8 @@ def forward_kinematics(
     """
     offsets = skeleton.t_parent_joint if t_parent_joint is None else t_parent_joint
     offsets = offsets.to(R_parent_joint)
-    if can_fuse(R_parent_joint, t_world_root, offsets):
-        return Rigid(*fused_forward_kinematics(skeleton, R_parent_joint, t_world_root, offsets))
+    if _can_fuse(R_parent_joint, t_world_root, offsets):
+        return Rigid(*_fused_forward_kinematics(skeleton, R_parent_joint, t_world_root, offsets))
     return level_forward_kinematics(skeleton, R_parent_joint, t_world_root, offsets)
 
 
@@ -94,7 +94,7 @@ def local_rotations(
     return torch.cat([R_world_joint[..., :1, :, :], local], -3)
 
 
-def can_fuse(*tensors: Tensor) -> bool:
+def _can_fuse(*tensors: Tensor) -> bool:
     """Whether the kernels support the inputs: plain CPU tensors of one precision, outside compilers and transforms."""
     first = tensors[0]
     plain = all(
@@ -107,7 +107,7 @@ def can_fuse(*tensors: Tensor) -> bool:
     return plain and first.dtype in (torch.float32, torch.float64) and not traced and not transformed
 
 
-def fused_forward_kinematics(
+def _fused_forward_kinematics(
     skeleton: Skeleton,
     R_parent_joint: Float[Tensor, "*batch joint 3 3"],
     t_world_root: Float[Tensor, "*batch 3"],

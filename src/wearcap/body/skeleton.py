@@ -136,6 +136,13 @@ class Skeleton:
         lowest = min(p[2].item() for p in (*self.rest_joints, *self.rest_sites.values()))
         return -lowest
 
+    @property
+    def stature(self) -> float:
+        """Height (m) of a person with this skeleton, from soles to crown."""
+        points = self.rest_sites.values()
+        top = max([self.rest_joints[:, 2].max().item(), *(point[2].item() for point in points)])
+        return top + self.root_height
+
     def height_of(self, joint: str) -> float:
         """Height of a joint above the floor in the rest pose (m)."""
         return self.rest_joints[self.index(joint), 2].item() + self.root_height
@@ -193,16 +200,9 @@ def xsens23() -> Skeleton:
     return build_skeleton("xsens23", rows, "left_toe")
 
 
-def stature(skeleton: Skeleton) -> float:
-    """Height (m) of a person with this skeleton, from soles to crown."""
-    points = skeleton.rest_sites.values()
-    top = max([skeleton.rest_joints[:, 2].max().item(), *(point[2].item() for point in points)])
-    return top + skeleton.root_height
-
-
 def skeleton_of_height(height_m: float, skeleton: Skeleton | None = None) -> Skeleton:
     """A skeleton (xsens23 by default) scaled to a person's height. Raises WearcapError outside 0.5…2.6 m."""
     if not 0.5 <= height_m <= 2.6:
         raise WearcapError(f"a height of {height_m} m", expected="0.5 to 2.6 m")
     skeleton = skeleton or xsens23()
-    return skeleton.scaled(height_m / stature(skeleton))
+    return skeleton.scaled(height_m / skeleton.stature)

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from wearcap.body.model import BodyModel, contact_regions, four_weights
-from wearcap.body.skeleton import Site, Skeleton
+from wearcap.body.skeleton import Site
 from wearcap.body.skeletons import skeleton_by_name
 from wearcap.errors import WearcapError
 
@@ -58,20 +58,7 @@ def smpl_body(arrays: SmplArrays, betas: Float[Tensor, "beta"] | None = None) ->
     skeleton = named.with_offsets(offsets.float())
     skin_joints, skin_weights = four_weights(weights)
     regions = contact_regions(skeleton, skeleton.rest_joints, vertices.float(), arrays.faces, weights.float())
-    skeleton = replace(skeleton, sites=skeleton.sites | _surface_sites(skeleton, vertices, regions))
-    blend = None
-    if arrays.pose_directions is not None:
-        # In our axes, per entry of our (R_parent_joint - I), of the joints that the skeleton keeps.
-        P = _WORLD_MODEL.to(arrays.pose_directions)
-        entries = arrays.pose_directions.unflatten(-1, (-1, 3, 3))[..., : len(named) - 1, :, :]
-        blend = torch.einsum("dc,vcjab,ka,lb->jklvd", P, entries, P, P).flatten(0, 2).float()
-    return BodyModel(skeleton, vertices.float(), arrays.faces, skin_joints, skin_weights.float(), regions, blend)
-
-
-def _surface_sites(
-    skeleton: Skeleton, vertices: Float[Tensor, "vertex 3"], regions: dict[str, Tensor]
-) -> dict[str, Site]:
-    """Heels, toe tips and crown, found on the surface."""
+    # Heels, toe tips and crown are found on the surface.
     at = {"crown": ("head", vertices[vertices[:, 2].argmax()])}
     for side in ("left", "right"):
         heel, toes = (vertices[regions[f"{side}_{part}"]] for part in ("heel", "toes"))
@@ -82,4 +69,11 @@ def _surface_sites(
     for name, (joint, place) in at.items():
         x, y, z = (place - skeleton.rest_joints[skeleton.index(joint)]).tolist()
         sites[name] = Site(joint, (x, y, z))
-    return sites
+    skeleton = replace(skeleton, sites=skeleton.sites | sites)
+    blend = None
+    if arrays.pose_directions is not None:
+        # In our axes, per entry of our (R_parent_joint - I), of the joints that the skeleton keeps.
+        P = _WORLD_MODEL.to(arrays.pose_directions)
+        entries = arrays.pose_directions.unflatten(-1, (-1, 3, 3))[..., : len(named) - 1, :, :]
+        blend = torch.einsum("dc,vcjab,ka,lb->jklvd", P, entries, P, P).flatten(0, 2).float()
+    return BodyModel(skeleton, vertices.float(), arrays.faces, skin_joints, skin_weights.float(), regions, blend)

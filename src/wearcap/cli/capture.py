@@ -29,7 +29,7 @@ from wearcap.recording import Motion, Recording
 from wearcap.recording.store import dataset_folder, load_recording
 from wearcap.runtime.system import CaptureInput, StageOptions, System
 from wearcap.scene.environment import Environment
-from wearcap.viewer.objects import with_objects
+from wearcap.viewer.page_layers import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png, write_video
 
 HELP = "turn a recording into motion: wearcap capture recording=DATASET/NAME, checkpoint=… or pipeline=hps"

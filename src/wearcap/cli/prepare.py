@@ -9,7 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 from wearcap.cli.conf import compose, conf_dir, explained, nearest, splits_dir
 from wearcap.errors import WearcapError
 from wearcap.prepare.engine import Report, prepare
-from wearcap.prepare.splits import read_splits
+from wearcap.prepare.splits import Splits
 from wearcap.recording.store import SPLITS, RecordingStore
 
 HELP = "make a data set: wearcap prepare simulated, wearcap prepare cmu source=DIR"
@@ -27,7 +27,7 @@ def run(config: DictConfig) -> Report:
         report = instantiate(config.rework, _convert_="all")
     else:
         listed = splits_dir() / config.splits
-        splits = read_splits(listed if listed.is_file() else Path(config.splits))
+        splits = Splits.read(listed if listed.is_file() else Path(config.splits))
         report = prepare(
             instantiate(config.tasks, _convert_="all", _partial_=True)(splits=splits),
             config.output,

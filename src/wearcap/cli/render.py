@@ -3,16 +3,14 @@
 import argparse
 from pathlib import Path
 
-import numpy as np
 from rich import print as show
 
 from wearcap.body.anny_body import anny_body
 from wearcap.cli.view import read_motions
 from wearcap.errors import WearcapError
-from wearcap.recording.motion import Motion
 from wearcap.recording.store import dataset_folder, load_recording
 from wearcap.runtime.system import CaptureInput
-from wearcap.viewer.objects import with_objects
+from wearcap.viewer.page_layers import with_objects
 from wearcap.viewer.picture import contact_sheet, draw_head_path, save_png, shared_frames, write_video
 
 HELP = "pictures without a screen: wearcap render DATASET/NAME --out sheet.png|motion.mp4"
@@ -47,7 +45,7 @@ def main(arguments: list[str]) -> None:
     environment = CaptureInput(recording, dataset_folder(options.recording)).objects(options.environment)
     truth = with_objects(recording, environment)
     motions = ({} if truth is None else {"truth": truth}) | read_motions(options.motion)
-    motions = {label: _between(motion, options.start, options.stop) for label, motion in motions.items()}
+    motions = {label: motion.between(options.start, options.stop) for label, motion in motions.items()}
     size = {"size": _size(options.size)} if options.size else {}
     if not motions:
         if out.suffix == ".mp4":
@@ -62,16 +60,6 @@ def main(arguments: list[str]) -> None:
         else:
             save_png(out, contact_sheet(motions, shared_frames(motions, options.frames), **shown))
     show(f"wrote {out}")
-
-
-def _between(motion: Motion, start_s: float, stop_s: float | None) -> Motion:
-    """The frames from one second to another, counted from the motion's first frame."""
-    since = (motion.timestamps - motion.timestamps[0]).numpy()
-    first = int(np.searchsorted(since, start_s))
-    stop = len(since) if stop_s is None else int(np.searchsorted(since, stop_s, side="right"))
-    if stop <= first:
-        raise WearcapError(f"no frames from {start_s} s to {stop_s} s", expected=f"times from 0 to {since[-1]:.1f} s")
-    return motion.sliced(first, stop)
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -25,8 +25,7 @@ from wearcap.io.formats.video import read_image
 from wearcap.localization.localizer import Localizer
 from wearcap.localization.map_builder import build_map, extended
 from wearcap.localization.visual_map import VisualMap
-from wearcap.recording.photo import Photo
-from wearcap.scene.scan import Scan
+from wearcap.scene.scan import Photo, Scan
 
 HELP = "the visual map of a scene: wearcap scene scene=FOLDER output=map.safetensors; its objects: wearcap scene edit FOLDER"
 

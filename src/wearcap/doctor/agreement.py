@@ -7,8 +7,7 @@ import torch
 
 from wearcap.doctor.inertial import check_offset
 from wearcap.doctor.report import Check, Finding, has_error, refusal
-from wearcap.doctor.signals import lag_between, quantile, spin_of
-from wearcap.doctor.streams import check_rotations
+from wearcap.doctor.streams import check_rotations, lag_between, quantile, spin_of
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
@@ -40,27 +39,25 @@ def check_head_against_body(head: HeadStream, motion: Motion) -> list[Finding]:
     T_head_device = Rigid(body.R_world_body[inside].double(), body.t_world_body[inside].double()).inverse() @ Rigid(
         at.R_world_body.double(), at.t_world_body.double()
     )
-    return [*findings, _check_seat(Check("head against body: seat"), T_head_device, head)]
-
-
-def _check_seat(check: Check, T_head_device: Rigid, head: HeadStream) -> Finding:
-    """The device keeps a constant pose on the head joint, the stated one."""
+    # The device keeps a constant pose on the head joint, the stated one.
+    check = Check("head against body: seat")
     mean_R, mean_t = rotation.mean_rotation(T_head_device.R), T_head_device.t.median(0).values
     turn = math.degrees(quantile(rotation.geodesic(T_head_device.R, mean_R.expand_as(T_head_device.R)), 0.9))
     shift = quantile((T_head_device.t - mean_t).norm(dim=-1), 0.9)
     evidence = f"90 % of the time within {100 * shift:.1f} cm and {turn:.1f}° of a constant seat"
     if shift > 0.3 or turn > 30:
         fix = "Head and body are in different worlds (align them), on different clocks, or of different people."
-        return check.error("the device does not ride on the head", evidence, fix)
+        return [*findings, check.error("the device does not ride on the head", evidence, fix)]
     off_m = (mean_t - head.t_head_device.double()).norm().item()
     off_deg = math.degrees(rotation.geodesic(mean_R, head.R_head_device.double()).item())
     evidence += f"; mean {100 * off_m:.1f} cm and {off_deg:.1f}° from the stated one"
     if off_m > 0.08 or off_deg > 15:
         fix = f"t_head_device = ({', '.join(f'{v:.3f}' for v in mean_t.tolist())}) m fits this recording."
-        return check.warning("the stated seat of the device is off", evidence, fix)
+        return [*findings, check.warning("the stated seat of the device is off", evidence, fix)]
     if shift > 0.06 or turn > 12:
-        return check.warning("the device moves on the head", evidence, "A drifting alignment or a slipping device.")
-    return check.ok("constant", evidence)
+        fix = "A drifting alignment or a slipping device."
+        return [*findings, check.warning("the device moves on the head", evidence, fix)]
+    return [*findings, check.ok("constant", evidence)]
 
 
 def check_head_cue(head: HeadStream, cue: Cue) -> Finding:
@@ -224,29 +221,27 @@ def check_claps(recording: Recording) -> list[Finding]:
 
 
 def check_files(recording: Recording, root: Path) -> list[Finding]:
-    """Existence of the video and the scan that a recording names, relative to its data set's folder."""
+    """Existence of the video (its size and frame count, too) and of the scan that a recording names, below its data set."""
     findings = []
     stream = recording.camera
     if stream is not None and stream.video:
-        findings.append(_check_video(Check("camera: video"), root / stream.video, stream))
+        check, size = Check("camera: video"), (stream.camera.width, stream.camera.height)
+        frames, (width, height) = len(stream.timestamps), size
+        try:
+            video = video_info(root / stream.video)
+        except WearcapError as error:
+            findings.append(refusal(error, check.name))
+        else:
+            if (video.width, video.height) != size:
+                evidence = f"{video.width}x{video.height} pixels, calibrated at {width}x{height}"
+                fix = "Calibrate at the video's size (wearcap calibrate), or scale the intrinsics (Camera.scaled)."
+                findings.append(check.error("image size and calibration differ", evidence, fix))
+            elif video.frames and abs(video.frames - frames) > 1:
+                evidence = f"{video.frames} and {frames}"
+                findings.append(check.error("frames and timestamps differ in number", evidence, "Pair them again."))
+            else:
+                findings.append(check.ok("fits its calibration", f"{video.frames} frames of {width}x{height}"))
     if recording.scene and not (root / recording.scene).is_file():
         fix = "Put it there, or prepare the data set again."
         findings.append(Check("scene: file").error("the scan is missing", str(root / recording.scene), fix))
     return findings
-
-
-def _check_video(check: Check, path: Path, stream: CameraStream) -> Finding:
-    """The video has the calibrated size and as many frames as there are timestamps."""
-    frames, width, height = len(stream.timestamps), stream.camera.width, stream.camera.height
-    try:
-        video = video_info(path)
-    except WearcapError as error:
-        return refusal(error, check.name)
-    if (video.width, video.height) != (width, height):
-        evidence = f"{video.width}x{video.height} pixels, calibrated at {width}x{height}"
-        fix = "Calibrate at the video's size (wearcap calibrate), or scale the intrinsics (Camera.scaled)."
-        return check.error("image size and calibration differ", evidence, fix)
-    if video.frames and abs(video.frames - frames) > 1:
-        evidence = f"{video.frames} and {frames}"
-        return check.error("frames and timestamps differ in number", evidence, "Pair them again.")
-    return check.ok("fits its calibration", f"{video.frames} frames of {width}x{height}")

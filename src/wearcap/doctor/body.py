@@ -6,10 +6,9 @@ import torch
 
 from wearcap.body.kinematics import site_positions
 from wearcap.body.landmarks import Landmarks, landmarks
-from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
+from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.doctor.report import Check, Finding, has_error
-from wearcap.doctor.signals import quantile
-from wearcap.doctor.streams import check_rotations, check_speed
+from wearcap.doctor.streams import check_rotations, check_speed, quantile
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory, interpolate, linear_velocity
@@ -21,7 +20,26 @@ def check_motion(stream: str, motion: Motion, floor: FloorTrack | None) -> list[
     """All checks of one motion whose timestamps rise."""
     root = Trajectory(motion.timestamps, motion.R_parent_joint[:, 0], motion.t_world_root)
     findings = [*check_rotations(stream, motion.R_parent_joint), *check_speed(stream, root)]
-    findings.append(_check_size(Check(f"{stream}: body size"), motion.skeleton))
+    check, skeleton = Check(f"{stream}: body size"), motion.skeleton
+    height = longest_path(skeleton) / REACH_PER_HEIGHT
+    evidence = f"about {height:.3g} m tall by its bones"
+    uneven = []
+    for name in skeleton.joint_names:
+        other = name.replace("left", "right")
+        if name.startswith("left") and other in skeleton:
+            left, right = (skeleton.t_parent_joint[skeleton.index(joint)].norm() for joint in (name, other))
+            if (left - right).abs() > 0.15 * torch.maximum(left, right) + 0.01:
+                uneven.append(name)
+    if not HEIGHT_M[0] < height < HEIGHT_M[1]:
+        unit = min(UNITS_M, key=lambda name: abs(height * UNITS_M[name] - 1.7))
+        fix = f"In {unit} it would be {height * UNITS_M[unit]:.2f} m: multiply lengths by {UNITS_M[unit]:.4g}."
+        findings.append(check.error("no person's size", evidence, fix))
+    elif uneven:
+        evidence += f"; {', '.join(uneven)}"
+        fix = "Check the subject's measured bone lengths."
+        findings.append(check.warning("bones differ left from right", evidence, fix))
+    else:
+        findings.append(check.ok("a person's size", evidence))
     if has_error(findings):
         return findings
     findings.append(_check_joint_angles(Check(f"{stream}: joint rotations"), motion))
@@ -31,27 +49,6 @@ def check_motion(stream: str, motion: Motion, floor: FloorTrack | None) -> list[
         return [*findings, Check(f"{stream}: skeleton").note("limbs are not recognised by name", str(error))]
     findings += _check_posture(stream, motion, parts)
     return findings if has_error(findings) else [*findings, *_check_feet(stream, motion, root, parts, floor)]
-
-
-def _check_size(check: Check, skeleton: Skeleton) -> Finding:
-    """A person's size, the same left and right."""
-    height = longest_path(skeleton) / REACH_PER_HEIGHT
-    evidence = f"about {height:.3g} m tall by its bones"
-    if not HEIGHT_M[0] < height < HEIGHT_M[1]:
-        unit = min(UNITS_M, key=lambda name: abs(height * UNITS_M[name] - 1.7))
-        fix = f"In {unit} it would be {height * UNITS_M[unit]:.2f} m: multiply lengths by {UNITS_M[unit]:.4g}."
-        return check.error("no person's size", evidence, fix)
-    uneven = []
-    for name in skeleton.joint_names:
-        other = name.replace("left", "right")
-        if name.startswith("left") and other in skeleton:
-            left, right = (skeleton.t_parent_joint[skeleton.index(joint)].norm() for joint in (name, other))
-            if (left - right).abs() > 0.15 * torch.maximum(left, right) + 0.01:
-                uneven.append(name)
-    if uneven:
-        evidence += f"; {', '.join(uneven)}"
-        return check.warning("bones differ left from right", evidence, "Check the subject's measured bone lengths.")
-    return check.ok("a person's size", evidence)
 
 
 def _check_joint_angles(check: Check, motion: Motion) -> Finding:

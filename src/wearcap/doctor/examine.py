@@ -1,14 +1,17 @@
-"""Examine one recording, or everything in a folder."""
+"""Examine one recording, or everything in a path: data sets, files, MPS folders, scenes, environments, motion capture."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
+import torch
 from jaxtyping import Float64
 from torch import Tensor
 
 from wearcap.doctor.agreement import (
     check_camera,
     check_claps,
+    check_files,
     check_head_against_body,
     check_head_cue,
     check_localization,
@@ -17,12 +20,27 @@ from wearcap.doctor.agreement import (
 )
 from wearcap.doctor.body import check_contact_prob, check_motion
 from wearcap.doctor.inertial import check_imu
-from wearcap.doctor.load import patients
+from wearcap.doctor.places import is_map, is_place, read_environment_file, read_map, read_place
 from wearcap.doctor.report import SEVERITIES, Check, Finding, Report, has_error, refusal
 from wearcap.doctor.streams import check_clock, check_spans, check_track
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.recording import Recording
+from wearcap.io.datasets.adt import is_adt, read_adt
+from wearcap.io.datasets.amass import read_amass
+from wearcap.io.datasets.hps_sequence import hps_names, is_hps, read_hps_sequence
+from wearcap.io.datasets.nymeria import is_nymeria, read_nymeria, read_xdata
+from wearcap.io.devices.aria_mps import find_mps_file, head_stream, is_mps_folder, read_closed_loop, read_mps
+from wearcap.io.formats.asf_amc import read_amc, read_asf
+from wearcap.io.formats.bvh import read_bvh
+from wearcap.io.formats.motion_npz import read_motion
+from wearcap.io.formats.mvnx import read_mvnx
+from wearcap.io.formats.npz import read_npz
+from wearcap.io.formats.pcd import read_pcd
+from wearcap.io.formats.ply import read_ply
+from wearcap.io.formats.poses import read_euroc, read_tum
+from wearcap.io.formats.text import read_json_object
+from wearcap.recording import HeadStream, Motion, PointCloud, Recording, RecordingStore
+from wearcap.recording.store import RecordingFile
 
 
 def examine(source: Recording | str | Path, progress: Callable[[int, int], None] | None = None) -> Report:
@@ -33,7 +51,7 @@ def examine(source: Recording | str | Path, progress: Callable[[int, int], None]
     """
     if isinstance(source, Recording):
         return Report(source.name, {source.name: tuple(examine_recording(source))})
-    found = patients(Path(source))
+    found = _patients(Path(source))
     findings: dict[str, tuple[Finding, ...]] = {}
     for done, (name, load) in enumerate(found.items(), 1):
         try:
@@ -59,29 +77,12 @@ def examine_recording(recording: Recording) -> list[Finding]:
     broken = {f.check.split(":")[0] for f in findings if f.severity == "error" and f.what != "dropped frames"}
     usable = {name for name, times in clocks.items() if name not in broken and len(times) > 1}
     findings += check_spans({name: times for name, times in clocks.items() if name in usable})
-    findings += _streams(recording, usable)
-    return sorted(findings, key=lambda finding: -SEVERITIES.index(finding.severity))
-
-
-def _clocks(recording: Recording) -> dict[str, Float64[Tensor, "_"]]:
-    streams = {
-        "head": recording.head,
-        "motion": recording.motion,
-        "suit": recording.suit,
-        "camera": recording.camera,
-        "localization": recording.localization,
-    }
-    streams |= {f"imu {name}": imu for name, imu in recording.imu.items()}
-    return {name: stream.timestamps for name, stream in streams.items() if stream is not None}
-
-
-def _streams(recording: Recording, usable: set[str]) -> list[Finding]:
-    """Findings about each usable stream, then about pairs of streams; streams with errors are not compared."""
-    findings: list[Finding] = []
+    # Each usable stream, then pairs of streams; streams with errors are not compared.
     head = recording.head if "head" in usable else None
     if head is not None:
-        findings += check_track("head", Trajectory(head.timestamps, head.R_world_device, head.t_world_device))
-        head = None if has_error(findings) else head
+        found = check_track("head", Trajectory(head.timestamps, head.R_world_device, head.t_world_device))
+        findings += found
+        head = None if has_error(found) else head
     floor = recording.floor
     if floor is None and recording.points is not None and head is not None:
         floor = floor_below(recording.points, head)
@@ -112,4 +113,162 @@ def _streams(recording: Recording, usable: set[str]) -> list[Finding]:
         findings += check_camera(recording.camera)
     if recording.localization is not None and "localization" in usable:
         findings += check_localization(recording.localization, bodies.get("suit", body))
-    return [*findings, *check_claps(recording)]
+    findings += check_claps(recording)
+    return sorted(findings, key=lambda finding: -SEVERITIES.index(finding.severity))
+
+
+def _clocks(recording: Recording) -> dict[str, Float64[Tensor, "_"]]:
+    streams = {
+        "head": recording.head,
+        "motion": recording.motion,
+        "suit": recording.suit,
+        "camera": recording.camera,
+        "localization": recording.localization,
+    }
+    streams |= {f"imu {name}": imu for name, imu in recording.imu.items()}
+    return {name: stream.timestamps for name, stream in streams.items() if stream is not None}
+
+
+Loaded = tuple[Recording, list[Finding]]
+
+
+def _patients(path: Path) -> dict[str, Callable[[], Loaded]]:
+    """What loads each recording in a path, by name; it returns the reader's findings, too (of a file's raw clock, say).
+
+    Raises WearcapError when there is nothing to examine.
+    """
+    if not path.exists() and (path.parent / "manifest.json").is_file():
+        store = RecordingStore.open(path.parent)
+        store.require(path.name)
+        return {path.name: partial(_read_stored, store, path.name)}
+    if not path.exists():
+        raise WearcapError("no such file or folder", where=path)
+    if path.is_file():
+        if _kind(path) is None:
+            raise WearcapError("a kind of file that the doctor does not know", where=path, expected=", ".join(_READERS))
+        return {path.name: partial(_read_file, path)}
+    if (path / "manifest.json").is_file():
+        store = RecordingStore.open(path)
+        return {name: partial(_read_stored, store, name) for name in store.names()}
+    for is_kind, read in _FOLDERS:
+        if is_kind(path):
+            return {path.resolve().name: partial(read, path)}
+    if is_hps(path):
+        return {name: partial(_read_hps, path, name) for name in hps_names(path)}
+    files = [file for file in sorted(path.rglob("*")) if file.is_file() and _kind(file) in _MOTIONS]
+    if not files:
+        raise WearcapError(
+            "nothing to examine here",
+            where=path,
+            expected=f"a data set (manifest.json), an MPS, Nymeria, ADT or HPS folder, a scene (pointcloud.ply, photos.json), an environment (environment.json), or files like {', '.join(_MOTIONS)}",
+        )
+    return {file.relative_to(path).as_posix(): partial(_read_file, file) for file in files}
+
+
+def _kind(path: Path) -> str | None:
+    """Suffix that determines a file's format, without compression."""
+    suffixes = [suffix.lower() for suffix in path.suffixes if suffix.lower() not in (".gz", ".xz")]
+    return suffixes[-1] if suffixes and suffixes[-1] in _READERS else None
+
+
+def _read_file(path: Path) -> Loaded:
+    content = _READERS[_kind(path) or ""](path)
+    name = path.name
+    if isinstance(content, tuple):
+        return content
+    if isinstance(content, Recording):
+        return content, []
+    if isinstance(content, Motion):
+        return Recording(name=name, motion=content, skeleton=content.skeleton), []
+    if isinstance(content, Trajectory):
+        head = HeadStream(content.timestamps, content.R_world_body, content.t_world_body, torch.eye(3), torch.zeros(3))
+        evidence, fix = "a trajectory file does not name its axes", "x forward, y left, z up is assumed."
+        return Recording(name=name, head=head), [
+            Check("head: axes").note("taken as the head's own pose", evidence, fix)
+        ]
+    return Recording(name=name, points=PointCloud(torch.from_numpy(content.points))), []
+
+
+def _read_stored(store: RecordingStore, name: str) -> Loaded:
+    """A recording of a data set, with its bytes rehashed."""
+    store.verify_one(name)
+    recording = store.load(name)
+    return recording, check_files(recording, store.root)
+
+
+def _read_hps(root: Path, name: str) -> Loaded:
+    recording = read_hps_sequence(root, name)
+    return recording, check_files(recording, root)
+
+
+def _read_mps(folder: Path) -> Loaded:
+    """An MPS folder at 60 Hz, with findings about the raw file's clock, its quality score and the service's own report."""
+    path = find_mps_file(folder, ("closed_loop_trajectory.csv",))
+    assert path is not None, "is_mps_folder has seen it"
+    track, scores = read_closed_loop(path)
+    findings = check_clock("closed-loop file", track.timestamps)
+    quality = scores.median().item()
+    low = (scores < 0.5).float().mean().item()
+    check, evidence = Check("closed-loop file: quality"), f"median score {quality:.2f}, {100 * low:.0f} % below 0.5"
+    if low > 0.1:
+        findings.append(check.warning("MPS trusts its poses little", evidence))
+    else:
+        findings.append(check.ok("MPS trusts its poses", evidence))
+    findings.append(Check("closed-loop file: gravity").ok("points along -z", "9.81 m/s²"))
+    recording = read_mps(folder)
+    check, path = Check("MPS summary"), find_mps_file(folder, ("summary.json",))
+    if path is None:
+        return recording, findings
+    try:
+        parts = read_json_object(path)
+    except WearcapError as error:
+        return recording, [*findings, check.warning("cannot be read", str(error))]
+    states = {name: part.get("status", "SUCCESS") for name, part in parts.items() if isinstance(part, dict)}
+    failed = [name for name, state in states.items() if state != "SUCCESS"]
+    if failed:
+        return recording, [*findings, check.error("MPS reports failures", ", ".join(failed), "Request MPS again.")]
+    services = ", ".join(name for name in parts if name != "version")
+    return recording, [*findings, check.ok("MPS reports success", services)]
+
+
+def _read_amc(path: Path) -> Motion:
+    """An AMC file with the ASF beside it: the only one, or the one whose name it begins with."""
+    beside = sorted(file for file in path.parent.iterdir() if ".asf" in file.suffixes)
+    stem = path.name.split(".")[0]
+    named = [file for file in beside if stem.startswith(file.name.split(".")[0])]
+    if not (named or len(beside) == 1):
+        raise WearcapError("no skeleton for this motion", where=path, expected="an .asf file beside it")
+    return read_amc(read_asf((named or beside)[-1]), path)
+
+
+def _read_csv(path: Path) -> Recording | Trajectory:
+    if "closed_loop" in path.name or "aria_trajectory" in path.name:
+        track = read_closed_loop(path, up="y" if "aria_trajectory" in path.name else "z")[0]
+        return Recording(name=path.name, head=head_stream(track, fps=None), source="Aria MPS")
+    return read_euroc(path)
+
+
+def _read_npz(path: Path) -> Recording | Motion:
+    """A wearcap motion, Nymeria's suit data, or an AMASS file, recognised by its arrays."""
+    if path.name == "xdata.npz":
+        return read_xdata(path)[0]
+    return read_motion(path) if read_npz(path, ("wearcap",)) else read_amass(path)
+
+
+_FOLDERS: tuple[tuple[Callable[[Path], bool], Callable[[Path], Loaded]], ...] = (
+    (is_nymeria, lambda folder: (read_nymeria(folder), [])),
+    (is_mps_folder, _read_mps),
+    (is_adt, lambda folder: (read_adt(folder), [])),
+    (is_place, read_place),
+)
+_MOTIONS = {".amc": _read_amc, ".bvh": read_bvh, ".mvnx": read_mvnx, ".npz": _read_npz}
+_READERS: dict[str, Callable] = {
+    **_MOTIONS,
+    ".safetensors": lambda path: read_map(path) if is_map(path) else RecordingFile(path).load(),
+    ".csv": _read_csv,
+    ".txt": read_tum,
+    ".tum": read_tum,
+    ".ply": read_ply,
+    ".pcd": read_pcd,
+    ".json": read_environment_file,
+}

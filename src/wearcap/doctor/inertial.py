@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from wearcap.doctor.report import Check, Finding, has_error
-from wearcap.doctor.signals import acceleration_of, lag_between, quantile, spin_of
-from wearcap.doctor.streams import check_rotations
+from wearcap.doctor.streams import acceleration_of, check_rotations, lag_between, quantile, spin_of
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory, interpolate, resample
 from wearcap.recording import ImuStream
@@ -111,8 +110,24 @@ def _against_motion(stream: str, imu: ImuStream, joint: Trajectory) -> list[Find
         findings += check_offset(f"{stream}: clock offset", lag)
     at = resample(joint, imu.timestamps[inside])
     if imu.R_world_imu is not None:
-        R = imu.R_world_imu[inside].double(), at.R_world_body.double()
-        findings.append(_mounting(Check(f"{stream}: mounting"), imu, *R))
+        check, R_world_imu = Check(f"{stream}: mounting"), imu.R_world_imu[inside].double()
+        R_world_joint = at.R_world_body.double()
+        mean, spread = _spread_deg(R_world_joint.mT @ R_world_imu)
+        evidence, off = f"90 % of the time within {spread:.1f}° of a constant mounting", 0.0
+        if imu.R_joint_imu is not None:
+            off = math.degrees(rotation.geodesic(mean, imu.R_joint_imu.double()).item())
+        if spread > 25:
+            fix = "Check the joint it is named for, quaternion order, heading drift, clock."
+            if _spread_deg(R_world_joint @ R_world_imu)[1] < 15:
+                fix = "Its orientation is inverted: use the sensor's pose in the world."
+            findings.append(check.error("the sensor does not ride on its joint", evidence, fix))
+        elif off > 15:
+            evidence += f"; {off:.0f}° from R_joint_imu"
+            findings.append(check.warning("differs from the stated mounting", evidence, "Calibrate again."))
+        elif spread > 12:
+            findings.append(check.warning("drifts against its joint", evidence, "Heading drift or a loose strap."))
+        else:
+            findings.append(check.ok("constant", evidence))
     if imu.acc_world is not None:
         acc_world = imu.acc_world[inside].double()
         findings.append(_acceleration(Check(f"{stream}: acceleration"), acc_world, joint, imu.timestamps[inside]))
@@ -133,24 +148,6 @@ def check_offset(name: str, lag: tuple[float, float, float] | None, who: str = "
         what, fix = f"{who} is {'late' if seconds > 0 else 'early'}", f"Add {-seconds:+.3f} s to its timestamps."
         return [check.found(severity, what, evidence, fix)]
     return [check.ok("in time with the motion", evidence)]
-
-
-def _mounting(check: Check, imu: ImuStream, R_world_imu: Tensor, R_world_joint: Tensor) -> Finding:
-    mean, spread = _spread_deg(R_world_joint.mT @ R_world_imu)
-    evidence = f"90 % of the time within {spread:.1f}° of a constant mounting"
-    if spread > 25:
-        fix = "Check the joint it is named for, quaternion order, heading drift, clock."
-        if _spread_deg(R_world_joint @ R_world_imu)[1] < 15:
-            fix = "Its orientation is inverted: use the sensor's pose in the world."
-        return check.error("the sensor does not ride on its joint", evidence, fix)
-    if imu.R_joint_imu is not None:
-        off = math.degrees(rotation.geodesic(mean, imu.R_joint_imu.double()).item())
-        if off > 15:
-            evidence += f"; {off:.0f}° from R_joint_imu"
-            return check.warning("differs from the stated mounting", evidence, "Calibrate again.")
-    if spread > 12:
-        return check.warning("drifts against its joint", evidence, "Heading drift or a loose strap.")
-    return check.ok("constant", evidence)
 
 
 def _spread_deg(R: Tensor) -> tuple[Tensor, float]:

@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import safetensors
 import torch
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32
 
 from wearcap.doctor.report import Check, Finding, refusal
 from wearcap.errors import WearcapError
+from wearcap.geometry.triangle_distance import TriangleIndex
 from wearcap.io.datasets.hps import CLOUD, is_hps_scene, read_hps_scene
 from wearcap.io.formats.camera_json import PHOTOS_FILE as PHOTOS
 from wearcap.io.formats.camera_json import read_photos
@@ -19,10 +20,9 @@ from wearcap.io.formats.scene_folder import read_scan
 from wearcap.io.formats.video import open_image
 from wearcap.localization.visual_map import VisualMap
 from wearcap.recording import PointCloud, Recording
-from wearcap.recording.photo import Photo
-from wearcap.scene.environment import Environment, box_in_world, hinge_gap_m, surface_index
-from wearcap.scene.objects import SceneObject
-from wearcap.scene.scan import Scan
+from wearcap.scene.environment import Environment
+from wearcap.scene.objects import FREEDOMS, SceneObject
+from wearcap.scene.scan import Photo, Scan
 
 SPARSE_M = 0.03
 """Spacing (m) beyond which pictures rendered from a scan have holes at arm's length."""
@@ -42,12 +42,6 @@ _MARGIN_M = 1.0
 """Largest distance (m) of photos from the scan's bounding box."""
 _POINTS = 50_000
 """Number of points of the scan that are projected into photos."""
-_MOVES = {
-    "plane": "slides on the floor",
-    "free": "is carried",
-    "axis": "slides along an axis",
-    "hinge": "turns about a hinge",
-}
 
 
 def is_place(folder: Path) -> bool:
@@ -199,12 +193,12 @@ def _thinned(points: Float32[np.ndarray, "point 3"]) -> Float32[np.ndarray, "cho
 def read_environment_file(path: Path) -> tuple[Recording, list[Finding]]:
     """All findings about an environment.json, including errors of reading it."""
     try:
-        return Recording(path.name), check_environment(read_environment(path))
+        return Recording(path.name), _check_environment(read_environment(path))
     except WearcapError as error:
         return Recording(path.name), [refusal(error, "environment")]
 
 
-def check_environment(environment: Environment) -> list[Finding]:
+def _check_environment(environment: Environment) -> list[Finding]:
     """One finding per object with its category, position and degrees of freedom, then likely problems."""
     check, objects = Check("environment"), environment.objects
     if not objects:
@@ -213,39 +207,35 @@ def check_environment(environment: Environment) -> list[Finding]:
     counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in sorted(set(kinds)))
     findings = [check.ok(f"{len(objects)} objects", counts)]
     for item in objects:
-        moves = _MOVES[item.freedom.kind]
+        moves = FREEDOMS[item.freedom.kind]
         if item.freedom.limits is not None:
             low, high = item.freedom.limits
             degrees = f"{math.degrees(low):.0f}° to {math.degrees(high):.0f}°"
             moves += f", {degrees if item.freedom.kind == 'hinge' else f'{low:.2f} to {high:.2f} m'}"
-        size = " x ".join(f"{side:.2f}" for side in np.ptp(box_in_world(item), axis=0))
+        size = " x ".join(f"{side:.2f}" for side in np.ptp(item.box_world, axis=0))
         at = ", ".join(f"{v:.2f}" for v in item.t_world_object.tolist())
         triangles = len(item.mesh.faces)
         shape = f"{triangles} triangles" if triangles else f"a cloud of {len(item.mesh.vertices)} points"
         check = Check(f"object {item.name}")
         findings.append(check.ok(f"{item.category or 'object'}: {moves}", f"{size} m, {shape}, at ({at}) m"))
     for item in objects:
-        findings += _check_size(item) + _check_freedom(item)
+        check, longest = Check(f"object {item.name}: size"), float(np.ptp(item.box_world, axis=0).max())
+        if longest < TINY_M:
+            fix = "Is it in another unit? Meshes are in metres."
+            findings.append(check.warning("the mesh is tiny", f"{100 * longest:.2g} cm at most", fix))
+        elif longest > HUGE_M:
+            fix = "Is it in millimetres, or the whole scan?"
+            findings.append(check.warning("the mesh is larger than an object", f"{longest:.3g} m", fix))
+        findings += _check_freedom(item)
     return findings + _check_floor(objects) + _check_overlaps(objects)
-
-
-def _check_size(item: SceneObject) -> list[Finding]:
-    check, longest = Check(f"object {item.name}: size"), float(np.ptp(box_in_world(item), axis=0).max())
-    if longest < TINY_M:
-        fix = "Is it in another unit? Meshes are in metres."
-        return [check.warning("the mesh is tiny", f"{100 * longest:.2g} cm at most", fix)]
-    if longest > HUGE_M:
-        fix = "Is it in millimetres, or the whole scan?"
-        return [check.warning("the mesh is larger than an object", f"{longest:.3g} m", fix)]
-    return []
 
 
 def _check_freedom(item: SceneObject) -> list[Finding]:
     """The hinge is at an edge of the mesh, and limits are set."""
     check, found = Check(f"object {item.name}: freedom"), []
     if item.freedom.pivot is not None:
-        gap = hinge_gap_m(item)
-        low, high = box_in_world(item)[:, :2]
+        gap = item.hinge_gap_m
+        low, high = item.box_world[:, :2]
         side = int((high - low).argmax())
         along = (item.freedom.pivot[side] - low[side]) / max(high[side] - low[side], 1e-9)
         if gap > HINGE_GAP_M:
@@ -262,7 +252,7 @@ def _check_freedom(item: SceneObject) -> list[Finding]:
 
 def _check_floor(objects: tuple[SceneObject, ...]) -> list[Finding]:
     """Sliding objects stand on one floor, and nothing is below it."""
-    lowest = {item.name: float(box_in_world(item)[0, 2]) for item in objects}
+    lowest = {item.name: float(item.box_world[0, 2]) for item in objects}
     standing = [lowest[item.name] for item in objects if item.freedom.kind == "plane"]
     if not standing:
         return []
@@ -282,7 +272,7 @@ def _check_floor(objects: tuple[SceneObject, ...]) -> list[Finding]:
 
 def _check_overlaps(objects: tuple[SceneObject, ...]) -> list[Finding]:
     """Pairs of objects with overlapping surfaces, or with one inside the other's bounding box."""
-    boxes = np.array([box_in_world(item) for item in objects])
+    boxes = np.array([item.box_world for item in objects])
     low, high = boxes[:, 0], boxes[:, 1]
     shared = np.maximum(
         np.minimum(high[:, None], high[None]) - np.maximum(low[:, None], low[None]) + SAME_SURFACE_M, 0
@@ -293,9 +283,20 @@ def _check_overlaps(objects: tuple[SceneObject, ...]) -> list[Finding]:
         inner, outer = (objects[k] for k in ((a, b) if volume[a] <= volume[b] else (b, a)))
         check = Check(f"objects {inner.name} and {outer.name}")
         # The share of the inner object's surface that coincides with the outer's.
-        points = _surface(inner) @ inner.R_world_object.double().numpy().T + inner.t_world_object.double().numpy()
+        rng = np.random.default_rng(0)
+        vertices, faces = inner.mesh.vertices.astype(np.float64), inner.mesh.faces
+        if len(faces):
+            first, second, third = (vertices[faces[:, corner]] for corner in range(3))
+            area = np.linalg.norm(np.cross(second - first, third - first), axis=1) + 1e-12
+            face = rng.choice(len(faces), _SAMPLES, p=area / area.sum())
+            u, v = rng.random((2, _SAMPLES, 1))
+            u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+            sample = first[face] + u * (second - first)[face] + v * (third - first)[face]
+        else:
+            sample = vertices[:: len(vertices) // _SAMPLES + 1]
+        points = sample @ inner.R_world_object.double().numpy().T + inner.t_world_object.double().numpy()
         local = (points - outer.t_world_object.double().numpy()) @ outer.R_world_object.double().numpy()
-        distance, _ = surface_index(outer.mesh).nearest(np.ascontiguousarray(local))
+        distance, _ = TriangleIndex.of(outer.mesh).nearest(np.ascontiguousarray(local))
         same = float((distance < SAME_SURFACE_M).mean())
         inside = float(shared[a, b] / min(volume[a], volume[b]))
         if same > _SAME_SHARE:
@@ -307,17 +308,3 @@ def _check_overlaps(objects: tuple[SceneObject, ...]) -> list[Finding]:
             fix = "A chair under a table does; a sofa in a wardrobe does not."
             found.append(check.note("the first stands within the second's box", evidence, fix))
     return found
-
-
-def _surface(item: SceneObject) -> Float64[np.ndarray, "sample 3"]:
-    """Points sampled on an object's surface (a cloud's own points), in its axes."""
-    rng = np.random.default_rng(0)
-    vertices, faces = item.mesh.vertices.astype(np.float64), item.mesh.faces
-    if not len(faces):
-        return vertices[:: len(vertices) // _SAMPLES + 1]
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) + 1e-12
-    face = rng.choice(len(faces), _SAMPLES, p=area / area.sum())
-    u, v = rng.random((2, _SAMPLES, 1))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    return a[face] + u * (b - a)[face] + v * (c - a)[face]

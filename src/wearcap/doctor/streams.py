@@ -2,14 +2,74 @@
 
 import math
 
+import numpy as np
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.doctor.report import Check, Finding, has_error
-from wearcap.doctor.signals import quantile
 from wearcap.geometry import rotation
-from wearcap.geometry.trajectory import Trajectory, linear_velocity
+from wearcap.geometry.trajectory import Trajectory, interpolate, linear_velocity
+from wearcap.io.devices.head_alignment import best_shift, correlate_shifts
+from wearcap.sensors.imu import acceleration
+
+LAG_RATE_HZ = 200.0
+
+
+def quantile(value: Float[Tensor, "*any"], q: float) -> float:
+    """Quantile of all entries (0 if empty); long signals are subsampled to a million entries."""
+    flat = value.flatten().double()
+    return torch.quantile(flat[:: len(flat) // 1_000_000 + 1], q).item() if len(flat) else 0.0
+
+
+def spin_of(track: Trajectory) -> Float[Tensor, "time 3"]:
+    """Angular velocity (rad/s) in the body's own axes, by central differences over two frames."""
+    R, times = track.R_world_body.double(), track.timestamps
+    if len(R) < 3:
+        return torch.zeros(len(R), 3, dtype=torch.float64)
+    turn = rotation.log(R[:-2].mT @ R[2:]) / (times[2:] - times[:-2])[:, None]
+    return torch.cat([turn[:1], turn, turn[-1:]])
+
+
+def acceleration_of(track: Trajectory) -> Float[Tensor, "time 3"]:
+    """Acceleration (m/s²) in the world, as synthetic IMUs have it: MocapEvery eq. 8 over the span of 4 frames at 60 Hz."""
+    if len(track) < 2:
+        return torch.zeros(len(track), 3, dtype=torch.float64)
+    fps = 1 / track.timestamps.diff().median().item()
+    return acceleration(track.t_world_body.double(), fps, max(1, round(fps / 15)))
+
+
+def lag_between(
+    reference_times: Float64[Tensor, "time"],
+    reference: Float[Tensor, "time"],
+    other_times: Float64[Tensor, "sample"],
+    other: Float[Tensor, "sample"],
+    max_lag_s: float = 1.0,
+) -> tuple[float, float, float] | None:
+    """(lag in s, correlation at that lag, correlation without a shift) between two signals of the same quantity.
+
+    A positive lag means that `other` is late. None if the streams share less than 4 s or a signal is constant.
+    """
+    start = max(reference_times[0].item(), other_times[0].item())
+    stop = min(reference_times[-1].item(), other_times[-1].item())
+    if stop - start < 4.0:
+        return None
+    grid = torch.arange(start, stop, 1 / LAG_RATE_HZ, dtype=torch.float64)[: int(600 * LAG_RATE_HZ)]
+    a, b = (interpolate(reference_times, reference.double(), grid), interpolate(other_times, other.double(), grid))
+    if a.std() < 1e-6 or b.std() < 1e-6:
+        return None
+    shifts, score = correlate_shifts(a.numpy(), b.numpy(), 0.7)
+    near = abs(shifts) <= max_lag_s * LAG_RATE_HZ
+    shifts, score = shifts[near], score[near]
+    # Walking is periodic: among peaks as good as the highest, the smallest shift is taken.
+    rising = np.diff(score, prepend=-np.inf) > 0
+    falling = np.diff(score, append=-np.inf) <= 0
+    peaks = (rising & falling & (score >= score.max() - 0.02)).nonzero()[0]
+    peak = int(peaks[abs(shifts[peaks]).argmin()])
+    beside = slice(max(peak - 1, 0), peak + 2)
+    shift, best = best_shift(shifts[beside], score[beside])
+    return shift / LAG_RATE_HZ, best, float(score[shifts == 0][0])
+
 
 FASTEST_M_S = 12.0
 """Highest running speed (m/s); a faster frame is a jump, a faster recording is in the wrong unit."""
@@ -80,7 +140,32 @@ def check_track(stream: str, track: Trajectory) -> list[Finding]:
     if any("NaN" in f.what or "no rotations" in f.what for f in findings):
         return findings
     findings.append(_check_upright(stream, track))
-    return findings if has_error(findings) else [*findings, *_check_facing(stream, track)]
+    if has_error(findings):
+        return findings
+    # Whether the body's x axis points where it walks; only while it walks.
+    check = Check(f"{stream}: forward axis")
+    velocity = linear_velocity(track).double()[:, :2]
+    walking = (velocity.norm(dim=-1) > 0.5) & (velocity.norm(dim=-1) < FASTEST_M_S)
+    walked_s = walking.double().mean().item() * (track.timestamps[-1] - track.timestamps[0]).item()
+    if walked_s < 3:
+        return findings
+    R = track.R_world_body.double()
+    course = torch.atan2(velocity[:, 1], velocity[:, 0])[walking]
+    offset, strength = _mean_angle(rotation.yaw_of(R)[walking] - course)
+    evidence = f"x axis {math.degrees(offset):+.0f}° off the walking direction (agreement {strength:.2f}, {walked_s:.0f} s of walking)"
+    if abs(offset) < math.radians(60) and strength > 0.5:
+        return [*findings, check.ok("x is forward", evidence)]
+    inverse_offset, inverse_strength = _mean_angle(rotation.yaw_of(R.mT)[walking] - course)
+    if inverse_strength > max(0.8, strength) and abs(inverse_offset) < math.radians(45):
+        evidence += f"; transposed they fit ({inverse_strength:.2f})"
+        fix = "Store the pose of the body in the world (R_world_body), not its inverse."
+        return [*findings, check.error("rotations are inverted", evidence, fix)]
+    if strength < 0.5:
+        fix = "The wearer may walk sideways or look around."
+        return [*findings, check.note("facing and walking direction hardly agree", evidence, fix)]
+    severity = "warning" if walked_s < 15 or abs(offset) < math.radians(75) else "error"
+    fix = f"Turn the body's axes by {-math.degrees(offset):+.0f}° about z, if the wearer did walk ahead."
+    return [*findings, check.found(severity, "x does not point forward", evidence, fix)]
 
 
 def check_rotations(stream: str, R: Float[Tensor, "*batch 3 3"]) -> list[Finding]:
@@ -162,33 +247,6 @@ def _check_upright(stream: str, track: Trajectory) -> Finding:
         return check.error(f"the body's {name} axis points up, not z", f"{evidence}; its {name} axis does", fix)
     fix = "Check axes and quaternion order; lying and crawling look like this too."
     return check.found("error" if up_world[2] < 0.3 else "warning", "is not upright", evidence, fix)
-
-
-def _check_facing(stream: str, track: Trajectory) -> list[Finding]:
-    """Whether the body's x axis points where it walks; only while it walks."""
-    check = Check(f"{stream}: forward axis")
-    velocity = linear_velocity(track).double()[:, :2]
-    walking = (velocity.norm(dim=-1) > 0.5) & (velocity.norm(dim=-1) < FASTEST_M_S)
-    walked_s = walking.double().mean().item() * (track.timestamps[-1] - track.timestamps[0]).item()
-    if walked_s < 3:
-        return []
-    R = track.R_world_body.double()
-    course = torch.atan2(velocity[:, 1], velocity[:, 0])[walking]
-    offset, strength = _mean_angle(rotation.yaw_of(R)[walking] - course)
-    evidence = f"x axis {math.degrees(offset):+.0f}° off the walking direction (agreement {strength:.2f}, {walked_s:.0f} s of walking)"
-    if abs(offset) < math.radians(60) and strength > 0.5:
-        return [check.ok("x is forward", evidence)]
-    inverse_offset, inverse_strength = _mean_angle(rotation.yaw_of(R.mT)[walking] - course)
-    if inverse_strength > max(0.8, strength) and abs(inverse_offset) < math.radians(45):
-        evidence += f"; transposed they fit ({inverse_strength:.2f})"
-        fix = "Store the pose of the body in the world (R_world_body), not its inverse."
-        return [check.error("rotations are inverted", evidence, fix)]
-    if strength < 0.5:
-        fix = "The wearer may walk sideways or look around."
-        return [check.note("facing and walking direction hardly agree", evidence, fix)]
-    severity = "warning" if walked_s < 15 or abs(offset) < math.radians(75) else "error"
-    fix = f"Turn the body's axes by {-math.degrees(offset):+.0f}° about z, if the wearer did walk ahead."
-    return [check.found(severity, "x does not point forward", evidence, fix)]
 
 
 def _mean_angle(angle: Tensor) -> tuple[float, float]:

@@ -119,7 +119,14 @@ class Camera:
         plane = target
         if self.model != "pinhole":
             with torch.no_grad():
-                root, found = self._invert_lens(target.detach())
+                limit, root = min(0.999 * math.sqrt(self.lens_terms.fold), 1e3), target.detach()
+                for _ in range(25):
+                    root = root * (limit / root.norm(dim=-1, keepdim=True).clamp(min=limit))
+                    value, jacobian = self._lens(root)
+                    root = root - torch.linalg.solve_ex(jacobian, value - target)[0]
+                close = ((self._lens(root)[0] - target).abs() < 1e4 * torch.finfo(target.dtype).eps).all(-1)
+                found = close & ((root**2).sum(-1) < self.lens_terms.fold)
+                root = torch.where(found[..., None], root, torch.zeros_like(root))
                 step = torch.linalg.inv(self._lens(root)[1])
                 rest = self._lens(root)[0]
             plane = root + (step @ (target - rest)[..., None])[..., 0]
@@ -170,19 +177,6 @@ class Camera:
         return _LensTerms(
             radial, tangential, prism, affine, min([math.pi**2 if self.is_fisheye else math.inf, *rising])
         )
-
-    def _invert_lens(self, target: Float[Tensor, "*batch 2"]) -> tuple[Tensor, Tensor]:
-        """Plane coordinates that the lens maps to `target`, and a mask of convergence."""
-        limit = min(0.999 * math.sqrt(self.lens_terms.fold), 1e3)
-        plane = target
-        for _ in range(25):
-            plane = plane * (limit / plane.norm(dim=-1, keepdim=True).clamp(min=limit))
-            value, jacobian = self._lens(plane)
-            plane = plane - torch.linalg.solve_ex(jacobian, value - target)[0]
-        tolerance = 1e4 * torch.finfo(target.dtype).eps
-        close = ((self._lens(plane)[0] - target).abs() < tolerance).all(-1)
-        found = close & ((plane**2).sum(-1) < self.lens_terms.fold)
-        return torch.where(found[..., None], plane, torch.zeros_like(plane)), found
 
 
 def _radial(m: Tensor, coefficients: tuple[float, ...], of_square: bool) -> tuple[Tensor, Tensor]:

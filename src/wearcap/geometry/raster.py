@@ -121,7 +121,7 @@ _BULGE = 4.0
 
 
 @compiled
-def project_point(x, y, z, lens):
+def _project_point(x, y, z, lens):
     """Pixel of a point in camera axes, and its nearness: 1/z, for fisheyes 1/distance; 0 if not visible.
 
     `lens` is laid out as in `geometry.render.lens_numbers`. Pixels may be outside the image.
@@ -223,7 +223,7 @@ def draw_splats(blocks, pose, planes, lens, radius, metric, offset, nearness, in
             x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
             y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
             z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
-            u, v, w = project_point(x, y, z, lens)
+            u, v, w = _project_point(x, y, z, lens)
             if w > 0 and -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5:
                 _disc(u, v, radius * focal * w if metric else radius, w, bulge, offset + number, nearness, index)
     return projected

@@ -135,7 +135,7 @@ def _empty_buffers(camera: Camera) -> tuple[Float32[np.ndarray, "height width"],
     return np.full(size, -np.inf, np.float32), np.full(size, -1, np.int32)
 
 
-def orthographic_map(
+def _orthographic_map(
     meshes: Sequence[Mesh],
     to_viewer: tuple[float, float, float],
     center: tuple[float, float, float],
@@ -202,9 +202,9 @@ def _shadow_maps(scene: raster.Triangles, light: Light) -> raster.Shadows:
         return raster.Shadows()
     casters = [Mesh(scene.vertices.astype(np.float32), scene.faces[scene.casts], np.ones(3, np.float32))]
     where = (light.shadow_center, light.shadow_radius, _MAP_SIZE)
-    nearest, key_axes = orthographic_map(casters, light.to_light, *where)
+    nearest, key_axes = _orthographic_map(casters, light.to_light, *where)
     nearest = np.maximum(nearest, np.float32(-1e6))
-    below, down_axes = orthographic_map(casters, (0.0, 0.0, -1.0), *where)
+    below, down_axes = _orthographic_map(casters, (0.0, 0.0, -1.0), *where)
     return raster.Shadows(
         np.concatenate([key_axes, down_axes]),
         _MAP_SIZE / (2 * light.shadow_radius),
@@ -258,7 +258,7 @@ class SplatCloud:
         nearness, index = _empty_buffers(camera)
         pose = _camera_from_world(T_world_cam)
         blocks = self.points, self.first, self.centers, self.radii + radius_m
-        lens, planes = lens_numbers(camera), view_planes(camera)
+        lens, planes = lens_numbers(camera), _view_planes(camera)
         raster.draw_splats(blocks, pose, planes, lens, radius_m, True, 0, nearness, index)
         depth = _point_depths(self.points, index, pose, camera.is_fisheye)
         seen = index >= 0
@@ -301,7 +301,7 @@ def lens_numbers(camera: Camera) -> Float64[np.ndarray, "number"]:
 
 
 @lru_cache(maxsize=64)
-def view_planes(camera: Camera) -> Float64[np.ndarray, "plane 3"]:
+def _view_planes(camera: Camera) -> Float64[np.ndarray, "plane 3"]:
     """Inward normals of planes through the camera's centre that have its whole picture on their inner side.
 
     None for cameras that see more than a half-space: their pictures have no such planes.

@@ -171,16 +171,11 @@ def outlier_mask(trajectory: Trajectory, max_speed: float) -> Bool[Tensor, "time
         kept = kept[~dropped[piece]]
     valid = torch.zeros_like(finite)
     valid[kept] = True
-    valid[_agreeing(position, time, valid, finite & ~valid, max_speed)] = True
-    return valid
-
-
-def _agreeing(position: Tensor, time: Tensor, valid: Tensor, candidate: Tensor, max_speed: float) -> Tensor:
-    """Candidates, from first to last, that are near enough to the next valid frame and to the previous one, which
-    may be a candidate that was just accepted."""
-    kept, frame = valid.nonzero()[:, 0], candidate.nonzero()[:, 0]
     if not len(kept):
-        return frame[:0]
+        return valid
+    # Candidates, from first to last, must be near enough to the next valid frame and to the previous one, which may be
+    # a candidate that was just accepted.
+    frame = (finite & ~valid).nonzero()[:, 0]
     stretch = torch.searchsorted(kept, frame)
     following = kept[stretch.clamp(max=len(kept) - 1)]
     distance = (position[frame] - position[following]).norm(dim=-1)
@@ -194,7 +189,8 @@ def _agreeing(position: Tensor, time: Tensor, valid: Tensor, candidate: Tensor, 
         if last < 0 or math.dist(p[now], p[last]) <= max_speed * (t[now] - t[last]):
             taken.append(now)
             last = now
-    return torch.tensor(taken, dtype=torch.int64, device=position.device)
+    valid[torch.tensor(taken, dtype=torch.int64, device=position.device)] = True
+    return valid
 
 
 def filled(trajectory: Trajectory, valid: Bool[Tensor, "time"]) -> Trajectory:

@@ -9,6 +9,7 @@ from jaxtyping import Float64, Int64
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.compiled import compiled
+from wearcap.geometry.mesh import Mesh
 
 _LEAF = 4
 """Faces in a leaf of the tree."""
@@ -46,6 +47,14 @@ class TriangleIndex:
         order = np.arange(len(faces))
         used = _build(corners.mean(1), corners.min(1), corners.max(1), order, low, high, span)
         return cls(_Tree(np.ascontiguousarray(corners[order]), low[:used], high[:used], span[:used]), order)
+
+    @classmethod
+    def of(cls, mesh: Mesh) -> "TriangleIndex":
+        """Index of a mesh's triangles; a cloud's points are triangles without extent. Raises WearcapError for NaN."""
+        faces = mesh.faces.astype(np.int64)
+        if not len(faces):
+            faces = np.repeat(np.arange(len(mesh.vertices))[:, None], 3, axis=1)
+        return cls.build(mesh.vertices.astype(np.float64), faces)
 
     def nearest(
         self, queries: Float64[np.ndarray, "query 3"]

@@ -19,8 +19,7 @@ from wearcap.io.formats.video import read_image
 from wearcap.localization.features import Extractor, Features, GlobalDescriptor, Vlad
 from wearcap.localization.point_map import PointMapper, described, undistortion
 from wearcap.localization.visual_map import Observations, VisualMap, from_bytes, merge, to_bytes
-from wearcap.recording.photo import Photo
-from wearcap.scene.scan import Scan
+from wearcap.scene.scan import Photo, Scan
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,7 @@ Open `engine.py` first. Sources: `worn.py` (worn sensors), `mocap_sources.py` (m
 object), `simulated.py`; `embeddings.py` and `keypoints.py` add to a data set. `conf/prepare/` names what `wearcap prepare` runs.
 """
 
-from wearcap.prepare.check import check_recording
-from wearcap.prepare.engine import Report, Task, content_hash, prepare
-from wearcap.prepare.splits import Splits, read_splits
+from wearcap.prepare.engine import Report, Task, check_recording, content_hash, prepare
+from wearcap.prepare.splits import Splits
 
-__all__ = ["Report", "Splits", "Task", "check_recording", "content_hash", "prepare", "read_splits"]
+__all__ = ["Report", "Splits", "Task", "check_recording", "content_hash", "prepare"]

@@ -12,10 +12,9 @@ from wearcap.errors import WearcapError
 from wearcap.files import remove_leftovers
 from wearcap.locks import folder_lock
 from wearcap.models.image_encoder import ImageEncoder
-from wearcap.prepare.check import check_recording
-from wearcap.prepare.engine import REGISTER_EVERY_S, Report, progress_bar
+from wearcap.prepare.engine import REGISTER_EVERY_S, Report, check_recording, progress_bar
 from wearcap.recording.recording import CameraStream
-from wearcap.recording.store import Entry, RecordingFile, RecordingStore, entry_for, save_recording
+from wearcap.recording.store import Entry, RecordingFile, RecordingStore, save_recording
 
 
 def embed_dataset(
@@ -91,4 +90,4 @@ def _embed(
     )
     check_recording(recording)
     save_recording(recording, store.path_of(name))
-    return entry_for(recording, store.root, entry.split, entry.config_hash)
+    return Entry.of(recording, store.root, entry.split, entry.config_hash)

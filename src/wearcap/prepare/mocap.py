@@ -89,7 +89,7 @@ def mocap_recording(motion: Motion, about: About, settings: MocapSettings) -> Re
     times = motion.timestamps
     return Recording(
         about.name,
-        head=nominal_head(motion, settings.t_head_device),
+        head=_nominal_head(motion, settings.t_head_device),
         motion=motion,
         contacts=ContactTrack(times, FOOT_PATCHES, contact),
         floor=FloorTrack(times, torch.zeros(len(times))) if level else None,
@@ -110,7 +110,7 @@ def on_xsens23(motion: Motion) -> Motion:
     return replace(motion, skeleton=skeleton, R_parent_joint=R, t_world_root=t)
 
 
-def nominal_head(motion: Motion, t_head_device: Sequence[float]) -> HeadStream:
+def _nominal_head(motion: Motion, t_head_device: Sequence[float]) -> HeadStream:
     """The path of a device fixed to the head joint, its axes parallel to the head's."""
     head = motion.joint("head")
     t = torch.tensor(list(t_head_device))

@@ -44,7 +44,7 @@ class BvhSettings:
     forward: str
 
 
-def cmu_recording(
+def _cmu_recording(
     file: Path,
     asf: Path | None,
     about: About,
@@ -114,7 +114,18 @@ def cmu_tasks(
     if index.is_file():
         with open(index, newline="", encoding="utf-8") as file:
             activities = {row["trial"]: row.get("category") for row in csv.DictReader(file) if row.get("trial")}
-    trials = _trials(source)
+    trials: dict[str, tuple[Path, Path | None]] = {}  # motion file, and skeleton file of an AMC
+    for path in sorted(p for p in source.rglob("*") if p.name.lower().endswith(MOTION_SUFFIXES)):
+        name, asf = path.name.split(".")[0], None
+        if name in trials and path.parent != trials[name][0].parent:
+            raise WearcapError(f"two trials are called {name!r}: {trials[name][0]} and {path}", fix="Rename one.")
+        if ".amc" in path.name.lower():  # its skeleton is its subject's .asf, else the only one in the folder
+            skeletons = sorted(p for p in path.parent.iterdir() if p.name.lower().split(".")[1:2] == ["asf"])
+            own = [p for p in skeletons if p.name.split(".")[0] == path.name.split("_")[0]]
+            asf = (own or skeletons)[0] if len(own or skeletons) == 1 else None
+        trials.setdefault(name, (path, asf))  # .amc comes first
+    if not trials:
+        raise WearcapError("no .amc or .bvh files", where=source, expected="motion files, plain or .xz or .gz")
     same: dict[tuple[str, Path | None], list[Path]] = {}
     for name, (path, asf) in trials.items():
         same.setdefault((_subject(name), asf), []).append(path)
@@ -124,31 +135,11 @@ def cmu_tasks(
         about = About(name, subject, "cmu", license, activities.get(name) or "")
         others = same[subject, asf]
         spread = tuple(others[:: -(-len(others) // HEAD_TRIALS)]) if asf is not None else ()
-        make = partial(cmu_recording, path, asf, about, amc_fps, bvh, settings, spread)
+        make = partial(_cmu_recording, path, asf, about, amc_fps, bvh, settings, spread)
         described = [asdict(about), asdict(settings), asdict(bvh), amc_fps, CMU_VERSION]
         sources = [path] if asf is None else [path, asf, *spread]
         tasks.append(Task(name, make, splits.of(subject), content_hash(*described, *sources)))
     return tasks
-
-
-def _trials(source: Path) -> dict[str, tuple[Path, Path | None]]:
-    """(Motion file, skeleton file of an AMC) by trial; where a folder has a trial in several formats, AMC is taken.
-
-    An AMC's skeleton is its subject's .asf, else the only one in the folder.
-    """
-    files: dict[str, tuple[Path, Path | None]] = {}
-    for path in sorted(p for p in source.rglob("*") if p.name.lower().endswith(MOTION_SUFFIXES)):
-        name, asf = path.name.split(".")[0], None
-        if name in files and path.parent != files[name][0].parent:
-            raise WearcapError(f"two trials are called {name!r}: {files[name][0]} and {path}", fix="Rename one.")
-        if ".amc" in path.name.lower():
-            skeletons = sorted(p for p in path.parent.iterdir() if p.name.lower().split(".")[1:2] == ["asf"])
-            own = [p for p in skeletons if p.name.split(".")[0] == path.name.split("_")[0]]
-            asf = (own or skeletons)[0] if len(own or skeletons) == 1 else None
-        files.setdefault(name, (path, asf))
-    if not files:
-        raise WearcapError("no .amc or .bvh files", where=source, expected="motion files, plain or .xz or .gz")
-    return files
 
 
 def _subject(name: str) -> str:

@@ -97,7 +97,7 @@ def _one_object(take: OneObject, about: About, settings: MocapSettings, output: 
     )
 
 
-def ground_rotation(points_world: Float[Tensor, "point 3"]) -> Float[Tensor, "3 3"]:
+def _ground_rotation(points_world: Float[Tensor, "point 3"]) -> Float[Tensor, "3 3"]:
     """Smallest rotation that levels the plane through positions of planted feet.
 
     The plane z = a·x + b·y + c is fitted robustly: points off it (feet on a step, on a chair's rung) lose their weight,
@@ -133,7 +133,7 @@ def _behave(root: Path, name: str, settings: MocapSettings, license: str, output
     take = read_behave(root, name)
     motion = on_xsens23(take.motion)
     positions, speed = foot_patches(motion)
-    R = ground_rotation(positions[speed < settings.limits.contact_speed])
+    R = _ground_rotation(positions[speed < settings.limits.contact_speed])
     tilt = float(torch.rad2deg(torch.arccos(R[2, 2].clamp(max=1.0))))
     if tilt > MAX_TILT_DEG:
         raise WearcapError(
@@ -192,7 +192,7 @@ def omomo_tasks(
     if not 0 < source_fps < 1e4:
         raise WearcapError(f"a frame rate of {source_fps} Hz", expected="source_fps=30 or another positive number")
     sequences = read_omomo(source)
-    check_rate(sequences, source, source_fps)
+    _check_rate(sequences, source, source_fps)
     shared = content_hash(asdict(settings), float(source_fps), license, VERSION)
     meshes = {sequence.object_name: omomo_mesh_path(source, sequence.object_name) for sequence in sequences}
     of_mesh = {name: content_hash(path) if path.is_file() else "" for name, path in meshes.items()}
@@ -208,7 +208,7 @@ def omomo_tasks(
     return tasks
 
 
-def check_rate(sequences: list[OmomoSequence], root: str | Path, fps: float | int) -> None:
+def _check_rate(sequences: list[OmomoSequence], root: str | Path, fps: float | int) -> None:
     """Raise WearcapError if, at this frame rate, people would run all the time or walk in slow motion.
 
     The check uses medians over `LOOKED_AT` sequences of the speeds over ground of the pelvis (95th percentile) and of

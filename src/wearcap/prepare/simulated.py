@@ -26,7 +26,7 @@ from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.io.formats.scene_folder import CLOUD
 from wearcap.prepare.engine import Task, content_hash
 from wearcap.prepare.splits import Splits
-from wearcap.recording.recording import HeadStream, Recording
+from wearcap.recording.recording import Recording
 from wearcap.recording.store import SPLITS, RecordingFile, RecordingStore
 from wearcap.sensors.slam import semidense_points
 from wearcap.simulation.places.site import changed_world
@@ -123,7 +123,7 @@ def simulated_tasks(
 
 
 @dataclass(frozen=True)
-class Video:
+class _Video:
     """Settings of the head camera's rendered video."""
 
     seconds: float | None
@@ -134,7 +134,7 @@ class Video:
 
 
 def _hps(
-    config: HpsConfig, scene: SceneSettings | None, video: Video, name: str, split: str, seed: int, root: Path
+    config: HpsConfig, scene: SceneSettings | None, video: _Video, name: str, split: str, seed: int, root: Path
 ) -> Recording:
     """One session, the missing files of its scene, and its video; the camera's timestamps become those of the frames."""
     simulated = simulate_hps(config, name, split, seed)
@@ -186,7 +186,7 @@ def simulated_hps_tasks(
     protocol = Protocol(returns_m=tuple(distances[1:-1]), end_m=distances[-1])
     config = HpsConfig(fps=float(fps), camera_fps=float(camera_fps), protocol=protocol)
     scene = None if spacing_m is None else SceneSettings(spacing_m=float(spacing_m), photo_m=float(photo_m))
-    video = Video(None if video_s is None else float(video_s), float(video_fps), float(changed))
+    video = _Video(None if video_s is None else float(video_s), float(video_fps), float(changed))
     made = [asdict(part) if part else None for part in (config, scene, video)]
     return _tasks("hps", recordings, seed, splits, output, partial(_hps, config, scene, video), *made)
 
@@ -267,7 +267,20 @@ def _surrounded(file: Path, name: str, root: Path, camera: bool, look_round: boo
     key = [seed, zlib.crc32(name.encode())]
     of_world, of_points, of_camera = (np.random.default_rng([number, *key]) for number in (31, 32, 33))
     world = surround(motion, of_world, f"cmu-room-{name}")
-    points = semidense_points(world.mesh, world.face_texture, _turned_round(head) if look_round else head, of_points)
+    path = head
+    if look_round:  # the path is preceded by two turns on the spot, one level and one looking down
+        ahead = head.R_world_device[0, :, 0]
+        yaw = torch.atan2(ahead[1], ahead[0]) + torch.arange(TURNS) * (2 * torch.pi / TURNS)
+        down = torch.tensor(DOWN_DEG).deg2rad().to(yaw.dtype)
+        R = (rotation.about_axis("z", yaw)[None] @ rotation.about_axis("y", down)[:, None]).flatten(0, 1)
+        before = head.timestamps[0] - VIEW_S * torch.arange(len(R), 0, -1, dtype=torch.float64)
+        path = replace(
+            head,
+            timestamps=torch.cat([before, head.timestamps]),
+            R_world_device=torch.cat([R.to(head.R_world_device.dtype), head.R_world_device]),
+            t_world_device=torch.cat([head.t_world_device[:1].expand(len(R), 3), head.t_world_device]),
+        )
+    points = semidense_points(world.mesh, world.face_texture, path, of_points)
     assert points.first_seen is not None
     points = replace(points, first_seen=points.first_seen.clamp(min=head.timestamps[0].item()))
     recording = replace(recording, points=points, location=world.name)
@@ -276,21 +289,6 @@ def _surrounded(file: Path, name: str, root: Path, camera: bool, look_round: boo
     video = root / "videos" / f"{name}.mp4"
     stream = write_ego_video(video, world, motion, recording.shape, head.t_head_device, of_camera)
     return replace(recording, camera=stream)
-
-
-def _turned_round(head: HeadStream) -> HeadStream:
-    """The path preceded by two turns on the spot, one level and one looking down."""
-    ahead = head.R_world_device[0, :, 0]
-    yaw = torch.atan2(ahead[1], ahead[0]) + torch.arange(TURNS) * (2 * torch.pi / TURNS)
-    down = torch.tensor(DOWN_DEG).deg2rad().to(yaw.dtype)
-    R = (rotation.about_axis("z", yaw)[None] @ rotation.about_axis("y", down)[:, None]).flatten(0, 1)
-    before = head.timestamps[0] - VIEW_S * torch.arange(len(R), 0, -1, dtype=torch.float64)
-    return replace(
-        head,
-        timestamps=torch.cat([before, head.timestamps]),
-        R_world_device=torch.cat([R.to(head.R_world_device.dtype), head.R_world_device]),
-        t_world_device=torch.cat([head.t_world_device[:1].expand(len(R), 3), head.t_world_device]),
-    )
 
 
 def cmu_surrounded_tasks(

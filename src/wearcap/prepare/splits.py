@@ -34,23 +34,25 @@ class Splits:
             fix="Add a row with it, or a last row such as '*,train'.",
         )
 
+    @classmethod
+    def read(cls, path: str | Path) -> "Splits":
+        """Read a list with columns `subject,split`; lines that begin with # are comments.
 
-def read_splits(path: str | Path) -> Splits:
-    """Read a list with columns `subject,split`; lines that begin with # are comments.
-
-    A subject may be a pattern (`HumanEva/*`), a split is train, val, test, or "hash".
-    """
-    path = Path(path)
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError as error:
-        raise WearcapError("no such split list", where=path, expected="a .csv with columns subject,split") from error
-    table = list(csv.DictReader(line for line in lines if line.strip() and not line.startswith("#")))
-    if not table or set(table[0]) != {"subject", "split"}:
-        raise WearcapError("not a split list", where=path, expected="columns subject,split")
-    for row in table:
-        if row["split"] not in (*SPLITS, BY_HASH):
+        A subject may be a pattern (`HumanEva/*`), a split is train, val, test, or "hash".
+        """
+        path = Path(path)
+        try:
+            lines = path.read_text(encoding="utf-8").splitlines()
+        except FileNotFoundError as error:
             raise WearcapError(
-                f"no split {row['split']!r}", where=path, expected=f"one of {', '.join((*SPLITS, BY_HASH))}"
-            )
-    return Splits(path, tuple((row["subject"], row["split"]) for row in table))
+                "no such split list", where=path, expected="a .csv with columns subject,split"
+            ) from error
+        table = list(csv.DictReader(line for line in lines if line.strip() and not line.startswith("#")))
+        if not table or set(table[0]) != {"subject", "split"}:
+            raise WearcapError("not a split list", where=path, expected="columns subject,split")
+        for row in table:
+            if row["split"] not in (*SPLITS, BY_HASH):
+                raise WearcapError(
+                    f"no split {row['split']!r}", where=path, expected=f"one of {', '.join((*SPLITS, BY_HASH))}"
+                )
+        return cls(path, tuple((row["subject"], row["split"]) for row in table))

@@ -17,14 +17,14 @@ from wearcap.recording.store import RecordingFile, save_recording
 END = "end"
 
 
-def piece_path(folder: str | Path, number: int) -> Path:
+def _piece_path(folder: str | Path, number: int) -> Path:
     """Path of the piece with this number."""
     return Path(folder) / f"piece-{number:06d}.safetensors"
 
 
 def write_piece(recording: Recording, folder: str | Path, number: int) -> None:
     """Write a piece to the folder."""
-    save_recording(recording, piece_path(folder, number))
+    save_recording(recording, _piece_path(folder, number))
 
 
 def close_pieces(folder: str | Path) -> None:
@@ -42,9 +42,9 @@ def follow_pieces(
     folder, number, since = Path(folder), 0, time.monotonic()
     while True:
         ended = (folder / END).exists()  # checked first, so that pieces written before the end are not missed
-        if piece_path(folder, number).exists():
+        if _piece_path(folder, number).exists():
             try:
-                piece = RecordingFile(piece_path(folder, number)).load()
+                piece = RecordingFile(_piece_path(folder, number)).load()
             except WearcapError:
                 if refused is None:
                     raise
@@ -58,7 +58,7 @@ def follow_pieces(
             raise WearcapError(
                 f"no piece {number} after {patience_s:.0f} s",
                 where=folder,
-                expected=f"{piece_path(folder, number).name}, or a file named {END!r}",
+                expected=f"{_piece_path(folder, number).name}, or a file named {END!r}",
                 fix="Is the recorder still running?",
             )
         else:

@@ -1,17 +1,48 @@
-"""The Motion: output of a pipeline, or ground truth."""
+"""The Motion (output of a pipeline, or ground truth), and interactions: which hands hold which object at which time."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
+import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
+from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.recording.interactions import Interactions
+
+HANDS = ("left", "right")
+
+
+@dataclass(frozen=True)
+class Interactions:
+    """Time intervals in which a fixed set of hands holds one object, ordered by start."""
+
+    start_s: Float64[Tensor, "interval"]
+    stop_s: Float64[Tensor, "interval"]
+    hands: Bool[Tensor, "interval hand"]
+    """Whether each of `HANDS` holds the object."""
+    objects: tuple[str, ...]
+    """Names of the objects in the environment; "" if unknown."""
+    classes: tuple[str, ...]
+    """Contact class of each interval, of `scene.objects.CONTACT_CLASSES`; "" if unknown."""
+
+    def __len__(self) -> int:
+        return len(self.start_s)
+
+    def hand_contact(
+        self, timestamps: Float64[Tensor, "time"], contact_class: str | None = None
+    ) -> Bool[Tensor, "time hand"]:
+        """Whether each hand holds an object (of `contact_class`, if given) at each time (start ≤ t < stop)."""
+        times = timestamps[:, None]
+        within = (self.start_s <= times) & (times < self.stop_s)
+        if contact_class is not None:
+            within = within & torch.tensor([name == contact_class for name in self.classes], dtype=torch.bool)
+        return (within[..., None] & self.hands).any(1)
+
 
 PROBABILITIES = ("contact_prob", "hand_contact_prob", "body_contact_prob")
 """Optional fields of a Motion with a row per frame."""
@@ -70,6 +101,20 @@ class Motion:
             last = int(torch.searchsorted(track.timestamps, cut.timestamps[-1].item(), right=True))
             objects[name] = track[first:last]
         return replace(cut, object_motion=objects)
+
+    def between(self, start_s: float, stop_s: float | None) -> "Motion":
+        """The frames from one second to another (None: to the end), counted from the first frame.
+
+        Raises WearcapError where there are none.
+        """
+        since = (self.timestamps - self.timestamps[0]).numpy()
+        first = int(np.searchsorted(since, start_s))
+        stop = len(since) if stop_s is None else int(np.searchsorted(since, stop_s, side="right"))
+        if stop <= first:
+            raise WearcapError(
+                f"no frames from {start_s} s to {stop_s} s", expected=f"times from 0 to {since[-1]:.1f} s"
+            )
+        return self.sliced(first, stop)
 
     def moved(self, T_new_world: Rigid) -> "Motion":
         """The motion and its objects in the coordinates of another world frame."""

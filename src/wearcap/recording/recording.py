@@ -9,8 +9,7 @@ from wearcap.body.skeleton import Skeleton
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.recording.interactions import Interactions
-from wearcap.recording.motion import Motion
+from wearcap.recording.motion import Interactions, Motion
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording import recording as parts
-from wearcap.recording.interactions import Interactions
-from wearcap.recording.motion import Motion
+from wearcap.recording.motion import Interactions, Motion
 
 _PARTS = {name: cls for name, cls in vars(parts).items() if getattr(cls, "__module__", "") == parts.__name__}
 KNOWN: dict[str, type] = _PARTS | {

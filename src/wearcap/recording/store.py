@@ -13,9 +13,8 @@ import safetensors
 from safetensors.torch import save
 from torch import Tensor
 
-from wearcap.checksums import remembered_sha256
 from wearcap.errors import WearcapError
-from wearcap.files import atomic_path, parse_json, sha256_of, write_text
+from wearcap.files import atomic_path, parse_json, remembered_sha256, sha256_of, write_text
 from wearcap.recording.recording import Recording
 from wearcap.recording.serialize import dumps, flatten, require_part, unflatten
 
@@ -44,6 +43,30 @@ class Entry:
     config_hash: str
     """Hash of source bytes and preparation settings: prepare skips a recording whose hash is current."""
 
+    @classmethod
+    def of(cls, recording: Recording, root: Path, split: str, config_hash: str) -> "Entry":
+        """The manifest entry of a recording whose file has been written."""
+        if split not in SPLITS:
+            raise WearcapError(f"no split {split!r}", expected=f"one of {', '.join(SPLITS)}")
+        path = recording_path(root, recording.name)
+        stream = recording.motion or recording.head
+        frames = len(stream.timestamps) if stream else 0
+        fps = round(1 / stream.timestamps.diff().median().item(), 4) if stream and frames > 1 else 0.0
+        return cls(
+            file=path.relative_to(root).as_posix(),
+            sha256=sha256_of(path),
+            bytes=path.stat().st_size,
+            frames=frames,
+            fps=fps,
+            duration_s=round(recording.duration_s, 4),
+            subject=recording.subject,
+            location=recording.location,
+            activity=recording.activity,
+            split=split,
+            license=recording.license,
+            config_hash=config_hash,
+        )
+
 
 _MOST = {"frames": MAX_FRAMES, "fps": MAX_FPS, "duration_s": 1e11, "bytes": 1 << 50}
 
@@ -52,7 +75,7 @@ class RecordingFile:
     """One recording on disk, opened without reading its tensors; slices read only their own rows.
 
     A file in a data set is verified against the manifest's checksum when it is opened, once while it is unchanged
-    (`wearcap.checksums`).
+    (`wearcap.files.remembered_sha256`).
     """
 
     def __init__(self, path: str | Path, *, verify: bool = True):
@@ -255,7 +278,7 @@ class RecordingStore:
     def add(self, recording: Recording, *, split: str, config_hash: str) -> None:
         """Write a recording and its manifest entry."""
         save_recording(recording, self.path_of(recording.name))
-        self.register({recording.name: entry_for(recording, self.root, split, config_hash)})
+        self.register({recording.name: Entry.of(recording, self.root, split, config_hash)})
 
     def register(self, entries: dict[str, Entry]) -> None:
         """Add manifest entries of recordings whose files already exist (written by workers)."""
@@ -305,30 +328,6 @@ def recording_path(root: Path, name: str) -> Path:
     if not name or Path(name).name != name or name.startswith("."):
         raise WearcapError(f"{name!r} cannot name a recording", expected="a plain file name")
     return Path(root) / FOLDER / f"{name}.safetensors"
-
-
-def entry_for(recording: Recording, root: Path, split: str, config_hash: str) -> Entry:
-    """The manifest entry of a recording whose file has been written."""
-    if split not in SPLITS:
-        raise WearcapError(f"no split {split!r}", expected=f"one of {', '.join(SPLITS)}")
-    path = recording_path(root, recording.name)
-    stream = recording.motion or recording.head
-    frames = len(stream.timestamps) if stream else 0
-    fps = round(1 / stream.timestamps.diff().median().item(), 4) if stream and frames > 1 else 0.0
-    return Entry(
-        file=path.relative_to(root).as_posix(),
-        sha256=sha256_of(path),
-        bytes=path.stat().st_size,
-        frames=frames,
-        fps=fps,
-        duration_s=round(recording.duration_s, 4),
-        subject=recording.subject,
-        location=recording.location,
-        activity=recording.activity,
-        split=split,
-        license=recording.license,
-        config_hash=config_hash,
-    )
 
 
 def load_recording(where: str | Path) -> Recording:

@@ -8,8 +8,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from wearcap.geometry.trajectory import Trajectory, interpolate, slerp
-from wearcap.recording.interactions import Interactions
-from wearcap.recording.motion import PER_FRAME, PROBABILITIES, Motion
+from wearcap.recording.motion import PER_FRAME, PROBABILITIES, Interactions, Motion
 
 _POSES = ("timestamps", "R_world_body", "t_world_body")
 

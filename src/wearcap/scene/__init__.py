@@ -1,6 +1,6 @@
 """The wearer's surroundings: scans, the floor, voxel grids, and objects with their degrees of freedom.
 
-Open `environment.py` and `objects.py` first: a door or a sofa is a `SceneObject`, and `object_motion.py` moves it with
-the hands. `scan.py` holds a scanned scene, `editing.py` cuts objects out of it; `floor.py` and `floor_update.py`
-estimate the floor height, `voxels.py` makes the grids that HMD² takes as input.
+Open `environment.py` and `objects.py` first: a door or a sofa is a `SceneObject`, which `follow_hands` moves. `scan.py`
+holds a scanned scene, `editing.py` cuts objects out of it; `floor.py` estimates the floor height, `voxels.py` makes the
+grids that HMD² takes as input.
 """

@@ -13,7 +13,8 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
-from wearcap.scene.environment import Environment, surface_index
+from wearcap.geometry.triangle_distance import TriangleIndex
+from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.scene.scan import Box, Scan, SlicedCloud
 
@@ -135,15 +136,15 @@ class ObjectEditing:
         points = self.scan.points[self.selected]
         remaining = self.left()
         remaining[self.selected] = False
-        floor = floor_below(points, self.scan.points[remaining])
-        origin = np.array([*footprint(points).center, floor])
+        floor = _floor_below(points, self.scan.points[remaining])
+        origin = np.array([*Footprint.of(points).center, floor])
         colors = np.full(3, 0.6, np.float32)
         if self.scan.colors is not None:
             colors = self.scan.colors[self.selected].astype(np.float32) / 255
         mesh = Mesh((points - origin).astype(np.float32), np.empty((0, 3), np.int32), colors)
         kind = kind or USUAL_KIND.get(category, "plane")
         item = SceneObject(
-            name, category, mesh, torch.eye(3), torch.from_numpy(origin).float(), usual_freedom(kind, points, floor)
+            name, category, mesh, torch.eye(3), torch.from_numpy(origin).float(), _usual_freedom(kind, points, floor)
         )
         self._step(_State((*self._state.cuts, _Cut(item, self.selected)), np.empty(0, np.int64)))
         return item
@@ -166,8 +167,8 @@ class ObjectEditing:
         """Set the kind of freedom, with its default parameters."""
         item = self._find(name).item
         if kind != item.freedom.kind:
-            points, floor = points_world(item), float(item.t_world_object[2])
-            self.set_freedom(name, usual_freedom(kind, points, floor))
+            points, floor = item.points_world, float(item.t_world_object[2])
+            self.set_freedom(name, _usual_freedom(kind, points, floor))
 
     def delete(self, name: str) -> None:
         """Give the object's points back to the scan."""
@@ -207,7 +208,7 @@ class ObjectEditing:
 
         Raises WearcapError for an object without points, or outside the scan.
         """
-        points, scan = points_world(item), self.scan.points
+        points, scan = item.points_world, self.scan.points
         if not len(points):
             raise WearcapError("an object without a shape", where=item.name, expected="a mesh or a cloud")
         low, high = points.min(0), points.max(0)
@@ -227,14 +228,8 @@ class ObjectEditing:
         if not len(item.mesh.faces):
             return around[KDTree(points).query(there, distance_upper_bound=_SAME_M)[0] <= _SAME_M]
         R, t = item.R_world_object.double().numpy(), item.t_world_object.double().numpy()
-        distance, _ = surface_index(item.mesh).nearest_points((there - t) @ R)
+        distance, _ = TriangleIndex.of(item.mesh).nearest_points((there - t) @ R)
         return around[distance <= _SURFACE_M]
-
-
-def points_world(item: SceneObject) -> Float[np.ndarray, "vertex 3"]:
-    """An object's vertices in the world (m, float64) at its initial pose."""
-    R, t = item.R_world_object.double().numpy(), item.t_world_object.double().numpy()
-    return item.mesh.vertices.astype(np.float64) @ R.T + t
 
 
 @dataclass(frozen=True)
@@ -252,28 +247,28 @@ class Footprint:
         """Unit vector along the shorter side, to the left of `long`."""
         return np.array([-self.long[1], self.long[0]])
 
+    @classmethod
+    def of(cls, points: Float[np.ndarray, "point 3"]) -> "Footprint":
+        """The rectangle of least area around points seen from above; one of its sides lies on the convex hull."""
+        plan = points[:, :2].astype(np.float64)
+        try:
+            corners = plan[ConvexHull(plan).vertices]
+        except QhullError:  # fewer than three points, or all on one line
+            corners = plan
+        edges = np.roll(corners, -1, axis=0) - corners
+        length = np.linalg.norm(edges, axis=1)
+        along = edges[length > 0] / length[length > 0, None] if (length > 0).any() else np.array([[1.0, 0.0]])
+        across = np.stack([-along[:, 1], along[:, 0]], 1)
+        low, high = ((reduce(corners @ along.T, 0), reduce(corners @ across.T, 0)) for reduce in (np.min, np.max))
+        sides = np.stack([high[0] - low[0], high[1] - low[1]], 1)
+        best = int(sides.prod(1).argmin())
+        center = (low[0][best] + high[0][best]) / 2 * along[best] + (low[1][best] + high[1][best]) / 2 * across[best]
+        length, width = sides[best]
+        long = along[best] if length >= width else across[best]
+        return cls(center, long, max(length, width) / 2, min(length, width) / 2)
 
-def footprint(points: Float[np.ndarray, "point 3"]) -> Footprint:
-    """The rectangle of least area around points seen from above; one of its sides lies on the convex hull."""
-    plan = points[:, :2].astype(np.float64)
-    try:
-        corners = plan[ConvexHull(plan).vertices]
-    except QhullError:  # fewer than three points, or all on one line
-        corners = plan
-    edges = np.roll(corners, -1, axis=0) - corners
-    length = np.linalg.norm(edges, axis=1)
-    along = edges[length > 0] / length[length > 0, None] if (length > 0).any() else np.array([[1.0, 0.0]])
-    across = np.stack([-along[:, 1], along[:, 0]], 1)
-    low, high = ((reduce(corners @ along.T, 0), reduce(corners @ across.T, 0)) for reduce in (np.min, np.max))
-    sides = np.stack([high[0] - low[0], high[1] - low[1]], 1)
-    best = int(sides.prod(1).argmin())
-    center = (low[0][best] + high[0][best]) / 2 * along[best] + (low[1][best] + high[1][best]) / 2 * across[best]
-    length, width = sides[best]
-    long = along[best] if length >= width else across[best]
-    return Footprint(center, long, max(length, width) / 2, min(length, width) / 2)
 
-
-def floor_below(points: Float[np.ndarray, "point 3"], scene: Float[np.ndarray, "other 3"]) -> float:
+def _floor_below(points: Float[np.ndarray, "point 3"], scene: Float[np.ndarray, "other 3"]) -> float:
     """Height (m) of the floor that an object stands on: the lowest strong layer of the scene's points around it.
 
     Without scene points below it, the object's own lowest point.
@@ -292,7 +287,7 @@ def floor_below(points: Float[np.ndarray, "point 3"], scene: Float[np.ndarray, "
 
 def hinge_places(points: Float[np.ndarray, "point 3"], floor: float) -> Float[np.ndarray, "place 3"]:
     """Likely hinges of a door or window: middles of its two ends, then its corners, then the middles of its sides."""
-    plan = footprint(points)
+    plan = Footprint.of(points)
     ends, sides = plan.half_length * plan.long, plan.half_width * plan.short
     offsets = [-ends, ends, sides - ends, -sides - ends, ends + sides, ends - sides, sides, -sides]
     # A corner of the rectangle may stand far off what is not rectangular: never outside of its extent.
@@ -310,12 +305,12 @@ def snapped(
     return np.array([place[0], place[1], places[0, 2]])
 
 
-def usual_freedom(kind: str, points: Float[np.ndarray, "point 3"], floor: float) -> Freedom:
+def _usual_freedom(kind: str, points: Float[np.ndarray, "point 3"], floor: float) -> Freedom:
     """Default freedom: a hinge at one end, opening to 90°; a slide of 40 cm across the longer side."""
     if kind == "hinge":
         x, y, z = hinge_places(points, floor)[0].tolist()
         return Freedom("hinge", pivot=(x, y, z), limits=_OPEN)
     if kind == "axis":
-        x, y = footprint(points).short.tolist()
+        x, y = Footprint.of(points).short.tolist()
         return Freedom("axis", axis=(x, y, 0.0), limits=_PULLED_M)
     return Freedom(kind)

@@ -6,11 +6,10 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from wearcap.errors import WearcapError
-from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.triangle_distance import BodiesIndex, TriangleIndex
 from wearcap.scene.objects import CONTACT_CLASSES, SceneObject
@@ -58,7 +57,7 @@ class Environment:
     def _shapes(self) -> list[TriangleIndex]:
         """One tree per object; objects of one mesh share it."""
         meshes = {id(item.mesh): item.mesh for item in self.objects}
-        built = {key: surface_index(mesh) for key, mesh in meshes.items()}
+        built = {key: TriangleIndex.of(mesh) for key, mesh in meshes.items()}
         return [built[id(item.mesh)] for item in self.objects]
 
     @cached_property
@@ -111,26 +110,3 @@ class Environment:
         distance, point = shape.nearest_points(local.contiguous().numpy())
         closest = (R @ torch.from_numpy(point)[..., None])[..., 0] + t
         return torch.from_numpy(distance).to(points_world.dtype), closest.to(points_world.dtype)
-
-
-def surface_index(mesh: Mesh) -> TriangleIndex:
-    """Tree over a mesh's triangles; a cloud's points are triangles without extent. Raises WearcapError for NaN."""
-    faces = mesh.faces.astype(np.int64)
-    if not len(faces):
-        faces = np.repeat(np.arange(len(mesh.vertices))[:, None], 3, axis=1)
-    return TriangleIndex.build(mesh.vertices.astype(np.float64), faces)
-
-
-def box_in_world(item: SceneObject) -> Float64[np.ndarray, "2 3"]:
-    """Minimum and maximum corner (m) of the bounding box of an object at its initial pose, in the world."""
-    points = item.mesh.vertices @ item.R_world_object.double().numpy().T + item.t_world_object.double().numpy()
-    return np.stack([points.min(0), points.max(0)])
-
-
-def hinge_gap_m(item: SceneObject) -> float:
-    """Horizontal distance of an object's hinge from its bounding box; 0 for objects without a hinge."""
-    if item.freedom.pivot is None:
-        return 0.0
-    low, high = box_in_world(item)[:, :2]
-    pivot = np.array(item.freedom.pivot[:2])
-    return float(np.linalg.norm(np.maximum(np.maximum(low - pivot, pivot - high), 0.0)))

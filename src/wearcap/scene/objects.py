@@ -1,12 +1,12 @@
-"""Objects of an interactive environment: shape, initial pose and degrees of freedom (thesis §5.2);
-validation of their meshes."""
+"""Objects of an interactive environment: shape, initial pose and degrees of freedom (thesis §5.2), validation of their
+meshes; and their motion with the hands that hold them (thesis §5.3.3, eq. 5.3–5.7)."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from wearcap.errors import WearcapError
@@ -14,7 +14,13 @@ from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
 
-FREEDOMS = ("plane", "axis", "hinge", "free")
+FREEDOMS = {
+    "plane": "slides on the floor",
+    "axis": "slides along an axis",
+    "hinge": "turns about a hinge",
+    "free": "is carried",
+}
+"""Kinds of freedom, in words."""
 CONTACT_CLASSES = ("sliding", "hinged")
 """Kinds of interaction that have a contact network each (thesis §5.3.2)."""
 EXTENTS_M = (0.01, 5.0)
@@ -96,6 +102,31 @@ class SceneObject:
     def T_world_object(self) -> Rigid:
         return Rigid(self.R_world_object, self.t_world_object)
 
+    @property
+    def points_world(self) -> Float64[np.ndarray, "vertex 3"]:
+        """Vertices in the world (m) at the initial pose."""
+        R, t = self.R_world_object.double().numpy(), self.t_world_object.double().numpy()
+        return self.mesh.vertices.astype(np.float64) @ R.T + t
+
+    @property
+    def box_world(self) -> Float64[np.ndarray, "2 3"]:
+        """Minimum and maximum corner (m) of the bounding box at the initial pose, in the world."""
+        points = self.points_world
+        return np.stack([points.min(0), points.max(0)])
+
+    @property
+    def hinge_gap_m(self) -> float:
+        """Horizontal distance of the hinge from the bounding box; 0 for objects without a hinge."""
+        if self.freedom.pivot is None:
+            return 0.0
+        low, high = self.box_world[:, :2]
+        pivot = np.array(self.freedom.pivot[:2])
+        return float(np.linalg.norm(np.maximum(np.maximum(low - pivot, pivot - high), 0.0)))
+
+    def check(self, where: str | Path) -> None:
+        """`check_object_mesh` of an environment's object; one on a hinge or axis may be in the axes of its mount."""
+        check_object_mesh(self.mesh, where, self.freedom.kind not in ("hinge", "axis"))
+
 
 def centered(mesh: Mesh) -> tuple[Mesh, Float64[np.ndarray, "3"]]:
     """The mesh with the mean of its vertices at the origin, and where that mean was in its former axes.
@@ -106,11 +137,6 @@ def centered(mesh: Mesh) -> tuple[Mesh, Float64[np.ndarray, "3"]]:
         raise WearcapError("a mesh without vertices", expected="at least one triangle")
     center = mesh.vertices.astype(np.float64).mean(0)
     return replace(mesh, vertices=(mesh.vertices - center).astype(np.float32)), center
-
-
-def check_object(item: SceneObject, where: str | Path) -> None:
-    """`check_object_mesh` of an environment's object; one on a hinge or axis may be in the axes of its mount."""
-    check_object_mesh(item.mesh, where, item.freedom.kind not in ("hinge", "axis"))
 
 
 def check_object_mesh(mesh: Mesh, where: str | Path, own_axes: bool = True) -> None:
@@ -163,3 +189,68 @@ def check_object_mesh(mesh: Mesh, where: str | Path, own_axes: bool = True) -> N
             expected="axes of its own, with the origin in or near the object",
             fix="Subtract the mean of its vertices, and place its poses accordingly.",
         )
+
+
+ANCHORS = ("right", "middle")
+"""Reference point of an object held by two hands: the right hand (thesis), or the middle of both (ours)."""
+_LEAST_APART_M = 0.05
+"""Smallest distance between the hands that defines a direction; below it the last angle is kept."""
+
+
+@dataclass(frozen=True)
+class ObjectState:
+    """Pose of an object, and its hinge angle or displacement."""
+
+    T_world_object: Rigid
+    value: float = 0.0
+    """Hinge angle (rad) or displacement along the axis (m) from the initial pose; 0 for other kinds."""
+
+
+def follow_hands(
+    item: SceneObject,
+    state: ObjectState,
+    palms_world: Float[Tensor, "time hand 3"],
+    holds: Bool[Tensor, "hand"],
+    anchor: str = "middle",
+) -> tuple[Rigid, Float[Tensor, "time"]]:
+    """Poses of an object from the frame of the grasp (in `state`) on, and its angle or displacement (0 for others).
+
+    `palms_world` holds the palm centres of the left and the right hand (m); `holds` marks the hands that hold the
+    object. A hinge or axis stays within its limits; an object that slides in the plane keeps its height.
+    """
+    palms = palms_world[:, holds].double()
+    kind = item.freedom.kind
+    if kind in ("hinge", "axis"):
+        if kind == "hinge":  # signed angle of the palms about the hinge (eq. 5.6, 5.4), averaged over hands
+            arm = palms[..., :2] - torch.tensor(item.freedom.pivot, dtype=palms.dtype)[:2]
+            change = _turned(arm.transpose(0, 1)).mean(0)
+        else:
+            change = ((palms - palms[:1]) @ torch.tensor(item.freedom.axis, dtype=palms.dtype)).mean(1)
+        value = item.freedom.clamped(state.value + change)
+        return item.freedom.moved(item.T_world_object, value), value
+    # O* = R^α (O − h) + h + t, α the turn of the vector from the right hand to the left (eq. 5.3–5.5, 5.7). h is the
+    # right hand or the middle of both, t its translation; a single hand gives a translation only.
+    alone = palms.shape[1] == 1
+    point = palms[:, -1] if alone or anchor == "right" else palms.mean(1)
+    angle = palms.new_zeros(len(palms)) if alone else _turned((palms[:, 0] - palms[:, -1])[None, :, :2])[0]
+    R = rotation.about_axis("z", angle)
+    start = state.T_world_object
+    t = point + (R @ (start.t.to(palms) - point[0])[:, None])[..., 0]
+    if kind == "plane":
+        t[:, 2] = start.t[2].to(t)
+    return Rigid(R @ start.R.to(palms), t), torch.zeros(len(palms), dtype=torch.float64)
+
+
+def _turned(vectors: Float[Tensor, "hand time 2"]) -> Float[Tensor, "hand time"]:
+    """Signed angle (rad) from the first vector to each one, unwrapped over time; short vectors keep the last angle.
+
+    Before the first vector that is long enough the angle is 0.
+    """
+    long = vectors.norm(dim=-1) > _LEAST_APART_M
+    first = long.long().argmax(-1, keepdim=True)
+    frame = torch.where(long, torch.arange(vectors.shape[1]), first).cummax(-1).values
+    kept = vectors.gather(1, frame[..., None].expand_as(vectors))
+    before, after = kept[:, :-1], kept[:, 1:]
+    cross = before[..., 0] * after[..., 1] - before[..., 1] * after[..., 0]
+    step = torch.atan2(cross, (before * after).sum(-1))
+    return torch.nn.functional.pad(step, (1, 0)).cumsum(-1)

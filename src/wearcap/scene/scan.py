@@ -1,11 +1,14 @@
-"""A scanned scene, and choosing points of it: in a box, within a brush's radius, along a ray of the view."""
+"""A scanned scene and its photos, and choosing points of it: in a box, within a brush's radius, along a ray of the view."""
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64, UInt8
 
+from wearcap.geometry.camera import Camera
+from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.surface import SurfaceIndex
 
 _SPREAD = 0.006
@@ -90,3 +93,12 @@ def first_hit(
         return None
     front = under[depth[under] < depth[under].min() + _DEPTH_M]
     return int(front[aside[front].argmin()])
+
+
+@dataclass(frozen=True)
+class Photo:
+    """An image file, its calibrated camera, and the camera's pose in the scene (no batch axes, m)."""
+
+    file: Path
+    camera: Camera
+    T_world_cam: Rigid

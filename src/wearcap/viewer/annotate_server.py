@@ -17,8 +17,7 @@ from typing import Any
 
 from wearcap.errors import WearcapError
 from wearcap.io.formats.contact_labels import annotation_of, hcontact_text
-from wearcap.viewer.annotate import Desk
-from wearcap.viewer.annotation_file import Conflict
+from wearcap.viewer.annotate import Conflict, Desk
 from wearcap.viewer.guard import Guard, Refused
 
 PAGE = Path(__file__).parent / "annotator"
@@ -158,12 +157,12 @@ class _Handler(BaseHTTPRequestHandler):
         super().handle_one_request()
 
     def do_GET(self) -> None:
-        self._answer(self._get)
+        self._answer(self.get)
 
     do_HEAD = do_GET
 
     def do_POST(self) -> None:
-        self._answer(self._post)
+        self._answer(self.post)
 
     def _answer(self, action) -> None:
         """Run an admitted action; errors that a user can fix become {"error": …} with a fitting status."""
@@ -192,18 +191,18 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header(name, value)
         super().end_headers()
 
-    def _get(self, path: str) -> None:
+    def get(self, path: str) -> None:
         if path == "/recordings":
             desk = self.server.desk
             return self._send_json([{"name": name, "annotated": desk.path(name).is_file()} for name in desk.names])
         if match := re.fullmatch(r"/recordings/(\d{1,6})(?:/(\w+))?", path):
-            return self._get_recording(int(match[1]), match[2] or "")
+            return self.get_recording(int(match[1]), match[2] or "")
         file = PAGE / (path[1:] or "index.html")
         if file.parent == PAGE and file.suffix in TYPES and file.is_file():
             return self._send(file.read_bytes(), TYPES[file.suffix])
         return self._send_error(HTTPStatus.NOT_FOUND, f"nothing at {path}")
 
-    def _get_recording(self, index: int, part: str) -> None:
+    def get_recording(self, index: int, part: str) -> None:
         desk = self.server.desk
         if index >= len(desk.names):
             return self._send_error(HTTPStatus.NOT_FOUND, f"no recording {index}")
@@ -219,10 +218,10 @@ class _Handler(BaseHTTPRequestHandler):
             text = hcontact_text(labels, take.clock)
             return self._send(text.encode(), "application/json", download=f"{take.clock.name}.json")
         if part == "video" and take.video is not None:
-            return self._send_video(take.video.path)
+            return self.send_video(take.video.path)
         return self._send_error(HTTPStatus.NOT_FOUND, f"recording {index} has no {part}")
 
-    def _post(self, path: str) -> None:
+    def post(self, path: str) -> None:
         match = re.fullmatch(r"/recordings/(\d{1,6})/labels", path)
         length = self.headers.get("Content-Length", "")
         self.close_connection = True  # until the body has been read
@@ -264,10 +263,10 @@ class _Handler(BaseHTTPRequestHandler):
         if self.command != "HEAD":
             self.wfile.write(data)
 
-    def _send_video(self, path: Path) -> None:
+    def send_video(self, path: Path) -> None:
         """Send a whole file, or the one requested range (RFC 9110, section 14)."""
         size = path.stat().st_size
-        span = byte_range(self.headers.get("Range", ""), size)
+        span = _byte_range(self.headers.get("Range", ""), size)
         if span is None:
             self.send_response(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE)
             self.send_header("Content-Range", f"bytes */{size}")
@@ -293,7 +292,7 @@ class _Handler(BaseHTTPRequestHandler):
         return None
 
 
-def byte_range(header: str, size: int) -> tuple[int, int, bool] | None:
+def _byte_range(header: str, size: int) -> tuple[int, int, bool] | None:
     """Start, stop and whether it is partial, of a Range header; None if the range is outside the file."""
     match = re.fullmatch(r"bytes=(\d{0,18})-(\d{0,18})", header.strip())
     if match is None or not (match[1] or match[2]):

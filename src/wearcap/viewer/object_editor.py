@@ -18,12 +18,10 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import matrix_from_quat_wxyz
 from wearcap.io.formats.environment import MAX_HINGE_GAP_M, read_environment, write_environment
-from wearcap.scene.editing import ObjectEditing, hinge_places, points_world, snapped
-from wearcap.scene.environment import hinge_gap_m
+from wearcap.scene.editing import ObjectEditing, hinge_places, snapped
 from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.scene.scan import Scan
-from wearcap.viewer.object_editor_panels import HINTS, TOOLS, ObjectPanel, SelectPanel
-from wearcap.viewer.object_editor_view import EditorView
+from wearcap.viewer.object_editor_view import HINTS, TOOLS, EditorView, ObjectPanel, SelectPanel
 from wearcap.viewer.page_server import ServedPage
 
 SNAP_M = 0.12
@@ -114,7 +112,7 @@ class ObjectEditor(ServedPage):
     def _wire(self) -> None:
         """Let controls and view call their actions."""
         select, objects, view, act = self.select, self.objects, self.view, self._acting
-        for slider in select.shape_sliders:
+        for slider in (select.length, select.width, select.height, select.turn):
             slider.on_update(act(self._show_box))
         select.take.on_click(act(lambda: self.editing.select_box(self.box)))
         select.leave.on_click(act(lambda: self.editing.select_box(self.box, add=False)))
@@ -127,7 +125,7 @@ class ObjectEditor(ServedPage):
         objects.kind.on_update(act(lambda: self.editing.set_kind(self._item().name, objects.chosen_kind)))
         objects.next_end.on_click(act(self.next_hinge))
         objects.direction.on_update(act(self.turn_axis))
-        for slider in objects.limit_sliders:
+        for slider in (objects.least_deg, objects.greatest_deg, objects.least_m, objects.greatest_m):
             slider.on_update(act(self.set_limits))
         for slider in (objects.try_deg, objects.try_m):
             slider.on_update(act(self.try_value))
@@ -222,7 +220,7 @@ class ObjectEditor(ServedPage):
     def next_hinge(self) -> None:
         """Place the hinge at the next likely position around the object's footprint."""
         item = self._item()
-        places = hinge_places(points_world(item), float(item.t_world_object[2]))
+        places = hinge_places(item.points_world, float(item.t_world_object[2]))
         nearest = np.linalg.norm(places - np.array(item.freedom.pivot), axis=1).argmin()
         self._set_pivot(item, places[(nearest + 1) % len(places)])
 
@@ -230,7 +228,9 @@ class ObjectEditor(ServedPage):
         """Show the current object at the slider's value, within its limits; its pose in the file stays."""
         item = self._item()
         if item.freedom.kind in ("hinge", "axis"):
-            value = item.freedom.clamped(torch.tensor(self.objects.tried(item.freedom.kind)))
+            panel = self.objects
+            tried = np.deg2rad(panel.try_deg.value) if item.freedom.kind == "hinge" else panel.try_m.value
+            value = item.freedom.clamped(torch.tensor(float(tried)))
             self._tried = item.freedom.moved(item.T_world_object, value)
             self.view.place(item.name, self._tried)
 
@@ -265,10 +265,10 @@ class ObjectEditor(ServedPage):
         """Place the hinge at a position (snapped to a near edge of the object), or point the slide's axis toward it."""
         item = self._item()
         if item.freedom.kind == "hinge":
-            places = hinge_places(points_world(item), float(item.t_world_object[2]))
+            places = hinge_places(item.points_world, float(item.t_world_object[2]))
             self._set_pivot(item, snapped(place, places, SNAP_M))
         elif item.freedom.kind == "axis":
-            box = points_world(item)
+            box = item.points_world
             height = (box[:, 2].min() + box[:, 2].max()) / 2
             direction = np.array([*place[:2], height if level else place[2]]) - (box.min(0) + box.max(0)) / 2
             length = float(np.linalg.norm(direction))
@@ -286,7 +286,7 @@ class ObjectEditor(ServedPage):
     def _set_pivot(self, item: SceneObject, pivot: Float[np.ndarray, "3"]) -> None:
         x, y, z = pivot.tolist()
         freedom = Freedom("hinge", pivot=(x, y, z), limits=item.freedom.limits)
-        gap = hinge_gap_m(replace(item, freedom=freedom))
+        gap = replace(item, freedom=freedom).hinge_gap_m
         if gap > MAX_HINGE_GAP_M:
             self._show_objects()
             raise WearcapError(

@@ -1,4 +1,4 @@
-"""The object editor's 3D view: the scan, the selection, the objects at their poses, hinges, slides and handles."""
+"""The object editor's controls and its 3D view: scan, selection, objects at their poses, hinges, slides and handles."""
 
 from dataclasses import dataclass
 
@@ -9,8 +9,8 @@ from scipy.spatial import KDTree
 
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import quat_wxyz_from_matrix
-from wearcap.scene.editing import points_world
-from wearcap.scene.objects import SceneObject
+from wearcap.scene.editing import USUAL_KIND
+from wearcap.scene.objects import FREEDOMS, Freedom, SceneObject
 from wearcap.scene.scan import Box, Scan, first_hit
 from wearcap.viewer.page_layers import by_height
 
@@ -45,7 +45,7 @@ class EditorView:
         low, high = np.quantile(scan.points[:: max(1, len(scan.points) // 10_000), 2], [0.02, 0.98])
         colors = scan.colors
         self._colors = by_height(scan.points, low, high).astype(np.uint8) if colors is None else colors
-        self.point_m = 1.9 * typical_spacing(scan.points[self._thinned])
+        self.point_m = 1.9 * _typical_spacing(scan.points[self._thinned])
         self._center = scan.points.mean(0, dtype=np.float64)
         self.visible = scan.points[:0]
         """Indices of the scan's points that are drawn."""
@@ -113,10 +113,11 @@ class EditorView:
                 del self._objects[name]
         for name, (item, tinted) in wanted.items():
             if name not in self._objects:
-                self._objects[name] = self._add_object(item, tinted)
+                self._objects[name] = self.added(item, tinted)
             self.place(name, item.T_world_object)
 
-    def _add_object(self, item: SceneObject, tinted: tuple[int, bool]) -> _Shown:
+    def added(self, item: SceneObject, tinted: tuple[int, bool]) -> _Shown:
+        """Draw one object, with its name above it."""
         node, mesh = f"/objects/{item.name}", item.mesh
         tint = CURRENT_TINT if tinted[1] else TINTS[tinted[0]]
         every = max(1, -(-len(mesh.vertices) // SHOWN_OF_OBJECT))
@@ -140,7 +141,7 @@ class EditorView:
             )
         top = mesh.vertices[:, 2].max() + 0.1
         label = self.scene.add_label(f"{node}/name", item.name, position=(0.0, 0.0, float(top)), anchor="bottom-center")
-        return _Shown(item, tinted, handle, label, points_world(item)[::every])
+        return _Shown(item, tinted, handle, label, item.points_world[::every])
 
     def place(self, name: str, T_world_object: Rigid) -> None:
         """Show an object at a pose (to try how it moves)."""
@@ -155,7 +156,7 @@ class EditorView:
         self.freedom_handle.visible = handled and kind in ("hinge", "axis")
         if item is None or kind not in ("hinge", "axis"):
             return
-        points = points_world(item)
+        points = item.points_world
         if item.freedom.pivot is not None:
             foot = np.array(item.freedom.pivot)
             line = np.array([[foot, [*foot[:2], points[:, 2].max() + 0.15]]])
@@ -192,8 +193,121 @@ class EditorView:
         return best
 
 
-def typical_spacing(points: Float[np.ndarray, "point 3"]) -> float:
+def _typical_spacing(points: Float[np.ndarray, "point 3"]) -> float:
     """Median distance (m) of neighbours in a cloud, over a sample."""
     sample = points[:: max(1, len(points) // 500)]
     distance, _ = KDTree(points).query(sample, k=2)
     return float(np.clip(np.median(distance[:, -1]), 0.002, 0.2)) if len(points) > 1 else 0.02
+
+
+TOOLS: tuple[str, ...] = ("look", "box", "brush", "eraser", "hinge / slide", "try")
+HINTS = {
+    "look": "A click on an object makes it the current one.",
+    "box": "A click moves the box there; its arrows move it, the sliders shape it.",
+    "brush": "A click selects what is around it; drag the ball to paint on.",
+    "eraser": "A click takes away from the selection; drag the ball to go on.",
+    "hinge / slide": "Drag the handle of the current object's hinge or arrow, or click where it belongs.",
+    "try": "Move the current object as a hand would; it goes back to its place afterwards.",
+}
+_NONE: str = "none yet"
+
+
+class SelectPanel:
+    """Shape of the box, size of the brush, and name and category of the next object to cut out."""
+
+    def __init__(self, gui: viser.GuiApi):
+        self.length = gui.add_slider("Length (m)", 0.02, 6.0, 0.01, 1.0)
+        self.width = gui.add_slider("Width (m)", 0.02, 6.0, 0.01, 1.0)
+        self.height = gui.add_slider("Height (m)", 0.02, 4.0, 0.01, 1.0)
+        self.turn = gui.add_slider("Turn (deg)", -180, 180, 1, 0)
+        self.take = gui.add_button("Select what is in the box")
+        self.leave = gui.add_button("Deselect what is in the box")
+        self.radius = gui.add_slider("Brush (m)", 0.02, 0.6, 0.01, 0.12)
+        self.clear = gui.add_button("Clear selection")
+        gui.add_divider()
+        self.category = gui.add_dropdown("Category", tuple(USUAL_KIND))
+        self.name = gui.add_text("Name", "")
+        self.cut = gui.add_button("Cut out", color="orange")
+
+    def box(self, center: tuple[float, float, float]) -> Box:
+        """Box of this shape at a position."""
+        size = (self.length.value, self.width.value, self.height.value)
+        return Box(center, size, float(np.deg2rad(self.turn.value)))
+
+
+class ObjectPanel:
+    """Controls of the current object: its name, its degrees of freedom, its limits, and a slider to try it."""
+
+    def __init__(self, gui: viser.GuiApi):
+        self.choice: viser.GuiDropdownHandle[str] = gui.add_dropdown("Object", (_NONE,))
+        self.name = gui.add_text("Name", "")
+        self.rename = gui.add_button("Rename")
+        self.kind = gui.add_dropdown("It", tuple(FREEDOMS.values()))
+        self.next_end = gui.add_button("Hinge at another edge")
+        self.direction = gui.add_slider("Direction (deg)", -180, 180, 1, 0)
+        self.least_deg = gui.add_slider("Least (deg)", -180, 0, 1, 0)
+        self.greatest_deg = gui.add_slider("Greatest (deg)", 0, 180, 1, 90)
+        self.least_m = gui.add_slider("Least (m)", -2.0, 0.0, 0.01, 0.0)
+        self.greatest_m = gui.add_slider("Greatest (m)", 0.0, 2.0, 0.01, 0.4)
+        self.try_deg = gui.add_slider("Try (deg)", -180.0, 180.0, 1.0, 0.0)
+        self.try_m = gui.add_slider("Try (m)", -2.0, 2.0, 0.01, 0.0)
+        self.back = gui.add_button("Put it back")
+        self.delete = gui.add_button("Delete", color="red")
+        self.show((), None)
+
+    @property
+    def current(self) -> str | None:
+        return None if self.choice.value == _NONE else self.choice.value
+
+    @property
+    def chosen_kind(self) -> str:
+        return next(kind for kind, name in FREEDOMS.items() if name == self.kind.value)
+
+    def limits(self, kind: str) -> tuple[float, float]:
+        """Limits set by the sliders: rad or m."""
+        if kind == "hinge":
+            return float(np.deg2rad(self.least_deg.value)), float(np.deg2rad(self.greatest_deg.value))
+        return float(self.least_m.value), float(self.greatest_m.value)
+
+    def show(self, items: tuple[SceneObject, ...], current: SceneObject | None) -> None:
+        """Show all objects' names, and the current one's properties."""
+        names = tuple(item.name for item in items) or (_NONE,)
+        if self.choice.options != names:
+            self.choice.options = names
+        chosen = current.name if current is not None else names[0]
+        if self.choice.value != chosen:
+            self.choice.value = chosen
+        kind = current.freedom.kind if current is not None else None
+        for control in (self.name, self.rename, self.kind, self.delete):
+            control.visible = current is not None
+        for control in (self.next_end, self.least_deg, self.greatest_deg, self.try_deg):
+            control.visible = kind == "hinge"
+        for control in (self.direction, self.least_m, self.greatest_m, self.try_m):
+            control.visible = kind == "axis"
+        self.back.visible = current is not None
+        if current is None:
+            return
+        freedom = current.freedom
+        _write(self.name, current.name)
+        _write(self.kind, FREEDOMS[freedom.kind])
+        if freedom.kind == "hinge":
+            low, high = np.rad2deg(_limits(freedom, np.pi))
+            _write(self.least_deg, round(low))
+            _write(self.greatest_deg, round(high))
+            self.try_deg.min, self.try_deg.max = float(low), float(max(high, low + 1.0))
+        if freedom.axis is not None:
+            low, high = _limits(freedom, 2.0)
+            _write(self.least_m, round(low, 3))
+            _write(self.greatest_m, round(high, 3))
+            _write(self.direction, round(float(np.rad2deg(np.arctan2(freedom.axis[1], freedom.axis[0])))))
+            self.try_m.min, self.try_m.max = float(low), float(max(high, low + 0.01))
+
+
+def _limits(freedom: Freedom, widest: float) -> tuple[float, float]:
+    return (-widest, widest) if freedom.limits is None else freedom.limits
+
+
+def _write(control, value) -> None:
+    """Set a control's value only if it has changed: a control that is being dragged must not jump."""
+    if control.value != value:
+        control.value = value

@@ -20,17 +20,20 @@ from wearcap.geometry.trajectory import Trajectory, nearest_frames
 from wearcap.recording import Motion, Recording
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
-from wearcap.viewer.objects import BodyPointsLayer, ObjectsLayer, poses_at, with_objects
 from wearcap.viewer.page_layers import (
     BodyLayer,
+    BodyPointsLayer,
     FeetLayer,
     HeadLayer,
     LabelLayer,
     Layer,
     MotionLayer,
+    ObjectsLayer,
     add_points,
+    poses_at,
     read_scene,
     surface_or_sticks,
+    with_objects,
 )
 from wearcap.viewer.page_server import ServedPage
 
@@ -51,7 +54,7 @@ SPEEDS = ("0.1×", "0.25×", "0.5×", "1×", "2×", "4×")
 
 
 @dataclass
-class Timeline:
+class _Timeline:
     """A time that runs between start and stop (s) when playing, at `speed` times real time."""
 
     start: float
@@ -61,7 +64,7 @@ class Timeline:
     speed: float = 1.0
 
     @classmethod
-    def of(cls, recording: Recording, motions: dict[str, Motion]) -> "Timeline":
+    def of(cls, recording: Recording, motions: dict[str, Motion]) -> "_Timeline":
         """A timeline over all moving layers. Raises WearcapError if there is nothing to show."""
         head = recording.head
         streams = [motion.timestamps for motion in motions.values()]
@@ -165,7 +168,7 @@ class Page(ServedPage):
         truth = with_objects(recording, environment)
         shown = ({} if truth is None else {TRUTH: truth}) | (captures or {})
         motions = {name: motion for name, motion in shown.items() if len(motion)}
-        self.timeline = Timeline.of(recording, motions)
+        self.timeline = _Timeline.of(recording, motions)
         scene = read_scene(folder / recording.scene) if recording.scene and folder is not None else None
         super().__init__("wearcap", host, port, "medium")
         moving, tracks = [], [motion.object_motion or {} for motion in motions.values()]
@@ -177,7 +180,7 @@ class Page(ServedPage):
             color = TRUTH_COLOR if name == TRUTH else COLORS[number % len(COLORS)]
             self.bodies[name] = _Placed.of(self.server, name, motion, recording, moving, color, len(motions) > 1)
         self.layers: list[Layer] = list(self.bodies.values())
-        self.aside_m = spacing_m(list(motions.values()), moving) if len(motions) > 1 else 0.0
+        self.aside_m = _spacing_m(list(motions.values()), moving) if len(motions) > 1 else 0.0
         if recording.head is not None and len(recording.head.timestamps):
             self.layers.append(HeadLayer(self.server, recording.head))
         self._surroundings = self.server.scene.add_frame("/surroundings", show_axes=False)
@@ -316,7 +319,7 @@ def _moves(track: Trajectory | None, item: SceneObject) -> bool:
     return float(shifted) > STILL_M or float(turned) > 2**0.5 * STILL_RAD
 
 
-def spacing_m(motions: Sequence[Motion], items: Sequence[SceneObject] = ()) -> float:
+def _spacing_m(motions: Sequence[Motion], items: Sequence[SceneObject] = ()) -> float:
     """Distance (m, along y) of neighbours at which none covers the next one at any time.
 
     The first has the greatest y. A motion occupies its body and the objects near it.
@@ -337,7 +340,8 @@ def _span(
     low, high = joints[..., 1].amin(1) - FLESH_M, joints[..., 1].amax(1) + FLESH_M
     for item in items if motion.object_motion else ():
         T = poses_at((motion.object_motion or {}).get(item.name), item, times)
-        corners = torch.from_numpy(_corners(item)).to(T.t)
+        box = zip(item.mesh.vertices.min(0), item.mesh.vertices.max(0), strict=True)
+        corners = torch.from_numpy(np.array(list(product(*box)))).to(T.t)  # of its bounding box, in its own axes
         placed = (corners @ T.R.mT + T.t[:, None]).double()
         y, middle = placed[..., 1], placed.mean(1)
         radius = (corners - corners.mean(0)).norm(dim=1).max()
@@ -345,9 +349,3 @@ def _span(
         low = torch.where(near, torch.minimum(low, y.amin(1)), low)
         high = torch.where(near, torch.maximum(high, y.amax(1)), high)
     return low, high
-
-
-def _corners(item: SceneObject) -> Float[np.ndarray, "8 3"]:
-    """Corners of an object's bounding box in its own axes (m)."""
-    low, high = item.mesh.vertices.min(0), item.mesh.vertices.max(0)
-    return np.array(list(product(*zip(low, high, strict=True))))

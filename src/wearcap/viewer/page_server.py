@@ -23,7 +23,7 @@ from wearcap.viewer.guard import Guard, Refused
 _starting = threading.Lock()
 
 
-def start_server(guard: Guard, port: int, label: str) -> viser.ViserServer:
+def _start_server(guard: Guard, port: int, label: str) -> viser.ViserServer:
     """A server on the guard's host and the next free port.
 
     Raises WearcapError if the host is no address of this machine, or viser cannot be guarded.
@@ -97,7 +97,7 @@ class ServedPage:
 
     def __init__(self, label: str, host: str, port: int, control_width: Literal["medium", "large"]):
         self.guard = Guard(host)
-        self.server = start_server(self.guard, port, label)
+        self.server = _start_server(self.guard, port, label)
         self.server.scene.set_up_direction("+z")
         self.server.gui.configure_theme(control_width=control_width, show_logo=False, show_share_button=False)
         self._stopped = False

@@ -24,12 +24,10 @@ from wearcap.geometry.camera import Camera
 from wearcap.geometry.mesh import Mesh, capsules, checker_floor
 from wearcap.geometry.render import Light, Splats, render
 from wearcap.geometry.rigid import Rigid
-from wearcap.recording.interactions import HANDS
-from wearcap.recording.motion import Motion
+from wearcap.recording.motion import HANDS, Motion
 from wearcap.recording.recording import Recording
 from wearcap.scene.environment import Environment
-from wearcap.viewer.objects import lit_points, posed_meshes
-from wearcap.viewer.page_layers import by_height, stick_body
+from wearcap.viewer.page_layers import by_height, lit_points, posed_meshes, stick_body
 
 PALETTE = np.array([[0.45, 0.55, 0.66], [0.86, 0.55, 0.30], [0.44, 0.62, 0.42], [0.62, 0.45, 0.62]])
 """Colours of the motions, in order."""
@@ -48,7 +46,7 @@ HEIGHT_COLORS = ((0.35, 0.45, 0.55), (0.80, 0.68, 0.45))
 
 
 @dataclass(frozen=True)
-class Actor:
+class _Actor:
     """A motion with the body surface that shows it."""
 
     label: str
@@ -100,9 +98,9 @@ class Actor:
         return [capsules(places, places, size, size, np.tile(color, (len(places), 1)), 8)]
 
 
-def actors(
+def _actors(
     motions: dict[str, Motion], body: BodyModel | None = None, environment: Environment | None = None
-) -> list[Actor]:
+) -> list[_Actor]:
     """One actor per motion, in sticks unless a body is given for them all. Raises WearcapError for none."""
     if not motions:
         raise WearcapError("no motion to draw", expected="at least one")
@@ -111,7 +109,7 @@ def actors(
         lowest = motion.T_world_joint.t[..., 2].amin(1)
         floor_z = float(torch.quantile(lowest[:: max(1, len(lowest) // 5000)], 0.05)) - 0.02
         color = PALETTE[number % len(PALETTE)]
-        shown.append(Actor(label, motion, body or stick_body(motion.skeleton), color, floor_z, environment))
+        shown.append(_Actor(label, motion, body or stick_body(motion.skeleton), color, floor_z, environment))
     return shown
 
 
@@ -128,8 +126,8 @@ def _looking(
     return camera, Rigid(torch.from_numpy(R).float(), torch.from_numpy(target - distance * forward).float())
 
 
-def panel(
-    actor: Actor,
+def _panel(
+    actor: _Actor,
     frame: int,
     target: Float[np.ndarray, "3"],
     size: tuple[int, int],
@@ -165,7 +163,7 @@ def contact_sheet(
     `environment` are drawn where each motion has them. Raises WearcapError for missing frames, and for
     motions that share no time.
     """
-    shown = actors(motions, body, environment)
+    shown = _actors(motions, body, environment)
     length = len(shown[0].motion)
     frames = shared_frames(motions, columns) if frames is None else list(frames)
     if not frames or max(frames) >= length or min(frames) < 0:
@@ -176,17 +174,17 @@ def contact_sheet(
     sheet = Image.new("RGB", (width * min(columns, len(frames)), height * len(shown) * len(bands)), "white")
     for band, chosen in enumerate(bands):
         for column, frame in enumerate(chosen):
-            target = focus(shown[0].motion, frame)
+            target = _focus(shown[0].motion, frame)
             for row, (actor, clock) in enumerate(zip(shown, clocks)):
                 nearest = frame if row == 0 else int(np.abs(clock - clocks[0][frame]).argmin())
-                image = panel(actor, nearest, target, size, distance=distance)
+                image = _panel(actor, nearest, target, size, distance=distance)
                 seconds = clock[nearest] - clocks[0][0]
                 text = f"{actor.label}  {seconds:.2f} s" if column == 0 else f"{seconds:.2f} s"
                 sheet.paste(captioned(image, text), (column * width, (band * len(shown) + row) * height))
     return np.asarray(sheet)
 
 
-def shared_time(motions: Iterable[Motion]) -> tuple[float, float]:
+def _shared_time(motions: Iterable[Motion]) -> tuple[float, float]:
     """First and last time (s) that all motions share. Raises WearcapError if there is none."""
     clocks = [motion.timestamps for motion in motions]
     start, stop = max(clock[0].item() for clock in clocks), min(clock[-1].item() for clock in clocks)
@@ -197,14 +195,14 @@ def shared_time(motions: Iterable[Motion]) -> tuple[float, float]:
 
 def shared_frames(motions: dict[str, Motion], count: int) -> list[int]:
     """`count` frames of the first motion (or all, if it has fewer), spread over the time that all motions share."""
-    start, stop = shared_time(motions.values())
+    start, stop = _shared_time(motions.values())
     clock = next(iter(motions.values())).timestamps.numpy()
     first = int(np.searchsorted(clock, start))
     last = max(int(np.searchsorted(clock, stop, side="right")) - 1, first)
     return np.linspace(first, last, min(count, last - first + 1)).round().astype(int).tolist()
 
 
-def focus(motion: Motion, frame: int) -> Float[np.ndarray, "3"]:
+def _focus(motion: Motion, frame: int) -> Float[np.ndarray, "3"]:
     """Target of the camera: a point slightly below the root (m)."""
     return motion.t_world_root[frame].double().numpy() - np.array([0.0, 0.0, 0.08])
 
@@ -273,8 +271,8 @@ def write_video(
     """
     if size[0] % 2 or size[1] % 2 or fps <= 0:
         raise WearcapError(f"a video of {size[0]}x{size[1]} at {fps} fps", expected="even sizes, a positive rate")
-    shown = actors(motions, body, environment)
-    start, stop = shared_time(motions.values())
+    shown = _actors(motions, body, environment)
+    start, stop = _shared_time(motions.values())
     if max_seconds is not None:
         stop = min(stop, start + max_seconds)
     times = start + np.arange(int((stop - start) * fps) + 1) / fps
@@ -286,9 +284,9 @@ def write_video(
         stream.width, stream.height, stream.pix_fmt = size[0] * len(shown), size[1], "yuv420p"
         for time in track(times, f"video {Path(path).name}", console=Console(stderr=True), disable=not progress):
             frames = [int(np.abs(clock - time).argmin()) for clock in clocks]
-            target = focus(shown[0].motion, frames[0])
+            target = _focus(shown[0].motion, frames[0])
             panels = [
-                np.asarray(captioned(panel(actor, frame, target, size, supersample=1), actor.label))
+                np.asarray(captioned(_panel(actor, frame, target, size, supersample=1), actor.label))
                 for actor, frame in zip(shown, frames)
             ]
             picture = av.VideoFrame.from_ndarray(np.concatenate(panels, 1), format="rgb24")

@@ -25,7 +25,7 @@ from wearcap.io.formats.contact_labels import LabelClock, interactions_of, label
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import checked_trajectory
 from wearcap.io.formats.text import read_json
-from wearcap.recording.interactions import HANDS, Interactions
+from wearcap.recording.motion import HANDS, Interactions
 from wearcap.recording.recording import Recording
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject

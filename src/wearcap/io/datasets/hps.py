@@ -38,7 +38,7 @@ from wearcap.io.formats.restricted_pickle import read_pickle
 from wearcap.io.formats.smpl import A, shape_from_betas, smpl_motion
 from wearcap.io.formats.text import at_line, finite_floats, numbered_lines, read_json, read_json_object
 from wearcap.recording import Localization, Motion
-from wearcap.recording.photo import Photo
+from wearcap.scene.scan import Photo
 
 FPS = 30.0
 """Frame rate (Hz) of the motion, the suit's exports and the localised video (resampled from 29.97)."""

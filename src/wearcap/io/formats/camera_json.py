@@ -18,7 +18,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.bounded import placed, understood
 from wearcap.io.formats.poses import are_rotations
 from wearcap.io.formats.text import read_json
-from wearcap.recording.photo import Photo
+from wearcap.scene.scan import Photo
 
 _NUMBERS = ("fx", "fy", "cx", "cy")
 EXAMPLE = (

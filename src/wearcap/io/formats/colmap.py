@@ -21,7 +21,7 @@ from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.bounded import read_bytes
 from wearcap.io.formats.text import at_line, finite_floats, numbered_lines
-from wearcap.recording.photo import Photo
+from wearcap.scene.scan import Photo
 
 _MAX_BYTES = 1 << 34
 """Largest binary file that is read (16 GiB)."""

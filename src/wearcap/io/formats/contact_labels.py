@@ -20,7 +20,7 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.io.formats.bounded import understood
 from wearcap.io.formats.text import read_json
-from wearcap.recording.interactions import HANDS, Interactions
+from wearcap.recording.motion import HANDS, Interactions
 from wearcap.scene.objects import CONTACT_CLASSES
 
 SCHEMA = 1

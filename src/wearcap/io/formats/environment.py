@@ -19,7 +19,7 @@ from wearcap.io.formats.bounded import placed
 from wearcap.io.formats.ply import Ply, read_ply, write_ply
 from wearcap.io.formats.poses import are_rotations
 from wearcap.io.formats.text import read_json
-from wearcap.scene.environment import Environment, hinge_gap_m
+from wearcap.scene.environment import Environment
 from wearcap.scene.objects import FREEDOMS, Freedom, SceneObject
 
 SCHEMA = 1
@@ -100,7 +100,7 @@ def _object(row: Any, number: int, path: Path) -> SceneObject:
 
 def _freedom(row: Any, where: str) -> Freedom:
     kind = row.get("kind") if isinstance(row, dict) else None
-    if kind not in FREEDOMS:
+    if kind not in tuple(FREEDOMS):  # a file may say anything, lists too
         raise WearcapError(f"no degree of freedom {kind!r}", where=where, expected=f"one of {', '.join(FREEDOMS)}")
     _require_keys(row, _FREEDOM_KEYS[kind], f"{where}, freedom")
     pivot = None if kind != "hinge" else tuple(_numbers(row["pivot"], (3,), "pivot", where).tolist())
@@ -173,7 +173,7 @@ def _check(item: SceneObject, where: str) -> None:
     if not (np.isfinite([*pose, *freedom]).all() and np.isfinite(item.mesh.vertices).all()):
         raise WearcapError("numbers that are not finite", where=where, expected="finite coordinates (m)")
     _rotation(item.R_world_object.tolist(), where)
-    gap = hinge_gap_m(item)
+    gap = item.hinge_gap_m
     if gap > MAX_HINGE_GAP_M:
         what = f"its hinge is {gap:.2f} m from its mesh, seen from above"
         expected = f"at most {MAX_HINGE_GAP_M} m"

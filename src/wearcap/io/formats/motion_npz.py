@@ -17,8 +17,7 @@ from wearcap.files import atomic_path, parse_json
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.npz import read_npz, require
-from wearcap.recording.interactions import HANDS, Interactions
-from wearcap.recording.motion import Motion
+from wearcap.recording.motion import HANDS, Interactions, Motion
 from wearcap.recording.serialize import dumps, flatten, unflatten
 
 SCHEMA = 1

@@ -14,8 +14,7 @@ from wearcap.io.formats.camera_json import PHOTOS_FILE, read_photos
 from wearcap.io.formats.colmap import Tracks, read_colmap
 from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply
-from wearcap.recording.photo import Photo
-from wearcap.scene.scan import Scan
+from wearcap.scene.scan import Photo, Scan
 
 MAX_EXTENT_M = 5000.0
 """Largest extent (m) of a scene that a person walks through in one recording."""

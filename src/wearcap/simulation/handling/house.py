@@ -8,8 +8,7 @@ from jaxtyping import Float
 
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.recording.interactions import HANDS, Interactions
-from wearcap.recording.motion import Motion
+from wearcap.recording.motion import HANDS, Interactions, Motion
 from wearcap.simulation.handling.grips import Handling, object_motion
 from wearcap.simulation.places.interactive_flat import InteractiveFlat, obstacle
 from wearcap.simulation.places.movables import Movable

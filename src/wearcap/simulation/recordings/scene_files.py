@@ -19,7 +19,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.camera_json import PHOTOS_FILE, write_photos
 from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.io.formats.scene_folder import CLOUD
-from wearcap.recording.photo import Photo
+from wearcap.scene.scan import Photo
 from wearcap.sensors.slam import R_DEVICE_CAM
 from wearcap.simulation.rendering.scan import Scanner, place_stations, scan_world
 from wearcap.simulation.rendering.views import Development, Scenery, render_view

@@ -16,7 +16,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.triangle_distance import TriangleIndex
 from wearcap.models.point_encoder import PointNeXt, cloud_extents
 from wearcap.recording.recording import Recording
-from wearcap.scene.environment import Environment, surface_index
+from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
 from wearcap.systems.echo.features import EchoFeatures
 
@@ -90,7 +90,14 @@ class ObjectReader:
             parts.append(self.encoder(both))
         code, code_mirrored = self._embedded(torch.cat(parts, -1)).unbind(0)
         return ObjectShape(
-            item.name, item.category, item.mesh, middle, both[0].clone(), code, code_mirrored, surface_index(item.mesh)
+            item.name,
+            item.category,
+            item.mesh,
+            middle,
+            both[0].clone(),
+            code,
+            code_mirrored,
+            TriangleIndex.of(item.mesh),
         )
 
     @torch.no_grad()

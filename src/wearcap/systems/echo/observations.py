@@ -18,7 +18,6 @@ from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 from wearcap.recording.timing import at_times
 from wearcap.scene.environment import Environment
-from wearcap.scene.objects import check_object
 from wearcap.systems.echo.features import CONTACTS
 from wearcap.systems.echo.model import MODALITIES
 from wearcap.systems.echo.objects import ObjectReader, ObjectShape
@@ -175,7 +174,7 @@ def _objects(scenario: Scenario, names: list[str], reader: ObjectReader) -> list
         where = f"object {name!r} of {scenario.recording.name}"
         try:
             item = scenario.environment.by_name(name)
-            check_object(item, where)
+            item.check(where)
             shapes.append(reader(item))
         except WearcapError as error:
             raise WearcapError(error.what, where=where, expected=error.expected, fix=error.fix) from error

@@ -31,7 +31,6 @@ from wearcap.runtime.graphs import undisturbed
 from wearcap.runtime.session import Session, WearerStream
 from wearcap.runtime.snapshot import classes_of
 from wearcap.scene.environment import Environment
-from wearcap.scene.objects import check_object
 from wearcap.sensors import packets, samples
 from wearcap.sensors.packets import MAX_WAITING, Admitted, Clock, HeadInput
 from wearcap.sensors.samples import ActiveObject, HeadSample, ObjectSample, WristSample
@@ -247,7 +246,7 @@ class EchoStream(WearerStream):
             if self._environment is None:
                 raise WearcapError(f"no object {name!r}", expected="a session with an environment")
             item = self._environment.by_name(name)
-            check_object(item, f"object {name!r}")
+            item.check(f"object {name!r}")
             self._shapes[name] = self._reader(item)
             if name not in self._names:
                 self._names.append(name)

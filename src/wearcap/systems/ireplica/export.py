@@ -12,7 +12,7 @@ from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry import rotation
 from wearcap.recording import Recording
-from wearcap.recording.interactions import HANDS
+from wearcap.recording.motion import HANDS
 from wearcap.runtime.graphs import Call, Exports, Graph, Run
 from wearcap.systems.ireplica.contact_prediction import ContactDetector, ContactStream
 from wearcap.systems.ireplica.contact_transformer import FRAMES, ContactNetwork

@@ -18,11 +18,10 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate
 from wearcap.recording import Motion
 from wearcap.recording.acts import MARGIN_S, Act, spread_acts
-from wearcap.recording.interactions import Interactions
+from wearcap.recording.motion import Interactions
 from wearcap.recording.timing import at_times, resampled
 from wearcap.scene.environment import Environment
-from wearcap.scene.object_motion import ANCHORS, ObjectState, follow_hands
-from wearcap.scene.objects import SceneObject
+from wearcap.scene.objects import ANCHORS, ObjectState, SceneObject, follow_hands
 from wearcap.systems.ireplica.contact_intervals import ContactInterval, ContactSettings, Span, class_intervals, settled
 from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 

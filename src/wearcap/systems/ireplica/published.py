@@ -13,7 +13,7 @@ from wearcap.geometry.trajectory import Trajectory, interpolate
 from wearcap.metrics.objects import handlings
 from wearcap.optimize.trajectory import BentPath
 from wearcap.recording import Motion, Recording
-from wearcap.recording.interactions import Interactions
+from wearcap.recording.motion import Interactions
 from wearcap.recording.timing import resampled
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import CONTACT_CLASSES

@@ -11,7 +11,7 @@ from wearcap.body.kinematics import site_positions
 from wearcap.optimize.contact_correction import OffsetSettings, bend_contacts, offset_for
 from wearcap.optimize.trajectory import BentPath
 from wearcap.recording import Motion
-from wearcap.recording.interactions import HANDS
+from wearcap.recording.motion import HANDS
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
 from wearcap.systems.ireplica.contact_intervals import ContactInterval

@@ -13,7 +13,7 @@ from wearcap.data.transforms import Cut, Draws, Window, joint_twins
 from wearcap.data.windows import Content, Windows, open_recording
 from wearcap.errors import WearcapError
 from wearcap.recording import Motion
-from wearcap.recording.interactions import Interactions
+from wearcap.recording.motion import Interactions
 from wearcap.recording.store import RecordingFile, RecordingStore
 from wearcap.systems.ireplica.features import PoseFeatures, is_even, pose_frames
 

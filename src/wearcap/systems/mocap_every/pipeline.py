@@ -18,7 +18,7 @@ from wearcap.recording.recording import FloorTrack
 from wearcap.recording.timing import at_times
 from wearcap.runtime.graphs import Run, chosen, run_of
 from wearcap.runtime.system import CaptureInput, LearnedSystem
-from wearcap.scene.floor_update import FloorFixed, FloorFollow, FloorFollower, FloorUpdate
+from wearcap.scene.floor import FloorFixed, FloorFollow, FloorFollower, FloorUpdate
 from wearcap.sensors.watches import watches_at
 from wearcap.systems.mocap_every.energy import LatentSolution
 from wearcap.systems.mocap_every.features import Sensed, WatchFeatures, synthetic_wrists

@@ -25,7 +25,7 @@ from wearcap.recording import motion as motion_types
 from wearcap.recording.timing import joined
 from wearcap.runtime.session import Session, WearerStream
 from wearcap.runtime.snapshot import classes_of
-from wearcap.scene import floor_update
+from wearcap.scene import floor as floor_types
 from wearcap.sensors import packets
 from wearcap.sensors import samples as sample_types
 from wearcap.sensors.packets import MAX_WAITING, Admitted, Clock, HeadInput
@@ -39,7 +39,7 @@ from wearcap.tracking import head_path
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.head_path import Chunk, HeadTrack
 
-_STATE = skeleton, motion_types, rigid, head_path, packets, sample_types, floor_update, features, windows
+_STATE = skeleton, motion_types, rigid, head_path, packets, sample_types, floor_types, features, windows
 """Modules with the classes that a session's state consists of."""
 MAX_POINTS = 1_000_000
 """Capacity of the buffer of points that wait for a head pose; the oldest are dropped."""

@@ -16,7 +16,7 @@ from wearcap.data.features import body_size
 from wearcap.data.transforms import mirrored_rotations
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.scene.floor_update import FloorFollower
+from wearcap.scene.floor import FloorFollower
 from wearcap.systems.mocap_every.features import Sensed
 
 if TYPE_CHECKING:
