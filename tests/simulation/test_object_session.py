@@ -9,8 +9,8 @@ import torch
 from wearcap.body.kinematics import site_positions
 from wearcap.errors import WearcapError
 from wearcap.simulation.handling.grips import Handling
-from wearcap.simulation.handling.house import House
 from wearcap.simulation.handling.household import HANDHELD, VARIED, Household
+from wearcap.simulation.places.interactive_flat import House
 from wearcap.simulation.places.movables import HANDHELDS
 from wearcap.simulation.recordings.interaction_session import ObjectConfig, flat_of, object_flat_of, simulate_objects
 from wearcap.simulation.recordings.simulate import POOLS, person_of

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from wearcap.simulation.handling.house import House
 from wearcap.simulation.handling.opening import operate
 from wearcap.simulation.handling.rearranging import rearrange, relocate
 from wearcap.simulation.people.actions import ACTIVITIES, follow, start_place
 from wearcap.simulation.people.person import Person
 from wearcap.simulation.people.plan import Plan
 from wearcap.simulation.people.wearer import TAIL_S
+from wearcap.simulation.places.interactive_flat import House
 from wearcap.simulation.places.movables import Movable
 from wearcap.simulation.places.openables import Openable
 from wearcap.simulation.places.outline import distance_to_convex

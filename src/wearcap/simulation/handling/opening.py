@@ -15,12 +15,12 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.simulation.handling.distractors import pretend_to_handle
 from wearcap.simulation.handling.grips import Handling, drawn_grip
-from wearcap.simulation.handling.house import House
 from wearcap.simulation.people.actions import approach
 from wearcap.simulation.people.gaze import look_at
 from wearcap.simulation.people.plan import LEFT_SIGN, SIDES, Plan, wrap
 from wearcap.simulation.people.shuffling import shuffle
 from wearcap.simulation.people.track import ease
+from wearcap.simulation.places.interactive_flat import House
 from wearcap.simulation.places.openables import Openable
 from wearcap.simulation.places.outline import distance_to_convex
 from wearcap.simulation.places.world import World

@@ -7,8 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from wearcap.simulation.places.builder import WorldBuilder, hue
-from wearcap.simulation.places.furnish import ROOM_KINDS, Plan
-from wearcap.simulation.places.furniture import wood
+from wearcap.simulation.places.furniture import ROOM_KINDS, Plan, wood
 from wearcap.simulation.places.outline import Box, inset, middle_and_size, rectangle
 from wearcap.simulation.places.walls import HEIGHT, THICKNESS, Wall, before_gap, build_flight, build_railing, build_wall
 from wearcap.simulation.places.world import Flight, World
@@ -84,8 +83,20 @@ def lay_out(builder: WorldBuilder, rng: np.random.Generator, stairs: bool, furni
         # The upper hallway: a strip past the hole, and the floor in front of it and behind it.
         past = (hall[0], hall[1], hall[2], hole[1])
         storeys.append((upper_z, [past, (hall[0], hole[1], hole[0], hall[3]), (hole[2], hole[1], hall[2], hall[3])]))
+    rooms = layout.side_a + layout.side_b
     for level, (z, floors) in enumerate(storeys):
-        _build_storey(builder, layout, level, z, floors, rng, furnish)
+        slab, wall_color = (0.05 if level == 0 else z - HEIGHT), hue(rng, (0.0, 0.15))
+        for outline in floors:
+            builder.add_slab("floor", outline, z, slab, wood(rng), 1.5, level=level)
+        for wall in layout.walls(z, rng):
+            build_wall(builder, wall, wall_color, rng)
+        kept_free = [before_gap(builder, door) for door in builder.doors if abs(door.position[2] - z) < 0.1]
+        kinds = rng.permutation([*ROOM_KINDS, *ROOM_KINDS])[: len(rooms)]
+        for number, (outline, kind) in enumerate(zip(rooms, kinds)):
+            builder.add_slab("floor", outline, z, slab, wood(rng), 1.5, level=level)
+            builder.add_room(f"{kind} {level}.{number}", rectangle(*middle_and_size(outline)), z)
+            furnish(Plan(builder, inset(outline, INSET_M), z, list(kept_free)), str(kind), rng)
+        builder.add_room(f"hallway {level}", rectangle(*middle_and_size(floors[0])), z)
 
 
 def _split(rng: np.random.Generator, width: float, count: int, low: float, high: float) -> tuple[Box, ...]:
@@ -95,30 +106,6 @@ def _split(rng: np.random.Generator, width: float, count: int, low: float, high:
     spare = (width - count * NARROWEST_ROOM_M) * rng.dirichlet(np.full(count, 2.0))
     edges = np.concatenate([[0.0], (NARROWEST_ROOM_M + spare).cumsum()])
     return tuple((float(a), low, float(b), high) for a, b in pairwise(edges))
-
-
-def _build_storey(
-    builder: WorldBuilder,
-    layout: _Layout,
-    level: int,
-    z: float,
-    hall: list[Box],
-    rng: np.random.Generator,
-    furnish: Furnish,
-) -> None:
-    slab, wall_color = (0.05 if level == 0 else z - HEIGHT), hue(rng, (0.0, 0.15))
-    for outline in hall:
-        builder.add_slab("floor", outline, z, slab, wood(rng), 1.5, level=level)
-    for wall in layout.walls(z, rng):
-        build_wall(builder, wall, wall_color, rng)
-    kept_free = [before_gap(builder, door) for door in builder.doors if abs(door.position[2] - z) < 0.1]
-    rooms = layout.side_a + layout.side_b
-    kinds = rng.permutation([*ROOM_KINDS, *ROOM_KINDS])[: len(rooms)]
-    for number, (outline, kind) in enumerate(zip(rooms, kinds)):
-        builder.add_slab("floor", outline, z, slab, wood(rng), 1.5, level=level)
-        builder.add_room(f"{kind} {level}.{number}", rectangle(*middle_and_size(outline)), z)
-        furnish(Plan(builder, inset(outline, INSET_M), z, list(kept_free)), str(kind), rng)
-    builder.add_room(f"hallway {level}", rectangle(*middle_and_size(hall[0])), z)
 
 
 def _build_stairs(builder: WorldBuilder, layout: _Layout, rng: np.random.Generator) -> tuple[Box, float]:

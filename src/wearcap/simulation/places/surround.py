@@ -12,8 +12,7 @@ from jaxtyping import Float
 from wearcap.recording.motion import Motion
 from wearcap.simulation.people.body_space import BodySpace, SweptFloor
 from wearcap.simulation.places.builder import Piece, WorldBuilder, hue
-from wearcap.simulation.places.furnish import ROOM_KINDS, Plan
-from wearcap.simulation.places.furniture import MAKERS, wood
+from wearcap.simulation.places.furniture import MAKERS, ROOM_KINDS, Plan, wood
 from wearcap.simulation.places.outdoor import MEADOW, PAVEMENT_KINDS, SQUARE_KINDS
 from wearcap.simulation.places.outline import Box, around, inset, middle_and_size, rectangle
 from wearcap.simulation.places.supports import build_seat, build_tread, find_sits, find_treads, meets

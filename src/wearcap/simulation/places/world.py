@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from wearcap.geometry.mesh import Mesh
-from wearcap.simulation.people.walking import plan_path
-from wearcap.simulation.places.navigation import NavigationGrid
+from wearcap.simulation.places.navigation import NavigationGrid, plan_path
 from wearcap.simulation.places.outline import points_in_convex
 
 STEP_UP_M = 0.35
@@ -155,20 +154,8 @@ class Door:
     width: float
 
 
-@dataclass(frozen=True)
-class Contents:
-    """What a world offers to its walkers beside objects and surfaces."""
-
-    seats: tuple[Seat, ...] = ()
-    reach_targets: tuple[ReachTarget, ...] = ()
-    flights: tuple[Flight, ...] = ()
-    rooms: tuple[Room, ...] = ()
-    doors: tuple[Door, ...] = ()
-    spots: tuple[CaptureSpot, ...] = ()
-
-
 @dataclass(frozen=True, kw_only=True)
-class World(Contents):
+class World:
     """Seeded surroundings. `face_object` gives each face of `mesh` its object (index), or -1 for the shell."""
 
     name: str
@@ -178,6 +165,12 @@ class World(Contents):
     """Visual features per m² of each face: near 0 on blank walls, hundreds on book spines."""
     objects: tuple[WorldObject, ...]
     surfaces: tuple[Surface, ...]
+    seats: tuple[Seat, ...] = ()
+    reach_targets: tuple[ReachTarget, ...] = ()
+    flights: tuple[Flight, ...] = ()
+    rooms: tuple[Room, ...] = ()
+    doors: tuple[Door, ...] = ()
+    spots: tuple[CaptureSpot, ...] = ()
     cell: float = 0.1
     """Side of a cell of the planning grid (m)."""
     outdoors: bool = False
