@@ -12,8 +12,8 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.simulation.handling.grips import GripPlace, Vector, drawn_grip, still, vector
 from wearcap.simulation.handling.holding import bend_for, bow, spread
 from wearcap.simulation.people.actions import ON_THIGHS, hold, squat
-from wearcap.simulation.people.gaze import look_about, look_at
 from wearcap.simulation.people.plan import SIDES, Plan
+from wearcap.simulation.people.posture import look_about, look_at
 
 SHORT_M = (0.05, 0.20)
 """Range of the palm's distance from the surface."""

@@ -16,10 +16,10 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.simulation.handling.distractors import pretend_to_handle
 from wearcap.simulation.handling.grips import Handling, drawn_grip
 from wearcap.simulation.people.actions import approach
-from wearcap.simulation.people.gaze import look_at
 from wearcap.simulation.people.plan import LEFT_SIGN, SIDES, Plan, wrap
-from wearcap.simulation.people.shuffling import shuffle
+from wearcap.simulation.people.posture import look_at
 from wearcap.simulation.people.track import ease
+from wearcap.simulation.people.walking import shuffle
 from wearcap.simulation.places.interactive_flat import House
 from wearcap.simulation.places.openables import Openable
 from wearcap.simulation.places.outline import distance_to_convex

@@ -12,7 +12,7 @@ from wearcap.simulation.handling.sliding import Slide, slide, slide_options
 from wearcap.simulation.handling.using import use
 from wearcap.simulation.people.actions import approach
 from wearcap.simulation.people.plan import Plan
-from wearcap.simulation.people.shuffling import step_to
+from wearcap.simulation.people.walking import step_to
 from wearcap.simulation.places.interactive_flat import House, obstacle
 from wearcap.simulation.places.movables import Movable, floor_pose
 from wearcap.simulation.places.outline import distance_to_convex, stays_apart

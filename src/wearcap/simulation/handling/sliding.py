@@ -9,10 +9,10 @@ from jaxtyping import Float
 
 from wearcap.simulation.handling.grips import Grip, GripPlace, Handling, Moves, drawn_grip
 from wearcap.simulation.people.gait import glide
-from wearcap.simulation.people.gaze import look_at, turn_head
 from wearcap.simulation.people.plan import LEFT_SIGN, OTHER, SIDES, Plan, wrap
-from wearcap.simulation.people.shuffling import arrive, shuffle
+from wearcap.simulation.people.posture import look_at, turn_head
 from wearcap.simulation.people.track import ease
+from wearcap.simulation.people.walking import arrive, shuffle
 from wearcap.simulation.places.movables import Movable, Rail, floor_pose
 from wearcap.simulation.places.outline import turn
 

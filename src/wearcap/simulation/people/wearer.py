@@ -15,10 +15,9 @@ from wearcap.recording.motion import Motion
 from wearcap.simulation.people.actions import ACTIVITIES, start_place
 from wearcap.simulation.people.arms import arm_motion, reach_help, two_bone
 from wearcap.simulation.people.gait import Feet
-from wearcap.simulation.people.gaze import head_angles
 from wearcap.simulation.people.person import Person
 from wearcap.simulation.people.plan import SIDES, Label, Plan
-from wearcap.simulation.people.posture import SPINE, Stance, Trunk, rotation_of, trunk_motion
+from wearcap.simulation.people.posture import SPINE, Stance, Trunk, head_angles, rotation_of, trunk_motion
 from wearcap.simulation.people.track import blur
 from wearcap.simulation.places.world import World
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from wearcap.geometry.mesh import Mesh
 from wearcap.simulation.places.navigation import NavigationGrid, plan_path
@@ -198,6 +198,14 @@ class World:
     def clearance(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
         """Distance (m, to about a cell) from floor points to the nearest obstacle; 0 inside one."""
         return self.navigation.clearance_at(points)
+
+    def on_stairs(self, points: Float[np.ndarray, "point 3"]) -> Bool[np.ndarray, "point"]:
+        """Whether floor points lie on a flight or within a step of its ends."""
+        near = np.zeros(len(points), bool)
+        for flight in self.flights:
+            run, side = flight.up_and_left(points[:, :2])
+            near |= (run > -0.8) & (run < flight.length + 0.8) & (np.abs(side) < flight.width / 2 + 0.1)
+        return near
 
     def plan_path(
         self, start: Float[np.ndarray, "3"], goal: Float[np.ndarray, "3"], rng: np.random.Generator

@@ -15,7 +15,7 @@ from wearcap.recording.motion import Motion
 from wearcap.recording.recording import ImuStream, Intervals, Recording
 from wearcap.sensors.imu import ImuNoise, synthesize_imu
 from wearcap.sensors.simulated import SuitNoise, suit_motion
-from wearcap.simulation.people.actions import ACTIVITIES, FREE_M, follow, on_stairs, path_length
+from wearcap.simulation.people.actions import ACTIVITIES, FREE_M, follow, path_length
 from wearcap.simulation.people.person import Person
 from wearcap.simulation.people.plan import LEFT_SIGN, SIDES, Plan
 from wearcap.simulation.people.walking import turn_to
@@ -220,7 +220,7 @@ class _Session:
     def wander(self, until_m: float) -> None:
         """Walk from place to place as long as the path home leaves room for it."""
         points = self.world.navigation.node_points
-        free = (self.world.clearance(points) > FREE_M) & ~on_stairs(self.world, points)
+        free = (self.world.clearance(points) > FREE_M) & ~self.world.on_stairs(points)
         while True:
             there = self.world.navigation.lengths_from(self.plan.position)
             left = until_m - self.travelled
