@@ -142,7 +142,7 @@ def _planned(
     )
     walkable = world.navigation.node_points[:, :2]
     walkable = walkable[np.linalg.norm(walkable - palms[0, :2], axis=1) < 2.0]
-    found = [(side, _find_stances(replace(task, sign=LEFT_SIGN[side]), walkable, rng)) for side in SIDES]
+    found = [(side, replace(task, sign=LEFT_SIGN[side]).stances(walkable, rng)) for side in SIDES]
     able = [(*stances, side) for side, stances in found if stances is not None]
     if not able:
         return None
@@ -171,7 +171,15 @@ def _perform(plan: Plan, house: House, turn: _Turn, rng: np.random.Generator) ->
     padded = np.concatenate([np.repeat(fine[:1], reach, 0), fine, np.repeat(fine[-1:], reach, 0)])
     path = scipy.ndimage.gaussian_filter1d(padded, sigma, axis=0)[reach : reach + count]
     times = np.linspace(begin, stop, count)
-    place, yaw = item.handles[turn.handle], _hand_yaw(plan, turn, path)
+    place = item.handles[turn.handle]
+    # the hand turns on the handle so that the fingers point along the arm
+    values = turn.values(np.linspace(0.0, 1.0, count))
+    held, pose = item.handle(turn.handle, values), item.pose(values)
+    fingers = (pose.R.numpy() @ np.array(place.fingers))[:, :2]
+    across = np.stack([-np.sin(path[:, 2]), np.cos(path[:, 2])], 1)
+    arm = held[:, :2] - path[:, :2] - 0.18 * LEFT_SIGN[turn.side] * across
+    angle = np.arctan2(fingers[:, 0] * arm[:, 1] - fingers[:, 1] * arm[:, 0], (fingers * arm).sum(1))
+    yaw = YAW_MOST * np.tanh(np.unwrap(angle) / YAW_MOST)
 
     def poses(at: Float[np.ndarray, "time"], chest: Rigid) -> Rigid:
         return item.pose(turn.values((at - begin) / turn.seconds))
@@ -194,17 +202,6 @@ def _perform(plan: Plan, house: House, turn: _Turn, rng: np.random.Generator) ->
     house.handlings.append(Handling.of(item.name, contact_class, poses, [(turn.side, grip)]))
     house.values[item.name] = turn.stop
     plan.time = max(plan.time, release)
-
-
-def _hand_yaw(plan: Plan, turn: _Turn, path: Float[np.ndarray, "time 3"]) -> Float[np.ndarray, "time"]:
-    """Rotation of the hand on the handle (rad), so that the fingers point along the arm."""
-    values = turn.values(np.linspace(0.0, 1.0, len(path)))
-    handle, pose = turn.item.handle(turn.handle, values), turn.item.pose(values)
-    fingers = (pose.R.numpy() @ np.array(turn.item.handles[turn.handle].fingers))[:, :2]
-    across = np.stack([-np.sin(path[:, 2]), np.cos(path[:, 2])], 1)
-    arm = handle[:, :2] - path[:, :2] - 0.18 * LEFT_SIGN[turn.side] * across
-    angle = np.arctan2(fingers[:, 0] * arm[:, 1] - fingers[:, 1] * arm[:, 0], (fingers * arm).sum(1))
-    return YAW_MOST * np.tanh(np.unwrap(angle) / YAW_MOST)
 
 
 @dataclass(frozen=True)
@@ -230,66 +227,64 @@ class _Task:
     beyond: tuple[Float[np.ndarray, "2"], float] | None = None
     """A point, and the preferred distance from it (m): who pulls a leaf does not step behind it."""
 
+    def stances(
+        self, walkable: Float[np.ndarray, "point 2"], rng: np.random.Generator
+    ) -> tuple[float, Float[np.ndarray, "key 3"]] | None:
+        """The cost of the cheapest path and its floor points and headings (m, m, rad unwrapped) at the task's keys.
 
-def _find_stances(
-    task: _Task, walkable: Float[np.ndarray, "point 2"], rng: np.random.Generator
-) -> tuple[float, Float[np.ndarray, "key 3"]] | None:
-    """The cost of the cheapest path and its floor points and headings (m, m, rad unwrapped) at the task's keys.
+        None where none is free; it begins within 0.45 m of a walkable point.
+        """
+        low, high = self.handle[:, :2].min(0) - AROUND_M, self.handle[:, :2].max(0) + AROUND_M
+        axes = [np.arange(a, b, SPACING_M) for a, b in zip(low, high)]
+        points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
+        points += rng.uniform(-0.5, 0.5, 2) * SPACING_M
+        near = np.linalg.norm(points[:, None] - self.handle[None, :, :2], axis=-1).min(1) < AROUND_M
+        points = points[near]
+        room = np.min([distance_to_convex(points, outline) for outline in self.solid], 0)
+        points, room = points[room >= BODY_M], room[room >= BODY_M]
+        if not len(points) or not len(walkable):
+            return None
+        cost, heading = self.rated(points, room)
+        cost += 0.15 * rng.standard_normal(len(points))
+        away = np.linalg.norm(points[:, None] - walkable[None], axis=-1).min(1)
+        cost[0, away > 0.45] = np.inf
+        chosen, total = _cheapest(points, cost)
+        if chosen is None:
+            return None
+        keys = np.arange(len(chosen))
+        return total, np.column_stack([points[chosen], np.unwrap(heading[keys, chosen])])
 
-    None where none is free; it begins within 0.45 m of a walkable point.
-    """
-    low, high = task.handle[:, :2].min(0) - AROUND_M, task.handle[:, :2].max(0) + AROUND_M
-    axes = [np.arange(a, b, SPACING_M) for a, b in zip(low, high)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
-    points += rng.uniform(-0.5, 0.5, 2) * SPACING_M
-    near = np.linalg.norm(points[:, None] - task.handle[None, :, :2], axis=-1).min(1) < AROUND_M
-    points = points[near]
-    room = np.min([distance_to_convex(points, outline) for outline in task.solid], 0)
-    points, room = points[room >= BODY_M], room[room >= BODY_M]
-    if not len(points) or not len(walkable):
-        return None
-    cost, heading = _rated(task, points, room)
-    cost += 0.15 * rng.standard_normal(len(points))
-    away = np.linalg.norm(points[:, None] - walkable[None], axis=-1).min(1)
-    cost[0, away > 0.45] = np.inf
-    chosen, total = _cheapest(points, cost)
-    if chosen is None:
-        return None
-    keys = np.arange(len(chosen))
-    return total, np.column_stack([points[chosen], np.unwrap(heading[keys, chosen])])
-
-
-def _rated(
-    task: _Task, points: Float[np.ndarray, "point 2"], room: Float[np.ndarray, "point"]
-) -> tuple[Float[np.ndarray, "key point"], Float[np.ndarray, "key point"]]:
-    """Cost of standing at each point at each key, infinite where it is impossible, and the heading there."""
-    offset = task.handle[:, None, :2] - points
-    toward = np.arctan2(offset[..., 1], offset[..., 0])
-    heading = toward - task.sign * ASIDE
-    across = np.stack([-np.sin(heading), np.cos(heading)], -1)
-    shoulder = points + task.sign * SHOULDER_ASIDE_M * across
-    arm = task.handle[:, None, :2] - shoulder
-    far = np.linalg.norm(arm, axis=-1)
-    drop = np.minimum(np.abs(task.shoulder_m - task.handle[:, 2]), 0.8 * task.reach_m)[:, None]
-    best = np.clip(np.sqrt((0.88 * task.reach_m) ** 2 - drop**2), 0.30, 0.55)
-    cost = ((far - best) / 0.14) ** 2
-    cost = np.where(far > best + HELP_M, np.inf, cost)
-    if task.beyond is not None:
-        pivot, radius = task.beyond
-        cost += 4.0 * np.maximum(radius - np.linalg.norm(points - pivot, axis=1), 0.0) / 0.15
-    leaf = np.stack([distance_to_convex(points, outline) for outline in task.footprint])
-    free = np.minimum(leaf, room)
-    cost += 2.0 * np.maximum(BODY_M + EASY_M - free, 0.0) / EASY_M
-    cost[leaf < BODY_M] = np.inf
-    # the straight arm, except its last 7 cm, may not pass through the moved object or another
-    last = np.clip(1.0 - 0.07 / np.maximum(far, 0.1), 0.0, 1.0)[..., None]
-    for share in np.linspace(0.25, 1.0, 7):
-        along = shoulder + share * last * arm
-        for key, outline in enumerate(task.footprint if not task.low else ()):
-            cost[key, _within(along[key], outline, 0.01 if share == 1.0 else ARM_M)] = np.inf
-        for outline in task.high if share < 0.9 else ():
-            cost[_within(along, outline, ARM_M)] = np.inf
-    return cost, heading
+    def rated(
+        self, points: Float[np.ndarray, "point 2"], room: Float[np.ndarray, "point"]
+    ) -> tuple[Float[np.ndarray, "key point"], Float[np.ndarray, "key point"]]:
+        """Cost of standing at each point at each key, infinite where it is impossible, and the heading there."""
+        offset = self.handle[:, None, :2] - points
+        toward = np.arctan2(offset[..., 1], offset[..., 0])
+        heading = toward - self.sign * ASIDE
+        across = np.stack([-np.sin(heading), np.cos(heading)], -1)
+        shoulder = points + self.sign * SHOULDER_ASIDE_M * across
+        arm = self.handle[:, None, :2] - shoulder
+        far = np.linalg.norm(arm, axis=-1)
+        drop = np.minimum(np.abs(self.shoulder_m - self.handle[:, 2]), 0.8 * self.reach_m)[:, None]
+        best = np.clip(np.sqrt((0.88 * self.reach_m) ** 2 - drop**2), 0.30, 0.55)
+        cost = ((far - best) / 0.14) ** 2
+        cost = np.where(far > best + HELP_M, np.inf, cost)
+        if self.beyond is not None:
+            pivot, radius = self.beyond
+            cost += 4.0 * np.maximum(radius - np.linalg.norm(points - pivot, axis=1), 0.0) / 0.15
+        leaf = np.stack([distance_to_convex(points, outline) for outline in self.footprint])
+        free = np.minimum(leaf, room)
+        cost += 2.0 * np.maximum(BODY_M + EASY_M - free, 0.0) / EASY_M
+        cost[leaf < BODY_M] = np.inf
+        # the straight arm, except its last 7 cm, may not pass through the moved object or another
+        last = np.clip(1.0 - 0.07 / np.maximum(far, 0.1), 0.0, 1.0)[..., None]
+        for share in np.linspace(0.25, 1.0, 7):
+            along = shoulder + share * last * arm
+            for key, outline in enumerate(self.footprint if not self.low else ()):
+                cost[key, _within(along[key], outline, 0.01 if share == 1.0 else ARM_M)] = np.inf
+            for outline in self.high if share < 0.9 else ():
+                cost[_within(along, outline, ARM_M)] = np.inf
+        return cost, heading
 
 
 def _within(

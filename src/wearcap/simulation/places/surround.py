@@ -64,6 +64,37 @@ THICK_M = 0.04
 POST_M = 0.035
 
 
+@dataclass(frozen=True, eq=False)
+class _Sit:
+    """An interval of sitting in one place."""
+
+    start: int
+    stop: int
+    place: Float[np.ndarray, "3"]
+    """Position of the buttocks (m)."""
+    heading: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Tread:
+    """A level rectangle that feet stood on, along the axes of `heading`."""
+
+    low: Float[np.ndarray, "2"]
+    high: Float[np.ndarray, "2"]
+    """Corners in axes turned by `heading` (m)."""
+    z: float
+    heading: float
+
+    @property
+    def size(self) -> Float[np.ndarray, "2"]:
+        return self.high - self.low
+
+    @property
+    def center(self) -> Float[np.ndarray, "2"]:
+        """Centre in the world (m)."""
+        return turn(self.heading) @ ((self.low + self.high) / 2)
+
+
 @dataclass(kw_only=True)
 class _FreePlan(Plan):
     """A plan that also keeps off the space that a moving body occupies."""
@@ -100,6 +131,69 @@ class _FreePlan(Plan):
                 near = self.distance(piece, float(x), float(y), heading)
                 if NEAR_M[0] <= near <= NEAR_M[1] and self.try_place(piece, float(x), float(y), heading):
                     break
+
+    def build_seat(self, sit: _Sit, rng: np.random.Generator) -> None:
+        """Place a seat of fitting height that the body touches only with the parts it sits on; none if not even a stool
+        fits."""
+        body, builder = self.body, self.builder
+        kinds = [str(kind) for kind in rng.permutation(SEATS)]
+        for soft in SOFT_M:
+            for kind in [*kinds, "small pedestal"]:
+                piece = {**MAKERS, **STOOLS}[kind](rng)
+                x, y, height, heading, _ = piece.seats[int(rng.integers(len(piece.seats)))]
+                factor = float(sit.place[2]) / height
+                if kind in MAKERS and not 0.8 < factor < 1.25:
+                    continue
+                piece, about = piece.stretched(factor), sit.heading - heading
+                position = np.array([*(sit.place[:2] - turn(about) @ np.array([x, y])), 0.0])
+                if not _meets(body, piece, position, about, 0.0, {"seat": soft, **NEAR_SEAT}):
+                    place = np.array([*builder.from_world(position[:2]), 0.0])
+                    builder.place(piece, tuple(place.tolist()), about - builder.heading)
+                    outline = rectangle((place[0], place[1]), piece.size, about - builder.heading)
+                    self.solid.append(around(outline))
+                    return
+
+    def build_tread(self, tread: _Tread, rng: np.random.Generator) -> None:
+        """Build a step down to the floor, else a board or a rung, as large as the body leaves room for."""
+        builder = self.builder
+        body = self.body.around(np.array([*tread.center, tread.z / 2]), max(tread.z / 2, 1.0))
+        for (solid, share), along, lower in product(_FORMS, (0.5, 0.75, 0.25, 1.0, 0.0), (0.0, 0.03)):
+            low, high = tread.low.copy(), tread.high.copy()
+            low[0] += along * (1 - share) * tread.size[0]
+            high[0] = low[0] + share * tread.size[0]
+            small = replace(tread, low=low, high=high, z=tread.z - lower)
+            if _clear(body, small, solid):
+                break
+        else:
+            return
+        # widened on all sides while the body is clear of it, up to a drawn size
+        tread = small
+        most = (rng.uniform(0.27, 0.36), rng.uniform(0.6, 1.0)) if solid else (0.0, rng.uniform(0.45, 0.6))
+        open_sides = [(axis, sign) for axis in (1, 0) for sign in (-1, 1)]
+        while open_sides:
+            for axis, sign in list(open_sides):
+                low, high = tread.low.copy(), tread.high.copy()
+                (low if sign < 0 else high)[axis] += 0.03 * sign
+                wider = replace(tread, low=low, high=high)
+                if wider.size[axis] > most[axis] or not _clear(body, wider, solid):
+                    open_sides.remove((axis, sign))
+                else:
+                    tread = wider
+        heading = tread.heading - builder.heading
+        middle = builder.from_world(tread.center)
+        shade = rng.uniform(0.8, 1.1)
+        color = (0.5 * shade, 0.425 * shade, 0.35 * shade)
+        outline = rectangle(tuple(middle.tolist()), tuple(tread.size.tolist()), heading)
+        thick = tread.z if solid else THICK_M
+        builder.add_surface("stairs_step", outline, color, plane=(0.0, 0.0, tread.z), texture=12.0, thickness=thick)
+        for side in () if solid else (-1, 1):
+            end = tread.center + turn(tread.heading) @ np.array([0.0, side * (tread.size[1] / 2 + POST_M / 2)])
+            size = (POST_M, POST_M, tread.z)
+            if not body.meets(np.array([*end, tread.z / 2]), np.array(size), tread.heading, 0.0, ON_STEP):
+                x, y = builder.from_world(end).tolist()
+                builder.add_box((x, y, tread.z / 2), size, color, 8.0, heading)
+        outline = rectangle(tuple(tread.center.tolist()), tuple(tread.size.tolist()), tread.heading)
+        self.solid.append(around(builder.from_world(outline)))
 
     def build_room(self, reach: Box, path: np.ndarray, rng: np.random.Generator) -> None:
         """Four walls with doors and windows, furniture beside the path, then along the walls."""
@@ -174,13 +268,9 @@ def surround(motion: Motion, rng: np.random.Generator, name: str) -> World:
     plan = _FreePlan(builder, (0.0, 0.0, 0.0, 0.0), 0.0, body=body, swept=swept)
     sits = find_sits(motion)
     for sit in sits:
-        if (built := build_seat(builder, body, sit, rng)) is not None:
-            piece, place, heading = built
-            plan.solid.append(around(rectangle((place[0], place[1]), piece.size, heading)))
+        plan.build_seat(sit, rng)
     for tread in find_treads(motion, sits):
-        if (step := build_tread(builder, body, tread, rng)) is not None:
-            outline = rectangle(tuple(step.center.tolist()), tuple(step.size.tolist()), step.heading)
-            plan.solid.append(around(builder.from_world(outline)))
+        plan.build_tread(tread, rng)
     reach = around(np.concatenate([here.points[:, :2] + side * here.radius[:, None] for side in (-1, 1)]))
     (plan.build_street if outdoors else plan.build_room)(reach, builder.from_world(path), rng)
     return builder.finish()
@@ -193,37 +283,6 @@ def _heading(path: Float[np.ndarray, "time 2"], rng: np.random.Generator) -> flo
         return float(rng.uniform(-np.pi, np.pi))
     along = np.linalg.svd(offset, full_matrices=False)[2][0]
     return float(np.arctan2(along[1], along[0]) + rng.normal(0.0, 0.12))
-
-
-@dataclass(frozen=True, eq=False)
-class _Sit:
-    """An interval of sitting in one place."""
-
-    start: int
-    stop: int
-    place: Float[np.ndarray, "3"]
-    """Position of the buttocks (m)."""
-    heading: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Tread:
-    """A level rectangle that feet stood on, along the axes of `heading`."""
-
-    low: Float[np.ndarray, "2"]
-    high: Float[np.ndarray, "2"]
-    """Corners in axes turned by `heading` (m)."""
-    z: float
-    heading: float
-
-    @property
-    def size(self) -> Float[np.ndarray, "2"]:
-        return self.high - self.low
-
-    @property
-    def center(self) -> Float[np.ndarray, "2"]:
-        """Centre in the world (m)."""
-        return turn(self.heading) @ ((self.low + self.high) / 2)
 
 
 def find_sits(motion: Motion) -> list[_Sit]:
@@ -300,30 +359,6 @@ def find_treads(motion: Motion, sits: list[_Sit]) -> list[_Tread]:
     return sorted(treads, key=lambda tread: tread.z)
 
 
-def build_seat(
-    builder: WorldBuilder, body: BodySpace, sit: _Sit, rng: np.random.Generator
-) -> tuple[Piece, np.ndarray, float] | None:
-    """Place a seat of fitting height that the body touches only with the parts it sits on.
-
-    Returns the piece with its place and heading in the builder's frame; None where not even a stool fits.
-    """
-    kinds = [str(kind) for kind in rng.permutation(SEATS)]
-    for soft in SOFT_M:
-        for kind in [*kinds, "small pedestal"]:
-            piece = {**MAKERS, **STOOLS}[kind](rng)
-            x, y, height, heading, _ = piece.seats[int(rng.integers(len(piece.seats)))]
-            factor = float(sit.place[2]) / height
-            if kind in MAKERS and not 0.8 < factor < 1.25:
-                continue
-            piece, about = piece.stretched(factor), sit.heading - heading
-            position = np.array([*(sit.place[:2] - turn(about) @ np.array([x, y])), 0.0])
-            if not _meets(body, piece, position, about, 0.0, {"seat": soft, **NEAR_SEAT}):
-                place = np.array([*builder.from_world(position[:2]), 0.0])
-                builder.place(piece, tuple(place.tolist()), about - builder.heading)
-                return piece, place, about - builder.heading
-    return None
-
-
 def _meets(
     body: BodySpace,
     piece: Piece,
@@ -376,50 +411,6 @@ STOOLS["small pedestal"] = partial(STOOLS["pedestal"], wide=0.18)
 
 def _seat(wide: float, seat: float, rows: list[tuple]) -> Piece:
     return Piece("stool", (wide, wide), (0.0, seat), parts_of(rows), seats=((0.0, 0.0, seat, 0.0, wide / 2),))
-
-
-def build_tread(builder: WorldBuilder, body: BodySpace, tread: _Tread, rng: np.random.Generator) -> _Tread | None:
-    """Build a step down to the floor, else a board or a rung, as large as the body leaves room for.
-
-    Returns what was built (`heading` and corners of the world); None where not even a rung fits.
-    """
-    body = body.around(np.array([*tread.center, tread.z / 2]), max(tread.z / 2, 1.0))
-    for (solid, share), along, lower in product(_FORMS, (0.5, 0.75, 0.25, 1.0, 0.0), (0.0, 0.03)):
-        low, high = tread.low.copy(), tread.high.copy()
-        low[0] += along * (1 - share) * tread.size[0]
-        high[0] = low[0] + share * tread.size[0]
-        small = replace(tread, low=low, high=high, z=tread.z - lower)
-        if _clear(body, small, solid):
-            break
-    else:
-        return None
-    # widened on all sides while the body is clear of it, up to a drawn size
-    tread = small
-    most = (rng.uniform(0.27, 0.36), rng.uniform(0.6, 1.0)) if solid else (0.0, rng.uniform(0.45, 0.6))
-    open_sides = [(axis, sign) for axis in (1, 0) for sign in (-1, 1)]
-    while open_sides:
-        for axis, sign in list(open_sides):
-            low, high = tread.low.copy(), tread.high.copy()
-            (low if sign < 0 else high)[axis] += 0.03 * sign
-            wider = replace(tread, low=low, high=high)
-            if wider.size[axis] > most[axis] or not _clear(body, wider, solid):
-                open_sides.remove((axis, sign))
-            else:
-                tread = wider
-    heading = tread.heading - builder.heading
-    middle = builder.from_world(tread.center)
-    shade = rng.uniform(0.8, 1.1)
-    color = (0.5 * shade, 0.425 * shade, 0.35 * shade)
-    outline = rectangle(tuple(middle.tolist()), tuple(tread.size.tolist()), heading)
-    thick = tread.z if solid else THICK_M
-    builder.add_surface("stairs_step", outline, color, plane=(0.0, 0.0, tread.z), texture=12.0, thickness=thick)
-    for side in () if solid else (-1, 1):
-        end = tread.center + turn(tread.heading) @ np.array([0.0, side * (tread.size[1] / 2 + POST_M / 2)])
-        size = (POST_M, POST_M, tread.z)
-        if not body.meets(np.array([*end, tread.z / 2]), np.array(size), tread.heading, 0.0, ON_STEP):
-            x, y = builder.from_world(end).tolist()
-            builder.add_box((x, y, tread.z / 2), size, color, 8.0, heading)
-    return tread
 
 
 _FORMS = ((True, 1.0), (True, 0.7), (True, 0.45), (False, 1.0), (False, 0.6), (False, 0.35), (False, 0.15))
