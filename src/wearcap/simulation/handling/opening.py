@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.simulation.handling.distractors import pretend_to_handle
-from wearcap.simulation.handling.grips import Handling, drawn_grip
+from wearcap.simulation.handling.grips import Grip, Handling
 from wearcap.simulation.people.actions import approach
 from wearcap.simulation.people.plan import LEFT_SIGN, SIDES, Plan, wrap
 from wearcap.simulation.people.posture import look_at
@@ -68,6 +68,56 @@ class _Turn:
     places: Float[np.ndarray, "key 3"]
     """Floor points between the feet (m) and headings (rad, unwrapped) at evenly spaced times."""
 
+    @classmethod
+    def planned(
+        cls, plan: Plan, house: House, world: World, rng: np.random.Generator, item: Openable, value: float, handle: int
+    ) -> "_Turn | None":
+        """Hand, tempo and body path; None where the leaf or drawer would hit something or one cannot stand for it."""
+        start, floor = house.values[item.name], float(plan.position[2])
+        shoulder = floor + 1.50 * plan.hip_height
+        amount = abs(value - start) / (np.deg2rad(80.0) if item.hinged else 0.4)
+        seconds = float(np.clip((0.9 + 1.3 * amount) * rng.normal(1.0, 0.12) / plan.style.briskness, 1.0, 3.2))
+        values = start + ease(np.linspace(0.0, 1.0, max(round(seconds / KEY_S), 6))) * (value - start)
+        palms = item.handle(handle, values)
+        near = [
+            other
+            for other in world.objects
+            if other.name != item.name and distance_to_convex(palms[:, :2], other.footprint).min() < NEAR_M
+        ]
+        # once it is out of its frame, a leaf or drawer may not meet other objects
+        out = item.footprint(values[np.abs(values - item.closed) > (OUT_RAD if item.hinged else OUT_M)])
+        edges = np.concatenate([out[:, (1, 2)], out[:, (1, 2)].mean(1, keepdims=True)], 1)
+        low, high = item.z_range
+        level = [other for other in near if other.z_range[0] < high - 0.02 and other.z_range[1] > low + 0.02]
+        if any((distance_to_convex(edges, other.footprint) < 0.015).any() for other in level):
+            return None
+        solid = [other for other in near if other.z_range[0] < floor + 1.9 and other.z_range[1] > floor + 0.1]
+        in_arms_way = [o for o in solid if o.z_range[1] > palms[0, 2] - 0.05 and o.z_range[0] < shoulder]
+        pivot, beyond = item.object.freedom.pivot, None
+        if item.hinged and not handle and pivot is not None:
+            beyond = np.array(pivot[:2]), float(item.outline[:, 0].max()) + BEYOND_M
+        task = _Task(
+            palms,
+            item.footprint(values),
+            tuple(other.footprint for other in solid),
+            tuple(other.footprint for other in in_arms_way),
+            1.0,
+            shoulder,
+            plan.arm_length + PALM_M,
+            low=bool(high < palms[0, 2] + 0.2),
+            beyond=beyond,
+        )
+        walkable = world.navigation.node_points[:, :2]
+        walkable = walkable[np.linalg.norm(walkable - palms[0, :2], axis=1) < 2.0]
+        found = [(side, replace(task, sign=LEFT_SIGN[side]).stances(walkable, rng)) for side in SIDES]
+        able = [(*stances, side) for side, stances in found if stances is not None]
+        if not able:
+            return None
+        able.sort(key=lambda option: option[0])
+        other = rng.random() < OTHER_HAND and able[-1][0] < able[0][0] + 8.0
+        _, places, side = able[-1 if other else 0]
+        return cls(item, start, value, handle, side, seconds, places)
+
     def values(self, share: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time"]:
         return self.start + ease(share) * (self.stop - self.start)
 
@@ -86,7 +136,7 @@ def operate(
     With `pretend`, the wearer only goes there and does something that resembles it, and nothing is touched.
     """
     world = house.world(plan.position)
-    turn = _planned(plan, house, world, rng, item, value, handle)
+    turn = _Turn.planned(plan, house, world, rng, item, value, handle)
     if turn is None:
         return False
     x, y, heading = turn.places[0]
@@ -100,56 +150,6 @@ def operate(
     else:
         _perform(plan, house, turn, rng)
     return True
-
-
-def _planned(
-    plan: Plan, house: House, world: World, rng: np.random.Generator, item: Openable, value: float, handle: int
-) -> _Turn | None:
-    """Hand, tempo and body path; None where the leaf or drawer would hit something or one cannot stand for it."""
-    start, floor = house.values[item.name], float(plan.position[2])
-    shoulder = floor + 1.50 * plan.hip_height
-    amount = abs(value - start) / (np.deg2rad(80.0) if item.hinged else 0.4)
-    seconds = float(np.clip((0.9 + 1.3 * amount) * rng.normal(1.0, 0.12) / plan.style.briskness, 1.0, 3.2))
-    values = start + ease(np.linspace(0.0, 1.0, max(round(seconds / KEY_S), 6))) * (value - start)
-    palms = item.handle(handle, values)
-    near = [
-        other
-        for other in world.objects
-        if other.name != item.name and distance_to_convex(palms[:, :2], other.footprint).min() < NEAR_M
-    ]
-    # once it is out of its frame, a leaf or drawer may not meet other objects
-    out = item.footprint(values[np.abs(values - item.closed) > (OUT_RAD if item.hinged else OUT_M)])
-    edges = np.concatenate([out[:, (1, 2)], out[:, (1, 2)].mean(1, keepdims=True)], 1)
-    low, high = item.z_range
-    level = [other for other in near if other.z_range[0] < high - 0.02 and other.z_range[1] > low + 0.02]
-    if any((distance_to_convex(edges, other.footprint) < 0.015).any() for other in level):
-        return None
-    solid = [other for other in near if other.z_range[0] < floor + 1.9 and other.z_range[1] > floor + 0.1]
-    in_arms_way = [o for o in solid if o.z_range[1] > palms[0, 2] - 0.05 and o.z_range[0] < shoulder]
-    pivot, beyond = item.object.freedom.pivot, None
-    if item.hinged and not handle and pivot is not None:
-        beyond = np.array(pivot[:2]), float(item.outline[:, 0].max()) + BEYOND_M
-    task = _Task(
-        palms,
-        item.footprint(values),
-        tuple(other.footprint for other in solid),
-        tuple(other.footprint for other in in_arms_way),
-        1.0,
-        shoulder,
-        plan.arm_length + PALM_M,
-        low=bool(high < palms[0, 2] + 0.2),
-        beyond=beyond,
-    )
-    walkable = world.navigation.node_points[:, :2]
-    walkable = walkable[np.linalg.norm(walkable - palms[0, :2], axis=1) < 2.0]
-    found = [(side, replace(task, sign=LEFT_SIGN[side]).stances(walkable, rng)) for side in SIDES]
-    able = [(*stances, side) for side, stances in found if stances is not None]
-    if not able:
-        return None
-    able.sort(key=lambda option: option[0])
-    other = rng.random() < OTHER_HAND and able[-1][0] < able[0][0] + 8.0
-    _, places, side = able[-1 if other else 0]
-    return _Turn(item, start, value, handle, side, seconds, places)
 
 
 def _perform(plan: Plan, house: House, turn: _Turn, rng: np.random.Generator) -> None:
@@ -191,7 +191,7 @@ def _perform(plan: Plan, house: House, turn: _Turn, rng: np.random.Generator) ->
         R, palm = about @ pose.R, (pose.R @ point[:, None])[..., 0] + pose.t
         return Rigid(R, palm - (R @ point[:, None])[..., 0])
 
-    grip = replace(drawn_grip(place, hand_poses, touch, release, rng, briskness), reach_s=touch - start)
+    grip = replace(Grip.drawn(place, hand_poses, touch, release, rng, briskness), reach_s=touch - start)
     plan.grip(turn.side, grip)
     middle = begin + 0.5 * turn.seconds
     handle = item.handle(turn.handle, np.array(turn.start))

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from wearcap.simulation.handling.grips import GripPlace, Handling, drawn_grip
+from wearcap.simulation.handling.grips import Grip, GripPlace, Handling
 from wearcap.simulation.people.gait import glide
 from wearcap.simulation.people.plan import LEFT_SIGN, OTHER, SIDES, Plan, wrap
 from wearcap.simulation.people.posture import look_at, turn_head
@@ -179,7 +179,7 @@ def slide(plan: Plan, choice: Slide, rng: np.random.Generator, floor_z: float = 
         # the new hand takes hold a little before the other lets go.
         start = touch + _stagger(rng) if first == 0 else cuts[first - 1] - rng.uniform(0.1, 0.4)
         stop = release + _stagger(rng) if last == count - 1 else cuts[last]
-        grips.append((side, drawn_grip(choice.places[side], moves, start, stop, rng, plan.style.briskness)))
+        grips.append((side, Grip.drawn(choice.places[side], moves, start, stop, rng, plan.style.briskness)))
     for side, grip in grips:
         plan.grip(side, grip)
     _lean(plan, choice, plan.time, begin, end, release, rng)

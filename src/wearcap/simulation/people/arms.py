@@ -10,7 +10,7 @@ from torch import Tensor
 from wearcap.geometry import rotation
 from wearcap.simulation.handling.grips import Hold
 from wearcap.simulation.people.plan import LEFT_SIGN, SIDES, Plan
-from wearcap.simulation.people.posture import HELP, Stance, Trunk, trunk_motion
+from wearcap.simulation.people.posture import HELP, Stance, Trunk
 from wearcap.simulation.people.track import blur, ease, lower_envelope, wander
 
 STRAIGHT = 0.9995
@@ -331,7 +331,7 @@ def reach_help(stance: Stance) -> Float[np.ndarray, "time 6"] | None:
     wanted = np.zeros((len(times), len(HELP)))
     crouch = plan.crouch.sample(times)[:, 0]
     easy = np.tile(EASY, (len(times), 1))
-    trunk, low = trunk_motion(stance), np.zeros(len(times))
+    trunk, low = Trunk.over(stance), np.zeros(len(times))
     floor = np.minimum(stance.feet.left.ground[:, 2], stance.feet.right.ground[:, 2])
     for side in SIDES:
         wrist, _, near = _held_wrist(trunk, side)
@@ -341,7 +341,7 @@ def reach_help(stance: Stance) -> Float[np.ndarray, "time 6"] | None:
         smooth = number >= ROUNDS
         if number == ROUNDS:
             wanted = _covering(np.maximum(wanted, 0.0), fps) - _covering(np.maximum(-wanted, 0.0), fps)
-        trunk = trunk_motion(stance, MOST * np.tanh(wanted / MOST))
+        trunk = Trunk.over(stance, MOST * np.tanh(wanted / MOST))
         lacks, gains = (np.stack(both, 1) for both in zip(*(_lack(trunk, side, smooth) for side in SIDES)))
         if smooth and lacks.max() < 1e-4:
             break

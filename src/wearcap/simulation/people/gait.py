@@ -62,7 +62,21 @@ class _FootMotion:
         pivot_x, pivot_z = (ball[i] + on_heel * (heel[i] - ball[i]) for i in (0, 2))
         rolled = pivot_x - (np.cos(roll) * pivot_x + np.sin(roll) * pivot_z)
         late = (share / 0.75) ** 9 * ((1.0 - share) / 0.25) ** 3  # a bump with its top at 0.75
-        depth = _depth((heel, ball, tip), roll, bend, SOFT_M * lifted)
+        # height of the ankle over the sole's lowest point (m): a softened maximum over heel, ball and tip
+        soft = SOFT_M * lifted
+        sole_cos, sole_sin = np.cos(roll), np.sin(roll)
+        toe_cos, toe_sin = np.cos(roll - bend), np.sin(roll - bend)
+        ball_depth = sole_sin * ball[0] - sole_cos * ball[2]
+        points = np.stack(
+            [
+                sole_sin * heel[0] - sole_cos * heel[2],
+                ball_depth - toe_cos * tip[2],
+                ball_depth + toe_sin * tip[0] - toe_cos * tip[2],
+            ]
+        )
+        width = np.maximum(soft, 1e-5)
+        top = points.max(0)
+        depth = top + width * np.log(np.exp((points - top) / width).sum(0)) * (soft > 1e-5)
         raised = at.clearance * lifted + LATE_LIFT * np.maximum(-at.land_pitch_next, 0.0) * late + depth
         tilt, heading = at.mix("tilt", turned), at.mix("heading", turned)
         ground = at.mix("ground", moved[:, None])
@@ -210,19 +224,3 @@ def climb(rise: Float[np.ndarray, "*#batch"], share: Float[np.ndarray, "*batch"]
     early, late = ease(share / 0.58), ease((share - 0.45) / 0.55)
     up = np.clip(0.5 + rise / 0.12, 0.0, 1.0)
     return up * early + (1.0 - up) * late
-
-
-def _depth(
-    foot: tuple[np.ndarray, np.ndarray, np.ndarray], roll: np.ndarray, bend: np.ndarray, soft: np.ndarray
-) -> np.ndarray:
-    """Height of the ankle over the sole's lowest point (m): a maximum over heel, ball and tip, softened by `soft`."""
-    heel, ball, tip = foot
-    cos, sin = np.cos(roll), np.sin(roll)
-    toe_cos, toe_sin = np.cos(roll - bend), np.sin(roll - bend)
-    below = sin * ball[0] - cos * ball[2]
-    points = np.stack(
-        [sin * heel[0] - cos * heel[2], below - toe_cos * tip[2], below + toe_sin * tip[0] - toe_cos * tip[2]]
-    )
-    width = np.maximum(soft, 1e-5)
-    top = points.max(0)
-    return top + width * np.log(np.exp((points - top) / width).sum(0)) * (soft > 1e-5)

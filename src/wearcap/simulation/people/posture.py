@@ -88,6 +88,48 @@ class Trunk:
     pelvis_angles: Float[np.ndarray, "time 3"]
     chest_angles: Float[np.ndarray, "time 3"]
 
+    @classmethod
+    def over(cls, stance: Stance, help_: Float[np.ndarray, "time 6"] | None = None) -> "Trunk":
+        """Pelvis and chest that follow from the feet, the plan's channels, the wearer's habits and the hands' need."""
+        plan, times, fps = stance.feet.plan, stance.feet.times, stance.feet.fps
+        style, heading, stride, drift = plan.style.posture, stance.heading, stance.stride, stance.drift
+        forward = np.stack([np.cos(heading), np.sin(heading)], 1)
+        seated = plan.seat_weight.sample(times)
+        moving = np.clip(np.abs(stance.speed) / 0.8, 0.0, 1.0)
+        lean, crouch, shift = plan.lean.sample(times), plan.crouch.sample(times)[:, 0], plan.shift.sample(times)
+        if help_ is not None:
+            lean, crouch, shift = lean + help_[:, :3], crouch + help_[:, 3], shift + help_[:, 4:]
+
+        # the pelvis drops on the side that swings: it rolls to the right while the left leg stands
+        drops = style.pelvis_list * (0.35 + 0.65 * moving) * np.sin(np.pi * (blur(stance.load, 0.05, fps) - 0.5))
+        pelvis_angles = np.stack(
+            [
+                heading - style.pelvis_yaw * stride * (1 - seated[:, 0]) + 0.3 * lean[:, 2],
+                style.pelvis_tilt * (0.4 + 0.6 * moving) + 0.45 * lean[:, 0] + drift[:, 0],
+                drops + 0.15 * lean[:, 1],
+            ],
+            1,
+        )
+        across = np.stack([-forward[:, 1], forward[:, 0]], 1)
+        sideways = (stance.acceleration * across).sum(1)
+        speeding = blur((stance.acceleration * forward).sum(1), 0.12, fps)
+        chest_angles = np.stack(
+            [
+                heading + style.trunk_counter * style.pelvis_yaw * blur(stride, 0.05, fps) + lean[:, 2] + drift[:, 1],
+                style.slouch + 0.035 * stance.speed + 0.03 * speeding + lean[:, 0] + drift[:, 2],
+                -0.35 * pelvis_angles[:, 2] - 0.025 * sideways + lean[:, 1] + drift[:, 3],
+            ],
+            1,
+        )
+        back = 0.26 * plan.hip_height * np.sin(np.clip(lean[:, 0], -0.5, 1.5)) + 0.012 - HIPS_AHEAD_M * moving
+        place = stance.mass - back[:, None] * forward
+        place = place + shift[:, :1] * forward + shift[:, 1:] * across
+        seat = plan.seat.sample(times)
+        place += seated[:, :1] * (seat[:, :2] - place)
+        height = _height(stance.feet, place, moving, rotation_of(pelvis_angles)) - crouch
+        height += seated[:, 1] * (seat[:, 2] - height)
+        return cls(stance, np.concatenate([place, height[:, None]], 1), pelvis_angles, chest_angles)
+
     @cached_property
     def spine(self) -> tuple[Float[Tensor, "time joint 3 3"], Rigid]:
         """World rotations of the joints of `SPINE` in order, the last one the chest's, and the chest's pose.
@@ -108,48 +150,6 @@ class Trunk:
     def chest(self) -> Rigid:
         """Pose of the chest."""
         return self.spine[1]
-
-
-def trunk_motion(stance: Stance, help_: Float[np.ndarray, "time 6"] | None = None) -> Trunk:
-    """Pelvis and chest that follow from the feet, the plan's channels, the wearer's habits and the hands' need."""
-    plan, times, fps = stance.feet.plan, stance.feet.times, stance.feet.fps
-    style, heading, stride, drift = plan.style.posture, stance.heading, stance.stride, stance.drift
-    forward = np.stack([np.cos(heading), np.sin(heading)], 1)
-    seated = plan.seat_weight.sample(times)
-    moving = np.clip(np.abs(stance.speed) / 0.8, 0.0, 1.0)
-    lean, crouch, shift = plan.lean.sample(times), plan.crouch.sample(times)[:, 0], plan.shift.sample(times)
-    if help_ is not None:
-        lean, crouch, shift = lean + help_[:, :3], crouch + help_[:, 3], shift + help_[:, 4:]
-
-    # the pelvis drops on the side that swings: it rolls to the right while the left leg stands
-    drops = style.pelvis_list * (0.35 + 0.65 * moving) * np.sin(np.pi * (blur(stance.load, 0.05, fps) - 0.5))
-    pelvis_angles = np.stack(
-        [
-            heading - style.pelvis_yaw * stride * (1 - seated[:, 0]) + 0.3 * lean[:, 2],
-            style.pelvis_tilt * (0.4 + 0.6 * moving) + 0.45 * lean[:, 0] + drift[:, 0],
-            drops + 0.15 * lean[:, 1],
-        ],
-        1,
-    )
-    across = np.stack([-forward[:, 1], forward[:, 0]], 1)
-    sideways = (stance.acceleration * across).sum(1)
-    speeding = blur((stance.acceleration * forward).sum(1), 0.12, fps)
-    chest_angles = np.stack(
-        [
-            heading + style.trunk_counter * style.pelvis_yaw * blur(stride, 0.05, fps) + lean[:, 2] + drift[:, 1],
-            style.slouch + 0.035 * stance.speed + 0.03 * speeding + lean[:, 0] + drift[:, 2],
-            -0.35 * pelvis_angles[:, 2] - 0.025 * sideways + lean[:, 1] + drift[:, 3],
-        ],
-        1,
-    )
-    back = 0.26 * plan.hip_height * np.sin(np.clip(lean[:, 0], -0.5, 1.5)) + 0.012 - HIPS_AHEAD_M * moving
-    place = stance.mass - back[:, None] * forward
-    place = place + shift[:, :1] * forward + shift[:, 1:] * across
-    seat = plan.seat.sample(times)
-    place += seated[:, :1] * (seat[:, :2] - place)
-    height = _height(stance.feet, place, moving, rotation_of(pelvis_angles)) - crouch
-    height += seated[:, 1] * (seat[:, 2] - height)
-    return Trunk(stance, np.concatenate([place, height[:, None]], 1), pelvis_angles, chest_angles)
 
 
 def _height(

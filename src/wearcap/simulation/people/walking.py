@@ -88,7 +88,14 @@ class _Course:
             stairs[near] = up
             beat = (0.58 if up > 0 else 0.54) / plan.style.briskness**0.5
             limit[near] = np.minimum(limit[near], tread / beat)
-        limit = blur(_ramped(limit), 0.10, 1 / SPACING_M)
+        # the highest speeds under the limit that start and stop gently: v² changes by no more than 2 a ds
+        squared = limit**2
+        squared = np.minimum(squared, END_SPEED**2 + 2 * ACCELERATION * length)
+        squared = np.minimum(squared, END_SPEED**2 + 2 * BRAKING * length[::-1])
+        rise, fall = 2 * ACCELERATION * length, 2 * BRAKING * length
+        squared = np.minimum.accumulate(squared - rise) + rise
+        limit = np.sqrt(np.minimum.accumulate((squared + fall)[::-1])[::-1] - fall)
+        limit = blur(limit, 0.10, 1 / SPACING_M)
         stride = np.minimum(np.sqrt(60 * plan.style.gait.walk_ratio * limit), limit * 60 / MIN_CADENCE)
         run_from = JOG_SPEED if speed > RUN_SPEED else np.inf
         stride = np.where(limit > run_from, limit * 60 / (158 + 6 * limit), stride)
@@ -178,17 +185,6 @@ def _walk_step(plan: Plan, side: str, lift: float, land: float, print_: Footprin
         clearance = max(clearance, float(min(need.max(), 0.35)))
     swing = {"land_pitch": land_pitch, "clearance": clearance, "bow": LEFT_SIGN[side] * 0.012, "running": running}
     plan.step(side, lift, land, lift_pitch, replace(print_, **swing))
-
-
-def _ramped(limit: np.ndarray) -> np.ndarray:
-    """The highest speeds under a limit that start and stop gently: v² changes by no more than 2 a ds."""
-    squared = limit**2
-    length = np.arange(len(limit)) * SPACING_M
-    squared = np.minimum(squared, END_SPEED**2 + 2 * ACCELERATION * length)
-    squared = np.minimum(squared, END_SPEED**2 + 2 * BRAKING * length[::-1])
-    rise, fall = 2 * ACCELERATION * length, 2 * BRAKING * length
-    squared = np.minimum.accumulate(squared - rise) + rise
-    return np.sqrt(np.minimum.accumulate((squared + fall)[::-1])[::-1] - fall)
 
 
 def _tread_anchors(points: np.ndarray, flight, foot: float) -> list[tuple[float, int, float]]:

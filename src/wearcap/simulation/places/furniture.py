@@ -49,7 +49,7 @@ def parts_of(rows: Iterable[tuple]) -> tuple[Part, ...]:
     return tuple(Part(row[:3], row[3:6], *row[6:]) for row in rows)
 
 
-def legs(depth: float, width: float, height: float, thick: float, color: Color) -> list[tuple]:
+def _legs(depth: float, width: float, height: float, thick: float, color: Color) -> list[tuple]:
     """Rows of four legs below the corners of an outline (m)."""
     corners = [(x * (depth - thick) / 2, y * (width - thick) / 2) for x in BOTH for y in BOTH]
     return [(x, y, height / 2, thick, thick, height, color, 8.0) for x, y in corners]
@@ -60,7 +60,7 @@ def _chair(rng: np.random.Generator) -> Piece:
     depth, width, seat = rng.uniform(0.40, 0.46), rng.uniform(0.40, 0.46), rng.uniform(0.43, 0.47)
     color, back = wood(rng), rng.uniform(0.82, 0.95)
     rows = [
-        *legs(depth, width, seat - 0.03, 0.04, color),
+        *_legs(depth, width, seat - 0.03, 0.04, color),
         (0, 0, seat - 0.02, depth, width, 0.04, hue(rng), 12.0),
         (-depth / 2 + 0.02, 0, (seat + back) / 2, 0.03, width, back - seat, color, 8.0),
     ]
@@ -135,7 +135,7 @@ def _laid_table(rng: np.random.Generator, kind: str, size: tuple[float, float], 
     depth, width = size
     color = wood(rng)
     rows = [
-        *legs(depth - 0.06, width - 0.06, top - 0.04, 0.06, color),
+        *_legs(depth - 0.06, width - 0.06, top - 0.04, 0.06, color),
         (0, 0, top - 0.02, depth, width, 0.04, color, PLAIN),
     ]
     props = [_prop(rng, (rng.uniform(0.0, depth / 2 - 0.12), y, top)) for y in _spread(rng, width - 0.3, 3)]

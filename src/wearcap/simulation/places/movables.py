@@ -16,7 +16,7 @@ from wearcap.geometry.mesh import Mesh, merged
 from wearcap.geometry.rigid import Rigid
 from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.simulation.handling.grips import SKIN_M, GripPlace, Vector, vector
-from wearcap.simulation.places.builder import Color, Part, Piece, entered, hue, piece_mesh
+from wearcap.simulation.places.builder import Color, Part, Piece, entered, hue
 from wearcap.simulation.places.furniture import MAKERS, wood
 from wearcap.simulation.places.outline import rectangle, turn
 
@@ -135,7 +135,7 @@ def _made(kind: str, mesh: Mesh, size: tuple[float, float], height: float, **hol
 
 
 def _sliding(piece: Piece, rails: list[Rail]) -> Movable:
-    return _made("plane", piece_mesh(piece), piece.size, piece.z_range[1], rails=tuple(rails))
+    return _made("plane", piece.mesh(), piece.size, piece.z_range[1], rails=tuple(rails))
 
 
 @entered(MOVABLES, "sofa")
@@ -198,7 +198,7 @@ def _carton(rng: np.random.Generator) -> Movable:
             for _, sign in HANDS
         )
         sides.append((*hands, facing))
-    return _made("free", piece_mesh(piece), piece.size, height, sides=tuple(sides))
+    return _made("free", piece.mesh(), piece.size, height, sides=tuple(sides))
 
 
 @entered(MOVABLES, "suitcase")

@@ -16,7 +16,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.simulation.handling.grips import GripPlace, vector
-from wearcap.simulation.places.builder import Part, Piece, hue, piece_mesh
+from wearcap.simulation.places.builder import Part, Piece, hue
 from wearcap.simulation.places.furniture import PATTERNED, PLAIN, parts_of, wood
 
 LEAF_M, PANEL_M = 0.04, 0.02
@@ -200,7 +200,7 @@ def _made(
     opened: float,
 ) -> Openable:
     """An openable of rows of parts, closed at a place; `corners` are the lowest and the highest of its outline (m)."""
-    mesh = piece_mesh(Piece(category, (1.0, 1.0), (0.0, 1.0), parts_of(rows)))
+    mesh = Piece(category, (1.0, 1.0), (0.0, 1.0), parts_of(rows)).mesh()
     R = rotation.about_axis("z", torch.tensor(heading, dtype=torch.float64)).float()
     made = SceneObject(category, category, mesh, R, torch.from_numpy(np.asarray(foot)).float(), freedom)
     (x_low, y_low), (x_high, y_high) = corners

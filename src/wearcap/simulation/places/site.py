@@ -19,7 +19,6 @@ from wearcap.simulation.places.walls import (
     before_gap,
     build_facade,
     build_flight,
-    build_wall,
     sloped_rail,
 )
 from wearcap.simulation.places.world import CaptureSpot, Flight, World
@@ -108,7 +107,7 @@ def build_site(rng: np.random.Generator, name: str, scale: float = 1.0) -> World
     walls = layout.walls(rng)
     painted = hue(rng, (0.0, 0.12))
     for wall in walls:
-        build_wall(builder, wall, painted, rng)
+        wall.build(builder, painted, rng)
     rooms = [(f"room {number}", box) for number, box in enumerate(layout.rooms)]
     halls = [(f"hall {number}", box) for number, box in enumerate(layout.halls)]
     for part, box in (*rooms, ("corridor", layout.corridor), *halls):

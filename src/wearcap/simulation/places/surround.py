@@ -22,7 +22,7 @@ from wearcap.simulation.places.builder import Piece, WorldBuilder, entered, hue
 from wearcap.simulation.places.furniture import BOTH, IRON, MAKERS, ROOM_KINDS, Plan, parts_of, wood
 from wearcap.simulation.places.outdoor import MEADOW, PAVEMENT_KINDS, SQUARE_KINDS
 from wearcap.simulation.places.outline import Box, around, inset, middle_and_size, rectangle, turn
-from wearcap.simulation.places.walls import HEIGHT, Wall, barrier, before_gap, build_facade, build_wall
+from wearcap.simulation.places.walls import HEIGHT, Wall, barrier, before_gap, build_facade
 from wearcap.simulation.places.world import World
 
 MARGIN_M = 0.12
@@ -214,11 +214,11 @@ class _FreePlan(Plan):
                 outline = np.array([a, b, wall.at(wall.length + 0.06, -0.06), wall.at(-0.06, -0.06)])
                 builder.add_surface("floor", outline, wood(rng), texture=1.5, thickness=0.05)
                 for start, end in ((wall.start, a), (a, b), (b, wall.end)):
-                    build_wall(builder, Wall(start, end), color, rng)
+                    Wall(start, end).build(builder, color, rng)
             elif rng.uniform() < 0.7:
                 count = max(1, int(wall.length / 3.0))
                 wall.windows += [(wall.length * (k + 0.5) / count, float(rng.uniform(0.9, 1.4))) for k in range(count)]
-            build_wall(builder, wall, color, rng)
+            wall.build(builder, color, rng)
         self.room = inset(box, 0.07)
         self.kept_free += [before_gap(builder, door) for door in builder.doors]
         self.place_beside(NEAR_INDOORS, path, rng)
