@@ -5,7 +5,7 @@ import pytest
 import torch
 from handled import assert_natural, level_world, palm_errors, performed, plan_at
 
-from wearcap.simulation.handling.grips import Grip, GripPlace, drawn_grip, still
+from wearcap.simulation.handling.grips import Grip, GripPlace, still
 from wearcap.simulation.people.person import draw_person
 from wearcap.simulation.places.movables import floor_pose
 
@@ -33,7 +33,7 @@ def test_palms_stay_on_what_moves_with_the_trunks_help(floor, seed):
     person = draw_person("p", rng)
     plan = plan_at(person, floor, 0.0, 0.0, 0.0)
     for side, aside in (("left", 0.2), ("right", -0.2)):
-        plan.grip(side, drawn_grip(UP, wandering(aside), 1.5, 8.0, rng, 1.0))
+        plan.grip(side, Grip.drawn(UP, wandering(aside), 1.5, 8.0, rng, 1.0))
     plan.time = 9.0
     simulated = performed(plan, floor, rng)
     assert palm_errors(plan, simulated.motion).max() < 0.002

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from wearcap.simulation.handling.house import House
-from wearcap.simulation.places.interactive_flat import FEWEST, build_interactive_flat
+from wearcap.simulation.places.interactive_flat import FEWEST, House, build_interactive_flat
 from wearcap.simulation.places.outline import distance_to_convex
 
 SEEDS = range(4)

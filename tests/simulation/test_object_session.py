@@ -9,8 +9,8 @@ import torch
 from wearcap.body.kinematics import site_positions
 from wearcap.errors import WearcapError
 from wearcap.simulation.handling.grips import Handling
-from wearcap.simulation.handling.house import House
-from wearcap.simulation.handling.household import HANDHELD, VARIED, Household
+from wearcap.simulation.handling.household import VARIED, Household
+from wearcap.simulation.places.interactive_flat import House
 from wearcap.simulation.places.movables import HANDHELDS
 from wearcap.simulation.recordings.interaction_session import ObjectConfig, flat_of, object_flat_of, simulate_objects
 from wearcap.simulation.recordings.simulate import POOLS, person_of
@@ -24,8 +24,8 @@ def simulated():
 def test_a_recording_has_all_its_parts(simulated):
     recording = simulated[0]
     categories = {item.category for item in simulated[1].environment.objects}
-    assert categories >= {*HANDHELD, "door", "sofa", "table", "chair", "box", "drawer"}
-    assert set(HANDHELD) == set(HANDHELDS)
+    assert categories >= {*HANDHELDS, "door", "sofa", "table", "chair", "box", "drawer"}
+    assert set(HANDHELDS) == set(HANDHELDS)
     assert set(recording.object_motion) == {item.name for item in simulated[1].environment.objects}
     assert recording.motion.fps == pytest.approx(30.0)
     assert recording.head.timestamps[-1] == pytest.approx(48.0, abs=0.2)
@@ -76,10 +76,10 @@ def test_every_hand_held_kind_is_handled():
     flat = object_flat_of("val", 1)
     house = House(flat)
     household = Household(house, person_of("val", 1), np.random.default_rng(0), VARIED)
-    for kind in HANDHELD:
+    for kind in HANDHELDS:
         names = [movable.name for movable in flat.movables if movable.category == kind]
         assert any(household.use(name) == f"move {kind}" for name in names for _ in range(4)), kind
-    assert {handling.name.rpartition("_")[0] for handling in house.handlings} >= set(HANDHELD)
+    assert {handling.name.rpartition("_")[0] for handling in house.handlings} >= set(HANDHELDS)
 
 
 def test_what_was_held_less_is_gone_for_more():

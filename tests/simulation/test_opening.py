@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
+from wearcap.recording.interactions import HANDS
 
 from wearcap.body.kinematics import site_positions
 from wearcap.recording.motion import HANDS
-from wearcap.simulation.handling.house import House
 from wearcap.simulation.handling.opening import operate
 from wearcap.simulation.people.plan import Plan
 from wearcap.simulation.people.wearer import TAIL_S, perform
-from wearcap.simulation.places.interactive_flat import build_interactive_flat
+from wearcap.simulation.places.interactive_flat import House, build_interactive_flat
 from wearcap.simulation.places.outline import distance_to_convex
 
 FPS = 30.0

@@ -18,8 +18,8 @@ from wearcap.recording.recording import CameraStream
 from wearcap.sensors.claps import camera_claps
 from wearcap.sensors.slam import R_DEVICE_CAM
 from wearcap.simulation.places.site import MOVABLE, build_site, changed_world
-from wearcap.simulation.recordings.scene_files import SceneSettings, plan_photos, write_scene
 from wearcap.simulation.rendering.head_camera import HEAD_CAMERA, Filming, film, write_head_video
+from wearcap.simulation.rendering.scan import SceneSettings, plan_photos, write_scene
 from wearcap.simulation.rendering.views import Scenery, render_view, view_depth
 
 COARSE = SceneSettings(spacing_m=0.15, photo_m=6.0, photo_size=128)

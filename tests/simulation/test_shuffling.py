@@ -6,8 +6,8 @@ from handled import assert_natural, level_world, performed, plan_at
 
 from wearcap.simulation.people.person import draw_person
 from wearcap.simulation.people.plan import SIDES
-from wearcap.simulation.people.shuffling import shuffle, step_to
 from wearcap.simulation.people.track import ease
+from wearcap.simulation.people.walking import shuffle, step_to
 
 
 @pytest.fixture(scope="module")

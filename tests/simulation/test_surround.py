@@ -11,8 +11,7 @@ from wearcap.io.formats.asf_amc import read_amc, read_asf
 from wearcap.prepare.mocap import About, CleaningLimits, MocapSettings, mocap_recording
 from wearcap.simulation.people.body_space import LIMBS, BodySpace, limb_ends
 from wearcap.simulation.places.outline import points_in_convex
-from wearcap.simulation.places.supports import PELVIS_OVER_SEAT_M, find_sits, find_treads
-from wearcap.simulation.places.surround import MARGIN_M, NEAR_M, surround
+from wearcap.simulation.places.surround import MARGIN_M, NEAR_M, PELVIS_OVER_SEAT_M, find_sits, find_treads, surround
 
 SEEDS = range(2)
 

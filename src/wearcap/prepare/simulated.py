@@ -38,11 +38,10 @@ from wearcap.simulation.recordings.interaction_session import (
     simulate_interactions,
     simulate_objects,
 )
-from wearcap.simulation.recordings.scene_files import SceneSettings, write_scene
 from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_recording
 from wearcap.simulation.rendering.ego_view import write_ego_video
 from wearcap.simulation.rendering.head_camera import HEAD_CAMERA_TRUTH, Filming, write_head_video
-from wearcap.simulation.rendering.scan import scan_world
+from wearcap.simulation.rendering.scan import SceneSettings, scan_world, write_scene
 from wearcap.simulation.rendering.views import Scenery
 
 MADE = "made.json"

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 
 from wearcap.geometry.rigid import Rigid
-from wearcap.simulation.handling.grips import GripPlace, Vector, drawn_grip, still, vector
+from wearcap.simulation.handling.grips import Grip, GripPlace, Vector, still, vector
 from wearcap.simulation.handling.holding import bend_for, bow, spread
 from wearcap.simulation.people.actions import ON_THIGHS, hold, squat
-from wearcap.simulation.people.gaze import look_about, look_at
 from wearcap.simulation.people.plan import SIDES, Plan
+from wearcap.simulation.people.posture import look_about, look_at
 
 SHORT_M = (0.05, 0.20)
 """Range of the palm's distance from the surface."""
@@ -60,7 +60,7 @@ def hover(plan: Plan, places: dict[str, GripPlace], T_world_object: Rigid, rng: 
         point = np.array(place.point) + gap * np.array(place.normal) - rng.uniform(0.0, 0.05) * np.array(place.fingers)
         short = replace(place, point=vector(point + 0.02 * rng.standard_normal(3)))
         late = rng.uniform(0.0, 0.3)
-        grip = drawn_grip(short, still(T_world_object), touch + late, leave + late, rng, briskness)
+        grip = Grip.drawn(short, still(T_world_object), touch + late, leave + late, rng, briskness)
         if crouch > 0 or grip.start_s < plan.time:
             grip = replace(grip, reach_s=grip.touch_s - start)
         if crouch > 0:

@@ -77,6 +77,20 @@ class Grip:
     return_s: float = 0.7
     hover_m: float = 0.06
 
+    @classmethod
+    def drawn(
+        cls,
+        place: GripPlace,
+        moves: Moves,
+        touch_s: float,
+        release_s: float,
+        rng: np.random.Generator,
+        briskness: float,
+    ) -> "Grip":
+        """A grip with random durations of approach and return (0.4–1.2 s each) and hover distance."""
+        there, back = (float(np.clip(rng.normal(0.75, 0.15) / briskness, 0.4, 1.2)) for _ in range(2))
+        return cls(place, moves, touch_s, release_s, there, back, rng.uniform(0.04, 0.09))
+
     @property
     def start_s(self) -> float:
         return self.touch_s - self.reach_s
@@ -102,14 +116,6 @@ class Grip:
         off = torch.from_numpy(self.hover_m * (ease(before) + ease(after)))
         out = T.R @ normal
         return Hold(T.t + T.R @ point + off[:, None] * out, out, T.R @ fingers)
-
-
-def drawn_grip(
-    place: GripPlace, moves: Moves, touch_s: float, release_s: float, rng: np.random.Generator, briskness: float
-) -> Grip:
-    """A grip with random durations of approach and return (0.4–1.2 s each) and hover distance."""
-    there, back = (float(np.clip(rng.normal(0.75, 0.15) / briskness, 0.4, 1.2)) for _ in range(2))
-    return Grip(place, moves, touch_s, release_s, there, back, rng.uniform(0.04, 0.09))
 
 
 def still(T_world_object: Rigid) -> Moves:

@@ -20,10 +20,10 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.simulation.handling.grips import Grip, GripPlace, Handling, Vector, vector
 from wearcap.simulation.people.actions import DEEP, HEELS_RAD, ON_THIGHS, hold
-from wearcap.simulation.people.gaze import look_at
 from wearcap.simulation.people.plan import LEFT_SIGN, OTHER, SIDES, Plan
-from wearcap.simulation.people.shuffling import arrive
+from wearcap.simulation.people.posture import look_at
 from wearcap.simulation.people.track import Track, ease
+from wearcap.simulation.people.walking import arrive
 from wearcap.simulation.places.movables import Movable
 from wearcap.simulation.places.outline import turn
 
@@ -45,14 +45,12 @@ STRETCH = 0.93
 """Distance from shoulder to palm of a hanging arm, as a share of its length."""
 LIFTED_M, LONG_LIFTED_M = 0.02, 0.08
 """Softness of the clearance from the floor: a held object keeps about half of it; the second is for long sticks."""
-SOFT_M = 0.02
-"""Height that soft knees and a slouch take off a standing body."""
 SWING_M, SWING_RAD = 0.05, 0.10
 """Swing of an object that hangs from a hand, forwards and back with each stride."""
 
 
 @dataclass(frozen=True)
-class Manner:
+class _Manner:
     """How objects are lifted and put down."""
 
     wait_s: float
@@ -73,7 +71,7 @@ class Manner:
 class Errand:
     """A plan to take an object from one place to another, not yet written to the motion's plan."""
 
-    manner: ClassVar[Manner]
+    manner: ClassVar[_Manner]
     movable: Movable
     start: Float[np.ndarray, "4"]
     """Pose of the object before: x, y (m), heading (rad), height of its underside (m)."""
@@ -142,7 +140,7 @@ class Errand:
         if not self.beside:
             bend, lean = bend_for(plan, low + 0.18 * plan.arm_length, rng)
             return bend, lean, -0.06 * self.sign
-        drop = max(shoulder_height(plan) - low - 0.98 * plan.arm_length, 0.0)
+        drop = max(plan.shoulder_height - low - 0.98 * plan.arm_length, 0.0)
         knees = float(np.clip(rng.normal(0.45, 0.1), 0.25, 0.65))
         bend = float(np.clip(knees * drop, 0.0, 0.4 * plan.hip_height))
         return bend, float(np.clip(0.10 + (1.3 - knees) * drop, 0.08, 0.8)), -0.12 * self.sign
@@ -161,7 +159,7 @@ class Errand:
 class Carry(Errand):
     """A plan to carry a box between both palms."""
 
-    manner = Manner(wait_s=0.5, rise=1.2, upright=-0.04, out=0.45, lower=1.2, release_s=0.4)
+    manner = _Manner(wait_s=0.5, rise=1.2, upright=-0.04, out=0.45, lower=1.2, release_s=0.4)
     chest: Float[np.ndarray, "2"]
     """Origin of the box ahead of and below the chest while it is carried (m)."""
 
@@ -170,7 +168,7 @@ class Carry(Errand):
 class Take(Errand):
     """A plan to take an object with one hand or both."""
 
-    manner = Manner(wait_s=0.4, rise=1.1, upright=-0.03, out=0.5, lower=1.1, release_s=0.35)
+    manner = _Manner(wait_s=0.4, rise=1.1, upright=-0.03, out=0.5, lower=1.1, release_s=0.35)
 
     def neutral(self) -> Float[np.ndarray, "3 3"]:
         """Rotation relative to the holder's heading while the keys' angles are zero: upright, or, for objects
@@ -194,9 +192,9 @@ class Take(Errand):
         up = np.zeros(6)
         if self.beside:
             palm = abs(float((turn(-self.facing) @ self.middle[:2])[1]))
-            out = LEG_M + self.extent[1] + palm - shoulder_of(plan)[1]
+            out = LEG_M + self.extent[1] + palm - plan.shoulder[1]
             hangs = np.sqrt(max((STRETCH * reach) ** 2 - out**2, 0.0))
-            lowest = shoulder_height(plan) - self.middle[2] - OFF_FLOOR_M
+            lowest = plan.shoulder_height - self.middle[2] - OFF_FLOOR_M
             up[:3] = [rng.uniform(0.0, 0.06), out, -min(hangs, lowest)]
         elif self.side is None:
             near = self.extent[0] + rng.uniform(0.15, 0.20)
@@ -408,7 +406,7 @@ def lift(plan: Plan, choice: Errand, rng: np.random.Generator) -> Held:
     plan.time = up[1] + rng.uniform(0.0, 0.3)
     if not isinstance(choice, Take):
         return Held(choice, start, touch, *up)
-    shoulder = shoulder_of(plan)
+    shoulder = plan.shoulder
     shoulder[1] *= 0.0 if choice.side is None else choice.sign
     reach = plan.arm_length + float(np.linalg.norm(plan.skeleton.sites["left_palm"].t_joint_site))
     return HeldObject(choice, start, touch, *up, shoulder, reach, choice.carrying_pose(plan, reach, rng))
@@ -466,15 +464,3 @@ def spread(plan: Plan, out: tuple[float, float], back: tuple[float, float]) -> N
     """Keep hands that do not hold the object beside it while bending over it."""
     for side in SIDES:
         plan.hands[side].take(OUT_OF_THE_WAY, out, back)
-
-
-def shoulder_of(plan: Plan) -> Float[np.ndarray, "3"]:
-    """Position of the left shoulder relative to the chest's joint in the rest pose (m)."""
-    return plan.bones("left_collar", "left_shoulder").sum(0).numpy()
-
-
-def shoulder_height(plan: Plan) -> float:
-    """Height of the shoulders above the floor when standing upright (m)."""
-    spine = plan.skeleton.indices("l5", "l3", "t12", "t8")
-    above = float(plan.skeleton.t_parent_joint[spine, 2].sum()) + float(shoulder_of(plan)[2])
-    return plan.hip_height + above - SOFT_M

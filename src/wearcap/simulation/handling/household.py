@@ -7,19 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from wearcap.simulation.handling.house import House
 from wearcap.simulation.handling.opening import operate
 from wearcap.simulation.handling.rearranging import rearrange, relocate
 from wearcap.simulation.people.actions import ACTIVITIES, follow, start_place
 from wearcap.simulation.people.person import Person
 from wearcap.simulation.people.plan import Plan
 from wearcap.simulation.people.wearer import TAIL_S
-from wearcap.simulation.places.movables import Movable
+from wearcap.simulation.places.interactive_flat import House
+from wearcap.simulation.places.movables import HANDHELDS, Movable
 from wearcap.simulation.places.openables import Openable
 from wearcap.simulation.places.outline import distance_to_convex
 
-HANDHELD = ("suitcase", "backpack", "bottle", "tool", "ball")
-"""Categories that are used while they are carried."""
 EVEN_S = 4.0
 """Kinds are drawn by their weight divided by the sum of this and the time for which they were held already (s)."""
 AGAIN, ROOM = 0.25, 0.10
@@ -113,7 +111,7 @@ class Household:
     def interact(self) -> str:
         """Use an object, after passing the doors on the path; "stand" where nothing could be done."""
         chance = self.rng.random()
-        held = self.last is not None and self.items[self.last].category in HANDHELD
+        held = self.last is not None and self.items[self.last].category in HANDHELDS
         again = AGAIN if held else self.habits.again
         if chance < again and self.last is not None and (done := self.use(self.last)) != "stand":
             return done
@@ -138,7 +136,7 @@ class Household:
         pretend = self.rng.random() < self.habits.distractor_share
         if name in self.openables:
             return self.turn(self.openables[name], pretend)
-        act = relocate if self.movables[name].category in ("box", *HANDHELD) else rearrange
+        act = relocate if self.movables[name].category in ("box", *HANDHELDS) else rearrange
         return act(self.plan, self.house, self.rng, self.movables[name], pretend)
 
     def rearrange_room(self) -> str:
@@ -169,7 +167,7 @@ class Household:
             world = self.house.world(self.plan.position)
             points = world.navigation.node_points
             away = np.linalg.norm(points[:, :2] - goal[:2], axis=1)
-            if len(points) and away.min() < max(REACHED_M, stop_m) and self._same_side(points[away.argmin()], goal):
+            if len(points) and away.min() < max(REACHED_M, stop_m) and self.same_side(points[away.argmin()], goal):
                 near = np.flatnonzero(away < max(away.min() + 0.15, stop_m))
                 target = points[near[np.linalg.norm(points[near, :2] - self.plan.position[:2], axis=1).argmin()]]
                 path = world.plan_path(self.plan.position, target, self.rng)
@@ -177,7 +175,7 @@ class Household:
                     return False
                 follow(self.plan, world, self.rng, path)
                 return True
-            door = self._door_between(goal)
+            door = self.door_between(goal)
             if door is None or not self.go_through(door):
                 return False
         return False
@@ -244,7 +242,7 @@ class Household:
         point = pose.R.numpy() @ np.array([width / 2, sign * far_m, 0.0]) + pose.t.numpy()
         return np.array([point[0], point[1], self.plan.position[2]])
 
-    def _same_side(self, point: Float[np.ndarray, "3"], goal: Float[np.ndarray, "3"]) -> bool:
+    def same_side(self, point: Float[np.ndarray, "3"], goal: Float[np.ndarray, "3"]) -> bool:
         """Whether no wall or closed door stands between two points near each other."""
         between = goal[:2] + np.linspace(0.0, 1.0, 9)[:, None] * (point[:2] - goal[:2])
         flat, values = self.house.flat, self.house.values
@@ -252,7 +250,7 @@ class Household:
         walls += [door.footprint(values[door.name]) for door in flat.openables if door.category == "door"]
         return min(float(distance_to_convex(between, wall).min()) for wall in walls) > 0.01
 
-    def _door_between(self, goal: Float[np.ndarray, "3"]) -> Openable | None:
+    def door_between(self, goal: Float[np.ndarray, "3"]) -> Openable | None:
         """The first door on the path to a point that is not open enough."""
         shut = [door for door in self.house.flat.openables if door.blocks(self.house.values[door.name])]
         world = self.house.world(self.plan.position, without=tuple(door.name for door in shut))

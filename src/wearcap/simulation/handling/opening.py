@@ -14,13 +14,13 @@ from jaxtyping import Bool, Float
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.simulation.handling.distractors import pretend_to_handle
-from wearcap.simulation.handling.grips import Handling, drawn_grip
-from wearcap.simulation.handling.house import House
+from wearcap.simulation.handling.grips import Grip, Handling
 from wearcap.simulation.people.actions import approach
-from wearcap.simulation.people.gaze import look_at
 from wearcap.simulation.people.plan import LEFT_SIGN, SIDES, Plan, wrap
-from wearcap.simulation.people.shuffling import shuffle
+from wearcap.simulation.people.posture import look_at
 from wearcap.simulation.people.track import ease
+from wearcap.simulation.people.walking import shuffle
+from wearcap.simulation.places.interactive_flat import House
 from wearcap.simulation.places.openables import Openable
 from wearcap.simulation.places.outline import distance_to_convex
 from wearcap.simulation.places.world import World
@@ -68,6 +68,56 @@ class _Turn:
     places: Float[np.ndarray, "key 3"]
     """Floor points between the feet (m) and headings (rad, unwrapped) at evenly spaced times."""
 
+    @classmethod
+    def planned(
+        cls, plan: Plan, house: House, world: World, rng: np.random.Generator, item: Openable, value: float, handle: int
+    ) -> "_Turn | None":
+        """Hand, tempo and body path; None where the leaf or drawer would hit something or one cannot stand for it."""
+        start, floor = house.values[item.name], float(plan.position[2])
+        shoulder = floor + 1.50 * plan.hip_height
+        amount = abs(value - start) / (np.deg2rad(80.0) if item.hinged else 0.4)
+        seconds = float(np.clip((0.9 + 1.3 * amount) * rng.normal(1.0, 0.12) / plan.style.briskness, 1.0, 3.2))
+        values = start + ease(np.linspace(0.0, 1.0, max(round(seconds / KEY_S), 6))) * (value - start)
+        palms = item.handle(handle, values)
+        near = [
+            other
+            for other in world.objects
+            if other.name != item.name and distance_to_convex(palms[:, :2], other.footprint).min() < NEAR_M
+        ]
+        # once it is out of its frame, a leaf or drawer may not meet other objects
+        out = item.footprint(values[np.abs(values - item.closed) > (OUT_RAD if item.hinged else OUT_M)])
+        edges = np.concatenate([out[:, (1, 2)], out[:, (1, 2)].mean(1, keepdims=True)], 1)
+        low, high = item.z_range
+        level = [other for other in near if other.z_range[0] < high - 0.02 and other.z_range[1] > low + 0.02]
+        if any((distance_to_convex(edges, other.footprint) < 0.015).any() for other in level):
+            return None
+        solid = [other for other in near if other.z_range[0] < floor + 1.9 and other.z_range[1] > floor + 0.1]
+        in_arms_way = [o for o in solid if o.z_range[1] > palms[0, 2] - 0.05 and o.z_range[0] < shoulder]
+        pivot, beyond = item.object.freedom.pivot, None
+        if item.hinged and not handle and pivot is not None:
+            beyond = np.array(pivot[:2]), float(item.outline[:, 0].max()) + BEYOND_M
+        task = _Task(
+            palms,
+            item.footprint(values),
+            tuple(other.footprint for other in solid),
+            tuple(other.footprint for other in in_arms_way),
+            1.0,
+            shoulder,
+            plan.arm_length + PALM_M,
+            low=bool(high < palms[0, 2] + 0.2),
+            beyond=beyond,
+        )
+        walkable = world.navigation.node_points[:, :2]
+        walkable = walkable[np.linalg.norm(walkable - palms[0, :2], axis=1) < 2.0]
+        found = [(side, replace(task, sign=LEFT_SIGN[side]).stances(walkable, rng)) for side in SIDES]
+        able = [(*stances, side) for side, stances in found if stances is not None]
+        if not able:
+            return None
+        able.sort(key=lambda option: option[0])
+        other = rng.random() < OTHER_HAND and able[-1][0] < able[0][0] + 8.0
+        _, places, side = able[-1 if other else 0]
+        return cls(item, start, value, handle, side, seconds, places)
+
     def values(self, share: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time"]:
         return self.start + ease(share) * (self.stop - self.start)
 
@@ -86,7 +136,7 @@ def operate(
     With `pretend`, the wearer only goes there and does something that resembles it, and nothing is touched.
     """
     world = house.world(plan.position)
-    turn = _planned(plan, house, world, rng, item, value, handle)
+    turn = _Turn.planned(plan, house, world, rng, item, value, handle)
     if turn is None:
         return False
     x, y, heading = turn.places[0]
@@ -100,56 +150,6 @@ def operate(
     else:
         _perform(plan, house, turn, rng)
     return True
-
-
-def _planned(
-    plan: Plan, house: House, world: World, rng: np.random.Generator, item: Openable, value: float, handle: int
-) -> _Turn | None:
-    """Hand, tempo and body path; None where the leaf or drawer would hit something or one cannot stand for it."""
-    start, floor = house.values[item.name], float(plan.position[2])
-    shoulder = floor + 1.50 * plan.hip_height
-    amount = abs(value - start) / (np.deg2rad(80.0) if item.hinged else 0.4)
-    seconds = float(np.clip((0.9 + 1.3 * amount) * rng.normal(1.0, 0.12) / plan.style.briskness, 1.0, 3.2))
-    values = start + ease(np.linspace(0.0, 1.0, max(round(seconds / KEY_S), 6))) * (value - start)
-    palms = item.handle(handle, values)
-    near = [
-        other
-        for other in world.objects
-        if other.name != item.name and distance_to_convex(palms[:, :2], other.footprint).min() < NEAR_M
-    ]
-    # once it is out of its frame, a leaf or drawer may not meet other objects
-    out = item.footprint(values[np.abs(values - item.closed) > (OUT_RAD if item.hinged else OUT_M)])
-    edges = np.concatenate([out[:, (1, 2)], out[:, (1, 2)].mean(1, keepdims=True)], 1)
-    low, high = item.z_range
-    level = [other for other in near if other.z_range[0] < high - 0.02 and other.z_range[1] > low + 0.02]
-    if any((distance_to_convex(edges, other.footprint) < 0.015).any() for other in level):
-        return None
-    solid = [other for other in near if other.z_range[0] < floor + 1.9 and other.z_range[1] > floor + 0.1]
-    in_arms_way = [o for o in solid if o.z_range[1] > palms[0, 2] - 0.05 and o.z_range[0] < shoulder]
-    pivot, beyond = item.object.freedom.pivot, None
-    if item.hinged and not handle and pivot is not None:
-        beyond = np.array(pivot[:2]), float(item.outline[:, 0].max()) + BEYOND_M
-    task = _Task(
-        palms,
-        item.footprint(values),
-        tuple(other.footprint for other in solid),
-        tuple(other.footprint for other in in_arms_way),
-        1.0,
-        shoulder,
-        plan.arm_length + PALM_M,
-        low=bool(high < palms[0, 2] + 0.2),
-        beyond=beyond,
-    )
-    walkable = world.navigation.node_points[:, :2]
-    walkable = walkable[np.linalg.norm(walkable - palms[0, :2], axis=1) < 2.0]
-    found = [(side, _find_stances(replace(task, sign=LEFT_SIGN[side]), walkable, rng)) for side in SIDES]
-    able = [(*stances, side) for side, stances in found if stances is not None]
-    if not able:
-        return None
-    able.sort(key=lambda option: option[0])
-    other = rng.random() < OTHER_HAND and able[-1][0] < able[0][0] + 8.0
-    _, places, side = able[-1 if other else 0]
-    return _Turn(item, start, value, handle, side, seconds, places)
 
 
 def _perform(plan: Plan, house: House, turn: _Turn, rng: np.random.Generator) -> None:
@@ -171,7 +171,15 @@ def _perform(plan: Plan, house: House, turn: _Turn, rng: np.random.Generator) ->
     padded = np.concatenate([np.repeat(fine[:1], reach, 0), fine, np.repeat(fine[-1:], reach, 0)])
     path = scipy.ndimage.gaussian_filter1d(padded, sigma, axis=0)[reach : reach + count]
     times = np.linspace(begin, stop, count)
-    place, yaw = item.handles[turn.handle], _hand_yaw(plan, turn, path)
+    place = item.handles[turn.handle]
+    # the hand turns on the handle so that the fingers point along the arm
+    values = turn.values(np.linspace(0.0, 1.0, count))
+    held, pose = item.handle(turn.handle, values), item.pose(values)
+    fingers = (pose.R.numpy() @ np.array(place.fingers))[:, :2]
+    across = np.stack([-np.sin(path[:, 2]), np.cos(path[:, 2])], 1)
+    arm = held[:, :2] - path[:, :2] - 0.18 * LEFT_SIGN[turn.side] * across
+    angle = np.arctan2(fingers[:, 0] * arm[:, 1] - fingers[:, 1] * arm[:, 0], (fingers * arm).sum(1))
+    yaw = YAW_MOST * np.tanh(np.unwrap(angle) / YAW_MOST)
 
     def poses(at: Float[np.ndarray, "time"], chest: Rigid) -> Rigid:
         return item.pose(turn.values((at - begin) / turn.seconds))
@@ -183,7 +191,7 @@ def _perform(plan: Plan, house: House, turn: _Turn, rng: np.random.Generator) ->
         R, palm = about @ pose.R, (pose.R @ point[:, None])[..., 0] + pose.t
         return Rigid(R, palm - (R @ point[:, None])[..., 0])
 
-    grip = replace(drawn_grip(place, hand_poses, touch, release, rng, briskness), reach_s=touch - start)
+    grip = replace(Grip.drawn(place, hand_poses, touch, release, rng, briskness), reach_s=touch - start)
     plan.grip(turn.side, grip)
     middle = begin + 0.5 * turn.seconds
     handle = item.handle(turn.handle, np.array(turn.start))
@@ -194,17 +202,6 @@ def _perform(plan: Plan, house: House, turn: _Turn, rng: np.random.Generator) ->
     house.handlings.append(Handling.of(item.name, contact_class, poses, [(turn.side, grip)]))
     house.values[item.name] = turn.stop
     plan.time = max(plan.time, release)
-
-
-def _hand_yaw(plan: Plan, turn: _Turn, path: Float[np.ndarray, "time 3"]) -> Float[np.ndarray, "time"]:
-    """Rotation of the hand on the handle (rad), so that the fingers point along the arm."""
-    values = turn.values(np.linspace(0.0, 1.0, len(path)))
-    handle, pose = turn.item.handle(turn.handle, values), turn.item.pose(values)
-    fingers = (pose.R.numpy() @ np.array(turn.item.handles[turn.handle].fingers))[:, :2]
-    across = np.stack([-np.sin(path[:, 2]), np.cos(path[:, 2])], 1)
-    arm = handle[:, :2] - path[:, :2] - 0.18 * LEFT_SIGN[turn.side] * across
-    angle = np.arctan2(fingers[:, 0] * arm[:, 1] - fingers[:, 1] * arm[:, 0], (fingers * arm).sum(1))
-    return YAW_MOST * np.tanh(np.unwrap(angle) / YAW_MOST)
 
 
 @dataclass(frozen=True)
@@ -230,66 +227,64 @@ class _Task:
     beyond: tuple[Float[np.ndarray, "2"], float] | None = None
     """A point, and the preferred distance from it (m): who pulls a leaf does not step behind it."""
 
+    def stances(
+        self, walkable: Float[np.ndarray, "point 2"], rng: np.random.Generator
+    ) -> tuple[float, Float[np.ndarray, "key 3"]] | None:
+        """The cost of the cheapest path and its floor points and headings (m, m, rad unwrapped) at the task's keys.
 
-def _find_stances(
-    task: _Task, walkable: Float[np.ndarray, "point 2"], rng: np.random.Generator
-) -> tuple[float, Float[np.ndarray, "key 3"]] | None:
-    """The cost of the cheapest path and its floor points and headings (m, m, rad unwrapped) at the task's keys.
+        None where none is free; it begins within 0.45 m of a walkable point.
+        """
+        low, high = self.handle[:, :2].min(0) - AROUND_M, self.handle[:, :2].max(0) + AROUND_M
+        axes = [np.arange(a, b, SPACING_M) for a, b in zip(low, high)]
+        points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
+        points += rng.uniform(-0.5, 0.5, 2) * SPACING_M
+        near = np.linalg.norm(points[:, None] - self.handle[None, :, :2], axis=-1).min(1) < AROUND_M
+        points = points[near]
+        room = np.min([distance_to_convex(points, outline) for outline in self.solid], 0)
+        points, room = points[room >= BODY_M], room[room >= BODY_M]
+        if not len(points) or not len(walkable):
+            return None
+        cost, heading = self.rated(points, room)
+        cost += 0.15 * rng.standard_normal(len(points))
+        away = np.linalg.norm(points[:, None] - walkable[None], axis=-1).min(1)
+        cost[0, away > 0.45] = np.inf
+        chosen, total = _cheapest(points, cost)
+        if chosen is None:
+            return None
+        keys = np.arange(len(chosen))
+        return total, np.column_stack([points[chosen], np.unwrap(heading[keys, chosen])])
 
-    None where none is free; it begins within 0.45 m of a walkable point.
-    """
-    low, high = task.handle[:, :2].min(0) - AROUND_M, task.handle[:, :2].max(0) + AROUND_M
-    axes = [np.arange(a, b, SPACING_M) for a, b in zip(low, high)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
-    points += rng.uniform(-0.5, 0.5, 2) * SPACING_M
-    near = np.linalg.norm(points[:, None] - task.handle[None, :, :2], axis=-1).min(1) < AROUND_M
-    points = points[near]
-    room = np.min([distance_to_convex(points, outline) for outline in task.solid], 0)
-    points, room = points[room >= BODY_M], room[room >= BODY_M]
-    if not len(points) or not len(walkable):
-        return None
-    cost, heading = _rated(task, points, room)
-    cost += 0.15 * rng.standard_normal(len(points))
-    away = np.linalg.norm(points[:, None] - walkable[None], axis=-1).min(1)
-    cost[0, away > 0.45] = np.inf
-    chosen, total = _cheapest(points, cost)
-    if chosen is None:
-        return None
-    keys = np.arange(len(chosen))
-    return total, np.column_stack([points[chosen], np.unwrap(heading[keys, chosen])])
-
-
-def _rated(
-    task: _Task, points: Float[np.ndarray, "point 2"], room: Float[np.ndarray, "point"]
-) -> tuple[Float[np.ndarray, "key point"], Float[np.ndarray, "key point"]]:
-    """Cost of standing at each point at each key, infinite where it is impossible, and the heading there."""
-    offset = task.handle[:, None, :2] - points
-    toward = np.arctan2(offset[..., 1], offset[..., 0])
-    heading = toward - task.sign * ASIDE
-    across = np.stack([-np.sin(heading), np.cos(heading)], -1)
-    shoulder = points + task.sign * SHOULDER_ASIDE_M * across
-    arm = task.handle[:, None, :2] - shoulder
-    far = np.linalg.norm(arm, axis=-1)
-    drop = np.minimum(np.abs(task.shoulder_m - task.handle[:, 2]), 0.8 * task.reach_m)[:, None]
-    best = np.clip(np.sqrt((0.88 * task.reach_m) ** 2 - drop**2), 0.30, 0.55)
-    cost = ((far - best) / 0.14) ** 2
-    cost = np.where(far > best + HELP_M, np.inf, cost)
-    if task.beyond is not None:
-        pivot, radius = task.beyond
-        cost += 4.0 * np.maximum(radius - np.linalg.norm(points - pivot, axis=1), 0.0) / 0.15
-    leaf = np.stack([distance_to_convex(points, outline) for outline in task.footprint])
-    free = np.minimum(leaf, room)
-    cost += 2.0 * np.maximum(BODY_M + EASY_M - free, 0.0) / EASY_M
-    cost[leaf < BODY_M] = np.inf
-    # the straight arm, except its last 7 cm, may not pass through the moved object or another
-    last = np.clip(1.0 - 0.07 / np.maximum(far, 0.1), 0.0, 1.0)[..., None]
-    for share in np.linspace(0.25, 1.0, 7):
-        along = shoulder + share * last * arm
-        for key, outline in enumerate(task.footprint if not task.low else ()):
-            cost[key, _within(along[key], outline, 0.01 if share == 1.0 else ARM_M)] = np.inf
-        for outline in task.high if share < 0.9 else ():
-            cost[_within(along, outline, ARM_M)] = np.inf
-    return cost, heading
+    def rated(
+        self, points: Float[np.ndarray, "point 2"], room: Float[np.ndarray, "point"]
+    ) -> tuple[Float[np.ndarray, "key point"], Float[np.ndarray, "key point"]]:
+        """Cost of standing at each point at each key, infinite where it is impossible, and the heading there."""
+        offset = self.handle[:, None, :2] - points
+        toward = np.arctan2(offset[..., 1], offset[..., 0])
+        heading = toward - self.sign * ASIDE
+        across = np.stack([-np.sin(heading), np.cos(heading)], -1)
+        shoulder = points + self.sign * SHOULDER_ASIDE_M * across
+        arm = self.handle[:, None, :2] - shoulder
+        far = np.linalg.norm(arm, axis=-1)
+        drop = np.minimum(np.abs(self.shoulder_m - self.handle[:, 2]), 0.8 * self.reach_m)[:, None]
+        best = np.clip(np.sqrt((0.88 * self.reach_m) ** 2 - drop**2), 0.30, 0.55)
+        cost = ((far - best) / 0.14) ** 2
+        cost = np.where(far > best + HELP_M, np.inf, cost)
+        if self.beyond is not None:
+            pivot, radius = self.beyond
+            cost += 4.0 * np.maximum(radius - np.linalg.norm(points - pivot, axis=1), 0.0) / 0.15
+        leaf = np.stack([distance_to_convex(points, outline) for outline in self.footprint])
+        free = np.minimum(leaf, room)
+        cost += 2.0 * np.maximum(BODY_M + EASY_M - free, 0.0) / EASY_M
+        cost[leaf < BODY_M] = np.inf
+        # the straight arm, except its last 7 cm, may not pass through the moved object or another
+        last = np.clip(1.0 - 0.07 / np.maximum(far, 0.1), 0.0, 1.0)[..., None]
+        for share in np.linspace(0.25, 1.0, 7):
+            along = shoulder + share * last * arm
+            for key, outline in enumerate(self.footprint if not self.low else ()):
+                cost[key, _within(along[key], outline, 0.01 if share == 1.0 else ARM_M)] = np.inf
+            for outline in self.high if share < 0.9 else ():
+                cost[_within(along, outline, ARM_M)] = np.inf
+        return cost, heading
 
 
 def _within(

@@ -8,15 +8,14 @@ from jaxtyping import Float
 from wearcap.simulation.handling.distractors import pretend_to_handle
 from wearcap.simulation.handling.grips import GripPlace
 from wearcap.simulation.handling.holding import Errand, HeldObject, carry_options, lift, put_down, take_options
-from wearcap.simulation.handling.house import House
 from wearcap.simulation.handling.sliding import Slide, slide, slide_options
 from wearcap.simulation.handling.using import use
 from wearcap.simulation.people.actions import approach
 from wearcap.simulation.people.plan import Plan
-from wearcap.simulation.people.shuffling import step_to
-from wearcap.simulation.places.interactive_flat import obstacle
+from wearcap.simulation.people.walking import step_to
+from wearcap.simulation.places.interactive_flat import House, obstacle
 from wearcap.simulation.places.movables import Movable, floor_pose
-from wearcap.simulation.places.outline import distance_to_convex, rectangle, turn
+from wearcap.simulation.places.outline import distance_to_convex, stays_apart
 from wearcap.simulation.places.world import World
 
 TRIES, OPTIONS, PLACES = 24, 4, 4
@@ -114,7 +113,7 @@ def _drawn_slide(plan: Plan, house: House, world: World, rng: np.random.Generato
     ]
     low = [item.footprint for item in near if item.z_range[0] < movable.height]
     zones = [zone for zone in house.kept_free() if distance_to_convex(start[:2], zone) < 4.0]
-    outline = rectangle((0.0, 0.0), (2 * movable.half_size[0], 2 * movable.half_size[1]))
+    outline = movable.outline
     for _ in range(TRIES):
         # mostly displaced along the object's own axes, now and then turned
         along = rng.choice(4) * np.pi / 2 + start[2] if rng.random() < 0.7 else rng.uniform(-np.pi, np.pi)
@@ -124,11 +123,10 @@ def _drawn_slide(plan: Plan, house: House, world: World, rng: np.random.Generato
             spin = rng.choice([-1.0, 1.0]) * (np.pi / 2 if rng.random() < 0.3 else rng.uniform(0.25, 1.2))
             far *= rng.uniform(0.2, 1.0)
         stop = start + np.array([far * np.cos(angle), far * np.sin(angle), spin])
-        placed = outlines(outline, stop[None])
-        if not apart(placed, low, APART_M) or not apart(placed, zones, 0.0):
+        if not stays_apart(outline, stop[None], low, APART_M) or not stays_apart(outline, stop[None], zones, 0.0):
             continue
         for choice in islice(slide_options(plan, movable, start, stop, rng), OPTIONS):
-            if not apart(outlines(outline, choice.object_at(KEYS)), low, 0.5 * APART_M):
+            if not stays_apart(outline, choice.object_at(KEYS), low, 0.5 * APART_M):
                 continue
             body = choice.body_at(KEYS)[:, :2]
             free = min(distance_to_convex(body, item.footprint).min() for item in near)
@@ -146,13 +144,13 @@ def _drawn_errand(plan: Plan, house: House, world: World, rng: np.random.Generat
     if np.linalg.norm(points - place[:2], axis=1).min() > 1.0:
         return None
     others = [item.footprint for item in world.objects if item.name != movable.name and item.z_range[0] < 1.5]
-    outline = rectangle((0.0, 0.0), (2 * movable.half_size[0], 2 * movable.half_size[1]))
+    outline = movable.outline
     zones, options = house.kept_free(), carry_options if movable.category == "box" else take_options
     for _ in range(TRIES):
         spot = points[rng.integers(len(points))] + rng.uniform(-0.3, 0.3, 2)
         stop = np.array([*spot, rng.uniform(-np.pi, np.pi)])
         far = 0.8 < np.linalg.norm(spot - place[:2]) < CARRIED_M
-        if not far or not apart(outlines(outline, stop[None]), [*others, *zones], APART_M):
+        if not far or not stays_apart(outline, stop[None], [*others, *zones], APART_M):
             continue
         for choice in options(plan, movable, np.append(place, level), np.append(stop, level), rng):
             ends = np.stack([choice.stand[:2], choice.goal[:2]])
@@ -173,28 +171,3 @@ def _keeps_floor_reachable(
     away = np.linalg.norm(grid.node_points[:, :2] - end[:2], axis=1)
     enough = grid.walkable.sum() > REACHABLE_SHARE * world.navigation.walkable.sum()
     return bool(enough) and float(away.min()) < REACHED_M
-
-
-def outlines(outline: Float[np.ndarray, "4 2"], places: Float[np.ndarray, "key 3"]) -> Float[np.ndarray, "key 4 2"]:
-    """An outline at places x, y (m), heading (rad)."""
-    return np.stack([outline @ turn(heading).T + np.array([x, y]) for x, y, heading in places])
-
-
-def apart(outlines: Float[np.ndarray, "key 4 2"], others: list[Float[np.ndarray, "corner 2"]], least_m: float) -> bool:
-    """Whether outlines keep a distance from others: neither's border comes near the other."""
-    share = np.linspace(0.0, 1.0, 7)[:-1, None]
-
-    def border(corners: Float[np.ndarray, "corner 2"]) -> Float[np.ndarray, "point 2"]:
-        return np.concatenate([a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, 0))])
-
-    points = np.concatenate([border(corners) for corners in outlines])
-    low, high = points.min(0) - least_m, points.max(0) + least_m
-    for other in others:
-        if (other.min(0) > high).any() or (other.max(0) < low).any():
-            continue
-        if distance_to_convex(points, other).min() <= least_m:
-            return False
-        rim = border(other)
-        if min(distance_to_convex(rim, corners).min() for corners in outlines) <= least_m:
-            return False
-    return True

@@ -7,12 +7,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from wearcap.simulation.handling.grips import Grip, GripPlace, Handling, Moves, drawn_grip
+from wearcap.simulation.handling.grips import Grip, GripPlace, Handling
 from wearcap.simulation.people.gait import glide
-from wearcap.simulation.people.gaze import look_at, turn_head
 from wearcap.simulation.people.plan import LEFT_SIGN, OTHER, SIDES, Plan, wrap
-from wearcap.simulation.people.shuffling import arrive, shuffle
+from wearcap.simulation.people.posture import look_at, turn_head
 from wearcap.simulation.people.track import ease
+from wearcap.simulation.people.walking import arrive, shuffle
 from wearcap.simulation.places.movables import Movable, Rail, floor_pose
 from wearcap.simulation.places.outline import turn
 
@@ -119,7 +119,17 @@ def _drawn(
         speed *= 0.75
     seconds = max((length + TURN_LEVER_M * turned) / speed, 1.2)
     pause = rng.uniform(0.5, 1.6) if seconds > 3.0 and rng.random() < 0.25 else 0.0
-    hands = (SIDES,) if turned > 0 else _hand_sets(both, seconds, rng)  # only both may turn an object
+    # sets of holding hands, one after the other; only both may turn an object
+    hands: tuple[tuple[str, ...], ...] = (SIDES,)
+    if turned == 0:
+        first = SIDES[int(rng.random() < 0.6)]
+        other = OTHER[first]
+        if seconds < 3.5 or rng.random() > (0.3 if both else 0.25):
+            hands = (SIDES,) if both else ((first,),)
+        elif not both:
+            hands = ((first,), (other,))
+        else:
+            hands = (((first,), SIDES), (SIDES, (first,)), ((first,), SIDES, (other,)))[rng.integers(3)]
     used = sorted({side for group in hands for side in group})
     wide = 2.0 * float(plan.skeleton.t_parent_joint[plan.skeleton.indices("left_collar", "left_shoulder"), 1].sum())
     apart = min(wide * rng.uniform(0.75, 1.5), rail.length) if len(used) > 1 else 0.0
@@ -148,17 +158,6 @@ def _drawn(
     return Slide(movable, start, stop, bow, places, hands, local, seconds, pause, angle)
 
 
-def _hand_sets(both: bool, seconds: float, rng: np.random.Generator) -> tuple[tuple[str, ...], ...]:
-    """Sets of holding hands, one after the other."""
-    first = SIDES[int(rng.random() < 0.6)]
-    other = OTHER[first]
-    if seconds < 3.5 or rng.random() > (0.3 if both else 0.25):
-        return (SIDES,) if both else ((first,),)
-    if not both:
-        return ((first,), (other,))
-    return (((first,), SIDES), (SIDES, (first,)), ((first,), SIDES, (other,)))[rng.integers(3)]
-
-
 def slide(plan: Plan, choice: Slide, rng: np.random.Generator, floor_z: float = 0.0) -> Handling:
     """Take hold of an object, move it and let go; the wearer stands at or near `choice.stand`.
 
@@ -170,23 +169,7 @@ def slide(plan: Plan, choice: Slide, rng: np.random.Generator, floor_z: float = 
     end = begin + (choice.seconds + choice.pause_s)
     moves = lambda times, chest: floor_pose(choice.object_at(choice.share(times - begin)), floor_z)  # noqa: E731
     release = end + rng.uniform(0.1, 0.7)
-    grips = _grips(plan, choice, moves, (touch, begin, end, release), rng)
-    for side, grip in grips:
-        plan.grip(side, grip)
-    _lean(plan, choice, plan.time, begin, end, release, rng)
-    _look(plan, choice, touch, begin, end, floor_z, rng)
-    base = float(choice.stand[2])
-    unwrap = np.array([0.0, 0.0, plan.heading + wrap(base - plan.heading) - base])
-    shuffle(plan, rng, lambda times: choice.body_at(choice.share(times - begin)) + unwrap, begin, end)
-    plan.time = max(plan.time, release + 0.5 * max(grip.return_s for _, grip in grips))
-    return Handling.of(choice.movable.name, "sliding", moves, grips)
-
-
-def _grips(
-    plan: Plan, choice: Slide, moves: Moves, when: tuple[float, float, float, float], rng: np.random.Generator
-) -> list[tuple[str, Grip]]:
-    """One grip per hand, from its first to its last set; sets change while the object moves."""
-    touch, begin, end, release = when
+    # one grip per hand, from its first to its last set; sets change while the object moves
     count = len(choice.hands)
     cuts = begin + (end - begin) * (np.arange(1, count) + 0.25 * rng.uniform(-1, 1, count - 1)) / count
     grips = []
@@ -196,8 +179,16 @@ def _grips(
         # the new hand takes hold a little before the other lets go.
         start = touch + _stagger(rng) if first == 0 else cuts[first - 1] - rng.uniform(0.1, 0.4)
         stop = release + _stagger(rng) if last == count - 1 else cuts[last]
-        grips.append((side, drawn_grip(choice.places[side], moves, start, stop, rng, plan.style.briskness)))
-    return grips
+        grips.append((side, Grip.drawn(choice.places[side], moves, start, stop, rng, plan.style.briskness)))
+    for side, grip in grips:
+        plan.grip(side, grip)
+    _lean(plan, choice, plan.time, begin, end, release, rng)
+    _look(plan, choice, touch, begin, end, floor_z, rng)
+    base = float(choice.stand[2])
+    unwrap = np.array([0.0, 0.0, plan.heading + wrap(base - plan.heading) - base])
+    shuffle(plan, rng, lambda times: choice.body_at(choice.share(times - begin)) + unwrap, begin, end)
+    plan.time = max(plan.time, release + 0.5 * max(grip.return_s for _, grip in grips))
+    return Handling.of(choice.movable.name, "sliding", moves, grips)
 
 
 def _stagger(rng: np.random.Generator) -> float:

@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wearcap.simulation.handling.holding import HeldObject, shoulder_height, shoulder_of
-from wearcap.simulation.people.gaze import look_about, turn_head
+from wearcap.simulation.handling.holding import HeldObject
 from wearcap.simulation.people.plan import Plan
+from wearcap.simulation.people.posture import look_about, turn_head
 
 Use = Callable[[Plan, HeldObject, np.random.Generator], None]
 USES: dict[str, list[Use]] = {}
@@ -33,7 +33,7 @@ def use(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
     uses[rng.integers(len(uses))](plan, held, rng)
 
 
-def use_of(*kinds: str) -> Callable[[Use], Use]:
+def _use_of(*kinds: str) -> Callable[[Use], Use]:
     """Enter a function into `USES`."""
 
     def enter(act: Use) -> Use:
@@ -44,11 +44,11 @@ def use_of(*kinds: str) -> Callable[[Use], Use]:
     return enter
 
 
-@use_of("bottle", "bottle", "bottle")
+@_use_of("bottle", "bottle", "bottle")
 def _drink(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
     """Bring a bottle to the mouth and tilt it, once or twice."""
     choice, head = held.choice, plan.bones("neck", "head").sum(0).numpy() + np.array(MOUTH_M)
-    mouth = (head - shoulder_of(plan)) / held.reach
+    mouth = (head - plan.shoulder) / held.reach
     top = choice.movable.height - choice.middle[2]
     aside = float(np.abs(choice.middle[:2]).max())
     time = plan.time + 0.1
@@ -74,7 +74,7 @@ def _drink(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
     plan.time = time + 0.95
 
 
-@use_of("hammer")
+@_use_of("hammer")
 def _hammer(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
     """Strike in front of the body, each stroke raised slower than it falls."""
     level, out = rng.uniform(-0.60, -0.25), rng.uniform(-0.12, 0.06)
@@ -98,7 +98,7 @@ def _hammer(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
     plan.time = time + 1.05
 
 
-@use_of("drill")
+@_use_of("drill")
 def _drill(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
     """Press a drill forwards at one or two places."""
     start = time = plan.time + 0.1
@@ -119,13 +119,13 @@ def _drill(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
     plan.time = time + 1.05
 
 
-@use_of("mop")
+@_use_of("mop")
 def _mop(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
     """Sweep the floor before the feet from side to side."""
     choice = held.choice
     lean, low = rng.uniform(0.15, 0.3), rng.uniform(0.62, 0.70)
     length = float(choice.middle[0]) + choice.movable.half_size[0]
-    high = shoulder_height(plan) - low * held.reach - 0.10 * lean
+    high = plan.shoulder_height - low * held.reach - 0.10 * lean
     tilt = -float(np.arccos(np.clip((high - 0.03) / length, 0.3, 0.95)))
     start = plan.time + 0.1
     plan.lean.move(start, start + 1.0, (lean, 0.0, 0.0))
@@ -142,7 +142,7 @@ def _mop(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
     plan.time = time + 1.15
 
 
-@use_of("suitcase", "suitcase", "backpack")
+@_use_of("suitcase", "suitcase", "backpack")
 def _hold_up(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
     """Lift the object that hangs from the hand up in front of the body, as if onto a shelf, and lower it again."""
     x, y, z = (held.carry[:3] / held.reach).tolist()
@@ -158,7 +158,7 @@ def _hold_up(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
     plan.time = stop + up + 0.1
 
 
-@use_of("suitcase", "backpack")
+@_use_of("suitcase", "backpack")
 def _swing_about(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
     """Let the object that hangs from the hand swing forwards and back."""
     x, y, z = (held.carry[:3] / held.reach).tolist()
@@ -173,7 +173,7 @@ def _swing_about(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None
     plan.time = time + 0.85
 
 
-@use_of("bottle")
+@_use_of("bottle")
 def _inspect(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
     """Hold a small object up in front of the eyes and turn it about."""
     start, time = plan.time + 0.1, plan.time + 1.0
@@ -188,7 +188,7 @@ def _inspect(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
     plan.time = time + 0.95
 
 
-@use_of("backpack in both hands", "backpack in both hands")
+@_use_of("backpack in both hands", "backpack in both hands")
 def _hug(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
     """Draw an object between both hands to the chest, and hold it there."""
     start, near = plan.time + 0.1, 0.13 + held.choice.extent[0]
@@ -206,7 +206,7 @@ def _hug(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
     plan.time = stop + 0.85
 
 
-@use_of("ball in both hands")
+@_use_of("ball in both hands")
 def _overhead(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
     """Raise an object between both hands in front of and above the head, up to three times."""
     start = time = plan.time + 0.1
@@ -228,7 +228,7 @@ def _overhead(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
     plan.time = time
 
 
-@use_of("backpack in both hands", "ball in both hands")
+@_use_of("backpack in both hands", "ball in both hands")
 def _sway(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
     """Move an object between both hands from side to side, the trunk turning with it."""
     start = time = plan.time + 0.1
@@ -246,12 +246,12 @@ def _sway(plan: Plan, held: HeldObject, rng: np.random.Generator) -> None:
 
 def _watch(plan: Plan, held: HeldObject, at: tuple[float, float, float], start_s: float, stop_s: float) -> None:
     """Look at the working hands: a place given as in `HeldObject.go`."""
-    shoulder = shoulder_of(plan)
+    shoulder = plan.shoulder
     ahead, out, up = held.reach * np.array(at)
     aside = held.choice.sign * (out + (0.0 if held.choice.side is None else shoulder[1]))
     cos, sin = np.cos(plan.heading), np.sin(plan.heading)
     x, y, z = plan.position
-    point = [x + ahead * cos - aside * sin, y + ahead * sin + aside * cos, max(z + shoulder_height(plan) + up, z)]
+    point = [x + ahead * cos - aside * sin, y + ahead * sin + aside * cos, max(z + plan.shoulder_height + up, z)]
     plan.gaze_point.move(start_s, start_s, point)
     plan.gaze_weight.move(start_s + 0.1, start_s + 0.7, 0.85)
     plan.gaze_weight.move(stop_s, stop_s + 0.6, 0.0)

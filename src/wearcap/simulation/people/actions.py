@@ -1,6 +1,6 @@
 """Activities of a wearer. Each is a function that writes footsteps and channels onto the plan.
 
-A new one (a door, a sofa to push, a box to carry) is a function `(plan, world, rng) -> bool` under `@activity`;
+A new one (a door, a sofa to push, a box to carry) is a function `(plan, world, rng) -> bool` under `@_activity`;
 it returns False, without having written anything, where the world gives no occasion for it.
 """
 
@@ -8,10 +8,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from wearcap.simulation.people.gaze import look_about, look_at, turn_head
 from wearcap.simulation.people.plan import LEFT_SIGN, SIDES, Plan, wrap
+from wearcap.simulation.people.posture import look_about, look_at, turn_head
 from wearcap.simulation.people.walking import turn_to, walk_along
 from wearcap.simulation.places.outline import turn
 from wearcap.simulation.places.world import ReachTarget, World
@@ -22,7 +22,7 @@ Pose = tuple[float, ...]
 
 
 @dataclass(frozen=True)
-class Activity:
+class _Activity:
     """An activity; `weight` is its share among all draws, `outdoors` the factor on that weight outdoors."""
 
     act: Act
@@ -53,14 +53,14 @@ DEEP = 0.30
 """Crouches deeper than this share of the hip height lift the heels, by `HEELS_RAD`."""
 HEELS_RAD = 0.35
 
-ACTIVITIES: dict[str, Activity] = {}
+ACTIVITIES: dict[str, _Activity] = {}
 
 
-def activity(name: str, weight: float, outdoors: float = 1.0) -> Callable[[Act], Act]:
+def _activity(name: str, weight: float, outdoors: float = 1.0) -> Callable[[Act], Act]:
     """Enter a function into `ACTIVITIES`."""
 
     def enter(act: Act) -> Act:
-        ACTIVITIES[name] = Activity(act, weight, outdoors)
+        ACTIVITIES[name] = _Activity(act, weight, outdoors)
         return act
 
     return enter
@@ -74,20 +74,11 @@ def start_place(world: World, rng: np.random.Generator) -> tuple[Float[np.ndarra
 def _free_point(world: World, rng: np.random.Generator, beside_z: float | None = None) -> Float[np.ndarray, "3"]:
     """A random free place to stand; outdoors, often one that is higher or lower than `beside_z` (m)."""
     points = world.sample_floor(rng, 24)
-    free = (world.clearance(points) > FREE_M) & ~on_stairs(world, points)
+    free = (world.clearance(points) > FREE_M) & ~world.on_stairs(points)
     if world.outdoors and beside_z is not None and rng.random() < ELSEWHERE:
         other = free & (np.abs(points[:, 2] - beside_z) > 0.3)
         free = other if other.any() else free
     return points[np.flatnonzero(free)[0]] if free.any() else points[0]
-
-
-def on_stairs(world: World, points: Float[np.ndarray, "point 3"]) -> Bool[np.ndarray, "point"]:
-    """Whether floor points lie on a flight or within a step of its ends."""
-    near = np.zeros(len(points), bool)
-    for flight in world.flights:
-        run, side = flight.up_and_left(points[:, :2])
-        near |= (run > -0.8) & (run < flight.length + 0.8) & (np.abs(side) < flight.width / 2 + 0.1)
-    return near
 
 
 def path_length(path: Float[np.ndarray, "waypoint 3"]) -> float:
@@ -146,7 +137,7 @@ def squat(
             plan.heel_lift[side].visit(HEELS_RAD, (start + 0.3 * down[1], out[1]), (leave, leave + 0.6 * up[1]))
 
 
-@activity("stand", weight=2.0)
+@_activity("stand", weight=2.0)
 def _stand(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     """Stand for some seconds, looking about a little."""
     stop = plan.time + rng.uniform(1.5, 6.0)
@@ -155,7 +146,7 @@ def _stand(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     return True
 
 
-@activity("look_around", weight=1.0)
+@_activity("look_around", weight=1.0)
 def _look_around(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     """Stand and look far about, the trunk turning with the head."""
     start, stop = plan.time, plan.time + rng.uniform(4.0, 9.0)
@@ -169,7 +160,7 @@ def _look_around(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     return True
 
 
-@activity("turn", weight=1.0)
+@_activity("turn", weight=1.0)
 def _turn(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     """Turn on the spot."""
     turn_to(plan, plan.heading + rng.choice([-1, 1]) * rng.uniform(0.7, 3.1), rng)
@@ -177,13 +168,13 @@ def _turn(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     return True
 
 
-@activity("walk", weight=6.0)
+@_activity("walk", weight=6.0)
 def _walk(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     """Walk to another place, over stairs where the path leads there."""
     return approach(plan, world, rng, None)
 
 
-@activity("run", weight=1.0, outdoors=3.0)
+@_activity("run", weight=1.0, outdoors=3.0)
 def _run(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     """Run along a path of at least 5 m without a step; False where none is found."""
     for _ in range(4):
@@ -202,7 +193,7 @@ def _run(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     return True
 
 
-@activity("hold", weight=1.2)
+@_activity("hold", weight=1.2)
 def _hold_posture(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     """Stand with hands on hips, clasped, at the phone …"""
     start, stop = plan.time, plan.time + rng.uniform(4.0, 10.0)
@@ -217,7 +208,7 @@ def _hold_posture(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     return True
 
 
-@activity("gesture", weight=1.2)
+@_activity("gesture", weight=1.2)
 def _gesture(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     """Talk with the hands: from posture to posture before the chest."""
     start, stop = plan.time, plan.time + rng.uniform(4.0, 9.0)
@@ -238,7 +229,7 @@ def _gesture(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     return True
 
 
-@activity("carry", weight=1.5)
+@_activity("carry", weight=1.5)
 def _carry_along(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     """Walk to another place with an object in the hands."""
     start = plan.time
@@ -249,7 +240,7 @@ def _carry_along(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     return True
 
 
-@activity("reach", weight=2.5)
+@_activity("reach", weight=2.5)
 def _reach(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     """Go to a shelf, table or handle and take hold of a point there, crouching or leaning as it needs."""
     if not world.reach_targets:
@@ -291,7 +282,7 @@ def _grasp(plan: Plan, target: ReachTarget, rng: np.random.Generator) -> None:
     plan.time = leave + back + rng.uniform(0.05, 0.6)
 
 
-@activity("sit", weight=2.0)
+@_activity("sit", weight=2.0)
 def _sit(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     """Walk to a seat, turn round, sit for a while, get up.
 
@@ -329,7 +320,7 @@ def _sit(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     return True
 
 
-@activity("crouch", weight=1.2)
+@_activity("crouch", weight=1.2)
 def _crouch(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     """Bend knees and trunk, often to touch an object before the feet with one hand, and come up again."""
     start = plan.time + 0.1

@@ -10,7 +10,7 @@ from torch import Tensor
 from wearcap.geometry import rotation
 from wearcap.simulation.handling.grips import Hold
 from wearcap.simulation.people.plan import LEFT_SIGN, SIDES, Plan
-from wearcap.simulation.people.posture import HELP, Stance, Trunk, trunk_motion
+from wearcap.simulation.people.posture import HELP, Stance, Trunk
 from wearcap.simulation.people.track import blur, ease, lower_envelope, wander
 
 STRAIGHT = 0.9995
@@ -81,7 +81,7 @@ def two_bone(
 
 
 @dataclass(frozen=True)
-class ArmBones:
+class _ArmBones:
     """Offsets of elbow and wrist in the rest pose, and the hinge axis of the elbow, in float64."""
 
     upper: Float[Tensor, "3"]
@@ -92,7 +92,7 @@ class ArmBones:
     sign: float
 
     @classmethod
-    def of(cls, plan: Plan, side: str) -> "ArmBones":
+    def of(cls, plan: Plan, side: str) -> "_ArmBones":
         """One arm of the plan's wearer."""
         upper, fore = plan.bones(f"{side}_elbow", f"{side}_wrist")
         sign = LEFT_SIGN[side]
@@ -113,14 +113,53 @@ class ArmBones:
         """Side to which the elbow points, in the chest's axes."""
         return torch.stack([torch.full_like(swivel, -0.35), self.sign * swivel.sin(), -swivel.cos()], -1)
 
+    def strain(
+        self, hold: Hold, R_world_chest: Tensor, shoulder: Tensor, swivel: Tensor, yaw: Tensor
+    ) -> Float[Tensor, "pick time"]:
+        """Discomfort of candidate swivels and yaws: squared angles in units of `EASE`, and penalties beyond the limits."""
+        hand = hold.hand(self.sign, yaw)
+        wrist = hold.palm - hand @ self.palm - shoulder
+        pole = _rotate(R_world_chest, self.pole(swivel))
+        R_upper, flexion = two_bone(self.upper, self.fore, self.hinge, wrist.reshape(-1, 3), pole.reshape(-1, 3))
+        R_forearm = (R_upper @ rotation.exp(flexion[:, None] * self.hinge)).reshape(*swivel.shape, 3, 3)
+        turn, bend = forearm_and_wrist(R_forearm, hand, self.axis)
+        strain = ((swivel - HABIT) / EASE["swivel"]) ** 2 + (yaw / EASE["yaw"]) ** 2
+        for name, angle in {"twist": turn, "flexion": bend[..., 0], "deviation": bend[..., 2]}.items():
+            strain = strain + (angle / EASE[name]) ** 2 + (10 * (angle.abs() - LIMITS[name]).clamp(min=0)) ** 2
+        far = wrist.norm(dim=-1) / self.length - STRETCHED
+        return strain + (far.clamp(min=0) / 0.01) ** 2
+
 
 @dataclass(frozen=True)
-class ArmPosture:
+class _ArmPosture:
     """A hold with the arm posture chosen for it."""
 
     wrist: Float[Tensor, "time 3"]
     hand: Float[Tensor, "time 3 3"]
     swivel: Float[Tensor, "time"]
+
+    @classmethod
+    def easiest(
+        cls,
+        bones: _ArmBones,
+        hold: Hold,
+        R_world_chest: Float[Tensor, "time 3 3"],
+        shoulder: Float[Tensor, "time 3"],
+        fps: float,
+    ) -> "_ArmPosture":
+        """Choose elbow swivel and hand yaw over time: the softly least strained of a grid of both, smooth in time."""
+        count = len(shoulder)
+        some = np.unique(np.linspace(0, count - 1, max(int(count / fps / SPACING_S), 2)).round().astype(int))
+        swivels, yaws = (torch.tensor(v, dtype=torch.float64) for v in (SWIVELS, YAWS))
+        grid = torch.cartesian_prod(swivels, yaws)[:, :, None].expand(-1, -1, len(some))
+        part = Hold(hold.palm[some], hold.normal[some], hold.fingers[some])
+        strain = bones.strain(part, R_world_chest[some], shoulder[some], grid[:, 0], grid[:, 1])
+        share = torch.softmax(-SHARPNESS * strain, 0)
+        chosen = (share[:, None] * grid).sum(0).numpy()
+        full = np.stack([np.interp(np.arange(count), some, row) for row in chosen], 1)
+        swivel, yaw = torch.from_numpy(blur(full, SMOOTH_S, fps)).unbind(-1)
+        hand = hold.hand(bones.sign, yaw)
+        return cls(hold.palm - hand @ bones.palm, hand, swivel)
 
 
 def forearm_and_wrist(
@@ -136,41 +175,6 @@ def forearm_and_wrist(
     return turn, rotation.log(rotation.exp(-turn[..., None] * axis) @ between)
 
 
-def easiest_posture(
-    bones: ArmBones, hold: Hold, R_world_chest: Float[Tensor, "time 3 3"], shoulder: Float[Tensor, "time 3"], fps: float
-) -> ArmPosture:
-    """Choose elbow swivel and hand yaw over time: the softly least strained of a grid of both, smooth in time."""
-    count = len(shoulder)
-    some = np.unique(np.linspace(0, count - 1, max(int(count / fps / SPACING_S), 2)).round().astype(int))
-    swivels, yaws = (torch.tensor(v, dtype=torch.float64) for v in (SWIVELS, YAWS))
-    grid = torch.cartesian_prod(swivels, yaws)[:, :, None].expand(-1, -1, len(some))
-    part = Hold(hold.palm[some], hold.normal[some], hold.fingers[some])
-    strain = _strain(bones, part, R_world_chest[some], shoulder[some], grid[:, 0], grid[:, 1])
-    share = torch.softmax(-SHARPNESS * strain, 0)
-    chosen = (share[:, None] * grid).sum(0).numpy()
-    full = np.stack([np.interp(np.arange(count), some, row) for row in chosen], 1)
-    swivel, yaw = torch.from_numpy(blur(full, SMOOTH_S, fps)).unbind(-1)
-    hand = hold.hand(bones.sign, yaw)
-    return ArmPosture(hold.palm - hand @ bones.palm, hand, swivel)
-
-
-def _strain(
-    bones: ArmBones, hold: Hold, R_world_chest: Tensor, shoulder: Tensor, swivel: Tensor, yaw: Tensor
-) -> Float[Tensor, "pick time"]:
-    """Discomfort of candidate swivels and yaws: squared angles in units of `EASE`, and penalties beyond the limits."""
-    hand = hold.hand(bones.sign, yaw)
-    wrist = hold.palm - hand @ bones.palm - shoulder
-    pole = _rotate(R_world_chest, bones.pole(swivel))
-    R_upper, flexion = two_bone(bones.upper, bones.fore, bones.hinge, wrist.reshape(-1, 3), pole.reshape(-1, 3))
-    R_forearm = (R_upper @ rotation.exp(flexion[:, None] * bones.hinge)).reshape(*swivel.shape, 3, 3)
-    turn, bend = forearm_and_wrist(R_forearm, hand, bones.axis)
-    strain = ((swivel - HABIT) / EASE["swivel"]) ** 2 + (yaw / EASE["yaw"]) ** 2
-    for name, angle in {"twist": turn, "flexion": bend[..., 0], "deviation": bend[..., 2]}.items():
-        strain = strain + (angle / EASE[name]) ** 2 + (10 * (angle.abs() - LIMITS[name]).clamp(min=0)) ** 2
-    far = wrist.norm(dim=-1) / bones.length - STRETCHED
-    return strain + (far.clamp(min=0) / 0.01) ** 2
-
-
 def _rotate(R: Tensor, vector: Tensor) -> Tensor:
     return (R @ vector[..., None])[..., 0]
 
@@ -183,7 +187,7 @@ def arm_motion(
     `running` is 1 where the wearer runs, smooth between.
     """
     plan, times, fps = trunk.stance.feet.plan, trunk.stance.feet.times, trunk.stance.feet.fps
-    hand, bones, chest = plan.hands[side], ArmBones.of(plan, side), trunk.chest
+    hand, bones, chest = plan.hands[side], _ArmBones.of(plan, side), trunk.chest
     sign, lower, hinge, length = bones.sign, bones.upper, bones.hinge, bones.length
     pose = hand.pose.sample(times)
     pose_weight = torch.from_numpy(hand.pose_weight.sample(times))
@@ -209,7 +213,7 @@ def arm_motion(
         part = slice(*np.searchsorted(times, (grip.start_s, grip.stop_s)).tolist())
         if part.start < part.stop:
             share, hold = torch.from_numpy(grip.weight(times[part])), grip.hold(times[part], chest[part])
-            taken = easiest_posture(bones, hold, chest.R[part], at_shoulder[part], fps)
+            taken = _ArmPosture.easiest(bones, hold, chest.R[part], at_shoulder[part], fps)
             grips.append((part, share, taken))
             wrist[part] += share[:, None] * (taken.wrist - at_shoulder[part] - wrist[part])
             pole[part] += share[:, None] * (_rotate(chest.R[part], bones.pole(taken.swivel)) - pole[part])
@@ -227,11 +231,11 @@ def arm_motion(
 
 
 def _turned(
-    bones: ArmBones,
+    bones: _ArmBones,
     R_forearm: Float[Tensor, "time 3 3"],
     turn: Float[Tensor, "time"],
     fold: Float[Tensor, "time"],
-    grips: list[tuple[slice, Tensor, ArmPosture]],
+    grips: list[tuple[slice, Tensor, _ArmPosture]],
 ) -> tuple[Float[Tensor, "time 3 3"], Float[Tensor, "time 3 3"]]:
     """The elbow's rotation in the world and the wrist's in the forearm: at ease, or as the grips have it."""
     axis, sign = bones.axis, bones.sign
@@ -277,7 +281,7 @@ def _shoulder_girdle(
     plan, chest, sign = trunk.stance.feet.plan, trunk.chest, LEFT_SIGN[side]
     collar, shoulder = plan.bones(f"{side}_collar", f"{side}_shoulder")
     at_collar = chest.t + (chest.R @ collar)
-    reach = (_rotate(chest.R.transpose(-1, -2), goal - at_collar) - shoulder) / ArmBones.of(plan, side).length
+    reach = (_rotate(chest.R.transpose(-1, -2), goal - at_collar) - shoulder) / _ArmBones.of(plan, side).length
     distance = reach.norm(dim=-1).clamp(min=1e-3)
     steep = (reach[:, 2] / distance).numpy()
     far = torch.from_numpy(ease((distance.numpy() - 0.65) / 0.5))
@@ -297,7 +301,7 @@ def _held_wrist(
     and the same weight rising `AROUND_S` earlier and falling as much later.
     """
     plan, times, chest = trunk.stance.feet.plan, trunk.stance.feet.times, trunk.chest
-    bones = ArmBones.of(plan, side)
+    bones = _ArmBones.of(plan, side)
     wrist, free = torch.zeros_like(chest.t), torch.ones(2, len(times), dtype=torch.float64)
     total = torch.full_like(free[0], 1e-12)
     for grip in plan.grips[side]:
@@ -327,7 +331,7 @@ def reach_help(stance: Stance) -> Float[np.ndarray, "time 6"] | None:
     wanted = np.zeros((len(times), len(HELP)))
     crouch = plan.crouch.sample(times)[:, 0]
     easy = np.tile(EASY, (len(times), 1))
-    trunk, low = trunk_motion(stance), np.zeros(len(times))
+    trunk, low = Trunk.over(stance), np.zeros(len(times))
     floor = np.minimum(stance.feet.left.ground[:, 2], stance.feet.right.ground[:, 2])
     for side in SIDES:
         wrist, _, near = _held_wrist(trunk, side)
@@ -337,7 +341,7 @@ def reach_help(stance: Stance) -> Float[np.ndarray, "time 6"] | None:
         smooth = number >= ROUNDS
         if number == ROUNDS:
             wanted = _covering(np.maximum(wanted, 0.0), fps) - _covering(np.maximum(-wanted, 0.0), fps)
-        trunk = trunk_motion(stance, MOST * np.tanh(wanted / MOST))
+        trunk = Trunk.over(stance, MOST * np.tanh(wanted / MOST))
         lacks, gains = (np.stack(both, 1) for both in zip(*(_lack(trunk, side, smooth) for side in SIDES)))
         if smooth and lacks.max() < 1e-4:
             break
@@ -362,7 +366,7 @@ def _lack(trunk: Trunk, side: str, smooth: bool) -> tuple[Float[np.ndarray, "tim
     _, at_shoulder = _shoulder_girdle(trunk, side, wrist, weight)
     offset = wrist - at_shoulder
     distance = offset.norm(dim=-1)
-    lack = ((distance - REACH * ArmBones.of(plan, side).length).clamp(min=0) * weight).numpy()
+    lack = ((distance - REACH * _ArmBones.of(plan, side).length).clamp(min=0) * weight).numpy()
     toward = (offset / distance[:, None].clamp(min=1e-6)).numpy()
     if smooth:
         lack = _covering(lack[:, None], trunk.stance.feet.fps)[:, 0]

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Bool, Float
 
-from wearcap.simulation.people.plan import SIDES, Footprint, Plan, step_rise
+from wearcap.simulation.people.plan import SIDES, Footprint, Plan
 from wearcap.simulation.people.track import Track, ease, hermite
 
 ROLL_DOWN_S = 0.13
@@ -23,7 +23,7 @@ STAIR_WAIT = 0.16
 
 
 @dataclass(frozen=True)
-class FootMotion:
+class _FootMotion:
     """One foot over time."""
 
     ankle: Float[np.ndarray, "time 3"]
@@ -41,6 +41,57 @@ class FootMotion:
     """Centre of pressure of the foot on the floor while it stands (m)."""
     running: Bool[np.ndarray, "time"]
 
+    @classmethod
+    def of(cls, plan: Plan, side: str, times: Float[np.ndarray, "time"]) -> "_FootMotion":
+        """Move a foot through its prints. Planted patches stand still in the world; swings clear the floor.
+
+        In a stance the sole turns about the heel (toe up) or, with toes flat, about the ball (heel up); the swing
+        continues both the turn and its rate, so that ankle and pitch are twice continuously differentiable.
+        """
+        skeleton, at = plan.skeleton, _Timeline(plan.prints[side], times)
+        # points of the foot in the ankle's axes (the tip in the toe joint's), flat on the floor (m)
+        heel, tip = (np.array(skeleton.sites[f"{side}_{site}"].t_joint_site) for site in ("heel", "toe_tip"))
+        ball = skeleton.t_parent_joint[skeleton.index(f"{side}_toe")].double().numpy()
+        roll, bend = at.roll(plan.heel_lift[side].sample(times)[:, 0])
+        share, lifted = at.swing_share, bump(at.swing_share)
+        rise = at["step"]
+        slope = at.mix("height", np.ones_like(share)) - at["height"] - rise
+        moved, turned = advance(share, rise), ease(share)
+        # the stationary point is the ball while the heel is up, the heel while the toe is
+        on_heel = np.where(at.planted, (roll < 0).astype(np.float64), np.where(at.land_pitch_next > 0, 0.0, turned))
+        pivot_x, pivot_z = (ball[i] + on_heel * (heel[i] - ball[i]) for i in (0, 2))
+        rolled = pivot_x - (np.cos(roll) * pivot_x + np.sin(roll) * pivot_z)
+        late = (share / 0.75) ** 9 * ((1.0 - share) / 0.25) ** 3  # a bump with its top at 0.75
+        # height of the ankle over the sole's lowest point (m): a softened maximum over heel, ball and tip
+        soft = SOFT_M * lifted
+        sole_cos, sole_sin = np.cos(roll), np.sin(roll)
+        toe_cos, toe_sin = np.cos(roll - bend), np.sin(roll - bend)
+        ball_depth = sole_sin * ball[0] - sole_cos * ball[2]
+        points = np.stack(
+            [
+                sole_sin * heel[0] - sole_cos * heel[2],
+                ball_depth - toe_cos * tip[2],
+                ball_depth + toe_sin * tip[0] - toe_cos * tip[2],
+            ]
+        )
+        width = np.maximum(soft, 1e-5)
+        top = points.max(0)
+        depth = top + width * np.log(np.exp((points - top) / width).sum(0)) * (soft > 1e-5)
+        raised = at.clearance * lifted + LATE_LIFT * np.maximum(-at.land_pitch_next, 0.0) * late + depth
+        tilt, heading = at.mix("tilt", turned), at.mix("heading", turned)
+        ground = at.mix("ground", moved[:, None])
+        ground[:, 2] = at["height"] + slope * moved + rise * climb(rise, share)
+        outward = at.bow * lifted
+        cos, sin = np.cos(heading), np.sin(heading)
+        ground[:, 0] -= outward * sin
+        ground[:, 1] += outward * cos
+        along = rolled * np.cos(tilt) + raised * np.sin(tilt)
+        above = raised * np.cos(tilt) - rolled * np.sin(tilt)
+        ankle = ground + np.stack([along * cos, along * sin, above], 1)
+        pressure = ground + at.pressure(heel, ball)[:, None] * np.stack([cos, sin, np.zeros_like(cos)], 1)
+        contact = at.planted[:, None] & np.stack([roll < 0.01, roll > -0.01], 1)
+        return cls(ankle, ground, heading, roll + tilt, bend, at.planted, contact, pressure, at.running)
+
 
 @dataclass(frozen=True)
 class Feet:
@@ -49,53 +100,40 @@ class Feet:
     plan: Plan
     times: Float[np.ndarray, "time"]
     fps: float
-    left: FootMotion
-    right: FootMotion
+    left: _FootMotion
+    right: _FootMotion
 
     @classmethod
     def of(cls, plan: Plan, times: Float[np.ndarray, "time"], fps: float) -> "Feet":
         """The feet moved through the plan's prints."""
-        return cls(plan, times, fps, *(_foot_motion(plan, side, times) for side in SIDES))
+        return cls(plan, times, fps, *(_FootMotion.of(plan, side, times) for side in SIDES))
 
-    def __getitem__(self, side: str) -> FootMotion:
+    def __getitem__(self, side: str) -> _FootMotion:
         return getattr(self, side)
 
-
-def _foot_motion(plan: Plan, side: str, times: Float[np.ndarray, "time"]) -> FootMotion:
-    """Move a foot through its prints. Planted patches stand still in the world; swings clear the floor.
-
-    In a stance the sole turns about the heel (toe up) or, with toes flat, about the ball (heel up); the swing
-    continues both the turn and its rate, so that ankle and pitch are twice continuously differentiable.
-    """
-    skeleton, at = plan.skeleton, _Timeline(plan.prints[side], times)
-    # points of the foot in the ankle's axes (the tip in the toe joint's), flat on the floor (m)
-    heel, tip = (np.array(skeleton.sites[f"{side}_{site}"].t_joint_site) for site in ("heel", "toe_tip"))
-    ball = skeleton.t_parent_joint[skeleton.index(f"{side}_toe")].double().numpy()
-    roll, bend = at.roll(plan.heel_lift[side].sample(times)[:, 0])
-    share, lifted = at.swing_share, bump(at.swing_share)
-    rise = at["step"]
-    slope = at.mix("height", np.ones_like(share)) - at["height"] - rise
-    moved, turned = advance(share, rise), ease(share)
-    # the stationary point is the ball while the heel is up, the heel while the toe is
-    on_heel = np.where(at.planted, (roll < 0).astype(np.float64), np.where(at.land_pitch_next > 0, 0.0, turned))
-    pivot_x, pivot_z = (ball[i] + on_heel * (heel[i] - ball[i]) for i in (0, 2))
-    rolled = pivot_x - (np.cos(roll) * pivot_x + np.sin(roll) * pivot_z)
-    late = (share / 0.75) ** 9 * ((1.0 - share) / 0.25) ** 3  # a bump with its top at 0.75
-    depth = _depth((heel, ball, tip), roll, bend, SOFT_M * lifted)
-    raised = at.clearance * lifted + LATE_LIFT * np.maximum(-at.land_pitch_next, 0.0) * late + depth
-    tilt, heading = at.mix("tilt", turned), at.mix("heading", turned)
-    ground = at.mix("ground", moved[:, None])
-    ground[:, 2] = at["height"] + slope * moved + rise * climb(rise, share)
-    outward = at.bow * lifted
-    cos, sin = np.cos(heading), np.sin(heading)
-    ground[:, 0] -= outward * sin
-    ground[:, 1] += outward * cos
-    along = rolled * np.cos(tilt) + raised * np.sin(tilt)
-    above = raised * np.cos(tilt) - rolled * np.sin(tilt)
-    ankle = ground + np.stack([along * cos, along * sin, above], 1)
-    pressure = ground + at.pressure(heel, ball)[:, None] * np.stack([cos, sin, np.zeros_like(cos)], 1)
-    contact = at.planted[:, None] & np.stack([roll < 0.01, roll > -0.01], 1)
-    return FootMotion(ankle, ground, heading, roll + tilt, bend, at.planted, contact, pressure, at.running)
+    def load_on_left(self, rng: np.random.Generator) -> Float[np.ndarray, "time"]:
+        """Share of the weight on the left foot; while standing long it shifts from leg to leg now and then."""
+        times, alone = self.times, self.left.planted.astype(int) - self.right.planted.astype(int)
+        edges = np.flatnonzero(np.diff(alone)) + 1
+        starts, stops = np.concatenate([[0], edges]), np.concatenate([edges, [len(times)]])
+        runs = [(alone[a], times[a], times[min(b, len(times) - 1)]) for a, b in zip(starts, stops)]
+        load = Track(np.array([0.5 + 0.5 * runs[0][0]]))
+        for index, (side, start, stop) in enumerate(runs):
+            if side != 0:
+                continue
+            target = 0.5 + 0.5 * runs[index + 1][0] if index + 1 < len(runs) else 0.5
+            if stop - start < LONG_STAND_S:
+                load.move(start, stop, target)
+                continue
+            load.move(start, start + 0.45, 0.5)
+            first, last = start + 0.6, stop - 0.8
+            time = first + rng.exponential(3.0)
+            while time + 2.0 < last:
+                load.move(time, time + rng.uniform(0.8, 1.6), np.clip(0.5 + rng.normal(0.0, 0.17), 0.12, 0.88))
+                time += 1.7 + rng.exponential(6.0)
+            load.move(max(last - 0.8, first), max(last, first + 0.1), 0.5)
+            load.move(stop - 0.5, stop, target)
+        return load.sample(times)[:, 0]
 
 
 class _Timeline:
@@ -108,7 +146,7 @@ class _Timeline:
         }
         columns["ground"] = np.stack([p.ground for p in prints])
         columns["height"] = columns["ground"][:, 2]
-        columns["step"] = np.array([step_rise(a, b) for a, b in pairwise(prints)] + [0.0])
+        columns["step"] = np.array([a.rise_to(b) for a, b in pairwise(prints)] + [0.0])
         self._columns = columns
         self.now = np.clip(np.searchsorted(columns["land_s"], times, side="right") - 1, 0, None)
         self.next = np.minimum(self.now + 1, len(prints) - 1)
@@ -186,44 +224,3 @@ def climb(rise: Float[np.ndarray, "*#batch"], share: Float[np.ndarray, "*batch"]
     early, late = ease(share / 0.58), ease((share - 0.45) / 0.55)
     up = np.clip(0.5 + rise / 0.12, 0.0, 1.0)
     return up * early + (1.0 - up) * late
-
-
-def _depth(
-    foot: tuple[np.ndarray, np.ndarray, np.ndarray], roll: np.ndarray, bend: np.ndarray, soft: np.ndarray
-) -> np.ndarray:
-    """Height of the ankle over the sole's lowest point (m): a maximum over heel, ball and tip, softened by `soft`."""
-    heel, ball, tip = foot
-    cos, sin = np.cos(roll), np.sin(roll)
-    toe_cos, toe_sin = np.cos(roll - bend), np.sin(roll - bend)
-    below = sin * ball[0] - cos * ball[2]
-    points = np.stack(
-        [sin * heel[0] - cos * heel[2], below - toe_cos * tip[2], below + toe_sin * tip[0] - toe_cos * tip[2]]
-    )
-    width = np.maximum(soft, 1e-5)
-    top = points.max(0)
-    return top + width * np.log(np.exp((points - top) / width).sum(0)) * (soft > 1e-5)
-
-
-def load_on_left(feet: Feet, rng: np.random.Generator) -> Float[np.ndarray, "time"]:
-    """Share of the weight on the left foot; while standing long it shifts from leg to leg now and then."""
-    times, alone = feet.times, feet.left.planted.astype(int) - feet.right.planted.astype(int)
-    edges = np.flatnonzero(np.diff(alone)) + 1
-    starts, stops = np.concatenate([[0], edges]), np.concatenate([edges, [len(times)]])
-    runs = [(alone[a], times[a], times[min(b, len(times) - 1)]) for a, b in zip(starts, stops)]
-    load = Track(np.array([0.5 + 0.5 * runs[0][0]]))
-    for index, (side, start, stop) in enumerate(runs):
-        if side != 0:
-            continue
-        target = 0.5 + 0.5 * runs[index + 1][0] if index + 1 < len(runs) else 0.5
-        if stop - start < LONG_STAND_S:
-            load.move(start, stop, target)
-            continue
-        load.move(start, start + 0.45, 0.5)
-        first, last = start + 0.6, stop - 0.8
-        time = first + rng.exponential(3.0)
-        while time + 2.0 < last:
-            load.move(time, time + rng.uniform(0.8, 1.6), np.clip(0.5 + rng.normal(0.0, 0.17), 0.12, 0.88))
-            time += 1.7 + rng.exponential(6.0)
-        load.move(max(last - 0.8, first), max(last, first + 0.1), 0.5)
-        load.move(stop - 0.5, stop, target)
-    return load.sample(times)[:, 0]

@@ -11,7 +11,7 @@ from wearcap.body.skeleton import Site, Skeleton, xsens23
 
 
 @dataclass(frozen=True)
-class Gait:
+class _Gait:
     """Habits of walking and standing (m, rad)."""
 
     speed: float
@@ -30,7 +30,7 @@ class Gait:
 
 
 @dataclass(frozen=True)
-class Arms:
+class _Arms:
     """Habits of the hanging arms (rad)."""
 
     swing: float
@@ -44,7 +44,7 @@ class Arms:
 
 
 @dataclass(frozen=True)
-class Posture:
+class _Posture:
     """Habits of trunk and head (rad)."""
 
     slouch: float
@@ -62,12 +62,12 @@ class Posture:
 
 
 @dataclass(frozen=True)
-class Style:
+class _Style:
     """Habits that make one person's movement their own; `briskness` scales the tempo of all that is not walking."""
 
-    gait: Gait
-    arms: Arms
-    posture: Posture
+    gait: _Gait
+    arms: _Arms
+    posture: _Posture
     briskness: float
 
 
@@ -77,7 +77,7 @@ class Person:
 
     name: str
     skeleton: Skeleton
-    style: Style
+    style: _Style
     shape: dict[str, float]
     """Body shape: height (m) and weight (kg)."""
     t_head_device: Float[Tensor, "3"]
@@ -101,18 +101,6 @@ LIMITS = {
     "heel_rise": (0.8, 1.2), "knee_soft": (0.08, 0.25), "step_width": (0.05, 0.16), "stance_width": (0.12, 0.30),
     "variability": (0.015, 0.05), "speed": (0.9, 1.65), "briskness": (0.7, 1.4),
 }  # fmt: skip
-
-
-def draw_style(rng: np.random.Generator, leg_length: float) -> Style:
-    """Habits drawn at random; `leg_length` is the hips' height above the floor (m)."""
-    drawn = {name: rng.normal(*spread) for name, spread in NORMAL.items()}
-    drawn["speed"] *= (leg_length / LEG_M) ** 0.5
-    drawn["walk_ratio"] = drawn["walk_ratio"] * leg_length / LEG_M
-    drawn |= {name: median * float(np.exp(rng.normal(0.0, LOG_DEVIATION))) for name, median in LOGNORMAL.items()}
-    drawn["heel_rise"] = rng.normal(1.0, 0.1)
-    drawn |= {name: float(np.clip(drawn[name], *limits)) for name, limits in LIMITS.items()}
-    gait, arms, posture = ({f.name: drawn[f.name] for f in fields(part)} for part in (Gait, Arms, Posture))
-    return Style(Gait(**gait), Arms(**arms), Posture(**posture), drawn["briskness"])
 
 
 def draw_person(name: str, rng: np.random.Generator) -> Person:
@@ -143,4 +131,11 @@ def draw_person(name: str, rng: np.random.Generator) -> Person:
     mass_index = float(np.clip(rng.normal(24.0, 3.0), 18.0, 34.0))
     device = torch.tensor([rng.uniform(0.08, 0.10), rng.normal(0.0, 0.003), rng.uniform(0.08, 0.10)]).float()
     shape = {"height": height, "weight": mass_index * height**2}
-    return Person(name, skeleton, draw_style(rng, skeleton.root_height), shape, device)
+    drawn = {name: rng.normal(*spread) for name, spread in NORMAL.items()}
+    drawn["speed"] *= (skeleton.root_height / LEG_M) ** 0.5
+    drawn["walk_ratio"] = drawn["walk_ratio"] * skeleton.root_height / LEG_M
+    drawn |= {name: median * float(np.exp(rng.normal(0.0, LOG_DEVIATION))) for name, median in LOGNORMAL.items()}
+    drawn["heel_rise"] = rng.normal(1.0, 0.1)
+    drawn |= {name: float(np.clip(drawn[name], *limits)) for name, limits in LIMITS.items()}
+    habits = (part(**{f.name: drawn[f.name] for f in fields(part)}) for part in (_Gait, _Arms, _Posture))
+    return Person(name, skeleton, _Style(*habits, drawn["briskness"]), shape, device)

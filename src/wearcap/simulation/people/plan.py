@@ -20,6 +20,8 @@ STEEPEST = 0.2
 """A foot adapts to slopes below this, and stays level on steeper ones (a step's edge)."""
 STEP_M = 0.05
 """Rise from print to print, beyond that of their slopes, from which on it counts as a step."""
+SOFT_M = 0.02
+"""Height that soft knees and a slouch take off a standing body."""
 
 A = TypeVar("A", float, np.ndarray)
 
@@ -49,16 +51,15 @@ class Footprint:
     """Outward deviation of that swing from the straight line (m)."""
     running: bool = False
 
-
-def step_rise(old: Footprint, new: Footprint) -> float:
-    """Height of a new print above an old one (m) beyond the slope on which both stand: a step, kerb or stair."""
-    rise = float(new.ground[2] - old.ground[2])
-    if old.tilt == new.tilt == 0.0:
-        return rise
-    offset = (new.ground - old.ground)[:2]
-    slopes = (-np.tan(p.tilt) * (offset @ turn(p.heading)[:, 0]) / 2 for p in (old, new))
-    remaining = rise - sum(slopes)
-    return remaining if abs(remaining) > STEP_M else 0.0
+    def rise_to(self, new: "Footprint") -> float:
+        """Height of a new print above this one (m) beyond the slope on which both stand: a step, kerb or stair."""
+        rise = float(new.ground[2] - self.ground[2])
+        if self.tilt == new.tilt == 0.0:
+            return rise
+        offset = (new.ground - self.ground)[:2]
+        slopes = (-np.tan(p.tilt) * (offset @ turn(p.heading)[:, 0]) / 2 for p in (self, new))
+        remaining = rise - sum(slopes)
+        return remaining if abs(remaining) > STEP_M else 0.0
 
 
 @dataclass
@@ -190,6 +191,18 @@ class Plan:
         """Distance from shoulder to wrist (m)."""
         joints = self.skeleton.indices("left_elbow", "left_wrist")
         return float(self.skeleton.t_parent_joint[joints].norm(dim=-1).sum())
+
+    @property
+    def shoulder(self) -> Float[np.ndarray, "3"]:
+        """Position of the left shoulder relative to the chest's joint in the rest pose (m)."""
+        return self.bones("left_collar", "left_shoulder").sum(0).numpy()
+
+    @property
+    def shoulder_height(self) -> float:
+        """Height of the shoulders above the floor when standing upright (m)."""
+        spine = self.skeleton.indices("l5", "l3", "t12", "t8")
+        above = float(self.skeleton.t_parent_joint[spine, 2].sum()) + float(self.shoulder[2])
+        return self.hip_height + above - SOFT_M
 
     def label(self, start_s: float, name: str) -> None:
         self.labels.append(Label(start_s, self.time, name))

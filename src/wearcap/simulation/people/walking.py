@@ -1,20 +1,19 @@
-"""Walking: smooth paths over the floor, and footsteps along them that meet the treads of stairs exactly."""
+"""Walking: footsteps along paths over the floor that meet the treads of stairs exactly, and small steps in place.
 
+Small steps carry the body along any path: forwards, backwards, sideways, turning.
+"""
+
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from wearcap.simulation.people.gait import advance, bump, climb
-from wearcap.simulation.people.plan import LEFT_SIGN, OTHER, SIDES, STEP_M, Footprint, Plan, step_rise, wrap
-from wearcap.simulation.people.track import blur
-from wearcap.simulation.places.navigation import CLEARANCE_M, NavigationGrid
+from wearcap.simulation.people.plan import LEFT_SIGN, OTHER, SIDES, STEP_M, Footprint, Plan, wrap
+from wearcap.simulation.people.track import blur, ease
 from wearcap.simulation.places.outline import turn
 
-WAYPOINT_M = 0.1
-SMOOTHING_PASSES = 80
-STAIR_APPROACH_M = 0.5
-"""Distance from stairs within which paths are straight."""
 SPACING_M = 0.02
 RUN_SPEED = 2.1
 JOG_SPEED = 1.4
@@ -31,47 +30,20 @@ HEEL_ROOM_M, TOE_ROOM_M, EDGE_M = 0.055, 0.015, 0.08
 PAST_KERB_M = 0.16
 """Distance of the ankle beyond a kerb's edge after stepping over it."""
 
+Body = Callable[[Float[np.ndarray, "time"]], Float[np.ndarray, "time 3"]]
+"""x, y (m) and unwrapped heading (rad) of the floor point between the feet at times (s)."""
 
-def plan_path(
-    grid: NavigationGrid,
-    flights: tuple,
-    start: Float[np.ndarray, "3"],
-    goal: Float[np.ndarray, "3"],
-    rng: np.random.Generator,
-) -> Float[np.ndarray, "waypoint 3"] | None:
-    """A smooth path from start to goal, waypoints about 0.1 m apart; heights only to a cell. None without a path.
-
-    It keeps off obstacles and is straight on stairs.
-    """
-    cells = grid.shortest(start, goal, shyness=rng.uniform(1.0, 4.0))
-    if cells is None:
-        return None
-    points = _evenly(np.concatenate([start[None], cells, goal[None]]))
-    if len(points) < 4:
-        return points
-    layer = grid.layer_of(points)
-    sides = [rng.uniform(-1, 1) * max(flight.width / 2 - 0.35, 0.0) for flight in flights]
-    for _ in range(SMOOTHING_PASSES):
-        moved = points.copy()
-        moved[1:-1, :2] += 0.5 * ((points[:-2, :2] + points[2:, :2]) / 2 - points[1:-1, :2])
-        for flight, side in zip(flights, sides):  # drawn to a line beside the flight's middle
-            run, off = flight.up_and_left(moved[:, :2])
-            on = (run > -STAIR_APPROACH_M) & (run < flight.length + STAIR_APPROACH_M) & (np.abs(off) < flight.width / 2)
-            on &= (moved[:, 2] > flight.base_z - 0.3) & (moved[:, 2] < flight.top_z + 0.3)
-            on[[0, -1]] = False
-            moved[on, :2] += ((side - off[on]) * 0.5)[:, None] * flight.left
-        clear = grid._clearance_in(layer, moved[:, :2])
-        tight = (clear < CLEARANCE_M) & (clear < grid._clearance_in(layer, points[:, :2]))
-        points = np.where(tight[:, None], points, moved)
-    return _evenly(points)
-
-
-def _evenly(points: np.ndarray) -> np.ndarray:
-    """The same polyline with waypoints spaced evenly in the plane, both ends kept."""
-    length = np.concatenate([[0.0], np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1).cumsum()])
-    count = max(int(np.ceil(length[-1] / WAYPOINT_M)), 1) + 1
-    place = np.linspace(0.0, length[-1], count)
-    return np.stack([np.interp(place, length, axis) for axis in points.T], 1)
+GRID_S = 0.02
+NEARBY_SPEED = 0.45
+"""Speed of steps to a place nearby (m/s)."""
+STILL = 0.035
+"""Below this speed (m/s) no step is taken."""
+TURNED_M = 0.24
+"""Path length equivalent to a turn of one radian (m)."""
+CLOSE_M = 0.15
+"""Least lateral distance of the feet when one passes the other."""
+APART_S = 0.05
+"""Least time for which both feet stand between two steps."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +65,17 @@ class _Course:
     @classmethod
     def of(cls, plan: Plan, path: Float[np.ndarray, "waypoint 3"], speed: float, flights: tuple) -> "_Course":
         """Speed, time and step phase along a path. Steps fall on the treads of the flights that it takes."""
-        points, heading = _rounded(path)
+        # evenly spaced points of the path with rounded corners, and its unwrapped heading
+        run = np.concatenate([[0.0], np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).cumsum()])
+        count = max(int(run[-1] / SPACING_M), 4)
+        even = np.stack([np.interp(np.linspace(0, run[-1], count), run, column) for column in path.T], 1)
+        reach = min(40, count - 1)
+        padded = np.concatenate([2 * even[0] - even[reach:0:-1], even, 2 * even[-1] - even[-2 : -reach - 2 : -1]])
+        padded[:, :2] = blur(padded[:, :2], 0.16, 1 / SPACING_M)
+        points = padded[reach : reach + count]
+        points[:, 2] = even[:, 2]
+        ahead = np.gradient(padded[:, :2], axis=0)[reach : reach + count]
+        heading = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
         length = np.arange(len(points)) * SPACING_M
         curvature = blur(np.abs(np.gradient(heading, SPACING_M)), 0.15, 1 / SPACING_M)
         pace = speed / 1.3 if speed < RUN_SPEED else 1.5
@@ -106,7 +88,14 @@ class _Course:
             stairs[near] = up
             beat = (0.58 if up > 0 else 0.54) / plan.style.briskness**0.5
             limit[near] = np.minimum(limit[near], tread / beat)
-        limit = blur(_ramped(limit), 0.10, 1 / SPACING_M)
+        # the highest speeds under the limit that start and stop gently: v² changes by no more than 2 a ds
+        squared = limit**2
+        squared = np.minimum(squared, END_SPEED**2 + 2 * ACCELERATION * length)
+        squared = np.minimum(squared, END_SPEED**2 + 2 * BRAKING * length[::-1])
+        rise, fall = 2 * ACCELERATION * length, 2 * BRAKING * length
+        squared = np.minimum.accumulate(squared - rise) + rise
+        limit = np.sqrt(np.minimum.accumulate((squared + fall)[::-1])[::-1] - fall)
+        limit = blur(limit, 0.10, 1 / SPACING_M)
         stride = np.minimum(np.sqrt(60 * plan.style.gait.walk_ratio * limit), limit * 60 / MIN_CADENCE)
         run_from = JOG_SPEED if speed > RUN_SPEED else np.inf
         stride = np.where(limit > run_from, limit * 60 / (158 + 6 * limit), stride)
@@ -174,7 +163,7 @@ def _walk_step(plan: Plan, side: str, lift: float, land: float, print_: Footprin
     lift = max(lift, old.land_s + 0.16)
     stride = float(np.linalg.norm((print_.ground - old.ground)[:2]))
     size = min(stride / 1.35, 1.15) * plan.style.gait.heel_rise
-    rise = step_rise(old, print_)
+    rise = old.rise_to(print_)
     lift_pitch, land_pitch, clearance = (0.85, -0.10, 0.10) if running else (0.95 * size, -0.44 * size, 0.02)
     if rise > STEP_M:
         lift_pitch, land_pitch, clearance = 0.55, 0.06, 0.05
@@ -182,51 +171,20 @@ def _walk_step(plan: Plan, side: str, lift: float, land: float, print_: Footprin
         lift_pitch, land_pitch, clearance = 0.60, 0.22, 0.03
     elif stride < 0.45:
         clearance = 0.03
-    clearance = max(clearance, _over_corner(plan, old, print_, rise))
+    if rise >= -STEP_M:  # the foot is lifted to clear a step or crest whose corner it cuts
+        share = np.linspace(0.15, 0.8, 14)
+        moved = advance(share, np.array(rise))
+        ankle = old.ground + moved[:, None] * (print_.ground - old.ground)
+        heading = old.heading + share * wrap(print_.heading - old.heading)
+        toes = ankle[:, :2] + plan.sole[1] * np.stack([np.cos(heading), np.sin(heading)], 1)
+        floor = plan.floor_height(toes, np.full(len(share), max(old.ground[2], print_.ground[2])))
+        line = old.ground[2] + (print_.ground[2] - old.ground[2] - rise) * moved + rise * climb(np.array(rise), share)
+        need = np.nan_to_num(floor - line, nan=0.0)
+        least = STEP_M if rise > STEP_M else 0.002
+        need = np.where(need > least, (need + 0.02) / bump(share), 0.0)
+        clearance = max(clearance, float(min(need.max(), 0.35)))
     swing = {"land_pitch": land_pitch, "clearance": clearance, "bow": LEFT_SIGN[side] * 0.012, "running": running}
     plan.step(side, lift, land, lift_pitch, replace(print_, **swing))
-
-
-def _over_corner(plan: Plan, old: Footprint, new: Footprint, rise: float) -> float:
-    """Height (m) to which a swing must lift the foot to clear a step or crest whose corner it cuts; 0 going down."""
-    if rise < -STEP_M:
-        return 0.0
-    share = np.linspace(0.15, 0.8, 14)
-    moved = advance(share, np.array(rise))
-    ankle = old.ground + moved[:, None] * (new.ground - old.ground)
-    heading = old.heading + share * wrap(new.heading - old.heading)
-    toes = ankle[:, :2] + plan.sole[1] * np.stack([np.cos(heading), np.sin(heading)], 1)
-    floor = plan.floor_height(toes, np.full(len(share), max(old.ground[2], new.ground[2])))
-    line = old.ground[2] + (new.ground[2] - old.ground[2] - rise) * moved + rise * climb(np.array(rise), share)
-    need = np.nan_to_num(floor - line, nan=0.0)
-    least = STEP_M if rise > STEP_M else 0.002
-    need = np.where(need > least, (need + 0.02) / bump(share), 0.0)
-    return float(min(need.max(), 0.35))
-
-
-def _rounded(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Evenly spaced points of a path with rounded corners, and its unwrapped heading."""
-    run = np.concatenate([[0.0], np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).cumsum()])
-    count = max(int(run[-1] / SPACING_M), 4)
-    even = np.stack([np.interp(np.linspace(0, run[-1], count), run, column) for column in path.T], 1)
-    reach = min(40, count - 1)
-    padded = np.concatenate([2 * even[0] - even[reach:0:-1], even, 2 * even[-1] - even[-2 : -reach - 2 : -1]])
-    padded[:, :2] = blur(padded[:, :2], 0.16, 1 / SPACING_M)
-    points = padded[reach : reach + count]
-    points[:, 2] = even[:, 2]
-    slope = np.gradient(padded[:, :2], axis=0)[reach : reach + count]
-    return points, np.unwrap(np.arctan2(slope[:, 1], slope[:, 0]))
-
-
-def _ramped(limit: np.ndarray) -> np.ndarray:
-    """The highest speeds under a limit that start and stop gently: v² changes by no more than 2 a ds."""
-    squared = limit**2
-    length = np.arange(len(limit)) * SPACING_M
-    squared = np.minimum(squared, END_SPEED**2 + 2 * ACCELERATION * length)
-    squared = np.minimum(squared, END_SPEED**2 + 2 * BRAKING * length[::-1])
-    rise, fall = 2 * ACCELERATION * length, 2 * BRAKING * length
-    squared = np.minimum.accumulate(squared - rise) + rise
-    return np.sqrt(np.minimum.accumulate((squared + fall)[::-1])[::-1] - fall)
 
 
 def _tread_anchors(points: np.ndarray, flight, foot: float) -> list[tuple[float, int, float]]:
@@ -283,3 +241,126 @@ def turn_to(plan: Plan, heading: float, rng: np.random.Generator) -> None:
         how = {"land_pitch": -0.05, "clearance": 0.025, "bow": LEFT_SIGN[side] * 0.02}
         plan.step(side, land - 0.72 * beat, land, 0.22, plan.footprint(side, center, facing, width / 2, **how))
         side, land = OTHER[side], land + beat * rng.normal(1.0, 0.04)
+
+
+@dataclass(frozen=True)
+class _BodyPath:
+    """Path of a body on a grid of times."""
+
+    times: Float[np.ndarray, "time"]
+    place: Float[np.ndarray, "time 3"]
+    ahead: Float[np.ndarray, "time"]
+    """Speed forwards, along the body's heading (m/s)."""
+    aside: Float[np.ndarray, "time"]
+    """Speed to the left (m/s)."""
+    turn: Float[np.ndarray, "time"]
+    """Turn rate to the left (rad/s)."""
+
+    @classmethod
+    def of(cls, body: Body, start_s: float, stop_s: float) -> "_BodyPath":
+        times = np.linspace(start_s, stop_s, max(int((stop_s - start_s) / GRID_S), 2) + 1)
+        place = body(times)
+        step = times[1] - times[0]
+        x, y, turn = blur(np.gradient(place, step, axis=0), 0.12, 1.0 / step).T
+        cos, sin = np.cos(place[:, 2]), np.sin(place[:, 2])
+        return cls(times, place, cos * x + sin * y, cos * y - sin * x, turn)
+
+    def at(self, name: str, time: float) -> float:
+        return float(np.interp(time, self.times, getattr(self, name)))
+
+    def place_at(self, time: float) -> Float[np.ndarray, "3"]:
+        return np.array([np.interp(time, self.times, column) for column in self.place.T])
+
+    def landings(
+        self, plan: Plan, rng: np.random.Generator
+    ) -> tuple[Float[np.ndarray, "step"], Float[np.ndarray, "step"]]:
+        """Landing times of the feet, and each step's duration (s); the last step closes the feet."""
+        effort = np.hypot(self.ahead, self.aside) + TURNED_M * np.abs(self.turn)
+        beat = np.clip(0.42 + 0.06 / np.maximum(effort, STILL), 0.45, 1.0) / plan.style.briskness**0.5
+        beat = np.clip(beat, 0.42, 1.1)
+        rate = ease((effort - STILL) / STILL) / beat
+        phase = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(self.times))])
+        if np.trapezoid(effort, self.times) < 0.04:
+            return np.zeros(0), np.zeros(0)
+        count = max(round(phase[-1]), 1)
+        rising = phase + 1e-6 * np.arange(len(phase))
+        wanted = (np.arange(1, count + 1) - 0.25) / count * phase[-1]
+        lands = np.interp(wanted, rising, self.times)
+        beats = np.interp(lands, self.times, beat)
+        lands = np.append(lands, lands[-1] + 0.9 * beats[-1])
+        beats = np.append(beats, min(beats[-1], 0.75))
+        noise = 1.2 * plan.style.gait.variability * rng.standard_normal(len(lands)) * beats
+        lands = np.maximum.accumulate(lands + noise)
+        first = max(plan.time, self.times[0] - 0.2) + 0.75 * beats[0]
+        least = first + np.concatenate([[0.0], np.cumsum(0.82 * beats[1:])])
+        return np.maximum(lands, least), beats
+
+    def first_foot(self, plan: Plan, rng: np.random.Generator) -> str:
+        """The foot on the side to which it goes or turns, else the one behind, else either."""
+        half = len(self.times) // 2
+        aside = np.trapezoid(self.aside[:half], self.times[:half])
+        aside += TURNED_M * np.trapezoid(self.turn[:half], self.times[:half])
+        if abs(aside) > 0.08:
+            return "left" if aside > 0 else "right"
+        cos, sin = np.cos(plan.heading), np.sin(plan.heading)
+        gap = plan.prints["left"][-1].ground - plan.prints["right"][-1].ground
+        lead = float(gap[0] * cos + gap[1] * sin) * np.sign(np.trapezoid(self.ahead, self.times))
+        if abs(lead) > 0.06:
+            return "right" if lead > 0 else "left"
+        return SIDES[int(rng.random() < 0.5)]
+
+    def step(
+        self, plan: Plan, side: str, timing: tuple[float, float, float], middle: float, rng: np.random.Generator
+    ) -> None:
+        """One step whose stance has its middle at a time; `timing` is its landing, swing and the steps' interval (s)."""
+        land, swing, beat = timing
+        gait, (x, y, heading) = plan.style.gait, self.place_at(middle)
+        across, ahead = abs(self.at("aside", middle)) * beat, self.at("ahead", middle)
+        half = max(gait.stance_width, across + CLOSE_M) / 2 * (1.0 + gait.variability * rng.standard_normal())
+        center = np.array([x, y, plan.position[2]])
+        center[:2] += 0.008 * rng.standard_normal(2)
+        size = float(np.clip(2.0 * abs(ahead) * beat, 0.0, 0.45))
+        land_pitch = -0.35 * size if ahead > 0 else 0.5 * size
+        how = {"land_pitch": land_pitch, "clearance": 0.02 + 0.03 * size, "bow": LEFT_SIGN[side] * 0.012}
+        print_ = plan.footprint(side, center, heading, half, **how)
+        old, other = plan.prints[side][-1], plan.prints[OTHER[side]][-1]
+        lift = max(land - swing, old.land_s + 0.2, other.land_s + APART_S)
+        stride = float(np.linalg.norm((print_.ground - old.ground)[:2]))
+        lift_pitch = 0.75 * min(stride, 0.6) if self.at("ahead", lift) > 0.02 else 0.12
+        plan.step(side, lift, max(land, lift + 0.3), lift_pitch, print_)
+
+
+def shuffle(plan: Plan, rng: np.random.Generator, body: Body, start_s: float, stop_s: float) -> None:
+    """Follow a body's path from one time to another with alternate steps, feet together at its end.
+
+    Each foot lands at the body's place in the middle of its stance. `plan.time` becomes the last landing, at most
+    about half a second after the path's end.
+    """
+    path = _BodyPath.of(body, start_s, stop_s)
+    lands, beats = path.landings(plan, rng)
+    side = path.first_foot(plan, rng) if len(lands) else ""
+    for k, (land, beat) in enumerate(zip(lands, beats)):
+        swing = beat * float(np.clip(0.66 + 0.05 * rng.standard_normal(), 0.55, 0.78))
+        last, following = k >= len(lands) - 2, lands[min(k + 2, len(lands) - 1)]
+        middle = stop_s if last else 0.5 * (land + following - swing)
+        path.step(plan, side, (land, swing, beat), middle, rng)
+        side = OTHER[side]
+    plan.time = max(plan.time, stop_s)
+
+
+def step_to(plan: Plan, rng: np.random.Generator, place: Float[np.ndarray, "2"], heading: float) -> None:
+    """Bring the feet beside each other to a place nearby (m) and a heading (rad), in small steps."""
+    start = np.append(plan.position[:2], plan.heading)
+    change = np.append(place - start[:2], wrap(heading - start[2]))
+    effort = float(np.linalg.norm(change[:2]) + TURNED_M * abs(change[2]))
+    if effort < 0.03:
+        return
+    duration, begin = max(1.5 * effort / NEARBY_SPEED, 0.7), plan.time + 0.15
+    body = lambda times: start + ease((times - begin) / duration)[:, None] * change  # noqa: E731
+    shuffle(plan, rng, body, begin, begin + duration)
+
+
+def arrive(plan: Plan, rng: np.random.Generator, place: Float[np.ndarray, "3"]) -> None:
+    """Step to x, y (m) and a heading (rad) nearby, unless one is there."""
+    if np.hypot(*(place[:2] - plan.position[:2])) > 0.03 or abs(wrap(place[2] - plan.heading)) > 0.1:
+        step_to(plan, rng, place[:2], place[2])

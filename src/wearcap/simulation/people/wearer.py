@@ -15,10 +15,9 @@ from wearcap.recording.motion import Motion
 from wearcap.simulation.people.actions import ACTIVITIES, start_place
 from wearcap.simulation.people.arms import arm_motion, reach_help, two_bone
 from wearcap.simulation.people.gait import Feet
-from wearcap.simulation.people.gaze import head_angles
 from wearcap.simulation.people.person import Person
 from wearcap.simulation.people.plan import SIDES, Label, Plan
-from wearcap.simulation.people.posture import SPINE, Stance, Trunk, rotation_of, trunk_motion
+from wearcap.simulation.people.posture import SPINE, Stance, Trunk, head_angles, rotation_of
 from wearcap.simulation.people.track import blur
 from wearcap.simulation.places.world import World
 
@@ -79,7 +78,7 @@ def perform(plan: Plan, world: World, rng: np.random.Generator, duration_s: floa
     times = np.arange(count + round(TAIL_S * fps)) / fps
     feet = Feet.of(plan, times, fps)
     stance = Stance.of(feet, rng)
-    trunk = trunk_motion(stance, reach_help(stance))
+    trunk = Trunk.over(stance, reach_help(stance))
     motion = Motion(
         timestamps=torch.from_numpy(times),
         skeleton=skeleton,
@@ -115,26 +114,23 @@ def _body(trunk: Trunk, rng: np.random.Generator) -> Float[Tensor, "time joint 3
 
     running = blur(np.mean([feet[side].running for side in SIDES], 0), 0.15, feet.fps)
     for side in SIDES:
-        for joint, R_joint in (arm_motion(trunk, side, running, rng) | _leg(trunk, side)).items():
+        # hip and knee carry the pelvis over the ankle; foot and toes are as planned
+        foot = feet[side]
+        hip, knee, ankle = feet.plan.bones(f"{side}_hip", f"{side}_knee", f"{side}_ankle")
+        heading, body = torch.from_numpy(foot.heading), torch.from_numpy(trunk.pelvis_angles[:, 0].copy())
+        zero = torch.zeros_like(heading)
+        pole = 0.65 * torch.stack([heading.cos(), heading.sin(), zero + 0.35], -1)
+        pole = pole + 0.35 * torch.stack([body.cos(), body.sin(), zero + 0.35], -1)
+        target = torch.from_numpy(foot.ankle - trunk.pelvis) - rotation_of(trunk.pelvis_angles) @ hip
+        hinge = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+        R_hip, bend = two_bone(knee, ankle, hinge, target, pole)
+        flat = np.zeros_like(foot.pitch)
+        leg = {
+            "hip": R_hip,
+            "knee": R_hip @ rotation.exp(bend[:, None] * hinge),
+            "ankle": rotation_of(np.stack([foot.heading, foot.pitch, flat], 1)),
+            "toe": rotation_of(np.stack([foot.heading, foot.pitch - foot.toe_bend, flat], 1)),
+        }
+        for joint, R_joint in (arm_motion(trunk, side, running, rng) | leg).items():
             R[:, skeleton.index(f"{side}_{joint}")] = R_joint
     return R
-
-
-def _leg(trunk: Trunk, side: str) -> dict[str, Float[Tensor, "time 3 3"]]:
-    """World rotations of hip and knee that carry the pelvis over the ankle, and of foot and toes as planned."""
-    foot = trunk.stance.feet[side]
-    hip, knee, ankle = trunk.stance.feet.plan.bones(f"{side}_hip", f"{side}_knee", f"{side}_ankle")
-    heading, body = torch.from_numpy(foot.heading), torch.from_numpy(trunk.pelvis_angles[:, 0].copy())
-    zero = torch.zeros_like(heading)
-    pole = 0.65 * torch.stack([heading.cos(), heading.sin(), zero + 0.35], -1)
-    pole = pole + 0.35 * torch.stack([body.cos(), body.sin(), zero + 0.35], -1)
-    target = torch.from_numpy(foot.ankle - trunk.pelvis) - rotation_of(trunk.pelvis_angles) @ hip
-    hinge = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
-    R_hip, bend = two_bone(knee, ankle, hinge, target, pole)
-    flat = np.zeros_like(foot.pitch)
-    return {
-        "hip": R_hip,
-        "knee": R_hip @ rotation.exp(bend[:, None] * hinge),
-        "ankle": rotation_of(np.stack([foot.heading, foot.pitch, flat], 1)),
-        "toe": rotation_of(np.stack([foot.heading, foot.pitch - foot.toe_bend, flat], 1)),
-    }

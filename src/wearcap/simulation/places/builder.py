@@ -57,6 +57,12 @@ class Piece:
         """Whether it is used from its front."""
         return bool(self.seats or self.reaches)
 
+    def mesh(self) -> Mesh:
+        """The surface in the piece's own frame."""
+        builder = WorldBuilder(self.kind)
+        builder.place(self, (0.0, 0.0, 0.0), 0.0)
+        return builder.mesh()
+
     def stretched(self, factor: float) -> "Piece":
         """The piece with all its heights times a factor, without points to reach for."""
         parts = tuple(
@@ -251,13 +257,6 @@ class WorldBuilder:
             outdoors=self.outdoors,
             spots=tuple(self.spots),
         )
-
-
-def piece_mesh(piece: Piece) -> Mesh:
-    """The surface of a piece of furniture in its own frame."""
-    builder = WorldBuilder(piece.kind)
-    builder.place(piece, (0.0, 0.0, 0.0), 0.0)
-    return builder.mesh()
 
 
 def _reachable(world: w.World, point: np.ndarray, within_m: float) -> bool:

@@ -7,10 +7,9 @@ from itertools import pairwise
 import numpy as np
 
 from wearcap.simulation.places.builder import WorldBuilder, hue
-from wearcap.simulation.places.furnish import ROOM_KINDS, Plan
-from wearcap.simulation.places.furniture import wood
+from wearcap.simulation.places.furniture import ROOM_KINDS, Plan, wood
 from wearcap.simulation.places.outline import Box, inset, middle_and_size, rectangle
-from wearcap.simulation.places.walls import HEIGHT, THICKNESS, Wall, before_gap, build_flight, build_railing, build_wall
+from wearcap.simulation.places.walls import HEIGHT, THICKNESS, Wall, before_gap, build_flight, build_railing
 from wearcap.simulation.places.world import Flight, World
 
 STAIR_SHARE = 0.35
@@ -80,12 +79,41 @@ def lay_out(builder: WorldBuilder, rng: np.random.Generator, stairs: bool, furni
     hall = (0.0, layout.hall[0], layout.width, layout.hall[1])
     storeys = [(0.0, [hall])]
     if stairs:
-        hole, upper_z = _build_stairs(builder, layout, rng)
+        # a flight along the hallway's outer wall, and the hole above it
+        steps, rise, tread, width = 15, rng.uniform(0.172, 0.18), rng.uniform(0.28, 0.29), rng.uniform(0.92, 1.0)
+        run = (steps - 1) * tread
+        low = rng.uniform(1.3, layout.width - run - 1.3)
+        y = layout.hall[1] - THICKNESS / 2 - width / 2 - 0.01
+        rightwards = bool(rng.uniform() < 0.5)
+        foot, direction = (low, 0.0) if rightwards else (low + run, np.pi)
+        flight = Flight((foot, y), direction, steps, rise, tread, width, 0.0)
+        build_flight(builder, flight, (-1,) if rightwards else (1,))
+        rail_y = y - width / 2 - 0.03
+        for start, end in (
+            ((low, rail_y), (low + run, rail_y)),
+            ((foot, rail_y), (foot, layout.hall[1] - THICKNESS / 2)),
+        ):
+            build_railing(builder, start, end, flight.top_z)
+        hole = (low, y - width / 2 - 0.06, low + run, layout.hall[1])
         # The upper hallway: a strip past the hole, and the floor in front of it and behind it.
         past = (hall[0], hall[1], hall[2], hole[1])
-        storeys.append((upper_z, [past, (hall[0], hole[1], hole[0], hall[3]), (hole[2], hole[1], hall[2], hall[3])]))
+        storeys.append(
+            (flight.top_z, [past, (hall[0], hole[1], hole[0], hall[3]), (hole[2], hole[1], hall[2], hall[3])])
+        )
+    rooms = layout.side_a + layout.side_b
     for level, (z, floors) in enumerate(storeys):
-        _build_storey(builder, layout, level, z, floors, rng, furnish)
+        slab, wall_color = (0.05 if level == 0 else z - HEIGHT), hue(rng, (0.0, 0.15))
+        for outline in floors:
+            builder.add_slab("floor", outline, z, slab, wood(rng), 1.5, level=level)
+        for wall in layout.walls(z, rng):
+            wall.build(builder, wall_color, rng)
+        kept_free = [before_gap(builder, door) for door in builder.doors if abs(door.position[2] - z) < 0.1]
+        kinds = rng.permutation([*ROOM_KINDS, *ROOM_KINDS])[: len(rooms)]
+        for number, (outline, kind) in enumerate(zip(rooms, kinds)):
+            builder.add_slab("floor", outline, z, slab, wood(rng), 1.5, level=level)
+            builder.add_room(f"{kind} {level}.{number}", rectangle(*middle_and_size(outline)), z)
+            furnish(Plan(builder, inset(outline, INSET_M), z, list(kept_free)), str(kind), rng)
+        builder.add_room(f"hallway {level}", rectangle(*middle_and_size(floors[0])), z)
 
 
 def _split(rng: np.random.Generator, width: float, count: int, low: float, high: float) -> tuple[Box, ...]:
@@ -95,43 +123,3 @@ def _split(rng: np.random.Generator, width: float, count: int, low: float, high:
     spare = (width - count * NARROWEST_ROOM_M) * rng.dirichlet(np.full(count, 2.0))
     edges = np.concatenate([[0.0], (NARROWEST_ROOM_M + spare).cumsum()])
     return tuple((float(a), low, float(b), high) for a, b in pairwise(edges))
-
-
-def _build_storey(
-    builder: WorldBuilder,
-    layout: _Layout,
-    level: int,
-    z: float,
-    hall: list[Box],
-    rng: np.random.Generator,
-    furnish: Furnish,
-) -> None:
-    slab, wall_color = (0.05 if level == 0 else z - HEIGHT), hue(rng, (0.0, 0.15))
-    for outline in hall:
-        builder.add_slab("floor", outline, z, slab, wood(rng), 1.5, level=level)
-    for wall in layout.walls(z, rng):
-        build_wall(builder, wall, wall_color, rng)
-    kept_free = [before_gap(builder, door) for door in builder.doors if abs(door.position[2] - z) < 0.1]
-    rooms = layout.side_a + layout.side_b
-    kinds = rng.permutation([*ROOM_KINDS, *ROOM_KINDS])[: len(rooms)]
-    for number, (outline, kind) in enumerate(zip(rooms, kinds)):
-        builder.add_slab("floor", outline, z, slab, wood(rng), 1.5, level=level)
-        builder.add_room(f"{kind} {level}.{number}", rectangle(*middle_and_size(outline)), z)
-        furnish(Plan(builder, inset(outline, INSET_M), z, list(kept_free)), str(kind), rng)
-    builder.add_room(f"hallway {level}", rectangle(*middle_and_size(hall[0])), z)
-
-
-def _build_stairs(builder: WorldBuilder, layout: _Layout, rng: np.random.Generator) -> tuple[Box, float]:
-    """A flight along the hallway's outer wall; returns the hole above it and the height it leads to."""
-    steps, rise, tread, width = 15, rng.uniform(0.172, 0.18), rng.uniform(0.28, 0.29), rng.uniform(0.92, 1.0)
-    run = (steps - 1) * tread
-    low = rng.uniform(1.3, layout.width - run - 1.3)
-    y = layout.hall[1] - THICKNESS / 2 - width / 2 - 0.01
-    rightwards = bool(rng.uniform() < 0.5)
-    foot, direction = (low, 0.0) if rightwards else (low + run, np.pi)
-    flight = Flight((foot, y), direction, steps, rise, tread, width, 0.0)
-    build_flight(builder, flight, (-1,) if rightwards else (1,))
-    rail_y = y - width / 2 - 0.03
-    for start, end in (((low, rail_y), (low + run, rail_y)), ((foot, rail_y), (foot, layout.hall[1] - THICKNESS / 2))):
-        build_railing(builder, start, end, flight.top_z)
-    return (low, y - width / 2 - 0.06, low + run, layout.hall[1]), flight.top_z

@@ -1,20 +1,37 @@
 """Furniture and outdoor objects: each maker draws sizes and colours and returns a Piece (front +x).
 
 To add a kind, write a maker and enter it in `MAKERS`; rooms and gardens ask for pieces by kind. Parts are rows of
-their middle and size (m), colour, texture and, for a column, its number of sides.
+their middle and size (m), colour, texture and, for a column, its number of sides. A `Plan` puts pieces into a rectangle
+of floor so that they overlap nothing, block no door and are usable from their front.
 """
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from wearcap.simulation.places.builder import Color, Part, Piece, entered, hue
+from wearcap.simulation.places.builder import Color, Part, Piece, WorldBuilder, entered, hue
+from wearcap.simulation.places.outline import Box, overlaps
 
 PATTERNED, PLAIN, PRINTED = 40.0, 4.0, 120.0
 """Visual features per m² of leaves and handles, of painted or upholstered surfaces, and of book spines and prints."""
 WOOD: Color = (0.55, 0.40, 0.26)
 DARK, GRAY, IRON = (0.1, 0.1, 0.12), (0.3, 0.3, 0.3), (0.3, 0.3, 0.32)
 BOTH = (-1, 1)
+
+FRONT_M = 0.8
+"""Free space in front of seats and of furniture that one reaches into."""
+TRIES = 12
+
+ROOM_KINDS: dict[str, tuple[str, ...]] = {
+    "living room": ("sofa", "cabinet", "shelf", "armchair", "plant", "lamp", "shelf"),
+    "bedroom": ("bed", "wardrobe", "desk", "shelf", "lamp", "plant"),
+    "kitchen": ("counter", "shelf", "cabinet", "plant"),
+    "study": ("desk", "shelf", "armchair", "shelf", "cabinet", "lamp"),
+}
+"""Furniture along the walls of each kind of room, in order of preference."""
+
+HAS_TABLE = ("living room", "kitchen")
 
 MAKERS: dict[str, Callable[[np.random.Generator], Piece]] = {}
 """Makers by kind of piece."""
@@ -32,7 +49,7 @@ def parts_of(rows: Iterable[tuple]) -> tuple[Part, ...]:
     return tuple(Part(row[:3], row[3:6], *row[6:]) for row in rows)
 
 
-def legs(depth: float, width: float, height: float, thick: float, color: Color) -> list[tuple]:
+def _legs(depth: float, width: float, height: float, thick: float, color: Color) -> list[tuple]:
     """Rows of four legs below the corners of an outline (m)."""
     corners = [(x * (depth - thick) / 2, y * (width - thick) / 2) for x in BOTH for y in BOTH]
     return [(x, y, height / 2, thick, thick, height, color, 8.0) for x, y in corners]
@@ -43,7 +60,7 @@ def _chair(rng: np.random.Generator) -> Piece:
     depth, width, seat = rng.uniform(0.40, 0.46), rng.uniform(0.40, 0.46), rng.uniform(0.43, 0.47)
     color, back = wood(rng), rng.uniform(0.82, 0.95)
     rows = [
-        *legs(depth, width, seat - 0.03, 0.04, color),
+        *_legs(depth, width, seat - 0.03, 0.04, color),
         (0, 0, seat - 0.02, depth, width, 0.04, hue(rng), 12.0),
         (-depth / 2 + 0.02, 0, (seat + back) / 2, 0.03, width, back - seat, color, 8.0),
     ]
@@ -118,7 +135,7 @@ def _laid_table(rng: np.random.Generator, kind: str, size: tuple[float, float], 
     depth, width = size
     color = wood(rng)
     rows = [
-        *legs(depth - 0.06, width - 0.06, top - 0.04, 0.06, color),
+        *_legs(depth - 0.06, width - 0.06, top - 0.04, 0.06, color),
         (0, 0, top - 0.02, depth, width, 0.04, color, PLAIN),
     ]
     props = [_prop(rng, (rng.uniform(0.0, depth / 2 - 0.12), y, top)) for y in _spread(rng, width - 0.3, 3)]
@@ -345,3 +362,113 @@ def _spread(rng: np.random.Generator, width: float, most: int) -> np.ndarray:
     count = int(rng.integers(1, most + 1))
     slots = (np.arange(count) + 0.5) / count - 0.5
     return slots * width + rng.uniform(-0.25, 0.25, count) * width / count
+
+
+@dataclass
+class Plan:
+    """A rectangle of floor that is being filled."""
+
+    builder: WorldBuilder
+    room: Box
+    z: float
+    kept_free: list[Box] = field(default_factory=list)
+    solid: list[Box] = field(default_factory=list)
+
+    def try_place(self, piece: Piece, x: float, y: float, heading: float, front: float = 0.0) -> bool:
+        """Place a piece if it fits with `front` metres free before it; returns whether it did."""
+        outline = _outline(piece.size, x, y, heading)
+        ahead = _outline((front, piece.size[1]), *_ahead(x, y, heading, (piece.size[0] + front) / 2), heading)
+        fits = _inside(outline, self.room) and (not front or _inside(ahead, self.room))
+        fits = fits and not any(overlaps(outline, other, 0.05) for other in (*self.solid, *self.kept_free))
+        if not fits or (front and any(overlaps(ahead, other) for other in self.solid)):
+            return False
+        self.builder.place(piece, (x, y, self.z), heading)
+        self.solid.append(outline)
+        if front:
+            self.kept_free.append(ahead)
+        return True
+
+    def against_wall(self, piece: Piece, rng: np.random.Generator, front: float | None = None) -> tuple | None:
+        """Put a piece with its back to a random wall; returns (x, y, heading), or None where nothing fits.
+
+        Without `front`, pieces used from their front have `FRONT_M` free before it.
+        """
+        if front is None:
+            front = FRONT_M if piece.has_front else 0.0
+        depth, width = piece.size[0] / 2 + 0.02, piece.size[1] / 2 + 0.02
+        x_low, y_low, x_high, y_high = self.room
+        for _ in range(TRIES):
+            side = int(rng.integers(4))
+            along = (y_low, y_high) if side % 2 == 0 else (x_low, x_high)
+            if along[1] - along[0] <= 2 * width:
+                continue
+            place = rng.uniform(along[0] + width, along[1] - width)
+            backs = [(x_low + depth, place), (place, y_low + depth), (x_high - depth, place), (place, y_high - depth)]
+            spot = (*backs[side], side * np.pi / 2)
+            if self.try_place(piece, *spot, front):
+                return spot
+        return None
+
+    def somewhere(self, kind: str, rng: np.random.Generator) -> None:
+        """Put a piece of furniture at a random place, squarely, with room to use it from its front."""
+        piece = MAKERS[kind](rng)
+        x_low, y_low, x_high, y_high = self.room
+        front = FRONT_M + 0.1 if piece.has_front else 0.0
+        for _ in range(TRIES):
+            place = float(rng.uniform(x_low, x_high)), float(rng.uniform(y_low, y_high))
+            if self.try_place(piece, *place, int(rng.integers(4)) * np.pi / 2, front):
+                return
+
+    def table_with_chairs(self, rng: np.random.Generator) -> None:
+        """A table somewhere in the room with chairs on its long sides, each with room to sit down."""
+        table = MAKERS["table"](rng)
+        x_low, y_low, x_high, y_high = self.room
+        for _ in range(TRIES):
+            heading = int(rng.integers(2)) * np.pi / 2
+            x = rng.uniform(x_low + 1.3, max(x_high - 1.3, x_low + 1.3))
+            y = rng.uniform(y_low + 1.3, max(y_high - 1.3, y_low + 1.3))
+            if self.try_place(table, x, y, heading):
+                break
+        else:
+            return
+        for side in (-1, 1):
+            for across in (-0.32, 0.32):
+                chair = MAKERS["chair"](rng)
+                off = side * (table.size[0] / 2 + rng.uniform(0.30, 0.42))
+                cx, cy = _ahead(*_ahead(x, y, heading, off), heading + np.pi / 2, across * table.size[1] / 0.8 * 0.6)
+                turned = heading + (0.0 if side < 0 else np.pi) + rng.uniform(-0.4, 0.4)
+                if rng.uniform() < 0.75:
+                    self.try_place(chair, cx, cy, turned)
+
+    def furnish(self, kind: str, rng: np.random.Generator) -> None:
+        """Fill a room of a kind (`ROOM_KINDS`)."""
+        narrow = min(self.room[2] - self.room[0], self.room[3] - self.room[1])
+        if kind in HAS_TABLE and rng.uniform() < 0.8 and narrow > 2.9:
+            self.table_with_chairs(rng)
+        for name in ROOM_KINDS[kind]:
+            if rng.uniform() < 0.15:
+                continue
+            spot = self.against_wall(MAKERS[name](rng), rng)
+            if spot and name == "desk":
+                chair, place = MAKERS["chair"](rng), _ahead(*spot, rng.uniform(0.65, 0.8))
+                self.try_place(chair, *place, spot[2] + np.pi + rng.uniform(-0.5, 0.5))
+            if spot and name == "sofa" and rng.uniform() < 0.5:
+                # A patterned rug in front of the sofa is visible, but no obstacle.
+                x, y = _ahead(*spot, 1.2)
+                size = (float(rng.uniform(1.2, 1.6)), float(rng.uniform(1.6, 2.2)))
+                if _inside(_outline(size, x, y, spot[2]), self.room):
+                    self.builder.add_box((x, y, self.z + 0.004), (*size, 0.008), (0.6, 0.3, 0.3), 40.0, spot[2])
+
+
+def _ahead(x: float, y: float, heading: float, distance: float) -> tuple[float, float]:
+    return x + distance * np.cos(heading), y + distance * np.sin(heading)
+
+
+def _outline(size: tuple[float, float], x: float, y: float, heading: float) -> Box:
+    cos, sin = abs(np.cos(heading)), abs(np.sin(heading))
+    half_x, half_y = (cos * size[0] + sin * size[1]) / 2, (sin * size[0] + cos * size[1]) / 2
+    return (x - half_x, y - half_y, x + half_x, y + half_y)
+
+
+def _inside(inner: Box, outer: Box) -> bool:
+    return bool(inner[0] >= outer[0] and inner[1] >= outer[1] and inner[2] <= outer[2] and inner[3] <= outer[3])

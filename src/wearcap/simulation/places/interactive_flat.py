@@ -1,21 +1,29 @@
-"""Seeded flats whose doors, windows, drawers and much furniture can be moved (iReplica thesis §5.2)."""
+"""Seeded flats whose doors, windows, drawers and much furniture can be moved (iReplica thesis §5.2).
+
+A `House` is such a flat's current state: where every object stands, what it keeps free, and the handlings so far.
+"""
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
 
 import numpy as np
+import torch
+from jaxtyping import Float
 
 from wearcap.geometry.mesh import merged
 from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.recording.interactions import HANDS
+from wearcap.recording.motion import Interactions, Motion
 from wearcap.scene.environment import Environment
+from wearcap.simulation.handling.grips import Handling, object_motion
 from wearcap.simulation.places.builder import Piece, WorldBuilder
 from wearcap.simulation.places.flat import lay_out
-from wearcap.simulation.places.furnish import FRONT_M, Plan
-from wearcap.simulation.places.furniture import MAKERS
+from wearcap.simulation.places.furniture import FRONT_M, MAKERS, Plan
 from wearcap.simulation.places.movables import Movable, make_movable
-from wearcap.simulation.places.openables import MOST_OPEN, Openable, at, hinged, with_fronts
+from wearcap.simulation.places.openables import MOST_OPEN, Openable, hinged, with_fronts
 from wearcap.simulation.places.outline import distance_to_convex, points_in_convex, turn
 from wearcap.simulation.places.walls import DOOR_HEIGHT, THICKNESS, WINDOW, before_gap
 from wearcap.simulation.places.world import Door, World, WorldObject
@@ -42,6 +50,10 @@ LEAST_OPEN = np.deg2rad(75.0)
 """Least angle to which a leaf must open, else it is left out."""
 FRAME_M = 0.015
 """Depth of a frame in front of its wall."""
+NEAR_WALKABLE_M = 0.3
+"""Distance from the walkable floor within which seats and reach targets can be used."""
+BEFORE_M = 0.45
+"""Depth kept free in front of openables, beyond their sweep."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +128,76 @@ class _Builder(WorldBuilder):
         self.openables += openables
         return super().place(piece, position, heading)
 
+    def door_leaves(self, static: World) -> list[Openable]:
+        """Door leaves in the gaps, mostly opening into rooms, on whichever side they have the space to."""
+        leaves, rng = [], self.rng
+        for door in self.doors:
+            variants = list(product((-1.0, 1.0), repeat=2))
+            into_hall = np.array([_room_at(static, door, side).startswith("hallway") for side, _ in variants])
+            order = np.argsort(rng.random(4) + np.where(into_hall, rng.choice([0.0, 1.0], p=[0.2, 0.8]), 0.0))
+            for side, hand in (variants[k] for k in order):
+                leaf = self.leaf_in(static, "door", door, side, hand, door.width)
+                if leaf is not None:
+                    leaves.append(leaf)
+                    break
+        return leaves
+
+    def sashes(self, static: World) -> list[Openable]:
+        """Window sashes that open into the room; a window wider than one sash has two."""
+        sashes = []
+        for number, window in enumerate(self.windows):
+            sides = [side for side in (-1.0, 1.0) if _room_at(static, window, side)]
+            if number in self.shut or len(sides) != 1:
+                continue
+            single = window.width < 1.0
+            width = min(window.width, 0.9) if single else window.width / 2
+            for hand in (float(self.rng.choice([-1.0, 1.0])),) if single else (-1.0, 1.0):
+                sashes.append(self.leaf_in(static, "window", window, sides[0], hand, width))
+        return [sash for sash in sashes if sash is not None]
+
+    def leaf_in(
+        self, static: World, category: str, gap: Door, side: float, hand: float, width: float
+    ) -> Openable | None:
+        """A leaf in a gap that opens towards a side, now and then ajar at first; None without space to open it.
+
+        Doors and windows are 1 cm off the gap's frame on each side.
+        """
+        ahead = side * turn(gap.heading)[:, 0]
+        along = hand * np.array([-ahead[1], ahead[0]])
+        foot = np.array(gap.position)
+        foot[:2] += (THICKNESS / 2 + FRAME_M) * ahead - (gap.width - 0.01) / 2 * along
+        heading, sense = (
+            float(np.arctan2(along[1], along[0])),
+            float(np.sign(along[0] * ahead[1] - along[1] * ahead[0])),
+        )
+        level = (0.01, DOOR_HEIGHT - 0.04) if category == "door" else (WINDOW[0] + 0.035, WINDOW[1] - 0.035)
+        leaf = hinged(category, foot, heading, sense, width - 0.02, level, self.rng)
+        # The angle to which it opens before it touches something, its own frame left aside.
+        solid = [
+            item for item in static.objects if np.linalg.norm(np.array(item.position[:2]) - gap.position[:2]) < 4.0
+        ]
+        solid += [obstacle(movable, None) for movable in self.movables]
+        solid = [item for item in solid if item.z_range[0] < leaf.z_range[1] and item.z_range[1] > leaf.z_range[0]]
+        angles = np.deg2rad(np.arange(15.0, 106.0, 5.0))
+        edge = np.linspace(0.3, 1.0, 12)[:, None] * leaf.outline[1]  # along the leaf, away from the frame
+        points = np.einsum(
+            "aij,ej->aei", leaf.pose(leaf.closed + leaf.opening_sign * angles).R[:, :2, :2].numpy(), edge
+        )
+        points = points + np.array(leaf.object.t_world_object[:2].tolist())
+        apart = np.min([distance_to_convex(points, item.footprint).min(1) for item in solid], 0)
+        hit = np.flatnonzero(apart < 0.02)
+        most = MOST_OPEN
+        if len(hit):
+            most = float(min(angles[hit[0] - 1], MOST_OPEN)) if hit[0] > 0 else 0.0
+        if most < LEAST_OPEN:
+            return None
+        opened = leaf.opening_sign * most
+        freedom = replace(leaf.object.freedom, limits=(min(opened, 0.0), max(opened, 0.0)))
+        leaf = replace(leaf, object=replace(leaf.object, freedom=freedom), opened=opened)
+        if self.rng.random() >= (AJAR_SHARE if category == "door" else AJAR_SHARE / 2):
+            return leaf
+        return leaf.at(leaf.opening_sign * float(self.rng.uniform(AJAR, leaf.openness(leaf.opened))))
+
 
 def build_interactive_flat(rng: np.random.Generator, name: str) -> InteractiveFlat:
     """A flat on one floor with at least a sofa, a table, a chair, a box, a window, doors and drawers that move."""
@@ -125,7 +207,7 @@ def build_interactive_flat(rng: np.random.Generator, name: str) -> InteractiveFl
         builder.rng = draws
         lay_out(builder, draws, stairs=False, furnish=_furnish)
         static = builder.finish()
-        leaves = _door_leaves(builder, static) + _sashes(builder, static)
+        leaves = builder.door_leaves(static) + builder.sashes(static)
         flat = InteractiveFlat(static, _numbered(builder.movables), _numbered([*leaves, *builder.openables]))
         kinds = Counter(item.category for item in (*flat.movables, *flat.openables))
         if all(kinds[kind] >= least for kind, least in FEWEST.items()) and kinds.total() >= FEWEST_OBJECTS:
@@ -188,74 +270,93 @@ def _place_loose(plan: Plan, category: str, rng: np.random.Generator) -> None:
             plan.try_place(_loose("chair", rng), chair_x, chair_y, facing)
 
 
-def _door_leaves(builder: _Builder, static: World) -> list[Openable]:
-    """Door leaves in the gaps, mostly opening into rooms, on whichever side they have the space to."""
-    leaves, rng = [], builder.rng
-    for door in builder.doors:
-        variants = list(product((-1.0, 1.0), repeat=2))
-        into_hall = np.array([_room_at(static, door, side).startswith("hallway") for side, _ in variants])
-        order = np.argsort(rng.random(4) + np.where(into_hall, rng.choice([0.0, 1.0], p=[0.2, 0.8]), 0.0))
-        for side, hand in (variants[k] for k in order):
-            leaf = _leaf_in(builder, static, "door", door, side, hand, door.width)
-            if leaf is not None:
-                leaves.append(leaf)
-                break
-    return leaves
-
-
-def _sashes(builder: _Builder, static: World) -> list[Openable]:
-    """Window sashes that open into the room; a window wider than one sash has two."""
-    sashes = []
-    for number, window in enumerate(builder.windows):
-        sides = [side for side in (-1.0, 1.0) if _room_at(static, window, side)]
-        if number in builder.shut or len(sides) != 1:
-            continue
-        single = window.width < 1.0
-        width = min(window.width, 0.9) if single else window.width / 2
-        for hand in (float(builder.rng.choice([-1.0, 1.0])),) if single else (-1.0, 1.0):
-            sashes.append(_leaf_in(builder, static, "window", window, sides[0], hand, width))
-    return [sash for sash in sashes if sash is not None]
-
-
-def _leaf_in(
-    builder: _Builder, static: World, category: str, gap: Door, side: float, hand: float, width: float
-) -> Openable | None:
-    """A leaf in a gap that opens towards a side, now and then ajar at first; None without space to open it.
-
-    Doors and windows are 1 cm off the gap's frame on each side.
-    """
-    ahead = side * turn(gap.heading)[:, 0]
-    along = hand * np.array([-ahead[1], ahead[0]])
-    foot = np.array(gap.position)
-    foot[:2] += (THICKNESS / 2 + FRAME_M) * ahead - (gap.width - 0.01) / 2 * along
-    heading, sense = float(np.arctan2(along[1], along[0])), float(np.sign(along[0] * ahead[1] - along[1] * ahead[0]))
-    level = (0.01, DOOR_HEIGHT - 0.04) if category == "door" else (WINDOW[0] + 0.035, WINDOW[1] - 0.035)
-    leaf = hinged(category, foot, heading, sense, width - 0.02, level, builder.rng)
-    # The angle to which it opens before it touches something, its own frame left aside.
-    solid = [item for item in static.objects if np.linalg.norm(np.array(item.position[:2]) - gap.position[:2]) < 4.0]
-    solid += [obstacle(movable, None) for movable in builder.movables]
-    solid = [item for item in solid if item.z_range[0] < leaf.z_range[1] and item.z_range[1] > leaf.z_range[0]]
-    angles = np.deg2rad(np.arange(15.0, 106.0, 5.0))
-    edge = np.linspace(0.3, 1.0, 12)[:, None] * leaf.outline[1]  # along the leaf, away from the frame
-    points = np.einsum("aij,ej->aei", leaf.pose(leaf.closed + leaf.opening_sign * angles).R[:, :2, :2].numpy(), edge)
-    points = points + np.array(leaf.object.t_world_object[:2].tolist())
-    apart = np.min([distance_to_convex(points, item.footprint).min(1) for item in solid], 0)
-    hit = np.flatnonzero(apart < 0.02)
-    most = MOST_OPEN
-    if len(hit):
-        most = float(min(angles[hit[0] - 1], MOST_OPEN)) if hit[0] > 0 else 0.0
-    if most < LEAST_OPEN:
-        return None
-    opened = leaf.opening_sign * most
-    freedom = replace(leaf.object.freedom, limits=(min(opened, 0.0), max(opened, 0.0)))
-    leaf = replace(leaf, object=replace(leaf.object, freedom=freedom), opened=opened)
-    if builder.rng.random() >= (AJAR_SHARE if category == "door" else AJAR_SHARE / 2):
-        return leaf
-    return at(leaf, leaf.opening_sign * float(builder.rng.uniform(AJAR, leaf.openness(leaf.opened))))
-
-
 def _room_at(static: World, gap: Door, side: float) -> str:
     """Name of the room half a metre away from a gap, "" outside."""
     point = np.array(gap.position[:2]) + side * 0.5 * turn(gap.heading)[:, 0]
     names = [room.name for room in static.rooms if points_in_convex(point[None], room.polygon)[0]]
     return names[0] if names else ""
+
+
+@dataclass
+class House:
+    """State of an interactive flat; it changes with every interaction that is planned."""
+
+    flat: InteractiveFlat
+    values: dict[str, float] = field(default_factory=dict)
+    """Current value of each openable, relative to its initial pose (rad or m)."""
+    poses: dict[str, Rigid] = field(default_factory=dict)
+    """Current pose of each movable object."""
+    handlings: list[Handling] = field(default_factory=list)
+    """Handlings so far, in the order of time."""
+
+    def __post_init__(self):
+        self.values = {item.name: 0.0 for item in self.flat.openables}
+        self.poses = {item.name: item.object.T_world_object.to(torch.float64) for item in self.flat.movables}
+
+    def obstacles(self, without: tuple[str, ...] = ()) -> tuple[WorldObject, ...]:
+        """Everything that can be moved, at its current place."""
+        poses = [(item, self.poses[item.name]) for item in self.flat.movables]
+        poses += [(item, item.pose(self.values[item.name])) for item in self.flat.openables]
+        return tuple(obstacle(item, pose) for item, pose in poses if item.name not in without)
+
+    def world(self, around: Float[np.ndarray, "3"], without: tuple[str, ...] = ()) -> World:
+        """The flat's current state, walkable where one gets to from a floor point (m); seats are the fixed ones."""
+        static, extra = self.flat.static, self.obstacles(without)
+        grid = static.navigation.barred(extra, around)
+
+        def near(point) -> bool:
+            away = np.linalg.norm(grid.node_points[:, :2] - np.array(point)[:2], axis=1)
+            return bool((away < NEAR_WALKABLE_M).any())
+
+        now = replace(
+            static,
+            objects=(*static.objects, *extra),
+            seats=tuple(seat for seat in static.seats if near(seat.standing_point())),
+            reach_targets=tuple(target for target in static.reach_targets if near(target.stand)),
+        )
+        now.__dict__["navigation"] = grid
+        return now
+
+    def floor_place(self, movable: Movable) -> Float[np.ndarray, "3"]:
+        """Floor pose of an object: x, y (m) and heading (rad)."""
+        pose = self.poses[movable.name]
+        return np.array([*pose.t[:2].tolist(), float(np.arctan2(pose.R[1, 0], pose.R[0, 0]))])
+
+    def kept_free(self) -> list[Float[np.ndarray, "4 2"]]:
+        """Outlines of the floor before doors, windows and cabinets, and behind doors."""
+        zones = []
+        for item in self.flat.openables:
+            if item.hinged:  # a square over the leaf's quarter circle
+                width, sign = float(item.outline[:, 0].max()), item.opening_sign
+                behind = -0.9 if item.category == "door" else 0.0
+                low, high = sorted((sign * (width + 0.1), sign * behind))
+                pose, depth = item.pose(item.closed), width + BEFORE_M
+            else:
+                high = float(item.outline[:, 1].max())
+                low, pose, depth = -high, item.object.T_world_object, abs(item.opened - item.closed) + BEFORE_M
+            corners = np.array([[0.0, low], [depth, low], [depth, high], [0.0, high]])
+            zones.append(corners @ pose.R[:2, :2].double().numpy().T + pose.t[:2].double().numpy())
+        return zones
+
+    def interactions(self, until_s: float) -> Interactions:
+        """Intervals in which hands hold objects, ordered by their start, up to the end of a recording (s)."""
+        rows = sorted(
+            ((row, handling) for handling in self.handlings for row in handling.rows if row[0] < until_s),
+            key=lambda pair: pair[0][:2],
+        )
+        return Interactions(
+            torch.tensor([row[0] for row, _ in rows], dtype=torch.float64),
+            torch.tensor([min(row[1], until_s) for row, _ in rows], dtype=torch.float64),
+            torch.tensor([row[2] for row, _ in rows], dtype=torch.bool).reshape(-1, len(HANDS)),
+            tuple(handling.name for _, handling in rows),
+            tuple(handling.contact_class for _, handling in rows),
+        )
+
+    def object_motion(self, motion: Motion) -> dict[str, Trajectory]:
+        """Poses of all movable objects and openables on a motion's timestamps; each stays where it was left."""
+        return {
+            item.name: object_motion(
+                item.object.T_world_object, [h for h in self.handlings if h.name == item.name], motion
+            )
+            for item in (*self.flat.movables, *self.flat.openables)
+        }

@@ -16,7 +16,7 @@ from wearcap.geometry.mesh import Mesh, merged
 from wearcap.geometry.rigid import Rigid
 from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.simulation.handling.grips import SKIN_M, GripPlace, Vector, vector
-from wearcap.simulation.places.builder import Color, Part, Piece, entered, hue, piece_mesh
+from wearcap.simulation.places.builder import Color, Part, Piece, entered, hue
 from wearcap.simulation.places.furniture import MAKERS, wood
 from wearcap.simulation.places.outline import rectangle, turn
 
@@ -65,7 +65,7 @@ class Rail:
 
 
 @dataclass(frozen=True)
-class Grasp:
+class _Grasp:
     """A grasp of an object with one hand."""
 
     side: str
@@ -87,7 +87,7 @@ class Movable:
     """Rails where it is pushed and pulled."""
     sides: tuple[Side, ...] = ()
     """Options for lifting it between both hands: the left and right palm's places and the holder's relative heading."""
-    grasps: tuple[Grasp, ...] = ()
+    grasps: tuple[_Grasp, ...] = ()
     """Options for lifting it with one hand."""
 
     @property
@@ -135,7 +135,7 @@ def _made(kind: str, mesh: Mesh, size: tuple[float, float], height: float, **hol
 
 
 def _sliding(piece: Piece, rails: list[Rail]) -> Movable:
-    return _made("plane", piece_mesh(piece), piece.size, piece.z_range[1], rails=tuple(rails))
+    return _made("plane", piece.mesh(), piece.size, piece.z_range[1], rails=tuple(rails))
 
 
 @entered(MOVABLES, "sofa")
@@ -198,7 +198,7 @@ def _carton(rng: np.random.Generator) -> Movable:
             for _, sign in HANDS
         )
         sides.append((*hands, facing))
-    return _made("free", piece_mesh(piece), piece.size, height, sides=tuple(sides))
+    return _made("free", piece.mesh(), piece.size, height, sides=tuple(sides))
 
 
 @entered(MOVABLES, "suitcase")
@@ -340,7 +340,7 @@ def _ball(rng: np.random.Generator) -> Movable:
     return _made("free", replace(mesh, color=rows), (2 * radius, 2 * radius), 2 * radius, sides=sides)
 
 
-def _beside_body(bar: Vector, facings: Sequence[float]) -> tuple[Grasp, ...]:
+def _beside_body(bar: Vector, facings: Sequence[float]) -> tuple[_Grasp, ...]:
     """Grasps of either hand on a bar along the holder's heading, beside the body, fingers down, palm inwards."""
     x, y, z = bar
     out = 0.011 + SKIN_M
@@ -351,10 +351,10 @@ def _beside_body(bar: Vector, facings: Sequence[float]) -> tuple[Grasp, ...]:
     )
 
 
-def _from_above(x: float, top: float) -> tuple[Grasp, ...]:
+def _from_above(x: float, top: float) -> tuple[_Grasp, ...]:
     """Grasps of either hand across a handle that lies along x, thumb towards +x."""
     return tuple(
-        Grasp(side, GripPlace((x, 0.0, top + SKIN_M), UP, (0.0, sign, 0.0)), sign * np.pi / 2) for side, sign in HANDS
+        _Grasp(side, GripPlace((x, 0.0, top + SKIN_M), UP, (0.0, sign, 0.0)), sign * np.pi / 2) for side, sign in HANDS
     )
 
 
@@ -370,12 +370,12 @@ def _between(halves: dict[float, float], level: float) -> tuple[Side, ...]:
     return tuple(sides)
 
 
-def _grasp(side: str, point, normal, fingers, facing: float) -> Grasp:
+def _grasp(side: str, point, normal, fingers, facing: float) -> _Grasp:
     """A grasp given in the holder's axes (x ahead) about the object's origin."""
     R = np.eye(3)
     R[:2, :2] = turn(facing)
     unit = np.array(fingers) / np.linalg.norm(fingers)
-    return Grasp(side, GripPlace(*(vector(R @ np.array(part)) for part in (point, normal, unit))), float(facing))
+    return _Grasp(side, GripPlace(*(vector(R @ np.array(part)) for part in (point, normal, unit))), float(facing))
 
 
 def _round(radius: float, corners: int = ROUND) -> Float[np.ndarray, "corner 2"]:

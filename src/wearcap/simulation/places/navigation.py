@@ -27,6 +27,9 @@ FAR_M = 1.5
 """Largest clearance that is measured."""
 SNAP_M = 1.5
 """Largest distance of a start or goal from the nearest walkable cell."""
+WAYPOINT_M, SMOOTHING_PASSES = 0.1, 80
+STAIR_APPROACH_M = 0.5
+"""Distance from stairs within which paths are straight."""
 
 _NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))
 
@@ -58,7 +61,18 @@ class NavigationGrid:
             inside = inside.reshape(middles[window].shape[:-1])
             layer = height[surface.level][window]
             layer[inside] = np.fmax(layer[inside], surface.height(middles[window][inside]))
-        clearance = np.minimum(_drop_distance(height, cell), FAR_M)
+        drop = np.zeros_like(height)  # distance (m) from where a layer ends with no other layer near that height
+        for layer, floor in enumerate(height):
+            void = np.isnan(floor)
+            if not void.any():
+                drop[layer] = FAR_M
+                continue
+            nearest = scipy.ndimage.distance_transform_edt(void, return_distances=False, return_indices=True)
+            gap = np.abs(height - floor[tuple(nearest)])
+            deep = void & ~(np.nan_to_num(gap, nan=np.inf).min(0) < DROP_M)
+            away = np.asarray(scipy.ndimage.distance_transform_edt(~np.pad(deep, 1, constant_values=True)))
+            drop[layer] = (away[1:-1, 1:-1] - 0.5) * cell
+        clearance = np.minimum(np.maximum(drop, 0.0), FAR_M)
         _keep_off(objects, origin, cell, height, clearance)
         free = np.isfinite(height) & (clearance >= CLEARANCE_M)
         part = _parts(height, free)
@@ -110,9 +124,10 @@ class NavigationGrid:
 
     def clearance_at(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
         """Distance from floor points to the nearest obstacle or drop (m), bilinear between cells."""
-        return self._clearance_in(self.layer_of(points), points[..., :2])
+        return self.clearance_in(self.layer_of(points), points[..., :2])
 
-    def _clearance_in(self, layer: np.ndarray, points_xy: np.ndarray) -> np.ndarray:
+    def clearance_in(self, layer: np.ndarray, points_xy: np.ndarray) -> np.ndarray:
+        """`clearance_at` for points (x y) of known layers."""
         place = (points_xy - self.origin) / self.cell - 0.5
         low = np.clip(np.floor(place).astype(int), 0, np.array(self.height.shape[1:]) - 2)
         u, v = np.moveaxis(np.clip(place - low, 0.0, 1.0), -1, 0)
@@ -170,23 +185,6 @@ def _window(outline: np.ndarray, origin: np.ndarray, cell: float, shape: tuple, 
     return tuple(slice(max(a, 0), max(min(b, size), 0)) for a, b, size in zip(low, high, shape))
 
 
-def _drop_distance(height: np.ndarray, cell: float) -> np.ndarray:
-    """Distance (m) of each cell from where its layer ends with no other layer near that height."""
-    distance = np.zeros_like(height)
-    for layer, floor in enumerate(height):
-        void = np.isnan(floor)
-        if not void.any():
-            distance[layer] = FAR_M
-            continue
-        nearest = scipy.ndimage.distance_transform_edt(void, return_distances=False, return_indices=True)
-        gap = np.abs(height - floor[tuple(nearest)])
-        deep = void & ~(np.nan_to_num(gap, nan=np.inf).min(0) < DROP_M)
-        deep = np.pad(deep, 1, constant_values=True)
-        away = np.asarray(scipy.ndimage.distance_transform_edt(~deep))
-        distance[layer] = (away[1:-1, 1:-1] - 0.5) * cell
-    return np.maximum(distance, 0.0)
-
-
 def _links(height: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Flat indices of linked pairs of cells: neighbours of any two layers that a step separates."""
     index = np.arange(height.size).reshape(height.shape)
@@ -221,3 +219,45 @@ def _keep_off(objects: tuple, origin: np.ndarray, cell: float, height: np.ndarra
         for floor, clear in zip(height, clearance):
             bars = (item.z_range[0] < floor[window] + HEADROOM_M) & (item.z_range[1] > floor[window] + LOW_M)
             clear[window] = np.where(bars, np.minimum(clear[window], distance), clear[window])
+
+
+def plan_path(
+    grid: NavigationGrid,
+    flights: tuple,
+    start: Float[np.ndarray, "3"],
+    goal: Float[np.ndarray, "3"],
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "waypoint 3"] | None:
+    """A smooth path from start to goal, waypoints about 0.1 m apart; heights only to a cell. None without a path.
+
+    It keeps off obstacles and is straight on stairs.
+    """
+    cells = grid.shortest(start, goal, shyness=rng.uniform(1.0, 4.0))
+    if cells is None:
+        return None
+    points = _evenly(np.concatenate([start[None], cells, goal[None]]))
+    if len(points) < 4:
+        return points
+    layer = grid.layer_of(points)
+    sides = [rng.uniform(-1, 1) * max(flight.width / 2 - 0.35, 0.0) for flight in flights]
+    for _ in range(SMOOTHING_PASSES):
+        moved = points.copy()
+        moved[1:-1, :2] += 0.5 * ((points[:-2, :2] + points[2:, :2]) / 2 - points[1:-1, :2])
+        for flight, side in zip(flights, sides):  # drawn to a line beside the flight's middle
+            run, off = flight.up_and_left(moved[:, :2])
+            on = (run > -STAIR_APPROACH_M) & (run < flight.length + STAIR_APPROACH_M) & (np.abs(off) < flight.width / 2)
+            on &= (moved[:, 2] > flight.base_z - 0.3) & (moved[:, 2] < flight.top_z + 0.3)
+            on[[0, -1]] = False
+            moved[on, :2] += ((side - off[on]) * 0.5)[:, None] * flight.left
+        clear = grid.clearance_in(layer, moved[:, :2])
+        tight = (clear < CLEARANCE_M) & (clear < grid.clearance_in(layer, points[:, :2]))
+        points = np.where(tight[:, None], points, moved)
+    return _evenly(points)
+
+
+def _evenly(points: np.ndarray) -> np.ndarray:
+    """The same polyline with waypoints spaced evenly in the plane, both ends kept."""
+    length = np.concatenate([[0.0], np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1).cumsum()])
+    count = max(int(np.ceil(length[-1] / WAYPOINT_M)), 1) + 1
+    place = np.linspace(0.0, length[-1], count)
+    return np.stack([np.interp(place, length, axis) for axis in points.T], 1)

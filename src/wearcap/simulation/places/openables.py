@@ -16,7 +16,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.simulation.handling.grips import GripPlace, vector
-from wearcap.simulation.places.builder import Part, Piece, hue, piece_mesh
+from wearcap.simulation.places.builder import Part, Piece, hue
 from wearcap.simulation.places.furniture import PATTERNED, PLAIN, parts_of, wood
 
 LEAF_M, PANEL_M = 0.04, 0.02
@@ -70,6 +70,14 @@ class Openable:
         """Pose in the world at a value."""
         return self.object.freedom.moved(self.object.T_world_object, torch.as_tensor(np.asarray(value, np.float64)))
 
+    def at(self, value: float) -> "Openable":
+        """The same openable with its initial pose at `value`, which becomes the new zero."""
+        pose, freedom = self.pose(value), self.object.freedom
+        assert freedom.limits is not None
+        freedom = replace(freedom, limits=(min(freedom.limits[0] - value, 0.0), max(freedom.limits[1] - value, 0.0)))
+        moved = replace(self.object, R_world_object=pose.R.float(), t_world_object=pose.t.float(), freedom=freedom)
+        return replace(self, object=moved, closed=self.closed - value, opened=self.opened - value)
+
     def openness(self, value: float) -> float:
         """Opening at a value (rad or m)."""
         return float(abs(value - self.closed))
@@ -121,7 +129,21 @@ def hinged(
     level = {"door": float(rng.uniform(1.0, 1.05)), "window": float(np.clip((low + high) / 2, 1.2, 1.5))}.get(
         category, float(np.clip(high - 0.15, low + 0.1, rng.uniform(1.0, 1.1)))
     )
-    rows, handles = _leaf(category, width, thick, z_range, opening_sign, rng), []
+    off, color = -opening_sign * thick / 2, wood(rng) if rng.random() < 0.5 else hue(rng, (0.0, 0.25))
+    middle, tall = (low + high) / 2, high - low
+    if category == "window":  # a frame around a pane
+        bar, pane = 0.06, (0.75, 0.85, 0.9)
+        rows: list[tuple] = [
+            *((x, off, middle, bar, thick, tall, color, 6.0) for x in (bar / 2, width - bar / 2)),
+            *((width / 2, off, z, width, thick, bar, color, 6.0) for z in (low + bar / 2, high - bar / 2)),
+            (width / 2, off, middle, width - bar, 0.008, tall - bar, pane, 0.5),
+        ]
+    else:
+        rows = [(width / 2, off, middle, width, thick, tall, color, PLAIN)]
+    if is_door and rng.random() < 0.6:
+        panel = (0.66 * width, thick + 0.012, 0.33 * tall, color, 8.0)
+        rows += [(width / 2, off, low + share * tall, *panel) for share in (0.25, 0.72)]
+    handles = []
     place, size = width - edge, (0.02, 0.02, 0.12)
     if is_door:
         place, size = width - edge - 0.11 / 2, (0.11, 0.02, 0.02)
@@ -135,32 +157,6 @@ def hinged(
     freedom = Freedom("hinge", pivot=vector(foot), limits=(min(most, 0.0), max(most, 0.0)))
     y_low, y_high = sorted((0.0, -opening_sign * thick))
     return _made(category, rows, foot, heading, freedom, ((0.0, y_low), (width, y_high)), z_range, handles, most)
-
-
-def _leaf(
-    category: str,
-    width: float,
-    thick: float,
-    z_range: tuple[float, float],
-    opening_sign: float,
-    rng: np.random.Generator,
-) -> list[tuple]:
-    """Rows of parts of a leaf: a slab, or a frame around a pane."""
-    off, color = -opening_sign * thick / 2, wood(rng) if rng.random() < 0.5 else hue(rng, (0.0, 0.25))
-    low, high = z_range
-    middle, tall = (low + high) / 2, high - low
-    if category == "window":
-        bar, pane = 0.06, (0.75, 0.85, 0.9)
-        return [
-            *((x, off, middle, bar, thick, tall, color, 6.0) for x in (bar / 2, width - bar / 2)),
-            *((width / 2, off, z, width, thick, bar, color, 6.0) for z in (low + bar / 2, high - bar / 2)),
-            (width / 2, off, middle, width - bar, 0.008, tall - bar, pane, 0.5),
-        ]
-    rows: list[tuple] = [(width / 2, off, middle, width, thick, tall, color, PLAIN)]
-    if category == "door" and rng.random() < 0.6:
-        panel = (0.66 * width, thick + 0.012, 0.33 * tall, color, 8.0)
-        rows += [(width / 2, off, low + share * tall, *panel) for share in (0.25, 0.72)]
-    return rows
 
 
 def _drawer(
@@ -204,7 +200,7 @@ def _made(
     opened: float,
 ) -> Openable:
     """An openable of rows of parts, closed at a place; `corners` are the lowest and the highest of its outline (m)."""
-    mesh = piece_mesh(Piece(category, (1.0, 1.0), (0.0, 1.0), parts_of(rows)))
+    mesh = Piece(category, (1.0, 1.0), (0.0, 1.0), parts_of(rows)).mesh()
     R = rotation.about_axis("z", torch.tensor(heading, dtype=torch.float64)).float()
     made = SceneObject(category, category, mesh, R, torch.from_numpy(np.asarray(foot)).float(), freedom)
     (x_low, y_low), (x_high, y_high) = corners
@@ -264,17 +260,3 @@ def with_fronts(
 def _carcass(depth: float, width: float, foot: float, height: float, rng: np.random.Generator) -> Part:
     size = (depth - 0.025, width, height - foot)
     return Part((-0.0125, 0.0, (foot + height) / 2), size, wood(rng), 3.0)
-
-
-def at(openable: Openable, value: float) -> Openable:
-    """The same openable with its initial pose at `value`, which becomes the new zero."""
-    pose, freedom = openable.pose(value), openable.object.freedom
-    assert freedom.limits is not None
-    limits = (min(freedom.limits[0] - value, 0.0), max(freedom.limits[1] - value, 0.0))
-    moved = replace(
-        openable.object,
-        R_world_object=pose.R.float(),
-        t_world_object=pose.t.float(),
-        freedom=replace(freedom, limits=limits),
-    )
-    return replace(openable, object=moved, closed=openable.closed - value, opened=openable.opened - value)

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from wearcap.simulation.places.builder import WorldBuilder, hue
-from wearcap.simulation.places.furnish import Plan
-from wearcap.simulation.places.furniture import MAKERS
+from wearcap.simulation.places.furniture import MAKERS, Plan
 from wearcap.simulation.places.outline import Box
 from wearcap.simulation.places.walls import KERB_TREAD_M, STONE, barrier, build_facade, build_flight, sloped_rail
 from wearcap.simulation.places.world import Flight, World
@@ -75,53 +74,53 @@ class _Layout:
     crossings: tuple[_Crossing, ...]
     """From left to right."""
 
+    @classmethod
+    def drawn(cls, rng: np.random.Generator, ramp_slope: float | None) -> "_Layout":
+        kerb, street = rng.uniform(0.10, 0.15), rng.uniform(3.6, 5.5)
+        pavement = street + rng.uniform(2.2, 3.2)
+        steps, rise, tread = int(rng.integers(3, 7)), rng.uniform(0.15, 0.17), rng.uniform(0.30, 0.32)
+        height = steps * rise
+        slope = float(np.clip(ramp_slope or rng.uniform(0.07, 0.10), height / LONGEST_RAMP_M, 0.10))
+        run, ramp_width = height / slope, rng.uniform(1.6, 2.1)
+        long, deep = rng.uniform(4.5, 6.5), rng.uniform(2.8, 3.6)
+        depth = pavement + deep + (steps - 1) * tread + rng.uniform(2.2, 3.5)
+        margin, entry = rng.uniform(0.0, 2.5), rng.uniform(2.0, 4.0)
+        width = margin + long + run + entry
+        stair_width = rng.uniform(1.5, 2.4)
+        stair_x = margin + rng.uniform(stair_width / 2 + 0.3, long - stair_width / 2 - 0.3)
+        ramp_up = int(rng.choice([-1, 1]))  # falls towards larger x from a terrace on the left, or mirrored
+        flip = (lambda low, high: (low, high)) if ramp_up < 0 else (lambda low, high: (width - high, width - low))
+        terrace_x, ramp_x = (flip(margin, margin + long), flip(margin + long, margin + long + run))
+        count = int(rng.integers(2, 4))
+        slots = (np.arange(count) + 0.5) * width / count
+        slots += rng.uniform(-0.25, 0.25, count) * width / count
+        crossings = [(float(x), float(rng.uniform(1.6, 2.6))) for x in slots]
+        dropped, drop = int(rng.integers(-1, count)), kerb / rng.uniform(0.08, 0.10)
+        y, top = depth - deep, kerb + height
+        start = (flip(stair_x, stair_x)[0], y - (steps - 1) * tread)
+        return cls(
+            width,
+            street,
+            pavement,
+            depth,
+            kerb,
+            top,
+            (terrace_x[0], y, terrace_x[1], depth),
+            _Ramp((ramp_x[0], depth - ramp_width, ramp_x[1], depth), slope, ramp_up),
+            Flight(start, np.pi / 2, steps, (top - kerb) / steps, tread, stair_width, kerb),
+            tuple(_Crossing(*place, drop, number == dropped) for number, place in enumerate(crossings)),
+        )
+
 
 def build_outdoor(rng: np.random.Generator, name: str, ramp_slope: float | None = None) -> World:
     """An open place with kerbs of 10–15 cm, stairs and a ramp of 7–10 % (`ramp_slope` None leaves it to chance)."""
     builder = WorldBuilder.drawn(name, rng, outdoors=True)
-    layout = _drawn_layout(rng, ramp_slope)
+    layout = _Layout.drawn(rng, ramp_slope)
     _build_ground(builder, layout, rng)
     _build_terrace(builder, layout)
     _build_borders(builder, layout, rng)
     _furnish(builder, layout, rng)
     return builder.finish()
-
-
-def _drawn_layout(rng: np.random.Generator, ramp_slope: float | None) -> _Layout:
-    kerb, street = rng.uniform(0.10, 0.15), rng.uniform(3.6, 5.5)
-    pavement = street + rng.uniform(2.2, 3.2)
-    steps, rise, tread = int(rng.integers(3, 7)), rng.uniform(0.15, 0.17), rng.uniform(0.30, 0.32)
-    height = steps * rise
-    slope = float(np.clip(ramp_slope or rng.uniform(0.07, 0.10), height / LONGEST_RAMP_M, 0.10))
-    run, ramp_width = height / slope, rng.uniform(1.6, 2.1)
-    long, deep = rng.uniform(4.5, 6.5), rng.uniform(2.8, 3.6)
-    depth = pavement + deep + (steps - 1) * tread + rng.uniform(2.2, 3.5)
-    margin, entry = rng.uniform(0.0, 2.5), rng.uniform(2.0, 4.0)
-    width = margin + long + run + entry
-    stair_width = rng.uniform(1.5, 2.4)
-    stair_x = margin + rng.uniform(stair_width / 2 + 0.3, long - stair_width / 2 - 0.3)
-    ramp_up = int(rng.choice([-1, 1]))  # falls towards larger x from a terrace on the left, or mirrored
-    flip = (lambda low, high: (low, high)) if ramp_up < 0 else (lambda low, high: (width - high, width - low))
-    terrace_x, ramp_x = (flip(margin, margin + long), flip(margin + long, margin + long + run))
-    count = int(rng.integers(2, 4))
-    slots = (np.arange(count) + 0.5) * width / count
-    slots += rng.uniform(-0.25, 0.25, count) * width / count
-    crossings = [(float(x), float(rng.uniform(1.6, 2.6))) for x in slots]
-    dropped, drop = int(rng.integers(-1, count)), kerb / rng.uniform(0.08, 0.10)
-    y, top = depth - deep, kerb + height
-    start = (flip(stair_x, stair_x)[0], y - (steps - 1) * tread)
-    return _Layout(
-        width,
-        street,
-        pavement,
-        depth,
-        kerb,
-        top,
-        (terrace_x[0], y, terrace_x[1], depth),
-        _Ramp((ramp_x[0], depth - ramp_width, ramp_x[1], depth), slope, ramp_up),
-        Flight(start, np.pi / 2, steps, (top - kerb) / steps, tread, stair_width, kerb),
-        tuple(_Crossing(*place, drop, number == dropped) for number, place in enumerate(crossings)),
-    )
 
 
 def _build_ground(builder: WorldBuilder, layout: _Layout, rng: np.random.Generator) -> None:

@@ -69,3 +69,32 @@ def around(points: Float[np.ndarray, "point 2"]) -> Box:
     """The smallest box around points (m)."""
     low, high = points.min(0), points.max(0)
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+def stays_apart(
+    outline: Float[np.ndarray, "4 2"],
+    places: Float[np.ndarray, "key 3"],
+    others: list[Float[np.ndarray, "corner 2"]],
+    least_m: float,
+) -> bool:
+    """Whether an outline at places x, y (m), heading (rad) keeps a distance from others.
+
+    Neither's border comes near the other.
+    """
+    share = np.linspace(0.0, 1.0, 7)[:-1, None]
+
+    def border(corners: Float[np.ndarray, "corner 2"]) -> Float[np.ndarray, "point 2"]:
+        return np.concatenate([a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, 0))])
+
+    outlines = np.stack([outline @ turn(heading).T + np.array([x, y]) for x, y, heading in places])
+    points = np.concatenate([border(corners) for corners in outlines])
+    low, high = points.min(0) - least_m, points.max(0) + least_m
+    for other in others:
+        if (other.min(0) > high).any() or (other.max(0) < low).any():
+            continue
+        if distance_to_convex(points, other).min() <= least_m:
+            return False
+        rim = border(other)
+        if min(distance_to_convex(rim, corners).min() for corners in outlines) <= least_m:
+            return False
+    return True

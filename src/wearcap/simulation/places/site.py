@@ -9,8 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from wearcap.simulation.places.builder import WorldBuilder, hue
-from wearcap.simulation.places.furnish import ROOM_KINDS, Plan
-from wearcap.simulation.places.furniture import MAKERS, wood
+from wearcap.simulation.places.furniture import MAKERS, ROOM_KINDS, Plan, wood
 from wearcap.simulation.places.outline import Box, inset, middle_and_size, overlaps, rectangle, turn
 from wearcap.simulation.places.walls import (
     HEIGHT,
@@ -20,7 +19,6 @@ from wearcap.simulation.places.walls import (
     before_gap,
     build_facade,
     build_flight,
-    build_wall,
     sloped_rail,
 )
 from wearcap.simulation.places.world import CaptureSpot, Flight, World
@@ -109,11 +107,19 @@ def build_site(rng: np.random.Generator, name: str, scale: float = 1.0) -> World
     walls = layout.walls(rng)
     painted = hue(rng, (0.0, 0.12))
     for wall in walls:
-        build_wall(builder, wall, painted, rng)
+        wall.build(builder, painted, rng)
     rooms = [(f"room {number}", box) for number, box in enumerate(layout.rooms)]
     halls = [(f"hall {number}", box) for number, box in enumerate(layout.halls)]
     for part, box in (*rooms, ("corridor", layout.corridor), *halls):
-        _add_floor_and_ceiling(builder, box, part, rng)
+        middle, size = middle_and_size(box)
+        shade = float(rng.uniform(0.45, 0.75))
+        color = wood(rng) if part.startswith("room") else (shade, 0.98 * shade, 0.93 * shade)
+        builder.add_surface("floor", rectangle(middle, size), color, texture=1.5, thickness=0.05)
+        builder.add_room(part, rectangle(middle, size), 0.0)
+        builder.add_box((*middle, HEIGHT + 0.05), (*size, 0.1), (0.88, 0.88, 0.86), 0.8)
+        for x in np.arange(box[0] + 1.3, box[2] - 1.0, 2.8):
+            for y in np.arange(box[1] + 1.2, box[3] - 0.8, 2.6):
+                builder.add_box((float(x), float(y), HEIGHT - 0.03), (1.25, 0.28, 0.06), (1.0, 1.0, 0.97), 8.0)
     _build_open_air(builder, layout, rng)
     _furnish(builder, layout, rng)
     return builder.finish()
@@ -129,20 +135,6 @@ def _row(box: Box, spacing: float, width: float) -> list[tuple[float, float]]:
     """Windows spread over a room's length."""
     count = max(int((box[2] - box[0] - 0.8) / spacing), 1)
     return [(box[0] + (k + 0.5) * (box[2] - box[0]) / count, float(width)) for k in range(count)]
-
-
-def _add_floor_and_ceiling(builder: WorldBuilder, box: Box, name: str, rng: np.random.Generator) -> None:
-    """Floor, ceiling with lamps, and the room's outline."""
-    middle, size = middle_and_size(box)
-    corners = rectangle(middle, size)
-    shade = float(rng.uniform(0.45, 0.75))
-    color = wood(rng) if name.startswith("room") else (shade, 0.98 * shade, 0.93 * shade)
-    builder.add_surface("floor", corners, color, texture=1.5, thickness=0.05)
-    builder.add_room(name, corners, 0.0)
-    builder.add_box((*middle, HEIGHT + 0.05), (*size, 0.1), (0.88, 0.88, 0.86), 0.8)
-    for x in np.arange(box[0] + 1.3, box[2] - 1.0, 2.8):
-        for y in np.arange(box[1] + 1.2, box[3] - 0.8, 2.6):
-            builder.add_box((float(x), float(y), HEIGHT - 0.03), (1.25, 0.28, 0.06), (1.0, 1.0, 0.97), 8.0)
 
 
 def _build_open_air(builder: WorldBuilder, layout: _Layout, rng: np.random.Generator) -> None:
@@ -195,7 +187,16 @@ def _furnish(builder: WorldBuilder, layout: _Layout, rng: np.random.Generator) -
         plan = Plan(builder, inset(box, margin), 0.0, list(free))
         if number == 0:
             _add_capture_spot(plan, rng)
-        _add_pillars(plan, rng)
+        # columns down the middle, out of the walkers' path, with notices on them
+        y, color = (plan.room[1] + plan.room[3]) / 2, hue(rng, (0.0, 0.1))
+        for x in np.arange(plan.room[0] + 2.5, plan.room[2] - 1.5, 4.2):
+            outline = (x - 0.25, y - 0.25, x + 0.25, y + 0.25)
+            if any(overlaps(outline, other) for other in (*plan.kept_free, *plan.solid)):
+                continue
+            builder.add_block("pillar", (float(x), y, HEIGHT / 2), (0.36, 0.36, HEIGHT), color, 1.0)
+            plan.solid.append(outline)
+            notice = (float(x), y + float(rng.choice([-1.0, 1.0])) * 0.19, 1.5)
+            builder.add_box(notice, (0.28, 0.02, 0.4), tuple(rng.uniform(0.3, 0.9, 3)), 150.0)
         for _ in range(3):
             plan.table_with_chairs(rng)
         for kind in HALL_KINDS:
@@ -233,20 +234,6 @@ def _add_capture_spot(plan: Plan, rng: np.random.Generator) -> None:
     builder = plan.builder
     spot = CaptureSpot(builder.point(x, y, plan.z), builder.heading + float(heading), SPOT_M, half, table.z_range[1])
     builder.spots.append(spot)
-
-
-def _add_pillars(plan: Plan, rng: np.random.Generator) -> None:
-    """Columns down the middle of a hall, out of the walkers' path, with notices on them."""
-    x_low, y_low, x_high, y_high = plan.room
-    y, color = (y_low + y_high) / 2, hue(rng, (0.0, 0.1))
-    for x in np.arange(x_low + 2.5, x_high - 1.5, 4.2):
-        outline = (x - 0.25, y - 0.25, x + 0.25, y + 0.25)
-        if any(overlaps(outline, other) for other in (*plan.kept_free, *plan.solid)):
-            continue
-        plan.builder.add_block("pillar", (float(x), y, HEIGHT / 2), (0.36, 0.36, HEIGHT), color, 1.0)
-        plan.solid.append(outline)
-        notice = (float(x), y + float(rng.choice([-1.0, 1.0])) * 0.19, 1.5)
-        plan.builder.add_box(notice, (0.28, 0.02, 0.4), tuple(rng.uniform(0.3, 0.9, 3)), 150.0)
 
 
 def changed_world(

@@ -45,46 +45,45 @@ class Wall:
         cos, sin = np.cos(self.heading), np.sin(self.heading)
         return (float(self.start[0] + distance * cos - off * sin), float(self.start[1] + distance * sin + off * cos))
 
+    def build(self, builder: WorldBuilder, color: Color, rng: np.random.Generator) -> None:
+        """Solid pieces between the openings, the wall above and below those, frames, pictures and switches."""
+        openings = sorted([(*door, True) for door in self.doors] + [(*window, False) for window in self.windows])
+        place = -THICKNESS / 2
+        for middle, width, is_door in openings:
+            start, stop = middle - width / 2, middle + width / 2
+            low, high = (0.0, DOOR_HEIGHT) if is_door else WINDOW
+            self.add_panel(builder, (place, start), (0.0, HEIGHT), color)
+            self.add_panel(builder, (start, stop), (high, HEIGHT), color)
+            if not is_door:
+                self.add_panel(builder, (start, stop), (0.0, low), color)
+            gap = w.Door(builder.point(*self.at(middle), self.z), builder.heading + self.heading + np.pi / 2, width)
+            (builder.doors if is_door else builder.windows).append(gap)
+            edges = [(middle + side * (width / 2 + 0.03), (low + high) / 2, 0.06, high - low) for side in (-1, 1)]
+            edges += [(middle, edge, width + 0.12, 0.06) for edge in ((high,) if is_door else (low, high))]
+            for along, z, long, tall in edges:  # posts and bars of the frame, slightly in front of the wall
+                center, size = (*self.at(along), self.z + z), (long, THICKNESS + 0.03, tall)
+                builder.add_box(center, size, (0.85, 0.83, 0.78), 6.0, self.heading)
+            place, along = stop, stop + 0.18
+            for side in (-1, 1) if is_door and along <= self.length - 0.1 else ():
+                switch = (*self.at(along, side * (THICKNESS / 2 + 0.005)), self.z + 1.1)
+                builder.add_box(switch, (0.08, 0.01, 0.08), (0.95, 0.95, 0.95), 100.0, self.heading)
+                stand = (*self.at(along, side * (THICKNESS / 2 + 0.42)), self.z)
+                builder.add_reach(switch, stand, self.heading - side * np.pi / 2)
+        self.add_panel(builder, (place, self.length + THICKNESS / 2), (0.0, HEIGHT), color)
+        for side, distance in product((-1, 1), np.arange(0.6, self.length - 0.6, 1.1)):
+            if rng.uniform() < 0.6 or any(abs(distance - middle) < width / 2 + 0.5 for middle, width, _ in openings):
+                continue
+            picture = (*self.at(float(distance), side * (THICKNESS / 2 + 0.01)), self.z + 1.55)
+            size = (float(rng.uniform(0.3, 0.7)), 0.02, float(rng.uniform(0.3, 0.8)))
+            builder.add_box(picture, size, tuple(rng.uniform(0.2, 0.9, 3)), 150.0, self.heading)
 
-def build_wall(builder: WorldBuilder, wall: Wall, color: Color, rng: np.random.Generator) -> None:
-    """Solid pieces between the openings, the wall above and below those, frames, pictures and switches."""
-    openings = sorted([(*door, True) for door in wall.doors] + [(*window, False) for window in wall.windows])
-    place = -THICKNESS / 2
-    for middle, width, is_door in openings:
-        start, stop = middle - width / 2, middle + width / 2
-        low, high = (0.0, DOOR_HEIGHT) if is_door else WINDOW
-        _add_panel(builder, wall, (place, start), (0.0, HEIGHT), color)
-        _add_panel(builder, wall, (start, stop), (high, HEIGHT), color)
-        if not is_door:
-            _add_panel(builder, wall, (start, stop), (0.0, low), color)
-        gap = w.Door(builder.point(*wall.at(middle), wall.z), builder.heading + wall.heading + np.pi / 2, width)
-        (builder.doors if is_door else builder.windows).append(gap)
-        edges = [(middle + side * (width / 2 + 0.03), (low + high) / 2, 0.06, high - low) for side in (-1, 1)]
-        edges += [(middle, edge, width + 0.12, 0.06) for edge in ((high,) if is_door else (low, high))]
-        for along, z, long, tall in edges:  # posts and bars of the frame, slightly in front of the wall
-            center, size = (*wall.at(along), wall.z + z), (long, THICKNESS + 0.03, tall)
-            builder.add_box(center, size, (0.85, 0.83, 0.78), 6.0, wall.heading)
-        place, along = stop, stop + 0.18
-        for side in (-1, 1) if is_door and along <= wall.length - 0.1 else ():
-            switch = (*wall.at(along, side * (THICKNESS / 2 + 0.005)), wall.z + 1.1)
-            builder.add_box(switch, (0.08, 0.01, 0.08), (0.95, 0.95, 0.95), 100.0, wall.heading)
-            stand = (*wall.at(along, side * (THICKNESS / 2 + 0.42)), wall.z)
-            builder.add_reach(switch, stand, wall.heading - side * np.pi / 2)
-    _add_panel(builder, wall, (place, wall.length + THICKNESS / 2), (0.0, HEIGHT), color)
-    for side, distance in product((-1, 1), np.arange(0.6, wall.length - 0.6, 1.1)):
-        if rng.uniform() < 0.6 or any(abs(distance - middle) < width / 2 + 0.5 for middle, width, _ in openings):
-            continue
-        picture = (*wall.at(float(distance), side * (THICKNESS / 2 + 0.01)), wall.z + 1.55)
-        size = (float(rng.uniform(0.3, 0.7)), 0.02, float(rng.uniform(0.3, 0.8)))
-        builder.add_box(picture, size, tuple(rng.uniform(0.2, 0.9, 3)), 150.0, wall.heading)
-
-
-def _add_panel(builder: WorldBuilder, wall: Wall, span: tuple, z_range: tuple, color: Color) -> None:
-    if span[1] - span[0] < 0.01:
-        return
-    tall = z_range[1] - z_range[0]
-    center = (*wall.at((span[0] + span[1]) / 2), wall.z + z_range[0] + tall / 2)
-    builder.add_block("wall", center, (span[1] - span[0], THICKNESS, tall), color, BLANK, wall.heading)
+    def add_panel(self, builder: WorldBuilder, span: tuple, z_range: tuple, color: Color) -> None:
+        """A solid piece over a span along the wall and a range of heights (m); none where it would be very narrow."""
+        if span[1] - span[0] < 0.01:
+            return
+        tall = z_range[1] - z_range[0]
+        center = (*self.at((span[0] + span[1]) / 2), self.z + z_range[0] + tall / 2)
+        builder.add_block("wall", center, (span[1] - span[0], THICKNESS, tall), color, BLANK, self.heading)
 
 
 def before_gap(builder: WorldBuilder, gap: w.Door, deep: float = 0.95, beside: float = 0.15) -> Box:

@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from wearcap.geometry.mesh import Mesh
-from wearcap.simulation.people.walking import plan_path
-from wearcap.simulation.places.navigation import NavigationGrid
+from wearcap.simulation.places.navigation import NavigationGrid, plan_path
 from wearcap.simulation.places.outline import points_in_convex
 
 STEP_UP_M = 0.35
@@ -155,20 +154,8 @@ class Door:
     width: float
 
 
-@dataclass(frozen=True)
-class Contents:
-    """What a world offers to its walkers beside objects and surfaces."""
-
-    seats: tuple[Seat, ...] = ()
-    reach_targets: tuple[ReachTarget, ...] = ()
-    flights: tuple[Flight, ...] = ()
-    rooms: tuple[Room, ...] = ()
-    doors: tuple[Door, ...] = ()
-    spots: tuple[CaptureSpot, ...] = ()
-
-
 @dataclass(frozen=True, kw_only=True)
-class World(Contents):
+class World:
     """Seeded surroundings. `face_object` gives each face of `mesh` its object (index), or -1 for the shell."""
 
     name: str
@@ -178,6 +165,12 @@ class World(Contents):
     """Visual features per m² of each face: near 0 on blank walls, hundreds on book spines."""
     objects: tuple[WorldObject, ...]
     surfaces: tuple[Surface, ...]
+    seats: tuple[Seat, ...] = ()
+    reach_targets: tuple[ReachTarget, ...] = ()
+    flights: tuple[Flight, ...] = ()
+    rooms: tuple[Room, ...] = ()
+    doors: tuple[Door, ...] = ()
+    spots: tuple[CaptureSpot, ...] = ()
     cell: float = 0.1
     """Side of a cell of the planning grid (m)."""
     outdoors: bool = False
@@ -205,6 +198,14 @@ class World(Contents):
     def clearance(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
         """Distance (m, to about a cell) from floor points to the nearest obstacle; 0 inside one."""
         return self.navigation.clearance_at(points)
+
+    def on_stairs(self, points: Float[np.ndarray, "point 3"]) -> Bool[np.ndarray, "point"]:
+        """Whether floor points lie on a flight or within a step of its ends."""
+        near = np.zeros(len(points), bool)
+        for flight in self.flights:
+            run, side = flight.up_and_left(points[:, :2])
+            near |= (run > -0.8) & (run < flight.length + 0.8) & (np.abs(side) < flight.width / 2 + 0.1)
+        return near
 
     def plan_path(
         self, start: Float[np.ndarray, "3"], goal: Float[np.ndarray, "3"], rng: np.random.Generator

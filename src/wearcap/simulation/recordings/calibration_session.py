@@ -62,7 +62,7 @@ class SessionNoise:
 
 
 @dataclass(frozen=True)
-class Measured:
+class _Measured:
     """Lengths that the wearer measures (m)."""
 
     distances_m: tuple[float, float]
@@ -72,7 +72,7 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class Planted:
+class _Planted:
     """The answers that a calibration should find."""
 
     R_world_ref: dict[str, Tensor]
@@ -100,8 +100,8 @@ class CalibrationSession:
     """Times on the camera's clock at which the hands are nearest."""
     board: dict[str, Stretch]
     t_pose: dict[str, Stretch]
-    measured: Measured
-    planted: Planted
+    measured: _Measured
+    planted: _Planted
 
 
 def simulate_calibration(
@@ -125,17 +125,26 @@ def simulate_calibration(
     T_world_cam = _camera_path(R_head_cam, distances, height, end, _FINER * camera_fps, noise, rng)
     slam = _seen(T_world_cam[::_FINER], scale, R_world_slam, t_world_slam, camera_fps, noise, rng)
     upright = (T_world_cam.timestamps >= STANDING[0]) & (T_world_cam.timestamps <= STANDING[1])
-    points = (_floor_and_objects(rng) - t_world_slam) @ R_world_slam / scale
+    # a semi-dense cloud (m, world): floor, a table, walls, and some points that are wrong
+    low, high = np.array([-8.0, -8.0]), np.array([8.0, 12.0])
+    floor = np.concatenate([rng.uniform(low, high, (3000, 2)), np.zeros((3000, 1))], 1)
+    table = np.concatenate([rng.uniform([-0.5, -0.3], [1.0, 1.0], (800, 2)), np.full((800, 1), 0.74)], 1)
+    wall = np.stack([rng.uniform(-8, 8, 3000), np.full(3000, 6.0), rng.uniform(0, 2.6, 3000)], -1)
+    points = np.concatenate([floor, table, wall])
+    points = points + 0.012 * rng.standard_normal(points.shape)
+    wrong = rng.random(len(points)) < 0.03
+    points[wrong] += rng.normal(0, 0.4, (int(wrong.sum()), 3))
+    points_slam = (torch.from_numpy(points) - t_world_slam) @ R_world_slam / scale
     logs, R_world_ref, R_joint_imu, clocks = (dict(zip(watches, made)) for made in zip(*watches.values()))
     return CalibrationSession(
         logs,
         slam,
         _head_imu(T_world_cam, watch_fps, noise, rng),
-        points.float(),
+        points_slam.float(),
         torch.from_numpy(np.round(tops * camera_fps) / camera_fps),
         *({joint: (clock(start), clock(stop)) for joint, clock in clocks.items()} for start, stop in (BOARD, T_POSE)),
-        Measured(distances, height, T_world_cam.t_world_body[upright, 2].mean().item()),
-        Planted(
+        _Measured(distances, height, T_world_cam.t_world_body[upright, 2].mean().item()),
+        _Planted(
             R_world_ref,
             R_joint_imu,
             R_world_slam,
@@ -329,16 +338,3 @@ def _head_imu(T: Trajectory, fps: float, noise: SessionNoise, rng: np.random.Gen
     felt = np.stack([np.interp(at, times.numpy(), felt[:, axis].numpy()) for axis in range(3)], -1)
     felt = felt + noise.acc_bias * rng.standard_normal(3) + noise.acc_noise * rng.standard_normal(felt.shape)
     return ImuStream(torch.from_numpy(at), "head", acc_imu=torch.from_numpy(felt).float())
-
-
-def _floor_and_objects(rng: np.random.Generator) -> Float64[Tensor, "point 3"]:
-    """Points of a semi-dense cloud (m, world): floor, a table, walls, and some that are wrong."""
-    low, high = np.array([-8.0, -8.0]), np.array([8.0, 12.0])
-    floor = np.concatenate([rng.uniform(low, high, (3000, 2)), np.zeros((3000, 1))], 1)
-    table = np.concatenate([rng.uniform([-0.5, -0.3], [1.0, 1.0], (800, 2)), np.full((800, 1), 0.74)], 1)
-    wall = np.stack([rng.uniform(-8, 8, 3000), np.full(3000, 6.0), rng.uniform(0, 2.6, 3000)], -1)
-    points = np.concatenate([floor, table, wall])
-    points = points + 0.012 * rng.standard_normal(points.shape)
-    wrong = rng.random(len(points)) < 0.03
-    points[wrong] += rng.normal(0, 0.4, (int(wrong.sum()), 3))
-    return torch.from_numpy(points)

@@ -15,7 +15,7 @@ from wearcap.recording.motion import Motion
 from wearcap.recording.recording import ImuStream, Intervals, Recording
 from wearcap.sensors.imu import ImuNoise, synthesize_imu
 from wearcap.sensors.simulated import SuitNoise, suit_motion
-from wearcap.simulation.people.actions import ACTIVITIES, FREE_M, follow, on_stairs, path_length
+from wearcap.simulation.people.actions import ACTIVITIES, FREE_M, follow, path_length
 from wearcap.simulation.people.person import Person
 from wearcap.simulation.people.plan import LEFT_SIGN, SIDES, Plan
 from wearcap.simulation.people.walking import turn_to
@@ -56,7 +56,7 @@ class Protocol:
 
 
 @dataclass(frozen=True)
-class SimulatedSession:
+class _SimulatedSession:
     """A motion with its stretches at the spot ("stand" and "move") and the times of its claps (s)."""
 
     simulated: SimulatedMotion
@@ -89,7 +89,7 @@ class Simulated:
     """A recording, and the world and session that it was made from."""
 
     recording: Recording
-    session: SimulatedSession
+    session: _SimulatedSession
     world: World
     clock: tuple[float, float]
     """Clock of the camera: its lead over the suit's at the suit's zero (s), and its drift (ms per hour)."""
@@ -109,7 +109,7 @@ def simulate_hps(config: HpsConfig, name: str, split: str, seed: int, world: Wor
     rng = seeded(5, split, seed)
     person = drawn_person(split, rng)
     world = world or world_of(split, seed % min(SITES[split], POOLS[split][1]), "site")
-    session = simulate_session(world, person, rng, config.fps, config.protocol)
+    session = _Session(world, person, rng, config.protocol).simulated(config.fps)
     motion = session.simulated.motion
     suit = suit_motion(motion, session.simulated.contact, config.suit, rng)
     strength = rng.uniform(*config.clap_acc, len(session.claps_s))
@@ -162,37 +162,6 @@ def _shaken_by_claps(stream: ImuStream, motion: Motion, claps_s: tuple[float, ..
     )
 
 
-def simulate_session(
-    world: World, person: Person, rng: np.random.Generator, fps: float = 60.0, protocol: Protocol = Protocol()
-) -> SimulatedSession:
-    """A session at the world's first capture spot, deterministic for a given state of `rng`."""
-    session = _Session(world, person, rng, protocol)
-    session.visit()
-    for distance in protocol.returns_m:
-        session.wander(distance)
-        session.go_home()
-        session.visit()
-    session.wander(protocol.end_m)
-    session.go_home()
-    session.clap()
-    plan = session.plan
-    plan.time += 1.0
-    duration = plan.time
-    ACTIVITIES["stand"].act(plan, world, rng)
-    plan.time = max(plan.time, duration + TAIL_S)
-    simulated = perform(plan, world, rng, duration, fps)
-    path_so_far = simulated.motion.t_world_root[:, :2].diff(dim=0).norm(dim=-1).cumsum(0).numpy()
-    starts, stops, names = zip(*session.stretches)
-    travelled = np.interp(starts, simulated.motion.timestamps.numpy()[1:], path_so_far)
-    intervals = Intervals(
-        torch.tensor(starts, dtype=torch.float64),
-        torch.tensor(stops, dtype=torch.float64),
-        torch.from_numpy(travelled).float(),
-        names,
-    )
-    return SimulatedSession(simulated, intervals, tuple(session.clap_times))
-
-
 class _Session:
     """The plan in the making, and the distance walked so far."""
 
@@ -207,6 +176,33 @@ class _Session:
         self.clap_times: list[float] = []
         self._length_home = world.navigation.lengths_from(self.home)
 
+    def simulated(self, fps: float) -> _SimulatedSession:
+        """The whole session, at the world's first capture spot."""
+        self.visit()
+        for distance in self.protocol.returns_m:
+            self.wander(distance)
+            self.go_home()
+            self.visit()
+        self.wander(self.protocol.end_m)
+        self.go_home()
+        self.clap()
+        plan = self.plan
+        plan.time += 1.0
+        duration = plan.time
+        ACTIVITIES["stand"].act(plan, self.world, self.rng)
+        plan.time = max(plan.time, duration + TAIL_S)
+        simulated = perform(plan, self.world, self.rng, duration, fps)
+        path_so_far = simulated.motion.t_world_root[:, :2].diff(dim=0).norm(dim=-1).cumsum(0).numpy()
+        starts, stops, names = zip(*self.stretches)
+        travelled = np.interp(starts, simulated.motion.timestamps.numpy()[1:], path_so_far)
+        intervals = Intervals(
+            torch.tensor(starts, dtype=torch.float64),
+            torch.tensor(stops, dtype=torch.float64),
+            torch.from_numpy(travelled).float(),
+            names,
+        )
+        return _SimulatedSession(simulated, intervals, tuple(self.clap_times))
+
     def walk(self, goal: np.ndarray, heading: float | None = None) -> bool:
         path = self.world.plan_path(self.plan.position, goal, self.rng)
         if path is None:
@@ -220,7 +216,7 @@ class _Session:
     def wander(self, until_m: float) -> None:
         """Walk from place to place as long as the path home leaves room for it."""
         points = self.world.navigation.node_points
-        free = (self.world.clearance(points) > FREE_M) & ~on_stairs(self.world, points)
+        free = (self.world.clearance(points) > FREE_M) & ~self.world.on_stairs(points)
         while True:
             there = self.world.navigation.lengths_from(self.plan.position)
             left = until_m - self.travelled

@@ -12,15 +12,13 @@ import numpy as np
 from wearcap.errors import WearcapError
 from wearcap.recording.recording import Recording
 from wearcap.sensors.simulated import SlamNoise, SuitNoise, head_stream, suit_motion
-from wearcap.simulation.handling.house import House
 from wearcap.simulation.handling.household import USUAL, VARIED, Habits, Household
-from wearcap.simulation.handling.rearranging import APART_M, apart, outlines
+from wearcap.simulation.handling.rearranging import APART_M
 from wearcap.simulation.people.person import Person
 from wearcap.simulation.people.wearer import SimulatedMotion, perform
-from wearcap.simulation.places.interactive_flat import InteractiveFlat, build_interactive_flat, obstacle
+from wearcap.simulation.places.interactive_flat import House, InteractiveFlat, build_interactive_flat, obstacle
 from wearcap.simulation.places.movables import HANDHELDS, Movable, make_movable
-from wearcap.simulation.places.openables import at
-from wearcap.simulation.places.outline import rectangle
+from wearcap.simulation.places.outline import stays_apart
 from wearcap.simulation.recordings.localization_noise import LocalizationNoise, localize_statistically
 from wearcap.simulation.recordings.simulate import POOLS, drawn_person, seeded, with_truth
 from wearcap.simulation.rendering.head_camera import HeadCameraConfig, head_camera, view_texture
@@ -86,7 +84,7 @@ def object_flat_of(split: str, number: int) -> InteractiveFlat:
     while True:
         flat = build_interactive_flat(rng, f"sim-{split}-object_flat-{number:03d}")
         openables = tuple(
-            at(item, item.opening_sign * float(rng.uniform(WIDE, item.openness(item.opened))))
+            item.at(item.opening_sign * float(rng.uniform(WIDE, item.openness(item.opened))))
             if item.category == "door" and item.blocks(0.0) and rng.random() < OPEN_SHARE
             else item
             for item in flat.openables
@@ -166,11 +164,10 @@ def _placed(flat: InteractiveFlat, movable: Movable, rng: np.random.Generator) -
     zones = house.kept_free()
     rooms = [navigation.barred(standing, point) for point in flat.static.sample_floor(rng, 6)]
     points = max(rooms, key=lambda grid: int(grid.walkable.sum())).node_points
-    outline = rectangle((0.0, 0.0), (2 * movable.half_size[0], 2 * movable.half_size[1]))
     for _ in range(TRIES):
         x, y, z = points[rng.integers(len(points))]
         x, y, heading = (float(v) for v in (*rng.normal((x, y), 0.15), rng.uniform(-np.pi, np.pi)))
-        if not apart(outlines(outline, np.array([[x, y, heading]])), [*solid, *zones], APART_M):
+        if not stays_apart(movable.outline, np.array([[x, y, heading]]), [*solid, *zones], APART_M):
             continue
         placed = movable.placed(x, y, heading, float(z))
         for around in points[rng.integers(len(points), size=2)]:

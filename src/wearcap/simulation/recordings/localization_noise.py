@@ -58,7 +58,17 @@ def localize_statistically(
     median_m, median_deg = rng.uniform(*noise.position_m), rng.uniform(*noise.rotation_deg)
     # the median length of a normal vector in space is 1.538 deviations of its parts
     scale = torch.tensor([np.deg2rad(median_deg)] * 3 + [median_m] * 3) / 1.538
-    error = scale * _view_noise(path, noise.lasting, rng, fps)
+    # a part of the error changes with the view, the other within a few frames
+    moved = path.t_world_body.diff(dim=0).norm(dim=-1) / VIEW_M
+    turned = rotation.geodesic(path.R_world_body[:-1], path.R_world_body[1:]) / np.deg2rad(VIEW_DEG)
+    passed = path.timestamps.diff().float() / VIEW_S
+    view = torch.cat([torch.zeros(1), (moved + turned + passed).cumsum(0)]).double().numpy()
+    steps = int(8 * view[-1]) + 3
+    coarse = smooth_noise(rng, steps, 6, 8.0, 1.0).numpy()
+    slow = np.stack([np.interp(8 * view, np.arange(steps), column) for column in coarse.T], 1)
+    quick = smooth_noise(rng, count, 6, 0.15, fps)
+    lasting = np.sqrt(noise.lasting) * torch.from_numpy(slow).float()
+    error = scale * (lasting + np.sqrt(1 - noise.lasting) * quick)
     wrong, off = _outliers(count, noise, rng, fps)
     error = torch.where(wrong[:, None], off, error).float()
     lost = _outages(count, fps, noise, rng, texture)
@@ -105,20 +115,6 @@ def _without(found: Localization, lost: Tensor) -> Localization:
         confidence=torch.where(lost, torch.zeros(()), found.confidence),
         covariance=covariance,
     )
-
-
-def _view_noise(path: Trajectory, lasting: float, rng: np.random.Generator, fps: float) -> Tensor:
-    """Unit noise (time, 6): a part that changes with the view, and one that changes within a few frames."""
-    count = len(path.timestamps)
-    moved = path.t_world_body.diff(dim=0).norm(dim=-1) / VIEW_M
-    turned = rotation.geodesic(path.R_world_body[:-1], path.R_world_body[1:]) / np.deg2rad(VIEW_DEG)
-    passed = path.timestamps.diff().float() / VIEW_S
-    view = torch.cat([torch.zeros(1), (moved + turned + passed).cumsum(0)]).double().numpy()
-    steps = int(8 * view[-1]) + 3
-    coarse = smooth_noise(rng, steps, 6, 8.0, 1.0).numpy()
-    slow = np.stack([np.interp(8 * view, np.arange(steps), column) for column in coarse.T], 1)
-    quick = smooth_noise(rng, count, 6, 0.15, fps)
-    return np.sqrt(lasting) * torch.from_numpy(slow).float() + np.sqrt(1 - lasting) * quick
 
 
 def _outliers(count: int, noise: LocalizationNoise, rng: np.random.Generator, fps: float) -> tuple[Tensor, Tensor]:

@@ -91,42 +91,44 @@ class _Body:
     color: Float32[np.ndarray, "vertex 3"]
     """Vertex colours, RGB 0…1."""
 
+    @classmethod
+    def dressed(cls, skeleton: Skeleton, shape: dict[str, float], rng: np.random.Generator) -> "_Body":
+        """A body fitted to the skeleton's bones; the skin tone is derived from the skeleton, the clothes are drawn.
 
-def _dressed(skeleton: Skeleton, shape: dict[str, float], rng: np.random.Generator) -> _Body:
-    """A body fitted to the skeleton's bones; the skin tone is derived from the skeleton, the clothes are drawn.
-
-    Raises WearcapError as `anny_body` does.
-    """
-    whole = anny_body(skeleton, shape)
-    dominant = whole.skin_joints.gather(1, whole.skin_weights.argmax(1, keepdim=True))[:, 0]
-    above = [skeleton.index(name) for name in ("neck", "head")]
-    kept = ~torch.isin(dominant, torch.tensor(above))
-    faces = whole.faces[kept[whole.faces].all(1)]
-    vertices = faces.unique()
-    number = torch.zeros(len(kept), dtype=torch.int64)
-    number[vertices] = torch.arange(len(vertices))
-    body = replace(
-        whole,
-        rest_vertices=whole.rest_vertices[vertices],
-        faces=number[faces],
-        regions={},
-        skin_joints=whole.skin_joints[vertices],
-        skin_weights=whole.skin_weights[vertices],
-    )
-    own = np.random.default_rng(zlib.crc32(skeleton.t_parent_joint.numpy().tobytes()))  # the same for the same bones
-    place = own.uniform(0, len(_SKIN) - 1)
-    tone = [np.interp(place, np.arange(len(_SKIN)), _SKIN[:, channel]) for channel in range(3)]
-    skin = (np.array(tone) * own.uniform(0.94, 1.06)).astype(np.float32)
-    shirt, trousers, shoe = (np.array(hue(rng, (0.0, 0.75))) * rng.uniform(0.25, 1.1) for _ in range(3))
-    worn = {"skin": skin, "shirt": shirt, "trousers": trousers, "shoe": shoe}
-    bare = rng.uniform(size=3)
-    worn["sleeve"] = skin if bare[0] < 0.1 else shirt
-    worn["forearm"] = skin if bare[1] < 0.5 or bare[0] < 0.1 else shirt
-    worn["shin"] = skin if bare[2] < 0.2 else trousers
-    parts = [name.removeprefix("left_").removeprefix("right_") for name in skeleton.joint_names]
-    table = np.stack([worn[_WORN.get(part, "shirt")] for part in parts])[dominant[vertices].numpy()]
-    color = np.clip(table * (1 + _MOTTLE * rng.standard_normal((len(table), 1))), 0.02, 0.98).astype(np.float32)
-    return _Body(body, body.faces.numpy().astype(np.int32), color)
+        Raises WearcapError as `anny_body` does.
+        """
+        whole = anny_body(skeleton, shape)
+        dominant = whole.skin_joints.gather(1, whole.skin_weights.argmax(1, keepdim=True))[:, 0]
+        above = [skeleton.index(name) for name in ("neck", "head")]
+        kept = ~torch.isin(dominant, torch.tensor(above))
+        faces = whole.faces[kept[whole.faces].all(1)]
+        vertices = faces.unique()
+        number = torch.zeros(len(kept), dtype=torch.int64)
+        number[vertices] = torch.arange(len(vertices))
+        body = replace(
+            whole,
+            rest_vertices=whole.rest_vertices[vertices],
+            faces=number[faces],
+            regions={},
+            skin_joints=whole.skin_joints[vertices],
+            skin_weights=whole.skin_weights[vertices],
+        )
+        own = np.random.default_rng(
+            zlib.crc32(skeleton.t_parent_joint.numpy().tobytes())
+        )  # the same for the same bones
+        place = own.uniform(0, len(_SKIN) - 1)
+        tone = [np.interp(place, np.arange(len(_SKIN)), _SKIN[:, channel]) for channel in range(3)]
+        skin = (np.array(tone) * own.uniform(0.94, 1.06)).astype(np.float32)
+        shirt, trousers, shoe = (np.array(hue(rng, (0.0, 0.75))) * rng.uniform(0.25, 1.1) for _ in range(3))
+        worn = {"skin": skin, "shirt": shirt, "trousers": trousers, "shoe": shoe}
+        bare = rng.uniform(size=3)
+        worn["sleeve"] = skin if bare[0] < 0.1 else shirt
+        worn["forearm"] = skin if bare[1] < 0.5 or bare[0] < 0.1 else shirt
+        worn["shin"] = skin if bare[2] < 0.2 else trousers
+        parts = [name.removeprefix("left_").removeprefix("right_") for name in skeleton.joint_names]
+        table = np.stack([worn[_WORN.get(part, "shirt")] for part in parts])[dominant[vertices].numpy()]
+        color = np.clip(table * (1 + _MOTTLE * rng.standard_normal((len(table), 1))), 0.02, 0.98).astype(np.float32)
+        return cls(body, body.faces.numpy().astype(np.int32), color)
 
 
 def write_ego_video(
@@ -164,7 +166,7 @@ def ego_frames(
     world: World, motion: Motion, shape: dict[str, float], stream: CameraStream, rng: np.random.Generator
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """The image at each timestamp of the stream, which must be timestamps of the motion."""
-    scenery, body, lens = Scenery.of(world), _dressed(motion.skeleton, shape, rng), _lens()
+    scenery, body, lens = Scenery.of(world), _Body.dressed(motion.skeleton, shape, rng), _lens()
     rows = torch.searchsorted(motion.timestamps, stream.timestamps.contiguous())
     T_head_cam = Rigid(stream.R_head_cam, stream.t_head_cam)
     shot = _Shot.drawn(len(rows), rng)

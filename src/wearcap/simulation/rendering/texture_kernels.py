@@ -74,20 +74,6 @@ def _hue(h):
 
 
 @compiled
-def _socket(a, b, seed, footprint):
-    """Whiteness and darkness of the sockets that are 30 cm above the floor on some stretches of wall."""
-    cell = math.floor(a / 1.7)
-    if _chance(cell, 3, seed) > 0.5:
-        return 0.0, 0.0
-    x = a - (cell + 0.2 + 0.6 * _chance(cell, 4, seed)) * 1.7
-    y = b - 0.3
-    plate = _inside(0.04 - max(abs(x), abs(y)), footprint)
-    hole = _inside(0.006 - math.hypot(abs(x) - 0.012, y), footprint)
-    ring = _inside(0.003 - abs(math.hypot(x, y) - 0.027), footprint)
-    return plate, max(hole, 0.5 * ring)
-
-
-@compiled
 def plaster(a, b, extent, red, green, blue, seed, footprint):
     """A painted wall: nearly blank, with a skirting board, sockets, and rarely a smudge."""
     shade = 1.0 + 0.012 * _noise(a, b, 1.4, seed, footprint) + 0.010 * _noise(a, b, 0.09, seed + 1, footprint)
@@ -99,7 +85,15 @@ def plaster(a, b, extent, red, green, blue, seed, footprint):
         shade -= 0.10 * _inside(reach - math.hypot(x, 2.2 * y), 0.03 + footprint)
     red, green, blue = red * shade, green * shade, blue * shade
     if extent[3] - extent[2] > 0.8:
-        plate, dark = _socket(a, b - extent[2], seed + 6, footprint)
+        plate, dark = 0.0, 0.0  # sockets, 30 cm above the floor on some stretches of wall
+        cell = math.floor(a / 1.7)
+        if _chance(cell, 3, seed + 6) <= 0.5:
+            x = a - (cell + 0.2 + 0.6 * _chance(cell, 4, seed + 6)) * 1.7
+            y = b - extent[2] - 0.3
+            plate = _inside(0.04 - max(abs(x), abs(y)), footprint)
+            hole = _inside(0.006 - math.hypot(abs(x) - 0.012, y), footprint)
+            ring = _inside(0.003 - abs(math.hypot(x, y) - 0.027), footprint)
+            dark = max(hole, 0.5 * ring)
         skirt = _inside(0.07 - (b - extent[2]), footprint)
         red, green, blue = _covered(red, green, blue, 0.35, 0.30, 0.26, skirt)
         red, green, blue = _covered(red, green, blue, 0.96, 0.96, 0.94, plate)
@@ -209,7 +203,7 @@ def books(a, b, extent, red, green, blue, seed, footprint):
 
 
 @compiled
-def grain(along, across, red, green, blue, seed, footprint):
+def _grain(along, across, red, green, blue, seed, footprint):
     """Wood: long streaks of several widths, here and there a knot."""
     bend = 0.012 * _noise(along, across, 0.7, seed + 1, footprint)
     y = across + bend
@@ -231,13 +225,13 @@ def parquet(a, b, red, green, blue, seed, footprint):
     shifted = a + 1.3 * _chance(row, 0, seed)
     plank = math.floor(shifted / 1.3)
     own = 1.0 + 0.42 * (_chance(plank, row, seed + 1) - 0.5) * _fade(0.25, footprint)
-    red, green, blue = grain(a, b, red * own, green * own, blue * own, seed + 31 * row, footprint)
+    red, green, blue = _grain(a, b, red * own, green * own, blue * own, seed + 31 * row, footprint)
     gap = 0.75 * max(_joint(b, 0.14, 0.005, footprint), _joint(shifted, 1.3, 0.005, footprint))
     return _covered(red, green, blue, 0.12, 0.09, 0.07, gap)
 
 
 @compiled
-def slabs(a, b, red, green, blue, seed, size, contrast, footprint):
+def _slabs(a, b, red, green, blue, seed, size, contrast, footprint):
     """Square tiles, flagstones or a rug's motifs with joints; a few are of another make, some are stained."""
     i, j = math.floor(a / size), math.floor(b / size)
     own = 1.0 + contrast * (_chance(i, j, seed) - 0.5) * _fade(size, footprint)
@@ -342,15 +336,15 @@ def pattern(material, a, b, extent, red, green, blue, seed, footprint):
     if material == WOOD:
         if extent[1] - extent[0] < extent[3] - extent[2]:
             a, b = b, a
-        return grain(a, b, red, green, blue, seed, footprint)
+        return _grain(a, b, red, green, blue, seed, footprint)
     if material == PARQUET:
         return parquet(a, b, red, green, blue, seed, footprint)
     if material == TILES:
-        return slabs(a, b, red, green, blue, seed, 0.3, 0.16, footprint)
+        return _slabs(a, b, red, green, blue, seed, 0.3, 0.16, footprint)
     if material == STONE:
-        return slabs(a, b, red, green, blue, seed, 0.45, 0.34, footprint)
+        return _slabs(a, b, red, green, blue, seed, 0.45, 0.34, footprint)
     if material == CARPET:
-        return slabs(a, b, red, green, blue, seed, 0.22, 0.7, footprint)
+        return _slabs(a, b, red, green, blue, seed, 0.22, 0.7, footprint)
     if material == FABRIC:
         return fabric(a, b, red, green, blue, seed, footprint)
     if material == FOLIAGE:

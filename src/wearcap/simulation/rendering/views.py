@@ -27,6 +27,9 @@ from wearcap.simulation.rendering.texture_kernels import color_points
 NEAR_M = 0.03
 SKY = np.array([[0.80, 0.84, 0.88], [0.48, 0.63, 0.85]]) * 255.0
 """Sky colour at the horizon and overhead."""
+_APART_M, _APART_STEPS = 0.00015, 16
+"""Smallest margin by which solids are grown, and the number of margins, its multiples."""
+_GROUND_M2 = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,35 +43,28 @@ class Scenery:
 
     @classmethod
     def of(cls, world: World) -> "Scenery":
-        return cls(world, Paint.of(world), _apart(world), world.mesh.faces)
+        """Solids that touch share planes; which one is seen would change from pixel to pixel.
 
-
-_APART_M, _APART_STEPS = 0.00015, 16
-_GROUND_M2 = 0.25
-
-
-def _apart(world: World) -> Float32[np.ndarray, "vertex 3"]:
-    """The mesh's vertices with every solid but the ground grown by its own tiny margin (at most 2.4 mm).
-
-    Solids that touch share planes; which one is seen would change from pixel to pixel.
-    """
-    vertices, faces = world.mesh.vertices.astype(np.float64), world.mesh.faces
-    ends = (np.concatenate([faces[:, 0], faces[:, 0]]), np.concatenate([faces[:, 1], faces[:, 2]]))
-    graph = scipy.sparse.coo_array((np.ones(len(ends[0])), ends), shape=(len(vertices),) * 2)
-    count, solid = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    corners = vertices[faces]
-    sides = np.roll(corners, -1, axis=1) - corners
-    normal = np.cross(sides[:, 0], sides[:, 1])
-    area = np.linalg.norm(normal, axis=1) / 2
-    normal /= np.maximum(2 * area, 1e-20)[:, None]
-    sides /= np.maximum(np.linalg.norm(sides, axis=-1, keepdims=True), 1e-20)
-    angle = np.arccos(np.clip(-(sides * np.roll(sides, 1, axis=1)).sum(-1), -1, 1))  # at each corner
-    outwards = np.zeros_like(vertices)
-    np.add.at(outwards, faces, (angle / (np.pi / 2))[..., None] * normal[:, None])
-    level = (world.face_object < 0) & (normal[:, 2] > 0.9) & (area > _GROUND_M2 / 2)
-    grown = _APART_M * (1 + np.arange(count) * 7 % _APART_STEPS)
-    grown[solid[faces[level, 0]]] = 0.0
-    return (vertices + grown[solid][:, None] * outwards).astype(np.float32)
+        So every solid but the ground is grown by its own tiny margin (at most 2.4 mm).
+        """
+        vertices, faces = world.mesh.vertices.astype(np.float64), world.mesh.faces
+        ends = (np.concatenate([faces[:, 0], faces[:, 0]]), np.concatenate([faces[:, 1], faces[:, 2]]))
+        graph = scipy.sparse.coo_array((np.ones(len(ends[0])), ends), shape=(len(vertices),) * 2)
+        count, solid = scipy.sparse.csgraph.connected_components(graph, directed=False)
+        corners = vertices[faces]
+        sides = np.roll(corners, -1, axis=1) - corners
+        normal = np.cross(sides[:, 0], sides[:, 1])
+        area = np.linalg.norm(normal, axis=1) / 2
+        normal /= np.maximum(2 * area, 1e-20)[:, None]
+        sides /= np.maximum(np.linalg.norm(sides, axis=-1, keepdims=True), 1e-20)
+        angle = np.arccos(np.clip(-(sides * np.roll(sides, 1, axis=1)).sum(-1), -1, 1))  # at each corner
+        outwards = np.zeros_like(vertices)
+        np.add.at(outwards, faces, (angle / (np.pi / 2))[..., None] * normal[:, None])
+        level = (world.face_object < 0) & (normal[:, 2] > 0.9) & (area > _GROUND_M2 / 2)
+        grown = _APART_M * (1 + np.arange(count) * 7 % _APART_STEPS)
+        grown[solid[faces[level, 0]]] = 0.0
+        vertices = (vertices + grown[solid][:, None] * outwards).astype(np.float32)
+        return cls(world, Paint.of(world), vertices, faces)
 
 
 @dataclass(frozen=True)
