@@ -90,7 +90,10 @@ def read_sidecar(path: str | Path, network: str | None = None) -> dict[str, Any]
     if not isinstance(tree, dict) or tree.get("wearcap_export") != VERSION:
         raise WearcapError("not a sidecar of this version", where=sidecar, fix="Export the model again.")
     name = str(tree.get("network"))
-    if (network or name) != name or not _exports(name):
+    package = f"wearcap.systems.{name}"
+    if (network or name) != name or not (
+        name.isidentifier() and all(map(importlib.util.find_spec, (package, f"{package}.export")))
+    ):
         raise WearcapError(f"a {name[:40]} network", where=path, expected=f"a {network or 'known'} network")
     files = {Path(path): tree["model"]}
     files |= {_file_of(path, part): entry for part, entry in tree["parts"].items()}
@@ -103,12 +106,6 @@ def read_sidecar(path: str | Path, network: str | None = None) -> dict[str, Any]
         if entry["sha256"] != sha256_of(file):
             raise WearcapError("its sidecar belongs to another model file", where=file, fix="Export the model again.")
     return tree
-
-
-def _exports(name: str) -> bool:
-    """Whether a system of this name exports networks."""
-    package = f"wearcap.systems.{name}"
-    return name.isidentifier() and all(map(importlib.util.find_spec, (package, f"{package}.export")))
 
 
 def _file_of(path: str | Path, part: str, weights: bool = False) -> Path:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float32, UInt8
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
@@ -149,7 +149,21 @@ def calibrate_from_pictures(
     if size is None:
         raise WearcapError("no pictures to calibrate from", expected="a video, or a folder of pictures")
     if not views:
-        raise _not_found(board, size, examined, missed)
+        # The fix suggests another count of corners if that one is found.
+        fix = "Count inner corners, not squares; show the whole board with a white margin, evenly lit and in focus."
+        for wider, higher in ((-1, -1), (1, 1), (-1, 0), (0, -1)):
+            columns, rows = board.columns + wider, board.rows + higher
+            if min(columns, rows) < 3:
+                continue
+            other = replace(board, columns=columns, rows=rows)
+            if any(other.find(gray) for gray in missed):
+                fix = f"A board of {columns}x{rows} inner corners was found: give columns={columns} rows={rows}."
+                break
+        raise WearcapError(
+            f"no board of {board} inner corners in {examined} pictures of {size[0]}x{size[1]} pixels",
+            expected="a checkerboard, seen as a whole",
+            fix=fix,
+        )
     sharp = [view for view in views if view.blur_px <= settings.max_blur_px]
     chosen = varied(sharp if len(sharp) >= settings.min_views else views, size, settings.max_views)
     return replace(_calibrated(chosen, board, size, settings), seen=len(views), examined=examined)
@@ -157,23 +171,22 @@ def calibrate_from_pictures(
 
 def varied(views: Sequence[View], size: tuple[int, int], count: int) -> list[View]:
     """Up to `count` views that differ most in position, size and tilt, by farthest-point sampling from the sharpest."""
-    appearance = np.array([_appearance(view.corners, size) for view in views])
+    appearances = []
+    for view in views:
+        # Place (shares of the picture), size (log of its share), and the projective part of the view: how it is tilted
+        side = float(max(size))
+        centred = (view.corners.astype(np.float64) - view.corners.mean(0)) / side
+        spread = np.sqrt((centred**2).sum(1).mean())
+        skew = (centred**3).mean(0) / spread**3  # perspective makes the near half of the board larger
+        shape = np.linalg.svd(centred, compute_uv=False)
+        appearances.append([*(view.corners.mean(0) / size), np.log(spread), shape[1] / shape[0], *(3 * skew)])
+    appearance = np.array(appearances)
     chosen = [int(np.argmin([view.blur_px for view in views]))]
     distance = np.linalg.norm(appearance - appearance[chosen[0]], axis=1)
     while len(chosen) < min(count, len(views)):
         chosen.append(int(distance.argmax()))
         distance = np.minimum(distance, np.linalg.norm(appearance - appearance[chosen[-1]], axis=1))
     return [views[k] for k in sorted(chosen)]
-
-
-def _appearance(corners: Float32[np.ndarray, "point 2"], size: tuple[int, int]) -> Float64[np.ndarray, "feature"]:
-    """Place (shares of the picture), size (log of its share), and the projective part of the view: how it is tilted."""
-    side = float(max(size))
-    centred = (corners.astype(np.float64) - corners.mean(0)) / side
-    spread = np.sqrt((centred**2).sum(1).mean())
-    skew = (centred**3).mean(0) / spread**3  # perspective makes the near half of the board larger
-    shape = np.linalg.svd(centred, compute_uv=False)
-    return np.array([*(corners.mean(0) / size), np.log(spread), shape[1] / shape[0], *(3 * skew)])
 
 
 def _calibrated(views: list[View], board: Board, size: tuple[int, int], settings: CalibrationSettings) -> Calibration:
@@ -216,21 +229,3 @@ def _calibrated(views: list[View], board: Board, size: tuple[int, int], settings
     cells = np.floor(corners / size * _CELLS).astype(int).clip(0, np.array(_CELLS) - 1)
     coverage = len(np.unique(cells, axis=0)) / (_CELLS[0] * _CELLS[1])
     return Calibration(camera, float(rms), focal_std, coverage, tuple(views), tuple(rejected))
-
-
-def _not_found(board: Board, size: tuple[int, int], examined: int, missed: list[np.ndarray]) -> WearcapError:
-    """Error for a missing board; its fix suggests another count of corners if that one is found."""
-    fix = "Count inner corners, not squares; show the whole board with a white margin, evenly lit and in focus."
-    for wider, higher in ((-1, -1), (1, 1), (-1, 0), (0, -1)):
-        columns, rows = board.columns + wider, board.rows + higher
-        if min(columns, rows) < 3:
-            continue
-        other = replace(board, columns=columns, rows=rows)
-        if any(other.find(gray) for gray in missed):
-            fix = f"A board of {columns}x{rows} inner corners was found: give columns={columns} rows={rows}."
-            break
-    return WearcapError(
-        f"no board of {board} inner corners in {examined} pictures of {size[0]}x{size[1]} pixels",
-        expected="a checkerboard, seen as a whole",
-        fix=fix,
-    )

@@ -98,7 +98,14 @@ class KeypointFlow:
     def advance(self, picture: UInt8[np.ndarray, "height width 3"], found: Mapping[str, Keypoint]) -> list[_Spotted]:
         """Frames that are final now, none to one."""
         grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
-        detected = self._detected(grey, found)
+        rows = [found.get(joint, Keypoint(np.nan, np.nan, 0.0)) for joint in self.joints]
+        table = np.array(rows, np.float32).reshape(-1, 3)
+        table[~(np.isfinite(table).all(-1) & (table[:, 2] > 0))] = np.nan
+        pixels, trust = table[:, :2].copy(), table[:, 2].copy()
+        there = np.isfinite(trust)
+        look = self._nowhere.look.copy()
+        look[there] = _patches(grey, pixels[there], self.settings.window_px)
+        detected = _Track(pixels, np.where(there, 0, np.nan).astype(np.float32), trust, look)
         forward = self._nowhere
         if self._frames:
             last = self._frames[-1]
@@ -127,16 +134,6 @@ class KeypointFlow:
         remaining = [_blended(frame, self.settings) for frame in self._frames]
         self._frames.clear()
         return remaining
-
-    def _detected(self, grey: np.ndarray, found: Mapping[str, Keypoint]) -> _Track:
-        rows = [found.get(joint, Keypoint(np.nan, np.nan, 0.0)) for joint in self.joints]
-        table = np.array(rows, np.float32).reshape(-1, 3)
-        table[~(np.isfinite(table).all(-1) & (table[:, 2] > 0))] = np.nan
-        pixels, trust = table[:, :2].copy(), table[:, 2].copy()
-        there = np.isfinite(trust)
-        look = self._nowhere.look.copy()
-        look[there] = _patches(grey, pixels[there], self.settings.window_px)
-        return _Track(pixels, np.where(there, 0, np.nan).astype(np.float32), trust, look)
 
 
 def tracked_cues(

@@ -146,7 +146,17 @@ class Localizer:
             pairs = match_landmarks(features.descriptors, descriptors, points, **settings)
             matches = Matches(features.keypoints[pairs[:, 0]], points[pairs[:, 1]], camera)
         else:
-            matches = Matches(*self._matched_by_pairs(features, images), camera)
+            # A keypoint and a landmark paired by several pictures are one match: repeated, it would count as many.
+            found, seen = [np.zeros((0, 2), np.int64)], self.map.observations
+            for image in images.tolist():
+                part, taken_by = seen.of(image), self.map.cameras[image]
+                known, size = from_bytes(seen.descriptors[part]), (taken_by.width, taken_by.height)
+                other = Features(seen.keypoints[part], known, np.ones(len(known), np.float32), size)
+                alike = self.matcher(features, other)
+                found.append(np.stack([alike[:, 0], seen.landmark[part][alike[:, 1]].astype(np.int64)], 1))
+            keypoint, number = np.unique(np.concatenate(found), axis=0).T
+            pixels, positions = features.keypoints[keypoint], self.map.landmarks.points_world[number]
+            matches = Matches(pixels, positions, camera)
         limit = self.settings.max_error_px * scale
         fit, evidence = matches.ransac(limit), matches
         if fit is None:
@@ -169,24 +179,6 @@ class Localizer:
             confidence(agreeing, camera),
             torch.from_numpy(matches.covariance(fit)).float(),
         )
-
-    def _matched_by_pairs(
-        self, features: Features, images: Int64[np.ndarray, "chosen"]
-    ) -> tuple[Float32[np.ndarray, "match 2"], Float32[np.ndarray, "match 3"]]:
-        """Pixels and world positions from picture-to-picture matches with each database picture.
-
-        A keypoint and a landmark paired by several images are one match: repeated, it would count as many.
-        """
-        assert self.matcher is not None
-        found, seen = [np.zeros((0, 2), np.int64)], self.map.observations
-        for image in images.tolist():
-            part, camera = seen.of(image), self.map.cameras[image]
-            descriptors, size = from_bytes(seen.descriptors[part]), (camera.width, camera.height)
-            other = Features(seen.keypoints[part], descriptors, np.ones(len(descriptors), np.float32), size)
-            pairs = self.matcher(features, other)
-            found.append(np.stack([pairs[:, 0], seen.landmark[part][pairs[:, 1]].astype(np.int64)], 1))
-        keypoint, landmark = np.unique(np.concatenate(found), axis=0).T
-        return features.keypoints[keypoint], self.map.landmarks.points_world[landmark]
 
 
 def confidence(agreeing: Float32[np.ndarray, "match 2"], camera: Camera) -> float:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Float64, UInt8
 from PIL import Image
 from torch import Tensor
 
@@ -110,7 +110,20 @@ class Track:
         for index, photo in photos.items():
             R[index], t[index] = photo.T_world_cam.R.float(), photo.T_world_cam.t.float()
         whole = filled(Trajectory(pictures.timestamps, R, t), placed)
-        gaps, kept = _gaps(placed, pictures.timestamps, max_gap_s)
+        # Stretches without placed pictures (from the last one before to the first one after), and the frames kept
+        kept, gaps = placed.clone(), []
+        known = placed.nonzero()[:, 0]
+        edges = [-1, *known.tolist(), len(placed)]
+        for before, after in itertools.pairwise(edges):
+            if after - before > 1:
+                inside = before >= 0 and after < len(placed)
+                start, stop = (
+                    pictures.timestamps[max(before, 0)].item(),
+                    pictures.timestamps[min(after, len(placed) - 1)].item(),
+                )
+                bridged = inside and stop - start <= max_gap_s
+                kept[before + 1 : after] = bridged
+                gaps.append((start, stop, bridged))
         tracks, distances = model.tracks, [np.zeros(0)]
         for index, photo in enumerate(model.photos):
             mine = tracks.photo == index
@@ -125,7 +138,7 @@ class Track:
             tracks.colors,
             len(placed),
             int(placed.sum()),
-            gaps,
+            tuple(gaps),
             float(joined.mean()) if len(joined) else float("nan"),
         )
 
@@ -176,23 +189,6 @@ def track_pictures(
         check_size(read_image(pictures.folder / pictures.names[0]), camera, pictures.names[0])
     model = map_pictures(pictures.names, pictures.folder, output, camera, settings.mapping, advance)
     return Track.of_model(read_colmap(model, pictures.folder), pictures, settings.max_gap_s, where=output)
-
-
-def _gaps(
-    placed: Bool[Tensor, "picture"], timestamps: Float64[Tensor, "picture"], max_gap_s: float
-) -> tuple[tuple[tuple[float, float, bool], ...], Bool[Tensor, "picture"]]:
-    """Stretches without placed pictures (from the last one before to the first one after), and the frames kept."""
-    kept, gaps = placed.clone(), []
-    index = placed.nonzero()[:, 0]
-    edges = [-1, *index.tolist(), len(placed)]
-    for before, after in itertools.pairwise(edges):
-        if after - before > 1:
-            inside = before >= 0 and after < len(placed)
-            start, stop = timestamps[max(before, 0)].item(), timestamps[min(after, len(placed) - 1)].item()
-            bridged = inside and stop - start <= max_gap_s
-            kept[before + 1 : after] = bridged
-            gaps.append((start, stop, bridged))
-    return tuple(gaps), kept
 
 
 def _claim(source: Path, output: Path, settings: TrackSettings, camera: Camera | None) -> None:

@@ -103,8 +103,15 @@ def run_of(graph: Graph, runtime: str = "eager", precision: str = "float32") -> 
     if runtime == "onnx":
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "network.onnx"
-            write_onnx(graph, path)
-            return open_onnx(_narrowed(path) if precision == "int8" else path)
+            exported = program(graph)
+            with quiet(), torch.inference_mode():
+                torch.onnx.export(exported, (), path, kwargs=graph.inputs, dynamo=True, external_data=False)
+            if precision == "int8":
+                from onnxruntime.quantization import QuantType, quantize_dynamic
+
+                wide, path = path, path.with_name("network8.onnx")
+                quantize_dynamic(wide, path, weight_type=QuantType.QInt8, per_channel=True, reduce_range=True)
+            return open_onnx(path)
     run: Run = graph.module
     if runtime == "compile":
         # Static shapes; on a GPU replayed as CUDA graphs, whose outputs are overwritten by the next replay.
@@ -132,13 +139,6 @@ def program(graph: Graph) -> torch.export.ExportedProgram:
         assert isinstance(graph.module, nn.Module)
         module = copy.deepcopy(graph.module).cpu().eval()
         return torch.export.export(module, (), graph.inputs, dynamic_shapes=dynamic)
-
-
-def write_onnx(graph: Graph, path: Path) -> None:
-    """Write a graph as an ONNX file."""
-    exported = program(graph)
-    with quiet(), torch.inference_mode():
-        torch.onnx.export(exported, (), path, kwargs=graph.inputs, dynamo=True, external_data=False)
 
 
 def open_onnx(path: str | Path) -> Run:
@@ -196,11 +196,3 @@ def quiet() -> Iterator[None]:
             yield
     finally:
         logging.disable(before)
-
-
-def _narrowed(path: Path) -> Path:
-    from onnxruntime.quantization import QuantType, quantize_dynamic
-
-    narrow = path.with_name("network8.onnx")
-    quantize_dynamic(path, narrow, weight_type=QuantType.QInt8, per_channel=True, reduce_range=True)
-    return narrow

@@ -81,16 +81,6 @@ def _name(kind: type) -> str:
     return f"{kind.__module__}.{kind.__qualname__}"
 
 
-def _attributes(value: Any) -> dict[str, Any]:
-    """What an object's state consists of; cached properties of data classes and `transient` attributes do not count."""
-    if dataclasses.is_dataclass(value):
-        names = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-    else:
-        names = vars(value)
-    left_out = getattr(type(value), "transient", ())
-    return {name: part for name, part in names.items() if name not in left_out}
-
-
 class _Writer:
     """Turns values into JSON: [kind, content], with tensors and objects by number."""
 
@@ -130,7 +120,14 @@ class _Writer:
             self._number[id(value)] = len(self.objects)
             self._alive.append(value)
             self.objects.append(None)
-            parts = {name: self.encoded(part) for name, part in _attributes(value).items()}
+            # Cached properties of data classes and `transient` attributes are no part of the state.
+            if dataclasses.is_dataclass(value):
+                names = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+            else:
+                names = vars(value)
+            left_out = getattr(type(value), "transient", ())
+            kept = {name: part for name, part in names.items() if name not in left_out}
+            parts = {name: self.encoded(part) for name, part in kept.items()}
             self.objects[self._number[id(value)]] = [_name(kind), parts]
         return ["object", self._number[id(value)]]
 

@@ -203,7 +203,15 @@ def initialize(
     if settings.yaw == "tangent":
         yaw = _tangent_yaw(paths, settings)
     else:
-        yaw = _orientation_yaw(suit, localization, seen, R_head_cam, settings)
+        # Angle about gravity from the suit's head to the head implied by the camera's orientation, robustly smoothed
+        head = suit.joint("head")
+        R_world_head = resample(Trajectory(suit.timestamps, head.R, head.t), times).R_world_body
+        angle, certainty = yaw_between(R_world_head, localization.R_world_cam[seen].to(head.R.dtype) @ R_head_cam.mT)
+        weight = (localization.confidence[seen] * certainty).double()
+        pointer = torch.stack([angle.cos(), angle.sin()], -1).double()
+        smooth = _robust_smooth(times, pointer, weight, settings.yaw_smoothing_s, ANGLE_SCALE)
+        frames = torch.from_numpy(np.unwrap(torch.atan2(smooth[:, 1], smooth[:, 0]).numpy()))
+        yaw = _interpolated(suit.timestamps, times, frames[:, None])[:, 0]
         # Alignment with a nominal mount inherits the mount's yaw error; walking reveals it: the constant angle by which
         # the suit's path, turned by `yaw`, still differs from the camera's.
         body_step, camera_step, moving = paths.steps(PATH_SPAN_S, settings.min_speed)
@@ -250,20 +258,6 @@ def _tangent_yaw(paths: _Paths, settings: InitializationSettings) -> Float64[Ten
     frame = torch.where(moving, torch.arange(len(body)), -1).cummax(0).values
     frame = torch.where(frame < 0, moving.nonzero()[0], frame)
     return (camera * body.conj()).angle()[frame]
-
-
-def _orientation_yaw(
-    suit: Motion, localization: Localization, seen: Tensor, R_head_cam: Tensor, settings: InitializationSettings
-) -> Float64[Tensor, "time"]:
-    """Angle about gravity from the suit's head to the head implied by the camera's orientation, robustly smoothed."""
-    head, times = suit.joint("head"), localization.timestamps[seen]
-    R_world_head = resample(Trajectory(suit.timestamps, head.R, head.t), times).R_world_body
-    angle, certainty = yaw_between(R_world_head, localization.R_world_cam[seen].to(head.R.dtype) @ R_head_cam.mT)
-    weight = (localization.confidence[seen] * certainty).double()
-    pointer = torch.stack([angle.cos(), angle.sin()], -1).double()
-    smooth = _robust_smooth(times, pointer, weight, settings.yaw_smoothing_s, ANGLE_SCALE)
-    frames = torch.from_numpy(np.unwrap(torch.atan2(smooth[:, 1], smooth[:, 0]).numpy()))
-    return _interpolated(suit.timestamps, times, frames[:, None])[:, 0]
 
 
 def _bridged(paths: _Paths, yaw: Tensor, settings: InitializationSettings) -> Float64[Tensor, "time 3"]:

@@ -142,7 +142,29 @@ def by_head_imu(
     a_slam, force_slam, R, fps = _alike(slam, imu, R_cam_imu, t_cam_imu)
     # a_slam = k R f - h - R b with h = -g/s (up), b = k bias
     rows = np.concatenate([force_slam[:, :, None], np.broadcast_to(-np.eye(3), R.shape), -R], 2)
-    x, covariance = _robust(rows, a_slam, round(_BLOCK_S * fps), _BIAS)
+    # Huber's estimate of x in rows @ x = y, and its covariance with errors that are correlated within blocks;
+    # the last three unknowns, k times a bias, have a zero-mean prior
+    block = round(_BLOCK_S * fps)
+    weight, prior = np.ones(len(a_slam)), np.zeros(rows.shape[2])
+    sigma2, k = a_slam.var(), 0.0
+    for _ in range(_ROUNDS):
+        # Errors are correlated over a block: a block counts as one observation against the prior.
+        prior[-3:] = block * sigma2 / max(k * _BIAS, 1e-6) ** 2 if k else 1e6 * len(a_slam)
+        normal = np.einsum("t,tij,tik->jk", weight, rows, rows) + np.diag(prior)
+        x = np.linalg.solve(normal, np.einsum("t,tij,ti->j", weight, rows, a_slam))
+        k = abs(x[0])
+        error = a_slam - rows @ x
+        size = np.linalg.norm(error, axis=1)
+        scale = np.median(size) / 1.54  # of a three-dimensional normal error, per axis
+        weight = np.minimum(1.0, 2.5 * scale / np.maximum(size, 1e-12))
+        sigma2 = scale**2
+    scores = np.einsum("t,tij,ti->tj", weight, rows, error)
+    count = len(scores) // block * block
+    summed = scores[:count].reshape(-1, block, rows.shape[2]).sum(1)
+    inverse = np.linalg.inv(normal)
+    middle = summed.T @ summed * len(scores) / max(count, 1)
+    middle[-3:, -3:] += np.diag(prior[-3:] ** 2 * (k * _BIAS) ** 2)
+    covariance = inverse @ middle @ inverse
     k, up = x[0], x[1:4]
     length = np.linalg.norm(up) / k if abs(k) > 1e-12 else math.inf
     deviation = math.sqrt(covariance[0, 0]) / abs(k)
@@ -210,31 +232,6 @@ def _alike(
     a_slam = acceleration(poses.t_world_body[::fine], 1 / step, n).numpy()
     inner = slice(n, len(a_slam) - n)
     return a_slam[inner], (force_slam - swung)[inner], turned.reshape(-1, 3, 3)[inner], 1 / step
-
-
-def _robust(rows: np.ndarray, y: np.ndarray, block: int, bias: float) -> tuple[np.ndarray, np.ndarray]:
-    """Huber's estimate of x in rows (time, 3, unknown) x = y (time, 3), and its covariance with errors that are
-    correlated within blocks. The last three unknowns, k times a bias, have a zero-mean prior."""
-    weight, prior = np.ones(len(y)), np.zeros(rows.shape[2])
-    sigma2, k = y.var(), 0.0
-    for _ in range(_ROUNDS):
-        # Errors are correlated over a block: a block counts as one observation against the prior.
-        prior[-3:] = block * sigma2 / max(k * bias, 1e-6) ** 2 if k else 1e6 * len(y)
-        normal = np.einsum("t,tij,tik->jk", weight, rows, rows) + np.diag(prior)
-        x = np.linalg.solve(normal, np.einsum("t,tij,ti->j", weight, rows, y))
-        k = abs(x[0])
-        error = y - rows @ x
-        size = np.linalg.norm(error, axis=1)
-        scale = np.median(size) / 1.54  # of a three-dimensional normal error, per axis
-        weight = np.minimum(1.0, 2.5 * scale / np.maximum(size, 1e-12))
-        sigma2 = scale**2
-    scores = np.einsum("t,tij,ti->tj", weight, rows, error)
-    count = len(scores) // block * block
-    summed = scores[:count].reshape(-1, block, rows.shape[2]).sum(1)
-    inverse = np.linalg.inv(normal)
-    middle = summed.T @ summed * len(scores) / max(count, 1)
-    middle[-3:, -3:] += np.diag(prior[-3:] ** 2 * (k * bias) ** 2)
-    return x, inverse @ middle @ inverse
 
 
 def by_floor(

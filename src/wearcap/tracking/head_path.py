@@ -206,7 +206,15 @@ class HeadTrack:
             count = self.stride if stop is None else min(stop - first, self.stride)
             chunk = None
             if count > 0:
-                chunk = self._chunk(measured, start, first, count)
+                frames = torch.arange(first - self._provisional, first + count, dtype=torch.float64)
+                times = start + frames / self.fps
+                at = times.clamp(measured.timestamps[0].item(), measured.timestamps[-1].item())
+                place = torch.searchsorted(measured.timestamps, at - _SAME_S).clamp_max(len(measured) - 1)
+                exact = (measured.timestamps[place] - at).abs() <= _SAME_S
+                at = torch.where(exact, measured.timestamps[place], at)
+                poses = (measured[place] if exact.all() else resample(measured, at)).T_world_body
+                old, self._provisional = self._provisional, int((times > measured.timestamps[-1] + _SAME_S).sum())
+                chunk = Chunk(times[old:], poses[old:], poses[:old], first, not self.inside)
                 self._start, self._next, self.inside = start, first + count, True
             if stop is not None and first + count >= stop:
                 self.inside, self._provisional = False, 0
@@ -227,17 +235,6 @@ class HeadTrack:
         every = Trajectory(torch.tensor(times, dtype=torch.float64), torch.stack(R), torch.stack(t))
         cut = _breaks(every)
         return every[: int(torch.searchsorted(every.timestamps, cut[0][0], right=True))] if cut else every
-
-    def _chunk(self, measured: Trajectory, start: float, first: int, count: int) -> Chunk:
-        frames = torch.arange(first - self._provisional, first + count, dtype=torch.float64)
-        times = start + frames / self.fps
-        at = times.clamp(measured.timestamps[0].item(), measured.timestamps[-1].item())
-        place = torch.searchsorted(measured.timestamps, at - _SAME_S).clamp_max(len(measured) - 1)
-        exact = (measured.timestamps[place] - at).abs() <= _SAME_S
-        at = torch.where(exact, measured.timestamps[place], at)
-        poses = (measured[place] if exact.all() else resample(measured, at)).T_world_body
-        old, self._provisional = self._provisional, int((times > measured.timestamps[-1] + _SAME_S).sum())
-        return Chunk(times[old:], poses[old:], poses[:old], first, not self.inside)
 
     def _forget(self, measured: Trajectory) -> None:
         """Drop the poses that later frames are not interpolated from."""

@@ -74,7 +74,15 @@ def read_egohoi(
     objects, paths, contacts = [], {}, []
     for object_id, (locations, labels) in _object_files(root, name, object_name).items():
         annotated = read_object_locations(locations)
-        kind = _motion_type(object_id, annotated, motion_types or {}, locations)
+        default = "along_floor" if annotated.hinge is None else "hinge"
+        kind = next(
+            (kind for pattern, kind in (motion_types or {}).items() if fnmatchcase(object_id, pattern)), default
+        )
+        if kind not in MOTION_TYPES:
+            raise WearcapError(f"motion type {kind!r} of {object_id}", expected=f"one of {', '.join(MOTION_TYPES)}")
+        if kind == "hinge" and annotated.hinge is None:
+            what = f"{object_id} is to turn about a hinge and has none"
+            raise WearcapError(what, where=locations, expected='"hinge": [x, y, z]', fix="Give it another motion type.")
         if kind == "absent":
             continue
         item = _scene_object(object_id, annotated, root / "object_models" / f"{object_id}.ply", kind, clock.start_s)
@@ -129,17 +137,6 @@ def _only_object(root: Path, name: str) -> str:
         fix = f"Give its object's name: one of {', '.join(fitting or models)}."
         raise WearcapError(what, where=root / "object_models", expected=f"{stem}.ply", fix=fix)
     return fitting[0]
-
-
-def _motion_type(object_id: str, annotated: _AnnotatedObject, motion_types: Mapping[str, str], where: Path) -> str:
-    default = "along_floor" if annotated.hinge is None else "hinge"
-    kind = next((kind for pattern, kind in motion_types.items() if fnmatchcase(object_id, pattern)), default)
-    if kind not in MOTION_TYPES:
-        raise WearcapError(f"motion type {kind!r} of {object_id}", expected=f"one of {', '.join(MOTION_TYPES)}")
-    if kind == "hinge" and annotated.hinge is None:
-        what = f"{object_id} is to turn about a hinge and has none"
-        raise WearcapError(what, where=where, expected='"hinge": [x, y, z]', fix="Give it another motion type.")
-    return kind
 
 
 def read_object_locations(path: str | Path) -> _AnnotatedObject:

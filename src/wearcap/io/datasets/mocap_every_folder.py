@@ -94,7 +94,18 @@ def read_mocap_every_folder(folder: str | Path) -> MocapEveryFolder:
     noted = marks.get("shutter")
     noted = config.get("cam_shutter_timestamp") if noted is None else noted
     shutter_s = 0.0 if noted is None else _numbers([noted], 1, "the shutter's time", folder)[0]
-    track = _trajectory(folder / TRAJECTORY, shutter_s)
+    path = folder / TRAJECTORY
+    content = read_pickle(path)
+    table = np.asarray(content) if isinstance(content, np.ndarray | list) else np.zeros(0)
+    require({"poses": table}, path, poses=("time", 7))
+    if not len(table):
+        raise WearcapError("no poses", where=path, expected="a row of 7 numbers per picture")
+    if abs(table[0, 3]) > 0.9999 > abs(table[0, 6]):
+        what = "the first quaternion is the identity with the scalar first"
+        expected = "x y z, then qx qy qz qw"
+        raise WearcapError(what, where=path, expected=expected, fix="Move the scalar to the end of the rows.")
+    times = shutter_s + np.arange(len(table)) / FPS
+    track = checked_trajectory(times, table[:, :3], table[:, [6, 3, 4, 5]], path)
     video = folder / VIDEO if (folder / VIDEO).is_file() else None
     size = None if video is None else (video_info(video).width, video_info(video).height)
     points = read_ply(folder / POINTS).points if (folder / POINTS).is_file() else None
@@ -146,46 +157,30 @@ def _camera_stream(folder: MocapEveryFolder, T_head_cam: Rigid) -> CameraStream 
     return CameraStream(track.timestamps, folder.camera, T_head_cam.R, T_head_cam.t)
 
 
-def _trajectory(path: Path, start_s: float) -> Trajectory:
-    content = read_pickle(path)
-    table = np.asarray(content) if isinstance(content, np.ndarray | list) else np.zeros(0)
-    require({"poses": table}, path, poses=("time", 7))
-    if not len(table):
-        raise WearcapError("no poses", where=path, expected="a row of 7 numbers per picture")
-    if abs(table[0, 3]) > 0.9999 > abs(table[0, 6]):
-        what = "the first quaternion is the identity with the scalar first"
-        expected = "x y z, then qx qy qz qw"
-        raise WearcapError(what, where=path, expected=expected, fix="Move the scalar to the end of the rows.")
-    times = start_s + np.arange(len(table)) / FPS
-    return checked_trajectory(times, table[:, :3], table[:, [6, 3, 4, 5]], path)
-
-
 def _config(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     damage = (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError)
     with understood("not readable YAML", path, errors=damage):
         text = read_text(path, usual=_MAX_CONFIG_BYTES)
-        _require_plain_yaml(text, path)
+        # Aliases and deep nesting take quadratic time to parse.
+        depth = 0
+        for event in yaml.parse(text, yaml.SafeLoader):
+            if isinstance(event, yaml.AliasEvent):
+                what = "it refers to its own parts (&name, *name)"
+                expected = "plain keys with values"
+                raise WearcapError(
+                    what, where=path, expected=expected, fix="Write them out: such references can blow up."
+                )
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > MAX_JSON_DEPTH:
+                raise WearcapError(
+                    "YAML that is nested too deeply", where=path, expected=f"at most {MAX_JSON_DEPTH} levels"
+                )
         content = yaml.safe_load(text)
     if not isinstance(content, dict | None):
         raise WearcapError(f"it holds a {type(content).__name__}", where=path, expected="keys with values")
     return content or {}
-
-
-def _require_plain_yaml(text: str, path: Path) -> None:
-    """Raise WearcapError for YAML aliases and for deep nesting, whose parsing takes quadratic time."""
-    depth = 0
-    for event in yaml.parse(text, yaml.SafeLoader):
-        if isinstance(event, yaml.AliasEvent):
-            what = "it refers to its own parts (&name, *name)"
-            expected = "plain keys with values"
-            raise WearcapError(what, where=path, expected=expected, fix="Write them out: such references can blow up.")
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if depth > MAX_JSON_DEPTH:
-            raise WearcapError(
-                "YAML that is nested too deeply", where=path, expected=f"at most {MAX_JSON_DEPTH} levels"
-            )
 
 
 def _marks(path: Path) -> dict[str, Any]:

@@ -100,7 +100,13 @@ def align_head(
     head, seen = (resample(track, grid).T_world_body.to(torch.float64) for track in (suit, device))
     R_head_device = _mounting_rotation(head.R, seen.R)
     R_apart = seen.R @ R_head_device.mT @ head.R.mT
-    yaw, knots = _windowed_yaw(R_apart, grid, window_s)
+    # Yaw (rad, unwrapped) by window, and the windows' middles
+    cos, sin = R_apart[:, 0, 0] + R_apart[:, 1, 1], R_apart[:, 1, 0] - R_apart[:, 0, 1]
+    length = torch.hypot(cos, sin).clamp(min=1e-9)
+    count = max(2, round((grid[-1] - grid[0]).item() / (window_s / 2)) + 1)
+    knots = torch.linspace(grid[0].item(), grid[-1].item(), count, dtype=torch.float64)
+    mean = _windowed_median(torch.stack([cos / length, sin / length], 1), grid, knots, window_s)
+    yaw = torch.from_numpy(np.unwrap(torch.atan2(mean[:, 1], mean[:, 0]).numpy()))
     R_world_suit = rotation.about_axis("z", _between(knots, yaw, grid))
     t_seat = _mounting_position(
         Rigid(R_world_suit @ head.R, (R_world_suit @ head.t[..., None])[..., 0]), seen, t_head_device.double()
@@ -148,16 +154,6 @@ def _mounting_position(head: Rigid, seen: Rigid, t_prior: Float64[Tensor, "3"]) 
         right = torch.einsum("n,nki,nk->i", weight, A, b) + t_prior / _SEAT_PRIOR_M**2
         t = torch.linalg.solve(normal, right)
     return t
-
-
-def _windowed_yaw(R_apart: Tensor, grid: Tensor, window_s: float) -> tuple[Tensor, Tensor]:
-    """Yaw (rad, unwrapped) by window, and the windows' middles."""
-    cos, sin = R_apart[:, 0, 0] + R_apart[:, 1, 1], R_apart[:, 1, 0] - R_apart[:, 0, 1]
-    length = torch.hypot(cos, sin).clamp(min=1e-9)
-    count = max(2, round((grid[-1] - grid[0]).item() / (window_s / 2)) + 1)
-    knots = torch.linspace(grid[0].item(), grid[-1].item(), count, dtype=torch.float64)
-    mean = _windowed_median(torch.stack([cos / length, sin / length], 1), grid, knots, window_s)
-    return torch.from_numpy(np.unwrap(torch.atan2(mean[:, 1], mean[:, 0]).numpy())), knots
 
 
 def _windowed_median(value: Tensor, grid: Tensor, knots: Tensor, window_s: float) -> Tensor:

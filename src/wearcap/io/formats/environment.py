@@ -71,7 +71,14 @@ def write_environment(environment: Environment, path: str | Path) -> None:
     for item in environment.objects:
         where = f"{path}: object {item.name!r}"
         _check(item, where)
-        rows.append(_row(item, f"objects/{_file_name(item.name, taken)}.ply", where))
+        plain = re.sub(r"[^A-Za-z0-9_-]+", "_", item.name).strip("_")[:60] or "object"
+        if re.fullmatch(r"(?i)con|prn|aux|nul|com\d|lpt\d", plain):
+            plain = f"{plain}_"
+        free, number = plain, 2
+        while free.lower() in taken:
+            free, number = f"{plain}-{number}", number + 1
+        taken.add(free.lower())
+        rows.append(_row(item, f"objects/{free}.ply", where))
     for item, row in zip(environment.objects, rows):
         write_ply(Ply.of(item.mesh), path.parent / row["mesh"])
     lines = ",\n  ".join(json.dumps(row, ensure_ascii=False, allow_nan=False) for row in rows)
@@ -150,18 +157,6 @@ def _row(item: SceneObject, mesh: str, where: str) -> dict[str, Any]:
     ]
     values = (item.name, item.category, mesh, R, t, row)
     return dict(zip(_KEYS, values))
-
-
-def _file_name(name: str, taken: set[str]) -> str:
-    """A file name that every file system accepts and that is unique in this environment."""
-    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "object"
-    if re.fullmatch(r"(?i)con|prn|aux|nul|com\d|lpt\d", plain):
-        plain = f"{plain}_"
-    free, number = plain, 2
-    while free.lower() in taken:
-        free, number = f"{plain}-{number}", number + 1
-    taken.add(free.lower())
-    return free
 
 
 def _check(item: SceneObject, where: str) -> None:

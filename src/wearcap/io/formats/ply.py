@@ -92,7 +92,19 @@ def read_ply(path: str | Path) -> Ply:
     data = read_bytes(path)
     byte_order, elements, body = _parse_header(data, path)
     if byte_order == "=":
-        tables = _read_ascii(elements, memoryview(data)[body:], path)
+        text = io.TextIOWrapper(io.BytesIO(memoryview(data)[body:]), "ascii", errors="replace", newline="\n")
+        lines = (line for line in text if line.strip())
+        tables = {}
+        for element in elements:
+            if element.count == 0:
+                tables[element.name] = {}
+                continue
+            read = _ascii_lists if any(p.count_dtype for p in element.properties) else _ascii_table
+            with understood(f"a {element.name} row does not match the header", path):
+                table, rows = read(element, lines)
+            if rows < element.count:
+                raise _cut_short(path, element)
+            tables[element.name] = table
     else:
         tables = {}
         for element in elements:
@@ -249,23 +261,6 @@ def _read_even_rows(element: _Element, data: bytes, start: int, order: str) -> t
                 return None, start
             table[p.name] = _Lists(values.reshape(-1), np.full(len(rows), values.shape[1]))
     return table, stop
-
-
-def _read_ascii(elements: list[_Element], body: memoryview, path) -> dict[str, dict]:
-    text = io.TextIOWrapper(io.BytesIO(body), "ascii", errors="replace", newline="\n")
-    lines = (line for line in text if line.strip())
-    tables = {}
-    for element in elements:
-        if element.count == 0:
-            tables[element.name] = {}
-            continue
-        read = _ascii_lists if any(p.count_dtype for p in element.properties) else _ascii_table
-        with understood(f"a {element.name} row does not match the header", path):
-            table, rows = read(element, lines)
-        if rows < element.count:
-            raise _cut_short(path, element)
-        tables[element.name] = table
-    return tables
 
 
 def _ascii_table(element: _Element, lines: Iterator[str]) -> tuple[dict, int]:
