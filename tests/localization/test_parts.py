@@ -13,11 +13,10 @@ from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.colmap import Tracks
-from wearcap.localization.absolute_pose import Fit, Matches
+from wearcap.localization.absolute_pose import Fit, Matches, match_landmarks, match_nearby
 from wearcap.localization.features import Features, RootSift, Vlad, most_similar, root
 from wearcap.localization.localizer import confidence
 from wearcap.localization.map_builder import MapSettings, _lift
-from wearcap.localization.matching import match_landmarks, match_nearby
 from wearcap.localization.point_map import PointMap, PointMapper, undistortion
 from wearcap.localization.visual_map import from_bytes, merge, to_bytes
 from wearcap.recording.photo import Photo

@@ -19,9 +19,8 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.localization.absolute_pose import CameraPose, Fit, Matches
+from wearcap.localization.absolute_pose import CameraPose, Fit, Matches, match_landmarks, match_nearby
 from wearcap.localization.features import Extractor, Features, GlobalDescriptor, Matcher, Vlad, most_similar
-from wearcap.localization.matching import match_landmarks, match_nearby
 from wearcap.localization.point_map import described
 from wearcap.localization.visual_map import VisualMap, from_bytes
 from wearcap.recording.recording import Localization

@@ -18,8 +18,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.hcontact import activity_of, location_of, read_smpl_json
-from wearcap.io.datasets.hps import read_hps_subject
-from wearcap.io.datasets.hps_sequence import subject_of
+from wearcap.io.datasets.hps import read_hps_subject, subject_of
 from wearcap.io.formats.bounded import understood
 from wearcap.io.formats.contact_labels import LabelClock, interactions_of, labels_of, parse_labels
 from wearcap.io.formats.ply import read_ply

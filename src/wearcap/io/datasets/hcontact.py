@@ -17,7 +17,7 @@ import torch
 from wearcap.body.skeletons import smpl24, smplh52
 from wearcap.errors import WearcapError
 from wearcap.files import parse_json
-from wearcap.io.datasets.hps_sequence import subject_of
+from wearcap.io.datasets.hps import subject_of
 from wearcap.io.formats.bounded import Budget, counted, file_size, understood
 from wearcap.io.formats.contact_labels import LabelClock, read_contact_labels
 from wearcap.io.formats.npz import readable, require
