@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 from safetensors.torch import load_file
-from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.files import parse_json, sha256_of
@@ -55,15 +54,38 @@ def load_exported(path: str | Path, network: str | None = None) -> Any:
     `network`: the expected system's name. Raises WearcapError when a file is missing, unreadable, of another system, or
     does not belong to the others.
     """
-    runs, about = {"model": open_exported(path)}, read_sidecar(path, network)
+    runs = {"model": open_exported(path)}
+    sidecar = sidecar_path(path)
+    try:
+        about = parse_json(sidecar.read_bytes(), sidecar)
+    except FileNotFoundError as error:
+        raise WearcapError(
+            "no such sidecar",
+            where=sidecar,
+            expected="the .json file that `wearcap export` wrote beside the model",
+            fix="Copy both files.",
+        ) from error
+    if not isinstance(about, dict) or about.get("wearcap_export") != VERSION:
+        raise WearcapError("not a sidecar of this version", where=sidecar, fix="Export the model again.")
+    name = str(about.get("network"))
+    package = f"wearcap.systems.{name}"
+    if (network or name) != name or not (
+        name.isidentifier() and all(map(importlib.util.find_spec, (package, f"{package}.export")))
+    ):
+        raise WearcapError(f"a {name[:40]} network", where=path, expected=f"a {network or 'known'} network")
+    files = {Path(path): about["model"]}
+    files |= {_file_of(path, part): entry for part, entry in about["parts"].items()}
+    files |= {_file_of(path, part, weights=True): entry for part, entry in about["weights"].items()}
+    for file, entry in files.items():
+        if not file.is_file():
+            raise WearcapError(
+                "a part of the exported model is missing", where=file, fix="Copy all files of the export."
+            )
+        if entry["sha256"] != sha256_of(file):
+            raise WearcapError("its sidecar belongs to another model file", where=file, fix="Export the model again.")
     runs |= {name: open_exported(part_path(path, name)) for name in about["parts"]}
-    weights = {name: weights_of(path, name) for name in about["weights"]}
+    weights = {name: load_file(_file_of(path, name, weights=True)) for name in about["weights"]}
     return importlib.import_module(f"wearcap.systems.{about['network']}.export").from_export(runs, weights, about)
-
-
-def weights_of(path: str | Path, name: str) -> dict[str, Tensor]:
-    """Weights that are written beside a model."""
-    return load_file(_file_of(path, name, weights=True))
 
 
 def part_path(path: str | Path, part: str) -> Path:
@@ -74,39 +96,6 @@ def part_path(path: str | Path, part: str) -> Path:
 
 def sidecar_path(path: str | Path) -> Path:
     return Path(path).with_suffix(".json")
-
-
-def read_sidecar(path: str | Path, network: str | None = None) -> dict[str, Any]:
-    """The sidecar of a model file. Raises WearcapError when it is missing, foreign, or of another network or file."""
-    sidecar = sidecar_path(path)
-    try:
-        tree = parse_json(sidecar.read_bytes(), sidecar)
-    except FileNotFoundError as error:
-        raise WearcapError(
-            "no such sidecar",
-            where=sidecar,
-            expected="the .json file that `wearcap export` wrote beside the model",
-            fix="Copy both files.",
-        ) from error
-    if not isinstance(tree, dict) or tree.get("wearcap_export") != VERSION:
-        raise WearcapError("not a sidecar of this version", where=sidecar, fix="Export the model again.")
-    name = str(tree.get("network"))
-    package = f"wearcap.systems.{name}"
-    if (network or name) != name or not (
-        name.isidentifier() and all(map(importlib.util.find_spec, (package, f"{package}.export")))
-    ):
-        raise WearcapError(f"a {name[:40]} network", where=path, expected=f"a {network or 'known'} network")
-    files = {Path(path): tree["model"]}
-    files |= {_file_of(path, part): entry for part, entry in tree["parts"].items()}
-    files |= {_file_of(path, part, weights=True): entry for part, entry in tree["weights"].items()}
-    for file, entry in files.items():
-        if not file.is_file():
-            raise WearcapError(
-                "a part of the exported model is missing", where=file, fix="Copy all files of the export."
-            )
-        if entry["sha256"] != sha256_of(file):
-            raise WearcapError("its sidecar belongs to another model file", where=file, fix="Export the model again.")
-    return tree
 
 
 def _file_of(path: str | Path, part: str, weights: bool = False) -> Path:

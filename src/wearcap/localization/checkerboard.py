@@ -21,7 +21,7 @@ _HINT_FRAMES = 12
 
 
 @dataclass(frozen=True)
-class View:
+class _View:
     """Detection of the board in one image."""
 
     name: str
@@ -57,7 +57,7 @@ class Board:
     def __str__(self) -> str:
         return f"{self.columns}x{self.rows}"
 
-    def find(self, gray: UInt8[np.ndarray, "height width"], name: str = "") -> View | None:
+    def find(self, gray: UInt8[np.ndarray, "height width"], name: str = "") -> _View | None:
         """Corners of the whole board in a grey picture, refined to a fraction of a pixel; None where it is not seen."""
         shrink = max(1.0, gray.shape[1] / _SEARCH_WIDTH)
         small = (
@@ -74,7 +74,7 @@ class Board:
         stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
         corners = cv2.cornerSubPix(gray, corners.astype(np.float32).reshape(-1, 1, 2), (reach, reach), (-1, -1), stop)
         blur = cv2.estimateChessboardSharpness(gray, pattern, corners)[0][0]
-        return View(name, corners.reshape(-1, 2), float(blur))
+        return _View(name, corners.reshape(-1, 2), float(blur))
 
 
 @dataclass(frozen=True)
@@ -110,8 +110,8 @@ class Calibration:
     """The larger standard deviation of the two focal lengths."""
     coverage: float
     """Share of the picture's 8 x 6 cells in which corners were seen; distortion is extrapolated in the others."""
-    views: tuple[View, ...]
-    rejected: tuple[View, ...] = ()
+    views: tuple[_View, ...]
+    rejected: tuple[_View, ...] = ()
     """Views whose residual was too large."""
     seen: int = 0
     """Number of images in which the board was found, before the selection."""
@@ -169,7 +169,7 @@ def calibrate_from_pictures(
     return replace(_calibrated(chosen, board, size, settings), seen=len(views), examined=examined)
 
 
-def varied(views: Sequence[View], size: tuple[int, int], count: int) -> list[View]:
+def varied(views: Sequence[_View], size: tuple[int, int], count: int) -> list[_View]:
     """Up to `count` views that differ most in position, size and tilt, by farthest-point sampling from the sharpest."""
     appearances = []
     for view in views:
@@ -189,9 +189,9 @@ def varied(views: Sequence[View], size: tuple[int, int], count: int) -> list[Vie
     return [views[k] for k in sorted(chosen)]
 
 
-def _calibrated(views: list[View], board: Board, size: tuple[int, int], settings: CalibrationSettings) -> Calibration:
+def _calibrated(views: list[_View], board: Board, size: tuple[int, int], settings: CalibrationSettings) -> Calibration:
     """Calibrate, reject views with large residuals, calibrate again, until all agree."""
-    rejected: list[View] = []
+    rejected: list[_View] = []
     while True:
         if len(views) < settings.min_views:
             raise WearcapError(

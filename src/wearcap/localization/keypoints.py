@@ -83,7 +83,7 @@ class RecordedDetections:
         return found
 
 
-class Hand(NamedTuple):
+class _Hand(NamedTuple):
     """One detected hand."""
 
     x: float
@@ -137,7 +137,7 @@ class MediaPipeHands:
         for marks, side in zip(result.hand_landmarks, result.handedness):
             # MediaPipe names the person's own side in a picture that is not mirrored, as a head camera's is.
             left = side[0].score if side[0].category_name == "Left" else 1.0 - side[0].score
-            hands.append(Hand(marks[WRIST].x, marks[WRIST].y, left))
+            hands.append(_Hand(marks[WRIST].x, marks[WRIST].y, left))
         height, width = picture.shape[:2]
         return {
             joint: Keypoint(hand.x * width - 0.5, hand.y * height - 0.5, sure)
@@ -145,7 +145,7 @@ class MediaPipeHands:
         }
 
 
-def wearers_hands(hands: Sequence[Hand]) -> dict[str, tuple[Hand, float]]:
+def wearers_hands(hands: Sequence[_Hand]) -> dict[str, tuple[_Hand, float]]:
     """Which of up to two hands is the wearer's left wrist and which the right, and how sure that is (0…1).
 
     A wearer sees their left hand rather on the left: that adds to what the hand looks like. Two hands are never one side's.

@@ -20,7 +20,7 @@ from wearcap.scene.scan import Scan
 
 
 @dataclass(frozen=True, eq=False)
-class PointMap:
+class _PointMap:
     """Visible scan points and depths of a camera."""
 
     camera: Camera
@@ -89,10 +89,10 @@ class PointMapper:
         self.points, self.colors, self.splat_m = scan.points, scan.colors, splat_m
         self._cloud = SplatCloud.build(scan.points)
 
-    def __call__(self, camera: Camera, T_world_cam: Rigid) -> PointMap:
-        return PointMap(camera, T_world_cam, *self._cloud.draw(camera, T_world_cam, self.splat_m))
+    def __call__(self, camera: Camera, T_world_cam: Rigid) -> _PointMap:
+        return _PointMap(camera, T_world_cam, *self._cloud.draw(camera, T_world_cam, self.splat_m))
 
-    def color_picture(self, point_map: PointMap) -> UInt8[np.ndarray, "height width 3"]:
+    def color_picture(self, point_map: _PointMap) -> UInt8[np.ndarray, "height width 3"]:
         """The scan's colours as the camera sees them, black where nothing is. Raises WearcapError without colours."""
         if self.colors is None:
             raise WearcapError(
@@ -121,14 +121,14 @@ class _Undistortion:
     def image(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "height width 3"]:
         return cv2.remap(image, self.x, self.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
 
-    def point_map(self, point_map: PointMap) -> PointMap:
+    def point_map(self, point_map: _PointMap) -> _PointMap:
         """The point map with the nearest original pixel's point in each, its depths along the optical axis."""
         column, row = (np.where(self.valid, np.rint(side), 0).astype(np.int64) for side in (self.x, self.y))
         index = np.where(self.valid, point_map.index[row, column], -1).astype(np.int32)
         depth = np.where(self.valid, point_map.depth[row, column], np.inf)
         if point_map.camera.is_fisheye:
             depth = depth * _axis_share(self.camera)
-        return PointMap(self.camera, point_map.T_world_cam, index, depth.astype(np.float32))
+        return _PointMap(self.camera, point_map.T_world_cam, index, depth.astype(np.float32))
 
 
 @lru_cache(maxsize=16)

@@ -55,7 +55,7 @@ def align_suit(
     head = resample(Trajectory(suit.timestamps, head.R, head.t), times).T_world_body
     T_world_cam = Rigid(localization.R_world_cam[early], localization.t_world_cam[early]).to(head.t.dtype)
     angle, certainty = yaw_between(head.R, T_world_cam.R @ mount.R.mT)
-    turn = robust_angle(angle, weight * certainty)
+    turn = _robust_angle(angle, weight * certainty)
     R_scene_suit = rotation.about_axis("z", turn)
     worn: Tensor = head @ mount.t  # pyright: ignore[reportAssignmentType]
     move = _weighted_median(T_world_cam.t - worn @ R_scene_suit.mT, weight)
@@ -82,7 +82,7 @@ def yaw_between(
     return torch.atan2(sin, cos), torch.hypot(sin, cos) / 2
 
 
-def robust_angle(
+def _robust_angle(
     angle: Float[Tensor, "sample"], weight: Float[Tensor, "sample"], scale_rad: float = 0.05
 ) -> Float[Tensor, ""]:
     """Centre (rad) of angles on the circle: the sample with the least weighted sum of distances to all others, then
@@ -218,7 +218,7 @@ def initialize(
         turned = body_step * torch.polar(torch.ones_like(yaw), yaw)
         product = (camera_step * turned.conj())[moving]
         if len(product):
-            yaw = yaw + robust_angle(product.angle(), product.abs(), scale_rad=ANGLE_SCALE).double()
+            yaw = yaw + _robust_angle(product.angle(), product.abs(), scale_rad=ANGLE_SCALE).double()
     if settings.bridge == "suit":
         camera = _bridged(paths, yaw, settings)
     turn = rotation.about_axis("z", yaw).to(body.dtype)

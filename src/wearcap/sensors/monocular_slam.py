@@ -112,7 +112,7 @@ def scale_by_walks(slam: Trajectory, walks: Sequence[tuple[float, float, float]]
 
 
 @dataclass(frozen=True)
-class GravityScale:
+class _GravityScale:
     """Vertical and scale of a SLAM's world. The heading stays the SLAM's: R_world_slam is the least turn that puts z up."""
 
     R_world_slam: Float64[Tensor, "3 3"]
@@ -132,7 +132,7 @@ def by_head_imu(
     imu: ImuStream,
     R_cam_imu: Float[Tensor, "3 3"] | None = None,
     t_cam_imu: Float[Tensor, "3"] | None = None,
-) -> GravityScale:
+) -> _GravityScale:
     """Scale and vertical from a sensor (acc_imu, the camera's clock) fixed to the camera at a known place (m).
 
     Huber's robust least squares in (1/s, g/s, bias/s); its covariance allows for correlated errors within a second.
@@ -185,7 +185,7 @@ def by_head_imu(
     direction = up / np.linalg.norm(up)
     across = np.eye(3) - np.outer(direction, direction)
     turn = across @ covariance[1:4, 1:4] @ across / (up @ up)
-    return GravityScale(_upright(direction), 1 / k, deviation / k, math.degrees(math.sqrt(np.trace(turn))))
+    return _GravityScale(_upright(direction), 1 / k, deviation / k, math.degrees(math.sqrt(np.trace(turn))))
 
 
 def _alike(
@@ -241,7 +241,7 @@ def by_floor(
     height_m: float,
     height_std_m: float = 0.005,
     seed: int = 0,
-) -> GravityScale:
+) -> _GravityScale:
     """Scale and vertical from the floor below the path, and the camera's height above it while standing (m).
 
     The floor is the plane with most points below the path (RANSAC, then total least squares), at most 35° from the
@@ -275,7 +275,7 @@ def by_floor(
         turns.append(math.acos(min(up @ up_k, 1.0)))
         scales.append((height_m + height_std_m * random.standard_normal()) / height_k)
     deviation = math.degrees(math.sqrt(np.mean(np.square(turns))))
-    return GravityScale(_upright(up), height_m / height, float(np.std(scales)), deviation)
+    return _GravityScale(_upright(up), height_m / height, float(np.std(scales)), deviation)
 
 
 def _floor_points(points: np.ndarray, eyes: np.ndarray, rough: np.ndarray, random: np.random.Generator) -> np.ndarray:

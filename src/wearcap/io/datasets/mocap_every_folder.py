@@ -44,7 +44,7 @@ _SLAM_PIXELS = 384 * 512
 
 
 @dataclass(frozen=True)
-class BoardWalks:
+class _BoardWalks:
     """Paths of the camera over the calibration board: start and end (SLAM's units), and the measured lengths."""
 
     x_slam: Float[Tensor, "end 3"]
@@ -69,7 +69,7 @@ class MocapEveryFolder:
     points_slam: Float[Tensor, "point 3"] | None = None
     video: Path | None = None
     imu: dict[str, ImuStream] | None = None
-    board: BoardWalks | None = None
+    board: _BoardWalks | None = None
 
 
 def is_mocap_every_folder(folder: str | Path) -> bool:
@@ -191,7 +191,7 @@ def _marks(path: Path) -> dict[str, Any]:
     return content
 
 
-def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], folder: Path) -> BoardWalks | None:
+def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], folder: Path) -> _BoardWalks | None:
     measured = config.get("cam_scale_origin")
     if measured is None or not {"x", "y"} <= marks.keys():
         return None
@@ -213,7 +213,7 @@ def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], fol
                 expected=f"{track.timestamps[0].item():.3f} s to {track.timestamps[-1].item():.3f} s, as the camera's path",
             )
         ends.append(track.t_world_body[(track.timestamps[None] - times[:, None]).abs().argmin(1)])
-    return BoardWalks(ends[0], ends[1], (length[0], length[1]), height)
+    return _BoardWalks(ends[0], ends[1], (length[0], length[1]), height)
 
 
 def _numbers(values: Any, count: int, what: str, where: Path) -> list[float]:

@@ -47,7 +47,7 @@ class _Bone:
 
 
 @dataclass(frozen=True)
-class AsfSkeleton:
+class _AsfSkeleton:
     """Content of an ASF file that reading an AMC file needs; per joint in the order of `skeleton.joint_names`."""
 
     skeleton: Skeleton
@@ -63,7 +63,7 @@ class AsfSkeleton:
     radians: bool
 
 
-def read_asf(path: str | Path, unit_m: float | int | None = None) -> AsfSkeleton:
+def read_asf(path: str | Path, unit_m: float | int | None = None) -> _AsfSkeleton:
     """Read an .asf file (plain, .gz or .xz).
 
     `unit_m` is the length of one unit in metres; by default an inch over the file's `length`. The skeleton is called
@@ -91,7 +91,7 @@ def read_asf(path: str | Path, unit_m: float | int | None = None) -> AsfSkeleton
     to_rad = 1.0 if content.radians else math.pi / 180
     angles = to_rad * torch.tensor([bone.axis_deg for bone in table], dtype=torch.float64)
     order = tuple(bone.order for bone in table)
-    return AsfSkeleton(
+    return _AsfSkeleton(
         skeleton,
         tuple(bone.dof for bone in table),
         order,
@@ -102,7 +102,7 @@ def read_asf(path: str | Path, unit_m: float | int | None = None) -> AsfSkeleton
     )
 
 
-def read_amc(asf: AsfSkeleton, path: str | Path, fps: float | int = 120) -> Motion:
+def read_amc(asf: _AsfSkeleton, path: str | Path, fps: float | int = 120) -> Motion:
     """Read an .amc file (plain, .gz or .xz) of this skeleton; the format carries no frame rate, CMU's is 120.
 
     Timestamps start at 0 and follow the file's frame numbers, so that dropped frames show as gaps.
@@ -322,7 +322,7 @@ def _sites(names: list[str], ends: Tensor, leaves: dict[str, Tensor]) -> dict[st
 # --- AMC -----------------------------------------------------------------------------------------------------------
 
 
-def _parse_amc(path: Path, asf: AsfSkeleton) -> tuple[np.ndarray, list[int], Float64[Tensor, "time channel"]]:
+def _parse_amc(path: Path, asf: _AsfSkeleton) -> tuple[np.ndarray, list[int], Float64[Tensor, "time channel"]]:
     """Frame numbers, joints in the file's order, and all channel values; every frame must have the first one's layout."""
     lines = _amc_lines(path, asf)
     beginning = list(islice(lines, 1))
@@ -364,7 +364,7 @@ def _parse_amc(path: Path, asf: AsfSkeleton) -> tuple[np.ndarray, list[int], Flo
     return np.array(frames), joints, torch.from_numpy(np.array(values).reshape(len(frames), -1))
 
 
-def _amc_lines(path: Path, asf: AsfSkeleton) -> Iterator[tuple[int, list[str]]]:
+def _amc_lines(path: Path, asf: _AsfSkeleton) -> Iterator[tuple[int, list[str]]]:
     """Numbers and words of the lines from the first frame on."""
     begun = False
     for number, line in numbered_lines(path):
@@ -376,7 +376,7 @@ def _amc_lines(path: Path, asf: AsfSkeleton) -> Iterator[tuple[int, list[str]]]:
             yield number, words
 
 
-def _layout_joints(path: Path, asf: AsfSkeleton, start: int, first: list[tuple[int, list[str]]]) -> list[int]:
+def _layout_joints(path: Path, asf: _AsfSkeleton, start: int, first: list[tuple[int, list[str]]]) -> list[int]:
     """Joints of the first frame, which begins in line `start`, checked against the skeleton's channels."""
     names = [words[0] for _, words in first]
     for line, (name, *values) in first:
