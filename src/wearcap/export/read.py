@@ -139,28 +139,22 @@ def check_archive(path: str | Path) -> None:
             if entry.filename.endswith(".json"):
                 if entry.file_size > MAX_JSON_BYTES:
                     raise _refused(f"a description of {entry.file_size} bytes", path)
-                content = parse_json(archive.read(entry), path)
-                for key, value in _members(content):
+                for key, value in _members(parse_json(archive.read(entry), path)):
                     if key == "use_pickle" and value:
                         raise _refused("pickled objects", path)
                     if key == "expr_str" and not (isinstance(value, str) and _EXPRESSION.fullmatch(value)):
                         raise _refused(f"the size {str(value)[:80]!r}", path)
-                    if key == "guards_code" and not (
-                        isinstance(value, list)
-                        and all((isinstance(guard, str) and _GUARD.fullmatch(guard) is not None) for guard in value)
+                    entries = value if isinstance(value, list) else [None]
+                    if key == "guards_code" and not all(
+                        isinstance(guard, str) and _GUARD.fullmatch(guard) for guard in entries
                     ):
                         raise _refused(f"the guards {str(value)[:80]!r}", path)
-                    if key == "nodes" and not (
-                        isinstance(value, list)
-                        and all(
-                            (
-                                isinstance(node, dict)
-                                and isinstance(node.get("target"), str)
-                                and _TARGET.fullmatch(node["target"]) is not None
-                                and set(node.get("metadata") or {}) <= set(_METADATA)
-                            )
-                            for node in value
-                        )
+                    if key == "nodes" and not all(
+                        isinstance(node, dict)
+                        and isinstance(node.get("target"), str)
+                        and _TARGET.fullmatch(node["target"])
+                        and set(node.get("metadata") or {}) <= set(_METADATA)
+                        for node in entries
                     ):
                         raise _refused("calls of other functions than tensor operations", path)
         if (damaged := archive.testzip()) is not None:

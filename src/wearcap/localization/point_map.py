@@ -54,26 +54,20 @@ class _PointMap:
         rays = (self.T_world_cam.R.double().cpu() @ rays[..., None])[..., 0].numpy()
         center = self.T_world_cam.t.double().cpu().numpy()
         around = points[np.where(valid[:, None, None], self.index[where], 0)].reshape(-1, 25, 3)
-        positions = center + rays * _distance_to_plane(around - center, rays)[:, None]
+        # Where each ray from the camera meets the plane through its points; without a plane (points in a line) or with one
+        # that it grazes, where the ray passes the middle of them
+        apart = around - center
+        middle = apart.mean(1)
+        spread = np.einsum("rpi,rpj->rij", apart - middle[:, None], apart - middle[:, None])
+        sizes, axes = np.linalg.eigh(spread)
+        normal = axes[..., 0]
+        slope = (normal * rays).sum(1)
+        flat = (sizes[:, 1] > 10 * np.abs(sizes[:, 0])) & (sizes[:, 1] > 1e-3 * sizes[:, 2])
+        usable = flat & (np.abs(slope) > 0.1)
+        distance = np.where(usable, (normal * middle).sum(1) / np.where(usable, slope, 1), (middle * rays).sum(1))
+        positions = center + rays * distance[:, None]
         valid &= np.isfinite(positions).all(1)
         return np.where(valid[:, None], positions, 0).astype(np.float32), valid
-
-
-def _distance_to_plane(
-    points: Float64[np.ndarray, "ray point 3"], rays: Float64[np.ndarray, "ray 3"]
-) -> Float64[np.ndarray, "ray"]:
-    """Where each ray from the origin meets the plane through its points.
-
-    Without a plane (points in a line) or one that it grazes, where the ray passes the middle of them.
-    """
-    middle = points.mean(1)
-    spread = np.einsum("rpi,rpj->rij", points - middle[:, None], points - middle[:, None])
-    sizes, axes = np.linalg.eigh(spread)
-    normal = axes[..., 0]
-    slope = (normal * rays).sum(1)
-    flat = (sizes[:, 1] > 10 * np.abs(sizes[:, 0])) & (sizes[:, 1] > 1e-3 * sizes[:, 2])
-    usable = flat & (np.abs(slope) > 0.1)
-    return np.where(usable, (normal * middle).sum(1) / np.where(usable, slope, 1), (middle * rays).sum(1))
 
 
 class PointMapper:

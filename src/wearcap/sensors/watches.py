@@ -68,7 +68,21 @@ def filtered(
         share = (timestamps - times[after - 1]) / (times[after] - times[after - 1])
         before.append(R[after - 1])
         turn.append((R[after - 1].mT @ R[after], share.clamp(0, 1).to(R.dtype)))
-        accelerations.append(_averaged(times, acc, around, step_s).unfold(0, FILTER, 1).mean(-1))
+        # Mean over the frame around each time, with linear interpolation between samples at any sample rate
+        interval = times.diff()[:, None]
+        area = torch.cat([acc.new_zeros(1, 3).double(), ((acc[1:] + acc[:-1]).double() / 2 * interval).cumsum(0)])
+        edges = torch.stack([around - step_s / 2, around + step_s / 2]).clamp(times[0].item(), times[-1].item())
+        later = torch.searchsorted(times, edges.contiguous(), right=True).clamp(1, len(times) - 1)
+        earlier = later - 1
+        into_s = (edges - times[earlier])[..., None]
+        slope = (acc[later] - acc[earlier]).double() / (times[later] - times[earlier])[..., None]
+        upto = area[earlier] + into_s * (acc[earlier].double() + slope * into_s / 2)
+        span = (edges[1] - edges[0])[:, None]
+        inside = (upto[1] - upto[0]) / span.clamp_min(1e-9)
+        # Outside the watch's log its first or last sample is repeated.
+        outside = acc[torch.where(around < times[0], 0, len(times) - 1)].double()
+        mean = torch.where(span > 1e-6, inside, outside).to(acc.dtype)
+        accelerations.append(mean.unfold(0, FILTER, 1).mean(-1))
     step, share = (torch.stack(part, 1) for part in zip(*turn))
     R_world_wrist = torch.stack(before, 1) @ rotation.exp(share[..., None] * rotation.log(step))
     return R_world_wrist, torch.stack(accelerations, 1)
@@ -116,22 +130,3 @@ def _require_no_gaps(times: Tensor, requested: Tensor, where: str) -> None:
             expected=f"no gap above {MAX_GAP_S} s",
             fix="Cut the recording there.",
         )
-
-
-def _averaged(
-    times: Float64[Tensor, "sample"], value: Float[Tensor, "sample 3"], at: Float64[Tensor, "time"], step_s: float
-) -> Float[Tensor, "time 3"]:
-    """Mean over the frame around each time, with linear interpolation between samples at any sample rate."""
-    step = times.diff()[:, None]
-    area = torch.cat([value.new_zeros(1, 3).double(), ((value[1:] + value[:-1]).double() / 2 * step).cumsum(0)])
-    edges = torch.stack([at - step_s / 2, at + step_s / 2]).clamp(times[0].item(), times[-1].item())
-    after = torch.searchsorted(times, edges.contiguous(), right=True).clamp(1, len(times) - 1)
-    before = after - 1
-    share = (edges - times[before])[..., None]
-    slope = (value[after] - value[before]).double() / (times[after] - times[before])[..., None]
-    upto = area[before] + share * (value[before].double() + slope * share / 2)
-    span = (edges[1] - edges[0])[:, None]
-    inside = (upto[1] - upto[0]) / span.clamp_min(1e-9)
-    # Outside the watch's log its first or last sample is repeated.
-    outside = value[torch.where(at < times[0], 0, len(times) - 1)].double()
-    return torch.where(span > 1e-6, inside, outside).to(value.dtype)

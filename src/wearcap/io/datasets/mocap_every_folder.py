@@ -133,28 +133,23 @@ def mocap_every_recording(folder: MocapEveryFolder, scale: float = 1.0, T_world_
     R_head_cam, t_head_cam = nominal_mount()
     points = folder.points_slam
     cloud = None if points is None else PointCloud(T_world_slam @ (scale * points))  # pyright: ignore[reportArgumentType]
-    return Recording(
-        folder.name,
-        head=HeadStream(track.timestamps, T_world_cam.R @ R_head_cam.mT, T_world_cam.t, torch.eye(3), t_head_cam),
-        imu=folder.imu or {},
-        camera=_camera_stream(folder, Rigid(R_head_cam, t_head_cam)),
-        points=cloud,
-        source="MocapEvery capture folder",
-    )
-
-
-def _camera_stream(folder: MocapEveryFolder, T_head_cam: Rigid) -> CameraStream | None:
-    """Camera stream of the video with its lens where both exist, else of SLAM's pictures."""
-    track = folder.T_slam_cam
+    camera = None  # of the video with its lens where both exist, else of SLAM's pictures
     if folder.video is not None and folder.lens is not None:
         info = video_info(folder.video)
         count = int((track.timestamps[-1] - track.timestamps[0]).item() * info.fps + 1.5)
         count = min(count, info.frames) if info.frames else count
         times = track.timestamps[0] + torch.arange(count, dtype=torch.float64) / info.fps
-        return CameraStream(times, folder.lens, T_head_cam.R, T_head_cam.t, video=str(folder.video.resolve()))
-    if folder.camera is None:
-        return None
-    return CameraStream(track.timestamps, folder.camera, T_head_cam.R, T_head_cam.t)
+        camera = CameraStream(times, folder.lens, R_head_cam, t_head_cam, video=str(folder.video.resolve()))
+    elif folder.camera is not None:
+        camera = CameraStream(track.timestamps, folder.camera, R_head_cam, t_head_cam)
+    return Recording(
+        folder.name,
+        head=HeadStream(track.timestamps, T_world_cam.R @ R_head_cam.mT, T_world_cam.t, torch.eye(3), t_head_cam),
+        imu=folder.imu or {},
+        camera=camera,
+        points=cloud,
+        source="MocapEvery capture folder",
+    )
 
 
 def _config(path: Path) -> dict[str, Any]:

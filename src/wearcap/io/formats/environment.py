@@ -99,27 +99,25 @@ def _object(row: Any, number: int, path: Path) -> SceneObject:
         raise WearcapError(f"category {row['category']!r}", where=where, expected="text")
     R = _rotation(row["R_world_object"], where).float()
     t = torch.from_numpy(_numbers(row["t_world_object"], (3,), "t_world_object", where)).float()
-    mesh, freedom = _mesh(row["mesh"], path, where), _freedom(row["freedom"], where)
-    item = SceneObject(row["name"], row["category"], mesh, R, t, freedom)
-    _check(item, where)
-    return item
-
-
-def _freedom(row: Any, where: str) -> Freedom:
-    kind = row.get("kind") if isinstance(row, dict) else None
+    mesh = _mesh(row["mesh"], path, where)
+    about = row["freedom"]
+    kind = about.get("kind") if isinstance(about, dict) else None
     if kind not in FREEDOMS:
         raise WearcapError(f"no degree of freedom {kind!r}", where=where, expected=f"one of {', '.join(FREEDOMS)}")
-    _require_keys(row, _FREEDOM_KEYS[kind], f"{where}, freedom")
-    pivot = None if kind != "hinge" else tuple(_numbers(row["pivot"], (3,), "pivot", where).tolist())
-    axis = None if kind != "axis" else tuple(_numbers(row["axis"], (3,), "axis", where).tolist())
+    _require_keys(about, _FREEDOM_KEYS[kind], f"{where}, freedom")
+    pivot = None if kind != "hinge" else tuple(_numbers(about["pivot"], (3,), "pivot", where).tolist())
+    axis = None if kind != "axis" else tuple(_numbers(about["axis"], (3,), "axis", where).tolist())
     limits = None
-    if (key := _FREEDOM_KEYS[kind][-1]) in row and key in _OPTIONAL and row[key] is not None:
-        limits = _numbers(row[key], (2,), key, where)
+    if (key := _FREEDOM_KEYS[kind][-1]) in about and key in _OPTIONAL and about[key] is not None:
+        limits = _numbers(about[key], (2,), key, where)
         if limits[0] > limits[1]:
             raise WearcapError(f"{key} {limits.tolist()} are reversed", where=where, expected="[least, greatest]")
         limits = tuple((np.radians(limits) if key == "limits_deg" else limits).tolist())
     with placed(where):
-        return Freedom(kind, pivot, axis, limits)
+        freedom = Freedom(kind, pivot, axis, limits)
+    item = SceneObject(row["name"], row["category"], mesh, R, t, freedom)
+    _check(item, where)
+    return item
 
 
 def _mesh(name: Any, path: Path, where: str) -> Mesh:
