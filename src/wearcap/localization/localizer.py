@@ -19,7 +19,7 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.localization.absolute_pose import CameraPose, Fit, Matches, match_landmarks, match_nearby
+from wearcap.localization.absolute_pose import CameraPose, Matches, match_landmarks, match_nearby
 from wearcap.localization.features import Extractor, Features, GlobalDescriptor, Matcher, Vlad, most_similar
 from wearcap.localization.point_map import described
 from wearcap.localization.visual_map import VisualMap, from_bytes
@@ -162,7 +162,15 @@ class Localizer:
             return None
         if self.matcher is None:
             for reach in (self.settings.second_look_px * scale, limit):
-                near = _near_pairs(features.keypoints, points, camera, fit, reach)
+                # (keypoint, landmark) pairs within reach in the picture, at most the 8 nearest landmarks per keypoint
+                seen, valid = fit.project(points, camera)
+                number, near = np.flatnonzero(valid), np.zeros((0, 2), np.int64)
+                if len(number):
+                    tree, nearest = KDTree(seen[number]), min(8, len(number))
+                    distance, place = tree.query(features.keypoints, k=nearest, distance_upper_bound=reach)
+                    distance, place = (part.reshape(len(features.keypoints), -1) for part in (distance, place))
+                    row, column = np.nonzero(np.isfinite(distance))
+                    near = np.stack([row, number[place[row, column]]], 1)
                 pairs = match_nearby(features.descriptors, descriptors, near, self.settings.min_cosine)
                 if len(pairs) < self.settings.min_inliers:
                     return None
@@ -188,24 +196,6 @@ def confidence(agreeing: Float32[np.ndarray, "match 2"], camera: Camera) -> floa
     cell = (agreeing / [camera.width / 8, camera.height / 6]).astype(np.int64).clip(0, [7, 5])
     counts = np.bincount(cell[:, 0] + 8 * cell[:, 1], minlength=48)
     return float(1 - 2.0 ** (-max(int(np.minimum(counts, 6).sum()) - 6, 0) / 8))
-
-
-def _near_pairs(
-    keypoints: Float32[np.ndarray, "keypoint 2"],
-    points: Float32[np.ndarray, "landmark 3"],
-    camera: Camera,
-    fit: Fit,
-    reach_px: float,
-) -> Int64[np.ndarray, "pair 2"]:
-    """(keypoint, landmark) pairs within `reach_px` in the picture, at most the 8 nearest landmarks per keypoint."""
-    seen, valid = fit.project(points, camera)
-    number = np.flatnonzero(valid)
-    if not len(number):
-        return np.zeros((0, 2), np.int64)
-    distance, place = KDTree(seen[number]).query(keypoints, k=min(8, len(number)), distance_upper_bound=reach_px)
-    distance, place = distance.reshape(len(keypoints), -1), place.reshape(len(keypoints), -1)
-    row, column = np.nonzero(np.isfinite(distance))
-    return np.stack([row, number[place[row, column]]], 1)
 
 
 def localize_video(

@@ -115,7 +115,16 @@ def _object_files(root: Path, name: str, object_name: str | None) -> dict[str, t
     if several.is_dir():
         found = {path.stem: (path, Path(name) / path.name) for path in sorted(several.glob("*.json"))}
     elif single.is_file():
-        found = {object_name or _only_object(root, name): (single, Path(single.name))}
+        if not object_name:  # the sequence is named after the model of its only object
+            stem = name.split(".")[0].removeprefix(f"{subject_of(name)}_")
+            models = sorted(path.stem for path in root.glob("object_models/*.ply"))
+            fitting = [stem] if stem in models else [model for model in models if model.startswith(stem)]
+            if len(fitting) != 1:
+                what = f"{len(fitting)} models fit the sequence {name!r}"
+                fix = f"Give its object's name: one of {', '.join(fitting or models)}."
+                raise WearcapError(what, where=root / "object_models", expected=f"{stem}.ply", fix=fix)
+            object_name = fitting[0]
+        found = {object_name: (single, Path(single.name))}
     else:
         raise WearcapError(
             "no object locations of this sequence", where=single, expected=f"this file, or a folder {several}"
@@ -124,18 +133,6 @@ def _object_files(root: Path, name: str, object_name: str | None) -> dict[str, t
         object_id: (path, next((place for folder in _CONTACTS if (place := root / folder / labels).is_file()), None))
         for object_id, (path, labels) in found.items()
     }
-
-
-def _only_object(root: Path, name: str) -> str:
-    """Name of the model that a single-object sequence is named after."""
-    stem = name.split(".")[0].removeprefix(f"{subject_of(name)}_")
-    models = sorted(path.stem for path in root.glob("object_models/*.ply"))
-    fitting = [stem] if stem in models else [model for model in models if model.startswith(stem)]
-    if len(fitting) != 1:
-        what = f"{len(fitting)} models fit the sequence {name!r}"
-        fix = f"Give its object's name: one of {', '.join(fitting or models)}."
-        raise WearcapError(what, where=root / "object_models", expected=f"{stem}.ply", fix=fix)
-    return fitting[0]
 
 
 def read_object_locations(path: str | Path) -> _AnnotatedObject:

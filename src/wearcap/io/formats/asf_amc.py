@@ -335,7 +335,22 @@ def _parse_amc(path: Path, asf: _AsfSkeleton) -> tuple[np.ndarray, list[int], Fl
         if len(first) > MAX_BONES:
             raise WearcapError(f"more than {MAX_BONES} bones", where=at_line(path, number))
     number = beginning[0][0] if beginning else 1
-    joints = _layout_joints(path, asf, number, first)
+    names = [words[0] for _, words in first]
+    for line, (name, *given) in first:
+        if name not in asf.skeleton.joint_names or names.count(name) > 1:
+            what = f"bone {name!r} is not in the ASF, or comes twice"
+            expected = "bones of the skeleton, once per frame"
+            fix = "Check that AMC and ASF belong together."
+            raise WearcapError(what, where=at_line(path, line), expected=expected, fix=fix)
+        if len(given) != (expected := len(asf.dof[asf.skeleton.index(name)])):
+            raise WearcapError(
+                f"{len(given)} values for {name!r}", where=at_line(path, line), expected=f"{expected} as in the ASF"
+            )
+    moving = {name for name, dof in zip(asf.skeleton.joint_names, asf.dof) if dof}
+    if not names or moving - set(names):
+        what = f"the first frame lacks {sorted(moving - set(names))[:5]}"
+        raise WearcapError(what, where=at_line(path, number), expected="every bone that has channels in the ASF")
+    joints = [asf.skeleton.index(name) for name in names]
     frames, values, place = array("q"), array("d"), 0
     for row, (number, words) in enumerate(chain(beginning, first, following, lines)):
         place = row % (len(first) + 1)
@@ -374,23 +389,3 @@ def _amc_lines(path: Path, asf: _AsfSkeleton) -> Iterator[tuple[int, list[str]]]
         begun = begun or (bool(words) and words[0][0] not in "#:")
         if begun and words:
             yield number, words
-
-
-def _layout_joints(path: Path, asf: _AsfSkeleton, start: int, first: list[tuple[int, list[str]]]) -> list[int]:
-    """Joints of the first frame, which begins in line `start`, checked against the skeleton's channels."""
-    names = [words[0] for _, words in first]
-    for line, (name, *values) in first:
-        if name not in asf.skeleton.joint_names or names.count(name) > 1:
-            what = f"bone {name!r} is not in the ASF, or comes twice"
-            expected = "bones of the skeleton, once per frame"
-            fix = "Check that AMC and ASF belong together."
-            raise WearcapError(what, where=at_line(path, line), expected=expected, fix=fix)
-        if len(values) != (expected := len(asf.dof[asf.skeleton.index(name)])):
-            raise WearcapError(
-                f"{len(values)} values for {name!r}", where=at_line(path, line), expected=f"{expected} as in the ASF"
-            )
-    moving = {name for name, dof in zip(asf.skeleton.joint_names, asf.dof) if dof}
-    if not names or moving - set(names):
-        what = f"the first frame lacks {sorted(moving - set(names))[:5]}"
-        raise WearcapError(what, where=at_line(path, start), expected="every bone that has channels in the ASF")
-    return [asf.skeleton.index(name) for name in names]
