@@ -59,12 +59,8 @@ def load_exported(path: str | Path, network: str | None = None) -> Any:
     try:
         about = parse_json(sidecar.read_bytes(), sidecar)
     except FileNotFoundError as error:
-        raise WearcapError(
-            "no such sidecar",
-            where=sidecar,
-            expected="the .json file that `wearcap export` wrote beside the model",
-            fix="Copy both files.",
-        ) from error
+        expected = "the .json file that `wearcap export` wrote beside the model"
+        raise WearcapError("no such sidecar", where=sidecar, expected=expected, fix="Copy both files.") from error
     if not isinstance(about, dict) or about.get("wearcap_export") != VERSION:
         raise WearcapError("not a sidecar of this version", where=sidecar, fix="Export the model again.")
     name = str(about.get("network"))

@@ -73,11 +73,8 @@ def export_network(graph: Graph, path: str | Path, format: str, max_error: float
     assert isinstance(graph.module, nn.Module)
     path, net = Path(path), copy.deepcopy(graph.module).cpu().eval()
     if path.suffix != f".{format}":
-        raise WearcapError(
-            f"a file of format {format} cannot end in {path.suffix!r}",
-            where=path,
-            expected=f"a name that ends in .{format}",
-        )
+        what = f"a file of format {format} cannot end in {path.suffix!r}"
+        raise WearcapError(what, where=path, expected=f"a name that ends in .{format}")
     exported = program(graph)
     with atomic_path(path) as temporary, torch.inference_mode(), quiet():
         if format == "pt2":
@@ -98,12 +95,9 @@ def export_network(graph: Graph, path: str | Path, format: str, max_error: float
                 window[name] = value
         error = max((net(**inputs) - run(**inputs)).abs().max().item() for inputs in windows.values())
         if not error < max_error:
-            raise WearcapError(
-                f"the exported network differs from the eager one by {error:.2e}",
-                where=path,
-                expected=f"less than {max_error:.0e}",
-                fix="Try the other format and report this model.",
-            )
+            what = f"the exported network differs from the eager one by {error:.2e}"
+            fix = "Try the other format and report this model."
+            raise WearcapError(what, where=path, expected=f"less than {max_error:.0e}", fix=fix)
         latency, eager = _milliseconds(run, windows[1]), _milliseconds(net, windows[1])
         size = temporary.stat().st_size
     return ExportReport(str(path), format, size, error, latency, eager)

@@ -43,10 +43,8 @@ class Board:
 
     def __post_init__(self):
         if min(self.columns, self.rows) < 3 or not self.square_m > 0:
-            raise WearcapError(
-                f"a board of {self.columns}x{self.rows} inner corners and squares of {self.square_m} m",
-                expected="at least 3x3 inner corners, and a positive size in metres",
-            )
+            what = f"a board of {self.columns}x{self.rows} inner corners and squares of {self.square_m} m"
+            raise WearcapError(what, expected="at least 3x3 inner corners, and a positive size in metres")
 
     @property
     def points(self) -> Float32[np.ndarray, "point 3"]:
@@ -134,12 +132,9 @@ def calibrate_from_pictures(
         examined += 1
         size = size or (picture.shape[1], picture.shape[0])
         if (picture.shape[1], picture.shape[0]) != size:
-            raise WearcapError(
-                f"{picture.shape[1]}x{picture.shape[0]} pixels",
-                where=name,
-                expected=f"{size[0]}x{size[1]}, as the pictures before",
-                fix="Calibrate each resolution by itself.",
-            )
+            what = f"{picture.shape[1]}x{picture.shape[0]} pixels"
+            expected = f"{size[0]}x{size[1]}, as the pictures before"
+            raise WearcapError(what, where=name, expected=expected, fix="Calibrate each resolution by itself.")
         gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
         view = board.find(gray, name)
         if view is not None:
@@ -159,11 +154,8 @@ def calibrate_from_pictures(
             if any(other.find(gray) for gray in missed):
                 fix = f"A board of {columns}x{rows} inner corners was found: give columns={columns} rows={rows}."
                 break
-        raise WearcapError(
-            f"no board of {board} inner corners in {examined} pictures of {size[0]}x{size[1]} pixels",
-            expected="a checkerboard, seen as a whole",
-            fix=fix,
-        )
+        what = f"no board of {board} inner corners in {examined} pictures of {size[0]}x{size[1]} pixels"
+        raise WearcapError(what, expected="a checkerboard, seen as a whole", fix=fix)
     sharp = [view for view in views if view.blur_px <= settings.max_blur_px]
     chosen = varied(sharp if len(sharp) >= settings.min_views else views, size, settings.max_views)
     return replace(_calibrated(chosen, board, size, settings), seen=len(views), examined=examined)
@@ -194,11 +186,9 @@ def _calibrated(views: list[_View], board: Board, size: tuple[int, int], setting
     rejected: list[_View] = []
     while True:
         if len(views) < settings.min_views:
-            raise WearcapError(
-                f"{len(views)} good views of the {board} board ({len(rejected)} rejected for their residuals)",
-                expected=f"at least {settings.min_views}",
-                fix="Film it slowly, from near and far, tilted to all sides, into the picture's corners.",
-            )
+            what = f"{len(views)} good views of the {board} board ({len(rejected)} rejected for their residuals)"
+            fix = "Film it slowly, from near and far, tilted to all sides, into the picture's corners."
+            raise WearcapError(what, expected=f"at least {settings.min_views}", fix=fix)
         points = [view.corners.reshape(-1, 1, 2) for view in views]
         rms, K, bent, turns, _, spread, _, residuals = cv2.calibrateCameraExtended(
             [board.points] * len(views), points, size, None, None, flags=cv2.CALIB_FIX_K3

@@ -42,10 +42,8 @@ class FlowSettings:
 
     def __post_init__(self):
         if self.reach < 0 or self.window_px < 3 or self.levels < 0:
-            raise WearcapError(
-                f"flow over {self.reach} frames in windows of {self.window_px} px with {self.levels} levels",
-                expected="0 frames or more, 3 px or more, 0 levels or more",
-            )
+            what = f"flow over {self.reach} frames in windows of {self.window_px} px with {self.levels} levels"
+            raise WearcapError(what, expected="0 frames or more, 3 px or more, 0 levels or more")
 
 
 class _Spotted(NamedTuple):
@@ -155,10 +153,8 @@ def tracked_cues(
         spotted += flow.advance(picture, detector(picture, times[count - 1]))
     spotted += flow.finish()
     if count != len(times):
-        raise WearcapError(
-            f"{'more' if count > len(times) else count} pictures for {len(times)} timestamps",
-            expected="a picture for each timestamp of the camera",
-        )
+        what = f"{'more' if count > len(times) else count} pictures for {len(times)} timestamps"
+        raise WearcapError(what, expected="a picture for each timestamp of the camera")
     if not spotted:
         return {}
     pixels, confidence = (torch.from_numpy(np.stack(part, 1)) for part in zip(*spotted))

@@ -107,10 +107,8 @@ class MediaPipeHands:
         try:
             self._mediapipe = importlib.import_module("mediapipe")
         except ModuleNotFoundError as error:
-            raise WearcapError(
-                f"MediaPipe's hands need the package {error.name!r}",
-                fix='pip install "wearcap[hands]", or take detector=recorded, which needs none.',
-            ) from error
+            fix = 'pip install "wearcap[hands]", or take detector=recorded, which needs none.'
+            raise WearcapError(f"MediaPipe's hands need the package {error.name!r}", fix=fix) from error
         vision, path = self._mediapipe.tasks.vision, find_model(model)
         options = vision.HandLandmarkerOptions(
             base_options=self._mediapipe.tasks.BaseOptions(model_asset_path=str(path)),
@@ -123,12 +121,8 @@ class MediaPipeHands:
         try:
             self._landmarker: Any = vision.HandLandmarker.create_from_options(options)
         except (ValueError, RuntimeError, OSError) as error:
-            raise WearcapError(
-                f"not a model that MediaPipe can run ({' '.join(str(error).split())[:200]})",
-                where=path,
-                expected="hand_landmarker.task",
-                fix="Download it again.",
-            ) from error
+            what = f"not a model that MediaPipe can run ({' '.join(str(error).split())[:200]})"
+            raise WearcapError(what, where=path, expected="hand_landmarker.task", fix="Download it again.") from error
 
     def __call__(self, picture: UInt8[np.ndarray, "height width 3"], time_s: float) -> dict[str, Keypoint]:
         image = self._mediapipe.Image(image_format=self._mediapipe.ImageFormat.SRGB, data=np.ascontiguousarray(picture))

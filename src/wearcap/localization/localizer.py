@@ -83,11 +83,9 @@ class Localizer:
         descriptor: GlobalDescriptor | None = None,
     ):
         if not len(visual_map) or not len(visual_map.landmarks.points_world):
-            raise WearcapError(
-                "the map is empty: nothing can be localised in it",
-                expected="pictures with landmarks",
-                fix="Build it from photos that show the scene: wearcap scene.",
-            )
+            what = "the map is empty: nothing can be localised in it"
+            fix = "Build it from photos that show the scene: wearcap scene."
+            raise WearcapError(what, expected="pictures with landmarks", fix=fix)
         visual_map.require_features(extractor, descriptor)
         self.map, self.extractor, self.matcher, self.settings = visual_map, extractor, matcher, settings
         self.descriptor: GlobalDescriptor = descriptor or Vlad(visual_map.vocabulary)
@@ -110,11 +108,8 @@ class Localizer:
         Raises WearcapError without intrinsics or for a picture of another size than they are for.
         """
         if camera is None:
-            raise WearcapError(
-                "no intrinsics of the camera",
-                expected="a calibrated camera",
-                fix="Calibrate it from a checkerboard video: wearcap calibrate.",
-            )
+            fix = "Calibrate it from a checkerboard video: wearcap calibrate."
+            raise WearcapError("no intrinsics of the camera", expected="a calibrated camera", fix=fix)
         fov_deg = self.settings.horizontal_fov_deg
         image, camera, features = described(image, camera, self.extractor, fov_deg, "localization")
         return _Described(camera, features, self.descriptor(image, features))

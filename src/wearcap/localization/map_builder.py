@@ -147,11 +147,8 @@ def _pictures(photos, source, extractor, descriptor, settings: MapSettings, prog
                     f"The cameras stand around {np.round(np.median(cameras, axis=0), 1).tolist()}, the scene reaches from "
                     f"{np.round(low, 1).tolist()} to {np.round(high, 1).tolist()}: are both in one unit (m) and in one world?"
                 )
-        raise WearcapError(
-            f"the map would be empty: none of {found} keypoints in {len(photos)} photos lies on the scene",
-            expected="photos that show the scanned scene",
-            fix=fix,
-        )
+        what = f"the map would be empty: none of {found} keypoints in {len(photos)} photos lies on the scene"
+        raise WearcapError(what, expected="photos that show the scanned scene", fix=fix)
     return pictures
 
 

@@ -89,10 +89,8 @@ class PointMapper:
     def color_picture(self, point_map: _PointMap) -> UInt8[np.ndarray, "height width 3"]:
         """The scan's colours as the camera sees them, black where nothing is. Raises WearcapError without colours."""
         if self.colors is None:
-            raise WearcapError(
-                "the scan has no colours, so no picture of it can be drawn",
-                expected="a coloured point cloud (point maps need none)",
-            )
+            what = "the scan has no colours, so no picture of it can be drawn"
+            raise WearcapError(what, expected="a coloured point cloud (point maps need none)")
         seen = point_map.index >= 0
         return np.where(seen[..., None], self.colors[np.where(seen, point_map.index, 0)], 0).astype(np.uint8)
 

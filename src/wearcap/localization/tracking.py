@@ -98,12 +98,8 @@ class Track:
             )
         cameras = {photo.camera for photo in photos.values()}
         if len(cameras) > 1:
-            raise WearcapError(
-                f"{len(cameras)} cameras",
-                where=where,
-                expected="pictures of one camera",
-                fix="Map the video as taken with a single camera.",
-            )
+            fix = "Map the video as taken with a single camera."
+            raise WearcapError(f"{len(cameras)} cameras", where=where, expected="pictures of one camera", fix=fix)
         placed = torch.zeros(len(pictures.names), dtype=torch.bool)
         placed[list(photos)] = True
         R, t = torch.eye(3).repeat(len(placed), 1, 1), torch.zeros(len(placed), 3)
@@ -204,12 +200,8 @@ def _claim(source: Path, output: Path, settings: TrackSettings, camera: Camera |
     mine["mapping"].pop("threads")
     if (output / STATE).is_file():
         if read_json(output / STATE) != mine:
-            raise WearcapError(
-                "this folder holds the track of another source, or of other settings",
-                where=output,
-                expected=str(output / STATE),
-                fix="Choose another: output=DIR.",
-            )
+            what = "this folder holds the track of another source, or of other settings"
+            raise WearcapError(what, where=output, expected=str(output / STATE), fix="Choose another: output=DIR.")
         return
     write_text(output / STATE, json.dumps(mine, indent=1) + "\n")
 

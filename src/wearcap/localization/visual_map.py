@@ -105,11 +105,9 @@ class VisualMap:
             (self.descriptor, described, f"the global descriptor {self.descriptor!r}", "descriptor", "descriptor"),
         ):
             if name != mine:
-                raise WearcapError(
-                    f"the map was made with {made}, not {name!r}",
-                    expected=f"the same {part} in map and picture",
-                    fix=f"Build the map again, or choose its {what}.",
-                )
+                expected = f"the same {part} in map and picture"
+                fix = f"Build the map again, or choose its {what}."
+                raise WearcapError(f"the map was made with {made}, not {name!r}", expected=expected, fix=fix)
 
     def save(self, path: str | Path) -> None:
         """Write one .safetensors file, atomically."""
@@ -153,12 +151,8 @@ class VisualMap:
         try:
             header = parse_json(metadata["wearcap_map"], path)
             if header["schema_version"] != SCHEMA_VERSION:
-                raise WearcapError(
-                    f"a map of version {header['schema_version']}",
-                    where=path,
-                    expected=f"version {SCHEMA_VERSION}",
-                    fix=_AGAIN,
-                )
+                what = f"a map of version {header['schema_version']}"
+                raise WearcapError(what, where=path, expected=f"version {SCHEMA_VERSION}", fix=_AGAIN)
             cameras = [camera | {"distortion": tuple(camera["distortion"])} for camera in header["cameras"]]
             loaded = cls(
                 header["extractor"],

@@ -70,11 +70,8 @@ def read_state(path: str | Path, settings: Mapping[str, Any], classes: Mapping[s
         raise WearcapError(
             "not a saved session", where=path, expected="a whole .safetensors file of Session.save"
         ) from error
-    raise WearcapError(
-        f"a session with {wrong} {theirs.get(wrong)}, not {ours.get(wrong)}",
-        where=path,
-        fix="Load it with the pipeline it ran with.",
-    )
+    what = f"a session with {wrong} {theirs.get(wrong)}, not {ours.get(wrong)}"
+    raise WearcapError(what, where=path, fix="Load it with the pipeline it ran with.")
 
 
 def _name(kind: type) -> str:

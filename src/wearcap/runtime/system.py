@@ -132,11 +132,8 @@ class System(ABC):
         """
         module, _ = load_trained(checkpoints[0])
         if getattr(module, "system", None) is not cls:
-            raise WearcapError(
-                f"{cls.__name__} cannot run {type(module).__name__}'s network",
-                where=checkpoints[0],
-                expected=f"a checkpoint of {cls.experiment}",
-            )
+            what = f"{cls.__name__} cannot run {type(module).__name__}'s network"
+            raise WearcapError(what, where=checkpoints[0], expected=f"a checkpoint of {cls.experiment}")
         return make(**module.pipeline_parts(), device=device)
 
     @abstractmethod

@@ -146,12 +146,9 @@ def detect_claps_audio(
     later = scipy.ndimage.median_filter(total, 21, mode="nearest")
     onsets = onsets[later[(onsets + round(1000 * max_length_s)).clip(max=len(total) - 1)] <= peak - 10]
     if not len(onsets):
-        raise WearcapError(
-            f"no clap found in {len(sound) / rate:.1f} s",
-            where="sound track",
-            expected="a short sound with a sudden start, 1 to 7.5 kHz",
-            fix="Give the times of the claps by hand.",
-        )
+        what = f"no clap found in {len(sound) / rate:.1f} s"
+        expected = "a short sound with a sudden start, 1 to 7.5 kHz"
+        raise WearcapError(what, where="sound track", expected=expected, fix="Give the times of the claps by hand.")
     return torch.from_numpy(np.array([_start(sound, rate, i * hop, hop) for i in onsets.tolist()]))
 
 

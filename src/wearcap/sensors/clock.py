@@ -88,11 +88,8 @@ def fit_clock(
     camera, suit = (np.sort(claps.numpy()) for claps in (claps_camera, claps_suit))
     for name, claps in (("camera", camera), ("suit", suit)):
         if not len(claps):
-            raise WearcapError(
-                f"no clap found by the {name}",
-                expected="at least one that both clocks saw",
-                fix="Give the times of the claps by hand.",
-            )
+            fix = "Give the times of the claps by hand."
+            raise WearcapError(f"no clap found by the {name}", expected="at least one that both clocks saw", fix=fix)
     pairs = _matched(camera, suit, max_offset_s)
     camera, suit = camera[pairs[1]], suit[pairs[0]]
     rate = _drift(suit, camera)

@@ -72,11 +72,9 @@ class Background:
     def of(cls, frames_mm: UInt16[np.ndarray, "time height width"]) -> "Background":
         """Mean depth of an empty scene, of the frames that saw each pixel. Raises WearcapError without frames."""
         if not len(frames_mm):
-            raise WearcapError(
-                "no frames of the empty scene",
-                expected="at least one depth image without the person",
-                fix="Record a few seconds of the scene before the person enters.",
-            )
+            expected = "at least one depth image without the person"
+            fix = "Record a few seconds of the scene before the person enters."
+            raise WearcapError("no frames of the empty scene", expected=expected, fix=fix)
         seen = frames_mm > 0
         count = seen.sum(0)
         depth = frames_mm.astype(np.float32) / 1000
@@ -91,10 +89,8 @@ class Background:
         Raises WearcapError when the sizes differ.
         """
         if depth_mm.shape != self.depth_m.shape:
-            raise WearcapError(
-                f"a depth image of shape {depth_mm.shape} and a background of {self.depth_m.shape}",
-                expected="images of one camera",
-            )
+            what = f"a depth image of shape {depth_mm.shape} and a background of {self.depth_m.shape}"
+            raise WearcapError(what, expected="images of one camera")
         depth = depth_mm / np.float32(1000)
         before = depth < self.depth_m - (_MARGIN_M + _DEVIATIONS * self.deviation_m)
         return (depth_mm > 0) & before & ~_flying(depth)

@@ -155,10 +155,8 @@ class InitializationSettings:
             if value not in choices:
                 raise WearcapError(f"{name}={value!r}", expected=f"one of {', '.join(choices)}")
         if self.bridge == "line" and self.path_smoothing_s:
-            raise WearcapError(
-                f"bridge='line' with path_smoothing_s={self.path_smoothing_s:g}",
-                expected="path_smoothing_s=0: smoothing applies to the difference from the suit's path",
-            )
+            expected = "path_smoothing_s=0: smoothing applies to the difference from the suit's path"
+            raise WearcapError(f"bridge='line' with path_smoothing_s={self.path_smoothing_s:g}", expected=expected)
 
 
 @dataclass(frozen=True)
@@ -188,12 +186,9 @@ def initialize(
     settings, suit, seen = settings or InitializationSettings(), suit_aligned, inliers(localization)
     seen &= (localization.timestamps >= suit.timestamps[0]) & (localization.timestamps <= suit.timestamps[-1])
     if not seen.any():
-        raise WearcapError(
-            "no localised frame in the suit's time",
-            where="localization",
-            expected="camera poses on the suit's clock",
-            fix="Synchronise the clocks, or check the map.",
-        )
+        what = "no localised frame in the suit's time"
+        fix = "Synchronise the clocks, or check the map."
+        raise WearcapError(what, where="localization", expected="camera poses on the suit's clock", fix=fix)
     times = localization.timestamps[seen]
     step = (localization.timestamps if len(seen) > 1 else suit.timestamps).diff().median().item()
     valid = (times[nearest_frames(times, suit.timestamps)] - suit.timestamps).abs() <= 1.5 * step

@@ -101,12 +101,9 @@ def scale_by_walks(slam: Trajectory, walks: Sequence[tuple[float, float, float]]
     lengths = (ends[:, 1] - ends[:, 0]).norm(dim=-1).numpy()
     metres = np.array([walk[2] for walk in walks])
     if lengths.min() < 1e-9 or metres.min() <= 0:
-        raise WearcapError(
-            f"walks of {metres.tolist()} m, and {lengths.round(4).tolist()} in the SLAM",
-            where="walked distances",
-            expected="two different places and a distance above 0",
-            fix="Check the times of the walks.",
-        )
+        what = f"walks of {metres.tolist()} m, and {lengths.round(4).tolist()} in the SLAM"
+        expected = "two different places and a distance above 0"
+        raise WearcapError(what, where="walked distances", expected=expected, fix="Check the times of the walks.")
     scales = metres / lengths
     return float(metres @ lengths / (lengths @ lengths)), float(np.ptp(scales) / scales.mean())
 
@@ -169,19 +166,14 @@ def by_head_imu(
     length = np.linalg.norm(up) / k if abs(k) > 1e-12 else math.inf
     deviation = math.sqrt(covariance[0, 0]) / abs(k)
     if deviation > 0.1:
-        raise WearcapError(
-            f"the scale stays uncertain by {100 * deviation:.0f} %",
-            where="scale from the head's sensor",
-            expected="at most 10 %",
-            fix="Walk with turns for half a minute; give more of the log.",
-        )
+        what = f"the scale stays uncertain by {100 * deviation:.0f} %"
+        fix = "Walk with turns for half a minute; give more of the log."
+        raise WearcapError(what, where="scale from the head's sensor", expected="at most 10 %", fix=fix)
     if k <= 0 or abs(length / GRAVITY - 1) > _GRAVITY_SHARE:
-        raise WearcapError(
-            f"gravity of {length:.2f} m/s² and a scale of {1 / k:.3g}",
-            where="scale from the head's sensor",
-            expected="9.81 m/s² and a scale above 0",
-            fix="Check the unit of the accelerations, how the sensor sits on the camera, and the clocks.",
-        )
+        what = f"gravity of {length:.2f} m/s² and a scale of {1 / k:.3g}"
+        expected = "9.81 m/s² and a scale above 0"
+        fix = "Check the unit of the accelerations, how the sensor sits on the camera, and the clocks."
+        raise WearcapError(what, where="scale from the head's sensor", expected=expected, fix=fix)
     direction = up / np.linalg.norm(up)
     across = np.eye(3) - np.outer(direction, direction)
     turn = across @ covariance[1:4, 1:4] @ across / (up @ up)
@@ -199,19 +191,13 @@ def _alike(
         raise WearcapError("a stream without acc_imu", where="the head's sensor", expected="specific force (m/s²)")
     start, stop = max(slam.timestamps[0], imu.timestamps[0]), min(slam.timestamps[-1], imu.timestamps[-1])
     if stop - start < 10:
-        raise WearcapError(
-            f"camera and sensor share {max((stop - start).item(), 0):.1f} s",
-            where="scale from the head's sensor",
-            expected="10 s or more",
-            fix="Bring both to one clock, and walk for longer.",
-        )
+        what = f"camera and sensor share {max((stop - start).item(), 0):.1f} s"
+        fix = "Bring both to one clock, and walk for longer."
+        raise WearcapError(what, where="scale from the head's sensor", expected="10 s or more", fix=fix)
     if len(gaps := find_gaps(slam.timestamps, 0.5)):
-        raise WearcapError(
-            f"the camera is lost at {slam.timestamps[gaps[0]].item():.2f} s",
-            where="scale from the head's sensor",
-            expected="poses without gaps",
-            fix="Give a part without gaps.",
-        )
+        what = f"the camera is lost at {slam.timestamps[gaps[0]].item():.2f} s"
+        fix = "Give a part without gaps."
+        raise WearcapError(what, where="scale from the head's sensor", expected="poses without gaps", fix=fix)
     step, fine = slam.timestamps.diff().median().item(), 4
     n = max(round(_HALF_S / step), 1)
     # On the camera's frames: between them positions would be interpolated, which flattens them.
@@ -293,12 +279,9 @@ def _floor_points(points: np.ndarray, eyes: np.ndarray, rough: np.ndarray, rando
         best = near if near.sum() > best.sum() else best
     for _ in range(3):
         if best.sum() < 30:
-            raise WearcapError(
-                f"{int(best.sum())} of {len(points)} points below the path lie on one plane",
-                where="scale from the floor",
-                expected="30 or more",
-                fix="Look at the floor while walking, or use the board.",
-            )
+            what = f"{int(best.sum())} of {len(points)} points below the path lie on one plane"
+            fix = "Look at the floor while walking, or use the board."
+            raise WearcapError(what, where="scale from the floor", expected="30 or more", fix=fix)
         up, height = _plane(points[best], eyes)
         best = np.abs((points - eyes) @ up + height) < 0.02 * height
     return points[best]

@@ -103,11 +103,8 @@ def measure_watches(streams: Mapping[str, ImuStream], board: Stretch, t_pose: St
     if missing := [joint for joint in WRISTS if joint not in streams]:
         raise WearcapError(f"no watch on {' and '.join(missing)}", expected=" and ".join(WRISTS))
     if board[0] < t_pose[1] and t_pose[0] < board[1]:
-        raise WearcapError(
-            f"board {board} and T-pose {t_pose} overlap",
-            where="board and T-pose",
-            expected="two stretches, one after the other",
-        )
+        what = f"board {board} and T-pose {t_pose} overlap"
+        raise WearcapError(what, where="board and T-pose", expected="two stretches, one after the other")
     R_world_joint = rotation.about_axis("z", torch.tensor(math.radians(FACING_DEG), dtype=torch.float64))
     found = {}
     for joint in WRISTS:
@@ -204,12 +201,9 @@ def propose_steps(streams: Mapping[str, ImuStream]) -> tuple[Stretch | None, Str
 
 def _orientation(stream: ImuStream) -> Float[Tensor, "time 3 3"]:
     if stream.R_world_imu is None:
-        raise WearcapError(
-            "a watch's log without orientation",
-            where=stream.joint,
-            expected="one with attitude",
-            fix="Switch on device motion when you record.",
-        )
+        what = "a watch's log without orientation"
+        fix = "Switch on device motion when you record."
+        raise WearcapError(what, where=stream.joint, expected="one with attitude", fix=fix)
     return stream.R_world_imu
 
 

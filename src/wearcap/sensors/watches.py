@@ -32,12 +32,8 @@ def watches_at(
     worn = []
     for joint in WRISTS:
         if joint not in streams:
-            raise WearcapError(
-                f"no watch on {joint}",
-                where=where,
-                expected=" and ".join(WRISTS),
-                fix="Give both watches, or capture with the head alone: pipeline=hmd2.",
-            )
+            fix = "Give both watches, or capture with the head alone: pipeline=hmd2."
+            raise WearcapError(f"no watch on {joint}", where=where, expected=" and ".join(WRISTS), fix=fix)
         stream = streams[joint]
         if stream.R_world_imu is None or stream.acc_world is None:
             raise WearcapError(
@@ -95,30 +91,23 @@ def require_sides(R_world_wrist: Float[Tensor, "time wrist 3 3"], where: str) ->
     """
     up = R_world_wrist[:, :, 2, 1].mean(0)
     if up[0] > _HANGING and up[1] < -_HANGING:
-        raise WearcapError(
-            "the watches seem to be swapped: both forearms would point up most of the time",
-            where=where,
-            fix="Exchange the logs of the left and the right watch, or calibrate them again.",
-        )
+        what = "the watches seem to be swapped: both forearms would point up most of the time"
+        fix = "Exchange the logs of the left and the right watch, or calibrate them again."
+        raise WearcapError(what, where=where, fix=fix)
 
 
 def _require_no_gaps(times: Tensor, requested: Tensor, where: str) -> None:
     """Raise WearcapError when the watch has no samples at some of the requested times."""
     step = times.diff()
     if len(times) < 2 or (step <= 0).any():
-        raise WearcapError(
-            "times of a watch that do not grow",
-            where=where,
-            fix="Sort its samples by time and leave repeated ones out.",
-        )
+        fix = "Sort its samples by time and leave repeated ones out."
+        raise WearcapError("times of a watch that do not grow", where=where, fix=fix)
     early, late = (times[0] - requested[0]).item(), (requested[-1] - times[-1]).item()
     if early > MAX_GAP_S or late > MAX_GAP_S:
-        raise WearcapError(
-            f"the watch logged from {times[0].item():.2f} s to {times[-1].item():.2f} s",
-            where=where,
-            expected=f"{requested[0].item():.2f} s to {requested[-1].item():.2f} s, as the camera did",
-            fix="Put both on one clock (wearcap calibrate), or cut the recording to what they share.",
-        )
+        what = f"the watch logged from {times[0].item():.2f} s to {times[-1].item():.2f} s"
+        expected = f"{requested[0].item():.2f} s to {requested[-1].item():.2f} s, as the camera did"
+        fix = "Put both on one clock (wearcap calibrate), or cut the recording to what they share."
+        raise WearcapError(what, where=where, expected=expected, fix=fix)
     gaps = find_gaps(times, MAX_GAP_S)
     inside = [g for g in gaps.tolist() if times[g + 1] > requested[0] and times[g] < requested[-1]]
     if inside:

@@ -76,11 +76,8 @@ def head_path(recording: Recording, fallback: Skeleton, fps: float) -> HeadPath:
             f"head poses of {len(times)} frames", where=recording.name, expected=f"at least {MIN_DURATION_S} s"
         )
     if not (times.diff() > 0).all():
-        raise WearcapError(
-            "head poses whose timestamps do not grow",
-            where=recording.name,
-            fix="Sort the head stream by time and leave repeated poses out.",
-        )
+        fix = "Sort the head stream by time and leave repeated poses out."
+        raise WearcapError("head poses whose timestamps do not grow", where=recording.name, fix=fix)
     _require_plausible(head.R_world_device[finite], times, fps, recording.name)
     skeleton = recording.skeleton or (recording.motion.skeleton if recording.motion else fallback)
     trajectory = Trajectory(times, head.R_world_device[finite], head.t_world_device[finite])
@@ -113,20 +110,14 @@ def _require_plausible(
     """Raise WearcapError for matrices that are not rotations, and for timestamps that are not in seconds."""
     skewed = (R_world_device.transpose(-1, -2) @ R_world_device - torch.eye(3)).abs().amax((-1, -2)) > 0.05
     if skewed.any():
-        raise WearcapError(
-            f"the head pose at {times[skewed][0].item():.3f} s is no rotation",
-            where=name,
-            expected="orthonormal matrices",
-            fix="Run `wearcap doctor` on the recording.",
-        )
+        what = f"the head pose at {times[skewed][0].item():.3f} s is no rotation"
+        fix = "Run `wearcap doctor` on the recording."
+        raise WearcapError(what, where=name, expected="orthonormal matrices", fix=fix)
     span = (times[-1] - times[0]).item()
     if span * fps > MAX_FILL * len(times):
-        raise WearcapError(
-            f"{len(times)} head poses over {span:.0f} s",
-            where=name,
-            expected=f"one in {MAX_FILL / fps:.0f} s at least",
-            fix="Give timestamps in seconds, or cut the recording at its pauses.",
-        )
+        what = f"{len(times)} head poses over {span:.0f} s"
+        fix = "Give timestamps in seconds, or cut the recording at its pauses."
+        raise WearcapError(what, where=name, expected=f"one in {MAX_FILL / fps:.0f} s at least", fix=fix)
 
 
 def _breaks(trajectory: Trajectory) -> list[tuple[float, float]]:
