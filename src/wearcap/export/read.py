@@ -74,9 +74,8 @@ def load_exported(path: str | Path, network: str | None = None) -> Any:
     files |= {_file_of(path, part, weights=True): entry for part, entry in about["weights"].items()}
     for file, entry in files.items():
         if not file.is_file():
-            raise WearcapError(
-                "a part of the exported model is missing", where=file, fix="Copy all files of the export."
-            )
+            what = "a part of the exported model is missing"
+            raise WearcapError(what, where=file, fix="Copy all files of the export.")
         if entry["sha256"] != sha256_of(file):
             raise WearcapError("its sidecar belongs to another model file", where=file, fix="Export the model again.")
     runs |= {name: open_exported(part_path(path, name)) for name in about["parts"]}

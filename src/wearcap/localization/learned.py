@@ -54,9 +54,8 @@ def _place(network: nn.Module, device: str) -> None:
     try:
         network.to(device).eval().requires_grad_(False)
     except (RuntimeError, AssertionError) as error:
-        raise WearcapError(
-            f"the device {device!r} cannot be used here", expected="cpu, or cuda on a machine with a GPU"
-        ) from error
+        what = f"the device {device!r} cannot be used here"
+        raise WearcapError(what, expected="cpu, or cuda on a machine with a GPU") from error
 
 
 def _identity(network: str, weights: str | Path | None) -> str:

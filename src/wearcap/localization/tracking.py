@@ -178,9 +178,8 @@ def track_pictures(
         Pictures.of_folder(source, settings.fps) if source.is_dir() else _frames(source, output, settings.fps, advance)
     )
     if len(pictures.names) < 3:
-        raise WearcapError(
-            f"{len(pictures.names)} pictures", where=source, expected="at least 3", fix="Take more a second: fps=…"
-        )
+        what = f"{len(pictures.names)} pictures"
+        raise WearcapError(what, where=source, expected="at least 3", fix="Take more a second: fps=…")
     if camera is not None:
         check_size(read_image(pictures.folder / pictures.names[0]), camera, pictures.names[0])
     model = map_pictures(pictures.names, pictures.folder, output, camera, settings.mapping, advance)

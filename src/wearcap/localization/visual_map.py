@@ -141,13 +141,11 @@ class VisualMap:
         except FileNotFoundError as error:
             raise WearcapError("no such map", where=path, fix="Build it: wearcap scene.") from error
         except (safetensors.SafetensorError, OSError, RuntimeError) as error:
-            raise WearcapError(
-                "not a readable map", where=path, expected="a complete .safetensors file", fix=_AGAIN
-            ) from error
+            expected = "a complete .safetensors file"
+            raise WearcapError("not a readable map", where=path, expected=expected, fix=_AGAIN) from error
         if "wearcap_map" not in metadata:
-            raise WearcapError(
-                "a .safetensors file, but not a visual map", where=path, expected="one that `wearcap scene` wrote"
-            )
+            what = "a .safetensors file, but not a visual map"
+            raise WearcapError(what, where=path, expected="one that `wearcap scene` wrote")
         try:
             header = parse_json(metadata["wearcap_map"], path)
             if header["schema_version"] != SCHEMA_VERSION:

@@ -77,9 +77,8 @@ def chosen(runtime: str, precision: str, device: torch.device | str) -> tuple[st
     device = torch.device(device)
     for what, value, allowed in (("runtime", runtime, RUNTIMES), ("precision", precision, PRECISIONS)):
         if value not in allowed:
-            raise WearcapError(
-                f"no {what} {value!r}", expected=f"one of {', '.join(allowed)}", fix=nearest(value, allowed)
-            )
+            expected = f"one of {', '.join(allowed)}"
+            raise WearcapError(f"no {what} {value!r}", expected=expected, fix=nearest(value, allowed))
     missing = missing_libraries()
     if runtime == "auto":
         plain = "eager" if missing or precision == "bfloat16" else "onnx"
@@ -94,9 +93,8 @@ def chosen(runtime: str, precision: str, device: torch.device | str) -> tuple[st
             fix=f"{_INSTALL}, or choose pipeline.runtime=eager.",
         )
     if (precision == "int8") > (runtime == "onnx") or (precision == "bfloat16" and runtime == "onnx"):
-        raise WearcapError(
-            f"no {precision} with runtime {runtime!r}", expected="int8 with onnx; bfloat16 with eager or compile"
-        )
+        expected = "int8 with onnx; bfloat16 with eager or compile"
+        raise WearcapError(f"no {precision} with runtime {runtime!r}", expected=expected)
     return runtime, precision
 
 

@@ -67,9 +67,8 @@ def read_state(path: str | Path, settings: Mapping[str, Any], classes: Mapping[s
             tree = parse_json(about[_KEY], path)
             return _Reader(classes, shared, tree["objects"], tensors).decoded(tree["state"])
     except (OSError, safetensors.SafetensorError, WearcapError, *_DAMAGE) as error:
-        raise WearcapError(
-            "not a saved session", where=path, expected="a whole .safetensors file of Session.save"
-        ) from error
+        expected = "a whole .safetensors file of Session.save"
+        raise WearcapError("not a saved session", where=path, expected=expected) from error
     what = f"a session with {wrong} {theirs.get(wrong)}, not {ours.get(wrong)}"
     raise WearcapError(what, where=path, fix="Load it with the pipeline it ran with.")
 

@@ -193,9 +193,8 @@ class LearnedSystem(System):
         """
         options = options or StageOptions()
         if options.until is not None or options.cache is not None:
-            raise WearcapError(
-                f"until={options.until} cache={options.cache}", expected="a pipeline with stages, such as pipeline=hps"
-            )
+            what = f"until={options.until} cache={options.cache}"
+            raise WearcapError(what, expected="a pipeline with stages, such as pipeline=hps")
         once = {id(recording): CaptureInput.of(recording) for recording in recordings}
         motions = self.motions([once[id(recording)] for recording in recordings], seeds)
         return [Captured(motion) for motion in motions]

@@ -190,10 +190,8 @@ class SwingClock:
 
     def checks(self, joint: str, min_swings: int = 5, max_std_s: float = 0.005) -> list[StepCheck]:
         """Quality checks of the swings."""
-        more, step = (
-            "Swing ten times, and give the frames in which the hands are nearest to the camera.",
-            f"arm swings, {joint}",
-        )
+        more = "Swing ten times, and give the frames in which the hands are nearest to the camera."
+        step = f"arm swings, {joint}"
         return [
             StepCheck(step, "seen by both clocks", self.clock.claps, min_swings, "", more, at_least=True),
             StepCheck(step, "deviation of the offset", 1000 * self.std_s, 1000 * max_std_s, "ms", more),

@@ -182,9 +182,8 @@ def _register(
     """
     for points, name in ((cloud, "the cloud to register"), (scene, "the scene")):
         if len(points) < _FEWEST or not np.isfinite(points).all():
-            raise WearcapError(
-                f"{name} has {len(points)} points, or some are NaN", expected=f"at least {_FEWEST} finite points (m)"
-            )
+            what = f"{name} has {len(points)} points, or some are NaN"
+            raise WearcapError(what, expected=f"at least {_FEWEST} finite points (m)")
     points, scene = cloud.astype(np.float64), scene.astype(np.float64)
     pose, converged = T_scene_cloud.to(torch.float64).matrix().numpy(), False
     placed, finest_m = _moved(points, pose), stages[-1][0]

@@ -235,9 +235,8 @@ def by_floor(
     measured height. Raises WearcapError when too few points lie on a plane, or for an implausible height.
     """
     if not 0.5 < height_m < 2.5:
-        raise WearcapError(
-            f"a standing height of {height_m} m", where="scale from the floor", expected="0.5 m to 2.5 m"
-        )
+        what = f"a standing height of {height_m} m"
+        raise WearcapError(what, where="scale from the floor", expected="0.5 m to 2.5 m")
     random = np.random.default_rng(seed)
     eyes = slam.t_world_body[during(slam.timestamps, standing, "standing", 1.0)].double().mean(0).numpy()
     rough = -slam.R_world_body[:, :, 1].double().mean(0).numpy()

@@ -36,9 +36,8 @@ def watches_at(
             raise WearcapError(f"no watch on {joint}", where=where, expected=" and ".join(WRISTS), fix=fix)
         stream = streams[joint]
         if stream.R_world_imu is None or stream.acc_world is None:
-            raise WearcapError(
-                "a watch without orientation or free acceleration", where=f"{where}, {joint}", expected="both"
-            )
+            what = "a watch without orientation or free acceleration"
+            raise WearcapError(what, where=f"{where}, {joint}", expected="both")
         _require_no_gaps(stream.timestamps, timestamps, f"{where}, {joint}")
         worn.append(stream)
     step = timestamps.diff().median().item() if len(timestamps) > 1 else 0.0

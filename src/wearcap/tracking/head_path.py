@@ -65,16 +65,14 @@ def head_path(recording: Recording, fallback: Skeleton, fps: float) -> HeadPath:
     that are not rotations, and for too few poses for their time span.
     """
     if recording.head is None:
-        raise WearcapError(
-            "no head poses in this recording", where=recording.name, expected="a recording with a `head` stream"
-        )
+        expected = "a recording with a `head` stream"
+        raise WearcapError("no head poses in this recording", where=recording.name, expected=expected)
     head = recording.head
     finite = head.R_world_device.isfinite().all(-1).all(-1) & head.t_world_device.isfinite().all(-1)
     times = head.timestamps[finite]
     if len(times) < 2 or times[-1] - times[0] < MIN_DURATION_S:
-        raise WearcapError(
-            f"head poses of {len(times)} frames", where=recording.name, expected=f"at least {MIN_DURATION_S} s"
-        )
+        what = f"head poses of {len(times)} frames"
+        raise WearcapError(what, where=recording.name, expected=f"at least {MIN_DURATION_S} s")
     if not (times.diff() > 0).all():
         fix = "Sort the head stream by time and leave repeated poses out."
         raise WearcapError("head poses whose timestamps do not grow", where=recording.name, fix=fix)

@@ -124,9 +124,8 @@ def read_behave_mesh(root: str | Path, object_name: str) -> Mesh:
     Raises WearcapError where it is missing, and for what `check_object_mesh` refuses.
     """
     if not re.fullmatch(r"[\w-]{1,64}", object_name):
-        raise WearcapError(
-            f"an object named {object_name[:60]!r}", where=root, expected="one of BEHAVE's names, as boxlarge"
-        )
+        what = f"an object named {object_name[:60]!r}"
+        raise WearcapError(what, where=root, expected="one of BEHAVE's names, as boxlarge")
     path = Path(root) / "objects" / object_name / _REGISTERED.get(object_name, f"{object_name}_f1000.ply")
     if not path.is_file():
         fix = "Unpack BEHAVE's objects.zip beside the sequences."

@@ -126,9 +126,8 @@ def _object_files(root: Path, name: str, object_name: str | None) -> dict[str, t
             object_name = fitting[0]
         found = {object_name: (single, Path(single.name))}
     else:
-        raise WearcapError(
-            "no object locations of this sequence", where=single, expected=f"this file, or a folder {several}"
-        )
+        what = "no object locations of this sequence"
+        raise WearcapError(what, where=single, expected=f"this file, or a folder {several}")
     return {
         object_id: (path, next((place for folder in _CONTACTS if (place := root / folder / labels).is_file()), None))
         for object_id, (path, labels) in found.items()
@@ -191,9 +190,8 @@ def read_egohoi_contacts(path: str | Path, clock: LabelClock, object_name: str, 
     parts: dict[str, list[list[Any]]] = {f"{hand}_hand": [] for hand in HANDS}
     for number, row in enumerate(rows):
         if not isinstance(row, dict) or not isinstance(row.get("parts"), list):
-            raise WearcapError(
-                f"interaction {number} is {row!r}"[:200], where=path, expected='{"start", "end", "parts"}'
-            )
+            expected = '{"start", "end", "parts"}'
+            raise WearcapError(f"interaction {number} is {row!r}"[:200], where=path, expected=expected)
         start, end = row.get("start"), row.get("end")
         if isinstance(start, int | float) and isinstance(end, int | float) and end < start:
             what = f"interaction {number} ends before it starts: {start} to {end} s"

@@ -164,14 +164,12 @@ def _config(path: Path) -> dict[str, Any]:
             if isinstance(event, yaml.AliasEvent):
                 what = "it refers to its own parts (&name, *name)"
                 expected = "plain keys with values"
-                raise WearcapError(
-                    what, where=path, expected=expected, fix="Write them out: such references can blow up."
-                )
+                fix = "Write them out: such references can blow up."
+                raise WearcapError(what, where=path, expected=expected, fix=fix)
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if depth > MAX_JSON_DEPTH:
-                raise WearcapError(
-                    "YAML that is nested too deeply", where=path, expected=f"at most {MAX_JSON_DEPTH} levels"
-                )
+                expected = f"at most {MAX_JSON_DEPTH} levels"
+                raise WearcapError("YAML that is nested too deeply", where=path, expected=expected)
         content = yaml.safe_load(text)
     if not isinstance(content, dict | None):
         raise WearcapError(f"it holds a {type(content).__name__}", where=path, expected="keys with values")
@@ -191,9 +189,8 @@ def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], fol
     if measured is None or not {"x", "y"} <= marks.keys():
         return None
     if not isinstance(measured, dict) or not {"dist", "height"} <= measured.keys():
-        raise WearcapError(
-            "cam_scale_origin lacks a number", where=folder / CONFIG, expected="dist: [x, y] and height (m)"
-        )
+        what = "cam_scale_origin lacks a number"
+        raise WearcapError(what, where=folder / CONFIG, expected="dist: [x, y] and height (m)")
     length = _numbers(measured["dist"], 2, "cam_scale_origin.dist", folder / CONFIG)
     (height,) = _numbers([measured["height"]], 1, "cam_scale_origin.height", folder / CONFIG)
     if min(*length, height) <= 0:

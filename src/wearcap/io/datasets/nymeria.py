@@ -97,9 +97,8 @@ def _contacts(arrays: dict[str, np.ndarray], motion: Motion, path: str | Path) -
         return None
     contact = arrays["foot_contacts"]
     if contact.shape != (len(motion), len(FOOT_PATCHES)):
-        raise WearcapError(
-            f"foot_contacts has shape {contact.shape}", where=path, expected=f"({len(motion)}, {len(FOOT_PATCHES)})"
-        )
+        what = f"foot_contacts has shape {contact.shape}"
+        raise WearcapError(what, where=path, expected=f"({len(motion)}, {len(FOOT_PATCHES)})")
     return ContactTrack(motion.timestamps, FOOT_PATCHES, torch.from_numpy(contact > 0.5))
 
 

@@ -67,23 +67,20 @@ def read_omomo(root: str | Path) -> list[OmomoSequence]:
     """
     paths = [Path(root) / name for name in FILES if (Path(root) / name).is_file()]
     if not paths:
-        raise WearcapError(
-            "no sequences", where=root, expected=" or ".join(FILES), fix="Give OMOMO's folder as source=DIR."
-        )
+        fix = "Give OMOMO's folder as source=DIR."
+        raise WearcapError("no sequences", where=root, expected=" or ".join(FILES), fix=fix)
     found = []
     for path in paths:
         content = read_pickle(path)
         if not isinstance(content, dict):
-            raise WearcapError(
-                f"it holds a {type(content).__name__}", where=path, expected="{number: {seq_name, trans, …}}"
-            )
+            what = f"it holds a {type(content).__name__}"
+            raise WearcapError(what, where=path, expected="{number: {seq_name, trans, …}}")
         for key, entry in content.items():
             name = entry.get("seq_name") if isinstance(entry, dict) else None
             if not isinstance(name, str) or len(name.split("_")) < 3 or not name.replace("_", "").isalnum():
                 what = f"sequence {key!r} is named {name!r}"[:200]
-                raise WearcapError(
-                    what, where=path, expected="seq_name SUBJECT_OBJECT_NUMBER, such as sub1_largebox_000"
-                )
+                expected = "seq_name SUBJECT_OBJECT_NUMBER, such as sub1_largebox_000"
+                raise WearcapError(what, where=path, expected=expected)
             arrays = {key: entry[key] for key in _KEYS if isinstance(entry.get(key), np.ndarray)}
             gender = entry.get("gender", "")
             if isinstance(gender, np.ndarray) and gender.size == 1:

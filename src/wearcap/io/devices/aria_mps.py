@@ -157,9 +157,8 @@ def read_points(
             named = known[place] == rows["uid"]
             np.minimum.at(first_us, place[named], rows["frame_tracking_timestamp_us"][named])
         if (first_us == np.iinfo(np.int64).max).all():
-            raise WearcapError(
-                "names none of the points", where=observations, expected="the observations of the same recording"
-            )
+            expected = "the observations of the same recording"
+            raise WearcapError("names none of the points", where=observations, expected=expected)
         seen = np.empty(len(uid))
         seen[order] = np.where(first_us < np.iinfo(np.int64).max, first_us * 1e-6, np.inf)
         keep &= np.isfinite(seen)

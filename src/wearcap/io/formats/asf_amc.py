@@ -183,10 +183,8 @@ class _AsfContent:
         for line, (parent, *below) in self.hierarchy:
             for name in below:
                 if name not in self.bones or name in seen:
-                    what, expected = (
-                        f"bone {name!r} is unknown or has two parents",
-                        "every bone of :bonedata once below a parent",
-                    )
+                    what = f"bone {name!r} is unknown or has two parents"
+                    expected = "every bone of :bonedata once below a parent"
                     raise WearcapError(what, where=at_line(path, line), expected=expected)
                 seen.add(name)
             children.setdefault(parent, []).extend(below)
@@ -343,9 +341,8 @@ def _parse_amc(path: Path, asf: _AsfSkeleton) -> tuple[np.ndarray, list[int], Fl
             fix = "Check that AMC and ASF belong together."
             raise WearcapError(what, where=at_line(path, line), expected=expected, fix=fix)
         if len(given) != (expected := len(asf.dof[asf.skeleton.index(name)])):
-            raise WearcapError(
-                f"{len(given)} values for {name!r}", where=at_line(path, line), expected=f"{expected} as in the ASF"
-            )
+            what = f"{len(given)} values for {name!r}"
+            raise WearcapError(what, where=at_line(path, line), expected=f"{expected} as in the ASF")
     moving = {name for name, dof in zip(asf.skeleton.joint_names, asf.dof) if dof}
     if not names or moving - set(names):
         what = f"the first frame lacks {sorted(moving - set(names))[:5]}"
@@ -363,10 +360,8 @@ def _parse_amc(path: Path, asf: _AsfSkeleton) -> tuple[np.ndarray, list[int], Fl
             continue
         like = first[place - 1][1]
         if words[0] != like[0] or len(words) != len(like):
-            what, expected = (
-                f"{' '.join(words)[:60]!r} differs from the first frame",
-                f"{like[0]!r} with {len(like) - 1} values",
-            )
+            what = f"{' '.join(words)[:60]!r} differs from the first frame"
+            expected = f"{like[0]!r} with {len(like) - 1} values"
             raise WearcapError(what, where=at_line(path, number), expected=expected)
         try:
             values.extend(finite_floats(words[1:]))

@@ -103,9 +103,8 @@ def parse_labels(content: Any, clock: LabelClock, *, where: str | Path) -> Label
         raise WearcapError("no contact labels", where=where, expected=expected)
     if "recording" in content:
         if content.get("schema_version") != SCHEMA:
-            raise WearcapError(
-                f"schema version {content.get('schema_version')}", where=where, expected=f"version {SCHEMA}"
-            )
+            what = f"schema version {content.get('schema_version')}"
+            raise WearcapError(what, where=where, expected=f"version {SCHEMA}")
         with understood("does not name the recording of its labels", where):
             about = content["recording"]
             name, frames, span = about["name"], about["frames"], (about["start_s"], about["stop_s"])
@@ -132,9 +131,8 @@ def parse_labels(content: Any, clock: LabelClock, *, where: str | Path) -> Label
             beside.append(texts)
         objects, classes = beside
         if unknown := set(classes) - {"", *CONTACT_CLASSES}:
-            raise WearcapError(
-                f"class {unknown.pop()!r} in {name}", where=where, expected=f"one of {', '.join(CONTACT_CLASSES)}"
-            )
+            expected = f"one of {', '.join(CONTACT_CLASSES)}"
+            raise WearcapError(f"class {unknown.pop()!r} in {name}", where=where, expected=expected)
         spans = [_span(pair, clock, f"{name} label {place}", where) for place, pair in enumerate(pairs)]
         found = [Label(*span, item, kind) for span, item, kind in zip(spans, objects, classes)]
         labels[hand] = tuple(sorted(found, key=lambda label: label.start_s))

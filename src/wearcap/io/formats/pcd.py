@@ -91,9 +91,8 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[dict[str, list[str]], 
 
 def _require(complete: bool, path: str | Path) -> None:
     if not complete:
-        raise WearcapError(
-            "it holds fewer points than its header states", where=path, fix="The file was cut short: copy it again."
-        )
+        what = "it holds fewer points than its header states"
+        raise WearcapError(what, where=path, fix="The file was cut short: copy it again.")
 
 
 def _compressed_rows(body: memoryview, dtype: np.dtype, count: int, path: str | Path) -> np.ndarray:

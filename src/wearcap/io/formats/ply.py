@@ -146,9 +146,8 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[str, list[_Element], i
     stop = data.find(b"end_header", 0, _MAX_HEADER_BYTES)
     newline = data.find(b"\n", stop)
     if stop < 0 or newline < 0:
-        raise WearcapError(
-            "its header has no end", where=path, expected="`end_header`", fix="The file was cut short: copy it again."
-        )
+        fix = "The file was cut short: copy it again."
+        raise WearcapError("its header has no end", where=path, expected="`end_header`", fix=fix)
     byte_order, elements = "", []
     with understood("its header cannot be understood", path, "a PLY 1.0 header"):
         for line in data[:stop].decode("ascii").splitlines()[1:]:
@@ -168,9 +167,8 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[str, list[_Element], i
     if any(len(set(group)) < len(group) or any(name.startswith("#") for name in group) for group in names):
         raise WearcapError("its header names a part twice", where=path, expected="a PLY 1.0 header")
     if not byte_order or any(not 0 <= element.count < 1 << 48 for element in elements):
-        raise WearcapError(
-            "its header names no format, or an impossible or negative count", where=path, expected="a PLY 1.0 header"
-        )
+        what = "its header names no format, or an impossible or negative count"
+        raise WearcapError(what, where=path, expected="a PLY 1.0 header")
     return byte_order, elements, newline + 1
 
 
