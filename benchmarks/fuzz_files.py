@@ -36,18 +36,7 @@ import keypoint_files  # noqa: E402
 from wearcap.body.skeletons import smplh52  # noqa: E402
 from wearcap.geometry.camera import Camera  # noqa: E402
 from wearcap.geometry.rigid import Rigid  # noqa: E402
-from wearcap.io.datasets import (  # noqa: E402
-    adt,
-    amass,
-    behave,
-    egohoi,
-    hcontact,
-    hps,
-    hps_sequence,
-    mocap_every_folder,
-    nymeria,
-    omomo,
-)
+from wearcap.io.datasets import adt, amass, behave, egohoi, hcontact, hps, mocap_every_folder, nymeria, omomo  # noqa: E402
 from wearcap.io.devices import aria_mps, watch_log  # noqa: E402
 from wearcap.io.formats import (  # noqa: E402
     asf_amc,
@@ -57,7 +46,6 @@ from wearcap.io.formats import (  # noqa: E402
     contact_labels,
     csv_table,
     environment,
-    keypoints_csv,
     motion_npz,
     mvnx,
     npz,
@@ -72,6 +60,7 @@ from wearcap.io.formats import (  # noqa: E402
     video,
     wavefront,
 )
+from wearcap.localization import keypoints  # noqa: E402
 from wearcap.recording import Cue  # noqa: E402
 from wearcap.scene.scan import Photo  # noqa: E402
 from wearcap_testing import swaying_motion  # noqa: E402
@@ -295,14 +284,14 @@ READERS: dict[str, Reader] = {
     "hps_scene": Reader(hps_files.write_scan, hps.read_hps_scene),
     "hps_sequence": Reader(
         lambda folder: hps_files.write_hps(folder, frames=FRAMES),
-        lambda folder: hps_sequence.read_hps_sequence(folder, hps_files.NAME),
+        lambda folder: hps.read_hps_sequence(folder, hps_files.NAME),
     ),
     "hps_unity": Reader(
         lambda folder: hps_files.write_unity(hps_files.motion(4), folder, "u"),
         lambda folder: hps.read_unity_motion(folder / "u_pose.txt", folder / "u_trans.txt"),
     ),
     "json_text": _one("a.json", '{"a": [1, 2.5, null], "b": {"c": "x"}}', text.read_json_object),
-    "keypoints_csv": _made("k.csv", _cues, keypoints_csv.read_keypoints),
+    "keypoints_csv": _made("k.csv", _cues, keypoints.read_keypoints),
     "mocap_every": Reader(_mocap_every, mocap_every_folder.read_mocap_every_folder),
     "motion_npz": _made("m.npz", lambda path: motion_npz.write_motion(swaying_motion(4), path), motion_npz.read_motion),
     "mvnx": _one("m.mvnx", test_mvnx.mvnx(test_mvnx.sample(2)), mvnx.read_mvnx),

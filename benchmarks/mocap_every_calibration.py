@@ -9,7 +9,7 @@ from wearcap.geometry import rotation
 from wearcap.metrics.table import Scores, Summary
 from wearcap.sensors.camera_alignment import align_by_marks, mark_positions, mount_by_standing
 from wearcap.sensors.clock import fit_swing_clock, swing_peaks
-from wearcap.sensors.monocular_slam import GravityScale, by_floor, by_head_imu
+from wearcap.sensors.monocular_slam import _GravityScale, by_floor, by_head_imu
 from wearcap.sensors.watch_calibration import measure_watches, require_watches
 from wearcap.simulation.recordings.calibration_session import (
     MARKS,
@@ -82,7 +82,7 @@ def _errors(made: CalibrationSession, fps: float) -> dict[str, list[float]]:
     }
 
 
-def _scale_and_tilt(found: GravityScale, made: CalibrationSession) -> dict[str, float]:
+def _scale_and_tilt(found: _GravityScale, made: CalibrationSession) -> dict[str, float]:
     cos = (found.R_world_slam[2] @ made.planted.R_world_slam[2]).clamp_max(1).item()
     return {
         "slam_world_deg": math.degrees(math.acos(cos)),

@@ -15,8 +15,15 @@ from test_mvnx import mvnx, sample
 from wearcap.body.skeletons import smpl24
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.datasets.hps import is_hps_scene, read_hps_scene
-from wearcap.io.datasets.hps_sequence import _scan_name, hps_names, is_hps, read_hps_sequence, subject_of
+from wearcap.io.datasets.hps import (
+    _scan_name,
+    hps_names,
+    is_hps,
+    is_hps_scene,
+    read_hps_scene,
+    read_hps_sequence,
+    subject_of,
+)
 
 # Scans -------------------------------------------------------------------------------------------------------------
 

@@ -7,7 +7,7 @@ from hypothesis import given
 
 from keypoint_files import write_keypoints
 from wearcap.errors import WearcapError
-from wearcap.io.formats.keypoints_csv import read_keypoints
+from wearcap.localization.keypoints import read_keypoints
 from wearcap.recording import Cue
 
 HEADER = "timestamp,joint,x,y,confidence\n"

@@ -16,7 +16,7 @@ from mocap_every_files import BOARD_M, FIX, SCALE, SHUTTER_S, cloud, truth, worl
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.datasets.mocap_every_folder import (
-    BoardWalks,
+    _BoardWalks,
     is_mocap_every_folder,
     mocap_every_files,
     mocap_every_recording,
@@ -25,7 +25,7 @@ from wearcap.io.datasets.mocap_every_folder import (
 from wearcap.sensors.camera_alignment import align_by_walks
 
 
-def aligned(board: BoardWalks):
+def aligned(board: _BoardWalks):
     return align_by_walks(board.x_slam, board.y_slam, board.length_m, board.height_m)
 
 

@@ -14,7 +14,7 @@ from wearcap.cli import main as cli
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.io.formats.camera_json import read_camera, write_camera
-from wearcap.localization.checkerboard import Board, View, calibrate_from_pictures, varied
+from wearcap.localization.checkerboard import Board, _View, calibrate_from_pictures, varied
 
 
 @pytest.fixture(scope="module")
@@ -82,10 +82,10 @@ def test_blurred_pictures_stand_back_for_sharp_ones(shown):
 def test_varied_views_are_chosen():
     random = np.random.default_rng(0)
     near_one = [
-        View(f"same{k}", BOARD.points[:, :2] * 800 + 100 + random.normal(0, 0.1, 2).astype(np.float32), 1.0)
+        _View(f"same{k}", BOARD.points[:, :2] * 800 + 100 + random.normal(0, 0.1, 2).astype(np.float32), 1.0)
         for k in range(30)
     ]
-    far = [View("left", BOARD.points[:, :2] * 800, 2.0), View("small", BOARD.points[:, :2] * 300 + 100, 2.0)]
+    far = [_View("left", BOARD.points[:, :2] * 800, 2.0), _View("small", BOARD.points[:, :2] * 300 + 100, 2.0)]
     assert {"left", "small"} <= {view.name for view in varied([*near_one, *far], (640, 480), 4)}
 
 

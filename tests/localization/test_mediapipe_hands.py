@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from wearcap.errors import WearcapError
-from wearcap.localization.keypoints import MODEL_VARIABLE, Detector, Hand, MediaPipeHands, wearers_hands
+from wearcap.localization.keypoints import MODEL_VARIABLE, Detector, MediaPipeHands, _Hand, wearers_hands
 
 
 def mark(x: float, y: float) -> SimpleNamespace:
@@ -66,7 +66,7 @@ def test_wrists_are_pixels_of_the_wearers_hands(package):
 
 
 def test_two_hands_are_never_of_one_side():
-    sure, unsure = Hand(0.5, 0.5, 0.95), Hand(0.6, 0.5, 0.7)
+    sure, unsure = _Hand(0.5, 0.5, 0.95), _Hand(0.6, 0.5, 0.7)
     found = wearers_hands([unsure, sure])
     assert found["left_wrist"][0] == sure
     assert found["right_wrist"][0] == unsure
@@ -74,8 +74,8 @@ def test_two_hands_are_never_of_one_side():
 
 
 def test_one_hand_is_what_it_looks_like_unless_that_is_unsure():
-    assert list(wearers_hands([Hand(0.9, 0.5, 0.99)])) == ["left_wrist"]
-    assert list(wearers_hands([Hand(0.9, 0.5, 0.55)])) == ["right_wrist"]
+    assert list(wearers_hands([_Hand(0.9, 0.5, 0.99)])) == ["left_wrist"]
+    assert list(wearers_hands([_Hand(0.9, 0.5, 0.55)])) == ["right_wrist"]
     assert wearers_hands([]) == {}
 
 

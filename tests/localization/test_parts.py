@@ -13,12 +13,11 @@ from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.colmap import Tracks
-from wearcap.localization.absolute_pose import Fit, Matches
+from wearcap.localization.absolute_pose import Fit, Matches, match_landmarks, match_nearby
 from wearcap.localization.features import Features, RootSift, Vlad, most_similar, root
 from wearcap.localization.localizer import confidence
 from wearcap.localization.map_builder import MapSettings, _lift
-from wearcap.localization.matching import match_landmarks, match_nearby
-from wearcap.localization.point_map import PointMap, PointMapper, undistortion
+from wearcap.localization.point_map import PointMapper, _PointMap, undistortion
 from wearcap.localization.visual_map import from_bytes, merge, to_bytes
 from wearcap.scene.scan import Photo, Scan
 
@@ -133,7 +132,7 @@ def test_a_border_between_two_pixels_does_not_lead_out_of_the_picture():
     remap = undistortion(lens, 90.0)
     assert remap.valid[149, 250]
     index, depth = np.zeros((300, 300), np.int32), np.ones((300, 300), np.float32)
-    flat_map = remap.point_map(PointMap(lens, Rigid.identity(), index, depth))
+    flat_map = remap.point_map(_PointMap(lens, Rigid.identity(), index, depth))
     assert flat_map.index[149, 250] == 0
 
 

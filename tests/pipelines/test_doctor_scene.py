@@ -18,7 +18,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import about_axis
 from wearcap.io.formats.camera_json import write_photos
 from wearcap.io.formats.ply import Ply, write_ply
-from wearcap.localization.visual_map import Landmarks, Observations, VisualMap
+from wearcap.localization.visual_map import Observations, VisualMap, _Landmarks
 from wearcap.recording import CameraStream, Localization, Recording, RecordingStore
 
 CAMERA = Camera("opencv", 64, 48, 40.0, 40.0, 31.5, 23.5, (0.0, 0.0, 0.0, 0.0))
@@ -270,7 +270,7 @@ def small_map(pictures: int, each: int) -> VisualMap:
     count = pictures * each
     positions = random.uniform(-3, 3, (count, 3)).astype(np.float32)
     descriptors = random.integers(-9, 9, (count, 128), dtype=np.int8)
-    landmarks = Landmarks(positions, descriptors)
+    landmarks = _Landmarks(positions, descriptors)
     return VisualMap(
         "sift",
         "vlad",

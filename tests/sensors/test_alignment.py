@@ -10,7 +10,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Localization
-from wearcap.sensors.initialization import align_suit, estimate_head_camera, robust_angle, yaw_between
+from wearcap.sensors.initialization import _robust_angle, align_suit, estimate_head_camera, yaw_between
 
 NOISY = LocalizationNoise(outages_s=((0.0, 1.5),))
 
@@ -68,9 +68,9 @@ def test_a_wrong_first_frame_does_not_matter():
 
 def test_angles_round_the_circle():
     angle = torch.cat([torch.tensor([3.13, -3.13, 3.14, -3.135]), torch.full((3,), 1.0)])
-    assert rotation.wrap_angle(robust_angle(angle, torch.ones(7)) - math.pi).abs() < 0.02
+    assert rotation.wrap_angle(_robust_angle(angle, torch.ones(7)) - math.pi).abs() < 0.02
     heavy = torch.tensor([0.01] * 4 + [1.0] * 3)
-    assert robust_angle(angle, heavy) == pytest.approx(1.0, abs=0.01)
+    assert _robust_angle(angle, heavy) == pytest.approx(1.0, abs=0.01)
 
 
 def test_the_mount_is_recovered_despite_outliers():

@@ -18,10 +18,10 @@ from wearcap.metrics.surface import chamfer, seen_vertices
 from wearcap.sensors.depth_rig import (
     Background,
     DepthView,
+    _unproject_depth,
+    _visible_points,
     largest_cluster,
     person_cloud,
-    unproject_depth,
-    visible_points,
 )
 from wearcap.simulation.places.builder import WorldBuilder
 from wearcap.simulation.rendering.depth_rig import KINECT, SimulatedRig, approximate, place_rig, simulate_rig
@@ -72,7 +72,7 @@ def test_what_stands_before_the_background_is_kept_and_flying_pixels_are_not():
 
 def test_unprojection_puts_points_where_they_project_from():
     depth = np.random.default_rng(0).uniform(1, 3, (30, 40)).astype(np.float32)
-    points = unproject_depth(depth, np.ones((30, 40), bool), LENS)
+    points = _unproject_depth(depth, np.ones((30, 40), bool), LENS)
     pixels, valid = LENS.project(torch.from_numpy(points))
     y, x = np.mgrid[:30, :40]
     assert valid.all()
@@ -194,7 +194,7 @@ def turned_about(R: torch.Tensor, center: torch.Tensor) -> Rigid:
 
 def test_walls_are_registered_from_the_side_that_is_seen(scene: Scene):
     """The outer faces of the walls, 10 cm behind the inner ones, are in the scan and out of sight."""
-    kept = visible_points(scene.scan, scene.rig.T_world_cam[0])
+    kept = _visible_points(scene.scan, scene.rig.T_world_cam[0])
     outside = (scene.scan[:, :2] < -0.05).any(1) | (scene.scan[:, :2] > [6.05, 5.05]).any(1)
     assert outside.mean() > 0.2
     assert ((kept[:, :2] < -0.05).any(1) | (kept[:, :2] > [6.05, 5.05]).any(1)).mean() < 0.03

@@ -11,7 +11,7 @@ import torch
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import ImuStream
-from wearcap.sensors.monocular_slam import GravityScale, by_floor, by_head_imu
+from wearcap.sensors.monocular_slam import _GravityScale, by_floor, by_head_imu
 from wearcap.simulation.recordings.calibration_session import (
     STANDING,
     CalibrationSession,
@@ -27,7 +27,7 @@ def walked(seed: int) -> CalibrationSession:
     return simulate_calibration(seed, camera_fps=30.0, walk_s=120.0)
 
 
-def tilt_deg(found: GravityScale, made: CalibrationSession) -> float:
+def tilt_deg(found: _GravityScale, made: CalibrationSession) -> float:
     cos = (found.R_world_slam[2] @ made.planted.R_world_slam[2]).item()
     return math.degrees(math.acos(min(cos, 1.0)))
 

@@ -8,7 +8,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.pcd import read_pcd
-from wearcap.sensors.depth_rig import register
+from wearcap.sensors.depth_rig import _register
 
 
 def room(points: int, seed: int) -> np.ndarray:
@@ -50,7 +50,7 @@ def cloud() -> np.ndarray:
 @pytest.mark.parametrize(("degrees", "shift", "seed"), [(3, 0.1, 0), (3, 0.1, 1), (8, 0.3, 2), (8, 0.3, 3)])
 def test_a_planted_pose_comes_back(scene: np.ndarray, cloud: np.ndarray, degrees: float, shift: float, seed: int):
     off = turned(degrees, shift, seed)
-    result = register(cloud, scene, Rigid(off.R @ POSE.R, POSE.t + off.t))
+    result = _register(cloud, scene, Rigid(off.R @ POSE.R, POSE.t + off.t))
     assert (result.T_scene_cloud.t - POSE.t).norm() < 0.002
     assert rotation.geodesic(result.T_scene_cloud.R, POSE.R) < np.deg2rad(0.05)
     assert result.fitness > 0.95
@@ -62,7 +62,7 @@ def test_a_planted_pose_comes_back(scene: np.ndarray, cloud: np.ndarray, degrees
 
 def test_a_bare_floor_may_slide_and_it_is_reported(scene: np.ndarray):
     floor = scene[(np.abs(scene[:, 2]) < 0.01) & (scene[:, :2] > 0.5).all(1) & (scene[:, :2] < [1.4, 2.5]).all(1)]
-    result = register(floor[::3], scene, Rigid.identity(dtype=torch.float64))
+    result = _register(floor[::3], scene, Rigid.identity(dtype=torch.float64))
     assert result.least_seen < 0.01
     assert "slide" in result.summary
 
@@ -79,7 +79,7 @@ def test_what_does_not_overlap_is_refused(scene: np.ndarray, cloud: np.ndarray, 
     else:
         cloud = cloud[:5]
     with pytest.raises(WearcapError):
-        register(cloud, scene, start)
+        _register(cloud, scene, start)
 
 
 @pytest.mark.real
@@ -89,8 +89,8 @@ def test_two_real_scans_of_a_room_meet(real_data):
     odometry = Rigid(
         rotation.about_axis("z", torch.tensor(0.6931).double()), torch.tensor([1.79387, 0.720047, 0.0]).double()
     )
-    there = register(second, first, odometry)
-    back = register(first, second, odometry.inverse())
+    there = _register(second, first, odometry)
+    back = _register(first, second, odometry.inverse())
     loop = back.T_scene_cloud @ there.T_scene_cloud
     assert loop.t.norm() < 0.02
     assert rotation.geodesic(loop.R, torch.eye(3).double()) < np.deg2rad(0.5)
@@ -99,4 +99,4 @@ def test_two_real_scans_of_a_room_meet(real_data):
     assert max(there.rmse_m, back.rmse_m) < 0.02
     off = turned(5.0, 0.2, 0)
     start = Rigid(off.R @ there.T_scene_cloud.R, there.T_scene_cloud.t + off.t)
-    assert (register(second, first, start).T_scene_cloud.t - there.T_scene_cloud.t).norm() < 0.005
+    assert (_register(second, first, start).T_scene_cloud.t - there.T_scene_cloud.t).norm() < 0.005

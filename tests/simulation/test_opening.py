@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from wearcap.recording.interactions import HANDS
 
 from wearcap.body.kinematics import site_positions
 from wearcap.recording.motion import HANDS

@@ -18,7 +18,6 @@ from wearcap.body.skeleton import WRISTS
 from wearcap.cli.conf import hydra_main
 from wearcap.errors import WearcapError, nearest
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.devices.watch_calibration_json import write_watch_calibration
 from wearcap.io.devices.watch_log import read_watch_log
 from wearcap.io.formats.poses import read_tum
 from wearcap.locks import folder_lock
@@ -26,8 +25,14 @@ from wearcap.recording import Recording, RecordingStore
 from wearcap.recording.store import load_recording, save_recording
 from wearcap.sensors.camera_alignment import HeadMount, SlamAlignment, align_by_marks, mark_positions, mount_by_standing
 from wearcap.sensors.stillness import StepCheck, Stretch, require
-from wearcap.sensors.watch_calibration import measure_watches, require_watches, watch_checks
-from wearcap.sensors.watch_session import WatchSession, WornCalibration
+from wearcap.sensors.watch_calibration import (
+    WatchSession,
+    WornCalibration,
+    measure_watches,
+    require_watches,
+    watch_checks,
+    write_watch_calibration,
+)
 
 STEPS = {
     "board": "Lay both watches on the board for 3 s: backs down, 12 o'clock along the board's y axis. Touch nothing.",

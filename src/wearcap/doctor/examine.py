@@ -27,7 +27,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.adt import is_adt, read_adt
 from wearcap.io.datasets.amass import read_amass
-from wearcap.io.datasets.hps_sequence import hps_names, is_hps, read_hps_sequence
+from wearcap.io.datasets.hps import hps_names, is_hps, read_hps_sequence
 from wearcap.io.datasets.nymeria import is_nymeria, read_nymeria, read_xdata
 from wearcap.io.devices.aria_mps import find_mps_file, head_stream, is_mps_folder, read_closed_loop, read_mps
 from wearcap.io.formats.asf_amc import read_amc, read_asf

@@ -2,16 +2,16 @@
 
 import importlib
 import importlib.util
-from collections.abc import Callable
+import re
+import zipfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors.torch import load_file
-from torch import Tensor
 
 from wearcap.errors import WearcapError
-from wearcap.export.archive import check_archive
 from wearcap.files import parse_json, sha256_of
 from wearcap.runtime.graphs import Run, open_onnx
 
@@ -54,15 +54,33 @@ def load_exported(path: str | Path, network: str | None = None) -> Any:
     `network`: the expected system's name. Raises WearcapError when a file is missing, unreadable, of another system, or
     does not belong to the others.
     """
-    runs, about = {"model": open_exported(path)}, read_sidecar(path, network)
+    runs = {"model": open_exported(path)}
+    sidecar = sidecar_path(path)
+    try:
+        about = parse_json(sidecar.read_bytes(), sidecar)
+    except FileNotFoundError as error:
+        expected = "the .json file that `wearcap export` wrote beside the model"
+        raise WearcapError("no such sidecar", where=sidecar, expected=expected, fix="Copy both files.") from error
+    if not isinstance(about, dict) or about.get("wearcap_export") != VERSION:
+        raise WearcapError("not a sidecar of this version", where=sidecar, fix="Export the model again.")
+    name = str(about.get("network"))
+    package = f"wearcap.systems.{name}"
+    if (network or name) != name or not (
+        name.isidentifier() and all(map(importlib.util.find_spec, (package, f"{package}.export")))
+    ):
+        raise WearcapError(f"a {name[:40]} network", where=path, expected=f"a {network or 'known'} network")
+    files = {Path(path): about["model"]}
+    files |= {_file_of(path, part): entry for part, entry in about["parts"].items()}
+    files |= {_file_of(path, part, weights=True): entry for part, entry in about["weights"].items()}
+    for file, entry in files.items():
+        if not file.is_file():
+            what = "a part of the exported model is missing"
+            raise WearcapError(what, where=file, fix="Copy all files of the export.")
+        if entry["sha256"] != sha256_of(file):
+            raise WearcapError("its sidecar belongs to another model file", where=file, fix="Export the model again.")
     runs |= {name: open_exported(part_path(path, name)) for name in about["parts"]}
-    weights = {name: weights_of(path, name) for name in about["weights"]}
+    weights = {name: load_file(_file_of(path, name, weights=True)) for name in about["weights"]}
     return importlib.import_module(f"wearcap.systems.{about['network']}.export").from_export(runs, weights, about)
-
-
-def weights_of(path: str | Path, name: str) -> dict[str, Tensor]:
-    """Weights that are written beside a model."""
-    return load_file(_file_of(path, name, weights=True))
 
 
 def part_path(path: str | Path, part: str) -> Path:
@@ -75,42 +93,80 @@ def sidecar_path(path: str | Path) -> Path:
     return Path(path).with_suffix(".json")
 
 
-def read_sidecar(path: str | Path, network: str | None = None) -> dict[str, Any]:
-    """The sidecar of a model file. Raises WearcapError when it is missing, foreign, or of another network or file."""
-    sidecar = sidecar_path(path)
-    try:
-        tree = parse_json(sidecar.read_bytes(), sidecar)
-    except FileNotFoundError as error:
-        raise WearcapError(
-            "no such sidecar",
-            where=sidecar,
-            expected="the .json file that `wearcap export` wrote beside the model",
-            fix="Copy both files.",
-        ) from error
-    if not isinstance(tree, dict) or tree.get("wearcap_export") != VERSION:
-        raise WearcapError("not a sidecar of this version", where=sidecar, fix="Export the model again.")
-    name = str(tree.get("network"))
-    if (network or name) != name or not _exports(name):
-        raise WearcapError(f"a {name[:40]} network", where=path, expected=f"a {network or 'known'} network")
-    files = {Path(path): tree["model"]}
-    files |= {_file_of(path, part): entry for part, entry in tree["parts"].items()}
-    files |= {_file_of(path, part, weights=True): entry for part, entry in tree["weights"].items()}
-    for file, entry in files.items():
-        if not file.is_file():
-            raise WearcapError(
-                "a part of the exported model is missing", where=file, fix="Copy all files of the export."
-            )
-        if entry["sha256"] != sha256_of(file):
-            raise WearcapError("its sidecar belongs to another model file", where=file, fix="Export the model again.")
-    return tree
-
-
-def _exports(name: str) -> bool:
-    """Whether a system of this name exports networks."""
-    package = f"wearcap.systems.{name}"
-    return name.isidentifier() and all(map(importlib.util.find_spec, (package, f"{package}.export")))
-
-
 def _file_of(path: str | Path, part: str, weights: bool = False) -> Path:
     file = part_path(path, Path(part).name)
     return file.with_suffix(".safetensors") if weights else file
+
+
+_SYMBOL = r"Symbol\('[su]\d{1,6}'(?:, \w{1,20}=(?:True|False))*\)"
+_EXPRESSION = re.compile(
+    rf"(?:{_SYMBOL}|Integer\(-?\d{{1,18}}\)|[su]\d{{1,6}}|-?\d{{1,18}}"
+    r"|(?:Mul|Add|Pow|Min|Max|Mod|PythonMod|FloorDiv|CleanDiv|CeilDiv|ModularIndexing)\(|[(), ])+"
+)
+"""Allowed symbolic sizes, which SymPy evaluates."""
+_SIZE = r"L\['\w{1,60}'\]\.size\(\)\[\d{1,2}\]"
+_GUARD = re.compile(rf"{_SIZE} (?:==|!=|<=|>=|<|>) (?:{_SIZE}|\d{{1,18}})")
+"""Allowed comparisons of input sizes, which PyTorch compiles into a function."""
+_TARGET = re.compile(
+    r"torch\.ops\.aten\.\w+\.\w+|_operator\.(?:add|sub|mul|floordiv|mod|neg|eq|ne|ge|gt|le|lt|getitem)"
+)
+"""Operations that a graph may call."""
+_METADATA = ("stack_trace", "nn_module_stack", "torch_fn")
+MAX_JSON_BYTES = 1 << 26
+"""Largest allowed JSON description of a graph (64 MiB); exported ones have about 1 MiB."""
+
+
+def check_archive(path: str | Path) -> None:
+    """Raise WearcapError unless an archive has only tensors and a graph of tensor operations.
+
+    Refused are pickled objects, compressed parts, guards and sizes other than arithmetic, and calls of functions that
+    are not ATen operations. Raises zipfile.BadZipFile for a file that is no archive or is damaged.
+    """
+    with zipfile.ZipFile(path) as archive:
+        names = archive.namelist()
+        if len(set(names)) < len(names):
+            raise _refused("two parts of one name", path)
+        for entry in archive.infolist():
+            if entry.compress_type != zipfile.ZIP_STORED:
+                raise _refused("compressed parts", path)
+            if "/sample_inputs/" in entry.filename and entry.file_size > 0:
+                raise _refused("pickled objects", path)
+            if entry.filename.endswith(".json"):
+                if entry.file_size > MAX_JSON_BYTES:
+                    raise _refused(f"a description of {entry.file_size} bytes", path)
+                for key, value in _members(parse_json(archive.read(entry), path)):
+                    if key == "use_pickle" and value:
+                        raise _refused("pickled objects", path)
+                    if key == "expr_str" and not (isinstance(value, str) and _EXPRESSION.fullmatch(value)):
+                        raise _refused(f"the size {str(value)[:80]!r}", path)
+                    entries = value if isinstance(value, list) else [None]
+                    if key == "guards_code" and not all(
+                        isinstance(guard, str) and _GUARD.fullmatch(guard) for guard in entries
+                    ):
+                        raise _refused(f"the guards {str(value)[:80]!r}", path)
+                    if key == "nodes" and not all(
+                        isinstance(node, dict)
+                        and isinstance(node.get("target"), str)
+                        and _TARGET.fullmatch(node["target"])
+                        and set(node.get("metadata") or {}) <= set(_METADATA)
+                        for node in entries
+                    ):
+                        raise _refused("calls of other functions than tensor operations", path)
+        if (damaged := archive.testzip()) is not None:
+            raise zipfile.BadZipFile(f"{damaged} is damaged")
+
+
+def _members(content: Any) -> Iterator[tuple[str, Any]]:
+    """Every key and value of a JSON tree."""
+    rest = [content]
+    while rest:
+        part = rest.pop()
+        if isinstance(part, dict):
+            yield from part.items()
+            rest += part.values()
+        elif isinstance(part, list):
+            rest += part
+
+
+def _refused(what: str, path: str | Path) -> WearcapError:
+    return WearcapError(f"the archive holds {what}", where=path, expected="one that `wearcap export` wrote")

@@ -1,7 +1,6 @@
 """Writes networks as ONNX or as torch.export archives, after checking them against the eager networks."""
 
 import copy
-import importlib.util
 import json
 import time
 from collections.abc import Callable
@@ -15,7 +14,7 @@ from torch import Tensor, nn
 from wearcap.errors import WearcapError
 from wearcap.export.read import RUN_BY_FORMAT, VERSION, part_path, sidecar_path
 from wearcap.files import atomic_path, sha256_of, write_text
-from wearcap.runtime.graphs import Exports, Graph, program, quiet
+from wearcap.runtime.graphs import Exports, Graph, missing_libraries, program, quiet
 
 TIMED_RUNS = 5
 
@@ -67,15 +66,15 @@ def export_network(graph: Graph, path: str | Path, format: str, max_error: float
     The file appears under its name only if its outputs differ from eager's by less than `max_error`. Raises
     WearcapError when they differ more, when the format is unknown, or when its libraries are missing.
     """
-    _require_libraries(format)
+    if format not in RUN_BY_FORMAT:
+        raise WearcapError(f"unknown export format {format!r}", expected=f"one of {', '.join(RUN_BY_FORMAT)}")
+    if missing := missing_libraries() if format == "onnx" else []:
+        raise WearcapError(f"export to ONNX needs {', '.join(missing)}", fix='Run: pip install "wearcap[export]"')
     assert isinstance(graph.module, nn.Module)
     path, net = Path(path), copy.deepcopy(graph.module).cpu().eval()
     if path.suffix != f".{format}":
-        raise WearcapError(
-            f"a file of format {format} cannot end in {path.suffix!r}",
-            where=path,
-            expected=f"a name that ends in .{format}",
-        )
+        what = f"a file of format {format} cannot end in {path.suffix!r}"
+        raise WearcapError(what, where=path, expected=f"a name that ends in .{format}")
     exported = program(graph)
     with atomic_path(path) as temporary, torch.inference_mode(), quiet():
         if format == "pt2":
@@ -84,40 +83,24 @@ def export_network(graph: Graph, path: str | Path, format: str, max_error: float
         else:
             torch.onnx.export(exported, (), temporary, kwargs=graph.inputs, dynamo=True, external_data=False)
         run = RUN_BY_FORMAT[format](temporary)
-        windows = {batch: _batch_of(graph, batch) for batch in (1, 3)}
+        # The example's first row, repeated; floats are scaled differently in every row.
+        windows: dict[int, dict[str, Tensor]] = {1: {}, 3: {}}
+        for batch, window in windows.items():
+            for name, value in graph.inputs.items():
+                if name not in graph.shared:
+                    axes = [1] * (value.ndim - 1)
+                    value = value[:1].repeat(batch, *axes)
+                    if value.is_floating_point():
+                        value = value / (1 + 0.1 * torch.arange(batch)).reshape(-1, *axes)
+                window[name] = value
         error = max((net(**inputs) - run(**inputs)).abs().max().item() for inputs in windows.values())
         if not error < max_error:
-            raise WearcapError(
-                f"the exported network differs from the eager one by {error:.2e}",
-                where=path,
-                expected=f"less than {max_error:.0e}",
-                fix="Try the other format and report this model.",
-            )
+            what = f"the exported network differs from the eager one by {error:.2e}"
+            fix = "Try the other format and report this model."
+            raise WearcapError(what, where=path, expected=f"less than {max_error:.0e}", fix=fix)
         latency, eager = _milliseconds(run, windows[1]), _milliseconds(net, windows[1])
         size = temporary.stat().st_size
     return ExportReport(str(path), format, size, error, latency, eager)
-
-
-def _require_libraries(format: str) -> None:
-    if format not in RUN_BY_FORMAT:
-        raise WearcapError(f"unknown export format {format!r}", expected=f"one of {', '.join(RUN_BY_FORMAT)}")
-    needed = ("onnx", "onnxscript", "onnxruntime") if format == "onnx" else ()
-    missing = [name for name in needed if importlib.util.find_spec(name) is None]
-    if missing:
-        raise WearcapError(f"export to ONNX needs {', '.join(missing)}", fix='Run: pip install "wearcap[export]"')
-
-
-def _batch_of(graph: Graph, batch: int) -> dict[str, Tensor]:
-    """The example's first row, repeated `batch` times; floats are scaled differently in every row."""
-    inputs = {}
-    for name, value in graph.inputs.items():
-        if name not in graph.shared:
-            axes = [1] * (value.ndim - 1)
-            value = value[:1].repeat(batch, *axes)
-            if value.is_floating_point():
-                value = value / (1 + 0.1 * torch.arange(batch)).reshape(-1, *axes)
-        inputs[name] = value
-    return inputs
 
 
 def _milliseconds(run: Callable[..., Tensor], inputs: dict[str, Tensor]) -> float:

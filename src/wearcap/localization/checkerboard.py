@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float32, UInt8
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
@@ -21,7 +21,7 @@ _HINT_FRAMES = 12
 
 
 @dataclass(frozen=True)
-class View:
+class _View:
     """Detection of the board in one image."""
 
     name: str
@@ -43,10 +43,8 @@ class Board:
 
     def __post_init__(self):
         if min(self.columns, self.rows) < 3 or not self.square_m > 0:
-            raise WearcapError(
-                f"a board of {self.columns}x{self.rows} inner corners and squares of {self.square_m} m",
-                expected="at least 3x3 inner corners, and a positive size in metres",
-            )
+            what = f"a board of {self.columns}x{self.rows} inner corners and squares of {self.square_m} m"
+            raise WearcapError(what, expected="at least 3x3 inner corners, and a positive size in metres")
 
     @property
     def points(self) -> Float32[np.ndarray, "point 3"]:
@@ -57,7 +55,7 @@ class Board:
     def __str__(self) -> str:
         return f"{self.columns}x{self.rows}"
 
-    def find(self, gray: UInt8[np.ndarray, "height width"], name: str = "") -> View | None:
+    def find(self, gray: UInt8[np.ndarray, "height width"], name: str = "") -> _View | None:
         """Corners of the whole board in a grey picture, refined to a fraction of a pixel; None where it is not seen."""
         shrink = max(1.0, gray.shape[1] / _SEARCH_WIDTH)
         small = (
@@ -74,7 +72,7 @@ class Board:
         stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
         corners = cv2.cornerSubPix(gray, corners.astype(np.float32).reshape(-1, 1, 2), (reach, reach), (-1, -1), stop)
         blur = cv2.estimateChessboardSharpness(gray, pattern, corners)[0][0]
-        return View(name, corners.reshape(-1, 2), float(blur))
+        return _View(name, corners.reshape(-1, 2), float(blur))
 
 
 @dataclass(frozen=True)
@@ -110,8 +108,8 @@ class Calibration:
     """The larger standard deviation of the two focal lengths."""
     coverage: float
     """Share of the picture's 8 x 6 cells in which corners were seen; distortion is extrapolated in the others."""
-    views: tuple[View, ...]
-    rejected: tuple[View, ...] = ()
+    views: tuple[_View, ...]
+    rejected: tuple[_View, ...] = ()
     """Views whose residual was too large."""
     seen: int = 0
     """Number of images in which the board was found, before the selection."""
@@ -134,12 +132,9 @@ def calibrate_from_pictures(
         examined += 1
         size = size or (picture.shape[1], picture.shape[0])
         if (picture.shape[1], picture.shape[0]) != size:
-            raise WearcapError(
-                f"{picture.shape[1]}x{picture.shape[0]} pixels",
-                where=name,
-                expected=f"{size[0]}x{size[1]}, as the pictures before",
-                fix="Calibrate each resolution by itself.",
-            )
+            what = f"{picture.shape[1]}x{picture.shape[0]} pixels"
+            expected = f"{size[0]}x{size[1]}, as the pictures before"
+            raise WearcapError(what, where=name, expected=expected, fix="Calibrate each resolution by itself.")
         gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
         view = board.find(gray, name)
         if view is not None:
@@ -149,15 +144,35 @@ def calibrate_from_pictures(
     if size is None:
         raise WearcapError("no pictures to calibrate from", expected="a video, or a folder of pictures")
     if not views:
-        raise _not_found(board, size, examined, missed)
+        # The fix suggests another count of corners if that one is found.
+        fix = "Count inner corners, not squares; show the whole board with a white margin, evenly lit and in focus."
+        for wider, higher in ((-1, -1), (1, 1), (-1, 0), (0, -1)):
+            columns, rows = board.columns + wider, board.rows + higher
+            if min(columns, rows) < 3:
+                continue
+            other = replace(board, columns=columns, rows=rows)
+            if any(other.find(gray) for gray in missed):
+                fix = f"A board of {columns}x{rows} inner corners was found: give columns={columns} rows={rows}."
+                break
+        what = f"no board of {board} inner corners in {examined} pictures of {size[0]}x{size[1]} pixels"
+        raise WearcapError(what, expected="a checkerboard, seen as a whole", fix=fix)
     sharp = [view for view in views if view.blur_px <= settings.max_blur_px]
     chosen = varied(sharp if len(sharp) >= settings.min_views else views, size, settings.max_views)
     return replace(_calibrated(chosen, board, size, settings), seen=len(views), examined=examined)
 
 
-def varied(views: Sequence[View], size: tuple[int, int], count: int) -> list[View]:
+def varied(views: Sequence[_View], size: tuple[int, int], count: int) -> list[_View]:
     """Up to `count` views that differ most in position, size and tilt, by farthest-point sampling from the sharpest."""
-    appearance = np.array([_appearance(view.corners, size) for view in views])
+    appearances = []
+    for view in views:
+        # Place (shares of the picture), size (log of its share), and the projective part of the view: how it is tilted
+        side = float(max(size))
+        centred = (view.corners.astype(np.float64) - view.corners.mean(0)) / side
+        spread = np.sqrt((centred**2).sum(1).mean())
+        skew = (centred**3).mean(0) / spread**3  # perspective makes the near half of the board larger
+        shape = np.linalg.svd(centred, compute_uv=False)
+        appearances.append([*(view.corners.mean(0) / size), np.log(spread), shape[1] / shape[0], *(3 * skew)])
+    appearance = np.array(appearances)
     chosen = [int(np.argmin([view.blur_px for view in views]))]
     distance = np.linalg.norm(appearance - appearance[chosen[0]], axis=1)
     while len(chosen) < min(count, len(views)):
@@ -166,26 +181,14 @@ def varied(views: Sequence[View], size: tuple[int, int], count: int) -> list[Vie
     return [views[k] for k in sorted(chosen)]
 
 
-def _appearance(corners: Float32[np.ndarray, "point 2"], size: tuple[int, int]) -> Float64[np.ndarray, "feature"]:
-    """Place (shares of the picture), size (log of its share), and the projective part of the view: how it is tilted."""
-    side = float(max(size))
-    centred = (corners.astype(np.float64) - corners.mean(0)) / side
-    spread = np.sqrt((centred**2).sum(1).mean())
-    skew = (centred**3).mean(0) / spread**3  # perspective makes the near half of the board larger
-    shape = np.linalg.svd(centred, compute_uv=False)
-    return np.array([*(corners.mean(0) / size), np.log(spread), shape[1] / shape[0], *(3 * skew)])
-
-
-def _calibrated(views: list[View], board: Board, size: tuple[int, int], settings: CalibrationSettings) -> Calibration:
+def _calibrated(views: list[_View], board: Board, size: tuple[int, int], settings: CalibrationSettings) -> Calibration:
     """Calibrate, reject views with large residuals, calibrate again, until all agree."""
-    rejected: list[View] = []
+    rejected: list[_View] = []
     while True:
         if len(views) < settings.min_views:
-            raise WearcapError(
-                f"{len(views)} good views of the {board} board ({len(rejected)} rejected for their residuals)",
-                expected=f"at least {settings.min_views}",
-                fix="Film it slowly, from near and far, tilted to all sides, into the picture's corners.",
-            )
+            what = f"{len(views)} good views of the {board} board ({len(rejected)} rejected for their residuals)"
+            fix = "Film it slowly, from near and far, tilted to all sides, into the picture's corners."
+            raise WearcapError(what, expected=f"at least {settings.min_views}", fix=fix)
         points = [view.corners.reshape(-1, 1, 2) for view in views]
         rms, K, bent, turns, _, spread, _, residuals = cv2.calibrateCameraExtended(
             [board.points] * len(views), points, size, None, None, flags=cv2.CALIB_FIX_K3
@@ -216,21 +219,3 @@ def _calibrated(views: list[View], board: Board, size: tuple[int, int], settings
     cells = np.floor(corners / size * _CELLS).astype(int).clip(0, np.array(_CELLS) - 1)
     coverage = len(np.unique(cells, axis=0)) / (_CELLS[0] * _CELLS[1])
     return Calibration(camera, float(rms), focal_std, coverage, tuple(views), tuple(rejected))
-
-
-def _not_found(board: Board, size: tuple[int, int], examined: int, missed: list[np.ndarray]) -> WearcapError:
-    """Error for a missing board; its fix suggests another count of corners if that one is found."""
-    fix = "Count inner corners, not squares; show the whole board with a white margin, evenly lit and in focus."
-    for wider, higher in ((-1, -1), (1, 1), (-1, 0), (0, -1)):
-        columns, rows = board.columns + wider, board.rows + higher
-        if min(columns, rows) < 3:
-            continue
-        other = replace(board, columns=columns, rows=rows)
-        if any(other.find(gray) for gray in missed):
-            fix = f"A board of {columns}x{rows} inner corners was found: give columns={columns} rows={rows}."
-            break
-    return WearcapError(
-        f"no board of {board} inner corners in {examined} pictures of {size[0]}x{size[1]} pixels",
-        expected="a checkerboard, seen as a whole",
-        fix=fix,
-    )

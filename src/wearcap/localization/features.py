@@ -72,10 +72,8 @@ class RootSift:
 
     def __init__(self, max_keypoints: int = 2048, contrast_threshold: float = 0.02, max_side: int | None = None):
         if max_keypoints < 1 or contrast_threshold < 0 or (max_side is not None and max_side < 32):
-            raise WearcapError(
-                f"SIFT with {max_keypoints} keypoints, contrast threshold {contrast_threshold}, side {max_side}",
-                expected="at least one keypoint, a threshold of 0 or more, at least 32 pixels",
-            )
+            what = f"SIFT with {max_keypoints} keypoints, contrast threshold {contrast_threshold}, side {max_side}"
+            raise WearcapError(what, expected="at least one keypoint, a threshold of 0 or more, at least 32 pixels")
         self.max_keypoints, self.contrast_threshold, self.max_side = max_keypoints, contrast_threshold, max_side
 
     def __call__(self, image: UInt8[np.ndarray, "height width 3"]) -> Features:
@@ -129,11 +127,9 @@ class Vlad:
         Raises WearcapError for fewer descriptors than words.
         """
         if len(descriptors) < words:
-            raise WearcapError(
-                f"{len(descriptors)} descriptors for a vocabulary of {words} words",
-                expected="many more than words",
-                fix="Give more photos, photos with more texture, or fewer words.",
-            )
+            what = f"{len(descriptors)} descriptors for a vocabulary of {words} words"
+            fix = "Give more photos, photos with more texture, or fewer words."
+            raise WearcapError(what, expected="many more than words", fix=fix)
         random = torch.Generator().manual_seed(0)
         samples = torch.from_numpy(descriptors)
         norms = (samples**2).sum(1)

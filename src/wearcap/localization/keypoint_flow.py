@@ -42,10 +42,8 @@ class FlowSettings:
 
     def __post_init__(self):
         if self.reach < 0 or self.window_px < 3 or self.levels < 0:
-            raise WearcapError(
-                f"flow over {self.reach} frames in windows of {self.window_px} px with {self.levels} levels",
-                expected="0 frames or more, 3 px or more, 0 levels or more",
-            )
+            what = f"flow over {self.reach} frames in windows of {self.window_px} px with {self.levels} levels"
+            raise WearcapError(what, expected="0 frames or more, 3 px or more, 0 levels or more")
 
 
 class _Spotted(NamedTuple):
@@ -98,7 +96,14 @@ class KeypointFlow:
     def advance(self, picture: UInt8[np.ndarray, "height width 3"], found: Mapping[str, Keypoint]) -> list[_Spotted]:
         """Frames that are final now, none to one."""
         grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
-        detected = self._detected(grey, found)
+        rows = [found.get(joint, Keypoint(np.nan, np.nan, 0.0)) for joint in self.joints]
+        table = np.array(rows, np.float32).reshape(-1, 3)
+        table[~(np.isfinite(table).all(-1) & (table[:, 2] > 0))] = np.nan
+        pixels, trust = table[:, :2].copy(), table[:, 2].copy()
+        there = np.isfinite(trust)
+        look = self._nowhere.look.copy()
+        look[there] = _patches(grey, pixels[there], self.settings.window_px)
+        detected = _Track(pixels, np.where(there, 0, np.nan).astype(np.float32), trust, look)
         forward = self._nowhere
         if self._frames:
             last = self._frames[-1]
@@ -128,16 +133,6 @@ class KeypointFlow:
         self._frames.clear()
         return remaining
 
-    def _detected(self, grey: np.ndarray, found: Mapping[str, Keypoint]) -> _Track:
-        rows = [found.get(joint, Keypoint(np.nan, np.nan, 0.0)) for joint in self.joints]
-        table = np.array(rows, np.float32).reshape(-1, 3)
-        table[~(np.isfinite(table).all(-1) & (table[:, 2] > 0))] = np.nan
-        pixels, trust = table[:, :2].copy(), table[:, 2].copy()
-        there = np.isfinite(trust)
-        look = self._nowhere.look.copy()
-        look[there] = _patches(grey, pixels[there], self.settings.window_px)
-        return _Track(pixels, np.where(there, 0, np.nan).astype(np.float32), trust, look)
-
 
 def tracked_cues(
     pictures: Iterable[UInt8[np.ndarray, "height width 3"]],
@@ -158,10 +153,8 @@ def tracked_cues(
         spotted += flow.advance(picture, detector(picture, times[count - 1]))
     spotted += flow.finish()
     if count != len(times):
-        raise WearcapError(
-            f"{'more' if count > len(times) else count} pictures for {len(times)} timestamps",
-            expected="a picture for each timestamp of the camera",
-        )
+        what = f"{'more' if count > len(times) else count} pictures for {len(times)} timestamps"
+        raise WearcapError(what, expected="a picture for each timestamp of the camera")
     if not spotted:
         return {}
     pixels, confidence = (torch.from_numpy(np.stack(part, 1)) for part in zip(*spotted))

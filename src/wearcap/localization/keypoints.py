@@ -1,5 +1,8 @@
 """Detectors of body joints in videos: their interface, one that replays recorded detections, and one of the wearer's
 wrists in head camera images by MediaPipe's hand landmarker, an optional package whose model is a file that the user has.
+
+Recorded keypoints are CSV: timestamp (s), joint, x, y (pixels) or x, y, z (m, in the world), confidence (0…1). A row is one
+joint at one time, in any order. A file holds pixels or 3D positions, not both.
 """
 
 import importlib
@@ -10,9 +13,11 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+import torch
 from jaxtyping import UInt8
 
 from wearcap.errors import WearcapError
+from wearcap.io.formats.csv_table import read_columns, read_header
 from wearcap.recording.recording import Cue
 
 MODEL_VARIABLE = "WEARCAP_HANDS_MODEL"
@@ -78,7 +83,7 @@ class RecordedDetections:
         return found
 
 
-class Hand(NamedTuple):
+class _Hand(NamedTuple):
     """One detected hand."""
 
     x: float
@@ -102,10 +107,8 @@ class MediaPipeHands:
         try:
             self._mediapipe = importlib.import_module("mediapipe")
         except ModuleNotFoundError as error:
-            raise WearcapError(
-                f"MediaPipe's hands need the package {error.name!r}",
-                fix='pip install "wearcap[hands]", or take detector=recorded, which needs none.',
-            ) from error
+            fix = 'pip install "wearcap[hands]", or take detector=recorded, which needs none.'
+            raise WearcapError(f"MediaPipe's hands need the package {error.name!r}", fix=fix) from error
         vision, path = self._mediapipe.tasks.vision, find_model(model)
         options = vision.HandLandmarkerOptions(
             base_options=self._mediapipe.tasks.BaseOptions(model_asset_path=str(path)),
@@ -118,12 +121,8 @@ class MediaPipeHands:
         try:
             self._landmarker: Any = vision.HandLandmarker.create_from_options(options)
         except (ValueError, RuntimeError, OSError) as error:
-            raise WearcapError(
-                f"not a model that MediaPipe can run ({' '.join(str(error).split())[:200]})",
-                where=path,
-                expected="hand_landmarker.task",
-                fix="Download it again.",
-            ) from error
+            what = f"not a model that MediaPipe can run ({' '.join(str(error).split())[:200]})"
+            raise WearcapError(what, where=path, expected="hand_landmarker.task", fix="Download it again.") from error
 
     def __call__(self, picture: UInt8[np.ndarray, "height width 3"], time_s: float) -> dict[str, Keypoint]:
         image = self._mediapipe.Image(image_format=self._mediapipe.ImageFormat.SRGB, data=np.ascontiguousarray(picture))
@@ -132,7 +131,7 @@ class MediaPipeHands:
         for marks, side in zip(result.hand_landmarks, result.handedness):
             # MediaPipe names the person's own side in a picture that is not mirrored, as a head camera's is.
             left = side[0].score if side[0].category_name == "Left" else 1.0 - side[0].score
-            hands.append(Hand(marks[WRIST].x, marks[WRIST].y, left))
+            hands.append(_Hand(marks[WRIST].x, marks[WRIST].y, left))
         height, width = picture.shape[:2]
         return {
             joint: Keypoint(hand.x * width - 0.5, hand.y * height - 0.5, sure)
@@ -140,7 +139,7 @@ class MediaPipeHands:
         }
 
 
-def wearers_hands(hands: Sequence[Hand]) -> dict[str, tuple[Hand, float]]:
+def wearers_hands(hands: Sequence[_Hand]) -> dict[str, tuple[_Hand, float]]:
     """Which of up to two hands is the wearer's left wrist and which the right, and how sure that is (0…1).
 
     A wearer sees their left hand rather on the left: that adds to what the hand looks like. Two hands are never one side's.
@@ -171,3 +170,41 @@ def find_model(given: str | Path | None) -> Path:
             f"model=PATH or set {MODEL_VARIABLE}, or take detector=recorded.",
         )
     return Path(named).expanduser()
+
+
+_AXES = "xyz"
+_MAX_PLACE = 1e9
+"""Largest coordinate (m or pixels); larger numbers need not be finite as float32."""
+
+
+def read_keypoints(path: str | Path) -> dict[str, Cue]:
+    """Cues by joint, with rising times. Rows with a confidence of 0 carry no information and are dropped.
+
+    Raises WearcapError for a missing column, a field that is no number, a time, place or confidence that cannot be one,
+    and a joint that occurs twice at one time. Whether a skeleton has the joints is not checked here.
+    """
+    axes = list(_AXES if "z" in read_header(path) else _AXES[:2])
+    table = read_columns(path, ["timestamp", *axes, "confidence"], text=["joint"])
+    times, confidence = table["timestamp"], table["confidence"]
+    points = np.stack([table[axis] for axis in axes], -1)
+    joints = np.char.strip(np.char.decode(table["joint"], "latin-1"))
+    observed = confidence != 0
+    for wrong, what, expected in (
+        (~np.isfinite(times), "a timestamp that is no time", "seconds"),
+        (~((confidence >= 0) & (confidence <= 1)), "a confidence that is none", "0 to 1"),
+        (observed & ~(np.abs(points) <= _MAX_PLACE).all(-1), "a place that is none", "numbers, or a confidence of 0"),
+        (joints == "", "no joint", "a joint's name"),
+    ):
+        if wrong.any():
+            raise WearcapError(what, where=f"{path}, row {int(wrong.argmax()) + 1} after the header", expected=expected)
+    cues = {}
+    for joint in map(str, np.unique(joints[observed])):
+        rows = np.flatnonzero(observed & (joints == joint))
+        rows = rows[np.argsort(times[rows], kind="stable")]
+        twice = rows[1:][np.diff(times[rows]) == 0]
+        if len(twice):
+            what = f"{joint!r} is twice at {times[twice[0]]:.6f} s"
+            raise WearcapError(what, where=path, expected="one row per joint and time")
+        place, sure = (torch.from_numpy(part[rows]).float() for part in (points, confidence))
+        cues[joint] = Cue(torch.from_numpy(times[rows]), joint, place, sure)
+    return cues

@@ -54,9 +54,8 @@ def _place(network: nn.Module, device: str) -> None:
     try:
         network.to(device).eval().requires_grad_(False)
     except (RuntimeError, AssertionError) as error:
-        raise WearcapError(
-            f"the device {device!r} cannot be used here", expected="cpu, or cuda on a machine with a GPU"
-        ) from error
+        what = f"the device {device!r} cannot be used here"
+        raise WearcapError(what, expected="cpu, or cuda on a machine with a GPU") from error
 
 
 def _identity(network: str, weights: str | Path | None) -> str:
@@ -67,10 +66,8 @@ def _identity(network: str, weights: str | Path | None) -> str:
 def _shrunk(image: UInt8[np.ndarray, "height width *channel"], max_side: int | None) -> np.ndarray:
     height, width = image.shape[:2]
     if min(height, width) < _SMALLEST:
-        raise WearcapError(
-            f"a picture of {width}×{height} pixels is too small for a network",
-            expected=f"at least {_SMALLEST} pixels a side",
-        )
+        what = f"a picture of {width}×{height} pixels is too small for a network"
+        raise WearcapError(what, expected=f"at least {_SMALLEST} pixels a side")
     shrink = 1.0 if max_side is None else max_side / max(height, width)
     if shrink >= 1:
         return image
@@ -95,10 +92,8 @@ class SuperPointExtractor:
         device: str = "cpu",
     ):
         if max_keypoints < 1 or not 0 <= threshold < 1 or nms_radius < 0:
-            raise WearcapError(
-                f"SuperPoint with {max_keypoints} keypoints, threshold {threshold}, radius {nms_radius}",
-                expected="at least one keypoint, a threshold in [0, 1), a radius of 0 or more",
-            )
+            what = f"SuperPoint with {max_keypoints} keypoints, threshold {threshold}, radius {nms_radius}"
+            raise WearcapError(what, expected="at least one keypoint, a threshold in [0, 1), a radius of 0 or more")
         tensors = _read(weights, _SUPERPOINT)
         network = SuperPoint(nms_radius, border=4, max_keypoints=max_keypoints)
         load_weights(network, tensors, name="SuperPoint", where=str(weights))
@@ -151,11 +146,9 @@ class LightGlueMatcher:
             return np.zeros((0, 2), np.int64)
         for features in (query, other):
             if features.descriptors.shape[1] != self.network.width:
-                raise WearcapError(
-                    f"LightGlue cannot pair descriptors of {features.descriptors.shape[1]} numbers",
-                    expected=f"SuperPoint's {self.network.width}",
-                    fix="Set localization.extractor to SuperPoint, in the map too, or take another matcher.",
-                )
+                what = f"LightGlue cannot pair descriptors of {features.descriptors.shape[1]} numbers"
+                fix = "Set localization.extractor to SuperPoint, in the map too, or take another matcher."
+                raise WearcapError(what, expected=f"SuperPoint's {self.network.width}", fix=fix)
         with torch.inference_mode():
             scores = self.network(*self._inputs(query), *self._inputs(other))
             partner = mutual_matches(scores, self.min_probability)[0][0].cpu().numpy()

@@ -19,9 +19,8 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.localization.absolute_pose import CameraPose, Fit, Matches
+from wearcap.localization.absolute_pose import CameraPose, Matches, match_landmarks, match_nearby
 from wearcap.localization.features import Extractor, Features, GlobalDescriptor, Matcher, Vlad, most_similar
-from wearcap.localization.matching import match_landmarks, match_nearby
 from wearcap.localization.point_map import described
 from wearcap.localization.visual_map import VisualMap, from_bytes
 from wearcap.recording.recording import Localization
@@ -84,11 +83,9 @@ class Localizer:
         descriptor: GlobalDescriptor | None = None,
     ):
         if not len(visual_map) or not len(visual_map.landmarks.points_world):
-            raise WearcapError(
-                "the map is empty: nothing can be localised in it",
-                expected="pictures with landmarks",
-                fix="Build it from photos that show the scene: wearcap scene.",
-            )
+            what = "the map is empty: nothing can be localised in it"
+            fix = "Build it from photos that show the scene: wearcap scene."
+            raise WearcapError(what, expected="pictures with landmarks", fix=fix)
         visual_map.require_features(extractor, descriptor)
         self.map, self.extractor, self.matcher, self.settings = visual_map, extractor, matcher, settings
         self.descriptor: GlobalDescriptor = descriptor or Vlad(visual_map.vocabulary)
@@ -111,11 +108,8 @@ class Localizer:
         Raises WearcapError without intrinsics or for a picture of another size than they are for.
         """
         if camera is None:
-            raise WearcapError(
-                "no intrinsics of the camera",
-                expected="a calibrated camera",
-                fix="Calibrate it from a checkerboard video: wearcap calibrate.",
-            )
+            fix = "Calibrate it from a checkerboard video: wearcap calibrate."
+            raise WearcapError("no intrinsics of the camera", expected="a calibrated camera", fix=fix)
         fov_deg = self.settings.horizontal_fov_deg
         image, camera, features = described(image, camera, self.extractor, fov_deg, "localization")
         return _Described(camera, features, self.descriptor(image, features))
@@ -146,14 +140,32 @@ class Localizer:
             pairs = match_landmarks(features.descriptors, descriptors, points, **settings)
             matches = Matches(features.keypoints[pairs[:, 0]], points[pairs[:, 1]], camera)
         else:
-            matches = Matches(*self._matched_by_pairs(features, images), camera)
+            # A keypoint and a landmark paired by several pictures are one match: repeated, it would count as many.
+            found, seen = [np.zeros((0, 2), np.int64)], self.map.observations
+            for image in images.tolist():
+                part, taken_by = seen.of(image), self.map.cameras[image]
+                known, size = from_bytes(seen.descriptors[part]), (taken_by.width, taken_by.height)
+                other = Features(seen.keypoints[part], known, np.ones(len(known), np.float32), size)
+                alike = self.matcher(features, other)
+                found.append(np.stack([alike[:, 0], seen.landmark[part][alike[:, 1]].astype(np.int64)], 1))
+            keypoint, number = np.unique(np.concatenate(found), axis=0).T
+            pixels, positions = features.keypoints[keypoint], self.map.landmarks.points_world[number]
+            matches = Matches(pixels, positions, camera)
         limit = self.settings.max_error_px * scale
         fit, evidence = matches.ransac(limit), matches
         if fit is None:
             return None
         if self.matcher is None:
             for reach in (self.settings.second_look_px * scale, limit):
-                near = _near_pairs(features.keypoints, points, camera, fit, reach)
+                # (keypoint, landmark) pairs within reach in the picture, at most the 8 nearest landmarks per keypoint
+                seen, valid = fit.project(points, camera)
+                number, near = np.flatnonzero(valid), np.zeros((0, 2), np.int64)
+                if len(number):
+                    tree, nearest = KDTree(seen[number]), min(8, len(number))
+                    distance, place = tree.query(features.keypoints, k=nearest, distance_upper_bound=reach)
+                    distance, place = (part.reshape(len(features.keypoints), -1) for part in (distance, place))
+                    row, column = np.nonzero(np.isfinite(distance))
+                    near = np.stack([row, number[place[row, column]]], 1)
                 pairs = match_nearby(features.descriptors, descriptors, near, self.settings.min_cosine)
                 if len(pairs) < self.settings.min_inliers:
                     return None
@@ -170,24 +182,6 @@ class Localizer:
             torch.from_numpy(matches.covariance(fit)).float(),
         )
 
-    def _matched_by_pairs(
-        self, features: Features, images: Int64[np.ndarray, "chosen"]
-    ) -> tuple[Float32[np.ndarray, "match 2"], Float32[np.ndarray, "match 3"]]:
-        """Pixels and world positions from picture-to-picture matches with each database picture.
-
-        A keypoint and a landmark paired by several images are one match: repeated, it would count as many.
-        """
-        assert self.matcher is not None
-        found, seen = [np.zeros((0, 2), np.int64)], self.map.observations
-        for image in images.tolist():
-            part, camera = seen.of(image), self.map.cameras[image]
-            descriptors, size = from_bytes(seen.descriptors[part]), (camera.width, camera.height)
-            other = Features(seen.keypoints[part], descriptors, np.ones(len(descriptors), np.float32), size)
-            pairs = self.matcher(features, other)
-            found.append(np.stack([pairs[:, 0], seen.landmark[part][pairs[:, 1]].astype(np.int64)], 1))
-        keypoint, landmark = np.unique(np.concatenate(found), axis=0).T
-        return features.keypoints[keypoint], self.map.landmarks.points_world[landmark]
-
 
 def confidence(agreeing: Float32[np.ndarray, "match 2"], camera: Camera) -> float:
     """1 − 2^(−(n − 6)/8) of the n matches made without knowing the pose that agree with it (ours).
@@ -197,24 +191,6 @@ def confidence(agreeing: Float32[np.ndarray, "match 2"], camera: Camera) -> floa
     cell = (agreeing / [camera.width / 8, camera.height / 6]).astype(np.int64).clip(0, [7, 5])
     counts = np.bincount(cell[:, 0] + 8 * cell[:, 1], minlength=48)
     return float(1 - 2.0 ** (-max(int(np.minimum(counts, 6).sum()) - 6, 0) / 8))
-
-
-def _near_pairs(
-    keypoints: Float32[np.ndarray, "keypoint 2"],
-    points: Float32[np.ndarray, "landmark 3"],
-    camera: Camera,
-    fit: Fit,
-    reach_px: float,
-) -> Int64[np.ndarray, "pair 2"]:
-    """(keypoint, landmark) pairs within `reach_px` in the picture, at most the 8 nearest landmarks per keypoint."""
-    seen, valid = fit.project(points, camera)
-    number = np.flatnonzero(valid)
-    if not len(number):
-        return np.zeros((0, 2), np.int64)
-    distance, place = KDTree(seen[number]).query(keypoints, k=min(8, len(number)), distance_upper_bound=reach_px)
-    distance, place = distance.reshape(len(keypoints), -1), place.reshape(len(keypoints), -1)
-    row, column = np.nonzero(np.isfinite(distance))
-    return np.stack([row, number[place[row, column]]], 1)
 
 
 def localize_video(

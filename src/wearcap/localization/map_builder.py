@@ -132,11 +132,22 @@ def _pictures(photos, source, extractor, descriptor, settings: MapSettings, prog
         pictures = list(track(done, "photos", total=len(photos), console=Console(stderr=True), disable=not progress))
     if not any(picture.valid.any() for picture in pictures):
         found = sum(len(picture.keypoints) for picture in pictures)
-        raise WearcapError(
-            f"the map would be empty: none of {found} keypoints in {len(photos)} photos lies on the scene",
-            expected="photos that show the scanned scene",
-            fix=_why_empty(photos, source),
-        )
+        # The most likely cause: poses and scene in different units or worlds
+        fix = "Are the poses camera-to-world, with OpenCV's camera axes (x right, y down, z forward)?"
+        points = source.points if isinstance(source, Scan) else source.points_world
+        if not len(points):
+            fix = "The scene has no points."
+        else:
+            cameras = np.stack([photo.T_world_cam.t.double().numpy() for photo in photos])
+            low, high = points.min(0), points.max(0)
+            outside = ((cameras < low - 20) | (cameras > high + 20)).any(1).mean() > 0.5
+            if outside or np.ptp(points, axis=0).max() > 100 * max(np.ptp(cameras, axis=0).max(), 1.0):
+                fix = (
+                    f"The cameras stand around {np.round(np.median(cameras, axis=0), 1).tolist()}, the scene reaches from "
+                    f"{np.round(low, 1).tolist()} to {np.round(high, 1).tolist()}: are both in one unit (m) and in one world?"
+                )
+        what = f"the map would be empty: none of {found} keypoints in {len(photos)} photos lies on the scene"
+        raise WearcapError(what, expected="photos that show the scanned scene", fix=fix)
     return pictures
 
 
@@ -193,19 +204,3 @@ def _assemble(
         vlad.vocabulary if vlad else np.zeros((0, descriptors.shape[1]), np.float32),
         cell_m,
     )
-
-
-def _why_empty(photos: Sequence[Photo], source: Scan | Tracks) -> str:
-    """Most likely cause of an empty map: poses and scene in different units or worlds."""
-    points = source.points if isinstance(source, Scan) else source.points_world
-    if not len(points):
-        return "The scene has no points."
-    cameras = np.stack([photo.T_world_cam.t.double().numpy() for photo in photos])
-    low, high = points.min(0), points.max(0)
-    outside = ((cameras < low - 20) | (cameras > high + 20)).any(1).mean() > 0.5
-    if outside or np.ptp(points, axis=0).max() > 100 * max(np.ptp(cameras, axis=0).max(), 1.0):
-        return (
-            f"The cameras stand around {np.round(np.median(cameras, axis=0), 1).tolist()}, the scene reaches from "
-            f"{np.round(low, 1).tolist()} to {np.round(high, 1).tolist()}: are both in one unit (m) and in one world?"
-        )
-    return "Are the poses camera-to-world, with OpenCV's camera axes (x right, y down, z forward)?"

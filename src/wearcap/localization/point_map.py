@@ -20,7 +20,7 @@ from wearcap.scene.scan import Scan
 
 
 @dataclass(frozen=True, eq=False)
-class PointMap:
+class _PointMap:
     """Visible scan points and depths of a camera."""
 
     camera: Camera
@@ -54,26 +54,20 @@ class PointMap:
         rays = (self.T_world_cam.R.double().cpu() @ rays[..., None])[..., 0].numpy()
         center = self.T_world_cam.t.double().cpu().numpy()
         around = points[np.where(valid[:, None, None], self.index[where], 0)].reshape(-1, 25, 3)
-        positions = center + rays * _distance_to_plane(around - center, rays)[:, None]
+        # Where each ray from the camera meets the plane through its points; without a plane (points in a line) or with one
+        # that it grazes, where the ray passes the middle of them
+        apart = around - center
+        middle = apart.mean(1)
+        spread = np.einsum("rpi,rpj->rij", apart - middle[:, None], apart - middle[:, None])
+        sizes, axes = np.linalg.eigh(spread)
+        normal = axes[..., 0]
+        slope = (normal * rays).sum(1)
+        flat = (sizes[:, 1] > 10 * np.abs(sizes[:, 0])) & (sizes[:, 1] > 1e-3 * sizes[:, 2])
+        usable = flat & (np.abs(slope) > 0.1)
+        distance = np.where(usable, (normal * middle).sum(1) / np.where(usable, slope, 1), (middle * rays).sum(1))
+        positions = center + rays * distance[:, None]
         valid &= np.isfinite(positions).all(1)
         return np.where(valid[:, None], positions, 0).astype(np.float32), valid
-
-
-def _distance_to_plane(
-    points: Float64[np.ndarray, "ray point 3"], rays: Float64[np.ndarray, "ray 3"]
-) -> Float64[np.ndarray, "ray"]:
-    """Where each ray from the origin meets the plane through its points.
-
-    Without a plane (points in a line) or one that it grazes, where the ray passes the middle of them.
-    """
-    middle = points.mean(1)
-    spread = np.einsum("rpi,rpj->rij", points - middle[:, None], points - middle[:, None])
-    sizes, axes = np.linalg.eigh(spread)
-    normal = axes[..., 0]
-    slope = (normal * rays).sum(1)
-    flat = (sizes[:, 1] > 10 * np.abs(sizes[:, 0])) & (sizes[:, 1] > 1e-3 * sizes[:, 2])
-    usable = flat & (np.abs(slope) > 0.1)
-    return np.where(usable, (normal * middle).sum(1) / np.where(usable, slope, 1), (middle * rays).sum(1))
 
 
 class PointMapper:
@@ -89,16 +83,14 @@ class PointMapper:
         self.points, self.colors, self.splat_m = scan.points, scan.colors, splat_m
         self._cloud = SplatCloud.build(scan.points)
 
-    def __call__(self, camera: Camera, T_world_cam: Rigid) -> PointMap:
-        return PointMap(camera, T_world_cam, *self._cloud.draw(camera, T_world_cam, self.splat_m))
+    def __call__(self, camera: Camera, T_world_cam: Rigid) -> _PointMap:
+        return _PointMap(camera, T_world_cam, *self._cloud.draw(camera, T_world_cam, self.splat_m))
 
-    def color_picture(self, point_map: PointMap) -> UInt8[np.ndarray, "height width 3"]:
+    def color_picture(self, point_map: _PointMap) -> UInt8[np.ndarray, "height width 3"]:
         """The scan's colours as the camera sees them, black where nothing is. Raises WearcapError without colours."""
         if self.colors is None:
-            raise WearcapError(
-                "the scan has no colours, so no picture of it can be drawn",
-                expected="a coloured point cloud (point maps need none)",
-            )
+            what = "the scan has no colours, so no picture of it can be drawn"
+            raise WearcapError(what, expected="a coloured point cloud (point maps need none)")
         seen = point_map.index >= 0
         return np.where(seen[..., None], self.colors[np.where(seen, point_map.index, 0)], 0).astype(np.uint8)
 
@@ -121,14 +113,14 @@ class _Undistortion:
     def image(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "height width 3"]:
         return cv2.remap(image, self.x, self.y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
 
-    def point_map(self, point_map: PointMap) -> PointMap:
+    def point_map(self, point_map: _PointMap) -> _PointMap:
         """The point map with the nearest original pixel's point in each, its depths along the optical axis."""
         column, row = (np.where(self.valid, np.rint(side), 0).astype(np.int64) for side in (self.x, self.y))
         index = np.where(self.valid, point_map.index[row, column], -1).astype(np.int32)
         depth = np.where(self.valid, point_map.depth[row, column], np.inf)
         if point_map.camera.is_fisheye:
             depth = depth * _axis_share(self.camera)
-        return PointMap(self.camera, point_map.T_world_cam, index, depth.astype(np.float32))
+        return _PointMap(self.camera, point_map.T_world_cam, index, depth.astype(np.float32))
 
 
 @lru_cache(maxsize=16)

@@ -52,10 +52,8 @@ def map_pictures(
     try:
         colmap = importlib.import_module("pycolmap")
     except ImportError as error:
-        raise WearcapError(
-            "structure from motion needs the package pycolmap",
-            fix='Run: pip install "wearcap[track]", or give a finished COLMAP model: from_model=DIR.',
-        ) from error
+        fix = 'Run: pip install "wearcap[track]", or give a finished COLMAP model: from_model=DIR.'
+        raise WearcapError("structure from motion needs the package pycolmap", fix=fix) from error
     colmap.logging.minloglevel = 2  # its errors come as exceptions, we report its progress
     folder.mkdir(parents=True, exist_ok=True)
     _extract(colmap, names, images, folder / "database.db", lens, settings, advance)
@@ -72,11 +70,9 @@ def colmap_camera(camera: Camera) -> tuple[str, str]:
     """COLMAP's name of a camera's model, and its parameters (pixel centres at .5) as COLMAP writes them."""
     name = _LENSES.get((camera.model, len(camera.distortion)))
     if name is None:
-        raise WearcapError(
-            f"COLMAP has no camera {camera.model!r} with {len(camera.distortion)} coefficients",
-            expected="pinhole, opencv (4) or fisheye (4)",
-            fix="Undistort the video, or leave the camera to be calibrated.",
-        )
+        what = f"COLMAP has no camera {camera.model!r} with {len(camera.distortion)} coefficients"
+        fix = "Undistort the video, or leave the camera to be calibrated."
+        raise WearcapError(what, expected="pinhole, opencv (4) or fisheye (4)", fix=fix)
     values = (camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5, *camera.distortion)
     return name, ",".join(f"{value:.12g}" for value in values)
 
@@ -148,12 +144,10 @@ def _map(
     )
     advance("mapping", count, count)
     if not models:
-        raise WearcapError(
-            f"no two of {count} pictures could be put together",
-            where=images,
-            expected="a textured, still scene, seen from places some way apart",
-            fix="Move the camera instead of turning it on the spot, or take more pictures a second (fps=…).",
-        )
+        what = f"no two of {count} pictures could be put together"
+        expected = "a textured, still scene, seen from places some way apart"
+        fix = "Move the camera instead of turning it on the spot, or take more pictures a second (fps=…)."
+        raise WearcapError(what, where=images, expected=expected, fix=fix)
     best = max(models.values(), key=lambda model: model.num_reg_images())
     written = folder / "sparse" / "best"  # removed with the folder by the next run, if this one is killed
     written.mkdir()
@@ -170,8 +164,5 @@ def _run_step(step: Callable, database: Path, *arguments: Any, **options: Any) -
     try:
         return step(database, *arguments, **options)
     except (RuntimeError, ValueError) as error:
-        raise WearcapError(
-            f"COLMAP stopped ({' '.join(str(error).split())})"[:300],
-            where=database,
-            fix="Remove the folder and run again.",
-        ) from error
+        fix = "Remove the folder and run again."
+        raise WearcapError(f"COLMAP stopped ({' '.join(str(error).split())})"[:300], where=database, fix=fix) from error

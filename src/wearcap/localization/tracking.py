@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Float64, UInt8
 from PIL import Image
 from torch import Tensor
 
@@ -98,19 +98,28 @@ class Track:
             )
         cameras = {photo.camera for photo in photos.values()}
         if len(cameras) > 1:
-            raise WearcapError(
-                f"{len(cameras)} cameras",
-                where=where,
-                expected="pictures of one camera",
-                fix="Map the video as taken with a single camera.",
-            )
+            fix = "Map the video as taken with a single camera."
+            raise WearcapError(f"{len(cameras)} cameras", where=where, expected="pictures of one camera", fix=fix)
         placed = torch.zeros(len(pictures.names), dtype=torch.bool)
         placed[list(photos)] = True
         R, t = torch.eye(3).repeat(len(placed), 1, 1), torch.zeros(len(placed), 3)
         for index, photo in photos.items():
             R[index], t[index] = photo.T_world_cam.R.float(), photo.T_world_cam.t.float()
         whole = filled(Trajectory(pictures.timestamps, R, t), placed)
-        gaps, kept = _gaps(placed, pictures.timestamps, max_gap_s)
+        # Stretches without placed pictures (from the last one before to the first one after), and the frames kept
+        kept, gaps = placed.clone(), []
+        known = placed.nonzero()[:, 0]
+        edges = [-1, *known.tolist(), len(placed)]
+        for before, after in itertools.pairwise(edges):
+            if after - before > 1:
+                inside = before >= 0 and after < len(placed)
+                start, stop = (
+                    pictures.timestamps[max(before, 0)].item(),
+                    pictures.timestamps[min(after, len(placed) - 1)].item(),
+                )
+                bridged = inside and stop - start <= max_gap_s
+                kept[before + 1 : after] = bridged
+                gaps.append((start, stop, bridged))
         tracks, distances = model.tracks, [np.zeros(0)]
         for index, photo in enumerate(model.photos):
             mine = tracks.photo == index
@@ -125,7 +134,7 @@ class Track:
             tracks.colors,
             len(placed),
             int(placed.sum()),
-            gaps,
+            tuple(gaps),
             float(joined.mean()) if len(joined) else float("nan"),
         )
 
@@ -169,30 +178,12 @@ def track_pictures(
         Pictures.of_folder(source, settings.fps) if source.is_dir() else _frames(source, output, settings.fps, advance)
     )
     if len(pictures.names) < 3:
-        raise WearcapError(
-            f"{len(pictures.names)} pictures", where=source, expected="at least 3", fix="Take more a second: fps=…"
-        )
+        what = f"{len(pictures.names)} pictures"
+        raise WearcapError(what, where=source, expected="at least 3", fix="Take more a second: fps=…")
     if camera is not None:
         check_size(read_image(pictures.folder / pictures.names[0]), camera, pictures.names[0])
     model = map_pictures(pictures.names, pictures.folder, output, camera, settings.mapping, advance)
     return Track.of_model(read_colmap(model, pictures.folder), pictures, settings.max_gap_s, where=output)
-
-
-def _gaps(
-    placed: Bool[Tensor, "picture"], timestamps: Float64[Tensor, "picture"], max_gap_s: float
-) -> tuple[tuple[tuple[float, float, bool], ...], Bool[Tensor, "picture"]]:
-    """Stretches without placed pictures (from the last one before to the first one after), and the frames kept."""
-    kept, gaps = placed.clone(), []
-    index = placed.nonzero()[:, 0]
-    edges = [-1, *index.tolist(), len(placed)]
-    for before, after in itertools.pairwise(edges):
-        if after - before > 1:
-            inside = before >= 0 and after < len(placed)
-            start, stop = timestamps[max(before, 0)].item(), timestamps[min(after, len(placed) - 1)].item()
-            bridged = inside and stop - start <= max_gap_s
-            kept[before + 1 : after] = bridged
-            gaps.append((start, stop, bridged))
-    return tuple(gaps), kept
 
 
 def _claim(source: Path, output: Path, settings: TrackSettings, camera: Camera | None) -> None:
@@ -208,12 +199,8 @@ def _claim(source: Path, output: Path, settings: TrackSettings, camera: Camera |
     mine["mapping"].pop("threads")
     if (output / STATE).is_file():
         if read_json(output / STATE) != mine:
-            raise WearcapError(
-                "this folder holds the track of another source, or of other settings",
-                where=output,
-                expected=str(output / STATE),
-                fix="Choose another: output=DIR.",
-            )
+            what = "this folder holds the track of another source, or of other settings"
+            raise WearcapError(what, where=output, expected=str(output / STATE), fix="Choose another: output=DIR.")
         return
     write_text(output / STATE, json.dumps(mine, indent=1) + "\n")
 

@@ -27,7 +27,7 @@ _AGAIN = "Build it again: wearcap scene."
 
 
 @dataclass(frozen=True, eq=False)
-class Landmarks:
+class _Landmarks:
     """Scene points at which keypoints were detected."""
 
     points_world: Float32[np.ndarray, "landmark 3"]
@@ -72,7 +72,7 @@ class VisualMap:
     """Pose of each picture (float64)."""
     global_descriptors: Float32[np.ndarray, "image global"]
     observations: Observations
-    landmarks: Landmarks
+    landmarks: _Landmarks
     vocabulary: Float32[np.ndarray, "word feature"]
     """VLAD's vocabulary; empty where another global descriptor is used."""
     cell_m: float
@@ -105,11 +105,9 @@ class VisualMap:
             (self.descriptor, described, f"the global descriptor {self.descriptor!r}", "descriptor", "descriptor"),
         ):
             if name != mine:
-                raise WearcapError(
-                    f"the map was made with {made}, not {name!r}",
-                    expected=f"the same {part} in map and picture",
-                    fix=f"Build the map again, or choose its {what}.",
-                )
+                expected = f"the same {part} in map and picture"
+                fix = f"Build the map again, or choose its {what}."
+                raise WearcapError(f"the map was made with {made}, not {name!r}", expected=expected, fix=fix)
 
     def save(self, path: str | Path) -> None:
         """Write one .safetensors file, atomically."""
@@ -143,22 +141,16 @@ class VisualMap:
         except FileNotFoundError as error:
             raise WearcapError("no such map", where=path, fix="Build it: wearcap scene.") from error
         except (safetensors.SafetensorError, OSError, RuntimeError) as error:
-            raise WearcapError(
-                "not a readable map", where=path, expected="a complete .safetensors file", fix=_AGAIN
-            ) from error
+            expected = "a complete .safetensors file"
+            raise WearcapError("not a readable map", where=path, expected=expected, fix=_AGAIN) from error
         if "wearcap_map" not in metadata:
-            raise WearcapError(
-                "a .safetensors file, but not a visual map", where=path, expected="one that `wearcap scene` wrote"
-            )
+            what = "a .safetensors file, but not a visual map"
+            raise WearcapError(what, where=path, expected="one that `wearcap scene` wrote")
         try:
             header = parse_json(metadata["wearcap_map"], path)
             if header["schema_version"] != SCHEMA_VERSION:
-                raise WearcapError(
-                    f"a map of version {header['schema_version']}",
-                    where=path,
-                    expected=f"version {SCHEMA_VERSION}",
-                    fix=_AGAIN,
-                )
+                what = f"a map of version {header['schema_version']}"
+                raise WearcapError(what, where=path, expected=f"version {SCHEMA_VERSION}", fix=_AGAIN)
             cameras = [camera | {"distortion": tuple(camera["distortion"])} for camera in header["cameras"]]
             loaded = cls(
                 header["extractor"],
@@ -168,7 +160,7 @@ class VisualMap:
                 Rigid(*(torch.from_numpy(tensors[name]) for name in ("R_world_cam", "t_world_cam"))),
                 tensors["global_descriptors"],
                 Observations(**{field.name: tensors[field.name] for field in dataclasses.fields(Observations)}),
-                Landmarks(tensors["landmarks.points_world"], tensors["landmarks.descriptors"]),
+                _Landmarks(tensors["landmarks.points_world"], tensors["landmarks.descriptors"]),
                 tensors["vocabulary"],
                 float(header["cell_m"]),
             )
@@ -216,14 +208,14 @@ def merge(
     descriptors: Int8[np.ndarray, "observation feature"],
     cell_m: float,
     min_cosine: float = 0.85,
-) -> tuple[Landmarks, Int32[np.ndarray, "observation"]]:
+) -> tuple[_Landmarks, Int32[np.ndarray, "observation"]]:
     """Landmarks, and the one that each observation belongs to.
 
     Observations within one cell of `cell_m` are one landmark where their descriptors are alike. With `cell_m` 0 those
     at exactly the same position are, whatever their descriptors (tracks of structure from motion).
     """
     if not len(positions):
-        return Landmarks(positions, descriptors), np.zeros(0, np.int32)
+        return _Landmarks(positions, descriptors), np.zeros(0, np.int32)
     place = positions if cell_m == 0 else np.floor(positions / cell_m).astype(np.int64)
     _, cell = np.unique(place, axis=0, return_inverse=True)
     group = cell.ravel() if cell_m == 0 else _leaders(cell.ravel(), descriptors, min_cosine)
@@ -233,7 +225,7 @@ def merge(
     mean = np.add.reduceat(positions[order].astype(np.float64), start) / count[:, None]
     total = np.add.reduceat(descriptors[order].astype(np.float32), start)
     total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-6)
-    return Landmarks(mean.astype(np.float32), to_bytes(total)), landmark.astype(np.int32)
+    return _Landmarks(mean.astype(np.float32), to_bytes(total)), landmark.astype(np.int32)
 
 
 def _leaders(cell: np.ndarray, descriptors: np.ndarray, min_cosine: float) -> np.ndarray:

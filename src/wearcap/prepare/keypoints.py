@@ -15,9 +15,8 @@ import numpy as np
 
 from wearcap.data.embeddings import pictures
 from wearcap.errors import WearcapError
-from wearcap.io.formats.keypoints_csv import read_keypoints
 from wearcap.localization.keypoint_flow import FlowSettings, tracked_cues
-from wearcap.localization.keypoints import MediaPipeHands, RecordedDetections, find_model
+from wearcap.localization.keypoints import MediaPipeHands, RecordedDetections, find_model, read_keypoints
 from wearcap.prepare.engine import Report, Task, content_hash, prepare
 from wearcap.recording.recording import CameraStream, Recording
 from wearcap.recording.store import RecordingFile, RecordingStore

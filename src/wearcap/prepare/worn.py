@@ -14,8 +14,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.datasets.egohoi import egohoi_names, read_egohoi
 from wearcap.io.datasets.hcontact import ENDING, hcontact_names, read_hcontact, read_hcontact_split
-from wearcap.io.datasets.hps import nominal_mount, resampled_localization
-from wearcap.io.datasets.hps_sequence import hps_names, read_hps_sequence, subject_of
+from wearcap.io.datasets.hps import hps_names, nominal_mount, read_hps_sequence, resampled_localization, subject_of
 from wearcap.io.datasets.mocap_every_folder import (
     MocapEveryFolder,
     is_mocap_every_folder,

@@ -98,7 +98,12 @@ def _parts(value: Any) -> Iterator[bytes | memoryview]:
         yield f"{array.dtype.str}{array.shape}".encode()
         yield np.ascontiguousarray(array).data.cast("B") if array.size else b""
     elif isinstance(value, Path):
-        yield _file_digest(value).encode()
+        try:
+            status = value.stat()
+            found = _unchanged_digest(value, status.st_size, status.st_mtime_ns)
+        except FileNotFoundError as error:
+            raise WearcapError("no such file", where=value) from error
+        yield found.encode()
     elif isinstance(value, dict):
         for key in sorted(value):
             yield from _parts((key, value[key]))
@@ -120,14 +125,6 @@ def _parts(value: Any) -> Iterator[bytes | memoryview]:
         yield from _parts(vars(value))
     else:
         raise TypeError(f"a {type(value).__name__} has no digest")
-
-
-def _file_digest(path: Path) -> str:
-    try:
-        status = path.stat()
-        return _unchanged_digest(path, status.st_size, status.st_mtime_ns)
-    except FileNotFoundError as error:
-        raise WearcapError("no such file", where=path) from error
 
 
 @functools.lru_cache(maxsize=1024)

@@ -17,6 +17,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from wearcap.body.skeleton import Site, Skeleton
+from wearcap.diffusion.schedule import CosineSchedule, LinearSchedule, Schedule
 from wearcap.errors import WearcapError, nearest
 
 RUNTIMES = ("auto", "eager", "compile", "onnx")
@@ -75,9 +77,8 @@ def chosen(runtime: str, precision: str, device: torch.device | str) -> tuple[st
     device = torch.device(device)
     for what, value, allowed in (("runtime", runtime, RUNTIMES), ("precision", precision, PRECISIONS)):
         if value not in allowed:
-            raise WearcapError(
-                f"no {what} {value!r}", expected=f"one of {', '.join(allowed)}", fix=nearest(value, allowed)
-            )
+            expected = f"one of {', '.join(allowed)}"
+            raise WearcapError(f"no {what} {value!r}", expected=expected, fix=nearest(value, allowed))
     missing = missing_libraries()
     if runtime == "auto":
         plain = "eager" if missing or precision == "bfloat16" else "onnx"
@@ -92,9 +93,8 @@ def chosen(runtime: str, precision: str, device: torch.device | str) -> tuple[st
             fix=f"{_INSTALL}, or choose pipeline.runtime=eager.",
         )
     if (precision == "int8") > (runtime == "onnx") or (precision == "bfloat16" and runtime == "onnx"):
-        raise WearcapError(
-            f"no {precision} with runtime {runtime!r}", expected="int8 with onnx; bfloat16 with eager or compile"
-        )
+        expected = "int8 with onnx; bfloat16 with eager or compile"
+        raise WearcapError(f"no {precision} with runtime {runtime!r}", expected=expected)
     return runtime, precision
 
 
@@ -103,8 +103,15 @@ def run_of(graph: Graph, runtime: str = "eager", precision: str = "float32") -> 
     if runtime == "onnx":
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "network.onnx"
-            write_onnx(graph, path)
-            return open_onnx(_narrowed(path) if precision == "int8" else path)
+            exported = program(graph)
+            with quiet(), torch.inference_mode():
+                torch.onnx.export(exported, (), path, kwargs=graph.inputs, dynamo=True, external_data=False)
+            if precision == "int8":
+                from onnxruntime.quantization import QuantType, quantize_dynamic
+
+                wide, path = path, path.with_name("network8.onnx")
+                quantize_dynamic(wide, path, weight_type=QuantType.QInt8, per_channel=True, reduce_range=True)
+            return open_onnx(path)
     run: Run = graph.module
     if runtime == "compile":
         # Static shapes; on a GPU replayed as CUDA graphs, whose outputs are overwritten by the next replay.
@@ -132,13 +139,6 @@ def program(graph: Graph) -> torch.export.ExportedProgram:
         assert isinstance(graph.module, nn.Module)
         module = copy.deepcopy(graph.module).cpu().eval()
         return torch.export.export(module, (), graph.inputs, dynamic_shapes=dynamic)
-
-
-def write_onnx(graph: Graph, path: Path) -> None:
-    """Write a graph as an ONNX file."""
-    exported = program(graph)
-    with quiet(), torch.inference_mode():
-        torch.onnx.export(exported, (), path, kwargs=graph.inputs, dynamo=True, external_data=False)
 
 
 def open_onnx(path: str | Path) -> Run:
@@ -198,9 +198,37 @@ def quiet() -> Iterator[None]:
         logging.disable(before)
 
 
-def _narrowed(path: Path) -> Path:
-    from onnxruntime.quantization import QuantType, quantize_dynamic
+SCHEDULES = {cls.__name__: cls for cls in (CosineSchedule, LinearSchedule)}
+ROT6D = tuple(f"{column}{axis}" for column in "xy" for axis in "xyz")
+"""First two columns of a rotation matrix, one after the other."""
 
-    narrow = path.with_name("network8.onnx")
-    quantize_dynamic(path, narrow, weight_type=QuantType.QInt8, per_channel=True, reduce_range=True)
-    return narrow
+
+def schedule_to_json(schedule: Schedule) -> dict[str, Any]:
+    """A schedule by name and settings. Raises WearcapError for one of another class than `SCHEDULES`."""
+    name = type(schedule).__name__
+    if name not in SCHEDULES:
+        raise WearcapError(f"schedule {name} cannot be exported", expected=f"one of {', '.join(SCHEDULES)}")
+    return {"name": name, **vars(schedule)}
+
+
+def schedule_from_json(tree: dict[str, Any]) -> Schedule:
+    """The inverse of `schedule_to_json`."""
+    return SCHEDULES[tree["name"]](**{key: value for key, value in tree.items() if key != "name"})
+
+
+def skeleton_to_json(skeleton: Skeleton) -> dict[str, Any]:
+    """A skeleton as plain data; offsets in m."""
+    return {
+        "name": skeleton.name,
+        "joint_names": skeleton.joint_names,
+        "parents": skeleton.parents,
+        "t_parent_joint": skeleton.t_parent_joint.tolist(),
+        "sites": {name: [site.joint, *site.t_joint_site] for name, site in skeleton.sites.items()},
+    }
+
+
+def skeleton_from_json(tree: dict[str, Any]) -> Skeleton:
+    """The inverse of `skeleton_to_json`."""
+    sites = {name: Site(joint, (x, y, z)) for name, (joint, x, y, z) in tree["sites"].items()}
+    offsets = torch.tensor(tree["t_parent_joint"])
+    return Skeleton(tree["name"], tuple(tree["joint_names"]), tuple(tree["parents"]), offsets, sites)

@@ -66,9 +66,8 @@ class Session(ABC):
         Raises WearcapError for samples of another number of wearers.
         """
         if len(samples) != len(self.streams):
-            raise WearcapError(
-                f"samples of {len(samples)} wearers", expected=f"of {len(self.streams)}, as the session has"
-            )
+            expected = f"of {len(self.streams)}, as the session has"
+            raise WearcapError(f"samples of {len(samples)} wearers", expected=expected)
         for stream, part in zip(self.streams, samples):
             for sample in part:
                 stream.take(sample)

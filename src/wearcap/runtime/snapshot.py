@@ -67,28 +67,14 @@ def read_state(path: str | Path, settings: Mapping[str, Any], classes: Mapping[s
             tree = parse_json(about[_KEY], path)
             return _Reader(classes, shared, tree["objects"], tensors).decoded(tree["state"])
     except (OSError, safetensors.SafetensorError, WearcapError, *_DAMAGE) as error:
-        raise WearcapError(
-            "not a saved session", where=path, expected="a whole .safetensors file of Session.save"
-        ) from error
-    raise WearcapError(
-        f"a session with {wrong} {theirs.get(wrong)}, not {ours.get(wrong)}",
-        where=path,
-        fix="Load it with the pipeline it ran with.",
-    )
+        expected = "a whole .safetensors file of Session.save"
+        raise WearcapError("not a saved session", where=path, expected=expected) from error
+    what = f"a session with {wrong} {theirs.get(wrong)}, not {ours.get(wrong)}"
+    raise WearcapError(what, where=path, fix="Load it with the pipeline it ran with.")
 
 
 def _name(kind: type) -> str:
     return f"{kind.__module__}.{kind.__qualname__}"
-
-
-def _attributes(value: Any) -> dict[str, Any]:
-    """What an object's state consists of; cached properties of data classes and `transient` attributes do not count."""
-    if dataclasses.is_dataclass(value):
-        names = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-    else:
-        names = vars(value)
-    left_out = getattr(type(value), "transient", ())
-    return {name: part for name, part in names.items() if name not in left_out}
 
 
 class _Writer:
@@ -130,7 +116,14 @@ class _Writer:
             self._number[id(value)] = len(self.objects)
             self._alive.append(value)
             self.objects.append(None)
-            parts = {name: self.encoded(part) for name, part in _attributes(value).items()}
+            # Cached properties of data classes and `transient` attributes are no part of the state.
+            if dataclasses.is_dataclass(value):
+                names = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+            else:
+                names = vars(value)
+            left_out = getattr(type(value), "transient", ())
+            kept = {name: part for name, part in names.items() if name not in left_out}
+            parts = {name: self.encoded(part) for name, part in kept.items()}
             self.objects[self._number[id(value)]] = [_name(kind), parts]
         return ["object", self._number[id(value)]]
 

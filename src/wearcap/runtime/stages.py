@@ -46,7 +46,7 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class StageRun:
+class _StageRun:
     """How a stage's result was obtained."""
 
     stage: str
@@ -107,7 +107,7 @@ class StageCache:
 
 def run_stages(
     stages: list[Stage], cache: StageCache | None = None, until: str | None = None, console: Console | None = None
-) -> tuple[dict[str, Any], list[StageRun]]:
+) -> tuple[dict[str, Any], list[_StageRun]]:
     """Results by stage, up to and including `until`, and how each was obtained; the console shows a line for each.
 
     Cached results are reused; damaged ones are recomputed. Raises WearcapError for an unknown `until`.
@@ -132,7 +132,7 @@ def run_stages(
             seconds = time.perf_counter() - begin
             if cache:
                 digests[stage.name] = cache.write(stage.name, key, results[stage.name], seconds)
-        runs.append(StageRun(stage.name, round(seconds, 3), kept is not None))
+        runs.append(_StageRun(stage.name, round(seconds, 3), kept is not None))
         console.print(f"{stage.name}: {'reused' if kept is not None else f'{seconds:.1f} s'}", highlight=False)
         if stage.name == until:
             break

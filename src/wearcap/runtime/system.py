@@ -130,11 +130,8 @@ class System(ABC):
         """
         module, _ = load_trained(checkpoints[0])
         if getattr(module, "system", None) is not cls:
-            raise WearcapError(
-                f"{cls.__name__} cannot run {type(module).__name__}'s network",
-                where=checkpoints[0],
-                expected=f"a checkpoint of {cls.experiment}",
-            )
+            what = f"{cls.__name__} cannot run {type(module).__name__}'s network"
+            raise WearcapError(what, where=checkpoints[0], expected=f"a checkpoint of {cls.experiment}")
         return make(**module.pipeline_parts(), device=device)
 
     @abstractmethod
@@ -194,9 +191,8 @@ class LearnedSystem(System):
         """
         options = options or StageOptions()
         if options.until is not None or options.cache is not None:
-            raise WearcapError(
-                f"until={options.until} cache={options.cache}", expected="a pipeline with stages, such as pipeline=hps"
-            )
+            what = f"until={options.until} cache={options.cache}"
+            raise WearcapError(what, expected="a pipeline with stages, such as pipeline=hps")
         once = {id(recording): CaptureInput.of(recording) for recording in recordings}
         motions = self.motions([once[id(recording)] for recording in recordings], seeds)
         return [Captured(motion) for motion in motions]

@@ -129,11 +129,8 @@ def mark_positions(
     """Mean camera centres during the four stretches, the root mean square deviation of samples from them (SLAM units),
     and the camera's rotation meanwhile (degrees)."""
     if len(stretches) != len(MARKS):
-        raise WearcapError(
-            f"{len(stretches)} stretches on the board",
-            where="camera on the board",
-            expected="four: C1 and C2 on the y axis, C3 and C4 on the x axis",
-        )
+        expected = "four: C1 and C2 on the y axis, C3 and C4 on the x axis"
+        raise WearcapError(f"{len(stretches)} stretches on the board", where="camera on the board", expected=expected)
     inside = [during(slam.timestamps, s, f"camera on {name}", 1.0) for name, s in zip(MARKS, stretches)]
     there = [slam.t_world_body[part].double() for part in inside]
     mean = torch.stack([part.mean(0) for part in there])
@@ -153,20 +150,15 @@ def align_by_marks(
     lines = np.stack([C[1] - C[0], C[3] - C[2]])
     lengths = np.linalg.norm(lines, axis=1)
     if min(distances_m) <= 0 or not np.isfinite(C).all() or lengths.min() < 1e-9:
-        raise WearcapError(
-            f"distances of {distances_m} m, and {lengths.round(4).tolist()} in the SLAM",
-            where="camera on the board",
-            expected="four different places and distances above 0",
-            fix="Measure |C1 C2| and |C3 C4| on the board.",
-        )
+        what = f"distances of {distances_m} m, and {lengths.round(4).tolist()} in the SLAM"
+        expected = "four different places and distances above 0"
+        fix = "Measure |C1 C2| and |C3 C4| on the board."
+        raise WearcapError(what, where="camera on the board", expected=expected, fix=fix)
     across = np.linalg.norm(np.cross(*lines)) / lengths.prod()
     if across < 0.5:
-        raise WearcapError(
-            f"C1 C2 and C3 C4 are {math.degrees(math.asin(across)):.0f}° apart",
-            where="camera on the board",
-            expected="90°",
-            fix="Put C1 and C2 on the y axis, C3 and C4 on the x axis.",
-        )
+        what = f"C1 C2 and C3 C4 are {math.degrees(math.asin(across)):.0f}° apart"
+        fix = "Put C1 and C2 on the y axis, C3 and C4 on the x axis."
+        raise WearcapError(what, where="camera on the board", expected="90°", fix=fix)
     distances = np.array(distances_m)
     scales = distances / lengths
     # Closed form: scale by least squares, rotation by Procrustes, each coordinate of the origin a mean of what should be 0.
@@ -209,12 +201,9 @@ def align_by_walks(
     displacements = torch.stack([end[1] - end[0] for end in (x_slam, y_slam)]).double()
     length = displacements.norm(dim=1)
     if not (length > 0).all() or abs((displacements[0] @ displacements[1] / length.prod()).item()) > 0.5:
-        raise WearcapError(
-            "the camera's paths along the board's edges are not at a right angle",
-            where="camera on the board",
-            expected="about 90°",
-            fix="Check the times of the walks along x and y.",
-        )
+        what = "the camera's paths along the board's edges are not at a right angle"
+        fix = "Check the times of the walks along x and y."
+        raise WearcapError(what, where="camera on the board", expected="about 90°", fix=fix)
     scale = (torch.tensor(length_m, dtype=torch.float64) / length).mean().item()
     axes = torch.eye(3, dtype=torch.float64)[:2]
     R: Tensor = roma.special_procrustes(axes.T @ (displacements / length[:, None]))  # pyright: ignore[reportAssignmentType]

@@ -43,7 +43,24 @@ def detect_claps(*wrists: ImuStream) -> Float64[Tensor, "clap"]:
     if len(wrists) not in (1, 2):
         raise WearcapError(f"{len(wrists)} inertial streams", expected="one wrist's or both wrists'")
     jerks = [_fast_part(wrist) for wrist in wrists]
-    spikes = [_spikes(wrist.timestamps.numpy(), jerk) for wrist, jerk in zip(wrists, jerks)]
+    spikes = []
+    for wrist, jerk in zip(wrists, jerks):
+        # Times of single short peaks; the top lies where a Gaussian through three samples has it
+        timestamps = wrist.timestamps.numpy()
+        step, amount = _step(timestamps), np.linalg.norm(jerk, axis=1)
+        peaks, _ = scipy.signal.find_peaks(amount, height=0.6 * _MIN_ACC, distance=max(round(0.1 / step), 1))
+        peaks = peaks[(peaks > 0) & (peaks < len(amount) - 1)]
+        width = scipy.signal.peak_widths(amount, peaks, rel_height=0.5)[0] * step
+        window = 2 * round(0.5 / step) + 1
+        around = scipy.ndimage.median_filter(amount, size=window, mode="nearest")[peaks]
+        before, top, after = (np.log(np.maximum(amount[peaks + k], 0.3)) for k in (-1, 0, 1))
+        curve = np.minimum(before - 2 * top + after, -1e-9)
+        shift = np.clip(0.5 * (before - after) / curve, -0.5, 0.5)
+        height = np.exp(top - 0.25 * (before - after) * shift)
+        good = height >= np.maximum(_MIN_ACC, _MIN_CONTRAST * around)
+        good &= width <= max(_MAX_WIDTH_S, 2.5 * step)
+        peaks, shift = peaks[good], shift[good]
+        spikes.append(np.interp(peaks + shift, np.arange(len(timestamps)), timestamps))
     times = spikes[0]
     if len(wrists) == 2:
         first, second = mutual_pairs(*spikes, _TOGETHER_S)
@@ -84,24 +101,6 @@ def _fast_part(wrist: ImuStream) -> np.ndarray:
 
 def _step(timestamps: np.ndarray) -> float:
     return float(np.median(np.diff(timestamps)))
-
-
-def _spikes(timestamps: np.ndarray, jerk: np.ndarray) -> np.ndarray:
-    """Times of single short peaks; the top lies where a Gaussian through three samples has it."""
-    step, amount = _step(timestamps), np.linalg.norm(jerk, axis=1)
-    peaks, _ = scipy.signal.find_peaks(amount, height=0.6 * _MIN_ACC, distance=max(round(0.1 / step), 1))
-    peaks = peaks[(peaks > 0) & (peaks < len(amount) - 1)]
-    width = scipy.signal.peak_widths(amount, peaks, rel_height=0.5)[0] * step
-    window = 2 * round(0.5 / step) + 1
-    around = scipy.ndimage.median_filter(amount, size=window, mode="nearest")[peaks]
-    before, top, after = (np.log(np.maximum(amount[peaks + k], 0.3)) for k in (-1, 0, 1))
-    curve = np.minimum(before - 2 * top + after, -1e-9)
-    shift = np.clip(0.5 * (before - after) / curve, -0.5, 0.5)
-    height = np.exp(top - 0.25 * (before - after) * shift)
-    good = height >= np.maximum(_MIN_ACC, _MIN_CONTRAST * around)
-    good &= width <= max(_MAX_WIDTH_S, 2.5 * step)
-    peaks, shift = peaks[good], shift[good]
-    return np.interp(peaks + shift, np.arange(len(timestamps)), timestamps)
 
 
 def _alike(times: np.ndarray, clocks: list[np.ndarray], jerks: list[np.ndarray]) -> np.ndarray:
@@ -147,12 +146,9 @@ def detect_claps_audio(
     later = scipy.ndimage.median_filter(total, 21, mode="nearest")
     onsets = onsets[later[(onsets + round(1000 * max_length_s)).clip(max=len(total) - 1)] <= peak - 10]
     if not len(onsets):
-        raise WearcapError(
-            f"no clap found in {len(sound) / rate:.1f} s",
-            where="sound track",
-            expected="a short sound with a sudden start, 1 to 7.5 kHz",
-            fix="Give the times of the claps by hand.",
-        )
+        what = f"no clap found in {len(sound) / rate:.1f} s"
+        expected = "a short sound with a sudden start, 1 to 7.5 kHz"
+        raise WearcapError(what, where="sound track", expected=expected, fix="Give the times of the claps by hand.")
     return torch.from_numpy(np.array([_start(sound, rate, i * hop, hop) for i in onsets.tolist()]))
 
 

@@ -88,11 +88,8 @@ def fit_clock(
     camera, suit = (np.sort(claps.numpy()) for claps in (claps_camera, claps_suit))
     for name, claps in (("camera", camera), ("suit", suit)):
         if not len(claps):
-            raise WearcapError(
-                f"no clap found by the {name}",
-                expected="at least one that both clocks saw",
-                fix="Give the times of the claps by hand.",
-            )
+            fix = "Give the times of the claps by hand."
+            raise WearcapError(f"no clap found by the {name}", expected="at least one that both clocks saw", fix=fix)
     pairs = _matched(camera, suit, max_offset_s)
     camera, suit = camera[pairs[1]], suit[pairs[0]]
     rate = _drift(suit, camera)
@@ -154,7 +151,20 @@ def _matched(camera: np.ndarray, suit: np.ndarray, max_offset_s: float) -> tuple
         score[part] = np.maximum(1 - (gap / reach) ** 2, 0).sum(1)
     found: dict[bytes, tuple[float, float, tuple]] = {}
     for candidate in np.argsort(-score, kind="stable")[:200]:
-        refined = _refined(camera, suit, start[candidate], offset[candidate])
+        # Refit offset and drift to the coinciding claps iteratively: score, offset at the middle, pairs
+        predicted, within_s = suit + offset[candidate], TOLERANCE_S + MAX_DRIFT * np.abs(suit - start[candidate])
+        for _ in range(8):
+            mutual = mutual_pairs(predicted, camera, within_s)
+            if not len(mutual[0]):
+                break
+            pairs = of_suit, of_camera = mutual
+            total = np.maximum(1 - (np.abs(predicted[of_suit] - camera[of_camera]) / within_s[of_suit]) ** 2, 0).sum()
+            rate = np.clip(_drift(suit[of_suit], camera[of_camera]), -MAX_DRIFT, MAX_DRIFT)
+            middle = suit.mean()
+            lag = float(np.median(camera[of_camera] - suit[of_suit] - rate * (suit[of_suit] - middle)))
+            predicted = suit + lag + rate * (suit - middle)
+            within_s = np.full(len(suit), TOLERANCE_S)
+        refined = float(total), lag, pairs
         found.setdefault(refined[2][0].tobytes() + refined[2][1].tobytes(), refined)
     best, *others = sorted(found.values(), key=lambda entry: -entry[0])
     rivals = [other for other in others if abs(other[1] - best[1]) > TOLERANCE_S and other[0] > best[0] - 0.3]
@@ -171,23 +181,6 @@ def _matched(camera: np.ndarray, suit: np.ndarray, max_offset_s: float) -> tuple
     )
 
 
-def _refined(camera: np.ndarray, suit: np.ndarray, start: float, offset: float) -> tuple[float, float, tuple]:
-    """Refit offset and drift to the coinciding claps iteratively: score, offset at the middle, pairs."""
-    predicted, reach = suit + offset, TOLERANCE_S + MAX_DRIFT * np.abs(suit - start)
-    for _ in range(8):
-        found = mutual_pairs(predicted, camera, reach)
-        if not len(found[0]):
-            break
-        pairs = of_suit, of_camera = found
-        score = np.maximum(1 - (np.abs(predicted[of_suit] - camera[of_camera]) / reach[of_suit]) ** 2, 0).sum()
-        rate = np.clip(_drift(suit[of_suit], camera[of_camera]), -MAX_DRIFT, MAX_DRIFT)
-        middle = suit.mean()
-        at = float(np.median(camera[of_camera] - suit[of_suit] - rate * (suit[of_suit] - middle)))
-        predicted = suit + at + rate * (suit - middle)
-        reach = np.full(len(suit), TOLERANCE_S)
-    return float(score), at, pairs
-
-
 @dataclass(frozen=True)
 class SwingClock:
     """Clock estimated from swings, and the standard deviation (s) of its offset at the swings."""
@@ -197,10 +190,8 @@ class SwingClock:
 
     def checks(self, joint: str, min_swings: int = 5, max_std_s: float = 0.005) -> list[StepCheck]:
         """Quality checks of the swings."""
-        more, step = (
-            "Swing ten times, and give the frames in which the hands are nearest to the camera.",
-            f"arm swings, {joint}",
-        )
+        more = "Swing ten times, and give the frames in which the hands are nearest to the camera."
+        step = f"arm swings, {joint}"
         return [
             StepCheck(step, "seen by both clocks", self.clock.claps, min_swings, "", more, at_least=True),
             StepCheck(step, "deviation of the offset", 1000 * self.std_s, 1000 * max_std_s, "ms", more),

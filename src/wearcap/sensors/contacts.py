@@ -32,9 +32,8 @@ def contacts_from_motion(motion: Motion) -> Bool[Tensor, "time patch"]:
     """Contacts of `FOOT_PATCHES`: each patch from its own speed. The skeleton needs the sites of that name."""
     missing = [patch for patch in FOOT_PATCHES if patch not in motion.skeleton.sites]
     if missing:
-        raise WearcapError(
-            f"skeleton {motion.skeleton.name!r} has no {missing[0]!r}", expected=f"sites {', '.join(FOOT_PATCHES)}"
-        )
+        what = f"skeleton {motion.skeleton.name!r} has no {missing[0]!r}"
+        raise WearcapError(what, expected=f"sites {', '.join(FOOT_PATCHES)}")
     if len(motion) < 3:
         raise WearcapError(f"a motion of {len(motion)} frames", expected="three or more")
     require_rising(motion.timestamps)
@@ -61,9 +60,8 @@ def contacts_from_imu(left: ImuStream, right: ImuStream) -> Bool[Tensor, "time p
     contacts = []
     for foot in (left, right):
         if foot.gyro_imu is None or foot.acc_world is None:
-            raise WearcapError(
-                "no angular rate or free acceleration", where=foot.joint, expected="gyro_imu and acc_world"
-            )
+            what = "no angular rate or free acceleration"
+            raise WearcapError(what, where=foot.joint, expected="gyro_imu and acc_world")
         gyro, acc = foot.gyro_imu.norm(dim=-1)[:, None], foot.acc_world.norm(dim=-1)[:, None]
         flat = _hysteresis(gyro, _GYRO) & _hysteresis(acc, _ACC)
         flat = _without_short(flat, _SHORTEST_S * fps)[:, 0].numpy()

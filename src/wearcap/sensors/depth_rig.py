@@ -72,11 +72,9 @@ class Background:
     def of(cls, frames_mm: UInt16[np.ndarray, "time height width"]) -> "Background":
         """Mean depth of an empty scene, of the frames that saw each pixel. Raises WearcapError without frames."""
         if not len(frames_mm):
-            raise WearcapError(
-                "no frames of the empty scene",
-                expected="at least one depth image without the person",
-                fix="Record a few seconds of the scene before the person enters.",
-            )
+            expected = "at least one depth image without the person"
+            fix = "Record a few seconds of the scene before the person enters."
+            raise WearcapError("no frames of the empty scene", expected=expected, fix=fix)
         seen = frames_mm > 0
         count = seen.sum(0)
         depth = frames_mm.astype(np.float32) / 1000
@@ -91,17 +89,15 @@ class Background:
         Raises WearcapError when the sizes differ.
         """
         if depth_mm.shape != self.depth_m.shape:
-            raise WearcapError(
-                f"a depth image of shape {depth_mm.shape} and a background of {self.depth_m.shape}",
-                expected="images of one camera",
-            )
+            what = f"a depth image of shape {depth_mm.shape} and a background of {self.depth_m.shape}"
+            raise WearcapError(what, expected="images of one camera")
         depth = depth_mm / np.float32(1000)
         before = depth < self.depth_m - (_MARGIN_M + _DEVIATIONS * self.deviation_m)
         return (depth_mm > 0) & before & ~_flying(depth)
 
 
 @dataclass(frozen=True)
-class Registration:
+class _Registration:
     """Pose of a cloud found by ICP, with its quality."""
 
     T_scene_cloud: Rigid
@@ -124,7 +120,7 @@ class Registration:
         )
 
 
-def unproject_depth(
+def _unproject_depth(
     depth_m: Float[np.ndarray, "height width"], valid: Bool[np.ndarray, "height width"], camera: Camera
 ) -> Float[np.ndarray, "point 3"]:
     """Points (m, camera axes) of the valid pixels; the depth lies along the optical axis."""
@@ -155,40 +151,39 @@ class DepthView:
 
     def registered(
         self, scene: Float32[np.ndarray, "scene_point 3"], correction: Rigid | None = None
-    ) -> tuple["DepthView", Registration]:
+    ) -> tuple["DepthView", _Registration]:
         """The camera at the pose that ICP of its empty depth image to the scene's scan (m) finds, and ICP's report.
 
         `T_world_cam` is the approximate pose, as visual localisation gives it. Where the result is wrong, a person
         gives it back with a `correction` in scene axes (new = correction @ old), and ICP starts from there: the
         thesis's localisation, ICP, manual correction, ICP. ICP runs twice, each time to the points that the camera
         would see from where it is thought to be: scans show walls from both sides, 10 cm apart.
-        Raises WearcapError as `register` does.
+        Raises WearcapError as `_register` does.
         """
         empty = self.background
-        cloud = unproject_depth(empty.depth_m, empty.steady, self.camera)
+        cloud = _unproject_depth(empty.depth_m, empty.steady, self.camera)
         pose = self.T_world_cam.to(torch.float64)
         if correction is not None:
             pose = correction.to(torch.float64) @ pose
-        pose = register(cloud, visible_points(scene, pose), pose).T_scene_cloud
-        result = register(cloud, visible_points(scene, pose), pose, STAGES[1:])
+        pose = _register(cloud, _visible_points(scene, pose), pose).T_scene_cloud
+        result = _register(cloud, _visible_points(scene, pose), pose, STAGES[1:])
         return replace(self, T_world_cam=result.T_scene_cloud), result
 
 
-def register(
+def _register(
     cloud: Float[np.ndarray, "point 3"],
     scene: Float[np.ndarray, "scene_point 3"],
     T_scene_cloud: Rigid,
     stages: Sequence[tuple[float, float]] = STAGES,
-) -> Registration:
+) -> _Registration:
     """Point-to-plane ICP of a cloud (m, its own axes) to the scene (m) from an approximate pose.
 
     Raises WearcapError when cloud and scene hardly overlap, or either is empty or has NaN.
     """
     for points, name in ((cloud, "the cloud to register"), (scene, "the scene")):
         if len(points) < _FEWEST or not np.isfinite(points).all():
-            raise WearcapError(
-                f"{name} has {len(points)} points, or some are NaN", expected=f"at least {_FEWEST} finite points (m)"
-            )
+            what = f"{name} has {len(points)} points, or some are NaN"
+            raise WearcapError(what, expected=f"at least {_FEWEST} finite points (m)")
     points, scene = cloud.astype(np.float64), scene.astype(np.float64)
     pose, converged = T_scene_cloud.to(torch.float64).matrix().numpy(), False
     placed, finest_m = _moved(points, pose), stages[-1][0]
@@ -222,10 +217,10 @@ def register(
     facing = np.linalg.eigvalsh(normals.T @ normals / max(len(normals), 1))
     rmse_m = float(np.sqrt(np.mean(to_plane**2))) if inside.any() else float("nan")
     T_scene_cloud = Rigid.from_matrix(torch.from_numpy(pose))
-    return Registration(T_scene_cloud, float(inside.mean()), rmse_m, float(facing[0]), converged)
+    return _Registration(T_scene_cloud, float(inside.mean()), rmse_m, float(facing[0]), converged)
 
 
-def visible_points(scene: Float32[np.ndarray, "scene_point 3"], T_world_cam: Rigid) -> Float32[np.ndarray, "point 3"]:
+def _visible_points(scene: Float32[np.ndarray, "scene_point 3"], T_world_cam: Rigid) -> Float32[np.ndarray, "point 3"]:
     """Points of a scan (m) that nothing hides from a camera at about this pose, within 100° (ours)."""
     wide = Camera.pinhole(500, 500, 100.0)
     splats = Splats(scene, np.ones(3, np.float32), _SPLAT_M, metric=True)
@@ -251,7 +246,7 @@ def person_cloud(
     parts = []
     for image, view in zip(depth_mm, views):
         mask = view.background.foreground(image)
-        points = torch.from_numpy(unproject_depth(image / np.float32(1000), mask, view.camera))
+        points = torch.from_numpy(_unproject_depth(image / np.float32(1000), mask, view.camera))
         pose = view.T_world_cam.to(torch.float64)
         parts.append((points @ pose.R.T + pose.t).numpy())
     merged = np.concatenate(parts)

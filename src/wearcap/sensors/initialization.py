@@ -55,7 +55,7 @@ def align_suit(
     head = resample(Trajectory(suit.timestamps, head.R, head.t), times).T_world_body
     T_world_cam = Rigid(localization.R_world_cam[early], localization.t_world_cam[early]).to(head.t.dtype)
     angle, certainty = yaw_between(head.R, T_world_cam.R @ mount.R.mT)
-    turn = robust_angle(angle, weight * certainty)
+    turn = _robust_angle(angle, weight * certainty)
     R_scene_suit = rotation.about_axis("z", turn)
     worn: Tensor = head @ mount.t  # pyright: ignore[reportAssignmentType]
     move = _weighted_median(T_world_cam.t - worn @ R_scene_suit.mT, weight)
@@ -82,7 +82,7 @@ def yaw_between(
     return torch.atan2(sin, cos), torch.hypot(sin, cos) / 2
 
 
-def robust_angle(
+def _robust_angle(
     angle: Float[Tensor, "sample"], weight: Float[Tensor, "sample"], scale_rad: float = 0.05
 ) -> Float[Tensor, ""]:
     """Centre (rad) of angles on the circle: the sample with the least weighted sum of distances to all others, then
@@ -155,10 +155,8 @@ class InitializationSettings:
             if value not in choices:
                 raise WearcapError(f"{name}={value!r}", expected=f"one of {', '.join(choices)}")
         if self.bridge == "line" and self.path_smoothing_s:
-            raise WearcapError(
-                f"bridge='line' with path_smoothing_s={self.path_smoothing_s:g}",
-                expected="path_smoothing_s=0: smoothing applies to the difference from the suit's path",
-            )
+            expected = "path_smoothing_s=0: smoothing applies to the difference from the suit's path"
+            raise WearcapError(f"bridge='line' with path_smoothing_s={self.path_smoothing_s:g}", expected=expected)
 
 
 @dataclass(frozen=True)
@@ -188,12 +186,9 @@ def initialize(
     settings, suit, seen = settings or InitializationSettings(), suit_aligned, inliers(localization)
     seen &= (localization.timestamps >= suit.timestamps[0]) & (localization.timestamps <= suit.timestamps[-1])
     if not seen.any():
-        raise WearcapError(
-            "no localised frame in the suit's time",
-            where="localization",
-            expected="camera poses on the suit's clock",
-            fix="Synchronise the clocks, or check the map.",
-        )
+        what = "no localised frame in the suit's time"
+        fix = "Synchronise the clocks, or check the map."
+        raise WearcapError(what, where="localization", expected="camera poses on the suit's clock", fix=fix)
     times = localization.timestamps[seen]
     step = (localization.timestamps if len(seen) > 1 else suit.timestamps).diff().median().item()
     valid = (times[nearest_frames(times, suit.timestamps)] - suit.timestamps).abs() <= 1.5 * step
@@ -203,14 +198,22 @@ def initialize(
     if settings.yaw == "tangent":
         yaw = _tangent_yaw(paths, settings)
     else:
-        yaw = _orientation_yaw(suit, localization, seen, R_head_cam, settings)
+        # Angle about gravity from the suit's head to the head implied by the camera's orientation, robustly smoothed
+        head = suit.joint("head")
+        R_world_head = resample(Trajectory(suit.timestamps, head.R, head.t), times).R_world_body
+        angle, certainty = yaw_between(R_world_head, localization.R_world_cam[seen].to(head.R.dtype) @ R_head_cam.mT)
+        weight = (localization.confidence[seen] * certainty).double()
+        pointer = torch.stack([angle.cos(), angle.sin()], -1).double()
+        smooth = _robust_smooth(times, pointer, weight, settings.yaw_smoothing_s, ANGLE_SCALE)
+        frames = torch.from_numpy(np.unwrap(torch.atan2(smooth[:, 1], smooth[:, 0]).numpy()))
+        yaw = _interpolated(suit.timestamps, times, frames[:, None])[:, 0]
         # Alignment with a nominal mount inherits the mount's yaw error; walking reveals it: the constant angle by which
         # the suit's path, turned by `yaw`, still differs from the camera's.
         body_step, camera_step, moving = paths.steps(PATH_SPAN_S, settings.min_speed)
         turned = body_step * torch.polar(torch.ones_like(yaw), yaw)
         product = (camera_step * turned.conj())[moving]
         if len(product):
-            yaw = yaw + robust_angle(product.angle(), product.abs(), scale_rad=ANGLE_SCALE).double()
+            yaw = yaw + _robust_angle(product.angle(), product.abs(), scale_rad=ANGLE_SCALE).double()
     if settings.bridge == "suit":
         camera = _bridged(paths, yaw, settings)
     turn = rotation.about_axis("z", yaw).to(body.dtype)
@@ -250,20 +253,6 @@ def _tangent_yaw(paths: _Paths, settings: InitializationSettings) -> Float64[Ten
     frame = torch.where(moving, torch.arange(len(body)), -1).cummax(0).values
     frame = torch.where(frame < 0, moving.nonzero()[0], frame)
     return (camera * body.conj()).angle()[frame]
-
-
-def _orientation_yaw(
-    suit: Motion, localization: Localization, seen: Tensor, R_head_cam: Tensor, settings: InitializationSettings
-) -> Float64[Tensor, "time"]:
-    """Angle about gravity from the suit's head to the head implied by the camera's orientation, robustly smoothed."""
-    head, times = suit.joint("head"), localization.timestamps[seen]
-    R_world_head = resample(Trajectory(suit.timestamps, head.R, head.t), times).R_world_body
-    angle, certainty = yaw_between(R_world_head, localization.R_world_cam[seen].to(head.R.dtype) @ R_head_cam.mT)
-    weight = (localization.confidence[seen] * certainty).double()
-    pointer = torch.stack([angle.cos(), angle.sin()], -1).double()
-    smooth = _robust_smooth(times, pointer, weight, settings.yaw_smoothing_s, ANGLE_SCALE)
-    frames = torch.from_numpy(np.unwrap(torch.atan2(smooth[:, 1], smooth[:, 0]).numpy()))
-    return _interpolated(suit.timestamps, times, frames[:, None])[:, 0]
 
 
 def _bridged(paths: _Paths, yaw: Tensor, settings: InitializationSettings) -> Float64[Tensor, "time 3"]:

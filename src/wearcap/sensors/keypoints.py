@@ -51,9 +51,8 @@ def camera_path(motion: Motion, stream: CameraStream) -> Trajectory:
     times = stream.timestamps
     times = times[(times >= motion.timestamps[0]) & (times <= motion.timestamps[-1])]
     if len(times) < 2:
-        raise WearcapError(
-            f"{len(times)} pictures of the head camera during the motion", expected="two or more, on one clock"
-        )
+        what = f"{len(times)} pictures of the head camera during the motion"
+        raise WearcapError(what, expected="two or more, on one clock")
     return resample(Trajectory(motion.timestamps, T_world_cam.R, T_world_cam.t), times)
 
 

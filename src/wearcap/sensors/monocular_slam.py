@@ -101,18 +101,15 @@ def scale_by_walks(slam: Trajectory, walks: Sequence[tuple[float, float, float]]
     lengths = (ends[:, 1] - ends[:, 0]).norm(dim=-1).numpy()
     metres = np.array([walk[2] for walk in walks])
     if lengths.min() < 1e-9 or metres.min() <= 0:
-        raise WearcapError(
-            f"walks of {metres.tolist()} m, and {lengths.round(4).tolist()} in the SLAM",
-            where="walked distances",
-            expected="two different places and a distance above 0",
-            fix="Check the times of the walks.",
-        )
+        what = f"walks of {metres.tolist()} m, and {lengths.round(4).tolist()} in the SLAM"
+        expected = "two different places and a distance above 0"
+        raise WearcapError(what, where="walked distances", expected=expected, fix="Check the times of the walks.")
     scales = metres / lengths
     return float(metres @ lengths / (lengths @ lengths)), float(np.ptp(scales) / scales.mean())
 
 
 @dataclass(frozen=True)
-class GravityScale:
+class _GravityScale:
     """Vertical and scale of a SLAM's world. The heading stays the SLAM's: R_world_slam is the least turn that puts z up."""
 
     R_world_slam: Float64[Tensor, "3 3"]
@@ -132,7 +129,7 @@ def by_head_imu(
     imu: ImuStream,
     R_cam_imu: Float[Tensor, "3 3"] | None = None,
     t_cam_imu: Float[Tensor, "3"] | None = None,
-) -> GravityScale:
+) -> _GravityScale:
     """Scale and vertical from a sensor (acc_imu, the camera's clock) fixed to the camera at a known place (m).
 
     Huber's robust least squares in (1/s, g/s, bias/s); its covariance allows for correlated errors within a second.
@@ -142,28 +139,45 @@ def by_head_imu(
     a_slam, force_slam, R, fps = _alike(slam, imu, R_cam_imu, t_cam_imu)
     # a_slam = k R f - h - R b with h = -g/s (up), b = k bias
     rows = np.concatenate([force_slam[:, :, None], np.broadcast_to(-np.eye(3), R.shape), -R], 2)
-    x, covariance = _robust(rows, a_slam, round(_BLOCK_S * fps), _BIAS)
+    # Huber's estimate of x in rows @ x = y, and its covariance with errors that are correlated within blocks;
+    # the last three unknowns, k times a bias, have a zero-mean prior
+    block = round(_BLOCK_S * fps)
+    weight, prior = np.ones(len(a_slam)), np.zeros(rows.shape[2])
+    sigma2, k = a_slam.var(), 0.0
+    for _ in range(_ROUNDS):
+        # Errors are correlated over a block: a block counts as one observation against the prior.
+        prior[-3:] = block * sigma2 / max(k * _BIAS, 1e-6) ** 2 if k else 1e6 * len(a_slam)
+        normal = np.einsum("t,tij,tik->jk", weight, rows, rows) + np.diag(prior)
+        x = np.linalg.solve(normal, np.einsum("t,tij,ti->j", weight, rows, a_slam))
+        k = abs(x[0])
+        error = a_slam - rows @ x
+        size = np.linalg.norm(error, axis=1)
+        scale = np.median(size) / 1.54  # of a three-dimensional normal error, per axis
+        weight = np.minimum(1.0, 2.5 * scale / np.maximum(size, 1e-12))
+        sigma2 = scale**2
+    scores = np.einsum("t,tij,ti->tj", weight, rows, error)
+    count = len(scores) // block * block
+    summed = scores[:count].reshape(-1, block, rows.shape[2]).sum(1)
+    inverse = np.linalg.inv(normal)
+    middle = summed.T @ summed * len(scores) / max(count, 1)
+    middle[-3:, -3:] += np.diag(prior[-3:] ** 2 * (k * _BIAS) ** 2)
+    covariance = inverse @ middle @ inverse
     k, up = x[0], x[1:4]
     length = np.linalg.norm(up) / k if abs(k) > 1e-12 else math.inf
     deviation = math.sqrt(covariance[0, 0]) / abs(k)
     if deviation > 0.1:
-        raise WearcapError(
-            f"the scale stays uncertain by {100 * deviation:.0f} %",
-            where="scale from the head's sensor",
-            expected="at most 10 %",
-            fix="Walk with turns for half a minute; give more of the log.",
-        )
+        what = f"the scale stays uncertain by {100 * deviation:.0f} %"
+        fix = "Walk with turns for half a minute; give more of the log."
+        raise WearcapError(what, where="scale from the head's sensor", expected="at most 10 %", fix=fix)
     if k <= 0 or abs(length / GRAVITY - 1) > _GRAVITY_SHARE:
-        raise WearcapError(
-            f"gravity of {length:.2f} m/s² and a scale of {1 / k:.3g}",
-            where="scale from the head's sensor",
-            expected="9.81 m/s² and a scale above 0",
-            fix="Check the unit of the accelerations, how the sensor sits on the camera, and the clocks.",
-        )
+        what = f"gravity of {length:.2f} m/s² and a scale of {1 / k:.3g}"
+        expected = "9.81 m/s² and a scale above 0"
+        fix = "Check the unit of the accelerations, how the sensor sits on the camera, and the clocks."
+        raise WearcapError(what, where="scale from the head's sensor", expected=expected, fix=fix)
     direction = up / np.linalg.norm(up)
     across = np.eye(3) - np.outer(direction, direction)
     turn = across @ covariance[1:4, 1:4] @ across / (up @ up)
-    return GravityScale(_upright(direction), 1 / k, deviation / k, math.degrees(math.sqrt(np.trace(turn))))
+    return _GravityScale(_upright(direction), 1 / k, deviation / k, math.degrees(math.sqrt(np.trace(turn))))
 
 
 def _alike(
@@ -177,19 +191,13 @@ def _alike(
         raise WearcapError("a stream without acc_imu", where="the head's sensor", expected="specific force (m/s²)")
     start, stop = max(slam.timestamps[0], imu.timestamps[0]), min(slam.timestamps[-1], imu.timestamps[-1])
     if stop - start < 10:
-        raise WearcapError(
-            f"camera and sensor share {max((stop - start).item(), 0):.1f} s",
-            where="scale from the head's sensor",
-            expected="10 s or more",
-            fix="Bring both to one clock, and walk for longer.",
-        )
+        what = f"camera and sensor share {max((stop - start).item(), 0):.1f} s"
+        fix = "Bring both to one clock, and walk for longer."
+        raise WearcapError(what, where="scale from the head's sensor", expected="10 s or more", fix=fix)
     if len(gaps := find_gaps(slam.timestamps, 0.5)):
-        raise WearcapError(
-            f"the camera is lost at {slam.timestamps[gaps[0]].item():.2f} s",
-            where="scale from the head's sensor",
-            expected="poses without gaps",
-            fix="Give a part without gaps.",
-        )
+        what = f"the camera is lost at {slam.timestamps[gaps[0]].item():.2f} s"
+        fix = "Give a part without gaps."
+        raise WearcapError(what, where="scale from the head's sensor", expected="poses without gaps", fix=fix)
     step, fine = slam.timestamps.diff().median().item(), 4
     n = max(round(_HALF_S / step), 1)
     # On the camera's frames: between them positions would be interpolated, which flattens them.
@@ -212,31 +220,6 @@ def _alike(
     return a_slam[inner], (force_slam - swung)[inner], turned.reshape(-1, 3, 3)[inner], 1 / step
 
 
-def _robust(rows: np.ndarray, y: np.ndarray, block: int, bias: float) -> tuple[np.ndarray, np.ndarray]:
-    """Huber's estimate of x in rows (time, 3, unknown) x = y (time, 3), and its covariance with errors that are
-    correlated within blocks. The last three unknowns, k times a bias, have a zero-mean prior."""
-    weight, prior = np.ones(len(y)), np.zeros(rows.shape[2])
-    sigma2, k = y.var(), 0.0
-    for _ in range(_ROUNDS):
-        # Errors are correlated over a block: a block counts as one observation against the prior.
-        prior[-3:] = block * sigma2 / max(k * bias, 1e-6) ** 2 if k else 1e6 * len(y)
-        normal = np.einsum("t,tij,tik->jk", weight, rows, rows) + np.diag(prior)
-        x = np.linalg.solve(normal, np.einsum("t,tij,ti->j", weight, rows, y))
-        k = abs(x[0])
-        error = y - rows @ x
-        size = np.linalg.norm(error, axis=1)
-        scale = np.median(size) / 1.54  # of a three-dimensional normal error, per axis
-        weight = np.minimum(1.0, 2.5 * scale / np.maximum(size, 1e-12))
-        sigma2 = scale**2
-    scores = np.einsum("t,tij,ti->tj", weight, rows, error)
-    count = len(scores) // block * block
-    summed = scores[:count].reshape(-1, block, rows.shape[2]).sum(1)
-    inverse = np.linalg.inv(normal)
-    middle = summed.T @ summed * len(scores) / max(count, 1)
-    middle[-3:, -3:] += np.diag(prior[-3:] ** 2 * (k * bias) ** 2)
-    return x, inverse @ middle @ inverse
-
-
 def by_floor(
     slam: Trajectory,
     points_slam: Float[Tensor, "point 3"],
@@ -244,7 +227,7 @@ def by_floor(
     height_m: float,
     height_std_m: float = 0.005,
     seed: int = 0,
-) -> GravityScale:
+) -> _GravityScale:
     """Scale and vertical from the floor below the path, and the camera's height above it while standing (m).
 
     The floor is the plane with most points below the path (RANSAC, then total least squares), at most 35° from the
@@ -252,9 +235,8 @@ def by_floor(
     measured height. Raises WearcapError when too few points lie on a plane, or for an implausible height.
     """
     if not 0.5 < height_m < 2.5:
-        raise WearcapError(
-            f"a standing height of {height_m} m", where="scale from the floor", expected="0.5 m to 2.5 m"
-        )
+        what = f"a standing height of {height_m} m"
+        raise WearcapError(what, where="scale from the floor", expected="0.5 m to 2.5 m")
     random = np.random.default_rng(seed)
     eyes = slam.t_world_body[during(slam.timestamps, standing, "standing", 1.0)].double().mean(0).numpy()
     rough = -slam.R_world_body[:, :, 1].double().mean(0).numpy()
@@ -278,7 +260,7 @@ def by_floor(
         turns.append(math.acos(min(up @ up_k, 1.0)))
         scales.append((height_m + height_std_m * random.standard_normal()) / height_k)
     deviation = math.degrees(math.sqrt(np.mean(np.square(turns))))
-    return GravityScale(_upright(up), height_m / height, float(np.std(scales)), deviation)
+    return _GravityScale(_upright(up), height_m / height, float(np.std(scales)), deviation)
 
 
 def _floor_points(points: np.ndarray, eyes: np.ndarray, rough: np.ndarray, random: np.random.Generator) -> np.ndarray:
@@ -296,12 +278,9 @@ def _floor_points(points: np.ndarray, eyes: np.ndarray, rough: np.ndarray, rando
         best = near if near.sum() > best.sum() else best
     for _ in range(3):
         if best.sum() < 30:
-            raise WearcapError(
-                f"{int(best.sum())} of {len(points)} points below the path lie on one plane",
-                where="scale from the floor",
-                expected="30 or more",
-                fix="Look at the floor while walking, or use the board.",
-            )
+            what = f"{int(best.sum())} of {len(points)} points below the path lie on one plane"
+            fix = "Look at the floor while walking, or use the board."
+            raise WearcapError(what, where="scale from the floor", expected="30 or more", fix=fix)
         up, height = _plane(points[best], eyes)
         best = np.abs((points - eyes) @ up + height) < 0.02 * height
     return points[best]

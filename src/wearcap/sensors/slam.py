@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
@@ -58,7 +58,19 @@ def semidense_points(
     for frame in frames:
         T_world_cam = Rigid(head.R_world_device[frame] @ R_DEVICE_CAM, head.t_world_device[frame])
         unseen = np.flatnonzero(first < 0)
-        seen = _visible(points[unseen], normals[unseen], mesh, T_world_cam, settings.range_m)
+        # Visible: inside the image, in range, facing the camera, and not occluded
+        candidates = points[unseen]
+        in_cam = T_world_cam.inverse()[None] @ torch.from_numpy(candidates).float()
+        pixels, valid = CAMERA.project(in_cam)
+        depth = render(CAMERA, T_world_cam, [mesh]).depth
+        z = np.asarray(in_cam[:, 2])
+        column, row = pixels.nan_to_num(-1.0).round().long().unbind(-1)
+        inside = valid.numpy() & (z > 0.2) & (z < settings.range_m)
+        inside &= ((column >= 0) & (column < CAMERA.width) & (row >= 0) & (row < CAMERA.height)).numpy()
+        inside &= ((np.asarray(T_world_cam.t) - candidates) * normals[unseen]).sum(1) > 0
+        surface = np.full(len(candidates), -np.inf)
+        surface[inside] = depth[row.numpy()[inside], column.numpy()[inside]]
+        seen = inside & (z < surface * 1.03 + 0.05)
         first[unseen[seen]] = frame
     seen = first >= 0
     points, first = points[seen], first[seen]
@@ -101,24 +113,3 @@ def keyframes(head: HeadStream, settings: SlamPoints) -> list[int]:
     effort = torch.cumsum(moved + turned / np.deg2rad(settings.keyframe_deg), 0)
     chosen = [0, *((effort.floor().diff() > 0).nonzero()[:, 0] + 2).tolist()]
     return chosen[:: max(1, -(-len(chosen) // settings.max_keyframes))]
-
-
-def _visible(
-    points: Float[np.ndarray, "point 3"],
-    normals: Float[np.ndarray, "point 3"],
-    mesh: Mesh,
-    T_world_cam: Rigid,
-    range_m: float,
-) -> Bool[np.ndarray, "point"]:
-    """Points visible to the camera: inside the image, in range, facing it, and not occluded."""
-    in_cam = T_world_cam.inverse()[None] @ torch.from_numpy(points).float()
-    pixels, valid = CAMERA.project(in_cam)
-    depth = render(CAMERA, T_world_cam, [mesh]).depth
-    z = np.asarray(in_cam[:, 2])
-    column, row = pixels.nan_to_num(-1.0).round().long().unbind(-1)
-    inside = valid.numpy() & (z > 0.2) & (z < range_m)
-    inside &= ((column >= 0) & (column < CAMERA.width) & (row >= 0) & (row < CAMERA.height)).numpy()
-    inside &= ((np.asarray(T_world_cam.t) - points) * normals).sum(1) > 0
-    surface = np.full(len(points), -np.inf)
-    surface[inside] = depth[row.numpy()[inside], column.numpy()[inside]]
-    return inside & (z < surface * 1.03 + 0.05)

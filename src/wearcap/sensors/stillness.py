@@ -58,21 +58,15 @@ def during(
     """Samples of a stretch. Raises WearcapError, naming the step, when it is too short or not in the log."""
     start, stop = stretch
     if stop - start < min_s:
-        raise WearcapError(
-            f"the stretch from {start:.2f} s to {stop:.2f} s is {stop - start:.2f} s long",
-            where=step,
-            expected=f"at least {min_s:g} s",
-            fix="Hold still for longer and do this step again.",
-        )
+        what = f"the stretch from {start:.2f} s to {stop:.2f} s is {stop - start:.2f} s long"
+        fix = "Hold still for longer and do this step again."
+        raise WearcapError(what, where=step, expected=f"at least {min_s:g} s", fix=fix)
     inside = (timestamps >= start) & (timestamps <= stop)
     first, last = (timestamps[inside][[0, -1]] if inside.any() else timestamps.new_zeros(2)).tolist()
     if not inside.any() or first - start > 0.25 or stop - last > 0.25:
-        raise WearcapError(
-            f"the log has {int(inside.sum())} samples from {start:.2f} s to {stop:.2f} s",
-            where=step,
-            expected=f"a stretch within the log, {timestamps[0].item():.2f} s to {timestamps[-1].item():.2f} s",
-            fix="Give other times for this step.",
-        )
+        what = f"the log has {int(inside.sum())} samples from {start:.2f} s to {stop:.2f} s"
+        expected = f"a stretch within the log, {timestamps[0].item():.2f} s to {timestamps[-1].item():.2f} s"
+        raise WearcapError(what, where=step, expected=expected, fix="Give other times for this step.")
     return inside
 
 

@@ -1,24 +1,38 @@
-"""Calibration of watches: from their reference frame to the world, and their mounting on the wrist (MocapEvery C.2).
+"""Guided calibration of watches and a head camera: from the watches' reference frame to the world, and their mounting on
+the wrist (MocapEvery C.2).
 
 Both watches lie on a board whose axes are the world's (z up, y where the wearer will face), then are worn in a T-pose
 that faces y. With our names eq. 6 and 7 read R_world_joint = R_world_ref R_ref_imu R_imu_joint,
 acc_world = R_world_ref acc_ref, and R_imu_joint = R_world_imu(T)ᵀ R_world_joint(T). A skeleton's rest pose is a T-pose that
 faces x, so that facing y R_world_joint(T) = Rz(90°) for both wrists. A constant error of the pose
 cannot be distinguished from another mounting of the watch.
+
+Times of steps count from `WatchSession.watch_zero` and `camera_zero`, so that they can be read off the logs. In the JSON
+file rotations are unit quaternions (scalar first), with m, s, degrees, and the checks; what was not calibrated is absent:
+{"watches": {"left_wrist": {"R_world_ref_wxyz", "R_joint_imu_wxyz", …}, …}, "clocks": {"left_wrist": {"camera_s", "watch_s", …}, …},
+ "camera": {"scale", "R_world_slam_wxyz", "t_world_slam", …}, "head": {"R_head_cam_wxyz", "t_head_cam", …}, "checks": […]}
 """
 
+import json
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
+from wearcap.files import write_text
 from wearcap.geometry import rotation
-from wearcap.recording.recording import ImuStream
+from wearcap.geometry.rotation import quat_wxyz_from_matrix
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.recording.recording import FloorTrack, ImuStream, Recording
+from wearcap.sensors.camera_alignment import HeadMount, SlamAlignment
+from wearcap.sensors.clock import SwingClock, fit_swing_clock, swing_peaks
 from wearcap.sensors.stillness import StepCheck, Stretch, during, require, still_intervals, unstillness_deg
 from wearcap.sensors.watches import require_sides
 
@@ -89,11 +103,8 @@ def measure_watches(streams: Mapping[str, ImuStream], board: Stretch, t_pose: St
     if missing := [joint for joint in WRISTS if joint not in streams]:
         raise WearcapError(f"no watch on {' and '.join(missing)}", expected=" and ".join(WRISTS))
     if board[0] < t_pose[1] and t_pose[0] < board[1]:
-        raise WearcapError(
-            f"board {board} and T-pose {t_pose} overlap",
-            where="board and T-pose",
-            expected="two stretches, one after the other",
-        )
+        what = f"board {board} and T-pose {t_pose} overlap"
+        raise WearcapError(what, where="board and T-pose", expected="two stretches, one after the other")
     R_world_joint = rotation.about_axis("z", torch.tensor(math.radians(FACING_DEG), dtype=torch.float64))
     found = {}
     for joint in WRISTS:
@@ -190,14 +201,133 @@ def propose_steps(streams: Mapping[str, ImuStream]) -> tuple[Stretch | None, Str
 
 def _orientation(stream: ImuStream) -> Float[Tensor, "time 3 3"]:
     if stream.R_world_imu is None:
-        raise WearcapError(
-            "a watch's log without orientation",
-            where=stream.joint,
-            expected="one with attitude",
-            fix="Switch on device motion when you record.",
-        )
+        what = "a watch's log without orientation"
+        fix = "Switch on device motion when you record."
+        raise WearcapError(what, where=stream.joint, expected="one with attitude", fix=fix)
     return stream.R_world_imu
 
 
 def _angle_deg(cos: Tensor) -> float:
     return math.degrees(math.acos(min(max(cos.item(), -1.0), 1.0)))
+
+
+MARK_S, STAND_S = 1.5, 8.0
+"""Least durations (s) for which the camera rests on a mark, and the wearer stands."""
+
+
+@dataclass(frozen=True)
+class WornCalibration:
+    """Result of a guided calibration; what was not calibrated is None or absent."""
+
+    watches: dict[str, WatchCalibration]
+    clocks: dict[str, SwingClock] = field(default_factory=dict)
+    """Clock relation of the camera and each watch."""
+    camera: SlamAlignment | None = None
+    head: HeadMount | None = None
+
+
+@dataclass(frozen=True)
+class WatchSession:
+    """Logs of both watches, by wrist, and the camera's path by SLAM, if there is one."""
+
+    watches: dict[str, ImuStream]
+    slam: Trajectory | None = None
+
+    @property
+    def watch_zero(self) -> float:
+        """Time (s) at which both watches' logs have begun."""
+        return max(stream.timestamps[0].item() for stream in self.watches.values())
+
+    @property
+    def camera_zero(self) -> float:
+        """Time (s) of the first camera pose."""
+        return 0.0 if self.slam is None else self.slam.timestamps[0].item()
+
+    def proposed(self) -> dict[str, list[Stretch]]:
+        """Stretches (s, from the zeros) of "board", "tpose", "marks" and "standing" that the logs probably contain."""
+        found = {}
+        for key, stretch in zip(("board", "tpose"), propose_steps(self.watches)):
+            if stretch is not None:
+                found[key] = [(stretch[0] - self.watch_zero, stretch[1] - self.watch_zero)]
+        if self.slam is not None:
+            still = still_intervals(self.slam.timestamps, self.slam.R_world_body, MARK_S, still_deg=1.0)
+            steady = still_intervals(self.slam.timestamps, self.slam.R_world_body, STAND_S)
+            zero = self.camera_zero
+            if len(still) >= 4:
+                found["marks"] = [(start - zero, stop - zero) for start, stop in still[:4]]
+                steady = [stretch for stretch in steady if stretch[0] > still[3][1]]
+            if steady:
+                found["standing"] = [(steady[0][0] - zero, steady[0][1] - zero)]
+        return found
+
+    def swing_clock(
+        self, watch: ImuStream, seen_s: Float64[Tensor, "swing"], stretch: Stretch, camera_fps: float
+    ) -> SwingClock:
+        """Clock relation of the camera and one calibrated watch, from times (s) at which the camera saw the swings.
+
+        `stretch` is the part (s) of the watch's log with the swings. Raises WearcapError as `fit_swing_clock` does.
+        """
+        peaks = swing_peaks(watch, stretch) - self.watch_zero
+        found = fit_swing_clock(seen_s, peaks, 1 / camera_fps)
+        clock = found.clock
+        clock = replace(clock, camera_s=clock.camera_s + self.camera_zero, suit_s=clock.suit_s + self.watch_zero)
+        return SwingClock(clock, found.std_s)
+
+    def added_to(self, recording: Recording, found: WornCalibration) -> Recording:
+        """The recording with the calibrated streams; z = 0 of its world is the floor the wearer stands on: MocapEvery's h_0."""
+        imu = {joint: found.watches[joint].apply(stream) for joint, stream in self.watches.items()}
+        for joint, clock in found.clocks.items():
+            imu[joint] = replace(imu[joint], timestamps=clock.clock.to_camera(self.watches[joint].timestamps))
+        recording = replace(recording, imu=recording.imu | imu)
+        if self.slam is None or found.camera is None or found.head is None:
+            return recording
+        head = found.head.apply(found.camera.apply(self.slam))
+        floor = recording.floor or FloorTrack(head.timestamps[:1], torch.zeros(1))
+        return replace(recording, head=head, floor=floor)
+
+
+_WATCH = ("board_still_deg", "board_tilt_deg", "pose_still_deg")
+_CAMERA = ("scale", "residual_m", "scale_spread", "corner_deg")
+
+
+def write_watch_calibration(
+    found: WornCalibration, path: str | Path, checks: Sequence[StepCheck] = (), about: dict[str, Any] | None = None
+) -> None:
+    """Write a calibration, its checks and its metadata (plain numbers, text, lists), atomically."""
+    content: dict[str, Any] = {
+        "watches": {
+            joint: {"R_world_ref_wxyz": _wxyz(one.R_world_ref), "R_joint_imu_wxyz": _wxyz(one.R_joint_imu)}
+            | {name: getattr(one, name) for name in _WATCH}
+            for joint, one in found.watches.items()
+        },
+        "clocks": {
+            joint: {
+                "camera_s": one.clock.camera_s.tolist(),
+                "watch_s": one.clock.suit_s.tolist(),
+                "swings": one.clock.claps,
+                "drift_s_per_hour": one.clock.drift_s_per_hour,
+                "residual_s": one.clock.residual_s,
+                "std_s": one.std_s,
+            }
+            for joint, one in found.clocks.items()
+        },
+    }
+    if found.camera is not None:
+        content["camera"] = {name: getattr(found.camera, name) for name in _CAMERA} | {
+            "R_world_slam_wxyz": _wxyz(found.camera.R_world_slam),
+            "t_world_slam": found.camera.t_world_slam.tolist(),
+        }
+    if found.head is not None:
+        content["head"] = {
+            "R_head_cam_wxyz": _wxyz(found.head.R_head_cam),
+            "t_head_cam": found.head.t_head_cam.tolist(),
+            "still_deg": found.head.still_deg,
+        }
+    content["checks"] = [
+        {"step": c.step, "what": c.what, "measured": c.measured, "expected": c.expected, "ok": c.ok} for c in checks
+    ]
+    write_text(path, json.dumps(content | ({"about": about} if about else {}), indent=1) + "\n")
+
+
+def _wxyz(R: Tensor) -> list[float]:
+    return quat_wxyz_from_matrix(R.double()).tolist()

@@ -32,17 +32,12 @@ def watches_at(
     worn = []
     for joint in WRISTS:
         if joint not in streams:
-            raise WearcapError(
-                f"no watch on {joint}",
-                where=where,
-                expected=" and ".join(WRISTS),
-                fix="Give both watches, or capture with the head alone: pipeline=hmd2.",
-            )
+            fix = "Give both watches, or capture with the head alone: pipeline=hmd2."
+            raise WearcapError(f"no watch on {joint}", where=where, expected=" and ".join(WRISTS), fix=fix)
         stream = streams[joint]
         if stream.R_world_imu is None or stream.acc_world is None:
-            raise WearcapError(
-                "a watch without orientation or free acceleration", where=f"{where}, {joint}", expected="both"
-            )
+            what = "a watch without orientation or free acceleration"
+            raise WearcapError(what, where=f"{where}, {joint}", expected="both")
         _require_no_gaps(stream.timestamps, timestamps, f"{where}, {joint}")
         worn.append(stream)
     step = timestamps.diff().median().item() if len(timestamps) > 1 else 0.0
@@ -68,7 +63,21 @@ def filtered(
         share = (timestamps - times[after - 1]) / (times[after] - times[after - 1])
         before.append(R[after - 1])
         turn.append((R[after - 1].mT @ R[after], share.clamp(0, 1).to(R.dtype)))
-        accelerations.append(_averaged(times, acc, around, step_s).unfold(0, FILTER, 1).mean(-1))
+        # Mean over the frame around each time, with linear interpolation between samples at any sample rate
+        interval = times.diff()[:, None]
+        area = torch.cat([acc.new_zeros(1, 3).double(), ((acc[1:] + acc[:-1]).double() / 2 * interval).cumsum(0)])
+        edges = torch.stack([around - step_s / 2, around + step_s / 2]).clamp(times[0].item(), times[-1].item())
+        later = torch.searchsorted(times, edges.contiguous(), right=True).clamp(1, len(times) - 1)
+        earlier = later - 1
+        into_s = (edges - times[earlier])[..., None]
+        slope = (acc[later] - acc[earlier]).double() / (times[later] - times[earlier])[..., None]
+        upto = area[earlier] + into_s * (acc[earlier].double() + slope * into_s / 2)
+        span = (edges[1] - edges[0])[:, None]
+        inside = (upto[1] - upto[0]) / span.clamp_min(1e-9)
+        # Outside the watch's log its first or last sample is repeated.
+        outside = acc[torch.where(around < times[0], 0, len(times) - 1)].double()
+        mean = torch.where(span > 1e-6, inside, outside).to(acc.dtype)
+        accelerations.append(mean.unfold(0, FILTER, 1).mean(-1))
     step, share = (torch.stack(part, 1) for part in zip(*turn))
     R_world_wrist = torch.stack(before, 1) @ rotation.exp(share[..., None] * rotation.log(step))
     return R_world_wrist, torch.stack(accelerations, 1)
@@ -81,30 +90,23 @@ def require_sides(R_world_wrist: Float[Tensor, "time wrist 3 3"], where: str) ->
     """
     up = R_world_wrist[:, :, 2, 1].mean(0)
     if up[0] > _HANGING and up[1] < -_HANGING:
-        raise WearcapError(
-            "the watches seem to be swapped: both forearms would point up most of the time",
-            where=where,
-            fix="Exchange the logs of the left and the right watch, or calibrate them again.",
-        )
+        what = "the watches seem to be swapped: both forearms would point up most of the time"
+        fix = "Exchange the logs of the left and the right watch, or calibrate them again."
+        raise WearcapError(what, where=where, fix=fix)
 
 
 def _require_no_gaps(times: Tensor, requested: Tensor, where: str) -> None:
     """Raise WearcapError when the watch has no samples at some of the requested times."""
     step = times.diff()
     if len(times) < 2 or (step <= 0).any():
-        raise WearcapError(
-            "times of a watch that do not grow",
-            where=where,
-            fix="Sort its samples by time and leave repeated ones out.",
-        )
+        fix = "Sort its samples by time and leave repeated ones out."
+        raise WearcapError("times of a watch that do not grow", where=where, fix=fix)
     early, late = (times[0] - requested[0]).item(), (requested[-1] - times[-1]).item()
     if early > MAX_GAP_S or late > MAX_GAP_S:
-        raise WearcapError(
-            f"the watch logged from {times[0].item():.2f} s to {times[-1].item():.2f} s",
-            where=where,
-            expected=f"{requested[0].item():.2f} s to {requested[-1].item():.2f} s, as the camera did",
-            fix="Put both on one clock (wearcap calibrate), or cut the recording to what they share.",
-        )
+        what = f"the watch logged from {times[0].item():.2f} s to {times[-1].item():.2f} s"
+        expected = f"{requested[0].item():.2f} s to {requested[-1].item():.2f} s, as the camera did"
+        fix = "Put both on one clock (wearcap calibrate), or cut the recording to what they share."
+        raise WearcapError(what, where=where, expected=expected, fix=fix)
     gaps = find_gaps(times, MAX_GAP_S)
     inside = [g for g in gaps.tolist() if times[g + 1] > requested[0] and times[g] < requested[-1]]
     if inside:
@@ -116,22 +118,3 @@ def _require_no_gaps(times: Tensor, requested: Tensor, where: str) -> None:
             expected=f"no gap above {MAX_GAP_S} s",
             fix="Cut the recording there.",
         )
-
-
-def _averaged(
-    times: Float64[Tensor, "sample"], value: Float[Tensor, "sample 3"], at: Float64[Tensor, "time"], step_s: float
-) -> Float[Tensor, "time 3"]:
-    """Mean over the frame around each time, with linear interpolation between samples at any sample rate."""
-    step = times.diff()[:, None]
-    area = torch.cat([value.new_zeros(1, 3).double(), ((value[1:] + value[:-1]).double() / 2 * step).cumsum(0)])
-    edges = torch.stack([at - step_s / 2, at + step_s / 2]).clamp(times[0].item(), times[-1].item())
-    after = torch.searchsorted(times, edges.contiguous(), right=True).clamp(1, len(times) - 1)
-    before = after - 1
-    share = (edges - times[before])[..., None]
-    slope = (value[after] - value[before]).double() / (times[after] - times[before])[..., None]
-    upto = area[before] + share * (value[before].double() + slope * share / 2)
-    span = (edges[1] - edges[0])[:, None]
-    inside = (upto[1] - upto[0]) / span.clamp_min(1e-9)
-    # Outside the watch's log its first or last sample is repeated.
-    outside = value[torch.where(at < times[0], 0, len(times) - 1)].double()
-    return torch.where(span > 1e-6, inside, outside).to(value.dtype)

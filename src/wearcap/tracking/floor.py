@@ -106,7 +106,15 @@ class FloorTracker:
     def _look(self, head: np.ndarray) -> None:
         self._heights.append(float(head[2]))
         self._path.append(head)
-        points = self._around()
+        # Points in the tiles that the recent path crosses and in the adjacent tiles
+        crossed = np.unique(np.floor(np.array(self._path)[:, :2] / _TILE_M).astype(np.int64), axis=0)
+        near = {(x + i, y + j) for x, y in crossed.tolist() for i in (-1, 0, 1) for j in (-1, 0, 1)}
+        parts = []
+        for tile in sorted(near & self._tiles.keys()):
+            if len(self._tiles[tile]) > 1:
+                self._tiles[tile] = [np.concatenate(self._tiles[tile])]
+            parts += self._tiles[tile]
+        points = np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
         if len(points) >= MIN_POINTS:
             path = np.array(self._path)
             path = torch.from_numpy(path[np.abs(path[:, 2] - head[2]) <= _STOREYS_M])
@@ -115,17 +123,6 @@ class FloorTracker:
                 self._height = float(estimate_floor(cloud, path, self.stature).height[-1])
         else:
             self._height = float(np.percentile(self._heights, 90)) - self.stature
-
-    def _around(self) -> np.ndarray:
-        """Points in the tiles that the recent path crosses and in the adjacent tiles."""
-        crossed = np.unique(np.floor(np.array(self._path)[:, :2] / _TILE_M).astype(np.int64), axis=0)
-        near = {(x + i, y + j) for x, y in crossed.tolist() for i in (-1, 0, 1) for j in (-1, 0, 1)}
-        parts = []
-        for tile in sorted(near & self._tiles.keys()):
-            if len(self._tiles[tile]) > 1:
-                self._tiles[tile] = [np.concatenate(self._tiles[tile])]
-            parts += self._tiles[tile]
-        return np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
 
 
 def tracked_floor(

@@ -65,22 +65,17 @@ def head_path(recording: Recording, fallback: Skeleton, fps: float) -> HeadPath:
     that are not rotations, and for too few poses for their time span.
     """
     if recording.head is None:
-        raise WearcapError(
-            "no head poses in this recording", where=recording.name, expected="a recording with a `head` stream"
-        )
+        expected = "a recording with a `head` stream"
+        raise WearcapError("no head poses in this recording", where=recording.name, expected=expected)
     head = recording.head
     finite = head.R_world_device.isfinite().all(-1).all(-1) & head.t_world_device.isfinite().all(-1)
     times = head.timestamps[finite]
     if len(times) < 2 or times[-1] - times[0] < MIN_DURATION_S:
-        raise WearcapError(
-            f"head poses of {len(times)} frames", where=recording.name, expected=f"at least {MIN_DURATION_S} s"
-        )
+        what = f"head poses of {len(times)} frames"
+        raise WearcapError(what, where=recording.name, expected=f"at least {MIN_DURATION_S} s")
     if not (times.diff() > 0).all():
-        raise WearcapError(
-            "head poses whose timestamps do not grow",
-            where=recording.name,
-            fix="Sort the head stream by time and leave repeated poses out.",
-        )
+        fix = "Sort the head stream by time and leave repeated poses out."
+        raise WearcapError("head poses whose timestamps do not grow", where=recording.name, fix=fix)
     _require_plausible(head.R_world_device[finite], times, fps, recording.name)
     skeleton = recording.skeleton or (recording.motion.skeleton if recording.motion else fallback)
     trajectory = Trajectory(times, head.R_world_device[finite], head.t_world_device[finite])
@@ -113,20 +108,14 @@ def _require_plausible(
     """Raise WearcapError for matrices that are not rotations, and for timestamps that are not in seconds."""
     skewed = (R_world_device.transpose(-1, -2) @ R_world_device - torch.eye(3)).abs().amax((-1, -2)) > 0.05
     if skewed.any():
-        raise WearcapError(
-            f"the head pose at {times[skewed][0].item():.3f} s is no rotation",
-            where=name,
-            expected="orthonormal matrices",
-            fix="Run `wearcap doctor` on the recording.",
-        )
+        what = f"the head pose at {times[skewed][0].item():.3f} s is no rotation"
+        fix = "Run `wearcap doctor` on the recording."
+        raise WearcapError(what, where=name, expected="orthonormal matrices", fix=fix)
     span = (times[-1] - times[0]).item()
     if span * fps > MAX_FILL * len(times):
-        raise WearcapError(
-            f"{len(times)} head poses over {span:.0f} s",
-            where=name,
-            expected=f"one in {MAX_FILL / fps:.0f} s at least",
-            fix="Give timestamps in seconds, or cut the recording at its pauses.",
-        )
+        what = f"{len(times)} head poses over {span:.0f} s"
+        fix = "Give timestamps in seconds, or cut the recording at its pauses."
+        raise WearcapError(what, where=name, expected=f"one in {MAX_FILL / fps:.0f} s at least", fix=fix)
 
 
 def _breaks(trajectory: Trajectory) -> list[tuple[float, float]]:
@@ -206,7 +195,15 @@ class HeadTrack:
             count = self.stride if stop is None else min(stop - first, self.stride)
             chunk = None
             if count > 0:
-                chunk = self._chunk(measured, start, first, count)
+                frames = torch.arange(first - self._provisional, first + count, dtype=torch.float64)
+                times = start + frames / self.fps
+                at = times.clamp(measured.timestamps[0].item(), measured.timestamps[-1].item())
+                place = torch.searchsorted(measured.timestamps, at - _SAME_S).clamp_max(len(measured) - 1)
+                exact = (measured.timestamps[place] - at).abs() <= _SAME_S
+                at = torch.where(exact, measured.timestamps[place], at)
+                poses = (measured[place] if exact.all() else resample(measured, at)).T_world_body
+                old, self._provisional = self._provisional, int((times > measured.timestamps[-1] + _SAME_S).sum())
+                chunk = Chunk(times[old:], poses[old:], poses[:old], first, not self.inside)
                 self._start, self._next, self.inside = start, first + count, True
             if stop is not None and first + count >= stop:
                 self.inside, self._provisional = False, 0
@@ -227,17 +224,6 @@ class HeadTrack:
         every = Trajectory(torch.tensor(times, dtype=torch.float64), torch.stack(R), torch.stack(t))
         cut = _breaks(every)
         return every[: int(torch.searchsorted(every.timestamps, cut[0][0], right=True))] if cut else every
-
-    def _chunk(self, measured: Trajectory, start: float, first: int, count: int) -> Chunk:
-        frames = torch.arange(first - self._provisional, first + count, dtype=torch.float64)
-        times = start + frames / self.fps
-        at = times.clamp(measured.timestamps[0].item(), measured.timestamps[-1].item())
-        place = torch.searchsorted(measured.timestamps, at - _SAME_S).clamp_max(len(measured) - 1)
-        exact = (measured.timestamps[place] - at).abs() <= _SAME_S
-        at = torch.where(exact, measured.timestamps[place], at)
-        poses = (measured[place] if exact.all() else resample(measured, at)).T_world_body
-        old, self._provisional = self._provisional, int((times > measured.timestamps[-1] + _SAME_S).sum())
-        return Chunk(times[old:], poses[old:], poses[:old], first, not self.inside)
 
     def _forget(self, measured: Trajectory) -> None:
         """Drop the poses that later frames are not interpolated from."""

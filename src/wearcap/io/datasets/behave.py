@@ -83,7 +83,22 @@ def read_behave(root: str | Path, name: str) -> OneObject:
     fitted = read_npz(folder / OBJECT_FILE, ("angles", "trans", "frame_times"))
     frames = require(body, folder / BODY_FILE, poses=("time", 156), trans=("time", 3))["time"]
     require(fitted, folder / OBJECT_FILE, angles=("time", 3), trans=("time", 3))
-    times = _common_times(body, fitted, folder, frames)
+    # Times (s) of the object's frames, which must equal the body's
+    if not frames:
+        raise WearcapError("no frames", where=folder / BODY_FILE, expected="poses of at least one frame")
+    if len(fitted["angles"]) != frames:
+        what = f"the object has {len(fitted['angles'])} frames, the body {frames}"
+        expected = f"as many in {OBJECT_FILE} as in {BODY_FILE}"
+        raise WearcapError(what, where=folder, expected=expected, fix="Fetch both files again.")
+    times = _times(fitted, folder / OBJECT_FILE, frames)
+    if "frame_times" in body:
+        other = _times(body, folder / BODY_FILE, frames)
+        apart = np.flatnonzero(other != times)
+        if len(apart):
+            what = f"the body's frame {apart[0]} is of {other[apart[0]]:.3f} s, the object's of {times[apart[0]]:.3f} s"
+            expected = "the same frame_times in both files"
+            raise WearcapError(what, where=folder, expected=expected, fix="Fetch both files again.")
+    times = torch.from_numpy(times)
     object_name, gender = _about(read_json(folder / INFO_FILE), folder / INFO_FILE)
     pelvis, about = body["trans"].astype(np.float64) + PELVIS_SMPLH, {"source": name, "format": "behave"}
     motion = smpl_motion(times, smplh52(), body["poses"], pelvis, **about, gender=gender)
@@ -109,9 +124,8 @@ def read_behave_mesh(root: str | Path, object_name: str) -> Mesh:
     Raises WearcapError where it is missing, and for what `check_object_mesh` refuses.
     """
     if not re.fullmatch(r"[\w-]{1,64}", object_name):
-        raise WearcapError(
-            f"an object named {object_name[:60]!r}", where=root, expected="one of BEHAVE's names, as boxlarge"
-        )
+        what = f"an object named {object_name[:60]!r}"
+        raise WearcapError(what, where=root, expected="one of BEHAVE's names, as boxlarge")
     path = Path(root) / "objects" / object_name / _REGISTERED.get(object_name, f"{object_name}_f1000.ply")
     if not path.is_file():
         fix = "Unpack BEHAVE's objects.zip beside the sequences."
@@ -121,27 +135,6 @@ def read_behave_mesh(root: str | Path, object_name: str) -> Mesh:
         mesh, _ = centered(mesh)
     check_object_mesh(mesh, path)
     return mesh
-
-
-def _common_times(
-    body: dict[str, np.ndarray], fitted: dict[str, np.ndarray], folder: Path, frames: int
-) -> torch.Tensor:
-    """Times (s) of the object's frames, which must equal the body's."""
-    if not frames:
-        raise WearcapError("no frames", where=folder / BODY_FILE, expected="poses of at least one frame")
-    if len(fitted["angles"]) != frames:
-        what = f"the object has {len(fitted['angles'])} frames, the body {frames}"
-        expected = f"as many in {OBJECT_FILE} as in {BODY_FILE}"
-        raise WearcapError(what, where=folder, expected=expected, fix="Fetch both files again.")
-    times = _times(fitted, folder / OBJECT_FILE, frames)
-    if "frame_times" in body:
-        other = _times(body, folder / BODY_FILE, frames)
-        apart = np.flatnonzero(other != times)
-        if len(apart):
-            what = f"the body's frame {apart[0]} is of {other[apart[0]]:.3f} s, the object's of {times[apart[0]]:.3f} s"
-            expected = "the same frame_times in both files"
-            raise WearcapError(what, where=folder, expected=expected, fix="Fetch both files again.")
-    return torch.from_numpy(times)
 
 
 def _times(arrays: dict[str, np.ndarray], path: Path, frames: int) -> Float64[np.ndarray, "time"]:

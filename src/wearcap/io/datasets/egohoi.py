@@ -18,8 +18,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.hcontact import activity_of, location_of, read_smpl_json
-from wearcap.io.datasets.hps import read_hps_subject
-from wearcap.io.datasets.hps_sequence import subject_of
+from wearcap.io.datasets.hps import read_hps_subject, subject_of
 from wearcap.io.formats.bounded import understood
 from wearcap.io.formats.contact_labels import LabelClock, interactions_of, labels_of, parse_labels
 from wearcap.io.formats.ply import read_ply
@@ -74,7 +73,15 @@ def read_egohoi(
     objects, paths, contacts = [], {}, []
     for object_id, (locations, labels) in _object_files(root, name, object_name).items():
         annotated = read_object_locations(locations)
-        kind = _motion_type(object_id, annotated, motion_types or {}, locations)
+        default = "along_floor" if annotated.hinge is None else "hinge"
+        kind = next(
+            (kind for pattern, kind in (motion_types or {}).items() if fnmatchcase(object_id, pattern)), default
+        )
+        if kind not in MOTION_TYPES:
+            raise WearcapError(f"motion type {kind!r} of {object_id}", expected=f"one of {', '.join(MOTION_TYPES)}")
+        if kind == "hinge" and annotated.hinge is None:
+            what = f"{object_id} is to turn about a hinge and has none"
+            raise WearcapError(what, where=locations, expected='"hinge": [x, y, z]', fix="Give it another motion type.")
         if kind == "absent":
             continue
         item = _scene_object(object_id, annotated, root / "object_models" / f"{object_id}.ply", kind, clock.start_s)
@@ -108,38 +115,23 @@ def _object_files(root: Path, name: str, object_name: str | None) -> dict[str, t
     if several.is_dir():
         found = {path.stem: (path, Path(name) / path.name) for path in sorted(several.glob("*.json"))}
     elif single.is_file():
-        found = {object_name or _only_object(root, name): (single, Path(single.name))}
+        if not object_name:  # the sequence is named after the model of its only object
+            stem = name.split(".")[0].removeprefix(f"{subject_of(name)}_")
+            models = sorted(path.stem for path in root.glob("object_models/*.ply"))
+            fitting = [stem] if stem in models else [model for model in models if model.startswith(stem)]
+            if len(fitting) != 1:
+                what = f"{len(fitting)} models fit the sequence {name!r}"
+                fix = f"Give its object's name: one of {', '.join(fitting or models)}."
+                raise WearcapError(what, where=root / "object_models", expected=f"{stem}.ply", fix=fix)
+            object_name = fitting[0]
+        found = {object_name: (single, Path(single.name))}
     else:
-        raise WearcapError(
-            "no object locations of this sequence", where=single, expected=f"this file, or a folder {several}"
-        )
+        what = "no object locations of this sequence"
+        raise WearcapError(what, where=single, expected=f"this file, or a folder {several}")
     return {
         object_id: (path, next((place for folder in _CONTACTS if (place := root / folder / labels).is_file()), None))
         for object_id, (path, labels) in found.items()
     }
-
-
-def _only_object(root: Path, name: str) -> str:
-    """Name of the model that a single-object sequence is named after."""
-    stem = name.split(".")[0].removeprefix(f"{subject_of(name)}_")
-    models = sorted(path.stem for path in root.glob("object_models/*.ply"))
-    fitting = [stem] if stem in models else [model for model in models if model.startswith(stem)]
-    if len(fitting) != 1:
-        what = f"{len(fitting)} models fit the sequence {name!r}"
-        fix = f"Give its object's name: one of {', '.join(fitting or models)}."
-        raise WearcapError(what, where=root / "object_models", expected=f"{stem}.ply", fix=fix)
-    return fitting[0]
-
-
-def _motion_type(object_id: str, annotated: _AnnotatedObject, motion_types: Mapping[str, str], where: Path) -> str:
-    default = "along_floor" if annotated.hinge is None else "hinge"
-    kind = next((kind for pattern, kind in motion_types.items() if fnmatchcase(object_id, pattern)), default)
-    if kind not in MOTION_TYPES:
-        raise WearcapError(f"motion type {kind!r} of {object_id}", expected=f"one of {', '.join(MOTION_TYPES)}")
-    if kind == "hinge" and annotated.hinge is None:
-        what = f"{object_id} is to turn about a hinge and has none"
-        raise WearcapError(what, where=where, expected='"hinge": [x, y, z]', fix="Give it another motion type.")
-    return kind
 
 
 def read_object_locations(path: str | Path) -> _AnnotatedObject:
@@ -198,9 +190,8 @@ def read_egohoi_contacts(path: str | Path, clock: LabelClock, object_name: str, 
     parts: dict[str, list[list[Any]]] = {f"{hand}_hand": [] for hand in HANDS}
     for number, row in enumerate(rows):
         if not isinstance(row, dict) or not isinstance(row.get("parts"), list):
-            raise WearcapError(
-                f"interaction {number} is {row!r}"[:200], where=path, expected='{"start", "end", "parts"}'
-            )
+            expected = '{"start", "end", "parts"}'
+            raise WearcapError(f"interaction {number} is {row!r}"[:200], where=path, expected=expected)
         start, end = row.get("start"), row.get("end")
         if isinstance(start, int | float) and isinstance(end, int | float) and end < start:
             what = f"interaction {number} ends before it starts: {start} to {end} s"

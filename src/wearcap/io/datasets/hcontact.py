@@ -17,7 +17,7 @@ import torch
 from wearcap.body.skeletons import smpl24, smplh52
 from wearcap.errors import WearcapError
 from wearcap.files import parse_json
-from wearcap.io.datasets.hps_sequence import subject_of
+from wearcap.io.datasets.hps import subject_of
 from wearcap.io.formats.bounded import Budget, counted, file_size, understood
 from wearcap.io.formats.contact_labels import LabelClock, read_contact_labels
 from wearcap.io.formats.npz import readable, require
@@ -46,7 +46,19 @@ def read_smpl_json(path: str | Path) -> tuple[Motion, dict[str, float]]:
     Raises WearcapError for what is damaged, missing or misshapen, for NaN, and for times that do not rise.
     """
     path = Path(path)
-    frames, about = _frames(_unzipped(path) if path.suffix == ".zip" else read_json(path), path)
+    if path.suffix == ".zip":
+        budget = Budget(path, file_size(path), MAX_JSON_BYTES)
+        with readable(".json.zip", path, _EXPECTED), zipfile.ZipFile(path) as archive:
+            members = [
+                info for info in archive.infolist() if not info.is_dir() and not info.filename.startswith("__MACOSX")
+            ]
+            if len(members) != 1:
+                raise WearcapError(f"an archive of {len(members)} files", where=path, expected="one JSON file")
+            with archive.open(members[0]) as file, counted(file, budget) as reader:
+                content = parse_json(reader.read(), path)
+    else:
+        content = read_json(path)
+    frames, about = _frames(content, path)
     arrays = {}
     for name in ("time", *_SIZES):
         if name in ("time", "global_orient", "body_pose") or name in frames[0]:
@@ -70,19 +82,6 @@ def read_smpl_json(path: str | Path) -> tuple[Motion, dict[str, float]]:
     if not np.isfinite(betas).all() or len(betas) > 300:
         raise WearcapError(f"{len(betas)} betas, or some that are not finite", where=path, expected="10 numbers")
     return motion, shape_from_betas(betas)
-
-
-def _unzipped(path: Path) -> Any:
-    """Content of the one JSON file in an archive."""
-    budget = Budget(path, file_size(path), MAX_JSON_BYTES)
-    with readable(".json.zip", path, _EXPECTED), zipfile.ZipFile(path) as archive:
-        members = [
-            info for info in archive.infolist() if not info.is_dir() and not info.filename.startswith("__MACOSX")
-        ]
-        if len(members) != 1:
-            raise WearcapError(f"an archive of {len(members)} files", where=path, expected="one JSON file")
-        with archive.open(members[0]) as file, counted(file, budget) as reader:
-            return parse_json(reader.read(), path)
 
 
 def _frames(content: Any, path: Path) -> tuple[list[dict], dict]:

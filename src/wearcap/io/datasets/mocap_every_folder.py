@@ -44,7 +44,7 @@ _SLAM_PIXELS = 384 * 512
 
 
 @dataclass(frozen=True)
-class BoardWalks:
+class _BoardWalks:
     """Paths of the camera over the calibration board: start and end (SLAM's units), and the measured lengths."""
 
     x_slam: Float[Tensor, "end 3"]
@@ -69,7 +69,7 @@ class MocapEveryFolder:
     points_slam: Float[Tensor, "point 3"] | None = None
     video: Path | None = None
     imu: dict[str, ImuStream] | None = None
-    board: BoardWalks | None = None
+    board: _BoardWalks | None = None
 
 
 def is_mocap_every_folder(folder: str | Path) -> bool:
@@ -94,7 +94,18 @@ def read_mocap_every_folder(folder: str | Path) -> MocapEveryFolder:
     noted = marks.get("shutter")
     noted = config.get("cam_shutter_timestamp") if noted is None else noted
     shutter_s = 0.0 if noted is None else _numbers([noted], 1, "the shutter's time", folder)[0]
-    track = _trajectory(folder / TRAJECTORY, shutter_s)
+    path = folder / TRAJECTORY
+    content = read_pickle(path)
+    table = np.asarray(content) if isinstance(content, np.ndarray | list) else np.zeros(0)
+    require({"poses": table}, path, poses=("time", 7))
+    if not len(table):
+        raise WearcapError("no poses", where=path, expected="a row of 7 numbers per picture")
+    if abs(table[0, 3]) > 0.9999 > abs(table[0, 6]):
+        what = "the first quaternion is the identity with the scalar first"
+        expected = "x y z, then qx qy qz qw"
+        raise WearcapError(what, where=path, expected=expected, fix="Move the scalar to the end of the rows.")
+    times = shutter_s + np.arange(len(table)) / FPS
+    track = checked_trajectory(times, table[:, :3], table[:, [6, 3, 4, 5]], path)
     video = folder / VIDEO if (folder / VIDEO).is_file() else None
     size = None if video is None else (video_info(video).width, video_info(video).height)
     points = read_ply(folder / POINTS).points if (folder / POINTS).is_file() else None
@@ -122,42 +133,23 @@ def mocap_every_recording(folder: MocapEveryFolder, scale: float = 1.0, T_world_
     R_head_cam, t_head_cam = nominal_mount()
     points = folder.points_slam
     cloud = None if points is None else PointCloud(T_world_slam @ (scale * points))  # pyright: ignore[reportArgumentType]
-    return Recording(
-        folder.name,
-        head=HeadStream(track.timestamps, T_world_cam.R @ R_head_cam.mT, T_world_cam.t, torch.eye(3), t_head_cam),
-        imu=folder.imu or {},
-        camera=_camera_stream(folder, Rigid(R_head_cam, t_head_cam)),
-        points=cloud,
-        source="MocapEvery capture folder",
-    )
-
-
-def _camera_stream(folder: MocapEveryFolder, T_head_cam: Rigid) -> CameraStream | None:
-    """Camera stream of the video with its lens where both exist, else of SLAM's pictures."""
-    track = folder.T_slam_cam
+    camera = None  # of the video with its lens where both exist, else of SLAM's pictures
     if folder.video is not None and folder.lens is not None:
         info = video_info(folder.video)
         count = int((track.timestamps[-1] - track.timestamps[0]).item() * info.fps + 1.5)
         count = min(count, info.frames) if info.frames else count
         times = track.timestamps[0] + torch.arange(count, dtype=torch.float64) / info.fps
-        return CameraStream(times, folder.lens, T_head_cam.R, T_head_cam.t, video=str(folder.video.resolve()))
-    if folder.camera is None:
-        return None
-    return CameraStream(track.timestamps, folder.camera, T_head_cam.R, T_head_cam.t)
-
-
-def _trajectory(path: Path, start_s: float) -> Trajectory:
-    content = read_pickle(path)
-    table = np.asarray(content) if isinstance(content, np.ndarray | list) else np.zeros(0)
-    require({"poses": table}, path, poses=("time", 7))
-    if not len(table):
-        raise WearcapError("no poses", where=path, expected="a row of 7 numbers per picture")
-    if abs(table[0, 3]) > 0.9999 > abs(table[0, 6]):
-        what = "the first quaternion is the identity with the scalar first"
-        expected = "x y z, then qx qy qz qw"
-        raise WearcapError(what, where=path, expected=expected, fix="Move the scalar to the end of the rows.")
-    times = start_s + np.arange(len(table)) / FPS
-    return checked_trajectory(times, table[:, :3], table[:, [6, 3, 4, 5]], path)
+        camera = CameraStream(times, folder.lens, R_head_cam, t_head_cam, video=str(folder.video.resolve()))
+    elif folder.camera is not None:
+        camera = CameraStream(track.timestamps, folder.camera, R_head_cam, t_head_cam)
+    return Recording(
+        folder.name,
+        head=HeadStream(track.timestamps, T_world_cam.R @ R_head_cam.mT, T_world_cam.t, torch.eye(3), t_head_cam),
+        imu=folder.imu or {},
+        camera=camera,
+        points=cloud,
+        source="MocapEvery capture folder",
+    )
 
 
 def _config(path: Path) -> dict[str, Any]:
@@ -166,26 +158,22 @@ def _config(path: Path) -> dict[str, Any]:
     damage = (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError)
     with understood("not readable YAML", path, errors=damage):
         text = read_text(path, usual=_MAX_CONFIG_BYTES)
-        _require_plain_yaml(text, path)
+        # Aliases and deep nesting take quadratic time to parse.
+        depth = 0
+        for event in yaml.parse(text, yaml.SafeLoader):
+            if isinstance(event, yaml.AliasEvent):
+                what = "it refers to its own parts (&name, *name)"
+                expected = "plain keys with values"
+                fix = "Write them out: such references can blow up."
+                raise WearcapError(what, where=path, expected=expected, fix=fix)
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > MAX_JSON_DEPTH:
+                expected = f"at most {MAX_JSON_DEPTH} levels"
+                raise WearcapError("YAML that is nested too deeply", where=path, expected=expected)
         content = yaml.safe_load(text)
     if not isinstance(content, dict | None):
         raise WearcapError(f"it holds a {type(content).__name__}", where=path, expected="keys with values")
     return content or {}
-
-
-def _require_plain_yaml(text: str, path: Path) -> None:
-    """Raise WearcapError for YAML aliases and for deep nesting, whose parsing takes quadratic time."""
-    depth = 0
-    for event in yaml.parse(text, yaml.SafeLoader):
-        if isinstance(event, yaml.AliasEvent):
-            what = "it refers to its own parts (&name, *name)"
-            expected = "plain keys with values"
-            raise WearcapError(what, where=path, expected=expected, fix="Write them out: such references can blow up.")
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if depth > MAX_JSON_DEPTH:
-            raise WearcapError(
-                "YAML that is nested too deeply", where=path, expected=f"at most {MAX_JSON_DEPTH} levels"
-            )
 
 
 def _marks(path: Path) -> dict[str, Any]:
@@ -196,14 +184,13 @@ def _marks(path: Path) -> dict[str, Any]:
     return content
 
 
-def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], folder: Path) -> BoardWalks | None:
+def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], folder: Path) -> _BoardWalks | None:
     measured = config.get("cam_scale_origin")
     if measured is None or not {"x", "y"} <= marks.keys():
         return None
     if not isinstance(measured, dict) or not {"dist", "height"} <= measured.keys():
-        raise WearcapError(
-            "cam_scale_origin lacks a number", where=folder / CONFIG, expected="dist: [x, y] and height (m)"
-        )
+        what = "cam_scale_origin lacks a number"
+        raise WearcapError(what, where=folder / CONFIG, expected="dist: [x, y] and height (m)")
     length = _numbers(measured["dist"], 2, "cam_scale_origin.dist", folder / CONFIG)
     (height,) = _numbers([measured["height"]], 1, "cam_scale_origin.height", folder / CONFIG)
     if min(*length, height) <= 0:
@@ -218,7 +205,7 @@ def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], fol
                 expected=f"{track.timestamps[0].item():.3f} s to {track.timestamps[-1].item():.3f} s, as the camera's path",
             )
         ends.append(track.t_world_body[(track.timestamps[None] - times[:, None]).abs().argmin(1)])
-    return BoardWalks(ends[0], ends[1], (length[0], length[1]), height)
+    return _BoardWalks(ends[0], ends[1], (length[0], length[1]), height)
 
 
 def _numbers(values: Any, count: int, what: str, where: Path) -> list[float]:

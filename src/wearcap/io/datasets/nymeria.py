@@ -12,7 +12,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.body.kinematics import local_rotations
-from wearcap.body.skeleton import FOOT_PATCHES, Skeleton, xsens23
+from wearcap.body.skeleton import FOOT_PATCHES, xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
@@ -59,7 +59,14 @@ def read_xdata(path: str | Path) -> tuple[Motion, ContactTrack | None]:
         raise WearcapError(f"{sizes['time']} frames", where=path, expected="at least 2")
     if "frameRate" in arrays and abs(float(arrays["frameRate"].reshape(-1)[0]) - SUIT_HZ) > 1:
         raise WearcapError(f"frame rate {arrays['frameRate'].reshape(-1)[0]}", where=path, expected=f"{SUIT_HZ:g} Hz")
-    timestamps = _clean_timestamps(arrays["timestamps_us"].astype(np.float64) * 1e-6, path)
+    seconds = arrays["timestamps_us"].astype(np.float64) * 1e-6
+    steps = np.diff(seconds)
+    steps[np.abs(steps - 1 / SUIT_HZ) > _STEP_TOLERANCE_S] = 1 / SUIT_HZ
+    timestamps = seconds[0] + np.concatenate([[0.0], steps.cumsum()])
+    if abs(timestamps[-1] - seconds[-1]) > _DRIFT_TOLERANCE_S:
+        what = f"after cleaning, time ends {timestamps[-1] - seconds[-1]:+.3f} s from the file's own"
+        expected = f"steady {SUIT_HZ:g} Hz"
+        raise WearcapError(what, where=path, expected=expected, fix="Frames were lost: cut the sequence there.")
     quat = arrays["segment_qWXYZ"].reshape(-1, count, 4).astype(np.float64)
     # Zeros become the same segment's previous quaternion (at the beginning: no rotation).
     latest = np.where(np.linalg.norm(quat, axis=-1) < 0.5, -1, np.arange(len(quat))[:, None])
@@ -68,7 +75,13 @@ def read_xdata(path: str | Path) -> tuple[Motion, ContactTrack | None]:
     quat[latest < 0] = (1.0, 0.0, 0.0, 0.0)
     R_world_joint = rotation.matrix_from_quat_wxyz(torch.from_numpy(quat))
     position = torch.from_numpy(arrays["segment_tXYZ"].reshape(-1, count, 3).astype(np.float64))
-    skeleton = _measured_skeleton(R_world_joint, position)
+    # The wearer's bone offsets (m): each segment's origin in its parent's axes, the median over a thousand frames
+    skeleton = xsens23()
+    frames = torch.linspace(0, len(position) - 1, min(len(position), 1000)).long()
+    parents = list(skeleton.parents[1:])
+    apart = position[frames][:, 1:] - position[frames][:, parents]
+    offsets = (R_world_joint[frames][:, parents].mT @ apart[..., None])[..., 0].median(0).values
+    skeleton = skeleton.with_offsets(torch.cat([torch.zeros(1, 3), offsets.float()]))
     motion = Motion(
         torch.from_numpy(timestamps),
         skeleton,
@@ -79,35 +92,13 @@ def read_xdata(path: str | Path) -> tuple[Motion, ContactTrack | None]:
     return motion, _contacts(arrays, motion, path)
 
 
-def _clean_timestamps(seconds: np.ndarray, path: str | Path) -> np.ndarray:
-    steps = np.diff(seconds)
-    steps[np.abs(steps - 1 / SUIT_HZ) > _STEP_TOLERANCE_S] = 1 / SUIT_HZ
-    cleaned = seconds[0] + np.concatenate([[0.0], steps.cumsum()])
-    if abs(cleaned[-1] - seconds[-1]) > _DRIFT_TOLERANCE_S:
-        what = f"after cleaning, time ends {cleaned[-1] - seconds[-1]:+.3f} s from the file's own"
-        expected = f"steady {SUIT_HZ:g} Hz"
-        raise WearcapError(what, where=path, expected=expected, fix="Frames were lost: cut the sequence there.")
-    return cleaned
-
-
-def _measured_skeleton(R_world_joint: Tensor, position: Tensor) -> Skeleton:
-    """The wearer's bone offsets (m): origin of each segment in its parent's axes, the median over a thousand frames."""
-    skeleton = xsens23()
-    frames = torch.linspace(0, len(position) - 1, min(len(position), 1000)).long()
-    parents = list(skeleton.parents[1:])
-    apart = position[frames][:, 1:] - position[frames][:, parents]
-    offsets = (R_world_joint[frames][:, parents].mT @ apart[..., None])[..., 0].median(0).values
-    return skeleton.with_offsets(torch.cat([torch.zeros(1, 3), offsets.float()]))
-
-
 def _contacts(arrays: dict[str, np.ndarray], motion: Motion, path: str | Path) -> ContactTrack | None:
     if "foot_contacts" not in arrays:
         return None
     contact = arrays["foot_contacts"]
     if contact.shape != (len(motion), len(FOOT_PATCHES)):
-        raise WearcapError(
-            f"foot_contacts has shape {contact.shape}", where=path, expected=f"({len(motion)}, {len(FOOT_PATCHES)})"
-        )
+        what = f"foot_contacts has shape {contact.shape}"
+        raise WearcapError(what, where=path, expected=f"({len(motion)}, {len(FOOT_PATCHES)})")
     return ContactTrack(motion.timestamps, FOOT_PATCHES, torch.from_numpy(contact > 0.5))
 
 

@@ -10,7 +10,6 @@ paths are the centre's. Where an object's pose is missing its scale is 0. Of the
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -68,34 +67,29 @@ def read_omomo(root: str | Path) -> list[OmomoSequence]:
     """
     paths = [Path(root) / name for name in FILES if (Path(root) / name).is_file()]
     if not paths:
-        raise WearcapError(
-            "no sequences", where=root, expected=" or ".join(FILES), fix="Give OMOMO's folder as source=DIR."
-        )
-    found = [sequence for path in paths for sequence in _sequences(read_pickle(path), path)]
+        fix = "Give OMOMO's folder as source=DIR."
+        raise WearcapError("no sequences", where=root, expected=" or ".join(FILES), fix=fix)
+    found = []
+    for path in paths:
+        content = read_pickle(path)
+        if not isinstance(content, dict):
+            what = f"it holds a {type(content).__name__}"
+            raise WearcapError(what, where=path, expected="{number: {seq_name, trans, …}}")
+        for key, entry in content.items():
+            name = entry.get("seq_name") if isinstance(entry, dict) else None
+            if not isinstance(name, str) or len(name.split("_")) < 3 or not name.replace("_", "").isalnum():
+                what = f"sequence {key!r} is named {name!r}"[:200]
+                expected = "seq_name SUBJECT_OBJECT_NUMBER, such as sub1_largebox_000"
+                raise WearcapError(what, where=path, expected=expected)
+            arrays = {key: entry[key] for key in _KEYS if isinstance(entry.get(key), np.ndarray)}
+            gender = entry.get("gender", "")
+            if isinstance(gender, np.ndarray) and gender.size == 1:
+                gender = gender.reshape(-1)[0]
+            gender = str(gender) if isinstance(gender, str) else ""
+            found.append(OmomoSequence(name, f"{path}, sequence {name}", arrays, gender))
     if not found:
         raise WearcapError("files without sequences", where=root, expected="{number: {seq_name, trans, …}}")
     return sorted(found, key=lambda sequence: sequence.name)
-
-
-def _sequences(content: Any, path: Path) -> list[OmomoSequence]:
-    if not isinstance(content, dict):
-        raise WearcapError(
-            f"it holds a {type(content).__name__}", where=path, expected="{number: {seq_name, trans, …}}"
-        )
-    found = []
-    for key, entry in content.items():
-        name = entry.get("seq_name") if isinstance(entry, dict) else None
-        if not isinstance(name, str) or len(name.split("_")) < 3 or not name.replace("_", "").isalnum():
-            what = f"sequence {key!r} is named {name!r}"[:200]
-            raise WearcapError(what, where=path, expected="seq_name SUBJECT_OBJECT_NUMBER, such as sub1_largebox_000")
-        arrays = {key: entry[key] for key in _KEYS if isinstance(entry.get(key), np.ndarray)}
-        gender = entry.get("gender", "")
-        if isinstance(gender, np.ndarray) and gender.size == 1:
-            gender = gender.reshape(-1)[0]
-        found.append(
-            OmomoSequence(name, f"{path}, sequence {name}", arrays, str(gender) if isinstance(gender, str) else "")
-        )
-    return found
 
 
 def omomo_mesh_path(root: str | Path, object_name: str) -> Path:

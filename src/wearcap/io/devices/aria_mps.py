@@ -72,7 +72,18 @@ def read_closed_loop(path: str | Path, *, up: str = "z") -> tuple[Trajectory, Fl
     if len(graphs := np.unique(table["graph_uid"])) > 1:
         what = f"{len(graphs)} unconnected world frames (graph_uid)"
         raise WearcapError(what, where=path, expected="one", fix="Keep the rows of one graph_uid.")
-    _check_gravity(columns["gravity"], up, path)
+    measured = columns["gravity"]
+    mean = measured.mean(0)
+    length = np.linalg.norm(mean)
+    if not 9.7 < length < 9.9:
+        raise WearcapError(f"gravity is {length:.2f} m/s² long", where=path, expected="9.81 m/s²")
+    upward = -mean / length
+    if upward["xyz".index(up)] < 0.99:
+        axis = "xyz"[int(np.abs(upward).argmax())]
+        sign = "-" if upward["xyz".index(axis)] < 0 else "+"
+        what = f"gravity {mean.round(2).tolist()} shows that {sign}{axis} is up"
+        fix = "Read it with up='y'." if (axis, sign) == ("y", "+") else "Rotate the world, or fix gravity's sign."
+        raise WearcapError(what, where=path, expected=f"+{up} up", fix=fix)
     trajectory = checked_trajectory(table[time] * 1e-6, columns["pose"][:, :3], columns["pose"][:, 3:], path)
     T_turned = Rigid(turn_up(up), torch.zeros(3)) @ trajectory.T_world_body
     return Trajectory(trajectory.timestamps, T_turned.R, T_turned.t), torch.tensor(table[quality], dtype=torch.float32)
@@ -85,20 +96,6 @@ def turn_up(up: str) -> Float[Tensor, "3 3"]:
     if up == "z":
         return torch.eye(3)
     return torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-
-
-def _check_gravity(gravity: np.ndarray, up: str, where: str | Path) -> None:
-    mean = gravity.mean(0)
-    length = np.linalg.norm(mean)
-    if not 9.7 < length < 9.9:
-        raise WearcapError(f"gravity is {length:.2f} m/s² long", where=where, expected="9.81 m/s²")
-    upward = -mean / length
-    if upward["xyz".index(up)] < 0.99:
-        axis = "xyz"[int(np.abs(upward).argmax())]
-        sign = "-" if upward["xyz".index(axis)] < 0 else "+"
-        what = f"gravity {mean.round(2).tolist()} shows that {sign}{axis} is up"
-        fix = "Read it with up='y'." if (axis, sign) == ("y", "+") else "Rotate the world, or fix gravity's sign."
-        raise WearcapError(what, where=where, expected=f"+{up} up", fix=fix)
 
 
 def head_stream(
@@ -150,28 +147,25 @@ def read_points(
     keep = (table["inv_dist_std"] < max_inv_dist_std) & (table["dist_std"] < max_dist_std)
     first_seen = None
     if observations is not None:
-        seen = _first_seen(observations, table["uid"])
+        # Time of each point's first observation (s, the device's clock); infinite for points without one
+        uid = table["uid"]
+        order = np.argsort(uid, kind="stable")
+        known = uid[order]
+        first_us = np.full(len(uid), np.iinfo(np.int64).max)
+        for rows in iter_columns(observations, [], whole=["uid", "frame_tracking_timestamp_us"]):
+            place = np.minimum(np.searchsorted(known, rows["uid"]), len(known) - 1)
+            named = known[place] == rows["uid"]
+            np.minimum.at(first_us, place[named], rows["frame_tracking_timestamp_us"][named])
+        if (first_us == np.iinfo(np.int64).max).all():
+            expected = "the observations of the same recording"
+            raise WearcapError("names none of the points", where=observations, expected=expected)
+        seen = np.empty(len(uid))
+        seen[order] = np.where(first_us < np.iinfo(np.int64).max, first_us * 1e-6, np.inf)
         keep &= np.isfinite(seen)
         first_seen = torch.from_numpy(seen[keep])
     confidence = 1 - table["inv_dist_std"][keep] / max_inv_dist_std
     points_world = torch.tensor(points[keep], dtype=torch.float32) @ turn_up(up).T
     return PointCloud(points_world, torch.tensor(confidence, dtype=torch.float32), first_seen)
-
-
-def _first_seen(path: str | Path, uid: np.ndarray) -> np.ndarray:
-    """Time of each point's first observation (s, the device's clock); infinite for points without one."""
-    order = np.argsort(uid, kind="stable")
-    known = uid[order]
-    first_us = np.full(len(uid), np.iinfo(np.int64).max)
-    for rows in iter_columns(path, [], whole=["uid", "frame_tracking_timestamp_us"]):
-        place = np.minimum(np.searchsorted(known, rows["uid"]), len(known) - 1)
-        named = known[place] == rows["uid"]
-        np.minimum.at(first_us, place[named], rows["frame_tracking_timestamp_us"][named])
-    if (first_us == np.iinfo(np.int64).max).all():
-        raise WearcapError("names none of the points", where=path, expected="the observations of the same recording")
-    seen = np.empty(len(uid))
-    seen[order] = np.where(first_us < np.iinfo(np.int64).max, first_us * 1e-6, np.inf)
-    return seen
 
 
 def find_mps_file(folder: str | Path, names: tuple[str, ...]) -> Path | None:

@@ -98,9 +98,28 @@ def align_head(
     start, stop = suit.timestamps[shared][0].item(), suit.timestamps[shared][-1].item()
     grid = start + torch.arange(int((stop - start) * _RATE_HZ), dtype=torch.float64) / _RATE_HZ
     head, seen = (resample(track, grid).T_world_body.to(torch.float64) for track in (suit, device))
-    R_head_device = _mounting_rotation(head.R, seen.R)
+    # turn_head = R_head_device · turn_device and up_head = R_head_device · up_device, robustly
+    step = int(_STEP_S * _RATE_HZ)
+    turn_head = rotation.log(head.R[:-step].mT @ head.R[step:])
+    turn_device = rotation.log(seen.R[:-step].mT @ seen.R[step:])
+    if turn_head.norm(dim=-1).quantile(0.9) < 0.1:
+        raise WearcapError("the head hardly turns", expected="turns of more than 6° in half a second, now and then")
+    a = torch.cat([turn_head, head.R[:, 2, :]])
+    b = torch.cat([turn_device, seen.R[:, 2, :]])
+    weight = torch.ones(len(a), dtype=torch.float64)
+    R_head_device = torch.eye(3, dtype=torch.float64)
+    for _ in range(8):
+        R_head_device = rotation.mean_rotation(torch.einsum("n,ni,nj->ij", weight, a, b)[None])
+        residual = (a - b @ R_head_device.mT).norm(dim=-1)
+        weight = 1 / (residual / residual.median().clamp(min=1e-6)).clamp(min=1.0)
     R_apart = seen.R @ R_head_device.mT @ head.R.mT
-    yaw, knots = _windowed_yaw(R_apart, grid, window_s)
+    # Yaw (rad, unwrapped) by window, and the windows' middles
+    cos, sin = R_apart[:, 0, 0] + R_apart[:, 1, 1], R_apart[:, 1, 0] - R_apart[:, 0, 1]
+    length = torch.hypot(cos, sin).clamp(min=1e-9)
+    count = max(2, round((grid[-1] - grid[0]).item() / (window_s / 2)) + 1)
+    knots = torch.linspace(grid[0].item(), grid[-1].item(), count, dtype=torch.float64)
+    mean = _windowed_median(torch.stack([cos / length, sin / length], 1), grid, knots, window_s)
+    yaw = torch.from_numpy(np.unwrap(torch.atan2(mean[:, 1], mean[:, 0]).numpy()))
     R_world_suit = rotation.about_axis("z", _between(knots, yaw, grid))
     t_seat = _mounting_position(
         Rigid(R_world_suit @ head.R, (R_world_suit @ head.t[..., None])[..., 0]), seen, t_head_device.double()
@@ -113,24 +132,6 @@ def align_head(
     turn = rotation.geodesic(R_world_suit @ head.R @ R_head_device, seen.R)
     T_head_device = Rigid(R_head_device, t_seat).to(torch.float32)
     return _Alignment(T_head_device, T_world_suit, error.norm(dim=-1).median().item(), turn.median().item())
-
-
-def _mounting_rotation(R_head: Tensor, R_device: Tensor) -> Float64[Tensor, "3 3"]:
-    """R_head_device with turn_head = R_head_device · turn_device and up_head = R_head_device · up_device, robustly."""
-    step = int(_STEP_S * _RATE_HZ)
-    turn_head = rotation.log(R_head[:-step].mT @ R_head[step:])
-    turn_device = rotation.log(R_device[:-step].mT @ R_device[step:])
-    if turn_head.norm(dim=-1).quantile(0.9) < 0.1:
-        raise WearcapError("the head hardly turns", expected="turns of more than 6° in half a second, now and then")
-    a = torch.cat([turn_head, R_head[:, 2, :]])
-    b = torch.cat([turn_device, R_device[:, 2, :]])
-    weight = torch.ones(len(a), dtype=torch.float64)
-    R = torch.eye(3, dtype=torch.float64)
-    for _ in range(8):
-        R = rotation.mean_rotation(torch.einsum("n,ni,nj->ij", weight, a, b)[None])
-        residual = (a - b @ R.mT).norm(dim=-1)
-        weight = 1 / (residual / residual.median().clamp(min=1e-6)).clamp(min=1.0)
-    return R
 
 
 def _mounting_position(head: Rigid, seen: Rigid, t_prior: Float64[Tensor, "3"]) -> Float64[Tensor, "3"]:
@@ -148,16 +149,6 @@ def _mounting_position(head: Rigid, seen: Rigid, t_prior: Float64[Tensor, "3"]) 
         right = torch.einsum("n,nki,nk->i", weight, A, b) + t_prior / _SEAT_PRIOR_M**2
         t = torch.linalg.solve(normal, right)
     return t
-
-
-def _windowed_yaw(R_apart: Tensor, grid: Tensor, window_s: float) -> tuple[Tensor, Tensor]:
-    """Yaw (rad, unwrapped) by window, and the windows' middles."""
-    cos, sin = R_apart[:, 0, 0] + R_apart[:, 1, 1], R_apart[:, 1, 0] - R_apart[:, 0, 1]
-    length = torch.hypot(cos, sin).clamp(min=1e-9)
-    count = max(2, round((grid[-1] - grid[0]).item() / (window_s / 2)) + 1)
-    knots = torch.linspace(grid[0].item(), grid[-1].item(), count, dtype=torch.float64)
-    mean = _windowed_median(torch.stack([cos / length, sin / length], 1), grid, knots, window_s)
-    return torch.from_numpy(np.unwrap(torch.atan2(mean[:, 1], mean[:, 0]).numpy())), knots
 
 
 def _windowed_median(value: Tensor, grid: Tensor, knots: Tensor, window_s: float) -> Tensor:

@@ -58,7 +58,21 @@ def read_watch_log(path: str | Path, joint: str) -> ImuStream:
     unit = next((unit for unit in (G_M_S2, 1.0) if abs(length * unit / G_M_S2 - 1) < 0.1), None)  # m/s² per unit
     if unit is None:
         raise WearcapError(f"gravity of length {length:.3g}", where=path, expected="1 (g) or 9.8 (m/s²)")
-    R, upright = _attitude(parts["quaternion"], gravity, path)
+    # R_world_imu, and the component of gravity along the world's z: about 1 or -1
+    quaternion = parts["quaternion"]
+    norm = np.linalg.norm(quaternion, axis=1)
+    if (np.abs(norm - 1) > 0.01).any():
+        row = int(np.argmax(np.abs(norm - 1)))
+        raise WearcapError(f"attitude of length {norm[row]:.3g} in row {row}", where=path, expected="1")
+    R = matrix_from_quat_wxyz(torch.from_numpy(quaternion)).numpy()
+    down = gravity / np.linalg.norm(gravity, axis=1, keepdims=True).clip(1e-9)
+    there, back = (float((turned @ down[..., None])[:, 2, 0].mean()) for turned in (R, R.swapaxes(1, 2)))
+    best = max(abs(there), abs(back))
+    if best < UPRIGHT:
+        what = f"the attitude turns gravity {best:.2f} upright"
+        fix = "Check the order of the quaternion's columns (W, X, Y, Z), and that z is up in its reference frame."
+        raise WearcapError(what, where=path, expected=f"at least {UPRIGHT}", fix=fix)
+    R, upright = (R, there) if abs(there) >= abs(back) else (np.ascontiguousarray(R.swapaxes(1, 2)), back)
     # Core Motion's gravity points down, and its accelerations have the opposite sign.
     free, felt = np.sign(upright) * unit * parts["free"], np.sign(upright) * unit * (parts["free"] + gravity)
     turn = torch.from_numpy(parts["turn"]).float() if "turn" in parts else None
@@ -107,20 +121,3 @@ def _require_times(seconds: np.ndarray, path: str | Path) -> None:
     if np.median(step) > 1 / MIN_RATE_HZ:
         what = f"{1 / np.median(step):.1f} rows a second"
         raise WearcapError(what, where=path, expected=f"at least {MIN_RATE_HZ:g}", fix="Log at 30 Hz or more.")
-
-
-def _attitude(quaternion: np.ndarray, gravity: np.ndarray, path: str | Path) -> tuple[np.ndarray, float]:
-    """R_world_imu, and the component of gravity along the world's z: about 1 or -1."""
-    length = np.linalg.norm(quaternion, axis=1)
-    if (np.abs(length - 1) > 0.01).any():
-        row = int(np.argmax(np.abs(length - 1)))
-        raise WearcapError(f"attitude of length {length[row]:.3g} in row {row}", where=path, expected="1")
-    R = matrix_from_quat_wxyz(torch.from_numpy(quaternion)).numpy()
-    down = gravity / np.linalg.norm(gravity, axis=1, keepdims=True).clip(1e-9)
-    there, back = (float((turned @ down[..., None])[:, 2, 0].mean()) for turned in (R, R.swapaxes(1, 2)))
-    best = max(abs(there), abs(back))
-    if best < UPRIGHT:
-        what = f"the attitude turns gravity {best:.2f} upright"
-        fix = "Check the order of the quaternion's columns (W, X, Y, Z), and that z is up in its reference frame."
-        raise WearcapError(what, where=path, expected=f"at least {UPRIGHT}", fix=fix)
-    return (R, there) if abs(there) >= abs(back) else (np.ascontiguousarray(R.swapaxes(1, 2)), back)

@@ -47,7 +47,7 @@ class _Bone:
 
 
 @dataclass(frozen=True)
-class AsfSkeleton:
+class _AsfSkeleton:
     """Content of an ASF file that reading an AMC file needs; per joint in the order of `skeleton.joint_names`."""
 
     skeleton: Skeleton
@@ -63,7 +63,7 @@ class AsfSkeleton:
     radians: bool
 
 
-def read_asf(path: str | Path, unit_m: float | int | None = None) -> AsfSkeleton:
+def read_asf(path: str | Path, unit_m: float | int | None = None) -> _AsfSkeleton:
     """Read an .asf file (plain, .gz or .xz).
 
     `unit_m` is the length of one unit in metres; by default an inch over the file's `length`. The skeleton is called
@@ -91,7 +91,7 @@ def read_asf(path: str | Path, unit_m: float | int | None = None) -> AsfSkeleton
     to_rad = 1.0 if content.radians else math.pi / 180
     angles = to_rad * torch.tensor([bone.axis_deg for bone in table], dtype=torch.float64)
     order = tuple(bone.order for bone in table)
-    return AsfSkeleton(
+    return _AsfSkeleton(
         skeleton,
         tuple(bone.dof for bone in table),
         order,
@@ -102,7 +102,7 @@ def read_asf(path: str | Path, unit_m: float | int | None = None) -> AsfSkeleton
     )
 
 
-def read_amc(asf: AsfSkeleton, path: str | Path, fps: float | int = 120) -> Motion:
+def read_amc(asf: _AsfSkeleton, path: str | Path, fps: float | int = 120) -> Motion:
     """Read an .amc file (plain, .gz or .xz) of this skeleton; the format carries no frame rate, CMU's is 120.
 
     Timestamps start at 0 and follow the file's frame numbers, so that dropped frames show as gaps.
@@ -183,10 +183,8 @@ class _AsfContent:
         for line, (parent, *below) in self.hierarchy:
             for name in below:
                 if name not in self.bones or name in seen:
-                    what, expected = (
-                        f"bone {name!r} is unknown or has two parents",
-                        "every bone of :bonedata once below a parent",
-                    )
+                    what = f"bone {name!r} is unknown or has two parents"
+                    expected = "every bone of :bonedata once below a parent"
                     raise WearcapError(what, where=at_line(path, line), expected=expected)
                 seen.add(name)
             children.setdefault(parent, []).extend(below)
@@ -322,7 +320,7 @@ def _sites(names: list[str], ends: Tensor, leaves: dict[str, Tensor]) -> dict[st
 # --- AMC -----------------------------------------------------------------------------------------------------------
 
 
-def _parse_amc(path: Path, asf: AsfSkeleton) -> tuple[np.ndarray, list[int], Float64[Tensor, "time channel"]]:
+def _parse_amc(path: Path, asf: _AsfSkeleton) -> tuple[np.ndarray, list[int], Float64[Tensor, "time channel"]]:
     """Frame numbers, joints in the file's order, and all channel values; every frame must have the first one's layout."""
     lines = _amc_lines(path, asf)
     beginning = list(islice(lines, 1))
@@ -335,7 +333,21 @@ def _parse_amc(path: Path, asf: AsfSkeleton) -> tuple[np.ndarray, list[int], Flo
         if len(first) > MAX_BONES:
             raise WearcapError(f"more than {MAX_BONES} bones", where=at_line(path, number))
     number = beginning[0][0] if beginning else 1
-    joints = _layout_joints(path, asf, number, first)
+    names = [words[0] for _, words in first]
+    for line, (name, *given) in first:
+        if name not in asf.skeleton.joint_names or names.count(name) > 1:
+            what = f"bone {name!r} is not in the ASF, or comes twice"
+            expected = "bones of the skeleton, once per frame"
+            fix = "Check that AMC and ASF belong together."
+            raise WearcapError(what, where=at_line(path, line), expected=expected, fix=fix)
+        if len(given) != (expected := len(asf.dof[asf.skeleton.index(name)])):
+            what = f"{len(given)} values for {name!r}"
+            raise WearcapError(what, where=at_line(path, line), expected=f"{expected} as in the ASF")
+    moving = {name for name, dof in zip(asf.skeleton.joint_names, asf.dof) if dof}
+    if not names or moving - set(names):
+        what = f"the first frame lacks {sorted(moving - set(names))[:5]}"
+        raise WearcapError(what, where=at_line(path, number), expected="every bone that has channels in the ASF")
+    joints = [asf.skeleton.index(name) for name in names]
     frames, values, place = array("q"), array("d"), 0
     for row, (number, words) in enumerate(chain(beginning, first, following, lines)):
         place = row % (len(first) + 1)
@@ -348,10 +360,8 @@ def _parse_amc(path: Path, asf: AsfSkeleton) -> tuple[np.ndarray, list[int], Flo
             continue
         like = first[place - 1][1]
         if words[0] != like[0] or len(words) != len(like):
-            what, expected = (
-                f"{' '.join(words)[:60]!r} differs from the first frame",
-                f"{like[0]!r} with {len(like) - 1} values",
-            )
+            what = f"{' '.join(words)[:60]!r} differs from the first frame"
+            expected = f"{like[0]!r} with {len(like) - 1} values"
             raise WearcapError(what, where=at_line(path, number), expected=expected)
         try:
             values.extend(finite_floats(words[1:]))
@@ -364,7 +374,7 @@ def _parse_amc(path: Path, asf: AsfSkeleton) -> tuple[np.ndarray, list[int], Flo
     return np.array(frames), joints, torch.from_numpy(np.array(values).reshape(len(frames), -1))
 
 
-def _amc_lines(path: Path, asf: AsfSkeleton) -> Iterator[tuple[int, list[str]]]:
+def _amc_lines(path: Path, asf: _AsfSkeleton) -> Iterator[tuple[int, list[str]]]:
     """Numbers and words of the lines from the first frame on."""
     begun = False
     for number, line in numbered_lines(path):
@@ -374,23 +384,3 @@ def _amc_lines(path: Path, asf: AsfSkeleton) -> Iterator[tuple[int, list[str]]]:
         begun = begun or (bool(words) and words[0][0] not in "#:")
         if begun and words:
             yield number, words
-
-
-def _layout_joints(path: Path, asf: AsfSkeleton, start: int, first: list[tuple[int, list[str]]]) -> list[int]:
-    """Joints of the first frame, which begins in line `start`, checked against the skeleton's channels."""
-    names = [words[0] for _, words in first]
-    for line, (name, *values) in first:
-        if name not in asf.skeleton.joint_names or names.count(name) > 1:
-            what = f"bone {name!r} is not in the ASF, or comes twice"
-            expected = "bones of the skeleton, once per frame"
-            fix = "Check that AMC and ASF belong together."
-            raise WearcapError(what, where=at_line(path, line), expected=expected, fix=fix)
-        if len(values) != (expected := len(asf.dof[asf.skeleton.index(name)])):
-            raise WearcapError(
-                f"{len(values)} values for {name!r}", where=at_line(path, line), expected=f"{expected} as in the ASF"
-            )
-    moving = {name for name, dof in zip(asf.skeleton.joint_names, asf.dof) if dof}
-    if not names or moving - set(names):
-        what = f"the first frame lacks {sorted(moving - set(names))[:5]}"
-        raise WearcapError(what, where=at_line(path, start), expected="every bone that has channels in the ASF")
-    return [asf.skeleton.index(name) for name in names]

@@ -98,9 +98,8 @@ def explained(path: str | Path, kind: str = "file") -> Iterator[None]:
     except (FileNotFoundError, NotADirectoryError) as error:
         raise WearcapError(f"no such {kind}", where=path) from error
     except PermissionError as error:
-        raise WearcapError(
-            "no permission to read it", where=path, fix="Ask its owner, or change its mode (chmod)."
-        ) from error
+        fix = "Ask its owner, or change its mode (chmod)."
+        raise WearcapError("no permission to read it", where=path, fix=fix) from error
     except IsADirectoryError as error:
         raise WearcapError("a folder", where=path, expected="a file") from error
     except _DAMAGE as error:

@@ -148,9 +148,8 @@ def _camera(model: str, width: int, height: int, values: list[float], where: str
         raise WearcapError(what, where=where, expected=f"one of {', '.join(_MODELS)}", fix=fix)
     ours, count = _MODELS[model]
     if len(values) != count or not all(map(math.isfinite, values)):
-        raise WearcapError(
-            f"camera model {model} with parameters {values}", where=where, expected=f"{count} finite numbers"
-        )
+        what = f"camera model {model} with parameters {values}"
+        raise WearcapError(what, where=where, expected=f"{count} finite numbers")
     single = model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
     fx, fy, cx, cy, *lens = (values[:1] if single else []) + values
     if ours == "opencv":
@@ -203,9 +202,8 @@ class _Text:
                 place, second = next(lines, (where, None))
                 if second is None:
                     fix = "The file was cut short: copy it again."
-                    raise WearcapError(
-                        f"it ends after image {name!r}", where=where, expected="a line of its points", fix=fix
-                    )
+                    what = f"it ends after image {name!r}"
+                    raise WearcapError(what, where=where, expected="a line of its points", fix=fix)
                 if len(second) % 3:
                     what = f"{len(second)} numbers for the points of image {name!r}"
                     raise WearcapError(what, where=place, expected="X Y POINT3D_ID for each point")

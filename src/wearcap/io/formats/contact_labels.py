@@ -102,43 +102,42 @@ def parse_labels(content: Any, clock: LabelClock, *, where: str | Path) -> Label
         expected = '{"contacts": {"left_hand": [[start, end], …], "right_hand": […]}} in seconds'
         raise WearcapError("no contact labels", where=where, expected=expected)
     if "recording" in content:
-        _check_recording(content, clock, where)
+        if content.get("schema_version") != SCHEMA:
+            what = f"schema version {content.get('schema_version')}"
+            raise WearcapError(what, where=where, expected=f"version {SCHEMA}")
+        with understood("does not name the recording of its labels", where):
+            about = content["recording"]
+            name, frames, span = about["name"], about["frames"], (about["start_s"], about["stop_s"])
+            same = all(abs(a - b) < 1e-3 for a, b in zip(span, (clock.start_s, clock.stop_s)))
+        if name != clock.name or frames != clock.frames or not same:
+            what = f"labels of recording {name!r} with {frames} frames from {span[0]:.3f} to {span[1]:.3f} s"
+            expected = f"{clock.name!r} with {clock.frames} frames from {clock.start_s:.3f} to {clock.stop_s:.3f} s"
+            fix = "Give another output folder, or move this file away."
+            raise WearcapError(what, where=where, expected=expected, fix=fix)
     labels: Labels = {}
     for hand, name in zip(HANDS, names):
         pairs = contacts[name]
-        objects, classes = (_texts(content, key, name, len(pairs), where) for key in ("objects", "classes"))
+        beside = []  # one text per label; empty if the file has none
+        for key in ("objects", "classes"):
+            texts = content.get(key, {})
+            texts = texts.get(name, [""] * len(pairs)) if isinstance(texts, dict) else None
+            if (
+                not isinstance(texts, list)
+                or len(texts) != len(pairs)
+                or not all(isinstance(text, str) for text in texts)
+            ):
+                what = f"{key} of {name} do not match its labels"
+                raise WearcapError(what, where=where, expected=f"{len(pairs)} texts")
+            beside.append(texts)
+        objects, classes = beside
         if unknown := set(classes) - {"", *CONTACT_CLASSES}:
-            raise WearcapError(
-                f"class {unknown.pop()!r} in {name}", where=where, expected=f"one of {', '.join(CONTACT_CLASSES)}"
-            )
+            expected = f"one of {', '.join(CONTACT_CLASSES)}"
+            raise WearcapError(f"class {unknown.pop()!r} in {name}", where=where, expected=expected)
         spans = [_span(pair, clock, f"{name} label {place}", where) for place, pair in enumerate(pairs)]
         found = [Label(*span, item, kind) for span, item, kind in zip(spans, objects, classes)]
         labels[hand] = tuple(sorted(found, key=lambda label: label.start_s))
         _refuse_overlap(labels[hand], clock, name, where)
     return labels
-
-
-def _check_recording(content: dict, clock: LabelClock, where: str | Path) -> None:
-    if content.get("schema_version") != SCHEMA:
-        raise WearcapError(f"schema version {content.get('schema_version')}", where=where, expected=f"version {SCHEMA}")
-    with understood("does not name the recording of its labels", where):
-        about = content["recording"]
-        name, frames, span = about["name"], about["frames"], (about["start_s"], about["stop_s"])
-        same = all(abs(a - b) < 1e-3 for a, b in zip(span, (clock.start_s, clock.stop_s)))
-    if name != clock.name or frames != clock.frames or not same:
-        what = f"labels of recording {name!r} with {frames} frames from {span[0]:.3f} to {span[1]:.3f} s"
-        expected = f"{clock.name!r} with {clock.frames} frames from {clock.start_s:.3f} to {clock.stop_s:.3f} s"
-        fix = "Give another output folder, or move this file away."
-        raise WearcapError(what, where=where, expected=expected, fix=fix)
-
-
-def _texts(content: dict, key: str, name: str, count: int, where: str | Path) -> list[str]:
-    """One text per label of a hand; empty if the file has none."""
-    texts = content.get(key, {})
-    texts = texts.get(name, [""] * count) if isinstance(texts, dict) else None
-    if not isinstance(texts, list) or len(texts) != count or not all(isinstance(text, str) for text in texts):
-        raise WearcapError(f"{key} of {name} do not match its labels", where=where, expected=f"{count} texts")
-    return texts
 
 
 def _span(pair: Any, clock: LabelClock, label: str, where: str | Path) -> tuple[float, float]:

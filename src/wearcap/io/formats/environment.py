@@ -71,7 +71,14 @@ def write_environment(environment: Environment, path: str | Path) -> None:
     for item in environment.objects:
         where = f"{path}: object {item.name!r}"
         _check(item, where)
-        rows.append(_row(item, f"objects/{_file_name(item.name, taken)}.ply", where))
+        plain = re.sub(r"[^A-Za-z0-9_-]+", "_", item.name).strip("_")[:60] or "object"
+        if re.fullmatch(r"(?i)con|prn|aux|nul|com\d|lpt\d", plain):
+            plain = f"{plain}_"
+        free, number = plain, 2
+        while free.lower() in taken:
+            free, number = f"{plain}-{number}", number + 1
+        taken.add(free.lower())
+        rows.append(_row(item, f"objects/{free}.ply", where))
     for item, row in zip(environment.objects, rows):
         write_ply(Ply.of(item.mesh), path.parent / row["mesh"])
     lines = ",\n  ".join(json.dumps(row, ensure_ascii=False, allow_nan=False) for row in rows)
@@ -92,27 +99,25 @@ def _object(row: Any, number: int, path: Path) -> SceneObject:
         raise WearcapError(f"category {row['category']!r}", where=where, expected="text")
     R = _rotation(row["R_world_object"], where).float()
     t = torch.from_numpy(_numbers(row["t_world_object"], (3,), "t_world_object", where)).float()
-    mesh, freedom = _mesh(row["mesh"], path, where), _freedom(row["freedom"], where)
-    item = SceneObject(row["name"], row["category"], mesh, R, t, freedom)
-    _check(item, where)
-    return item
-
-
-def _freedom(row: Any, where: str) -> Freedom:
-    kind = row.get("kind") if isinstance(row, dict) else None
+    mesh = _mesh(row["mesh"], path, where)
+    about = row["freedom"]
+    kind = about.get("kind") if isinstance(about, dict) else None
     if kind not in tuple(FREEDOMS):  # a file may say anything, lists too
         raise WearcapError(f"no degree of freedom {kind!r}", where=where, expected=f"one of {', '.join(FREEDOMS)}")
-    _require_keys(row, _FREEDOM_KEYS[kind], f"{where}, freedom")
-    pivot = None if kind != "hinge" else tuple(_numbers(row["pivot"], (3,), "pivot", where).tolist())
-    axis = None if kind != "axis" else tuple(_numbers(row["axis"], (3,), "axis", where).tolist())
+    _require_keys(about, _FREEDOM_KEYS[kind], f"{where}, freedom")
+    pivot = None if kind != "hinge" else tuple(_numbers(about["pivot"], (3,), "pivot", where).tolist())
+    axis = None if kind != "axis" else tuple(_numbers(about["axis"], (3,), "axis", where).tolist())
     limits = None
-    if (key := _FREEDOM_KEYS[kind][-1]) in row and key in _OPTIONAL and row[key] is not None:
-        limits = _numbers(row[key], (2,), key, where)
+    if (key := _FREEDOM_KEYS[kind][-1]) in about and key in _OPTIONAL and about[key] is not None:
+        limits = _numbers(about[key], (2,), key, where)
         if limits[0] > limits[1]:
             raise WearcapError(f"{key} {limits.tolist()} are reversed", where=where, expected="[least, greatest]")
         limits = tuple((np.radians(limits) if key == "limits_deg" else limits).tolist())
     with placed(where):
-        return Freedom(kind, pivot, axis, limits)
+        freedom = Freedom(kind, pivot, axis, limits)
+    item = SceneObject(row["name"], row["category"], mesh, R, t, freedom)
+    _check(item, where)
+    return item
 
 
 def _mesh(name: Any, path: Path, where: str) -> Mesh:
@@ -150,18 +155,6 @@ def _row(item: SceneObject, mesh: str, where: str) -> dict[str, Any]:
     ]
     values = (item.name, item.category, mesh, R, t, row)
     return dict(zip(_KEYS, values))
-
-
-def _file_name(name: str, taken: set[str]) -> str:
-    """A file name that every file system accepts and that is unique in this environment."""
-    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:60] or "object"
-    if re.fullmatch(r"(?i)con|prn|aux|nul|com\d|lpt\d", plain):
-        plain = f"{plain}_"
-    free, number = plain, 2
-    while free.lower() in taken:
-        free, number = f"{plain}-{number}", number + 1
-    taken.add(free.lower())
-    return free
 
 
 def _check(item: SceneObject, where: str) -> None:

@@ -82,8 +82,21 @@ def _check(motion: Motion, path: str | Path) -> None:
         "hand_contact_prob": (motion.hand_contact_prob, ("time", len(HANDS))),
         "body_contact_prob": (motion.body_contact_prob, ("time", "point")),
     }
-    if motion.interactions is not None:
-        _check_interactions(motion.interactions, path)
+    if (interactions := motion.interactions) is not None:
+        if not isinstance(interactions, Interactions) or interactions.hands.dtype != torch.bool:
+            raise TypeError("interactions that are none")
+        stored = {
+            "start_s": interactions.start_s.numpy(),
+            "stop_s": interactions.stop_s.numpy(),
+            "hands": interactions.hands.numpy().astype(np.uint8),
+        }
+        sizes = require(stored, path, start_s=("interval",), stop_s=("interval",), hands=("interval", len(HANDS)))
+        count = sizes["interval"]
+        if {interactions.start_s.dtype, interactions.stop_s.dtype} != {torch.float64}:
+            raise TypeError("times of interactions of another number type")
+        for names in (interactions.objects, interactions.classes):
+            if not isinstance(names, tuple) or len(names) != count or not all(isinstance(name, str) for name in names):
+                raise ValueError(f"names that do not match {count} interactions")
     for name, track in (motion.object_motion or {}).items():
         if not isinstance(track, Trajectory):
             raise TypeError(f"object {name!r} has no trajectory")
@@ -102,23 +115,6 @@ def _check(motion: Motion, path: str | Path) -> None:
             raise ValueError("a site without a finite position")
     if not all(isinstance(item, str) for pair in motion.provenance.items() for item in pair):
         raise TypeError("provenance that is no text")
-
-
-def _check_interactions(interactions: Interactions, path: str | Path) -> None:
-    if not isinstance(interactions, Interactions) or interactions.hands.dtype != torch.bool:
-        raise TypeError("interactions that are none")
-    arrays = {
-        "start_s": interactions.start_s.numpy(),
-        "stop_s": interactions.stop_s.numpy(),
-        "hands": interactions.hands.numpy().astype(np.uint8),
-    }
-    sizes = require(arrays, path, start_s=("interval",), stop_s=("interval",), hands=("interval", len(HANDS)))
-    count = sizes["interval"]
-    if {interactions.start_s.dtype, interactions.stop_s.dtype} != {torch.float64}:
-        raise TypeError("times of interactions of another number type")
-    for names in (interactions.objects, interactions.classes):
-        if not isinstance(names, tuple) or len(names) != count or not all(isinstance(name, str) for name in names):
-            raise ValueError(f"names that do not match {count} interactions")
 
 
 STILL_FPS = 30.0

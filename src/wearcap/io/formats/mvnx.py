@@ -235,9 +235,18 @@ def _recording(file: _File) -> Recording:
         contact_prob=_contacts(file),
         provenance={"source": file.path.name, "format": "mvnx"},
     )
-    return Recording(
-        file.path.name.split(".")[0], motion=motion, skeleton=skeleton, imu=_imu(file, timestamps), source="Xsens MVNX"
-    )
+    # One stream per sensor on a known segment, with free acceleration (m/s², world) and orientation
+    parts: dict[str, Any] = {}
+    if file.frames["sensorFreeAcceleration"]:
+        parts["acc_world"] = file.column("sensorFreeAcceleration", 3)
+    if file.frames["sensorOrientation"]:
+        parts["R_world_imu"] = matrix_from_quat_wxyz(_quaternions(file, "sensorOrientation"))
+    known = [(k, _JOINT_OF[label]) for k, label in enumerate(file.sensors if parts else []) if label in _JOINT_OF]
+    imu = {
+        joint: ImuStream(timestamps, joint, **{name: part[:, k].contiguous() for name, part in parts.items()})
+        for k, joint in known
+    }
+    return Recording(file.path.name.split(".")[0], motion=motion, skeleton=skeleton, imu=imu, source="Xsens MVNX")
 
 
 def _timestamps(file: _File) -> Tensor:
@@ -316,17 +325,3 @@ def _contacts(file: _File) -> Float[Tensor, "time patch"] | None:
             raise WearcapError(f"foot contacts {file.contacts}", where=file.path, expected="heel and toe of both feet")
         columns += found
     return contacts[:, columns]
-
-
-def _imu(file: _File, timestamps: Tensor) -> dict[str, ImuStream]:
-    """One stream per sensor on a known segment, with free acceleration (m/s², world) and orientation."""
-    parts: dict[str, Any] = {}
-    if file.frames["sensorFreeAcceleration"]:
-        parts["acc_world"] = file.column("sensorFreeAcceleration", 3)
-    if file.frames["sensorOrientation"]:
-        parts["R_world_imu"] = matrix_from_quat_wxyz(_quaternions(file, "sensorOrientation"))
-    known = [(k, _JOINT_OF[label]) for k, label in enumerate(file.sensors if parts else []) if label in _JOINT_OF]
-    return {
-        joint: ImuStream(timestamps, joint, **{name: part[:, k].contiguous() for name, part in parts.items()})
-        for k, joint in known
-    }

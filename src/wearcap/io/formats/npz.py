@@ -111,7 +111,6 @@ def require(arrays: dict[str, np.ndarray], path: str | Path, **shapes: tuple[int
             raise WearcapError(f"array {key!r} is of type {array.dtype}", where=path, expected="real numbers")
         if not np.isfinite(array).all():
             row = np.argwhere(~np.isfinite(array))[0].tolist()
-            raise WearcapError(
-                f"array {key!r} holds NaN or infinity, first at {row}", where=path, expected="finite numbers"
-            )
+            what = f"array {key!r} holds NaN or infinity, first at {row}"
+            raise WearcapError(what, where=path, expected="finite numbers")
     return sizes

@@ -126,27 +126,25 @@ def read_sensor_frame(path: str | Path) -> dict[str, OCamModel]:
             continue  # other lens models are listed beside OCamCalib's
         if name in found:
             raise WearcapError("the camera is there twice", where=where)
-        found[name] = _from_xml(element, where)
+        lens, size = _child(element, "OCamModel"), _child(element, "ImageSize")
+        if lens is None or size is None:
+            raise WearcapError("no ImageSize", where=where, expected="ImageSize with Width and Height")
+        polynomials = {}
+        for part, (least, most) in _COUNTS.items():
+            holder = _child(lens, part)
+            coefficients = [] if holder is None else [item.text or "" for item in holder if tag_of(item) == "coeff"]
+            if not least <= len(coefficients) <= most and (part == "cam2world" or coefficients):
+                what = f"{part} with {len(coefficients)} coefficients"
+                raise WearcapError(what, where=where, expected=f"at least {least}")
+            polynomials[part] = tuple(_number(item, part, where) for item in coefficients)
+        c, d, e, cx, cy = (_number(_text(lens, part, where), part, where) for part in ("c", "d", "e", "cx", "cy"))
+        width, height = (_number(_text(size, part, where), part, where) for part in ("Width", "Height"))
+        found[name] = OCamModel(
+            polynomials["cam2world"], polynomials["world2cam"], cx, cy, (c, d, e), int(width), int(height)
+        )
     if not found:
         raise WearcapError("no cameras", where=path, expected="CameraModel elements with an OCamModel (NavVis)")
     return found
-
-
-def _from_xml(element: Element, where: str) -> OCamModel:
-    lens, size = _child(element, "OCamModel"), _child(element, "ImageSize")
-    if lens is None or size is None:
-        raise WearcapError("no ImageSize", where=where, expected="ImageSize with Width and Height")
-    polynomials = {}
-    for name, (least, most) in _COUNTS.items():
-        holder = _child(lens, name)
-        coefficients = [] if holder is None else [item.text or "" for item in holder if tag_of(item) == "coeff"]
-        if not least <= len(coefficients) <= most and (name == "cam2world" or coefficients):
-            what = f"{name} with {len(coefficients)} coefficients"
-            raise WearcapError(what, where=where, expected=f"at least {least}")
-        polynomials[name] = tuple(_number(item, name, where) for item in coefficients)
-    c, d, e, cx, cy = (_number(_text(lens, name, where), name, where) for name in ("c", "d", "e", "cx", "cy"))
-    width, height = (_number(_text(size, name, where), name, where) for name in ("Width", "Height"))
-    return OCamModel(polynomials["cam2world"], polynomials["world2cam"], cx, cy, (c, d, e), int(width), int(height))
 
 
 def _child(element: Element, name: str) -> Element | None:

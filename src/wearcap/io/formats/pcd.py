@@ -26,11 +26,33 @@ def read_pcd(path: str | Path) -> Ply:
     """
     data = read_bytes(path)
     header, body = _parse_header(data, path)
-    dtype = _row_type(header, path)
+    counts = header.get("COUNT", ["1"] * len(header["FIELDS"]))
+    fields = []
+    with understood("its header cannot be understood", path, "a SIZE, TYPE and COUNT for every field"):
+        for i, name in enumerate(header["FIELDS"]):
+            letter = _TYPES.get((header["TYPE"][i], int(header["SIZE"][i])))
+            if letter is None:
+                raise ValueError(f"TYPE {header['TYPE'][i]} of SIZE {header['SIZE'][i]}"[:60])
+            if not 0 < int(counts[i]) <= _MAX_COUNT or (name in ("x", "y", "z") and int(counts[i]) != 1):
+                raise ValueError(f"COUNT {counts[i]} of {name}"[:60])
+            shape = (int(counts[i]),) if int(counts[i]) != 1 else ()
+            fields.append((f"_padding{i}" if name == "_" else name, letter, shape))
+        if not {"x", "y", "z"} <= {name for name, _, _ in fields}:
+            raise WearcapError("no fields x, y, z", where=path, expected="a point cloud")
+        dtype = np.dtype(fields)
     count = int(header["POINTS"][0])
     encoding = header["DATA"][0]
     if encoding == "ascii":
-        rows = _ascii_rows(memoryview(data)[body:], dtype, count, path)
+        text = io.TextIOWrapper(io.BytesIO(memoryview(data)[body:]), "ascii", errors="replace", newline="\n")
+        lines = islice((line for line in text if line.strip()), count)
+        with (
+            warnings.catch_warnings(),
+            np.errstate(over="ignore", invalid="ignore"),
+            understood("a row does not match the header", path, errors=(ValueError, OverflowError)),
+        ):
+            warnings.simplefilter("ignore", UserWarning)  # numpy warns about a file that ends here
+            rows = np.loadtxt(lines, dtype=dtype, ndmin=1, comments=None)
+        _require(len(rows) == count, path)
     elif encoding == "binary":
         _require(len(data) - body >= count * dtype.itemsize, path)
         rows = np.frombuffer(data, dtype, count, body)
@@ -67,42 +89,10 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[dict[str, list[str]], 
     return header, start
 
 
-def _row_type(header: dict[str, list[str]], path: str | Path) -> np.dtype:
-    counts = header.get("COUNT", ["1"] * len(header["FIELDS"]))
-    fields = []
-    with understood("its header cannot be understood", path, "a SIZE, TYPE and COUNT for every field"):
-        for i, name in enumerate(header["FIELDS"]):
-            letter = _TYPES.get((header["TYPE"][i], int(header["SIZE"][i])))
-            if letter is None:
-                raise ValueError(f"TYPE {header['TYPE'][i]} of SIZE {header['SIZE'][i]}"[:60])
-            if not 0 < int(counts[i]) <= _MAX_COUNT or (name in ("x", "y", "z") and int(counts[i]) != 1):
-                raise ValueError(f"COUNT {counts[i]} of {name}"[:60])
-            shape = (int(counts[i]),) if int(counts[i]) != 1 else ()
-            fields.append((f"_padding{i}" if name == "_" else name, letter, shape))
-        if not {"x", "y", "z"} <= {name for name, _, _ in fields}:
-            raise WearcapError("no fields x, y, z", where=path, expected="a point cloud")
-        return np.dtype(fields)
-
-
 def _require(complete: bool, path: str | Path) -> None:
     if not complete:
-        raise WearcapError(
-            "it holds fewer points than its header states", where=path, fix="The file was cut short: copy it again."
-        )
-
-
-def _ascii_rows(body: memoryview, dtype: np.dtype, count: int, path: str | Path) -> np.ndarray:
-    text = io.TextIOWrapper(io.BytesIO(body), "ascii", errors="replace", newline="\n")
-    lines = islice((line for line in text if line.strip()), count)
-    with (
-        warnings.catch_warnings(),
-        np.errstate(over="ignore", invalid="ignore"),
-        understood("a row does not match the header", path, errors=(ValueError, OverflowError)),
-    ):
-        warnings.simplefilter("ignore", UserWarning)  # numpy warns about a file that ends here
-        rows = np.loadtxt(lines, dtype=dtype, ndmin=1, comments=None)
-    _require(len(rows) == count, path)
-    return rows
+        what = "it holds fewer points than its header states"
+        raise WearcapError(what, where=path, fix="The file was cut short: copy it again.")
 
 
 def _compressed_rows(body: memoryview, dtype: np.dtype, count: int, path: str | Path) -> np.ndarray:

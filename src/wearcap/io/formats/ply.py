@@ -92,7 +92,19 @@ def read_ply(path: str | Path) -> Ply:
     data = read_bytes(path)
     byte_order, elements, body = _parse_header(data, path)
     if byte_order == "=":
-        tables = _read_ascii(elements, memoryview(data)[body:], path)
+        text = io.TextIOWrapper(io.BytesIO(memoryview(data)[body:]), "ascii", errors="replace", newline="\n")
+        lines = (line for line in text if line.strip())
+        tables = {}
+        for element in elements:
+            if element.count == 0:
+                tables[element.name] = {}
+                continue
+            read = _ascii_lists if any(p.count_dtype for p in element.properties) else _ascii_table
+            with understood(f"a {element.name} row does not match the header", path):
+                table, rows = read(element, lines)
+            if rows < element.count:
+                raise _cut_short(path, element)
+            tables[element.name] = table
     else:
         tables = {}
         for element in elements:
@@ -134,9 +146,8 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[str, list[_Element], i
     stop = data.find(b"end_header", 0, _MAX_HEADER_BYTES)
     newline = data.find(b"\n", stop)
     if stop < 0 or newline < 0:
-        raise WearcapError(
-            "its header has no end", where=path, expected="`end_header`", fix="The file was cut short: copy it again."
-        )
+        fix = "The file was cut short: copy it again."
+        raise WearcapError("its header has no end", where=path, expected="`end_header`", fix=fix)
     byte_order, elements = "", []
     with understood("its header cannot be understood", path, "a PLY 1.0 header"):
         for line in data[:stop].decode("ascii").splitlines()[1:]:
@@ -156,9 +167,8 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[str, list[_Element], i
     if any(len(set(group)) < len(group) or any(name.startswith("#") for name in group) for group in names):
         raise WearcapError("its header names a part twice", where=path, expected="a PLY 1.0 header")
     if not byte_order or any(not 0 <= element.count < 1 << 48 for element in elements):
-        raise WearcapError(
-            "its header names no format, or an impossible or negative count", where=path, expected="a PLY 1.0 header"
-        )
+        what = "its header names no format, or an impossible or negative count"
+        raise WearcapError(what, where=path, expected="a PLY 1.0 header")
     return byte_order, elements, newline + 1
 
 
@@ -249,23 +259,6 @@ def _read_even_rows(element: _Element, data: bytes, start: int, order: str) -> t
                 return None, start
             table[p.name] = _Lists(values.reshape(-1), np.full(len(rows), values.shape[1]))
     return table, stop
-
-
-def _read_ascii(elements: list[_Element], body: memoryview, path) -> dict[str, dict]:
-    text = io.TextIOWrapper(io.BytesIO(body), "ascii", errors="replace", newline="\n")
-    lines = (line for line in text if line.strip())
-    tables = {}
-    for element in elements:
-        if element.count == 0:
-            tables[element.name] = {}
-            continue
-        read = _ascii_lists if any(p.count_dtype for p in element.properties) else _ascii_table
-        with understood(f"a {element.name} row does not match the header", path):
-            table, rows = read(element, lines)
-        if rows < element.count:
-            raise _cut_short(path, element)
-        tables[element.name] = table
-    return tables
 
 
 def _ascii_table(element: _Element, lines: Iterator[str]) -> tuple[dict, int]:

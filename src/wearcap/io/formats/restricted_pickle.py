@@ -41,7 +41,20 @@ def read_pickle(path: str | Path, max_bytes: int | None = None) -> Any:
     Python 2's byte strings come as str (Latin-1). Raises WearcapError naming the class or function when the file
     holds anything else, and when it is damaged.
     """
-    content = _unpacked(path, max_bytes)
+    # joblib's files are packed; their first bytes name the compression.
+    packed = Budget(path, file_size(path), MAX_BYTES, max_bytes)
+    packed.spend(file_size(path))
+    with explained(path), open(path, "rb") as file:
+        begin = file.peek(2)
+        packers = {b"\x1f\x8b": gzip.open, b"BZ": bz2.open, b"\xfd7": lzma.open}
+        if begin[:1] == b"x":
+            file = _Inflated(file)
+        elif begin[:2] in packers:
+            file = packers[begin[:2]](file)
+        with counted(file, Budget(path, file_size(path), MAX_BYTES, max_bytes)) as reader:
+            content = reader.read()
+    if not content:
+        raise WearcapError("the file is empty", where=path)
     try:
         value = _Unpickler(io.BytesIO(content), encoding="latin1").load()
         _require_plain(value)
@@ -57,24 +70,6 @@ def read_pickle(path: str | Path, max_bytes: int | None = None) -> Any:
 
 class _RefusedError(Exception):
     """Raised for content that is never admitted."""
-
-
-def _unpacked(path: str | Path, max_bytes: int | None) -> bytes:
-    """Decompressed content of a joblib file, whose first bytes name the compression."""
-    packed = Budget(path, file_size(path), MAX_BYTES, max_bytes)
-    packed.spend(file_size(path))
-    with explained(path), open(path, "rb") as file:
-        begin = file.peek(2)
-        packers = {b"\x1f\x8b": gzip.open, b"BZ": bz2.open, b"\xfd7": lzma.open}
-        if begin[:1] == b"x":
-            file = _Inflated(file)
-        elif begin[:2] in packers:
-            file = packers[begin[:2]](file)
-        with counted(file, Budget(path, file_size(path), MAX_BYTES, max_bytes)) as reader:
-            content = reader.read()
-    if not content:
-        raise WearcapError("the file is empty", where=path)
-    return content
 
 
 class _Inflated(io.BufferedIOBase):

@@ -74,7 +74,19 @@ def read_smpl(path: str | Path) -> SmplArrays:
     Raises WearcapError naming the file and the array that is missing, misshapen or not finite.
     """
     path = Path(path)
-    table = read_npz(path, (*_SHAPES, "posedirs")) if path.suffix.lower() == ".npz" else _cleaned_pickle(path)
+    if path.suffix.lower() == ".npz":
+        table = read_npz(path, (*_SHAPES, "posedirs"))
+    else:
+        try:
+            table = read_pickle(path)
+        except WearcapError as error:
+            what = f"not a plain model file ({error.what})"
+            fix = (
+                "SMPL's first releases hold chumpy objects: clean them with smplx's tools/clean_ch.py, or use the .npz."
+            )
+            raise WearcapError(what, where=path, expected="arrays only", fix=fix) from error
+        if not isinstance(table, dict):
+            raise WearcapError("not a body model", where=path, expected="a dictionary of arrays")
     size = require(table, path, **_SHAPES)
     parents = np.asarray(table["kintree_table"])[0].astype(np.int64)
     parents[0] = -1
@@ -88,15 +100,3 @@ def read_smpl(path: str | Path) -> SmplArrays:
     names = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights")
     floats = (torch.from_numpy(np.asarray(table[n], np.float32)) if n in table else None for n in names)
     return SmplArrays(*floats, tuple(parents.tolist()), faces)  # pyright: ignore[reportArgumentType]
-
-
-def _cleaned_pickle(path: Path) -> dict:
-    try:
-        table = read_pickle(path)
-    except WearcapError as error:
-        what = f"not a plain model file ({error.what})"
-        fix = "SMPL's first releases hold chumpy objects: clean them with smplx's tools/clean_ch.py, or use the .npz."
-        raise WearcapError(what, where=path, expected="arrays only", fix=fix) from error
-    if not isinstance(table, dict):
-        raise WearcapError("not a body model", where=path, expected="a dictionary of arrays")
-    return table

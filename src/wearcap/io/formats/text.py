@@ -111,9 +111,8 @@ def plain_xml(path: str | Path, kind: str) -> Iterator[None]:
         fix = "Such declarations can blow up or fetch other files, and are never read."
         raise WearcapError(what, where=path, expected=f"a plain {kind}", fix=fix) from error
     except ParseError as error:
-        raise WearcapError(
-            f"broken XML ({error.msg})", where=path, expected=f"a whole {kind}", fix="Export or copy it again."
-        ) from error
+        what = f"broken XML ({error.msg})"
+        raise WearcapError(what, where=path, expected=f"a whole {kind}", fix="Export or copy it again.") from error
 
 
 def tag_of(element: Element) -> str:

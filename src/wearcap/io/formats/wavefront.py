@@ -30,7 +30,15 @@ def read_obj(path: str | Path) -> Mesh:
                     raise ValueError(f"{' '.join(words[1:4])!r} are no three finite numbers")
                 vertices.extend(values)
             elif words[:1] == ["f"]:
-                faces.extend(_fan(words, len(vertices) // 3))
+                # Corners count from 1, or backwards from the newest vertex; `a/texture/normal` names vertex a.
+                known = len(vertices) // 3
+                named = [int(word.split("/")[0]) for word in words[1:]]
+                if len(named) < 3:
+                    raise ValueError(f"{len(named)} corners")
+                face = [index - 1 if index > 0 else known + index for index in named]
+                if min(face) < 0 or 0 in named or max(named) > 1 << 30:
+                    raise ValueError(f"corner {min(named)}")
+                faces.extend([corner for k in range(1, len(face) - 1) for corner in (face[0], face[k], face[k + 1])])
         except ValueError as error:
             what = f"not a readable {'vertex' if words[0] == 'v' else 'face'} ({error})"[:300]
             fix = "The file was damaged: copy it again."
@@ -44,14 +52,3 @@ def read_obj(path: str | Path) -> Mesh:
         expected = "faces of its own vertices"
         raise WearcapError(what, where=path, expected=expected, fix="The file was cut short: copy it again.")
     return Mesh(points, corners, GREY)
-
-
-def _fan(words: list[str], known: int) -> list[int]:
-    """Corners are counted from 1, or backwards from the newest vertex; `a/texture/normal` names vertex a."""
-    named = [int(word.split("/")[0]) for word in words[1:]]
-    if len(named) < 3:
-        raise ValueError(f"{len(named)} corners")
-    corners = [index - 1 if index > 0 else known + index for index in named]
-    if min(corners) < 0 or 0 in named or max(named) > 1 << 30:
-        raise ValueError(f"corner {min(named)}")
-    return [corner for k in range(1, len(corners) - 1) for corner in (corners[0], corners[k], corners[k + 1])]

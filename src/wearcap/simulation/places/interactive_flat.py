@@ -15,8 +15,7 @@ from jaxtyping import Float
 from wearcap.geometry.mesh import merged
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.recording.interactions import HANDS
-from wearcap.recording.motion import Interactions, Motion
+from wearcap.recording.motion import HANDS, Interactions, Motion
 from wearcap.scene.environment import Environment
 from wearcap.simulation.handling.grips import Handling, object_motion
 from wearcap.simulation.places.builder import Piece, WorldBuilder

@@ -14,8 +14,16 @@ from wearcap.data.features import LIMBS
 from wearcap.errors import WearcapError
 from wearcap.models.layers import Normalizer
 from wearcap.models.point_encoder import PointNeXt
-from wearcap.runtime.describe import ROT6D, schedule_from_json, schedule_to_json, skeleton_from_json, skeleton_to_json
-from wearcap.runtime.graphs import Exports, Graph, Run
+from wearcap.runtime.graphs import (
+    ROT6D,
+    Exports,
+    Graph,
+    Run,
+    schedule_from_json,
+    schedule_to_json,
+    skeleton_from_json,
+    skeleton_to_json,
+)
 from wearcap.systems.echo.features import POINTS, EchoFeatures
 from wearcap.systems.echo.guidance import Guidance
 from wearcap.systems.echo.model import MODALITIES, EchoDenoiser

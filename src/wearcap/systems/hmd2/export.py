@@ -13,8 +13,17 @@ from wearcap.data.features import LIMBS
 from wearcap.errors import WearcapError
 from wearcap.models.layers import Normalizer
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
-from wearcap.runtime.describe import ROT6D, schedule_from_json, schedule_to_json, skeleton_from_json, skeleton_to_json
-from wearcap.runtime.graphs import Call, Exports, Graph, Run
+from wearcap.runtime.graphs import (
+    ROT6D,
+    Call,
+    Exports,
+    Graph,
+    Run,
+    schedule_from_json,
+    schedule_to_json,
+    skeleton_from_json,
+    skeleton_to_json,
+)
 from wearcap.scene.voxels import VoxelGrid
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import Conditions, MotionDenoiser

@@ -8,8 +8,7 @@ from torch import Tensor
 
 from wearcap.body.skeleton import FEET
 from wearcap.errors import WearcapError
-from wearcap.runtime.describe import skeleton_from_json, skeleton_to_json
-from wearcap.runtime.graphs import Exports, Run
+from wearcap.runtime.graphs import Exports, Run, skeleton_from_json, skeleton_to_json
 from wearcap.systems.mocap_every.features import WatchFeatures
 from wearcap.systems.mocap_every.model import Estimate, WatchEstimator
 from wearcap.systems.mocap_every.pipeline import SETTINGS, MocapEvery
