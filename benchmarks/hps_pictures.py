@@ -9,6 +9,7 @@ import torch
 from hps_sessions import Session
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
+from simulated_depth_rig import look_at
 
 from wearcap.body.model import FOOT_REGIONS
 from wearcap.body.skeleton import FOOT_PATCHES
@@ -17,7 +18,6 @@ from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.render import Light, Splats, render
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
-from wearcap.simulation.rendering.depth_rig import look_at
 from wearcap.systems.hps.scores import HpsTruth, nearest_frames
 from wearcap.viewer.picture import captioned, save_png
 

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from depth_rig import Background, DepthView, person_cloud
+from simulated_depth_rig import approximate, place_rig, simulate_rig
 
 from wearcap.body.anny_body import anny_body
 from wearcap.files import write_text
@@ -22,10 +24,8 @@ from wearcap.recording import Recording
 from wearcap.recording.store import RecordingFile, save_recording
 from wearcap.scene.scan import Scan
 from wearcap.sensors.clock import Clock
-from wearcap.sensors.depth_rig import Background, DepthView, person_cloud
 from wearcap.simulation.places.world import World
 from wearcap.simulation.recordings.hps import HpsConfig, simulate_hps
-from wearcap.simulation.rendering.depth_rig import approximate, place_rig, simulate_rig
 from wearcap.simulation.rendering.scan import scan_world
 from wearcap.simulation.rendering.views import Scenery
 from wearcap.systems.hps.scores import RigCloud, nearest_frames, visit_times

@@ -15,16 +15,23 @@ from wearcap.geometry.camera import Camera
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
 from wearcap.metrics.surface import chamfer, seen_vertices
-from wearcap.sensors.depth_rig import (
-    Background,
-    DepthView,
-    _unproject_depth,
-    _visible_points,
-    largest_cluster,
-    person_cloud,
-)
 from wearcap.simulation.places.builder import WorldBuilder
-from wearcap.simulation.rendering.depth_rig import KINECT, SimulatedRig, approximate, place_rig, simulate_rig
+from wearcap_testing import benchmark
+
+rig = benchmark("depth_rig")
+Background = rig.Background
+DepthView = rig.DepthView
+_unproject_depth = rig._unproject_depth
+_visible_points = rig._visible_points
+largest_cluster = rig.largest_cluster
+person_cloud = rig.person_cloud
+
+simulated = benchmark("simulated_depth_rig")
+KINECT = simulated.KINECT
+SimulatedRig = simulated.SimulatedRig
+approximate = simulated.approximate
+place_rig = simulated.place_rig
+simulate_rig = simulated.simulate_rig
 
 LENS = Camera("pinhole", 40, 30, 30.0, 30.0, 19.5, 14.5)
 

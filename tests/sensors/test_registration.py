@@ -8,7 +8,10 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.pcd import read_pcd
-from wearcap.sensors.depth_rig import _register
+from wearcap_testing import benchmark
+
+rig = benchmark("depth_rig")
+_register = rig._register
 
 
 def room(points: int, seed: int) -> np.ndarray:

@@ -9,7 +9,15 @@ from wearcap.geometry import rotation
 from wearcap.geometry.mesh import capsules, checker_floor
 from wearcap.geometry.rigid import Rigid
 from wearcap.simulation.places.world import World
-from wearcap.simulation.rendering.depth_rig import KINECT, DepthNoise, approximate, look_at, place_rig, simulate_rig
+from wearcap_testing import benchmark
+
+simulated = benchmark("simulated_depth_rig")
+KINECT = simulated.KINECT
+DepthNoise = simulated.DepthNoise
+approximate = simulated.approximate
+look_at = simulated.look_at
+place_rig = simulated.place_rig
+simulate_rig = simulated.simulate_rig
 
 CAMERA = KINECT.scaled(320, 288)
 FLOOR = checker_floor(np.zeros(3), 4.0, 0.5, np.ones((2, 3)), np.ones(3))
