@@ -21,12 +21,12 @@ VERSION = 6
 
 def open_pt2(path: str | Path) -> Run:
     """A torch.export archive on the CPU. Raises WearcapError when it is missing, not readable, or refused by
-    `check_archive`: PyTorch by itself would run code from it.
+    `_check_archive`: PyTorch by itself would run code from it.
     """
     if not Path(path).is_file():
         raise WearcapError("no such exported model", where=path, fix="Make one with `wearcap export`.")
     try:
-        check_archive(path)
+        _check_archive(path)
         module = torch.export.load(str(path)).module()
     except WearcapError:
         raise
@@ -116,7 +116,7 @@ MAX_JSON_BYTES = 1 << 26
 """Largest allowed JSON description of a graph (64 MiB); exported ones have about 1 MiB."""
 
 
-def check_archive(path: str | Path) -> None:
+def _check_archive(path: str | Path) -> None:
     """Raise WearcapError unless an archive has only tensors and a graph of tensor operations.
 
     Refused are pickled objects, compressed parts, guards and sizes other than arithmetic, and calls of functions that

@@ -141,7 +141,7 @@ class Stretch:
 
     def __init__(self, energy: HpsEnergy, data: HpsData, start: HpsState):
         self.energy, self.data, self.start = energy, data, start
-        joints, self.body = active_body(data.patches)
+        joints, self.body = _active_body(data.patches)
         self.columns = [joint - 1 for joint in joints]
         """Columns of θ that are optimised."""
         self.theta = np.ascontiguousarray(start.theta[:, self.columns].numpy())
@@ -333,7 +333,7 @@ def _value_of(name: str) -> int:
     return _VALUES.get(term.inputs[0], kernels.DIFFERENTIATED) if known else kernels.DIFFERENTIATED
 
 
-def active_body(patches: FootPatches) -> tuple[tuple[int, ...], Body]:
+def _active_body(patches: FootPatches) -> tuple[tuple[int, ...], Body]:
     """The optimised joints (without the root, parents first): the chains to the head and the feet, and their arrays.
 
     Raises WearcapError when a patch is skinned to joints other than the last two of its leg, or the body's feet change

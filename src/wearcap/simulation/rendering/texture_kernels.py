@@ -74,7 +74,7 @@ def _hue(h):
 
 
 @compiled
-def plaster(a, b, extent, red, green, blue, seed, footprint):
+def _plaster(a, b, extent, red, green, blue, seed, footprint):
     """A painted wall: nearly blank, with a skirting board, sockets, and rarely a smudge."""
     shade = 1.0 + 0.012 * _noise(a, b, 1.4, seed, footprint) + 0.010 * _noise(a, b, 0.09, seed + 1, footprint)
     i, j = math.floor(a / 0.8), math.floor(b / 0.8)
@@ -102,7 +102,7 @@ def plaster(a, b, extent, red, green, blue, seed, footprint):
 
 
 @compiled
-def brick(a, b, red, green, blue, seed, footprint):
+def _brick(a, b, red, green, blue, seed, footprint):
     """Courses of bricks in mortar, each brick of its own shade; weathered in large patches."""
     row = math.floor(b / 0.083)
     along = a / 0.25 + 0.5 * (row % 2)
@@ -150,7 +150,7 @@ def _sheet(x, y, wide, tall, red, green, blue, seed, footprint):
 
 
 @compiled
-def poster(a, b, extent, red, green, blue, seed, footprint):
+def _poster(a, b, extent, red, green, blue, seed, footprint):
     """A framed print; a large board has several sheets; a small object (a switch, a mug) gets a mark."""
     wide, tall = extent[1] - extent[0], extent[3] - extent[2]
     x, y = a - extent[0], b - extent[2]
@@ -175,7 +175,7 @@ def poster(a, b, extent, red, green, blue, seed, footprint):
 
 
 @compiled
-def books(a, b, extent, red, green, blue, seed, footprint):
+def _books(a, b, extent, red, green, blue, seed, footprint):
     """Spines side by side, with titles and bands; darkness above the shorter ones."""
     width = 0.033
     place = a / width
@@ -219,7 +219,7 @@ def _grain(along, across, red, green, blue, seed, footprint):
 
 
 @compiled
-def parquet(a, b, red, green, blue, seed, footprint):
+def _parquet(a, b, red, green, blue, seed, footprint):
     """Planks of 14 cm, each of its own shade, with open joints."""
     row = math.floor(b / 0.14)
     shifted = a + 1.3 * _chance(row, 0, seed)
@@ -253,7 +253,7 @@ def _slabs(a, b, red, green, blue, seed, size, contrast, footprint):
 
 
 @compiled
-def fabric(a, b, red, green, blue, seed, footprint):
+def _fabric(a, b, red, green, blue, seed, footprint):
     """Cloth with stripes or checks of its own width, and a worn surface."""
     width = 0.05 + 0.07 * _chance(0, 1, seed)
     visible = _fade(2.0 * width, footprint)
@@ -265,7 +265,7 @@ def fabric(a, b, red, green, blue, seed, footprint):
 
 
 @compiled
-def foliage(a, b, red, green, blue, seed, footprint):
+def _foliage(a, b, red, green, blue, seed, footprint):
     """Leaves or blades of grass: light and dark on every scale, yellower here, bluer there."""
     tone = 0.34 * _noise(a, b, 0.05, seed, footprint) + 0.28 * _noise(a, b, 0.11, seed + 1, footprint)
     tone += 0.22 * _noise(a, b, 0.3, seed + 2, footprint) + 0.16 * _noise(a, b, 1.2, seed + 3, footprint)
@@ -274,7 +274,7 @@ def foliage(a, b, red, green, blue, seed, footprint):
 
 
 @compiled
-def asphalt(a, b, red, green, blue, seed, footprint):
+def _asphalt(a, b, red, green, blue, seed, footprint):
     """Asphalt: gravelly, mended in patches, cracked."""
     tone = 0.14 * _noise(a, b, 0.045, seed, footprint) + 0.10 * _noise(a, b, 0.13, seed + 1, footprint)
     tone += 0.10 * _noise(a, b, 1.6, seed + 2, footprint)
@@ -290,7 +290,7 @@ def asphalt(a, b, red, green, blue, seed, footprint):
 
 
 @compiled
-def paint(a, b, red, green, blue, seed, footprint):
+def _paint(a, b, red, green, blue, seed, footprint):
     """Lacquered wood, plastic or metal: even, with a few marks, labels and scratches."""
     tone = 1.0 + 0.03 * _noise(a, b, 0.5, seed, footprint) + 0.03 * _noise(a, b, 0.06, seed + 1, footprint)
     i, j = math.floor(a / 0.3), math.floor(b / 0.3)
@@ -305,7 +305,7 @@ def paint(a, b, red, green, blue, seed, footprint):
 
 
 @compiled
-def ceiling(a, b, red, green, blue, seed, footprint):
+def _ceiling(a, b, red, green, blue, seed, footprint):
     """Panels of 62 cm; some have a grille, a sprinkler or a stain."""
     size = 0.625
     i, j = math.floor(a / size), math.floor(b / size)
@@ -323,22 +323,22 @@ def ceiling(a, b, red, green, blue, seed, footprint):
 
 
 @compiled
-def pattern(material, a, b, extent, red, green, blue, seed, footprint):
+def _pattern(material, a, b, extent, red, green, blue, seed, footprint):
     """Colour of a material at (a, b)."""
     if material == PLASTER:
-        return plaster(a, b, extent, red, green, blue, seed, footprint)
+        return _plaster(a, b, extent, red, green, blue, seed, footprint)
     if material == BRICK:
-        return brick(a, b, red, green, blue, seed, footprint)
+        return _brick(a, b, red, green, blue, seed, footprint)
     if material == POSTER:
-        return poster(a, b, extent, red, green, blue, seed, footprint)
+        return _poster(a, b, extent, red, green, blue, seed, footprint)
     if material == BOOKS:
-        return books(a, b, extent, red, green, blue, seed, footprint)
+        return _books(a, b, extent, red, green, blue, seed, footprint)
     if material == WOOD:
         if extent[1] - extent[0] < extent[3] - extent[2]:
             a, b = b, a
         return _grain(a, b, red, green, blue, seed, footprint)
     if material == PARQUET:
-        return parquet(a, b, red, green, blue, seed, footprint)
+        return _parquet(a, b, red, green, blue, seed, footprint)
     if material == TILES:
         return _slabs(a, b, red, green, blue, seed, 0.3, 0.16, footprint)
     if material == STONE:
@@ -346,14 +346,14 @@ def pattern(material, a, b, extent, red, green, blue, seed, footprint):
     if material == CARPET:
         return _slabs(a, b, red, green, blue, seed, 0.22, 0.7, footprint)
     if material == FABRIC:
-        return fabric(a, b, red, green, blue, seed, footprint)
+        return _fabric(a, b, red, green, blue, seed, footprint)
     if material == FOLIAGE:
-        return foliage(a, b, red, green, blue, seed, footprint)
+        return _foliage(a, b, red, green, blue, seed, footprint)
     if material == ASPHALT:
-        return asphalt(a, b, red, green, blue, seed, footprint)
+        return _asphalt(a, b, red, green, blue, seed, footprint)
     if material == CEILING:
-        return ceiling(a, b, red, green, blue, seed, footprint)
-    return paint(a, b, red, green, blue, seed, footprint)
+        return _ceiling(a, b, red, green, blue, seed, footprint)
+    return _paint(a, b, red, green, blue, seed, footprint)
 
 
 @compiled
@@ -371,7 +371,7 @@ def color_points(points, face, facing, footprint, tables, light, out):
         px, py, pz = points[k, 0] - f[0], points[k, 1] - f[1], points[k, 2] - f[2]
         a = px * f[3] + py * f[4] + pz * f[5]
         b = px * f[6] + py * f[7] + pz * f[8]
-        red, green, blue = pattern(material, a, b, extents[number], c[0], c[1], c[2], seeds[number], footprint[k])
+        red, green, blue = _pattern(material, a, b, extents[number], c[0], c[1], c[2], seeds[number], footprint[k])
         shade = 250.0
         if material != LAMP:
             nx, ny, nz = facing[k] * f[9], facing[k] * f[10], facing[k] * f[11]

@@ -32,7 +32,7 @@ from wearcap.systems.hmd2.pipeline import HMD2
 SETTINGS = ("steps", "stride", "eta", "spacing", "guidance", "inpaint", "fade", "lookahead", "live", "use")
 
 
-class ConditionGraph(nn.Module):
+class _ConditionGraph(nn.Module):
     """The part of a denoiser that is computed once per window: the encoding of its conditions."""
 
     def __init__(self, net: MotionDenoiser):
@@ -77,7 +77,7 @@ def exports(pipeline: HMD2) -> Exports:
         if size:
             present = valid & (torch.rand(shape, generator=random) < 0.7)
             inputs |= {name: torch.randn(*shape, size, generator=random), f"{name}_valid": present}
-    graphs["conditions"] = Graph(ConditionGraph(net), inputs)
+    graphs["conditions"] = Graph(_ConditionGraph(net), inputs)
     if pipeline.place_encoder is not None and net.points_size:
         grid = pipeline.place_encoder.grid
         grids = grid.clip_m * torch.rand(2, *[grid.cells] * 3, generator=random)

@@ -188,7 +188,7 @@ class HPS(StagedSystem):
             R_cam,
             sure,
             sure * start.valid if self.evidence.confident else torch.ones_like(sure),
-            believed_contact(aligned, self.evidence.max_contact_speed).double(),
+            _believed_contact(aligned, self.evidence.max_contact_speed).double(),
             SuitSteps(
                 (heading @ aligned.t_world_root.double().diff(dim=0)[..., None])[..., 0], turns(root), turns(head)
             ),
@@ -260,7 +260,7 @@ def turns(R_world_body: Float[Tensor, "time 3 3"]) -> Float[Tensor, "pair 3 3"]:
     return R_world_body[1:] @ R_world_body[:-1].mT
 
 
-def believed_contact(suit: Motion, max_speed: float | None) -> Bool[Tensor, "time patch"]:
+def _believed_contact(suit: Motion, max_speed: float | None) -> Bool[Tensor, "time patch"]:
     """The suit's contact flags, without those of patches that move faster than `max_speed` (m/s) in the suit's motion.
 
     Raises WearcapError when there are no flags, or not one per frame.

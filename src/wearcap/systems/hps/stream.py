@@ -61,7 +61,7 @@ class StreamSettings:
     """Weight of a final frame's position, relative to a localised frame's (1)."""
 
 
-def suit_fault(suit: object, like: Motion | None) -> str | None:
+def _suit_fault(suit: object, like: Motion | None) -> str | None:
     """Reason to refuse a piece of a suit's motion, None for a good one; it must match an earlier good piece `like`."""
     if not isinstance(suit, Motion) or not isinstance(suit.timestamps, Tensor) or suit.timestamps.ndim != 1:
         return WRONG_TYPE
@@ -84,7 +84,7 @@ def suit_fault(suit: object, like: Motion | None) -> str | None:
     return fault
 
 
-def localization_fault(seen: object, suit: Motion) -> str | None:
+def _localization_fault(seen: object, suit: Motion) -> str | None:
     """Reason to refuse a piece's camera poses, None for good ones; poses of confidence 0 are not checked."""
     if not isinstance(seen, Localization) or not isinstance(seen.timestamps, Tensor):
         return WRONG_TYPE
@@ -185,7 +185,7 @@ class HpsStream:
 
         When a new stretch begins, the remaining frames of the previous one are returned.
         """
-        fault = suit_fault(suit, self._like)
+        fault = _suit_fault(suit, self._like)
         if fault is not None:
             self.refused[f"suit: {fault}"] += 1
             return None
@@ -223,7 +223,7 @@ class HpsStream:
         """The localisation of a piece, or None if it is unusable."""
         if localization is None:
             return None
-        if fault := localization_fault(localization, suit):
+        if fault := _localization_fault(localization, suit):
             self.refused[f"localization: {fault}"] += 1
             return None
         assert isinstance(localization, Localization)

@@ -11,7 +11,7 @@ from wearcap.systems.ireplica.contact_transformer import REACH, ContactNetwork
 _HANDS = 2
 
 
-class GatedBlock(nn.Module):
+class _GatedBlock(nn.Module):
     """Residual block: dilated depthwise convolution without padding (time shrinks), then a gated linear unit."""
 
     def __init__(self, width: int, taps: int, dilation: int, dropout: float):
@@ -58,7 +58,7 @@ class ContactSequence(ContactNetwork):
         derived = inputs // _HANDS * (1 + len(self.strides))
         self.normalizer = Normalizer(derived)
         self.widen = nn.Linear(derived, width)
-        self.blocks = nn.ModuleList(GatedBlock(width, taps, dilation, dropout) for dilation in dilations)
+        self.blocks = nn.ModuleList(_GatedBlock(width, taps, dilation, dropout) for dilation in dilations)
         self.norm = nn.LayerNorm(width)
         self.head = nn.Linear(width, classes)
         reach = max(self.strides) + sum(block.reach for block in self.blocks)

@@ -162,7 +162,7 @@ def _chamfer(
     for name, start, stop in rows:
         times = torch.arange(start, stop, CHAMFER_EVERY_S, dtype=torch.float64)
         frames = torch.searchsorted(motion.timestamps, times).clamp(max=len(motion) - 1).tolist()
-        surface = surface_points(environment.by_name(name))
+        surface = _surface_points(environment.by_name(name))
         for frame in frames:
             bodies = [_thinned(body.vertices(m.T_world_joint[frame]).numpy()) for m in (motion, true)]
             errors[0].append(_both_ways(*bodies))
@@ -170,7 +170,7 @@ def _chamfer(
     return tuple(float(np.mean(part)) if part else float("nan") for part in errors)  # pyright: ignore[reportReturnType]
 
 
-def surface_points(scene_object: SceneObject) -> Float[Tensor, "point 3"]:
+def _surface_points(scene_object: SceneObject) -> Float[Tensor, "point 3"]:
     """`CHAMFER_POINTS` points, uniform by area on an object's surface (without faces: its vertices); a fixed seed."""
     vertices, faces = scene_object.mesh.vertices, scene_object.mesh.faces
     rng = np.random.default_rng(0)
