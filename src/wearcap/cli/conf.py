@@ -162,7 +162,8 @@ def _missing_choice(error: MissingConfigException) -> WearcapError:
     if not group:
         roots = [path.stem for path in conf_dir().glob("*.yaml")]
         return WearcapError(f"no config {choice!r}", where=conf_dir(), fix=nearest(choice, roots))
-    options = error.options or [path.stem for path in (conf_dir() / group).glob("*.yaml")]
+    folder = conf_dir() / group
+    options = sorted(path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.yaml"))
     if not options:
         return WearcapError(f"no config group {group!r}", fix=nearest(group, _groups()))
     return WearcapError(f"no choice {choice!r} in config group {group!r}", fix=nearest(choice, options))
