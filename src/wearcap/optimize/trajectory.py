@@ -32,7 +32,7 @@ class Bending:
     """λ: metres of the control term per unit of E_tr (rad²/s, or rad for "absolute")."""
     norm: str = "square"
     """Penalty on the difference of heading rates, which eq. 5.1 does not print: ∫ (dα̂/dτ − dα/dτ)² dτ, or ∫ |…| dτ."""
-    loss: Loss = field(default_factory=Loss)
+    loss: Loss = field(default_factory=lambda: Loss("norm"))
     """Loss of a control point's distance: the thesis's norm; "huber", or "cauchy" for bursts of wrong points (ours)."""
     free_start: bool = False
     """Whether the first point is an unknown too, so that the whole path may shift."""
