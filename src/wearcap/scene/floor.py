@@ -311,9 +311,9 @@ class FloorFollow:
         # The rise of the floor (m) within a frame follows from the head's smoothed height (Holt's linear trend).
         rise, (low, high) = [], self.WALKING_M_S
         for head in t_world_head.detach().cpu().double().numpy():
-            if self._head is None:
-                self._head, self._level = head, float(head[2])
-            velocity = (head[:2] - self._head[:2]) * self._fps
+            if (last := self._head) is None:
+                last, self._level = head, float(head[2])
+            velocity = (head[:2] - last[:2]) * self._fps
             self._velocity += self.LEVEL * (velocity - self._velocity)
             self._head = head
             before, innovation = self._level, float(head[2]) - self._level - self._trend

@@ -203,6 +203,7 @@ def build_interactive_flat(rng: np.random.Generator, name: str) -> InteractiveFl
     while True:
         draws = np.random.default_rng(rng.integers(2**63))
         builder = _Builder.drawn(name, draws)
+        assert isinstance(builder, _Builder)
         builder.rng = draws
         lay_out(builder, draws, stairs=False, furnish=_furnish)
         static = builder.finish()

@@ -117,7 +117,7 @@ class EchoStream(WearerStream):
         self._track = HeadTrack(pipeline.fps, 1)
         self._track.dropped = dropped
         self._chunks: list[Chunk] = []
-        self._queue: EchoQueue | None = None
+        self._queue = None
         self._pending: list[tuple[float, Conditioning, Rigid]] = []
         """Time, conditioning and head pose of frames that were consumed but not output yet."""
         self._floor = FloorTracker(self.wearer.skeleton.height_of("head"), pipeline.fps)

@@ -1,6 +1,6 @@
 """MocapEvery's two-stage estimator (§3.3): end-effectors first, then contacts, then the body."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -37,7 +37,8 @@ class WatchEstimator(nn.Module):
 
     def graph(self, size: int) -> Graph:
         """The network as a graph of unnormalised features, `size` per frame."""
-        normalizer, random = self.feature_normalizer, torch.Generator().manual_seed(0)
+        normalizer: Any = self.feature_normalizer
+        random = torch.Generator().manual_seed(0)
         noise = torch.randn(2, self.window, size, generator=random)
         return Graph(_EstimatorOutput(self), {"features": normalizer.mean.cpu() + normalizer.scale.cpu() * noise})
 
