@@ -64,7 +64,7 @@ def measure() -> list[dict]:
 def gradients(folder: str, rank: int, world: int) -> dict[str, Tensor]:
     """Gradients of one step on this process's share of the joint batch."""
     config = compose("train", ["experiment=motion_diffusion_head", f"paths.datasets={folder}", "paths.run=unused"])
-    data: WindowsModule = instantiate(config.data)
+    data: WindowsModule = instantiate(config.data, _convert_="all")
     dataset = data.dataset("train")
     loss = WeightedLoss(instantiate(config.model)).eval()
     loss.system.set_statistics(dataset)

@@ -42,7 +42,7 @@ def measure(steps: int = 100, overrides: tuple[str, ...] = ()) -> list[dict]:
         )
         torch.manual_seed(0)
         turns = _TakeTurns(_hand_written(config))
-        system, data = instantiate(config.model), instantiate(config.data)
+        system, data = instantiate(config.model), instantiate(config.data, _convert_="all")
         system.set_statistics(data.dataset("train"))
         trainer = lightning.Trainer(
             accelerator="cpu",
@@ -92,7 +92,7 @@ class _TakeTurns(Callback):
 def _hand_written(config: DictConfig) -> Iterator[float]:
     """The loop one would write without Lightning; yields the loss once per step."""
     system: MotionDiffusion = instantiate(config.model)
-    data = instantiate(config.data)
+    data = instantiate(config.data, _convert_="all")
     data.setup("fit")
     system.set_statistics(data.dataset("train"))
     weights = system.loss_weights

@@ -88,7 +88,7 @@ def test_onnx_runtime_agrees_with_eager():
 
 def worst_of_compiled(device: str) -> float:
     """In its own process: the tests' shape checks cannot be compiled."""
-    program = f"from test_echo_model import worst_of; print(worst_of('compile', {device!r}))"
+    program = f"from test_echo_runtime import worst_of; print(worst_of('compile', {device!r}))"
     here = Path(__file__).parent
     paths = os.pathsep.join([str(here), str(here.parent)])
     # Compiled in that process itself: others that help would have to import PyTorch first.

@@ -17,7 +17,7 @@ from wearcap.optimize.adam_windows import AdamSettings, solve_adam_windows
 from wearcap.optimize.banded import BandedSettings, Stretch, _spans, solve_banded, solve_in_stretches
 from wearcap.optimize.banded_kernels import LEGS
 from wearcap.optimize.costs import Loss
-from wearcap.optimize.hps import TERMS, FootPatches, HpsData, HpsEnergy, HpsState, Term, energy_terms
+from wearcap.optimize.hps import TERMS, FootPatches, HpsData, HpsEnergy, HpsState, SuitSteps, Term, energy_terms
 
 MIXED = {
     "hold": Loss("cauchy", 0.05),
@@ -58,9 +58,11 @@ def still_data(length: int = 8, noise: float = 0.0, seed: int = 0) -> HpsData:
         one,
         one.clone(),
         torch.ones(length, 4, dtype=torch.float64),
-        randn(length - 1, 3, scale=noise),
-        rotation.exp(randn(length - 1, 3, scale=noise)),
-        rotation.exp(randn(length - 1, 3, scale=noise)),
+        SuitSteps(
+            randn(length - 1, 3, scale=noise),
+            rotation.exp(randn(length - 1, 3, scale=noise)),
+            rotation.exp(randn(length - 1, 3, scale=noise)),
+        ),
         SurfaceIndex.build(floor.astype(np.float32)),
     )
 
@@ -212,9 +214,11 @@ def planted() -> tuple[HpsData, HpsState]:
         data.cam_confidence,
         data.hold_confidence,
         data.contact,
-        torch.zeros(39, 3, dtype=torch.float64),
-        torch.eye(3, dtype=torch.float64).expand(39, 3, 3).clone(),
-        torch.eye(3, dtype=torch.float64).expand(39, 3, 3).clone(),
+        SuitSteps(
+            torch.zeros(39, 3, dtype=torch.float64),
+            torch.eye(3, dtype=torch.float64).expand(39, 3, 3).clone(),
+            torch.eye(3, dtype=torch.float64).expand(39, 3, 3).clone(),
+        ),
         data.surface,
     )
     return exact, truth

@@ -89,7 +89,9 @@ def test_planted_errors_of_suit_and_clock_go():
     clock = pipeline.synchronize(recording, Path())
     assert clock is not None
     assert clock.offset_s == pytest.approx(1.7, abs=0.002)
-    wrong_clock = PIPELINE(CaptureInput(recording, scan=Scan(floor_points())))
+    wrong_clock = replace(PIPELINE, synchronization=Synchronization("shared"))(
+        CaptureInput(recording, scan=Scan(floor_points()))
+    )
     assert root_error_m(wrong_clock, recording).mean() > 0.5
 
 

@@ -72,7 +72,7 @@ def test_a_drifting_heading_is_followed_also_while_standing():
     suit = drifting(motion, drift)
     found = localized(motion, LocalizationNoise())
     errors = {}
-    for name, settings in (("orientation", InitializationSettings()), ("tangent", PAPER)):
+    for name, settings in (("orientation", InitializationSettings(yaw_smoothing_s=10.0)), ("tangent", PAPER)):
         start = initialize(suit, found, MOUNT.R, MOUNT.t, settings)
         errors[name] = yaw_error_deg(start.motion, motion)
     assert errors["orientation"].abs().max() < 3.0

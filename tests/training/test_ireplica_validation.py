@@ -61,7 +61,7 @@ def equipped(root: Path, recording: Recording) -> Recording:
         np.zeros((0, 3), np.int32),
         np.ones(3, np.float32),
     )
-    unmoved = SceneObject("unmoved", "table", mesh, torch.eye(3), place, Freedom("plane"))
+    unmoved = SceneObject("object", "table", mesh, torch.eye(3), place, Freedom("plane"))
     write_environment(Environment((unmoved,)), root / "scene")
     (root / "scene/pointcloud.ply").touch()
     return replace(
@@ -69,7 +69,7 @@ def equipped(root: Path, recording: Recording) -> Recording:
         camera=CameraStream(times, Camera.pinhole(64, 48, 60.0), torch.eye(3), torch.zeros(3)),
         localization=Localization(times, head.R, head.t, torch.ones(len(times))),
         scene="scene/pointcloud.ply",
-        object_motion={"unmoved": Trajectory(times[[0, -1]], torch.eye(3).repeat(2, 1, 1), place.repeat(2, 1))},
+        object_motion={"object": Trajectory(times[[0, -1]], torch.eye(3).repeat(2, 1, 1), place.repeat(2, 1))},
         environment="scene/environment.json",
     )
 

@@ -423,7 +423,7 @@ def test_too_many_connections_at_work_are_answered_so(tmp_path, monkeypatch):
     page = an_annotator(tmp_path)
     going, done = threading.Barrier(3), threading.Event()
     monkeypatch.setattr(
-        annotate_server._Handler, "_get", lambda self, path: (going.wait(20), done.wait(20), self._send_json([]))
+        annotate_server._Handler, "get", lambda self, path: (going.wait(20), done.wait(20), self._send_json([]))
     )
     target = f"/recordings?token={page.guard.token}"
     threads = [threading.Thread(target=status, args=(page, target)) for _ in range(2)]
