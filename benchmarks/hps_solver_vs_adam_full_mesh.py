@@ -21,7 +21,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.surface import SurfaceIndex
 from wearcap.optimize.adam_windows import AdamSettings, solve_adam_windows
 from wearcap.optimize.banded import BandedSettings, solve_in_stretches
-from wearcap.optimize.hps import FootPatches, HpsData, HpsEnergy, HpsState, energy_terms
+from wearcap.optimize.hps import FootPatches, HpsData, HpsEnergy, HpsState, SuitSteps, energy_terms
 from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_recording
 from wearcap.systems.hps.pipeline import turns
 
@@ -97,8 +97,6 @@ def walk(duration_s: float, vertices: int | None = None, seed: int = 3) -> HpsDa
         one,
         one.clone(),
         suit.contact_prob.double(),
-        suit.t_world_root.double().diff(dim=0),
-        turns(R[:, 0]),
-        turns(head),
+        SuitSteps(suit.t_world_root.double().diff(dim=0), turns(R[:, 0]), turns(head)),
         SurfaceIndex.build(floor.astype(np.float32)),
     )
