@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -118,37 +119,12 @@ def test_steps_have_no_level_floor():
 
 def walking_bvh(path: Path) -> None:
     """A small upright figure in centimetres, 30 frames at 60 Hz."""
-    joints = [
-        "Hips",
-        "Spine",
-        "Neck",
-        "Head",
-        "LeftArm",
-        "LeftForeArm",
-        "LeftHand",
-        "RightArm",
-        "RightForeArm",
-        "RightHand",
-        "LeftUpLeg",
-        "LeftLeg",
-        "LeftFoot",
-        "RightUpLeg",
-        "RightLeg",
-        "RightFoot",
-    ]
+    names = "Hips Spine Neck Head LeftArm LeftForeArm LeftHand RightArm RightForeArm RightHand"
+    joints = f"{names} LeftUpLeg LeftLeg LeftFoot RightUpLeg RightLeg RightFoot".split()
     offsets = {"Spine": (0, 15, 0), "Neck": (0, 35, 0), "Head": (0, 12, 0), "Arm": (18, 30, 0), "ForeArm": (28, 0, 0),
                "Hand": (25, 0, 0), "UpLeg": (9, 0, 0), "Leg": (0, -42, 0), "Foot": (0, -42, 0)}  # fmt: skip
-    parents = {
-        "Spine": "Hips",
-        "Neck": "Spine",
-        "Head": "Neck",
-        "Arm": "Spine",
-        "ForeArm": "Arm",
-        "Hand": "ForeArm",
-        "UpLeg": "Hips",
-        "Leg": "UpLeg",
-        "Foot": "Leg",
-    }
+    chains = ("Hips Spine Neck Head", "Spine Arm ForeArm Hand", "Hips UpLeg Leg Foot")
+    parents = {child: parent for chain in chains for parent, child in pairwise(chain.split())}
     ends = {"Head": (0, 18, 0), "Hand": (15, 0, 0), "Foot": (0, -6, 18)}
 
     def bare(name: str) -> str:
