@@ -2,17 +2,16 @@
 
 import difflib
 from collections.abc import Iterable
-from functools import partial
 from pathlib import Path
 
 
 class WearcapError(Exception):
-    """Something a user can mend: says what was wrong, where, what was expected, and what to do.
+    """Something a user can mend: says, in this order, what was wrong, where, what was expected, and what to do.
 
     The command line prints it without a traceback and exits with code 2.
     """
 
-    def __init__(self, what: str, *, where: str | Path | None = None, expected: str = "", fix: str = ""):
+    def __init__(self, what: str, where: str | Path | None = None, expected: str = "", fix: str = ""):
         parts = [f"{where}: {what}" if where is not None else what]
         if expected:
             parts.append(f"Expected {expected}.")
@@ -23,7 +22,7 @@ class WearcapError(Exception):
 
     def __reduce__(self):
         """Survive the trip back from a worker process."""
-        return partial(type(self), self.what, where=self.where, expected=self.expected, fix=self.fix), ()
+        return type(self), (self.what, self.where, self.expected, self.fix)
 
 
 def nearest(wrong: str, valid: Iterable[str]) -> str:

@@ -81,7 +81,7 @@ def explaining_writes(path: Path, only_about: tuple[Path, ...] | None = None) ->
             what, fix = "no permission to write here", "Choose another output folder."
         else:
             what, fix = f"cannot be written ({error.strerror or error})", ""
-        raise WearcapError(what, where=path, fix=fix) from error
+        raise WearcapError(what, path, fix=fix) from error
 
 
 def _sync_folder(folder: Path) -> None:
@@ -171,7 +171,7 @@ def parse_json(text: str | bytes, where: str | Path) -> Any:
     except RecursionError as error:
         raise _too_deep(where) from error
     except ValueError as error:  # JSONDecodeError and UnicodeDecodeError are ValueErrors
-        raise WearcapError(f"not readable JSON ({error})"[:300], where=where, expected="a whole JSON text") from error
+        raise WearcapError(f"not readable JSON ({error})"[:300], where, "a whole JSON text") from error
     level = [content]
     for _ in range(MAX_JSON_DEPTH):
         level = [
@@ -187,7 +187,7 @@ def parse_json(text: str | bytes, where: str | Path) -> Any:
 
 
 def _too_deep(where: str | Path) -> WearcapError:
-    return WearcapError("JSON that is nested too deeply", where=where, expected=f"at most {MAX_JSON_DEPTH} levels")
+    return WearcapError("JSON that is nested too deeply", where, f"at most {MAX_JSON_DEPTH} levels")
 
 
 def sha256_of(path: str | Path) -> str:

@@ -156,14 +156,14 @@ def _held_by(holder: dict[str, Any], folder: Path) -> WearcapError:
     if _has_ended(holder):
         return WearcapError(
             f"workers of a run that has ended still write here ({who})",
-            where=folder,
-            expected="one run at a time in a folder",
-            fix="Run again when they have ended, or end them.",
+            folder,
+            "one run at a time in a folder",
+            "Run again when they have ended, or end them.",
         )
     end = f"end it (kill {pid})" if host == platform.node() else f"end it on {host}"
     return WearcapError(
         f"another run writes here ({who})",
-        where=folder,
-        expected="one run at a time in a folder",
-        fix=f"Wait until it has ended, {end}, or choose another folder.",
+        folder,
+        "one run at a time in a folder",
+        f"Wait until it has ended, {end}, or choose another folder.",
     )

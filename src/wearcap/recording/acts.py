@@ -41,8 +41,8 @@ def true_acts(recording: Recording, margin_s: float = MARGIN_S) -> list[Act]:
         if len(objects) > 1:
             raise WearcapError(
                 f"{len(objects)} objects and no interactions to choose the active one",
-                where=recording.name,
-                expected="interactions, or a single object",
+                recording.name,
+                "interactions, or a single object",
             )
         times = recording.object_motion[objects[0]].timestamps
         return [Act(objects[0], times[0].item(), times[-1].item() + 1.0)]

@@ -57,9 +57,9 @@ def follow_pieces(
         elif time.monotonic() - since > patience_s:
             raise WearcapError(
                 f"no piece {number} after {patience_s:.0f} s",
-                where=folder,
-                expected=f"{_piece_path(folder, number).name}, or a file named {END!r}",
-                fix="Is the recorder still running?",
+                folder,
+                f"{_piece_path(folder, number).name}, or a file named {END!r}",
+                "Is the recorder still running?",
             )
         else:
             time.sleep(poll_s)

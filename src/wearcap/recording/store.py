@@ -88,29 +88,22 @@ class RecordingFile:
             self._file = safetensors.safe_open(str(self.path), framework="pt")
         except FileNotFoundError as error:
             if self.path.exists():  # safetensors reports unreadable files as missing
-                raise WearcapError(f"cannot be read ({error.strerror or 'no permission'})", where=self.path) from error
-            raise WearcapError("no such recording", where=self.path) from error
+                raise WearcapError(f"cannot be read ({error.strerror or 'no permission'})", self.path) from error
+            raise WearcapError("no such recording", self.path) from error
         except (safetensors.SafetensorError, OSError, RuntimeError) as error:
             raise WearcapError(
-                "not a readable recording",
-                where=path,
-                expected="a complete .safetensors file",
-                fix="Prepare this recording again.",
+                "not a readable recording", path, "a complete .safetensors file", "Prepare this recording again."
             ) from error
         metadata = self._file.metadata() or {}
         if "wearcap" not in metadata:
-            raise WearcapError(
-                "a .safetensors file, but not a recording", where=path, expected="one that `wearcap prepare` wrote"
-            )
+            raise WearcapError("a .safetensors file, but not a recording", path, "one that `wearcap prepare` wrote")
         content = parse_json(metadata["wearcap"], path)
         try:
             version, self._tree = content["schema_version"], dict(content["recording"])
         except (KeyError, TypeError, ValueError) as error:
             raise self._unreadable(error) from error
         if version != SCHEMA_VERSION:
-            raise WearcapError(
-                f"schema version {version}", where=path, expected=f"version {SCHEMA_VERSION}", fix="Prepare it again."
-            )
+            raise WearcapError(f"schema version {version}", path, f"version {SCHEMA_VERSION}", "Prepare it again.")
 
     @cached_property
     def keys(self) -> frozenset[str]:
@@ -152,15 +145,11 @@ class RecordingFile:
             raise self._unreadable(error) from error
 
     def _unreadable(self, error: Exception) -> WearcapError:
-        return WearcapError(
-            f"its description is unreadable ({error})", where=self.path, fix="Prepare this recording again."
-        )
+        return WearcapError(f"its description is unreadable ({error})", self.path, fix="Prepare this recording again.")
 
     def _require(self, key: str) -> None:
         if key not in self.keys:
-            raise WearcapError(
-                f"this recording has no {key!r}", where=self.path, expected=f"one of {', '.join(sorted(self.keys))}"
-            )
+            raise WearcapError(f"this recording has no {key!r}", self.path, f"one of {', '.join(sorted(self.keys))}")
 
 
 def _verify(path: Path) -> None:
@@ -174,19 +163,19 @@ def _verify(path: Path) -> None:
         if entry is not None and (size := path.stat().st_size) != entry.bytes:
             raise WearcapError(
                 f"{size} bytes long",
-                where=path,
-                expected=f"{entry.bytes} bytes, as the manifest says",
-                fix="It was cut short or replaced: prepare it again.",
+                path,
+                f"{entry.bytes} bytes, as the manifest says",
+                "It was cut short or replaced: prepare it again.",
             )
         if entry is not None and remembered_sha256(path) != entry.sha256:
             raise _differs(path)
     except OSError as error:
-        raise WearcapError(f"cannot be read ({error.strerror or error})", where=path) from error
+        raise WearcapError(f"cannot be read ({error.strerror or error})", path) from error
 
 
 def _differs(path: Path) -> WearcapError:
     return WearcapError(
-        "its checksum differs from the manifest's", where=path, fix="It was damaged or replaced: prepare it again."
+        "its checksum differs from the manifest's", path, fix="It was damaged or replaced: prepare it again."
     )
 
 
@@ -218,22 +207,17 @@ class RecordingStore:
         try:
             manifest = parse_json(path.read_bytes(), path)
         except OSError as error:
-            raise WearcapError(f"cannot be read ({error.strerror or error})", where=path) from error
+            raise WearcapError(f"cannot be read ({error.strerror or error})", path) from error
         version = manifest.get("schema_version") if isinstance(manifest, dict) else None
         if version != SCHEMA_VERSION:
             raise WearcapError(
-                f"schema version {str(version)[:40]}",
-                where=path,
-                expected=f"version {SCHEMA_VERSION}",
-                fix="Prepare the data set again.",
+                f"schema version {str(version)[:40]}", path, f"version {SCHEMA_VERSION}", "Prepare the data set again."
             )
         try:
             self.entries |= {name: self._entry(name, entry) for name, entry in manifest["recordings"].items()}
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise WearcapError(
-                f"not a readable manifest ({str(error)[:200]})",
-                where=path,
-                fix="Delete it and prepare the data set again.",
+                f"not a readable manifest ({str(error)[:200]})", path, fix="Delete it and prepare the data set again."
             ) from error
 
     @classmethod
@@ -241,10 +225,7 @@ class RecordingStore:
         """Open an existing data set. Raises WearcapError if there is none."""
         if not (Path(root) / MANIFEST).is_file():
             raise WearcapError(
-                "no data set here",
-                where=root,
-                expected="a folder with a manifest.json",
-                fix="Make one with `wearcap prepare`.",
+                "no data set here", root, "a folder with a manifest.json", "Make one with `wearcap prepare`."
             )
         return cls(root)
 
@@ -295,8 +276,8 @@ class RecordingStore:
         if name not in self.entries:
             raise WearcapError(
                 f"no recording {name!r}",
-                where=self.manifest_path,
-                expected=f"one of {len(self.entries)} recordings, as {self.names()[:3]}",
+                self.manifest_path,
+                f"one of {len(self.entries)} recordings, as {self.names()[:3]}",
             )
 
     def open_file(self, name: str) -> RecordingFile:
@@ -344,14 +325,12 @@ def load_recording(where: str | Path) -> Recording:
             return RecordingStore.open(path).load(names[0])
         raise WearcapError(
             f"a data set of {len(names)} recordings",
-            where=path,
-            expected=f"one of them, such as {path / names[0] if names else path / 'NAME'}",
+            path,
+            f"one of them, such as {path / names[0] if names else path / 'NAME'}",
         )
     if (path.parent / "manifest.json").is_file():
         return RecordingStore.open(path.parent).load(path.name)
-    raise WearcapError(
-        "no recording here", where=path, expected="DATASET/NAME or a .safetensors file that `wearcap prepare` wrote"
-    )
+    raise WearcapError("no recording here", path, "DATASET/NAME or a .safetensors file that `wearcap prepare` wrote")
 
 
 def dataset_folder(where: str | Path) -> Path:

@@ -40,7 +40,7 @@ def read_adt(folder: str | Path, *, fps: float | None = None, T_aria_cpf: Rigid 
     """
     folder = Path(folder)
     if not is_adt(folder):
-        raise WearcapError("no aria_trajectory.csv", where=folder, expected="an ADT sequence folder")
+        raise WearcapError("no aria_trajectory.csv", folder, "an ADT sequence folder")
     trajectory = read_closed_loop(folder / "aria_trajectory.csv", up="y")[0]
     skeletons = sorted(folder.glob("Skeleton_*.json"))
     metadata = folder / "metadata.json"
@@ -61,7 +61,7 @@ def read_skeleton(path: str | Path) -> dict[str, Cue]:
         times = np.array([frame["timestamp_ns"] for frame in frames], dtype=np.float64) * 1e-9
         joints = np.array([frame["joints"] for frame in frames], dtype=np.float64)
     if joints.ndim != 3 or joints.shape[1:] != (_JOINTS, 3):
-        raise WearcapError(f"joints of shape {joints.shape}", where=path, expected=f"(frames, {_JOINTS}, 3)")
+        raise WearcapError(f"joints of shape {joints.shape}", path, f"(frames, {_JOINTS}, 3)")
     check_finite({"joints": joints}, path)
     check_rising(times, path)
     world = torch.tensor(joints, dtype=torch.float32) @ turn_up("y").T
@@ -91,9 +91,8 @@ def read_moving_objects(folder: str | Path) -> dict[str, Trajectory]:
         if about is None or uid not in boxes:
             continue
         if not isinstance(about, dict):
-            what = f"object {name} is a {type(about).__name__}"
             expected = "its instance_name, category and motion_type"
-            raise WearcapError(what, where=folder / "instances.json", expected=expected)
+            raise WearcapError(f"object {name} is a {type(about).__name__}", folder / "instances.json", expected)
         with understood("a time is no number", path, "nanoseconds, or -1"):
             times = poses["timestamp[ns]"][rows].astype(np.float64) * 1e-9
         timeless = bool((times < 0).any())

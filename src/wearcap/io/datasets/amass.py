@@ -38,9 +38,8 @@ def read_amass(path: str | Path, t_template_pelvis: tuple[float, float, float] |
     path = Path(path)
     arrays = read_npz(path, _KEYS)
     if "poses" not in arrays and "pose_body" not in arrays:
-        what = "holds no poses"
         fix = "shape.npz files beside the motions hold none: leave them out."
-        raise WearcapError(what, where=path, expected="a motion file of AMASS (poses, trans, mocap_framerate)", fix=fix)
+        raise WearcapError("holds no poses", path, "a motion file of AMASS (poses, trans, mocap_framerate)", fix)
     fps = _rate(arrays, path)
     model = _text(arrays.get("surface_model_type")).lower()
     stageii = "pose_body" in arrays or "mocap_frame_rate" in arrays or model.startswith("smplx")
@@ -52,7 +51,7 @@ def read_amass(path: str | Path, t_template_pelvis: tuple[float, float, float] |
         require(arrays, path, trans=("time", 3), poses=("time", width))
         rotvec = arrays["poses"][:, : _SMPLX_BODY if stageii else width]
     if len(rotvec) == 0:
-        raise WearcapError("no frames", where=path)
+        raise WearcapError("no frames", path)
     skeleton = smplx22() if stageii else smplh52()
     pelvis = arrays["trans"].astype(np.float64) + (t_template_pelvis or (PELVIS_SMPLX if stageii else PELVIS_SMPLH))
     times = torch.arange(len(rotvec), dtype=torch.float64) / fps
@@ -82,10 +81,9 @@ def write_amass(
     target = smplh52()
     if set(motion.skeleton.joint_names[:22]) != set(target.joint_names[:22]):
         what = f"a motion of skeleton {motion.skeleton.name!r}"
-        expected = "one of SMPL's skeletons"
-        raise WearcapError(what, where=path, expected=expected, fix='Retarget it to "smplh52" first (body.retarget).')
+        raise WearcapError(what, path, "one of SMPL's skeletons", 'Retarget it to "smplh52" first (body.retarget).')
     if not (motion.R_parent_joint.isfinite().all() and motion.t_world_root.isfinite().all()):
-        raise WearcapError("the motion holds NaN or infinite values", where=path, expected="finite poses")
+        raise WearcapError("the motion holds NaN or infinite values", path, "finite poses")
     frames, fps = even_frames(motion)
     source = motion.R_parent_joint[frames].double()
     R = torch.eye(3, dtype=torch.float64).repeat(len(frames), len(target), 1, 1)
@@ -111,10 +109,10 @@ def write_amass(
 def _rate(arrays: dict[str, np.ndarray], path: Path) -> float:
     found = [arrays[key] for key in _RATES if key in arrays]
     if not found or found[0].size != 1 or not np.issubdtype(found[0].dtype, np.number):
-        raise WearcapError("no frame rate", where=path, expected="mocap_framerate or mocap_frame_rate, one number")
+        raise WearcapError("no frame rate", path, "mocap_framerate or mocap_frame_rate, one number")
     fps = float(found[0].reshape(-1)[0].real)
     if not (np.isfinite(fps) and 0 < fps < 1e5):
-        raise WearcapError(f"a frame rate of {fps} Hz", where=path, expected="a positive number")
+        raise WearcapError(f"a frame rate of {fps} Hz", path, "a positive number")
     return nominal_fps(fps)
 
 

@@ -52,9 +52,8 @@ def behave_folder(root: str | Path) -> Path:
     """The folder of sequences. Raises WearcapError where there is none with fits at 30 frames per second."""
     found = [Path(root) / name for name in _FOLDERS if _names(Path(root) / name)]
     if not found:
-        what = "no sequences"
         fix = "Give BEHAVE's folder as source=DIR, with the parameters of all frames (30 fps) in it."
-        raise WearcapError(what, where=root, expected=f"sequences/NAME/{BODY_FILE} and {OBJECT_FILE}", fix=fix)
+        raise WearcapError("no sequences", root, f"sequences/NAME/{BODY_FILE} and {OBJECT_FILE}", fix)
     return found[0]
 
 
@@ -74,30 +73,28 @@ def read_behave(root: str | Path, name: str) -> OneObject:
     different frames, times that are not 1/30 s apart, and for the mesh what `check_object_mesh` refuses.
     """
     if name not in behave_names(root):
-        raise WearcapError(f"no sequence {name!r}", where=root, expected=f"sequences/{name}/{BODY_FILE}")
+        raise WearcapError(f"no sequence {name!r}", root, f"sequences/{name}/{BODY_FILE}")
     folder, parts = behave_folder(root) / name, name.split("_")
     if len(parts) < 3:
         expected = "a folder DATE_SUBJECT_OBJECT, such as Date01_Sub01_boxlarge_hand"
-        raise WearcapError("not named as BEHAVE's are", where=folder, expected=expected)
+        raise WearcapError("not named as BEHAVE's are", folder, expected)
     body = read_npz(folder / BODY_FILE, ("poses", "trans", "betas", "frame_times"))
     fitted = read_npz(folder / OBJECT_FILE, ("angles", "trans", "frame_times"))
     frames = require(body, folder / BODY_FILE, poses=("time", 156), trans=("time", 3))["time"]
     require(fitted, folder / OBJECT_FILE, angles=("time", 3), trans=("time", 3))
     # Times (s) of the object's frames, which must equal the body's
     if not frames:
-        raise WearcapError("no frames", where=folder / BODY_FILE, expected="poses of at least one frame")
+        raise WearcapError("no frames", folder / BODY_FILE, "poses of at least one frame")
     if len(fitted["angles"]) != frames:
         what = f"the object has {len(fitted['angles'])} frames, the body {frames}"
-        expected = f"as many in {OBJECT_FILE} as in {BODY_FILE}"
-        raise WearcapError(what, where=folder, expected=expected, fix="Fetch both files again.")
+        raise WearcapError(what, folder, f"as many in {OBJECT_FILE} as in {BODY_FILE}", "Fetch both files again.")
     times = _times(fitted, folder / OBJECT_FILE, frames)
     if "frame_times" in body:
         other = _times(body, folder / BODY_FILE, frames)
         apart = np.flatnonzero(other != times)
         if len(apart):
             what = f"the body's frame {apart[0]} is of {other[apart[0]]:.3f} s, the object's of {times[apart[0]]:.3f} s"
-            expected = "the same frame_times in both files"
-            raise WearcapError(what, where=folder, expected=expected, fix="Fetch both files again.")
+            raise WearcapError(what, folder, "the same frame_times in both files", "Fetch both files again.")
     times = torch.from_numpy(times)
     object_name, gender = _about(read_json(folder / INFO_FILE), folder / INFO_FILE)
     pelvis, about = body["trans"].astype(np.float64) + PELVIS_SMPLH, {"source": name, "format": "behave"}
@@ -124,12 +121,11 @@ def read_behave_mesh(root: str | Path, object_name: str) -> Mesh:
     Raises WearcapError where it is missing, and for what `check_object_mesh` refuses.
     """
     if not re.fullmatch(r"[\w-]{1,64}", object_name):
-        what = f"an object named {object_name[:60]!r}"
-        raise WearcapError(what, where=root, expected="one of BEHAVE's names, as boxlarge")
+        raise WearcapError(f"an object named {object_name[:60]!r}", root, "one of BEHAVE's names, as boxlarge")
     path = Path(root) / "objects" / object_name / _REGISTERED.get(object_name, f"{object_name}_f1000.ply")
     if not path.is_file():
         fix = "Unpack BEHAVE's objects.zip beside the sequences."
-        raise WearcapError(f"no mesh of {object_name}", where=path, expected="objects/OBJECT/OBJECT_f1000.ply", fix=fix)
+        raise WearcapError(f"no mesh of {object_name}", path, "objects/OBJECT/OBJECT_f1000.ply", fix)
     mesh = read_ply(path).mesh
     if len(mesh.vertices):
         mesh, _ = centered(mesh)
@@ -142,18 +138,18 @@ def _times(arrays: dict[str, np.ndarray], path: Path, frames: int) -> Float64[np
     stamps = arrays.get("frame_times")
     if stamps is None or stamps.shape != (frames,) or stamps.dtype.kind not in "US":
         what = f"frame_times is {'missing' if stamps is None else f'{stamps.dtype} {stamps.shape}'}"
-        raise WearcapError(what, where=path, expected=f'{frames} texts such as "t0003.033" (s)')
+        raise WearcapError(what, path, f'{frames} texts such as "t0003.033" (s)')
     texts = [text.decode("latin-1") if isinstance(text, bytes) else str(text) for text in stamps]
     with understood("frame_times cannot be read", path, 'texts such as "t0003.033" (s)'):
         seconds = np.array([float(text.removeprefix("t")) for text in texts])
     if not (np.abs(seconds) < 1e6).all():
-        raise WearcapError("frame_times holds NaN or infinity", where=path, expected="seconds")
+        raise WearcapError("frame_times holds NaN or infinity", path, "seconds")
     grid = np.rint(seconds * FPS)
     step = float(np.median(np.diff(grid))) if frames > 1 else 1.0
     if np.abs(seconds * FPS - grid).max() > _OFF_GRID or step != 1.0:
         rate = 1 / max(float(np.median(np.abs(np.diff(seconds)))), 1e-6) if frames > 1 else 0.0
         fix = "Use the release of all frames (30 fps), not the one of one frame per second."
-        raise WearcapError(f"frames come at {rate:.4g} per second", where=path, expected=f"{FPS} per second", fix=fix)
+        raise WearcapError(f"frames come at {rate:.4g} per second", path, f"{FPS} per second", fix)
     check_rising(grid / FPS, path)
     return grid / FPS
 
@@ -161,7 +157,7 @@ def _times(arrays: dict[str, np.ndarray], path: Path, frames: int) -> Float64[np
 def _about(info: Any, path: Path) -> tuple[str, str]:
     """Name of the object and gender of the person."""
     if not isinstance(info, dict) or not isinstance(info.get("cat"), str) or not info["cat"].isidentifier():
-        raise WearcapError("does not name the object", where=path, expected='{"cat": "boxlarge", "gender": "male", …}')
+        raise WearcapError("does not name the object", path, '{"cat": "boxlarge", "gender": "male", …}')
     gender = info.get("gender")
     return info["cat"], gender if isinstance(gender, str) else ""
 

@@ -64,9 +64,8 @@ def read_egohoi(
     """
     root = Path(root)
     if name not in egohoi_names(root):
-        what = f"no sequence {name!r}"
         fix = f"There are {len(egohoi_names(root))}, such as {egohoi_names(root)[:3]}."
-        raise WearcapError(what, where=root, expected=f"smpl_motions/{name}.json.zip or .json", fix=fix)
+        raise WearcapError(f"no sequence {name!r}", root, f"smpl_motions/{name}.json.zip or .json", fix)
     packed = root / "smpl_motions" / f"{name}.json.zip"
     motion, betas = read_smpl_json(packed if packed.is_file() else packed.with_suffix(""))
     clock = LabelClock.of(name, motion.timestamps)
@@ -81,7 +80,7 @@ def read_egohoi(
             raise WearcapError(f"motion type {kind!r} of {object_id}", expected=f"one of {', '.join(MOTION_TYPES)}")
         if kind == "hinge" and annotated.hinge is None:
             what = f"{object_id} is to turn about a hinge and has none"
-            raise WearcapError(what, where=locations, expected='"hinge": [x, y, z]', fix="Give it another motion type.")
+            raise WearcapError(what, locations, '"hinge": [x, y, z]', "Give it another motion type.")
         if kind == "absent":
             continue
         item = _scene_object(object_id, annotated, root / "object_models" / f"{object_id}.ply", kind, clock.start_s)
@@ -122,12 +121,11 @@ def _object_files(root: Path, name: str, object_name: str | None) -> dict[str, t
             if len(fitting) != 1:
                 what = f"{len(fitting)} models fit the sequence {name!r}"
                 fix = f"Give its object's name: one of {', '.join(fitting or models)}."
-                raise WearcapError(what, where=root / "object_models", expected=f"{stem}.ply", fix=fix)
+                raise WearcapError(what, root / "object_models", f"{stem}.ply", fix)
             object_name = fitting[0]
         found = {object_name: (single, Path(single.name))}
     else:
-        what = "no object locations of this sequence"
-        raise WearcapError(what, where=single, expected=f"this file, or a folder {several}")
+        raise WearcapError("no object locations of this sequence", single, f"this file, or a folder {several}")
     return {
         object_id: (path, next((place for folder in _CONTACTS if (place := root / folder / labels).is_file()), None))
         for object_id, (path, labels) in found.items()
@@ -165,10 +163,10 @@ def _scene_object(
 ) -> SceneObject:
     """SceneObject at its last annotated pose before `start_s`, else its first. Raises WearcapError without its model."""
     if not Path(model).is_file():
-        raise WearcapError(f"no model of {name}", where=model, expected="object_models/OBJECT.ply")
+        raise WearcapError(f"no model of {name}", model, "object_models/OBJECT.ply")
     mesh = read_ply(model).mesh
     if not len(mesh.vertices):
-        raise WearcapError("an empty model", where=model, expected="at least one point")
+        raise WearcapError("an empty model", model, "at least one point")
     mesh = replace(mesh, vertices=(mesh.vertices.astype(np.float64) - annotated.center).astype(np.float32))
     kind = {"hinge": "hinge", "along_floor": "plane", "free": "free"}[motion_type]
     freedom = Freedom(kind, annotated.hinge if motion_type == "hinge" else None)
@@ -186,20 +184,18 @@ def read_egohoi_contacts(path: str | Path, clock: LabelClock, object_name: str, 
     content = read_json(path)
     rows = content.get("interactions") if isinstance(content, dict) else None
     if not isinstance(rows, list):
-        raise WearcapError("no contact labels", where=path, expected='{"interactions": [{"start", "end", "parts"}]}')
+        raise WearcapError("no contact labels", path, '{"interactions": [{"start", "end", "parts"}]}')
     parts: dict[str, list[list[Any]]] = {f"{hand}_hand": [] for hand in HANDS}
     for number, row in enumerate(rows):
         if not isinstance(row, dict) or not isinstance(row.get("parts"), list):
-            expected = '{"start", "end", "parts"}'
-            raise WearcapError(f"interaction {number} is {row!r}"[:200], where=path, expected=expected)
+            raise WearcapError(f"interaction {number} is {row!r}"[:200], path, '{"start", "end", "parts"}')
         start, end = row.get("start"), row.get("end")
         if isinstance(start, int | float) and isinstance(end, int | float) and end < start:
             what = f"interaction {number} ends before it starts: {start} to {end} s"
-            expected = "start < end"
-            raise WearcapError(what, where=path, expected=expected, fix="Exchange the two, if that is what was meant.")
+            raise WearcapError(what, path, "start < end", "Exchange the two, if that is what was meant.")
         for part in row["parts"]:
             if part not in parts:
-                raise WearcapError(f"interaction {number} is with {part!r}", where=path, expected=" or ".join(parts))
+                raise WearcapError(f"interaction {number} is with {part!r}", path, " or ".join(parts))
             parts[part].append([start, end])
     named = {
         key: {hand: [text] * len(spans) for hand, spans in parts.items()}

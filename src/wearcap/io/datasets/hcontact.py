@@ -53,7 +53,7 @@ def read_smpl_json(path: str | Path) -> tuple[Motion, dict[str, float]]:
                 info for info in archive.infolist() if not info.is_dir() and not info.filename.startswith("__MACOSX")
             ]
             if len(members) != 1:
-                raise WearcapError(f"an archive of {len(members)} files", where=path, expected="one JSON file")
+                raise WearcapError(f"an archive of {len(members)} files", path, "one JSON file")
             with archive.open(members[0]) as file, counted(file, budget) as reader:
                 content = parse_json(reader.read(), path)
     else:
@@ -67,8 +67,7 @@ def read_smpl_json(path: str | Path) -> tuple[Motion, dict[str, float]]:
     require(arrays, path, time=("frame", 1), **{name: ("frame", _SIZES[name]) for name in arrays if name != "time"})
     body, hands = arrays["body_pose"], [arrays[name] for name in _HANDS if name in arrays]
     if body.shape[1] not in (_BODY, _BODY + 6) or len(hands) == 1:
-        what = f"poses of {body.shape[1]} numbers with {', '.join(arrays)}"
-        raise WearcapError(what, where=path, expected=_EXPECTED)
+        raise WearcapError(f"poses of {body.shape[1]} numbers with {', '.join(arrays)}", path, _EXPECTED)
     check_rising(arrays["time"][:, 0], path)
     parts = [body[:, :_BODY], *hands] if hands else [body, np.zeros((len(body), _BODY + 6 - body.shape[1]))]
     rotvec = np.concatenate([arrays["global_orient"], *parts], 1)
@@ -80,7 +79,7 @@ def read_smpl_json(path: str | Path) -> tuple[Motion, dict[str, float]]:
     with understood("betas are no numbers", path):
         betas = np.array(about.get("betas") or [], np.float64).reshape(-1)
     if not np.isfinite(betas).all() or len(betas) > 300:
-        raise WearcapError(f"{len(betas)} betas, or some that are not finite", where=path, expected="10 numbers")
+        raise WearcapError(f"{len(betas)} betas, or some that are not finite", path, "10 numbers")
     return motion, shape_from_betas(betas)
 
 
@@ -88,13 +87,13 @@ def _frames(content: Any, path: Path) -> tuple[list[dict], dict]:
     """Frames in the newer layout, and the content that applies to all of them."""
     sequence = content.get("sequence") if isinstance(content, dict) else content
     if not isinstance(sequence, list) or not sequence or not all(isinstance(frame, dict) for frame in sequence):
-        raise WearcapError("no poses", where=path, expected=_EXPECTED)
+        raise WearcapError("no poses", path, _EXPECTED)
     about = content.get("global", {}) if isinstance(content, dict) else {"betas": sequence[0].get("shape", [])}
     if "pose" in sequence[0]:
         for number, frame in enumerate(sequence):
             pose = frame.get("pose")
             if not isinstance(pose, list) or len(pose) != 72:
-                raise WearcapError(f"frame {number} has no pose of 72 numbers", where=path, expected=_EXPECTED)
+                raise WearcapError(f"frame {number} has no pose of 72 numbers", path, _EXPECTED)
             newer = {"time": frame.get("time"), "global_orient": pose[:3], "body_pose": pose[3:]}
             sequence[number] = newer | ({"transl": frame["translation"]} if "translation" in frame else {})
     return sequence, about if isinstance(about, dict) else {}
@@ -130,7 +129,7 @@ def read_hcontact(root: str | Path, name: str, contact_class: str = "") -> Recor
     root = Path(root)
     if name not in hcontact_names(root):
         fix = f"There are {len(hcontact_names(root))}, such as {hcontact_names(root)[:3]}."
-        raise WearcapError(f"no sequence {name!r}", where=root, expected=f"body/{name}{ENDING}", fix=fix)
+        raise WearcapError(f"no sequence {name!r}", root, f"body/{name}{ENDING}", fix)
     motion, shape = read_smpl_json(root / "body" / f"{name}{ENDING}")
     clock = LabelClock.of(name, motion.timestamps)
     contacts = read_contact_labels(root / "contacts" / f"{name}.json", clock)
@@ -170,5 +169,5 @@ def read_hcontact_split(path: str | Path) -> _HContactSplit:
     sound = sound and all(type(k) is int and 0 <= k < 1 << 40 for windows in frames for k in windows)
     if not sound:
         expected = '{"window_radius": 30, "train": [frame, …], "valid": […], "test": […]}'
-        raise WearcapError("not a split of windows", where=path, expected=expected)
+        raise WearcapError("not a split of windows", path, expected)
     return _HContactSplit(radius, *map(tuple, lists))

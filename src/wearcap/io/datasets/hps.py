@@ -66,11 +66,11 @@ def read_hps_motion(path: str | Path, t_template_pelvis: tuple[float, float, flo
     """
     content = read_pickle(path)
     if not isinstance(content, dict):
-        raise WearcapError(f"it holds a {type(content).__name__}", where=path, expected="a dict of poses and transes")
+        raise WearcapError(f"it holds a {type(content).__name__}", path, "a dict of poses and transes")
     arrays = {key: np.asarray(content[key]) for key in ("poses", "transes") if key in content}
     sizes = require(arrays, path, poses=("time", 72), transes=("time", 3))
     if not sizes["time"]:
-        raise WearcapError("no frames", where=path)
+        raise WearcapError("no frames", path)
     times, pelvis = torch.arange(sizes["time"], dtype=torch.float64) / FPS, arrays["transes"].astype(np.float64)
     about = {"source": Path(path).name, "format": "hps"}
     return smpl_motion(times, smpl24(), arrays["poses"], pelvis + t_template_pelvis, **about)
@@ -86,7 +86,7 @@ def read_hps_subject(path: str | Path) -> tuple[dict[str, float], dict[str, str]
         betas = np.asarray(content["betas"], np.float64).reshape(-1)
         heel_m = float(content.get("root_to_heel", 0.0))
     if not (0 < len(betas) <= 300 and np.isfinite(betas).all() and np.isfinite(heel_m)):
-        raise WearcapError(f"{len(betas)} betas, or some that are not finite", where=path, expected="10 numbers")
+        raise WearcapError(f"{len(betas)} betas, or some that are not finite", path, "10 numbers")
     about = {"gender": str(content.get("gender", "neutral")), "root_to_heel_m": f"{heel_m:.4f}"}
     return shape_from_betas(betas.tolist()), about
 
@@ -96,7 +96,7 @@ def read_hps_starts(path: str | Path) -> tuple[int, int]:
     content = read_json_object(path)
     starts = [content.get(key) for key in ("cam_start", "imu_start")]
     if not all(isinstance(start, int | float) and 0 <= start <= MAX_FRAMES for start in starts):
-        raise WearcapError(f"starts {starts}", where=path, expected='{"cam_start": frame, "imu_start": frame}, from 0')
+        raise WearcapError(f"starts {starts}", path, '{"cam_start": frame, "imu_start": frame}, from 0')
     return int(starts[0]), int(starts[1])  # pyright: ignore[reportArgumentType]
 
 
@@ -109,10 +109,10 @@ def read_hps_localization(path: str | Path, fps: float | int = FPS) -> Localizat
     rows = read_json_object(path)
     for key in rows:
         if not (key.isascii() and key.isdigit() and len(key) < 20 and int(key) < MAX_FRAMES):
-            raise WearcapError(f"frame {key[:30]!r}", where=path, expected="frame numbers from 0 as keys")
+            raise WearcapError(f"frame {key[:30]!r}", path, "frame numbers from 0 as keys")
     frames = {key: int(key) for key in rows}
     if len(set(frames.values())) < len(frames):
-        raise WearcapError("a frame is there twice", where=path)
+        raise WearcapError("a frame is there twice", path)
     count = max(frames.values(), default=-1) + 1
     quat_wxyz, position = np.tile([1.0, 0, 0, 0], (count, 1)), np.zeros((count, 3))
     confidence = torch.zeros(count)
@@ -121,7 +121,7 @@ def read_hps_localization(path: str | Path, fps: float | int = FPS) -> Localizat
             quat_wxyz[frame], position[frame] = _read_hps_pose(rows[key], f"{path}, frame {key}")
             confidence[frame] = 1.0
     if not confidence.any():
-        raise WearcapError("no frame has a pose", where=path, expected="poses of some frames, null for the others")
+        raise WearcapError("no frame has a pose", path, "poses of some frames, null for the others")
     return Localization(
         torch.arange(count, dtype=torch.float64) / fps,
         rotation.matrix_from_quat_wxyz(torch.from_numpy(quat_wxyz)).float(),
@@ -137,7 +137,7 @@ def _read_hps_pose(row: Any, where: str) -> tuple[np.ndarray, np.ndarray]:
         position = np.asarray(row["position"], np.float64).reshape(3)
     if not (np.abs(position) < 1e6).all() or not abs(np.linalg.norm(quat_wxyz) - 1) < NORM_TOLERANCE:
         what = f"position {position.tolist()}, quaternion {quat_wxyz.tolist()}"
-        raise WearcapError(what, where=where, expected="metres, and a quaternion of length 1")
+        raise WearcapError(what, where, "metres, and a quaternion of length 1")
     return quat_wxyz, position
 
 
@@ -210,17 +210,17 @@ def read_hps_scene(folder: str | Path) -> tuple[Path, list[Photo]]:
     """
     folder = Path(folder)
     if folder.suffix == ".zip":
-        raise WearcapError("a packed scan", where=folder, expected="its folder", fix="Unzip it first.")
+        raise WearcapError("a packed scan", folder, "its folder", "Unzip it first.")
     for part in (CLOUD, CALIBRATION, "cam", "info"):
         if not (folder / part).exists():
-            raise WearcapError(f"no {part}", where=folder, expected=f"a scan with {CLOUD}, {CALIBRATION}, cam/, info/")
+            raise WearcapError(f"no {part}", folder, f"a scan with {CLOUD}, {CALIBRATION}, cam/, info/")
     cameras = {
         name: model.camera(f"{folder / CALIBRATION}, camera {name!r}")
         for name, model in read_sensor_frame(folder / CALIBRATION).items()
     }
     named = [(match, path) for path in sorted((folder / "cam").iterdir()) if (match := _PHOTO.fullmatch(path.name))]
     if not named:
-        raise WearcapError("no pictures", where=folder / "cam", expected="files such as 00000-cam0.jpg")
+        raise WearcapError("no pictures", folder / "cam", "files such as 00000-cam0.jpg")
     photos, info, info_path = [], {}, None
     for match, path in named:
         frame, name = match.groups()
@@ -228,9 +228,9 @@ def read_hps_scene(folder: str | Path) -> tuple[Path, list[Photo]]:
             info_path = folder / "info" / f"{frame}-info.json"
             info = read_json(info_path)
         if not isinstance(info, dict) or name not in info:
-            raise WearcapError(f"no pose of {name}", where=info_path, expected=f"one for {path.name}")
+            raise WearcapError(f"no pose of {name}", info_path, f"one for {path.name}")
         if name not in cameras:
-            raise WearcapError(f"no intrinsics of {name}", where=folder / CALIBRATION, expected=f"one for {path.name}")
+            raise WearcapError(f"no intrinsics of {name}", folder / CALIBRATION, f"one for {path.name}")
         if str(info.get("valid", "true")).lower() == "false":
             continue
         quat_wxyz, position = _read_hps_pose(info[name], f"{info_path}, {name}")
@@ -271,7 +271,7 @@ def read_unity_motion(
     trans = _table(trans_path, (3,))
     if abs(len(angles_deg) - len(trans)) > 1:
         what = f"{len(trans)} positions for {len(angles_deg)} poses"
-        raise WearcapError(what, where=trans_path, expected=f"as many lines as in {Path(pose_path).name}")
+        raise WearcapError(what, trans_path, f"as many lines as in {Path(pose_path).name}")
     count = min(len(angles_deg), len(trans))
     R_smpl = rotations_from_unity(torch.from_numpy(angles_deg[:count]).unflatten(1, (-1, 3)))
     skeleton = smpl24()
@@ -313,9 +313,9 @@ def _table(path: str | Path, widths: tuple[int, ...]) -> np.ndarray:
         try:
             values.extend(finite_floats(tokens))
         except ValueError as error:
-            raise WearcapError(str(error), where=at_line(path, number)) from error
+            raise WearcapError(str(error), at_line(path, number)) from error
     if not values:
-        raise WearcapError("no lines of numbers", where=path)
+        raise WearcapError("no lines of numbers", path)
     return np.asarray(values).reshape(-1, width)
 
 
@@ -372,13 +372,12 @@ def read_hps_sequence(root: str | Path, name: str, camera_hz: float | int = FPS)
     """
     root = Path(root)
     if not name or Path(name).name != name or escape(name) != name:
-        expected = "a plain name, such as SUB4_MPI_Etage6_working_standing"
-        raise WearcapError(f"no sequence {name!r}", where=root, expected=expected)
+        raise WearcapError(f"no sequence {name!r}", root, "a plain name, such as SUB4_MPI_Etage6_working_standing")
     motion_path = _one(root, f"*hps_smpl*/{name}.pkl")
     if motion_path is None:
         known = hps_names(root)
         expected = f"one of {len(known)}, such as {known[:3]}" if known else "hps_smpl/NAME.pkl"
-        raise WearcapError(f"no sequence {name!r}", where=root, expected=expected)
+        raise WearcapError(f"no sequence {name!r}", root, expected)
     motion = read_hps_motion(motion_path)
     subject, shape = _one(root, f"*betas*/{subject_of(name)}.json"), {}
     if subject is not None:
@@ -389,14 +388,14 @@ def read_hps_sequence(root: str | Path, name: str, camera_hz: float | int = FPS)
     starts = _one(root, f"*init*/{name}.json")
     if starts is None and (localization_path is not None or suit is not None):
         fix = "Without them its streams' clocks are unknown."
-        raise WearcapError(f"no starts of sequence {name!r}", where=root, expected=f"hps_inits/{name}.json", fix=fix)
+        raise WearcapError(f"no starts of sequence {name!r}", root, f"hps_inits/{name}.json", fix)
     cam_start, imu_start = (0, 0) if starts is None else read_hps_starts(starts)
     localization = None
     if localization_path is not None:
         localization = read_hps_localization(localization_path, camera_hz)
         if cam_start >= len(localization.timestamps):
             what = f"cam_start {cam_start} is beyond the {len(localization.timestamps)} localised frames"
-            raise WearcapError(what, where=starts)
+            raise WearcapError(what, starts)
         localization = replace(localization, timestamps=localization.timestamps - cam_start / camera_hz)
         _warn_if_apart(motion, localization, motion_path)
     scan = _one(root, *(f"{depth}{_scan_name(name)}/{CLOUD}" for depth in ("", "*/", "*/*/")))
@@ -417,7 +416,7 @@ def read_hps_sequence(root: str | Path, name: str, camera_hz: float | int = FPS)
         return recording
     motion, imu = suit
     if imu_start >= len(motion):
-        raise WearcapError(f"imu_start {imu_start} is beyond the suit's {len(motion)} frames", where=name)
+        raise WearcapError(f"imu_start {imu_start} is beyond the suit's {len(motion)} frames", name)
     clap_s = motion.timestamps[imu_start]
     imu = {joint: replace(stream, timestamps=stream.timestamps - clap_s) for joint, stream in imu.items()}
     return replace(recording, suit=replace(motion, timestamps=motion.timestamps - clap_s), imu=imu)
@@ -446,13 +445,13 @@ def _camera(root: Path, name: str, clap_s: float, localization: Localization | N
     cameras = read_hps_cameras(calibration)
     if name not in cameras:
         expected = f"its name among captured_videos (there are {len(cameras)})"
-        raise WearcapError(f"no intrinsics for the video of {name!r}", where=calibration, expected=expected)
+        raise WearcapError(f"no intrinsics for the video of {name!r}", calibration, expected)
     if path is None:
         return None if localization is None else CameraStream(localization.timestamps, cameras[name], *nominal_mount())
     video = video_info(path)
     if (video.width, video.height) != IMAGE_SIZE or not video.frames:
         what = f"a video of {video.frames} frames of {video.width}x{video.height} pixels"
-        raise WearcapError(what, where=path, expected=f"{IMAGE_SIZE[0]}x{IMAGE_SIZE[1]}, as its camera was calibrated")
+        raise WearcapError(what, path, f"{IMAGE_SIZE[0]}x{IMAGE_SIZE[1]}, as its camera was calibrated")
     times = torch.arange(video.frames, dtype=torch.float64) / video.fps - clap_s
     return CameraStream(times, cameras[name], *nominal_mount(), video=str(path.resolve()))
 

@@ -99,11 +99,10 @@ def read_mocap_every_folder(folder: str | Path) -> MocapEveryFolder:
     table = np.asarray(content) if isinstance(content, np.ndarray | list) else np.zeros(0)
     require({"poses": table}, path, poses=("time", 7))
     if not len(table):
-        raise WearcapError("no poses", where=path, expected="a row of 7 numbers per picture")
+        raise WearcapError("no poses", path, "a row of 7 numbers per picture")
     if abs(table[0, 3]) > 0.9999 > abs(table[0, 6]):
         what = "the first quaternion is the identity with the scalar first"
-        expected = "x y z, then qx qy qz qw"
-        raise WearcapError(what, where=path, expected=expected, fix="Move the scalar to the end of the rows.")
+        raise WearcapError(what, path, "x y z, then qx qy qz qw", "Move the scalar to the end of the rows.")
     times = shutter_s + np.arange(len(table)) / FPS
     track = checked_trajectory(times, table[:, :3], table[:, [6, 3, 4, 5]], path)
     video = folder / VIDEO if (folder / VIDEO).is_file() else None
@@ -162,17 +161,14 @@ def _config(path: Path) -> dict[str, Any]:
         depth = 0
         for event in yaml.parse(text, yaml.SafeLoader):
             if isinstance(event, yaml.AliasEvent):
-                what = "it refers to its own parts (&name, *name)"
-                expected = "plain keys with values"
                 fix = "Write them out: such references can blow up."
-                raise WearcapError(what, where=path, expected=expected, fix=fix)
+                raise WearcapError("it refers to its own parts (&name, *name)", path, "plain keys with values", fix)
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if depth > MAX_JSON_DEPTH:
-                expected = f"at most {MAX_JSON_DEPTH} levels"
-                raise WearcapError("YAML that is nested too deeply", where=path, expected=expected)
+                raise WearcapError("YAML that is nested too deeply", path, f"at most {MAX_JSON_DEPTH} levels")
         content = yaml.safe_load(text)
     if not isinstance(content, dict | None):
-        raise WearcapError(f"it holds a {type(content).__name__}", where=path, expected="keys with values")
+        raise WearcapError(f"it holds a {type(content).__name__}", path, "keys with values")
     return content or {}
 
 
@@ -180,7 +176,7 @@ def _marks(path: Path) -> dict[str, Any]:
     """Times (s) of the calibration movements along x and y (start, stop), and of the shutter."""
     content = read_pickle(path) if path.is_file() else {}
     if not isinstance(content, dict):
-        raise WearcapError(f"it holds a {type(content).__name__}", where=path, expected="a dict of times")
+        raise WearcapError(f"it holds a {type(content).__name__}", path, "a dict of times")
     return content
 
 
@@ -189,20 +185,19 @@ def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], fol
     if measured is None or not {"x", "y"} <= marks.keys():
         return None
     if not isinstance(measured, dict) or not {"dist", "height"} <= measured.keys():
-        what = "cam_scale_origin lacks a number"
-        raise WearcapError(what, where=folder / CONFIG, expected="dist: [x, y] and height (m)")
+        raise WearcapError("cam_scale_origin lacks a number", folder / CONFIG, "dist: [x, y] and height (m)")
     length = _numbers(measured["dist"], 2, "cam_scale_origin.dist", folder / CONFIG)
     (height,) = _numbers([measured["height"]], 1, "cam_scale_origin.height", folder / CONFIG)
     if min(*length, height) <= 0:
-        raise WearcapError(f"distances {length} and height {height}", where=folder / CONFIG, expected="metres above 0")
+        raise WearcapError(f"distances {length} and height {height}", folder / CONFIG, "metres above 0")
     ends = []
     for name in ("x", "y"):
         times = torch.tensor(_numbers(marks[name], 2, name, folder / MARKS), dtype=torch.float64)
         if not ((times >= track.timestamps[0] - 1) & (times <= track.timestamps[-1] + 1)).all():
             raise WearcapError(
                 f"{name} at {times.tolist()} s",
-                where=folder / MARKS,
-                expected=f"{track.timestamps[0].item():.3f} s to {track.timestamps[-1].item():.3f} s, as the camera's path",
+                folder / MARKS,
+                f"{track.timestamps[0].item():.3f} s to {track.timestamps[-1].item():.3f} s, as the camera's path",
             )
         ends.append(track.t_world_body[(track.timestamps[None] - times[:, None]).abs().argmin(1)])
     return _BoardWalks(ends[0], ends[1], (length[0], length[1]), height)
@@ -214,7 +209,7 @@ def _numbers(values: Any, count: int, what: str, where: Path) -> list[float]:
     except (TypeError, ValueError, OverflowError):
         found = []
     if len(found) != count or not np.isfinite(found).all():
-        raise WearcapError(f"{what} is {str(values)[:60]}", where=where, expected=f"{count} finite numbers")
+        raise WearcapError(f"{what} is {str(values)[:60]}", where, f"{count} finite numbers")
     return found
 
 
@@ -223,7 +218,7 @@ def _intrinsics(path: Path, counts: tuple[int, ...]) -> list[float]:
         values = finite_floats(read_text(path).split()).tolist()
     if len(values) not in counts:
         what = f"{len(values)} numbers"
-        raise WearcapError(what, where=path, expected=f"{' or '.join(map(str, counts))}: fx fy cx cy and distortion")
+        raise WearcapError(what, path, f"{' or '.join(map(str, counts))}: fx fy cx cy and distortion")
     return values
 
 
@@ -238,7 +233,7 @@ def _undistorted(path: Path, video: tuple[int, int] | None) -> Camera | None:
         width, height = (int(side * shrink) // 8 * 8 for side in video)
     if not (0.25 * width < cx < 0.75 * width and 0.25 * height < cy < 0.75 * height):
         what = f"principal point {cx:.1f}, {cy:.1f}"
-        raise WearcapError(what, where=path, expected=f"one near the middle of {width}x{height} pixels")
+        raise WearcapError(what, path, f"one near the middle of {width}x{height} pixels")
     return Camera("pinhole", width, height, fx, fy, cx, cy)
 
 

@@ -56,17 +56,16 @@ def read_xdata(path: str | Path) -> tuple[Motion, ContactTrack | None]:
         arrays, path, timestamps_us=("time",), segment_tXYZ=("time", 3 * count), segment_qWXYZ=("time", 4 * count)
     )
     if sizes["time"] < 2:
-        raise WearcapError(f"{sizes['time']} frames", where=path, expected="at least 2")
+        raise WearcapError(f"{sizes['time']} frames", path, "at least 2")
     if "frameRate" in arrays and abs(float(arrays["frameRate"].reshape(-1)[0]) - SUIT_HZ) > 1:
-        raise WearcapError(f"frame rate {arrays['frameRate'].reshape(-1)[0]}", where=path, expected=f"{SUIT_HZ:g} Hz")
+        raise WearcapError(f"frame rate {arrays['frameRate'].reshape(-1)[0]}", path, f"{SUIT_HZ:g} Hz")
     seconds = arrays["timestamps_us"].astype(np.float64) * 1e-6
     steps = np.diff(seconds)
     steps[np.abs(steps - 1 / SUIT_HZ) > _STEP_TOLERANCE_S] = 1 / SUIT_HZ
     timestamps = seconds[0] + np.concatenate([[0.0], steps.cumsum()])
     if abs(timestamps[-1] - seconds[-1]) > _DRIFT_TOLERANCE_S:
         what = f"after cleaning, time ends {timestamps[-1] - seconds[-1]:+.3f} s from the file's own"
-        expected = f"steady {SUIT_HZ:g} Hz"
-        raise WearcapError(what, where=path, expected=expected, fix="Frames were lost: cut the sequence there.")
+        raise WearcapError(what, path, f"steady {SUIT_HZ:g} Hz", "Frames were lost: cut the sequence there.")
     quat = arrays["segment_qWXYZ"].reshape(-1, count, 4).astype(np.float64)
     # Zeros become the same segment's previous quaternion (at the beginning: no rotation).
     latest = np.where(np.linalg.norm(quat, axis=-1) < 0.5, -1, np.arange(len(quat))[:, None])
@@ -97,8 +96,7 @@ def _contacts(arrays: dict[str, np.ndarray], motion: Motion, path: str | Path) -
         return None
     contact = arrays["foot_contacts"]
     if contact.shape != (len(motion), len(FOOT_PATCHES)):
-        what = f"foot_contacts has shape {contact.shape}"
-        raise WearcapError(what, where=path, expected=f"({len(motion)}, {len(FOOT_PATCHES)})")
+        raise WearcapError(f"foot_contacts has shape {contact.shape}", path, f"({len(motion)}, {len(FOOT_PATCHES)})")
     return ContactTrack(motion.timestamps, FOOT_PATCHES, torch.from_numpy(contact > 0.5))
 
 
@@ -117,7 +115,7 @@ def read_nymeria(
     path = find_mps_file(slam, ("closed_loop_trajectory.csv",))
     if path is None or not is_nymeria(folder):
         expected = "body/xdata.npz and recording_head/mps/slam/closed_loop_trajectory.csv"
-        raise WearcapError("not a complete Nymeria sequence", where=folder, expected=expected)
+        raise WearcapError("not a complete Nymeria sequence", folder, expected)
     suit, contacts = read_xdata(folder / "body" / "xdata.npz")
     device = head_stream(read_closed_loop(path)[0], fps=None)
     with placed(folder):

@@ -67,20 +67,17 @@ def read_omomo(root: str | Path) -> list[OmomoSequence]:
     """
     paths = [Path(root) / name for name in FILES if (Path(root) / name).is_file()]
     if not paths:
-        fix = "Give OMOMO's folder as source=DIR."
-        raise WearcapError("no sequences", where=root, expected=" or ".join(FILES), fix=fix)
+        raise WearcapError("no sequences", root, " or ".join(FILES), "Give OMOMO's folder as source=DIR.")
     found = []
     for path in paths:
         content = read_pickle(path)
         if not isinstance(content, dict):
-            what = f"it holds a {type(content).__name__}"
-            raise WearcapError(what, where=path, expected="{number: {seq_name, trans, …}}")
+            raise WearcapError(f"it holds a {type(content).__name__}", path, "{number: {seq_name, trans, …}}")
         for key, entry in content.items():
             name = entry.get("seq_name") if isinstance(entry, dict) else None
             if not isinstance(name, str) or len(name.split("_")) < 3 or not name.replace("_", "").isalnum():
-                what = f"sequence {key!r} is named {name!r}"[:200]
                 expected = "seq_name SUBJECT_OBJECT_NUMBER, such as sub1_largebox_000"
-                raise WearcapError(what, where=path, expected=expected)
+                raise WearcapError(f"sequence {key!r} is named {name!r}"[:200], path, expected)
             arrays = {key: entry[key] for key in _KEYS if isinstance(entry.get(key), np.ndarray)}
             gender = entry.get("gender", "")
             if isinstance(gender, np.ndarray) and gender.size == 1:
@@ -88,7 +85,7 @@ def read_omomo(root: str | Path) -> list[OmomoSequence]:
             gender = str(gender) if isinstance(gender, str) else ""
             found.append(OmomoSequence(name, f"{path}, sequence {name}", arrays, gender))
     if not found:
-        raise WearcapError("files without sequences", where=root, expected="{number: {seq_name, trans, …}}")
+        raise WearcapError("files without sequences", root, "{number: {seq_name, trans, …}}")
     return sorted(found, key=lambda sequence: sequence.name)
 
 
@@ -110,7 +107,7 @@ def omomo_take(sequence: OmomoSequence, root: str | Path, fps: float | int) -> O
     frames, others = len(arrays["trans"]), len(arrays["obj_trans"])
     if frames != others or not frames:
         what = f"the object has {others} frames, the body {frames}"
-        raise WearcapError(what, where=where, expected="as many of both, and at least one", fix="Fetch the file again.")
+        raise WearcapError(what, where, "as many of both, and at least one", "Fetch the file again.")
     times = torch.arange(frames, dtype=torch.float64) / fps
     about = {"source": sequence.name, "format": "omomo", "gender": sequence.gender}
     if sequence.object_name in _TWO_PARTS:
@@ -151,15 +148,15 @@ def _flat(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def _mesh(root: str | Path, object_name: str, scales: np.ndarray, where: str) -> tuple[Mesh, Float64[np.ndarray, "3"]]:
     """The mesh in metres about its centre, and the centre in the file's axes and unit; `scales`: metres per unit."""
     if not len(scales):
-        raise WearcapError("obj_scale is nowhere positive", where=where, expected="metres per unit of the mesh")
+        raise WearcapError("obj_scale is nowhere positive", where, "metres per unit of the mesh")
     scale = float(np.median(scales))
     if np.ptp(scales) > _SCALE_WITHIN * scale:
         what = f"obj_scale runs from {scales.min():.4g} to {scales.max():.4g}"
-        raise WearcapError(what, where=where, expected=f"one scale within {_SCALE_WITHIN:.0%}: a rigid object")
+        raise WearcapError(what, where, f"one scale within {_SCALE_WITHIN:.0%}: a rigid object")
     path = omomo_mesh_path(root, object_name)
     if not path.is_file():
         fix = "Unpack OMOMO's captured_objects beside the sequences."
-        raise WearcapError(f"no mesh of {object_name}", where=path, expected=f"{MESHES}/OBJECT{MESH_ENDING}", fix=fix)
+        raise WearcapError(f"no mesh of {object_name}", path, f"{MESHES}/OBJECT{MESH_ENDING}", fix)
     mesh, center = centered(read_obj(path))
     mesh = Mesh((mesh.vertices.astype(np.float64) * scale).astype(np.float32), mesh.faces, mesh.color)
     check_object_mesh(mesh, path)
@@ -172,7 +169,7 @@ def _path(arrays: dict[str, np.ndarray], times: Tensor, center: Tensor, posed: T
     bad = ~are_rotations(R, _ORTHOGONAL_WITHIN) & posed
     if bad.any():
         what = f"obj_rot of frame {int(bad.nonzero()[0])} is no rotation ({int(bad.sum())} such frames)"
-        raise WearcapError(what, where=where, expected="orthogonal matrices of determinant +1")
+        raise WearcapError(what, where, "orthogonal matrices of determinant +1")
     U, _, Vh = torch.linalg.svd(torch.where(posed[:, None, None], R, torch.eye(3, dtype=R.dtype)))
     R = U @ Vh
     scale = torch.from_numpy(arrays["obj_scale"].astype(np.float64))

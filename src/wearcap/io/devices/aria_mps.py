@@ -71,19 +71,18 @@ def read_closed_loop(path: str | Path, *, up: str = "z") -> tuple[Trajectory, Fl
     check_finite({**columns, quality: table[quality]}, path)
     if len(graphs := np.unique(table["graph_uid"])) > 1:
         what = f"{len(graphs)} unconnected world frames (graph_uid)"
-        raise WearcapError(what, where=path, expected="one", fix="Keep the rows of one graph_uid.")
+        raise WearcapError(what, path, "one", "Keep the rows of one graph_uid.")
     measured = columns["gravity"]
     mean = measured.mean(0)
     length = np.linalg.norm(mean)
     if not 9.7 < length < 9.9:
-        raise WearcapError(f"gravity is {length:.2f} m/s² long", where=path, expected="9.81 m/s²")
+        raise WearcapError(f"gravity is {length:.2f} m/s² long", path, "9.81 m/s²")
     upward = -mean / length
     if upward["xyz".index(up)] < 0.99:
         axis = "xyz"[int(np.abs(upward).argmax())]
         sign = "-" if upward["xyz".index(axis)] < 0 else "+"
-        what = f"gravity {mean.round(2).tolist()} shows that {sign}{axis} is up"
         fix = "Read it with up='y'." if (axis, sign) == ("y", "+") else "Rotate the world, or fix gravity's sign."
-        raise WearcapError(what, where=path, expected=f"+{up} up", fix=fix)
+        raise WearcapError(f"gravity {mean.round(2).tolist()} shows that {sign}{axis} is up", path, f"+{up} up", fix)
     trajectory = checked_trajectory(table[time] * 1e-6, columns["pose"][:, :3], columns["pose"][:, 3:], path)
     T_turned = Rigid(turn_up(up), torch.zeros(3)) @ trajectory.T_world_body
     return Trajectory(trajectory.timestamps, T_turned.R, T_turned.t), torch.tensor(table[quality], dtype=torch.float32)
@@ -117,7 +116,7 @@ def head_stream(
         if stop - start > _MAX_DURATION_S:
             what = f"poses over {(stop - start) / 3600:.3g} hours"
             fix = "A time stamp is damaged, or two recordings stand in one file: cut it."
-            raise WearcapError(what, where=where, expected="a recording of less than half a day", fix=fix)
+            raise WearcapError(what, where, "a recording of less than half a day", fix)
         count = int((stop - start) * fps + 1e-6) + 1
         trajectory = resample(trajectory, start + torch.arange(count, dtype=torch.float64) / fps)
     T_aria_cpf = T_aria_cpf or nominal_T_aria_cpf()
@@ -157,8 +156,7 @@ def read_points(
             named = known[place] == rows["uid"]
             np.minimum.at(first_us, place[named], rows["frame_tracking_timestamp_us"][named])
         if (first_us == np.iinfo(np.int64).max).all():
-            expected = "the observations of the same recording"
-            raise WearcapError("names none of the points", where=observations, expected=expected)
+            raise WearcapError("names none of the points", observations, "the observations of the same recording")
         seen = np.empty(len(uid))
         seen[order] = np.where(first_us < np.iinfo(np.int64).max, first_us * 1e-6, np.inf)
         keep &= np.isfinite(seen)
@@ -191,7 +189,7 @@ def read_mps(folder: str | Path, *, fps: float | None = 60.0, T_aria_cpf: Rigid 
     path = find_mps_file(folder, _TRAJECTORY)
     if path is None:
         what = "no closed_loop_trajectory.csv (plain, .gz or .xz)"
-        raise WearcapError(what, where=folder, expected="the output folder of Aria's MPS")
+        raise WearcapError(what, folder, "the output folder of Aria's MPS")
     head = head_stream(read_closed_loop(path)[0], fps=fps, T_aria_cpf=T_aria_cpf, where=path)
     return Recording(name=Path(folder).resolve().name, head=head, points=read_mps_points(folder), source="Aria MPS")
 

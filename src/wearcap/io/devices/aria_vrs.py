@@ -38,7 +38,7 @@ def read_device(path: str | Path) -> tuple[Rigid, dict[str, Rigid]]:
     """
     device = _open(path).get_device_calibration()
     if device is None:
-        raise WearcapError("holds no calibration", where=path, expected="a recording of Aria glasses")
+        raise WearcapError("holds no calibration", path, "a recording of Aria glasses")
     labels = [*device.get_camera_labels(), *device.get_imu_labels()]
     poses = {label: device.get_transform_device_sensor(label) for label in labels}
     T_aria_sensor = {label: _rigid(pose) for label, pose in poses.items() if pose is not None}
@@ -64,7 +64,7 @@ def extract_video(
     provider, (T_aria_cpf, T_aria_sensor) = _open(path), read_device(path)
     source = provider.get_stream_id_from_label(label)
     if source is None or label not in T_aria_sensor:
-        raise WearcapError(f"no camera {label!r}", where=path, expected=f"one of {', '.join(T_aria_sensor)}")
+        raise WearcapError(f"no camera {label!r}", path, f"one of {', '.join(T_aria_sensor)}")
     original = provider.get_device_calibration().get_camera_calib(label)
     pose = original.get_transform_device_camera()
     pinhole, drawn = (
@@ -86,7 +86,7 @@ def extract_video(
         first, stop = np.searchsorted(times.numpy(), between).tolist()
     if stop - first < 2:
         what = f"{stop - first} pictures of {label!r} in the time that is wanted"
-        raise WearcapError(what, where=path, expected="a recording of the same time")
+        raise WearcapError(what, path, "a recording of the same time")
     fps = 1 / times[first:stop].diff().median().item()
     write_frames(file, (picture(i) for i in range(first, stop)), fps)
     upright = aria_calibration.rotate_camera_calib_cw90deg(pinhole)
@@ -102,11 +102,11 @@ def _open(path: str | Path):
     """Data provider of projectaria-tools. Raises WearcapError that names what is missing."""
     if data_provider is None:
         what = "reading VRS recordings needs projectaria-tools"
-        raise WearcapError(what, where=path, fix='Install it with `pip install "wearcap[aria]"` (about 1 GB).')
+        raise WearcapError(what, path, fix='Install it with `pip install "wearcap[aria]"` (about 1 GB).')
     file_size(path)
     provider = data_provider.create_vrs_data_provider(str(path))
     if provider is None:
-        raise WearcapError("not a readable VRS recording", where=path, expected="a complete .vrs file of Aria glasses")
+        raise WearcapError("not a readable VRS recording", path, "a complete .vrs file of Aria glasses")
     return provider
 
 

@@ -46,32 +46,31 @@ def read_watch_log(path: str | Path, joint: str) -> ImuStream:
     are not finite, gravity that is neither 1 g nor 9.8 m/s² long, or that neither direction of the attitude turns upright.
     """
     if joint not in WRISTS:
-        raise WearcapError(f"a watch on {joint!r}", where=path, expected=" or ".join(WRISTS))
+        raise WearcapError(f"a watch on {joint!r}", path, " or ".join(WRISTS))
     seconds, parts = _columns(path)
     _require_times(seconds, path)
     for name, values in parts.items():
         if not np.isfinite(values).all():
             row = int(np.flatnonzero(~np.isfinite(values).all(1))[0])
-            raise WearcapError(f"{name} of row {row} is not finite", where=path, expected="numbers")
+            raise WearcapError(f"{name} of row {row} is not finite", path, "numbers")
     gravity = parts["gravity"] if "gravity" in parts else parts["whole"] - parts["free"]
     length = float(np.median(np.linalg.norm(gravity, axis=1)))
     unit = next((unit for unit in (G_M_S2, 1.0) if abs(length * unit / G_M_S2 - 1) < 0.1), None)  # m/s² per unit
     if unit is None:
-        raise WearcapError(f"gravity of length {length:.3g}", where=path, expected="1 (g) or 9.8 (m/s²)")
+        raise WearcapError(f"gravity of length {length:.3g}", path, "1 (g) or 9.8 (m/s²)")
     # R_world_imu, and the component of gravity along the world's z: about 1 or -1
     quaternion = parts["quaternion"]
     norm = np.linalg.norm(quaternion, axis=1)
     if (np.abs(norm - 1) > 0.01).any():
         row = int(np.argmax(np.abs(norm - 1)))
-        raise WearcapError(f"attitude of length {norm[row]:.3g} in row {row}", where=path, expected="1")
+        raise WearcapError(f"attitude of length {norm[row]:.3g} in row {row}", path, "1")
     R = matrix_from_quat_wxyz(torch.from_numpy(quaternion)).numpy()
     down = gravity / np.linalg.norm(gravity, axis=1, keepdims=True).clip(1e-9)
     there, back = (float((turned @ down[..., None])[:, 2, 0].mean()) for turned in (R, R.swapaxes(1, 2)))
     best = max(abs(there), abs(back))
     if best < UPRIGHT:
-        what = f"the attitude turns gravity {best:.2f} upright"
         fix = "Check the order of the quaternion's columns (W, X, Y, Z), and that z is up in its reference frame."
-        raise WearcapError(what, where=path, expected=f"at least {UPRIGHT}", fix=fix)
+        raise WearcapError(f"the attitude turns gravity {best:.2f} upright", path, f"at least {UPRIGHT}", fix)
     R, upright = (R, there) if abs(there) >= abs(back) else (np.ascontiguousarray(R.swapaxes(1, 2)), back)
     # Core Motion's gravity points down, and its accelerations have the opposite sign.
     free, felt = np.sign(upright) * unit * parts["free"], np.sign(upright) * unit * (parts["free"] + gravity)
@@ -104,20 +103,19 @@ def _columns(path: str | Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
                 iso = text.decode().strip().replace(" +", "+").replace(" -", "-")
                 seconds[row] = datetime.fromisoformat(iso).timestamp()
     else:
-        what = "not a watch's motion log"
         expected = "SensorLog's CSV (motionQuaternionW(R), …) or WristMotion.csv (quaternionW, …)"
-        raise WearcapError(what, where=path, expected=expected, fix="Switch on device motion when you record.")
+        raise WearcapError("not a watch's motion log", path, expected, "Switch on device motion when you record.")
     return seconds, {name: np.stack([table[column] for column in group], 1) for name, group in groups.items()}
 
 
 def _require_times(seconds: np.ndarray, path: str | Path) -> None:
     if len(seconds) < 2:
-        raise WearcapError(f"{len(seconds)} rows", where=path, expected="at least 2")
+        raise WearcapError(f"{len(seconds)} rows", path, "at least 2")
     step = np.diff(seconds)
     if (step <= 0).any():
         row = int(np.flatnonzero(step <= 0)[0]) + 1
         what = f"time does not grow at row {row} ({step[row - 1]:+.3f} s)"
-        raise WearcapError(what, where=path, fix="Sort the rows by time and leave repeated ones out.")
+        raise WearcapError(what, path, fix="Sort the rows by time and leave repeated ones out.")
     if np.median(step) > 1 / MIN_RATE_HZ:
         what = f"{1 / np.median(step):.1f} rows a second"
-        raise WearcapError(what, where=path, expected=f"at least {MIN_RATE_HZ:g}", fix="Log at 30 Hz or more.")
+        raise WearcapError(what, path, f"at least {MIN_RATE_HZ:g}", "Log at 30 Hz or more.")

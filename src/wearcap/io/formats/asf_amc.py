@@ -110,7 +110,7 @@ def read_amc(asf: _AsfSkeleton, path: str | Path, fps: float | int = 120) -> Mot
     """
     path = Path(path)
     if not (math.isfinite(fps) and fps > 0):
-        raise WearcapError(f"frame rate {fps}", where=path, expected="a positive number of frames per second")
+        raise WearcapError(f"frame rate {fps}", path, "a positive number of frames per second")
     frames, joints, values = _parse_amc(path, asf)
     channels = [(joint, dof) for joint in joints for dof in asf.dof[joint]]
     angles = torch.zeros(len(values), len(asf.skeleton), 3, dtype=torch.float64)
@@ -169,11 +169,11 @@ class _AsfContent:
                     content.take(number, words)
             except (ValueError, IndexError) as error:
                 what = f"cannot read {text.strip()[:80]!r} ({error})"
-                raise WearcapError(what, where=at_line(path, number), expected="Acclaim ASF") from error
+                raise WearcapError(what, at_line(path, number), "Acclaim ASF") from error
         if content.bone is not None or not content.bones or not content.hierarchy:
             what = "bones or hierarchy are missing or cut short"
             expected = "an ASF file with :bonedata and :hierarchy"
-            raise WearcapError(what, where=at_line(path, number), expected=expected, fix="Fetch the file again.")
+            raise WearcapError(what, at_line(path, number), expected, "Fetch the file again.")
         return content
 
     def tree_order(self, path: Path) -> tuple[list[str], list[int]]:
@@ -183,9 +183,8 @@ class _AsfContent:
         for line, (parent, *below) in self.hierarchy:
             for name in below:
                 if name not in self.bones or name in seen:
-                    what = f"bone {name!r} is unknown or has two parents"
                     expected = "every bone of :bonedata once below a parent"
-                    raise WearcapError(what, where=at_line(path, line), expected=expected)
+                    raise WearcapError(f"bone {name!r} is unknown or has two parents", at_line(path, line), expected)
                 seen.add(name)
             children.setdefault(parent, []).extend(below)
         names, parents = ["root"], [-1]
@@ -197,7 +196,7 @@ class _AsfContent:
             stack += [(child, len(names) - 1) for child in reversed(children.get(name, []))]
         if missing := sorted(set(self.bones) - set(names)):
             what = f"bones {missing[:5]} do not hang on the root"
-            raise WearcapError(what, where=path, expected="one tree below 'root' in :hierarchy")
+            raise WearcapError(what, path, "one tree below 'root' in :hierarchy")
         return names, parents
 
     def take(self, number: int, words: list[str]) -> None:
@@ -331,22 +330,20 @@ def _parse_amc(path: Path, asf: _AsfSkeleton) -> tuple[np.ndarray, list[int], Fl
             break
         first.append((number, words))
         if len(first) > MAX_BONES:
-            raise WearcapError(f"more than {MAX_BONES} bones", where=at_line(path, number))
+            raise WearcapError(f"more than {MAX_BONES} bones", at_line(path, number))
     number = beginning[0][0] if beginning else 1
     names = [words[0] for _, words in first]
     for line, (name, *given) in first:
         if name not in asf.skeleton.joint_names or names.count(name) > 1:
-            what = f"bone {name!r} is not in the ASF, or comes twice"
             expected = "bones of the skeleton, once per frame"
             fix = "Check that AMC and ASF belong together."
-            raise WearcapError(what, where=at_line(path, line), expected=expected, fix=fix)
+            raise WearcapError(f"bone {name!r} is not in the ASF, or comes twice", at_line(path, line), expected, fix)
         if len(given) != (expected := len(asf.dof[asf.skeleton.index(name)])):
-            what = f"{len(given)} values for {name!r}"
-            raise WearcapError(what, where=at_line(path, line), expected=f"{expected} as in the ASF")
+            raise WearcapError(f"{len(given)} values for {name!r}", at_line(path, line), f"{expected} as in the ASF")
     moving = {name for name, dof in zip(asf.skeleton.joint_names, asf.dof) if dof}
     if not names or moving - set(names):
         what = f"the first frame lacks {sorted(moving - set(names))[:5]}"
-        raise WearcapError(what, where=at_line(path, number), expected="every bone that has channels in the ASF")
+        raise WearcapError(what, at_line(path, number), "every bone that has channels in the ASF")
     joints = [asf.skeleton.index(name) for name in names]
     frames, values, place = array("q"), array("d"), 0
     for row, (number, words) in enumerate(chain(beginning, first, following, lines)):
@@ -355,22 +352,20 @@ def _parse_amc(path: Path, asf: _AsfSkeleton) -> tuple[np.ndarray, list[int], Fl
             sound = len(words) == 1 and words[0].isdecimal() and len(words[0]) <= 15
             if not sound or (frames and int(words[0]) <= frames[-1]):
                 what = f"{' '.join(words)[:60]!r} where a frame number should stand"
-                raise WearcapError(what, where=at_line(path, number), expected="rising frame numbers")
+                raise WearcapError(what, at_line(path, number), "rising frame numbers")
             frames.append(int(words[0]))
             continue
         like = first[place - 1][1]
         if words[0] != like[0] or len(words) != len(like):
             what = f"{' '.join(words)[:60]!r} differs from the first frame"
-            expected = f"{like[0]!r} with {len(like) - 1} values"
-            raise WearcapError(what, where=at_line(path, number), expected=expected)
+            raise WearcapError(what, at_line(path, number), f"{like[0]!r} with {len(like) - 1} values")
         try:
             values.extend(finite_floats(words[1:]))
         except ValueError as error:
-            raise WearcapError(str(error), where=at_line(path, number)) from error
+            raise WearcapError(str(error), at_line(path, number)) from error
     if place < len(first):
-        what = "the last frame is cut short"
         expected = f"{len(first)} bones per frame"
-        raise WearcapError(what, where=at_line(path, number), expected=expected, fix="Fetch the file again.")
+        raise WearcapError("the last frame is cut short", at_line(path, number), expected, "Fetch the file again.")
     return np.array(frames), joints, torch.from_numpy(np.array(values).reshape(len(frames), -1))
 
 
@@ -380,7 +375,7 @@ def _amc_lines(path: Path, asf: _AsfSkeleton) -> Iterator[tuple[int, list[str]]]
     for number, line in numbered_lines(path):
         words = line.split()
         if not begun and line.strip().upper() == (":DEGREES" if asf.radians else ":RADIANS"):
-            raise WearcapError("its angles are in another unit than the ASF's", where=path, expected="one unit in both")
+            raise WearcapError("its angles are in another unit than the ASF's", path, "one unit in both")
         begun = begun or (bool(words) and words[0][0] not in "#:")
         if begun and words:
             yield number, words

@@ -49,11 +49,10 @@ class Budget:
             units = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))
             unit, name = next((known for known in units if self.max_bytes >= known[0]), (1, "bytes"))
             what = f"larger than {self.max_bytes / unit:.4g} {name} once unpacked"
-            raise WearcapError(what, where=self.path, expected="a smaller file", fix=_lift(self.spent))
+            raise WearcapError(what, self.path, "a smaller file", _lift(self.spent))
         if self.spent > self._by_ratio:
             what = f"it unpacks to more than {MAX_RATIO} times its size"
-            expected = "a capture, which packs 5 to 30 times"
-            raise WearcapError(what, where=self.path, expected=expected, fix=_lift(self.spent))
+            raise WearcapError(what, self.path, "a capture, which packs 5 to 30 times", _lift(self.spent))
 
 
 def gib_bytes(text: str, where: str) -> int:
@@ -63,7 +62,7 @@ def gib_bytes(text: str, where: str) -> int:
     except ValueError:
         gib = math.nan
     if not 0 < gib < 1e9:
-        raise WearcapError(f"a limit of {text[:30]!r} GiB", where=where, expected="a number above 0, such as 16")
+        raise WearcapError(f"a limit of {text[:30]!r} GiB", where, "a number above 0, such as 16")
     return int(gib * (1 << 30))
 
 
@@ -80,13 +79,13 @@ def file_size(path: str | Path, kind: str = "file") -> int:
         try:
             status = os.stat(path)
         except ValueError as error:  # a NUL, or what the file system's encoding does not have
-            raise WearcapError("a name that no file can have", where=repr(str(path))) from error
+            raise WearcapError("a name that no file can have", repr(str(path))) from error
         mode = status.st_mode
         if stat.S_ISDIR(mode):
             raise IsADirectoryError
         if not stat.S_ISREG(mode):
             found = "pipe" if stat.S_ISFIFO(mode) else "socket" if stat.S_ISSOCK(mode) else "device"
-            raise WearcapError(f"a {found}", where=path, expected="a regular file", fix="Copy its content to a file.")
+            raise WearcapError(f"a {found}", path, "a regular file", "Copy its content to a file.")
         return status.st_size
 
 
@@ -96,19 +95,19 @@ def explained(path: str | Path, kind: str = "file") -> Iterator[None]:
     try:
         yield
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise WearcapError(f"no such {kind}", where=path) from error
+        raise WearcapError(f"no such {kind}", path) from error
     except PermissionError as error:
         fix = "Ask its owner, or change its mode (chmod)."
-        raise WearcapError("no permission to read it", where=path, fix=fix) from error
+        raise WearcapError("no permission to read it", path, fix=fix) from error
     except IsADirectoryError as error:
-        raise WearcapError("a folder", where=path, expected="a file") from error
+        raise WearcapError("a folder", path, "a file") from error
     except _DAMAGE as error:
         what = f"not a complete {Path(path).suffix} file: its packed data is damaged or cut short ({error})"
-        raise WearcapError(what, where=path, fix="Copy or fetch it again.") from error
+        raise WearcapError(what, path, fix="Copy or fetch it again.") from error
     except OSError as error:
-        raise WearcapError(f"cannot be read ({error.strerror or error})", where=path) from error
+        raise WearcapError(f"cannot be read ({error.strerror or error})", path) from error
     except MemoryError as error:
-        raise WearcapError("it does not fit into this machine's memory", where=path) from error
+        raise WearcapError("it does not fit into this machine's memory", path) from error
 
 
 _MALFORMED = (LookupError, TypeError, ValueError, OverflowError, AttributeError)
@@ -131,9 +130,7 @@ def understood(
             raise
     except errors as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
-        raise WearcapError(
-            f"{what} ({reason or type(error).__name__})"[:300], where=where, expected=expected, fix=fix
-        ) from error
+        raise WearcapError(f"{what} ({reason or type(error).__name__})"[:300], where, expected, fix) from error
 
 
 @contextmanager
@@ -142,7 +139,7 @@ def placed(where: str | Path) -> Iterator[None]:
     try:
         yield
     except WearcapError as error:
-        raise WearcapError(error.what, where=where, expected=error.expected, fix=error.fix) from error
+        raise WearcapError(error.what, where, error.expected, error.fix) from error
 
 
 @contextmanager
@@ -193,5 +190,5 @@ def read_bytes(path: str | Path, max_bytes: int | None = None, usual: int = MAX_
     with open_bytes(path, max_bytes, usual) as file:
         content = file.read()
     if not content:
-        raise WearcapError("the file is empty", where=path)
+        raise WearcapError("the file is empty", path)
     return content

@@ -93,13 +93,12 @@ class _Hierarchy:
                 found.take(word)
         except (ValueError, IndexError, StopIteration) as error:
             what = f"the hierarchy is broken here ({str(error) or 'it ends too early'})"[:200]
-            raise WearcapError(what, where=at_line(path, line), expected="BVH") from error
+            raise WearcapError(what, at_line(path, line), "BVH") from error
         if not found.joints or found.open or not found.motion_line:
             what = "no complete HIERARCHY followed by MOTION"
-            expected = "a whole BVH file"
-            raise WearcapError(what, where=at_line(path, found.line), expected=expected, fix="Fetch it again.")
+            raise WearcapError(what, at_line(path, found.line), "a whole BVH file", "Fetch it again.")
         if len({joint.name for joint in found.joints}) < len(found.joints):
-            raise WearcapError("two joints share a name", where=path, expected="unique joint names")
+            raise WearcapError("two joints share a name", path, "unique joint names")
         return found.joints, found.motion_line
 
     def split(self, lines: Iterator[tuple[int, str]]) -> Iterator[str]:
@@ -175,9 +174,9 @@ def _parse_motion(
         count = int(first.lower().split("frames:")[1])
         step_s = float(second.lower().split("frame time:")[1])
     except (ValueError, IndexError, StopIteration) as error:
-        raise WearcapError("no 'Frames:' and 'Frame Time:' below MOTION", where=at_line(path, motion_line)) from error
+        raise WearcapError("no 'Frames:' and 'Frame Time:' below MOTION", at_line(path, motion_line)) from error
     if not 1e-5 <= step_s <= 10:
-        raise WearcapError(f"frame time {step_s} s", where=at_line(path, line), expected="seconds per frame, above 0")
+        raise WearcapError(f"frame time {step_s} s", at_line(path, line), "seconds per frame, above 0")
     values, odd, rows = array("d"), None, 0
     for number, text in lines:
         words = text.split()
@@ -185,7 +184,7 @@ def _parse_motion(
         try:
             values.extend(finite_floats(words))
         except ValueError as error:
-            raise WearcapError(str(error), where=at_line(path, number)) from error
+            raise WearcapError(str(error), at_line(path, number)) from error
         if len(words) != channels and odd is None:
             expected = f"{channels}, one per channel of the hierarchy"
             odd = WearcapError(f"{len(words)} values", where=at_line(path, number), expected=expected)
@@ -252,7 +251,7 @@ def read_cmu_bvh(path: str | Path) -> Motion:
     lost = ("Neck", "LeftShoulder", "RightShoulder")
     motion = read_bvh(path, unit_m=CGSPEED_UNIT_M, offsets=dict.fromkeys(lost, CGSPEED_THORAX))
     if len(motion) < 2:
-        raise WearcapError("only the T-pose frame", where=path, expected="frames of motion after it")
+        raise WearcapError("only the T-pose frame", path, "frames of motion after it")
     motion = motion.sliced(1, len(motion))
     return replace(motion, timestamps=motion.timestamps - motion.timestamps[0])
 
@@ -262,13 +261,13 @@ def _axes(path: Path, up: str, forward: str) -> Tensor:
     rows = {}
     for name in (up, forward):
         if name.removeprefix("-") not in ("x", "y", "z"):
-            raise WearcapError(f"axis {name!r}", where=path, expected='one of "x", "y", "z", "-x", "-y", "-z"')
+            raise WearcapError(f"axis {name!r}", path, 'one of "x", "y", "z", "-x", "-y", "-z"')
         row = torch.zeros(3, dtype=torch.float64)
         row["xyz".index(name[-1])] = -1.0 if name.startswith("-") else 1.0
         rows[name] = row
     if up[-1] == forward[-1]:
         what = f"up {up!r} and forward {forward!r} are one axis"
-        raise WearcapError(what, where=path, fix='For a z-up file give forward as well, mostly "-y", "x" or "y".')
+        raise WearcapError(what, path, fix='For a z-up file give forward as well, mostly "-y", "x" or "y".')
     return torch.stack([rows[forward], torch.linalg.cross(rows[up], rows[forward]), rows[up]])
 
 
@@ -360,7 +359,7 @@ def _check_body(motion: Motion, path: Path, unit_m: float, R_world_file: Float[T
         name = "xyz"[int(R_world_file[axis].abs().argmax())]
         what = f"the body lies down: {moving[2]:.2f} m high and {moving[axis]:.2f} m long"
         fix = f'up="{name}" (or "-{name}") would raise it; check=False takes it as it is.'
-        raise WearcapError(what, where=path, expected="a person upright in the bind pose or in most frames", fix=fix)
+        raise WearcapError(what, path, "a person upright in the bind pose or in most frames", fix)
 
 
 def longest_path(skeleton: Skeleton) -> float:
@@ -388,7 +387,7 @@ def write_bvh(motion: Motion, path: str | Path, unit_m: float | int = 0.01) -> N
     R = _R_FILE_WORLD @ motion.R_parent_joint[frames].double() @ _R_FILE_WORLD.T
     root = motion.t_world_root[frames].double() @ _R_FILE_WORLD.T / unit_m
     if not (R.isfinite().all() and root.isfinite().all()):
-        raise WearcapError("the motion holds NaN or infinite values", where=path, expected="finite poses")
+        raise WearcapError("the motion holds NaN or infinite values", path, "finite poses")
     # R = Rz · Ry · Rx; at gimbal lock x is zero.
     cos_y = torch.hypot(R[..., 0, 0], R[..., 1, 0])
     locked = cos_y < 1e-7

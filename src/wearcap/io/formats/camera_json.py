@@ -89,7 +89,7 @@ def write_photos(photos: list[Photo], folder: str | Path) -> None:
         file = Path(photo.file)
         if file.is_absolute() or file.is_relative_to(folder):
             if not file.is_relative_to(folder):
-                raise WearcapError("this photo is outside its scene", where=file, expected=f"in {folder}")
+                raise WearcapError("this photo is outside its scene", file, f"in {folder}")
             file = file.relative_to(folder)
         rows.append(
             {
@@ -108,9 +108,9 @@ def _photo(row: Any, folder: Path, where: str) -> Photo:
         R, t = (np.array(row[key], np.float64) for key in ("R_world_cam", "t_world_cam"))
     lens = _camera_from_row(camera, where)
     if file.is_absolute() or ".." in file.parts:
-        raise WearcapError(f"file {str(file)!r} is outside the scene's folder", where=where)
+        raise WearcapError(f"file {str(file)!r} is outside the scene's folder", where)
     if R.shape != (3, 3) or t.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(t).all()):
-        raise WearcapError(f"a pose of shapes {R.shape} and {t.shape}", where=where, expected="finite 3x3 and 3")
+        raise WearcapError(f"a pose of shapes {R.shape} and {t.shape}", where, "finite 3x3 and 3")
     if not are_rotations(torch.from_numpy(R), _NOT_ORTHONORMAL):
-        raise WearcapError("R_world_cam is no rotation", where=where, expected="an orthonormal 3x3 matrix")
+        raise WearcapError("R_world_cam is no rotation", where, "an orthonormal 3x3 matrix")
     return Photo(folder / file, lens, Rigid(torch.from_numpy(R).float(), torch.from_numpy(t).float()))

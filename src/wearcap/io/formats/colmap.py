@@ -103,18 +103,18 @@ def read_colmap(folder: str | Path, images: str | Path | None = None) -> ColmapM
     if file.is_file():
         points = reader.points(file)
         if not np.isfinite(points.xyz).all():
-            raise WearcapError("a point is NaN or infinite", where=file, expected="finite coordinates")
+            raise WearcapError("a point is NaN or infinite", file, "finite coordinates")
     return ColmapModel([_photo(image, cameras, images) for image in found], _tracks(found, points))
 
 
 def _photo(image: _Image, cameras: dict[int, Camera], images: Path) -> Photo:
     if image.camera not in cameras:
         what = f"image {image.name!r} names camera {image.camera}, which is not in the model"
-        raise WearcapError(what, where=image.where, expected=f"one of {', '.join(map(str, sorted(cameras)))}")
+        raise WearcapError(what, image.where, f"one of {', '.join(map(str, sorted(cameras)))}")
     wxyz = torch.tensor(image.quaternion_wxyz, dtype=torch.float64)
     if not (wxyz.isfinite().all() and 0.9 < wxyz.norm() < 1.1 and all(map(math.isfinite, image.translation))):
         what = f"image {image.name!r} has no valid pose"
-        raise WearcapError(what, where=image.where, expected="a unit quaternion (w first) and a finite translation")
+        raise WearcapError(what, image.where, "a unit quaternion (w first) and a finite translation")
     wxyz = wxyz / wxyz.norm()
     R_cam_world = roma.unitquat_to_rotmat(wxyz[[1, 2, 3, 0]])
     T_cam_world = Rigid(R_cam_world, torch.tensor(image.translation, dtype=torch.float64))
@@ -143,13 +143,11 @@ def _tracks(images: list[_Image], points: _Points) -> Tracks:
 
 def _camera(model: str, width: int, height: int, values: list[float], where: str) -> Camera:
     if model not in _MODELS:
-        what = f"camera model {model} is not supported"
         fix = "COLMAP's image_undistorter turns any model into PINHOLE."
-        raise WearcapError(what, where=where, expected=f"one of {', '.join(_MODELS)}", fix=fix)
+        raise WearcapError(f"camera model {model} is not supported", where, f"one of {', '.join(_MODELS)}", fix)
     ours, count = _MODELS[model]
     if len(values) != count or not all(map(math.isfinite, values)):
-        what = f"camera model {model} with parameters {values}"
-        raise WearcapError(what, where=where, expected=f"{count} finite numbers")
+        raise WearcapError(f"camera model {model} with parameters {values}", where, f"{count} finite numbers")
     single = model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
     fx, fy, cx, cy, *lens = (values[:1] if single else []) + values
     if ours == "opencv":
@@ -168,7 +166,7 @@ def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
 
 
 def _damaged(where: str | Path, error: Exception, expected: str) -> WearcapError:
-    return WearcapError(f"cannot be understood ({error})", where=where, expected=expected)
+    return WearcapError(f"cannot be understood ({error})", where, expected)
 
 
 class _Text:
@@ -201,12 +199,11 @@ class _Text:
                     raise ValueError("no name")
                 place, second = next(lines, (where, None))
                 if second is None:
-                    fix = "The file was cut short: copy it again."
                     what = f"it ends after image {name!r}"
-                    raise WearcapError(what, where=where, expected="a line of its points", fix=fix)
+                    raise WearcapError(what, where, "a line of its points", "The file was cut short: copy it again.")
                 if len(second) % 3:
                     what = f"{len(second)} numbers for the points of image {name!r}"
-                    raise WearcapError(what, where=place, expected="X Y POINT3D_ID for each point")
+                    raise WearcapError(what, place, "X Y POINT3D_ID for each point")
                 table = finite_floats(second).reshape(-1, 3)
                 points = table[:, :2], table[:, 2].astype(np.int64)
                 images.append(_Image(name, int(camera), tuple(pose[:4]), tuple(pose[4:]), *points, where))
@@ -263,10 +260,7 @@ class _Cursor:
 
     def cut_short(self, part: str) -> WearcapError:
         return WearcapError(
-            f"it ends inside {part}",
-            where=self.path,
-            expected="a whole COLMAP file",
-            fix="The file was cut short: copy it again.",
+            f"it ends inside {part}", self.path, "a whole COLMAP file", "The file was cut short: copy it again."
         )
 
 

@@ -42,7 +42,7 @@ class LabelClock:
     def of(cls, name: str, timestamps: Float64[Tensor, "time"]) -> "LabelClock":
         """Raises WearcapError for fewer than two frames."""
         if len(timestamps) < 2:
-            raise WearcapError(f"a motion of {len(timestamps)} frames", where=name, expected="at least two to label")
+            raise WearcapError(f"a motion of {len(timestamps)} frames", name, "at least two to label")
         step = timestamps.diff().median().item()
         return cls(name, len(timestamps), timestamps[0].item(), timestamps[-1].item() + step)
 
@@ -100,11 +100,10 @@ def parse_labels(content: Any, clock: LabelClock, *, where: str | Path) -> Label
     names = [f"{hand}_hand" for hand in HANDS]
     if not isinstance(contacts, dict) or not all(isinstance(contacts.get(name), list) for name in names):
         expected = '{"contacts": {"left_hand": [[start, end], …], "right_hand": […]}} in seconds'
-        raise WearcapError("no contact labels", where=where, expected=expected)
+        raise WearcapError("no contact labels", where, expected)
     if "recording" in content:
         if content.get("schema_version") != SCHEMA:
-            what = f"schema version {content.get('schema_version')}"
-            raise WearcapError(what, where=where, expected=f"version {SCHEMA}")
+            raise WearcapError(f"schema version {content.get('schema_version')}", where, f"version {SCHEMA}")
         with understood("does not name the recording of its labels", where):
             about = content["recording"]
             name, frames, span = about["name"], about["frames"], (about["start_s"], about["stop_s"])
@@ -112,8 +111,7 @@ def parse_labels(content: Any, clock: LabelClock, *, where: str | Path) -> Label
         if name != clock.name or frames != clock.frames or not same:
             what = f"labels of recording {name!r} with {frames} frames from {span[0]:.3f} to {span[1]:.3f} s"
             expected = f"{clock.name!r} with {clock.frames} frames from {clock.start_s:.3f} to {clock.stop_s:.3f} s"
-            fix = "Give another output folder, or move this file away."
-            raise WearcapError(what, where=where, expected=expected, fix=fix)
+            raise WearcapError(what, where, expected, "Give another output folder, or move this file away.")
     labels: Labels = {}
     for hand, name in zip(HANDS, names):
         pairs = contacts[name]
@@ -126,13 +124,11 @@ def parse_labels(content: Any, clock: LabelClock, *, where: str | Path) -> Label
                 or len(texts) != len(pairs)
                 or not all(isinstance(text, str) for text in texts)
             ):
-                what = f"{key} of {name} do not match its labels"
-                raise WearcapError(what, where=where, expected=f"{len(pairs)} texts")
+                raise WearcapError(f"{key} of {name} do not match its labels", where, f"{len(pairs)} texts")
             beside.append(texts)
         objects, classes = beside
         if unknown := set(classes) - {"", *CONTACT_CLASSES}:
-            expected = f"one of {', '.join(CONTACT_CLASSES)}"
-            raise WearcapError(f"class {unknown.pop()!r} in {name}", where=where, expected=expected)
+            raise WearcapError(f"class {unknown.pop()!r} in {name}", where, f"one of {', '.join(CONTACT_CLASSES)}")
         spans = [_span(pair, clock, f"{name} label {place}", where) for place, pair in enumerate(pairs)]
         found = [Label(*span, item, kind) for span, item, kind in zip(spans, objects, classes)]
         labels[hand] = tuple(sorted(found, key=lambda label: label.start_s))
@@ -144,17 +140,16 @@ def _span(pair: Any, clock: LabelClock, label: str, where: str | Path) -> tuple[
     """Start and stop of a label within the recording; end < start lasts until its end."""
     numbers = isinstance(pair, list) and len(pair) == 2 and all(type(value) in (int, float) for value in pair)
     if not numbers or not all(math.isfinite(value) for value in pair):
-        raise WearcapError(f"{label} is {pair!r}"[:200], where=where, expected="[start, end] in seconds")
+        raise WearcapError(f"{label} is {pair!r}"[:200], where, "[start, end] in seconds")
     start, end = pair
     if start == end:
-        what = f"{label} is empty: {start} to {end} s"
         fix = "Delete the label, or write an end before its start where it lasts to the end."
-        raise WearcapError(what, where=where, expected="an end after the start", fix=fix)
+        raise WearcapError(f"{label} is empty: {start} to {end} s", where, "an end after the start", fix)
     stop = clock.stop_s if end < start else end
     if not (clock.start_s - SLACK_S <= start < clock.stop_s - 1e-9 and clock.start_s < stop <= clock.stop_s + SLACK_S):
         what = f"{label} from {start} to {end} s is outside the recording"
         expected = f"times from {clock.start_s:.3f} to {clock.stop_s:.3f} s"
-        raise WearcapError(what, where=where, expected=expected, fix="Is it the file of another recording?")
+        raise WearcapError(what, where, expected, "Is it the file of another recording?")
     return max(float(start), clock.start_s), min(float(stop), clock.stop_s)
 
 
@@ -164,7 +159,7 @@ def _refuse_overlap(labels: Sequence[Label], clock: LabelClock, name: str, where
             until = "to the end of the recording" if label.stop_s == clock.stop_s else f"to {label.stop_s} s"
             what = f"labels of {name} overlap: one from {label.start_s} {until}, the next from {following.start_s} s"
             fix = "Give the first an end before the second starts (an end before its start means: until the end)."
-            raise WearcapError(what, where=where, expected="one contact of a hand at a time", fix=fix)
+            raise WearcapError(what, where, "one contact of a hand at a time", fix)
 
 
 def interactions_of(labels: Labels) -> Interactions:

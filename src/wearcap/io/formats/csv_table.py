@@ -32,8 +32,7 @@ def open_text(path: str | Path, usual: int = MAX_BYTES) -> Iterator[Iterator[str
     def lines(file: io.TextIOWrapper) -> Iterator[str]:
         while line := file.readline(MAX_LINE):
             if len(line) == MAX_LINE:
-                what = f"a line longer than {MAX_LINE} characters"
-                raise WearcapError(what, where=path, expected="a table as text")
+                raise WearcapError(f"a line longer than {MAX_LINE} characters", path, "a table as text")
             yield line
 
     with understood("not a text file", path, "UTF-8 text", errors=UnicodeDecodeError):  # noqa: SIM117
@@ -53,7 +52,7 @@ def read_header(path: str | Path) -> list[str]:
     with open_text(path) as file:
         header = [name.strip() for name in next(csv.reader(file), [])]
     if not any(header):
-        raise WearcapError("the file is empty", where=path, expected="a header line with column names")
+        raise WearcapError("the file is empty", path, "a header line with column names")
     return header
 
 
@@ -83,7 +82,7 @@ def iter_columns(
         if name not in header:
             near = difflib.get_close_matches(name, header, n=1)
             fix = f"The nearest is {near[0]!r}." if near else ""
-            raise WearcapError(f"no column {name!r}", where=path, expected=f"the columns {', '.join(wanted)}", fix=fix)
+            raise WearcapError(f"no column {name!r}", path, f"the columns {', '.join(wanted)}", fix)
     kinds = dict.fromkeys(columns, "f8") | dict.fromkeys(text, "S64") | dict.fromkeys(whole, "i8")
     done = 0
     with open_text(path, MAX_BYTES if rows is None else MAX_STREAMED_BYTES) as file:
@@ -101,7 +100,7 @@ def iter_columns(
                 max_rows=rows,
             )
             if not len(table) and not done:
-                raise WearcapError("a header line, but no rows", where=path)
+                raise WearcapError("a header line, but no rows", path)
             if len(table):
                 yield {name: table[name] for name in wanted}
             done += len(table)

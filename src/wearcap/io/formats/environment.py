@@ -49,11 +49,10 @@ def read_environment(path: str | Path) -> Environment:
     path = path / FILE_NAME if path.is_dir() else path
     content = read_json(path)
     if not isinstance(content, dict) or not isinstance(content.get("objects"), list):
-        raise WearcapError("not an environment", where=path, expected='{"schema_version": 1, "objects": […]}')
+        raise WearcapError("not an environment", path, '{"schema_version": 1, "objects": […]}')
     if content.get("schema_version") != SCHEMA:
-        what = f"schema version {content.get('schema_version')!r}"
         fix = "Read it with the wearcap that wrote it, or update."
-        raise WearcapError(what, where=path, expected=str(SCHEMA), fix=fix)
+        raise WearcapError(f"schema version {content.get('schema_version')!r}", path, str(SCHEMA), fix)
     _require_keys(content, ("schema_version", "objects"), path)
     objects = tuple(_object(row, number, path) for number, row in enumerate(content["objects"]))
     with placed(path):
@@ -89,21 +88,20 @@ def _object(row: Any, number: int, path: Path) -> SceneObject:
     named = isinstance(row, dict) and isinstance(row.get("name"), str) and row["name"].strip()
     where = f"{path}: object {row['name']!r}" if named else f"{path}: object {number}"
     if not named:
-        raise WearcapError("an object without a name", where=where, expected=f"an object with {', '.join(_KEYS)}")
+        raise WearcapError("an object without a name", where, f"an object with {', '.join(_KEYS)}")
     if row.get("freedom") is None:
-        what = "no degree of freedom"
         fix = "What cannot move belongs to the scan and not among the objects."
-        raise WearcapError(what, where=where, expected=f'"freedom": {{"kind": one of {", ".join(FREEDOMS)}}}', fix=fix)
+        raise WearcapError("no degree of freedom", where, f'"freedom": {{"kind": one of {", ".join(FREEDOMS)}}}', fix)
     _require_keys(row, _KEYS, where)
     if not isinstance(row["category"], str):
-        raise WearcapError(f"category {row['category']!r}", where=where, expected="text")
+        raise WearcapError(f"category {row['category']!r}", where, "text")
     R = _rotation(row["R_world_object"], where).float()
     t = torch.from_numpy(_numbers(row["t_world_object"], (3,), "t_world_object", where)).float()
     mesh = _mesh(row["mesh"], path, where)
     about = row["freedom"]
     kind = about.get("kind") if isinstance(about, dict) else None
     if kind not in tuple(FREEDOMS):  # a file may say anything, lists too
-        raise WearcapError(f"no degree of freedom {kind!r}", where=where, expected=f"one of {', '.join(FREEDOMS)}")
+        raise WearcapError(f"no degree of freedom {kind!r}", where, f"one of {', '.join(FREEDOMS)}")
     _require_keys(about, _FREEDOM_KEYS[kind], f"{where}, freedom")
     pivot = None if kind != "hinge" else tuple(_numbers(about["pivot"], (3,), "pivot", where).tolist())
     axis = None if kind != "axis" else tuple(_numbers(about["axis"], (3,), "axis", where).tolist())
@@ -111,7 +109,7 @@ def _object(row: Any, number: int, path: Path) -> SceneObject:
     if (key := _FREEDOM_KEYS[kind][-1]) in about and key in _OPTIONAL and about[key] is not None:
         limits = _numbers(about[key], (2,), key, where)
         if limits[0] > limits[1]:
-            raise WearcapError(f"{key} {limits.tolist()} are reversed", where=where, expected="[least, greatest]")
+            raise WearcapError(f"{key} {limits.tolist()} are reversed", where, "[least, greatest]")
         limits = tuple((np.radians(limits) if key == "limits_deg" else limits).tolist())
     with placed(where):
         freedom = Freedom(kind, pivot, axis, limits)
@@ -123,16 +121,15 @@ def _object(row: Any, number: int, path: Path) -> SceneObject:
 def _mesh(name: Any, path: Path, where: str) -> Mesh:
     plain = isinstance(name, str) and name and not set(name) & {"\0", "\\"} and len(name.encode(errors="replace")) < 256
     if not plain or PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-        what = f"mesh {name!r}"
         fix = "Copy it there and name it relatively, as objects/sofa_1.ply."
-        raise WearcapError(what, where=where, expected="a .ply file below the environment's folder", fix=fix)
+        raise WearcapError(f"mesh {name!r}", where, "a .ply file below the environment's folder", fix)
     file = path.parent / name
     if not file.is_file():
         fix = "Copy the folder objects/ together with the environment."
-        raise WearcapError(f"its mesh {name} is missing", where=where, expected=str(file), fix=fix)
+        raise WearcapError(f"its mesh {name} is missing", where, str(file), fix)
     mesh = read_ply(file).mesh
     if not len(mesh.vertices):
-        raise WearcapError("an empty mesh", where=file, expected="at least one point")
+        raise WearcapError("an empty mesh", file, "at least one point")
     return mesh
 
 
@@ -145,7 +142,7 @@ def _row(item: SceneObject, mesh: str, where: str) -> dict[str, Any]:
         row["axis"] = list(freedom.axis)
     if limits is not None and freedom.kind not in ("hinge", "axis"):
         what = f"limits of an object that is {freedom.kind!r}"
-        raise WearcapError(what, where=where, expected="limits of hinges and of slides along an axis alone")
+        raise WearcapError(what, where, "limits of hinges and of slides along an axis alone")
     if limits is not None:
         hinge = freedom.kind == "hinge"
         row["limits_deg" if hinge else "limits_m"] = [math.degrees(v) if hinge else v for v in limits]
@@ -162,15 +159,14 @@ def _check(item: SceneObject, where: str) -> None:
     pose = [*item.R_world_object.flatten().tolist(), *item.t_world_object.tolist()]
     freedom = [*(item.freedom.pivot or ()), *(item.freedom.axis or ()), *(item.freedom.limits or ())]
     if not item.name.strip() or not len(item.mesh.vertices):
-        raise WearcapError("no name, or no points", where=where, expected="a named object with a mesh or a cloud")
+        raise WearcapError("no name, or no points", where, "a named object with a mesh or a cloud")
     if not (np.isfinite([*pose, *freedom]).all() and np.isfinite(item.mesh.vertices).all()):
-        raise WearcapError("numbers that are not finite", where=where, expected="finite coordinates (m)")
+        raise WearcapError("numbers that are not finite", where, "finite coordinates (m)")
     _rotation(item.R_world_object.tolist(), where)
     gap = item.hinge_gap_m
     if gap > MAX_HINGE_GAP_M:
         what = f"its hinge is {gap:.2f} m from its mesh, seen from above"
-        expected = f"at most {MAX_HINGE_GAP_M} m"
-        raise WearcapError(what, where=where, expected=expected, fix="The pivot is a point of the world, in metres.")
+        raise WearcapError(what, where, f"at most {MAX_HINGE_GAP_M} m", "The pivot is a point of the world, in metres.")
 
 
 def _rotation(value: Any, where: str) -> Float64[Tensor, "3 3"]:
@@ -178,7 +174,7 @@ def _rotation(value: Any, where: str) -> Float64[Tensor, "3 3"]:
     R = torch.from_numpy(_numbers(value, (3, 3), "R_world_object", where))
     if not are_rotations(R, _ORTHOGONAL_WITHIN):
         expected = f"an orthogonal matrix (within {_ORTHOGONAL_WITHIN}) of determinant +1"
-        raise WearcapError("R_world_object is no rotation", where=where, expected=expected)
+        raise WearcapError("R_world_object is no rotation", where, expected)
     return rotation.mean_rotation(R[None])
 
 
@@ -187,12 +183,12 @@ def _numbers(value: Any, shape: tuple[int, ...], key: str, where: str) -> Float6
     leaves = np.array(value, dtype=object) if isinstance(value, list) else np.array(None)
     plain = leaves.shape == shape and all(type(leaf) in (int, float) for leaf in leaves.flat)
     if not plain or not all(abs(leaf) < _LARGEST for leaf in leaves.flat):
-        raise WearcapError(f"{key} is {value!r}"[:200], where=where, expected=expected)
+        raise WearcapError(f"{key} is {value!r}"[:200], where, expected)
     return leaves.astype(np.float64)
 
 
 def _require_keys(row: dict, keys: tuple[str, ...], where: str | Path) -> None:
     if unknown := sorted(set(row) - set(keys)):
-        raise WearcapError(f"unknown key {unknown[0]!r}", where=where, expected=f"only {', '.join(keys)}")
+        raise WearcapError(f"unknown key {unknown[0]!r}", where, f"only {', '.join(keys)}")
     if missing := [key for key in keys if key not in row and key not in _OPTIONAL]:
-        raise WearcapError(f"no {missing[0]!r}", where=where, expected=", ".join(keys))
+        raise WearcapError(f"no {missing[0]!r}", where, ", ".join(keys))

@@ -100,9 +100,9 @@ def write_glb(motion: Motion, path: str | Path, body: BodyModel | None = None) -
     values = [motion.R_parent_joint, motion.t_world_root]
     values += [v for track in tracks.values() for v in (track.R_world_body, track.t_world_body)]
     if len(motion) == 0 or not all(value.isfinite().all() for value in (*values, *clocks)):
-        raise WearcapError("the motion is empty or holds NaN or infinite values", where=path, expected="finite poses")
+        raise WearcapError("the motion is empty or holds NaN or infinite values", path, "finite poses")
     if not all((clock.diff() > 0).all() for clock in clocks):
-        raise WearcapError("timestamps repeat or fall", where=path, expected="rising timestamps")
+        raise WearcapError("timestamps repeat or fall", path, "rising timestamps")
     joints = len(motion.skeleton)
     shown = _SkinnedMesh.sticks(motion.skeleton) if body is None else _SkinnedMesh.of_body(body, motion.skeleton)
     figure = _Figure(start_s=min(clock[0].item() for clock in clocks))

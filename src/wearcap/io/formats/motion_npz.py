@@ -30,7 +30,7 @@ def write_motion(motion: Motion, path: str | Path) -> None:
     """
     tree, tensors = flatten(motion)
     if bad := [key for key, tensor in tensors.items() if not tensor.isfinite().all()]:
-        raise WearcapError(f"{bad[0]!r} holds NaN or infinite values", where=path, expected="a finite motion")
+        raise WearcapError(f"{bad[0]!r} holds NaN or infinite values", path, "a finite motion")
     arrays = {key: tensor.numpy() for key, tensor in sorted(tensors.items())}
     arrays["wearcap"] = np.array(dumps({"schema": SCHEMA, "motion": tree}))
     arrays["trans"] = arrays["t_world_root"]
@@ -47,12 +47,12 @@ def read_motion(path: str | Path) -> Motion:
     arrays = read_npz(path)
     if "wearcap" not in arrays:
         fix = "AMASS files are read by io.datasets.amass."
-        raise WearcapError("an .npz file, but not of ours", where=path, expected="one that write_motion wrote", fix=fix)
+        raise WearcapError("an .npz file, but not of ours", path, "one that write_motion wrote", fix)
     try:
         tree = parse_json(str(arrays.pop("wearcap")), path)
         version = tree["schema"]
         if version != SCHEMA:
-            raise WearcapError(f"schema version {version}", where=path, expected=f"version {SCHEMA}")
+            raise WearcapError(f"schema version {version}", path, f"version {SCHEMA}")
         motion = unflatten(tree["motion"], lambda key: torch.from_numpy(arrays[key]))
         _check(motion, path)
     except WearcapError as error:
@@ -65,13 +65,13 @@ def read_motion(path: str | Path) -> Motion:
 
 
 def _damaged(error: Exception, path: str | Path) -> WearcapError:
-    return WearcapError(f"its description is damaged ({error})", where=path, fix="Capture it again.")
+    return WearcapError(f"its description is damaged ({error})", path, fix="Capture it again.")
 
 
 def _check(motion: Motion, path: str | Path) -> None:
     """Check the shapes and types of the container's annotations, for a file with arbitrary content."""
     if not isinstance(motion, Motion):
-        raise WearcapError("holds no motion", where=path)
+        raise WearcapError("holds no motion", path)
     skeleton = motion.skeleton
     parts: dict[str, tuple[Tensor | None, tuple[int | str, ...]]] = {
         "timestamps": (motion.timestamps, ("time",)),

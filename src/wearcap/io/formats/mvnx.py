@@ -130,8 +130,7 @@ class _File:
 
     def require_segments(self) -> None:
         if missing := sorted(set(_JOINT_OF) - set(self.segments)):
-            what = f"segments {missing[:5]} are missing"
-            raise WearcapError(what, where=self.path, expected="the 23 segments of a full-body suit")
+            raise WearcapError(f"segments {missing[:5]} are missing", self.path, "the 23 segments of a full-body suit")
 
     def numbers(self, name: str, text: str) -> np.ndarray:
         """The numbers of one of a frame's fields."""
@@ -219,9 +218,9 @@ def _plain(label: str) -> str:
 def _recording(file: _File) -> Recording:
     file.require_segments()
     if not file.fps:
-        raise WearcapError("no subject with a frame rate", where=file.path, expected='<subject frameRate="60">')
+        raise WearcapError("no subject with a frame rate", file.path, '<subject frameRate="60">')
     if not file.index:
-        raise WearcapError("no frames of motion", where=file.path, expected='frames of type "normal"')
+        raise WearcapError("no frames of motion", file.path, 'frames of type "normal"')
     timestamps = _timestamps(file)
     skeleton, rows = xsens23(), [file.segments.index(_LABEL_OF[name]) for name in xsens23().joint_names]
     R_world = matrix_from_quat_wxyz(_quaternions(file, "orientation"))[:, rows].double()
@@ -253,7 +252,7 @@ def _timestamps(file: _File) -> Tensor:
     """Timestamps (s) from the frame numbers, which unlike the times are not rounded to milliseconds."""
     index = torch.tensor(file.index, dtype=torch.float64)
     if not (index.diff() > 0).all():
-        raise WearcapError("frame numbers repeat or fall", where=file.path, expected="rising `index`")
+        raise WearcapError("frame numbers repeat or fall", file.path, "rising `index`")
     timestamps = (index - index[0]) / file.fps
     span_s = (file.time_ms[-1] - file.time_ms[0]) / 1000
     if np.isfinite(span_s) and abs(span_s - timestamps[-1].item()) > 0.01 * span_s + 0.05:
@@ -271,7 +270,7 @@ def _quaternions(file: _File, name: str) -> Float[Tensor, "time segment 4"]:
     if len(wrong):
         frame, element = wrong[0].tolist()
         what = f"{name} {element} is no unit quaternion"
-        raise WearcapError(what, where=f"{file.path}, frame {file.index[frame]}", expected="w x y z of length 1")
+        raise WearcapError(what, f"{file.path}, frame {file.index[frame]}", "w x y z of length 1")
     return quat_wxyz
 
 
@@ -322,6 +321,6 @@ def _contacts(file: _File) -> Float[Tensor, "time patch"] | None:
         side, part = patch.split("_")[:2]
         found = [k for k, label in enumerate(file.contacts) if side in label and part in label]
         if len(found) != 1:
-            raise WearcapError(f"foot contacts {file.contacts}", where=file.path, expected="heel and toe of both feet")
+            raise WearcapError(f"foot contacts {file.contacts}", file.path, "heel and toe of both feet")
         columns += found
     return contacts[:, columns]

@@ -68,9 +68,9 @@ def _read_array(file: io.BufferedIOBase, file_bytes: int, where: str, budget: Bu
     shape, fortran, dtype = _HEADERS[version](head)
     if dtype.hasobject:
         fix = "Such arrays can run code when they are loaded and are never read."
-        raise WearcapError("it holds Python objects", where=where, expected="plain numbers or text", fix=fix)
+        raise WearcapError("it holds Python objects", where, "plain numbers or text", fix)
     if dtype.kind not in "biufcSU":
-        raise WearcapError(f"an array of {dtype}"[:100], where=where, expected="plain numbers or text")
+        raise WearcapError(f"an array of {dtype}"[:100], where, "plain numbers or text")
     if any(length < 0 for length in shape):
         raise ValueError(f"an array of shape {shape}")
     size = math.prod(shape) * dtype.itemsize
@@ -98,7 +98,7 @@ def require(arrays: dict[str, np.ndarray], path: str | Path, **shapes: tuple[int
     sizes: dict[str, int] = {}
     for key, shape in shapes.items():
         if key not in arrays:
-            raise WearcapError(f"no array {key!r}", where=path, expected=f"{', '.join(shapes)} in this file")
+            raise WearcapError(f"no array {key!r}", path, f"{', '.join(shapes)} in this file")
         array = arrays[key]
         fits = array.ndim == len(shape) and all(
             length == (sizes.setdefault(axis, length) if isinstance(axis, str) else axis)
@@ -106,11 +106,10 @@ def require(arrays: dict[str, np.ndarray], path: str | Path, **shapes: tuple[int
         )
         if not fits:
             words = ", ".join(f"{axis}={sizes[axis]}" if axis in sizes else str(axis) for axis in shape)
-            raise WearcapError(f"array {key!r} has shape {array.shape}", where=path, expected=f"({words})")
+            raise WearcapError(f"array {key!r} has shape {array.shape}", path, f"({words})")
         if not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
-            raise WearcapError(f"array {key!r} is of type {array.dtype}", where=path, expected="real numbers")
+            raise WearcapError(f"array {key!r} is of type {array.dtype}", path, "real numbers")
         if not np.isfinite(array).all():
             row = np.argwhere(~np.isfinite(array))[0].tolist()
-            what = f"array {key!r} holds NaN or infinity, first at {row}"
-            raise WearcapError(what, where=path, expected="finite numbers")
+            raise WearcapError(f"array {key!r} holds NaN or infinity, first at {row}", path, "finite numbers")
     return sizes

@@ -55,7 +55,7 @@ class OCamModel:
         determinant = c - d * e
         if not (0 < self.width <= _MAX_SIDE and 0 < self.height <= _MAX_SIDE and 0.1 < determinant < 10):
             what = f"an image of {self.width}x{self.height} pixels with affine parameters {self.affine}"
-            raise WearcapError(what, where=where, expected=f"sizes of 1 to {_MAX_SIDE}, c near 1, d and e near 0")
+            raise WearcapError(what, where, f"sizes of 1 to {_MAX_SIDE}, c near 1, d and e near 0")
         if not (0 <= self.row < self.height and 0 <= self.column < self.width):
             raise WearcapError(
                 f"its centre, row {self.row:g} and column {self.column:g}, is outside the image of "
@@ -66,7 +66,7 @@ class OCamModel:
         focal = -self.pol[0]
         if focal <= 0:
             what = f"its direct polynomial begins with {self.pol[0]:g}"
-            raise WearcapError(what, where=where, expected="a negative number (the axis points backwards)")
+            raise WearcapError(what, where, "a negative number (the axis points backwards)")
         rho, theta = self._curve(determinant, where)
         share = theta / theta[-1]  # powers of numbers up to 1 keep the system solvable
         exponents = np.arange(2, _POWERS + 2)
@@ -74,8 +74,7 @@ class OCamModel:
         solution = np.linalg.lstsq(basis, rho / focal - theta, rcond=None)[0]
         misfit_px = float(np.abs(basis @ solution + theta - rho / focal).max()) * focal
         if misfit_px > _MAX_MISFIT_PX:
-            what = f"its polynomial is met only within {misfit_px:.2f} px"
-            raise WearcapError(what, where=where, expected="a fisheye lens")
+            raise WearcapError(f"its polynomial is met only within {misfit_px:.2f} px", where, "a fisheye lens")
         powers = (solution / theta[-1] ** exponents).tolist()
         return Camera("ocam", self.width, self.height, focal, focal, self.column, self.row, (c, d, e, *powers))
 
@@ -95,14 +94,14 @@ class OCamModel:
         # If the polynomial turns within the image, the lens's image circle is smaller than the picture.
         if last < len(rho) // 4:
             what = f"its direct polynomial turns back {rho[last]:.0f} px from the centre"
-            raise WearcapError(what, where=where, expected="angles that rise with the radius")
+            raise WearcapError(what, where, "angles that rise with the radius")
         rho, theta = rho[: last + 1], theta[: last + 1]
         if self.invpol:
             disagreement = np.abs(np.polynomial.polynomial.polyval(theta - np.pi / 2, self.invpol) - rho)
             central = disagreement[theta < 0.8 * theta[-1]]
             if central.max() > _MAX_DISAGREEMENT_PX:
                 what = f"its two polynomials differ by up to {central.max():.3g} px"
-                raise WearcapError(what, where=where, expected="two fits of one lens")
+                raise WearcapError(what, where, "two fits of one lens")
         return rho, theta
 
 
@@ -125,17 +124,16 @@ def read_sensor_frame(path: str | Path) -> dict[str, OCamModel]:
         if _child(element, "OCamModel") is None:
             continue  # other lens models are listed beside OCamCalib's
         if name in found:
-            raise WearcapError("the camera is there twice", where=where)
+            raise WearcapError("the camera is there twice", where)
         lens, size = _child(element, "OCamModel"), _child(element, "ImageSize")
         if lens is None or size is None:
-            raise WearcapError("no ImageSize", where=where, expected="ImageSize with Width and Height")
+            raise WearcapError("no ImageSize", where, "ImageSize with Width and Height")
         polynomials = {}
         for part, (least, most) in _COUNTS.items():
             holder = _child(lens, part)
             coefficients = [] if holder is None else [item.text or "" for item in holder if tag_of(item) == "coeff"]
             if not least <= len(coefficients) <= most and (part == "cam2world" or coefficients):
-                what = f"{part} with {len(coefficients)} coefficients"
-                raise WearcapError(what, where=where, expected=f"at least {least}")
+                raise WearcapError(f"{part} with {len(coefficients)} coefficients", where, f"at least {least}")
             polynomials[part] = tuple(_number(item, part, where) for item in coefficients)
         c, d, e, cx, cy = (_number(_text(lens, part, where), part, where) for part in ("c", "d", "e", "cx", "cy"))
         width, height = (_number(_text(size, part, where), part, where) for part in ("Width", "Height"))
@@ -143,7 +141,7 @@ def read_sensor_frame(path: str | Path) -> dict[str, OCamModel]:
             polynomials["cam2world"], polynomials["world2cam"], cx, cy, (c, d, e), int(width), int(height)
         )
     if not found:
-        raise WearcapError("no cameras", where=path, expected="CameraModel elements with an OCamModel (NavVis)")
+        raise WearcapError("no cameras", path, "CameraModel elements with an OCamModel (NavVis)")
     return found
 
 
@@ -154,7 +152,7 @@ def _child(element: Element, name: str) -> Element | None:
 def _text(element: Element, name: str, where: str | Path) -> str:
     child = _child(element, name)
     if child is None or not (child.text or "").strip():
-        raise WearcapError(f"no {name}", where=where, expected="NavVis' layout of sensor_frame.xml")
+        raise WearcapError(f"no {name}", where, "NavVis' layout of sensor_frame.xml")
     return (child.text or "").strip()
 
 

@@ -38,7 +38,7 @@ def read_pcd(path: str | Path) -> Ply:
             shape = (int(counts[i]),) if int(counts[i]) != 1 else ()
             fields.append((f"_padding{i}" if name == "_" else name, letter, shape))
         if not {"x", "y", "z"} <= {name for name, _, _ in fields}:
-            raise WearcapError("no fields x, y, z", where=path, expected="a point cloud")
+            raise WearcapError("no fields x, y, z", path, "a point cloud")
         dtype = np.dtype(fields)
     count = int(header["POINTS"][0])
     encoding = header["DATA"][0]
@@ -59,7 +59,7 @@ def read_pcd(path: str | Path) -> Ply:
     elif encoding == "binary_compressed":
         rows = _compressed_rows(memoryview(data)[body:], dtype, count, path)
     else:
-        raise WearcapError(f"DATA {encoding}", where=path, expected="ascii, binary or binary_compressed")
+        raise WearcapError(f"DATA {encoding}", path, "ascii, binary or binary_compressed")
     with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite and is dropped
         points = np.stack([rows[axis] for axis in "xyz"], 1).astype(np.float32)
     valid = np.isfinite(points).all(1)
@@ -77,7 +77,7 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[dict[str, list[str]], 
     while "DATA" not in header:
         stop = data.find(b"\n", start, _MAX_HEADER_BYTES)
         if stop < 0:
-            raise WearcapError("not a PCD file, or its header is cut short", where=path, expected="lines up to `DATA`")
+            raise WearcapError("not a PCD file, or its header is cut short", path, "lines up to `DATA`")
         words = data[start:stop].decode("ascii", errors="replace").split("#")[0].split()
         if words:
             header[words[0]] = words[1:] or [""]
@@ -85,14 +85,14 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[dict[str, list[str]], 
     missing = {"FIELDS", "SIZE", "TYPE", "POINTS"} - set(header)
     if missing or not (header["POINTS"][0].isdigit() and len(header["POINTS"][0]) < 15):
         what = f"its header lacks {', '.join(sorted(missing)) or 'a count of points'}"
-        raise WearcapError(what, where=path, expected="a PCD 0.7 header")
+        raise WearcapError(what, path, "a PCD 0.7 header")
     return header, start
 
 
 def _require(complete: bool, path: str | Path) -> None:
     if not complete:
         what = "it holds fewer points than its header states"
-        raise WearcapError(what, where=path, fix="The file was cut short: copy it again.")
+        raise WearcapError(what, path, fix="The file was cut short: copy it again.")
 
 
 def _compressed_rows(body: memoryview, dtype: np.dtype, count: int, path: str | Path) -> np.ndarray:

@@ -111,12 +111,12 @@ def read_ply(path: str | Path) -> Ply:
             tables[element.name], body = _read_binary(element, data, body, byte_order, path)
     vertex = {name: column for name, column in tables.get("vertex", {}).items() if isinstance(column, np.ndarray)}
     if not {"x", "y", "z"} <= set(vertex):
-        raise WearcapError("no vertices with x, y, z", where=path, expected="a PLY with `element vertex`")
+        raise WearcapError("no vertices with x, y, z", path, "a PLY with `element vertex`")
     with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite and is refused below
         points = np.stack([vertex[axis] for axis in "xyz"], 1).astype(np.float32)
     if not np.isfinite(points).all():
         what = f"{int((~np.isfinite(points)).any(1).sum())} points are NaN or infinite"
-        raise WearcapError(what, where=path, expected="finite coordinates")
+        raise WearcapError(what, path, "finite coordinates")
     return Ply(points, _colors(vertex), _triangles(tables.get("face", {}), len(points), path))
 
 
@@ -142,12 +142,11 @@ def write_ply(ply: Ply, path: str | Path) -> None:
 def _parse_header(data: bytes, path: str | Path) -> tuple[str, list[_Element], int]:
     """Byte order, elements, and where the body begins."""
     if not data.startswith(b"ply"):
-        raise WearcapError("not a PLY file", where=path, expected="a file that begins with `ply`")
+        raise WearcapError("not a PLY file", path, "a file that begins with `ply`")
     stop = data.find(b"end_header", 0, _MAX_HEADER_BYTES)
     newline = data.find(b"\n", stop)
     if stop < 0 or newline < 0:
-        fix = "The file was cut short: copy it again."
-        raise WearcapError("its header has no end", where=path, expected="`end_header`", fix=fix)
+        raise WearcapError("its header has no end", path, "`end_header`", "The file was cut short: copy it again.")
     byte_order, elements = "", []
     with understood("its header cannot be understood", path, "a PLY 1.0 header"):
         for line in data[:stop].decode("ascii").splitlines()[1:]:
@@ -165,10 +164,9 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[str, list[_Element], i
                 elements[-1].properties.append(_Property(words[2], _known(_TYPES, words[1])))
     names = [[element.name for element in elements], *([p.name for p in element.properties] for element in elements)]
     if any(len(set(group)) < len(group) or any(name.startswith("#") for name in group) for group in names):
-        raise WearcapError("its header names a part twice", where=path, expected="a PLY 1.0 header")
+        raise WearcapError("its header names a part twice", path, "a PLY 1.0 header")
     if not byte_order or any(not 0 <= element.count < 1 << 48 for element in elements):
-        what = "its header names no format, or an impossible or negative count"
-        raise WearcapError(what, where=path, expected="a PLY 1.0 header")
+        raise WearcapError("its header names no format, or an impossible or negative count", path, "a PLY 1.0 header")
     return byte_order, elements, newline + 1
 
 
@@ -181,9 +179,9 @@ def _known(table: dict[str, str], word: str) -> str:
 def _cut_short(path: str | Path, element: _Element) -> WearcapError:
     return WearcapError(
         f"it ends inside its {element.count} {element.name} rows",
-        where=path,
-        expected="as many rows as the header states",
-        fix="The file was cut short: copy it again.",
+        path,
+        "as many rows as the header states",
+        "The file was cut short: copy it again.",
     )
 
 
@@ -309,5 +307,5 @@ def _triangles(face: dict, vertices: int, path) -> np.ndarray | None:
     faces = np.stack([corners.values[first], corners.values[first + k], corners.values[first + k + 1]], 1)
     if len(faces) and not (faces.min() >= 0 and faces.max() < vertices):
         low, high = faces.min(), faces.max()
-        raise WearcapError(f"a face names vertex {high if low >= 0 else low:g}, there are {vertices}", where=path)
+        raise WearcapError(f"a face names vertex {high if low >= 0 else low:g}, there are {vertices}", path)
     return faces.astype(np.int32)

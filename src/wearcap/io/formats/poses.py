@@ -35,8 +35,7 @@ def checked_trajectory(
     worst = int(np.abs(norm - 1).argmax())
     if abs(norm[worst] - 1) > NORM_TOLERANCE:
         what = f"row {worst + 1}: quaternion {quat_wxyz[worst].round(4).tolist()} has norm {norm[worst]:.4f}"
-        expected = "unit quaternions"
-        raise WearcapError(what, where=where, expected=expected, fix="Check that the columns are the quaternion's.")
+        raise WearcapError(what, where, "unit quaternions", "Check that the columns are the quaternion's.")
     return Trajectory(
         torch.from_numpy(np.ascontiguousarray(timestamps, dtype=np.float64)),
         matrix_from_quat_wxyz(torch.tensor(quat_wxyz)).float(),
@@ -50,7 +49,7 @@ def check_finite(columns: dict[str, np.ndarray], where: str | Path) -> None:
         bad = ~(np.abs(values.reshape(len(values), -1)) < np.finfo(np.float32).max).all(1)
         if bad.any():
             what = f"row {int(bad.argmax()) + 1}: {name} is NaN or infinite ({int(bad.sum())} such rows)"
-            raise WearcapError(what, where=where, expected="finite numbers")
+            raise WearcapError(what, where, "finite numbers")
 
 
 def check_rising(timestamps: np.ndarray, where: str | Path) -> None:
@@ -59,8 +58,7 @@ def check_rising(timestamps: np.ndarray, where: str | Path) -> None:
     if late.any():
         row = int(late.argmax()) + 1
         what = f"row {row + 1}: timestamp {timestamps[row]:.6f} s follows {timestamps[row - 1]:.6f} s"
-        expected = "timestamps that rise"
-        raise WearcapError(what, where=where, expected=expected, fix="Sort the rows by time and drop repeated ones.")
+        raise WearcapError(what, where, "timestamps that rise", "Sort the rows by time and drop repeated ones.")
 
 
 def are_rotations(R: Float[Tensor, "*batch 3 3"], within: float) -> Bool[Tensor, "*batch"]:
@@ -79,15 +77,13 @@ def read_tum(path: str | Path) -> Trajectory:
         for number, line in enumerate(file, 1):
             row = line.split("#")[0].replace(",", " ").split()
             if row and len(row) != 8:
-                what = f"line {number} has {len(row)} fields"
-                raise WearcapError(what, where=path, expected="timestamp tx ty tz qx qy qz qw")
+                raise WearcapError(f"line {number} has {len(row)} fields", path, "timestamp tx ty tz qx qy qz qw")
             try:
                 values.extend(map(float, row))
             except ValueError as error:
-                what = f"line {number}: {error}"[:200]
-                raise WearcapError(what, where=path, expected="lines of 8 numbers") from error
+                raise WearcapError(f"line {number}: {error}"[:200], path, "lines of 8 numbers") from error
     if not values:
-        raise WearcapError("no poses in the file", where=path, expected="lines of 8 numbers")
+        raise WearcapError("no poses in the file", path, "lines of 8 numbers")
     table = np.asarray(values).reshape(-1, 8)
     return checked_trajectory(table[:, 0], table[:, 1:4], table[:, [7, 4, 5, 6]], path)
 
@@ -112,5 +108,5 @@ def read_euroc(path: str | Path) -> Trajectory:
         expected = "timestamp [ns], x, y, z, qw, qx, qy, qz in every line"
         table = load_rows(lines, "not an EuRoC trajectory", path, expected, ndmin=2, usecols=range(8))
     if not len(table):
-        raise WearcapError("no poses in the file", where=path, expected="lines of at least 8 numbers")
+        raise WearcapError("no poses in the file", path, "lines of at least 8 numbers")
     return checked_trajectory(table[:, 0] * 1e-9, table[:, 1:4], table[:, 4:8], path)

@@ -54,18 +54,17 @@ def read_pickle(path: str | Path, max_bytes: int | None = None) -> Any:
         with counted(file, Budget(path, file_size(path), MAX_BYTES, max_bytes)) as reader:
             content = reader.read()
     if not content:
-        raise WearcapError("the file is empty", where=path)
+        raise WearcapError("the file is empty", path)
     try:
         value = _Unpickler(io.BytesIO(content), encoding="latin1").load()
         _require_plain(value)
         return value
     except _RefusedError as error:
-        expected = "numbers, text, lists, dicts and NumPy arrays only"
         fix = "Anything else in a pickle can run code when it is loaded, and is never read."
-        raise WearcapError(str(error), where=path, expected=expected, fix=fix) from error
+        raise WearcapError(str(error), path, "numbers, text, lists, dicts and NumPy arrays only", fix) from error
     except Exception as error:  # the opcodes are the file's own program and can raise anything
         what = f"a damaged pickle ({type(error).__name__}: {error})"[:300]
-        raise WearcapError(what, where=path, expected="a whole pickle file", fix="Fetch it again.") from error
+        raise WearcapError(what, path, "a whole pickle file", "Fetch it again.") from error
 
 
 class _RefusedError(Exception):

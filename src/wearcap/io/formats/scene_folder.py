@@ -36,17 +36,17 @@ def read_scan(path: str | Path, *, needs_colors: bool = False, metres_per_unit: 
     path = Path(path)
     reader = {".ply": read_ply, ".pcd": read_pcd}.get(path.suffix.lower())
     if reader is None:
-        raise WearcapError("no scan of a kind that can be read", where=path, expected="a .ply or .pcd file")
+        raise WearcapError("no scan of a kind that can be read", path, "a .ply or .pcd file")
     content = reader(path)
     points = content.points if metres_per_unit is None else content.points * np.float32(metres_per_unit)
     if not len(points):
-        raise WearcapError("the scan has no points", where=path, expected="a cloud of the scene's surfaces")
+        raise WearcapError("the scan has no points", path, "a cloud of the scene's surfaces")
     if metres_per_unit is None and (fault := _unit_fault(points)):
         fix = "Give metres_per_unit=0.001 for a scan in millimetres, 1 for one that is sparse."
-        raise WearcapError(fault, where=path, expected="metres", fix=fix)
+        raise WearcapError(fault, path, "metres", fix)
     if needs_colors and content.colors is None:
         fix = "Export it with colours: pictures of the scene are drawn from them."
-        raise WearcapError("the scan has no colour", where=path, expected="red, green and blue of every point", fix=fix)
+        raise WearcapError("the scan has no colour", path, "red, green and blue of every point", fix)
     return Scan(points, content.colors)
 
 
@@ -85,7 +85,7 @@ def read_scene(
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise WearcapError("no such folder", where=folder, expected="a scene's folder")
+        raise WearcapError("no such folder", folder, "a scene's folder")
     if (folder / PHOTOS_FILE).is_file():
         return read_photos(folder), read_scan(folder / CLOUD, metres_per_unit=metres_per_unit)
     if is_hps_scene(folder):
@@ -95,13 +95,12 @@ def read_scene(
         model = read_colmap(folder, images)
         return model.photos, model.tracks
     expected = f"{PHOTOS_FILE} with {CLOUD}, a scan of the HPS data set, or a COLMAP model (cameras, images, points3D)"
-    raise WearcapError("no scene of a known kind", where=folder, expected=expected)
+    raise WearcapError("no scene of a known kind", folder, expected)
 
 
 def cloud_file(scene: str | Path) -> Path:
     """The cloud of a scene: the file that was named, or the one in the folder. Raises WearcapError without one."""
     path = Path(scene) / CLOUD if Path(scene).is_dir() else Path(scene)
     if not path.is_file():
-        expected = f"a folder with {CLOUD}, or a .ply or .pcd file"
-        raise WearcapError("no scan of a scene here", where=scene, expected=expected)
+        raise WearcapError("no scan of a scene here", scene, f"a folder with {CLOUD}, or a .ply or .pcd file")
     return path

@@ -80,23 +80,22 @@ def read_smpl(path: str | Path) -> SmplArrays:
         try:
             table = read_pickle(path)
         except WearcapError as error:
-            what = f"not a plain model file ({error.what})"
             fix = (
                 "SMPL's first releases hold chumpy objects: clean them with smplx's tools/clean_ch.py, or use the .npz."
             )
-            raise WearcapError(what, where=path, expected="arrays only", fix=fix) from error
+            raise WearcapError(f"not a plain model file ({error.what})", path, "arrays only", fix) from error
         if not isinstance(table, dict):
-            raise WearcapError("not a body model", where=path, expected="a dictionary of arrays")
+            raise WearcapError("not a body model", path, "a dictionary of arrays")
     size = require(table, path, **_SHAPES)
     parents = np.asarray(table["kintree_table"])[0].astype(np.int64)
     parents[0] = -1
     if not all(0 <= parent < joint for joint, parent in enumerate(parents.tolist()) if joint):
-        raise WearcapError("joints that do not follow their parents", where=path, expected="kintree_table of a tree")
+        raise WearcapError("joints that do not follow their parents", path, "kintree_table of a tree")
     if "posedirs" in table:
         require(table, path, posedirs=(size["vertex"], 3, 9 * (size["joint"] - 1)))
     faces = torch.from_numpy(np.asarray(table["f"]).astype(np.int64))
     if faces.min() < 0 or faces.max() >= size["vertex"]:
-        raise WearcapError("faces that name vertices beyond the last", where=path)
+        raise WearcapError("faces that name vertices beyond the last", path)
     names = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights")
     floats = (torch.from_numpy(np.asarray(table[n], np.float32)) if n in table else None for n in names)
     return SmplArrays(*floats, tuple(parents.tolist()), faces)  # pyright: ignore[reportArgumentType]

@@ -37,7 +37,7 @@ def read_text(path: str | Path, max_bytes: int | None = None, usual: int = MAX_B
     """Text of a file (UTF-8, else Latin-1). Raises WearcapError as `read_bytes` does, and for binary content."""
     content = read_bytes(path, max_bytes, usual)
     if b"\0" in content:
-        raise WearcapError("binary content", where=path, expected="a text file")
+        raise WearcapError("binary content", path, "a text file")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -55,13 +55,12 @@ def numbered_lines(path: str | Path, usual: int = MAX_STREAMED_BYTES) -> Iterato
         while line := file.readline(MAX_LINE):
             number += 1
             if "\0" in line:
-                raise WearcapError("binary content", where=at_line(path, number), expected="a text file")
+                raise WearcapError("binary content", at_line(path, number), "a text file")
             if len(line) == MAX_LINE and not line.endswith("\n"):
-                what = f"a line longer than {MAX_LINE} characters"
-                raise WearcapError(what, where=at_line(path, number), expected="a text file")
+                raise WearcapError(f"a line longer than {MAX_LINE} characters", at_line(path, number), "a text file")
             yield number, line
     if not number:
-        raise WearcapError("the file is empty", where=path)
+        raise WearcapError("the file is empty", path)
 
 
 def at_line(path: str | Path, line: int) -> str:
@@ -97,7 +96,7 @@ def read_json_object(path: str | Path) -> dict[str, Any]:
     """A JSON file's object. Raises WearcapError as `read_json` does, and for a file that holds something else."""
     content = read_json(path)
     if not isinstance(content, dict):
-        raise WearcapError(f"it holds a {type(content).__name__}", where=path, expected="a JSON object")
+        raise WearcapError(f"it holds a {type(content).__name__}", path, "a JSON object")
     return content
 
 
@@ -107,12 +106,10 @@ def plain_xml(path: str | Path, kind: str) -> Iterator[None]:
     try:
         yield
     except DefusedXmlException as error:
-        what = "it declares a document type or entities"
         fix = "Such declarations can blow up or fetch other files, and are never read."
-        raise WearcapError(what, where=path, expected=f"a plain {kind}", fix=fix) from error
+        raise WearcapError("it declares a document type or entities", path, f"a plain {kind}", fix) from error
     except ParseError as error:
-        what = f"broken XML ({error.msg})"
-        raise WearcapError(what, where=path, expected=f"a whole {kind}", fix="Export or copy it again.") from error
+        raise WearcapError(f"broken XML ({error.msg})", path, f"a whole {kind}", "Export or copy it again.") from error
 
 
 def tag_of(element: Element) -> str:

@@ -84,7 +84,7 @@ def read_frames(
             if number >= start and (number - start) % step == 0:
                 yield time - begin, frame.to_ndarray(format="rgb24")
         if number < 0:
-            raise WearcapError("a video without frames", where=path)
+            raise WearcapError("a video without frames", path)
 
 
 @contextmanager
@@ -97,15 +97,14 @@ def _open_video(path: str | Path) -> Iterator[tuple[InputContainer, VideoStream]
         av.open(str(path), metadata_errors="replace") as container,
     ):
         if not container.streams.video:
-            raise WearcapError("a file without pictures", where=path, expected="a video")
+            raise WearcapError("a file without pictures", path, "a video")
         stream = container.streams.video[0]
         if stream.codec_context is None:
-            what = "pictures packed in a way that is not known"
-            raise WearcapError(what, where=path, expected="a video in H.264, say")
+            raise WearcapError("pictures packed in a way that is not known", path, "a video in H.264, say")
         stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}  # for sizes that only the pictures have
         if stream.width * stream.height > MAX_PIXELS:
             what = f"pictures of {stream.width}x{stream.height} pixels"
-            raise WearcapError(what, where=path, expected=f"at most {MAX_PIXELS} pixels", fix="Scale the video down.")
+            raise WearcapError(what, path, f"at most {MAX_PIXELS} pixels", "Scale the video down.")
         yield container, stream
 
 
@@ -126,11 +125,10 @@ def video_info(path: str | Path) -> _VideoInfo:
         fps = float(stream.average_rate or 30)
         frames = stream.frames or round((container.duration or 0) / av.time_base * fps)
         if not (stream.width > 0 and stream.height > 0):
-            raise WearcapError(f"pictures of {stream.width}x{stream.height} pixels", where=path, expected="a video")
+            raise WearcapError(f"pictures of {stream.width}x{stream.height} pixels", path, "a video")
         if not (0 < fps <= _MAX_FPS and 0 <= frames <= file_size(path)):
             what = f"a header that announces {frames} frames at {fps:.6g} per second"
-            expected = "no more frames than bytes"
-            raise WearcapError(what, where=path, expected=expected, fix="The file was damaged: copy it again.")
+            raise WearcapError(what, path, "no more frames than bytes", "The file was damaged: copy it again.")
         return _VideoInfo(stream.width, stream.height, fps, frames)
 
 
@@ -161,10 +159,10 @@ def write_frames(
                 stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
             if (frame.shape[1], frame.shape[0]) != size or size[0] % 2 or size[1] % 2:
                 what = f"a picture of {frame.shape[1]}x{frame.shape[0]} pixels"
-                raise WearcapError(what, where=path, expected="even sizes, all alike")
+                raise WearcapError(what, path, "even sizes, all alike")
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
         if not count:
-            raise WearcapError("no pictures to write", where=path)
+            raise WearcapError("no pictures to write", path)
         container.mux(stream.encode(None))
     return count
 
@@ -181,7 +179,7 @@ def read_pictures(source: str | Path, max_count: int) -> Iterator[tuple[str, UIn
     if source.is_dir():
         files = sorted(path for path in source.iterdir() if path.suffix.lower() in SUFFIXES)
         if not files:
-            raise WearcapError("no pictures in this folder", where=source, expected=", ".join(SUFFIXES))
+            raise WearcapError("no pictures in this folder", source, ", ".join(SUFFIXES))
         wanted = np.unique(np.linspace(0, len(files) - 1, max_count).round().astype(int))
         for path in (files[k] for k in wanted):
             yield path.name, read_image(path)
@@ -190,4 +188,4 @@ def read_pictures(source: str | Path, max_count: int) -> Iterator[tuple[str, UIn
         for count, (_, picture) in enumerate(read_frames(source, step=step)):
             yield f"frame {count * step}", picture
     else:
-        raise WearcapError("no such file or folder", where=source, expected="a video, or a folder of pictures")
+        raise WearcapError("no such file or folder", source, "a video, or a folder of pictures")

@@ -42,13 +42,12 @@ def read_obj(path: str | Path) -> Mesh:
         except ValueError as error:
             what = f"not a readable {'vertex' if words[0] == 'v' else 'face'} ({error})"[:300]
             fix = "The file was damaged: copy it again."
-            raise WearcapError(what, where=at_line(path, number), expected="v x y z, or f a b c …", fix=fix) from error
+            raise WearcapError(what, at_line(path, number), "v x y z, or f a b c …", fix) from error
     if not vertices:
-        raise WearcapError("no vertices", where=path, expected="a Wavefront .obj with lines `v x y z`")
+        raise WearcapError("no vertices", path, "a Wavefront .obj with lines `v x y z`")
     points = np.array(vertices, np.float32).reshape(-1, 3)
     corners = np.array(faces, np.int32).reshape(-1, 3)
     if len(corners) and corners.max() >= len(points):
         what = f"a face names vertex {corners.max() + 1}, there are {len(points)}"
-        expected = "faces of its own vertices"
-        raise WearcapError(what, where=path, expected=expected, fix="The file was cut short: copy it again.")
+        raise WearcapError(what, path, "faces of its own vertices", "The file was cut short: copy it again.")
     return Mesh(points, corners, GREY)
