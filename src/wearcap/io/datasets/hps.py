@@ -239,19 +239,12 @@ def read_hps_scene(folder: str | Path) -> tuple[Path, list[Photo]]:
     return folder / CLOUD, photos
 
 
-_ARM = ("collar", "shoulder", "elbow", "wrist", "hand")
-_LEG = ("hip", "knee", "ankle", "foot")
-UNITY_JOINTS = (
-    "pelvis",
-    *(f"{side}_{joint}" for side in ("left", "right") for joint in _LEG),
-    "spine1",
-    "spine2",
-    "spine3",
-    *(f"left_{joint}" for joint in _ARM),
-    "neck",
-    "head",
-    *(f"right_{joint}" for joint in _ARM),
+_HIERARCHY = (
+    "pelvis left_hip left_knee left_ankle left_foot right_hip right_knee right_ankle right_foot spine1 spine2 spine3 "
+    "left_collar left_shoulder left_elbow left_wrist left_hand neck head "
+    "right_collar right_shoulder right_elbow right_wrist right_hand"
 )
+UNITY_JOINTS = tuple(_HIERARCHY.split())
 """Order of the file's Euler angles: Unity's hierarchy of SMPL, depth first."""
 _WITH_INNER_ROOT = 3 * (len(UNITY_JOINTS) + 1)
 """Files name the root twice: the avatar, which turns, and below it the model's own root, which does not."""
@@ -310,10 +303,7 @@ def _table(path: str | Path, widths: tuple[int, ...]) -> np.ndarray:
             if len(tokens) >= width:
                 raise short
             continue  # the recorder stops in the middle of a line: only the last may be short
-        try:
-            values.extend(finite_floats(tokens))
-        except ValueError as error:
-            raise WearcapError(str(error), at_line(path, number)) from error
+        values.extend(finite_floats(tokens, at_line(path, number)))
     if not values:
         raise WearcapError("no lines of numbers", path)
     return np.asarray(values).reshape(-1, width)

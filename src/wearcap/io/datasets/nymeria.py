@@ -8,15 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
-from torch import Tensor
 
 from wearcap.body.kinematics import local_rotations
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.trajectory import Trajectory, interpolate
+from wearcap.geometry.trajectory import Trajectory, interpolate, nearest_frames, slerp
 from wearcap.io.devices.aria_mps import T_HEAD_DEVICE, find_mps_file, head_stream, read_closed_loop, read_mps_points
 from wearcap.io.devices.aria_vrs import extract_video
 from wearcap.io.devices.head_alignment import align_head, clock_offset
@@ -160,7 +158,7 @@ def _on_device(
     motion = Motion(
         times,
         suit.skeleton,
-        _resampled_rotations(own.timestamps, R, times),
+        slerp(own.timestamps, R, times),
         interpolate(own.timestamps, T_world_root.t, times).float(),
         provenance=suit.provenance
         | {
@@ -171,22 +169,11 @@ def _on_device(
     )
     contact = None
     if contacts is not None:
-        nearest = torch.searchsorted((own.timestamps[1:] + own.timestamps[:-1]) / 2, times)
-        contact = ContactTrack(times, contacts.parts, contacts.contact[nearest])
-    R_world_device = _resampled_rotations(track.timestamps, track.R_world_body, times)
+        contact = ContactTrack(times, contacts.parts, contacts.contact[nearest_frames(own.timestamps, times)])
+    R_world_device = slerp(track.timestamps, track.R_world_body, times)
     t_world_device = interpolate(track.timestamps, track.t_world_body, times)
     T_head_device = alignment.T_head_device
     return motion, contact, HeadStream(times, R_world_device, t_world_device, T_head_device.R, T_head_device.t)
-
-
-def _resampled_rotations(
-    timestamps: Float64[Tensor, "time"], R: Float[Tensor, "time *rest"], at: Float64[Tensor, "new_time"]
-) -> Float[Tensor, "new_time *rest"]:
-    """Rotations at other times, by slerp between neighbours."""
-    after = torch.searchsorted(timestamps, at, right=True).clamp(1, len(timestamps) - 1)
-    blend = ((at - timestamps[after - 1]) / (timestamps[after] - timestamps[after - 1])).clamp(0, 1).to(R.dtype)
-    turn = rotation.log(R[after - 1].mT @ R[after])
-    return R[after - 1] @ rotation.exp(turn * blend.reshape(-1, *[1] * (turn.ndim - 1)))
 
 
 def read_metadata(folder: Path) -> dict:

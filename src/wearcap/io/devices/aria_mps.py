@@ -168,12 +168,8 @@ def read_points(
 
 def find_mps_file(folder: str | Path, names: tuple[str, ...]) -> Path | None:
     """First of `names` (plain, .gz, .xz) in an MPS folder or its usual subfolders; None where there is none."""
-    for subfolder in _SUBFOLDERS:
-        for name in names:
-            for suffix in _SUFFIXES:
-                if (path := Path(folder) / subfolder / f"{name}{suffix}").is_file():
-                    return path
-    return None
+    files = (Path(part) / f"{name}{suffix}" for part in _SUBFOLDERS for name in names for suffix in _SUFFIXES)
+    return next((path for file in files if (path := Path(folder) / file).is_file()), None)
 
 
 def is_mps_folder(folder: str | Path) -> bool:

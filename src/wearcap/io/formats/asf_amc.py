@@ -7,10 +7,11 @@ the file's length scale (CMU: 1 unit = 0.0254 / 0.45 m).
 
 import math
 from array import array
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import chain, islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from torch import Tensor
 from wearcap.body.skeleton import Site, Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis
+from wearcap.io.formats.bounded import understood
 from wearcap.io.formats.text import at_line, finite_floats, numbered_lines
 from wearcap.recording.motion import Motion
 
@@ -31,6 +33,9 @@ MAX_BONES = 2000
 ROTATIONS = ("rx", "ry", "rz")
 SIDES = {"l": "left", "r": "right"}
 END_SITES = {"toes": "toe_tip", "fingers": "fingertip", "thumb": "thumb_tip"}
+_CMU_SPINE = "root lowerback upperback thorax lowerneck upperneck head"
+_CMU_LIMBS = "hipjoint femur tibia foot toes clavicle humerus radius wrist hand fingers thumb"
+"""Names of CMU's nodes; those of the limbs follow "l" or "r"."""
 HEEL_BACK, HEEL_DOWN = 0.35, 0.45
 """Heel behind and below the ankle joint, as fractions of the foot bone (the file has no heel)."""
 
@@ -72,6 +77,7 @@ def read_asf(path: str | Path, unit_m: float | int | None = None) -> _AsfSkeleto
     """
     path = Path(path)
     content = _AsfContent.read(path)
+    cmu_nodes = {*_CMU_SPINE.split(), *(side + part for side in SIDES for part in _CMU_LIMBS.split())}
     unit_m = INCH_M / content.length if unit_m is None else unit_m
     names, parents = content.tree_order(path)
     table = [content.root, *(content.bones[name] for name in names[1:])]
@@ -82,7 +88,7 @@ def read_asf(path: str | Path, unit_m: float | int | None = None) -> _AsfSkeleto
     offsets[0] = 0
     leaves = {name: ends[joint] for joint, name in enumerate(names) if joint not in parents}
     skeleton = Skeleton(
-        "cmu31" if set(names) == _CMU_NODES else path.name.split(".")[0],
+        "cmu31" if set(names) == cmu_nodes else path.name.split(".")[0],
         tuple(names),
         tuple(parents),
         offsets.float(),
@@ -164,12 +170,9 @@ class _AsfContent:
         content, number = cls(), 0
         for number, text in numbered_lines(path):
             words = text.split("#")[0].split()
-            try:
+            with understood(f"cannot read {text.strip()[:80]!r}", at_line(path, number), "Acclaim ASF"):
                 if words:
                     content.take(number, words)
-            except (ValueError, IndexError) as error:
-                what = f"cannot read {text.strip()[:80]!r} ({error})"
-                raise WearcapError(what, at_line(path, number), "Acclaim ASF") from error
         if content.bone is not None or not content.bones or not content.hierarchy:
             what = "bones or hierarchy are missing or cut short"
             expected = "an ASF file with :bonedata and :hierarchy"
@@ -202,50 +205,23 @@ class _AsfContent:
     def take(self, number: int, words: list[str]) -> None:
         if words[0].startswith(":"):
             self.section, self.bone = words[0].lower(), None
-        elif self.section == ":units":
-            self.take_unit(words)
-        elif self.section == ":root":
-            self.take_root(words)
+        elif self.section == ":units" and words[0] == "length":
+            self.length = float(finite_floats(words[1:2])[0])
+            if not self.length > 0:
+                raise ValueError("the length unit must be positive")
+        elif self.section == ":units" and words[0] == "angle":
+            self.radians = words[1].lower().startswith("rad")
         elif self.section == ":bonedata" and words[0] == "begin":
             self.bone = _Bone("", number)
         elif self.section == ":bonedata" and words[0] == "end" and self.bone is not None:
             self.close_bone(self.bone)
-        elif self.section == ":bonedata" and self.bone is not None:
-            self.take_bone(self.bone, words)
+        elif self.section == ":root" or (self.section == ":bonedata" and self.bone is not None):
+            for name, read in _FIELDS[self.section].get(words[0], {}).items():
+                setattr(self.bone or self.root, name, read(words[1:]))
         elif self.section == ":hierarchy" and words[0] not in ("begin", "end"):
             self.hierarchy.append((number, words))
             if max(len(self.hierarchy), len(words)) > MAX_BONES:
                 raise ValueError(f"more than {MAX_BONES} bones")
-
-    def take_unit(self, words: list[str]) -> None:
-        if words[0] == "length":
-            self.length = float(finite_floats(words[1:2])[0])
-            if not self.length > 0:
-                raise ValueError("the length unit must be positive")
-        elif words[0] == "angle":
-            self.radians = words[1].lower().startswith("rad")
-
-    def take_root(self, words: list[str]) -> None:
-        if words[0] == "order":
-            self.root.dof = _channels(words[1:], ("tx", "ty", "tz", *ROTATIONS))
-        elif words[0] == "axis":
-            self.root.order = _order(words[1])
-        elif words[0] == "position":
-            self.root.direction = _three(words[1:4])
-        elif words[0] == "orientation":
-            self.root.axis_deg = _three(words[1:4])
-
-    def take_bone(self, bone: _Bone, words: list[str]) -> None:
-        if words[0] == "name":
-            bone.name = words[1]
-        elif words[0] == "direction":
-            bone.direction = _three(words[1:4])
-        elif words[0] == "length":
-            bone.length = float(finite_floats(words[1:2])[0])
-        elif words[0] == "axis":
-            bone.axis_deg, bone.order = _three(words[1:4]), _order(words[4])
-        elif words[0] == "dof":
-            bone.dof = _channels(words[1:], ROTATIONS)
 
     def close_bone(self, bone: _Bone) -> None:
         if not bone.name or bone.name == "root" or bone.name in self.bones:
@@ -256,7 +232,7 @@ class _AsfContent:
 
 
 def _three(words: list[str]) -> list[float]:
-    values = finite_floats(words)
+    values = finite_floats(words[:3])
     if len(values) != 3:
         raise ValueError("three numbers are needed")
     return values.tolist()
@@ -275,24 +251,22 @@ def _channels(words: list[str], known: tuple[str, ...]) -> tuple[str, ...]:
     return channels
 
 
-_CMU_NODES = {"root", "lowerback", "upperback", "thorax", "lowerneck", "upperneck", "head"} | {
-    side + part
-    for side in SIDES
-    for part in [
-        "hipjoint",
-        "femur",
-        "tibia",
-        "foot",
-        "toes",
-        "clavicle",
-        "humerus",
-        "radius",
-        "wrist",
-        "hand",
-        "fingers",
-        "thumb",
-    ]
+_FIELDS: dict[str, dict[str, dict[str, Callable[[list[str]], Any]]]] = {
+    ":root": {
+        "order": {"dof": lambda words: _channels(words, ("tx", "ty", "tz", *ROTATIONS))},
+        "axis": {"order": lambda words: _order(words[0])},
+        "position": {"direction": _three},
+        "orientation": {"axis_deg": _three},
+    },
+    ":bonedata": {
+        "name": {"name": lambda words: words[0]},
+        "direction": {"direction": _three},
+        "length": {"length": lambda words: float(finite_floats(words[:1])[0])},
+        "axis": {"axis_deg": _three, "order": lambda words: _order(words[3])},
+        "dof": {"dof": lambda words: _channels(words, ROTATIONS)},
+    },
 }
+"""By section and a line's first word: the fields of `_Bone` that it sets, and how its other words are read."""
 
 
 def _sites(names: list[str], ends: Tensor, leaves: dict[str, Tensor]) -> dict[str, Site]:
@@ -359,10 +333,7 @@ def _parse_amc(path: Path, asf: _AsfSkeleton) -> tuple[np.ndarray, list[int], Fl
         if words[0] != like[0] or len(words) != len(like):
             what = f"{' '.join(words)[:60]!r} differs from the first frame"
             raise WearcapError(what, at_line(path, number), f"{like[0]!r} with {len(like) - 1} values")
-        try:
-            values.extend(finite_floats(words[1:]))
-        except ValueError as error:
-            raise WearcapError(str(error), at_line(path, number)) from error
+        values.extend(finite_floats(words[1:], at_line(path, number)))
     if place < len(first):
         expected = f"{len(first)} bones per frame"
         raise WearcapError("the last frame is cut short", at_line(path, number), expected, "Fetch the file again.")

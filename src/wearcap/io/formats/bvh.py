@@ -181,10 +181,7 @@ def _parse_motion(
     for number, text in lines:
         words = text.split()
         rows += 1
-        try:
-            values.extend(finite_floats(words))
-        except ValueError as error:
-            raise WearcapError(str(error), at_line(path, number)) from error
+        values.extend(finite_floats(words, at_line(path, number)))
         if len(words) != channels and odd is None:
             expected = f"{channels}, one per channel of the hierarchy"
             odd = WearcapError(f"{len(words)} values", where=at_line(path, number), expected=expected)
@@ -395,31 +392,18 @@ def write_bvh(motion: Motion, path: str | Path, unit_m: float | int = 0.01) -> N
     z = torch.where(locked, torch.atan2(-R[..., 0, 1], R[..., 1, 1]), torch.atan2(R[..., 1, 0], R[..., 0, 0]))
     zyx = torch.stack([z, torch.atan2(-R[..., 2, 0], cos_y), x], -1)
     degrees = np.unwrap(np.degrees(zyx.numpy()), axis=0, period=360)
-    order = _depth_first(motion.skeleton)
+    order: list[int] = []
+    lines = ["HIERARCHY", *_hierarchy(motion.skeleton, 0, 0, float(unit_m), order)]
     table = np.concatenate([root.numpy(), degrees[:, order].reshape(len(frames), -1)], -1)
     row = " ".join(["%.6f"] * table.shape[1])
-    lines = [
-        "HIERARCHY",
-        *_hierarchy(motion.skeleton, 0, 0, float(unit_m)),
-        "MOTION",
-        f"Frames: {len(table)}",
-        f"Frame Time: {1 / fps:.9f}",
-        *(row % tuple(values) for values in table.tolist()),
-    ]
+    lines += ["MOTION", f"Frames: {len(table)}", f"Frame Time: {1 / fps:.9f}"]
+    lines += [row % tuple(values) for values in table.tolist()]
     write_text(path, "\n".join(lines) + "\n")
 
 
-def _children(skeleton: Skeleton, joint: int) -> list[int]:
-    return [child for child, parent in enumerate(skeleton.parents) if parent == joint]
-
-
-def _depth_first(skeleton: Skeleton, joint: int = 0) -> list[int]:
-    """Joints in the order in which a BVH hierarchy names them."""
-    return [joint, *(k for child in _children(skeleton, joint) for k in _depth_first(skeleton, child))]
-
-
-def _hierarchy(skeleton: Skeleton, joint: int, depth: int, unit_m: float) -> list[str]:
-    """The lines of one joint's block."""
+def _hierarchy(skeleton: Skeleton, joint: int, depth: int, unit_m: float, order: list[int]) -> list[str]:
+    """The lines of one joint's block; its joints are appended to `order` as they are named."""
+    order.append(joint)
     tab = "\t" * depth
     offset = _R_FILE_WORLD @ skeleton.t_parent_joint[joint].double() / unit_m * (joint > 0)
     position = "6 Xposition Yposition Zposition" if joint == 0 else "3"
@@ -429,9 +413,9 @@ def _hierarchy(skeleton: Skeleton, joint: int, depth: int, unit_m: float) -> lis
         tab + "\tOFFSET {:.6f} {:.6f} {:.6f}".format(*offset.tolist()),
         f"{tab}\tCHANNELS {position} Zrotation Yrotation Xrotation",
     ]
-    children = _children(skeleton, joint)
+    children = [child for child, parent in enumerate(skeleton.parents) if parent == joint]
     for child in children:
-        lines += _hierarchy(skeleton, child, depth + 1, unit_m)
+        lines += _hierarchy(skeleton, child, depth + 1, unit_m, order)
     if not children:
         ends = [site.t_joint_site for site in skeleton.sites.values() if site.joint == skeleton.joint_names[joint]]
         end = max(ends, key=lambda end: math.hypot(*end), default=(0.0, 0.0, 0.0))

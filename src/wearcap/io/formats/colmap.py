@@ -19,7 +19,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.io.formats.bounded import read_bytes
+from wearcap.io.formats.bounded import read_bytes, understood
 from wearcap.io.formats.text import at_line, finite_floats, numbered_lines
 from wearcap.scene.scan import Photo
 
@@ -165,10 +165,6 @@ def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
             yield at_line(path, number), line.split()
 
 
-def _damaged(where: str | Path, error: Exception, expected: str) -> WearcapError:
-    return WearcapError(f"cannot be understood ({error})", where, expected)
-
-
 class _Text:
     """A model as text."""
 
@@ -177,11 +173,9 @@ class _Text:
         cameras = {}
         for where, words in _lines(path):
             if words:
-                try:
+                with understood("cannot be understood", where, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS…"):
                     number, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
                     values = [float(word) for word in words[4:]]
-                except (ValueError, IndexError) as error:
-                    raise _damaged(where, error, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS…") from error
                 cameras[number] = _camera(model, width, height, values, where)
         return cameras
 
@@ -192,7 +186,9 @@ class _Text:
         for where, words in lines:
             if not words:
                 continue
-            try:
+            with understood(
+                "cannot be understood", where, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its points"
+            ):
                 _, *pose, camera, name = [*words[:9], " ".join(words[9:])]
                 pose = [float(word) for word in pose]
                 if not name:
@@ -207,8 +203,6 @@ class _Text:
                 table = finite_floats(second).reshape(-1, 3)
                 points = table[:, :2], table[:, 2].astype(np.int64)
                 images.append(_Image(name, int(camera), tuple(pose[:4]), tuple(pose[4:]), *points, where))
-            except (ValueError, IndexError) as error:
-                raise _damaged(where, error, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its points") from error
         return images
 
     @staticmethod
@@ -216,14 +210,12 @@ class _Text:
         points = _Points()
         for where, words in _lines(path):
             if words:
-                try:
+                with understood("cannot be understood", where, "POINT3D_ID X Y Z R G B ERROR TRACK…"):
                     if len(words) < 7:
                         raise ValueError("too few numbers")
                     points.number.append(int(words[0]))
                     points.xyz.extend(map(float, words[1:4]))
                     points.rgb += bytes(map(int, words[4:7]))  # raises beyond 0…255
-                except (ValueError, IndexError, OverflowError) as error:
-                    raise _damaged(where, error, "POINT3D_ID X Y Z R G B ERROR TRACK…") from error
         return points
 
 

@@ -119,10 +119,8 @@ def parse_labels(content: Any, clock: LabelClock, *, where: str | Path) -> Label
         for key in ("objects", "classes"):
             texts = content.get(key, {})
             texts = texts.get(name, [""] * len(pairs)) if isinstance(texts, dict) else None
-            if (
-                not isinstance(texts, list)
-                or len(texts) != len(pairs)
-                or not all(isinstance(text, str) for text in texts)
+            if not (
+                isinstance(texts, list) and len(texts) == len(pairs) and all(isinstance(text, str) for text in texts)
             ):
                 raise WearcapError(f"{key} of {name} do not match its labels", where, f"{len(pairs)} texts")
             beside.append(texts)

@@ -40,11 +40,11 @@ def open_text(path: str | Path, usual: int = MAX_BYTES) -> Iterator[Iterator[str
             yield lines(io.TextIOWrapper(file, "utf-8", newline=""))
 
 
-def load_rows(lines: Iterable[str], what: str, where: str | Path, expected: str, **options: Any) -> np.ndarray:
-    """`numpy.loadtxt` of comma-separated lines, of which there may be none; its errors become WearcapError."""
+def load_rows(lines: Iterable[str], what: str, where: str | Path, expected: str = "", **options: Any) -> np.ndarray:
+    """`numpy.loadtxt` of lines, of which there may be none; its errors become WearcapError."""
     with warnings.catch_warnings(), understood(what, where, expected, errors=(ValueError, OverflowError)):
         warnings.simplefilter("ignore", UserWarning)  # numpy warns about an empty file
-        return np.loadtxt(lines, delimiter=",", **options)
+        return np.loadtxt(lines, **options)
 
 
 def read_header(path: str | Path) -> list[str]:
@@ -94,6 +94,7 @@ def iter_columns(
                 path,
                 f"{len(header)} comma-separated fields in every line",
                 dtype=np.dtype(list(kinds.items())),
+                delimiter=",",
                 usecols=[header.index(name) for name in kinds],
                 comments=None,
                 ndmin=1,

@@ -15,7 +15,7 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, parse_json
 from wearcap.geometry import rotation
-from wearcap.geometry.trajectory import Trajectory
+from wearcap.geometry.trajectory import Trajectory, nearest_frames
 from wearcap.io.formats.npz import read_npz, require
 from wearcap.recording.motion import HANDS, Interactions, Motion
 from wearcap.recording.serialize import dumps, flatten, unflatten
@@ -137,8 +137,7 @@ def even_frames(motion: Motion) -> tuple[Int64[Tensor, "time"], float]:
         raise WearcapError(what, expected="rising timestamps in s", fix="Cut the motion at the gap.")
     start, duration = motion.timestamps[0], motion.timestamps[-1] - motion.timestamps[0]
     grid = start + torch.arange(round(duration.item() * fps) + 1, dtype=torch.float64) / fps
-    midpoints = (motion.timestamps[1:] + motion.timestamps[:-1]) / 2
-    return torch.searchsorted(midpoints, grid), fps
+    return nearest_frames(motion.timestamps, grid), fps
 
 
 def nominal_fps(fps: float) -> float:

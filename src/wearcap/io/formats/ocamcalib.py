@@ -121,12 +121,12 @@ def read_sensor_frame(path: str | Path) -> dict[str, OCamModel]:
     for element in (item for item in root.iter() if tag_of(item) == "CameraModel"):
         name = _text(element, "SensorName", path)
         where = f"{path}, camera {name!r}"
-        if _child(element, "OCamModel") is None:
+        lens, size = _child(element, "OCamModel"), _child(element, "ImageSize")
+        if lens is None:
             continue  # other lens models are listed beside OCamCalib's
         if name in found:
             raise WearcapError("the camera is there twice", where)
-        lens, size = _child(element, "OCamModel"), _child(element, "ImageSize")
-        if lens is None or size is None:
+        if size is None:
             raise WearcapError("no ImageSize", where, "ImageSize with Width and Height")
         polynomials = {}
         for part, (least, most) in _COUNTS.items():

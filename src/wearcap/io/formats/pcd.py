@@ -1,7 +1,6 @@
 """PCD point clouds (ASCII, binary, binary_compressed): x y z and, where there are any, colours."""
 
 import io
-import warnings
 from itertools import islice
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import numpy as np
 
 from wearcap.errors import WearcapError
 from wearcap.io.formats.bounded import read_bytes, understood
+from wearcap.io.formats.csv_table import load_rows
 from wearcap.io.formats.ply import Ply
 
 _MAX_HEADER_BYTES = 1 << 16
@@ -45,13 +45,8 @@ def read_pcd(path: str | Path) -> Ply:
     if encoding == "ascii":
         text = io.TextIOWrapper(io.BytesIO(memoryview(data)[body:]), "ascii", errors="replace", newline="\n")
         lines = islice((line for line in text if line.strip()), count)
-        with (
-            warnings.catch_warnings(),
-            np.errstate(over="ignore", invalid="ignore"),
-            understood("a row does not match the header", path, errors=(ValueError, OverflowError)),
-        ):
-            warnings.simplefilter("ignore", UserWarning)  # numpy warns about a file that ends here
-            rows = np.loadtxt(lines, dtype=dtype, ndmin=1, comments=None)
+        with np.errstate(over="ignore", invalid="ignore"):
+            rows = load_rows(lines, "a row does not match the header", path, dtype=dtype, ndmin=1, comments=None)
         _require(len(rows) == count, path)
     elif encoding == "binary":
         _require(len(data) - body >= count * dtype.itemsize, path)

@@ -106,7 +106,7 @@ def read_euroc(path: str | Path) -> Trajectory:
     with open_text(path) as file:
         lines = (line for line in file if line.strip() and not line.startswith("#"))
         expected = "timestamp [ns], x, y, z, qw, qx, qy, qz in every line"
-        table = load_rows(lines, "not an EuRoC trajectory", path, expected, ndmin=2, usecols=range(8))
+        table = load_rows(lines, "not an EuRoC trajectory", path, expected, delimiter=",", ndmin=2, usecols=range(8))
     if not len(table):
         raise WearcapError("no poses in the file", path, "lines of at least 8 numbers")
     return checked_trajectory(table[:, 0] * 1e-9, table[:, 1:4], table[:, 4:8], path)

@@ -68,15 +68,16 @@ def at_line(path: str | Path, line: int) -> str:
     return f"{path}, line {line}"
 
 
-def finite_floats(tokens: Iterable[str]) -> np.ndarray:
-    """All tokens as float64. Raises ValueError naming the first that is no finite number."""
+def finite_floats(tokens: Iterable[str], where: str | None = None) -> np.ndarray:
+    """All tokens as float64. Raises ValueError (WearcapError, if `where` is given) naming the first that is no finite number."""
     tokens = tokens if isinstance(tokens, list) else list(tokens)
     try:
         values = list(map(float, tokens))
     except ValueError:
         values = [math.nan]
     if not all(map(math.isfinite, values)):
-        raise ValueError(f"{next(filter(_no_finite_number, tokens))[:30]!r} is no finite number")
+        what = f"{next(filter(_no_finite_number, tokens))[:30]!r} is no finite number"
+        raise WearcapError(what, where) if where else ValueError(what)
     return np.array(values, np.float64)
 
 
