@@ -15,15 +15,7 @@ from test_mvnx import mvnx, sample
 from wearcap.body.skeletons import smpl24
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.datasets.hps import (
-    _scan_name,
-    hps_names,
-    is_hps,
-    is_hps_scene,
-    read_hps_scene,
-    read_hps_sequence,
-    subject_of,
-)
+from wearcap.io.datasets.hps import _scan_name, hps_names, is_hps_scene, read_hps_scene, read_hps_sequence, subject_of
 
 # Scans -------------------------------------------------------------------------------------------------------------
 
@@ -90,7 +82,6 @@ def write_video(path: Path, frames: int, size: tuple[int, int]) -> None:
 
 def test_a_sequence_on_one_clock(tmp_path):
     truth = write_hps(tmp_path)
-    assert is_hps(tmp_path)
     assert hps_names(tmp_path) == [NAME]
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -20,7 +20,7 @@ def test_a_scan_comes_back(tmp_path):
     points = room()
     colors = np.random.default_rng(0).integers(0, 255, points.shape, dtype=np.uint8)
     write_ply(Ply(points, colors), tmp_path / "a.ply")
-    scan = read_scan(tmp_path / "a.ply", needs_colors=True)
+    scan = read_scan(tmp_path / "a.ply")
     np.testing.assert_array_equal(scan.points, points)
     np.testing.assert_array_equal(scan.colors, colors)
 
@@ -42,18 +42,17 @@ def test_a_sparse_or_tiny_cloud_is_no_fault():
 
 
 @pytest.mark.parametrize(
-    ("points", "name", "options", "message"),
+    ("points", "name", "message"),
     [
-        (room(), "a.ply", {"needs_colors": True}, "no colour"),
-        (room()[:0], "a.ply", {}, "no points"),
-        (room() * 1000, "a.ply", {}, "metres_per_unit=0.001"),
-        (room(), "a.obj", {}, "a .ply or .pcd file"),
+        (room()[:0], "a.ply", "no points"),
+        (room() * 1000, "a.ply", "metres_per_unit=0.001"),
+        (room(), "a.obj", "a .ply or .pcd file"),
     ],
 )
-def test_refusals(points, name, options, message, tmp_path):
+def test_refusals(points, name, message, tmp_path):
     write_ply(Ply(points.astype(np.float32)), tmp_path / name)
     with pytest.raises(WearcapError, match=message):
-        read_scan(tmp_path / name, **options)
+        read_scan(tmp_path / name)
 
 
 def test_millimetres_are_read_where_the_unit_is_given(tmp_path):

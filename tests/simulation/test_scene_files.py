@@ -45,14 +45,14 @@ def test_a_scene_is_whole(scenery, folder):
     for photo in photos:
         with Image.open(photo.file) as picture:
             assert picture.size == (128, 128) == (photo.camera.width, photo.camera.height)
-    scan = read_scan(folder / "pointcloud.ply", needs_colors=True)
+    scan = read_scan(folder / "pointcloud.ply")
     assert len(scan.points) > 30_000
     assert not list(folder.rglob(".*.tmp-*"))
 
 
 def test_a_photo_shows_the_scan_where_it_is_registered(scenery, folder):
     """Points of the scan that are not hidden have the colour of the pixel that they fall on."""
-    photos, scan = read_photos(folder), read_scan(folder / "pointcloud.ply", needs_colors=True)
+    photos, scan = read_photos(folder), read_scan(folder / "pointcloud.ply")
     photo = photos[4]
     depth = view_depth(scenery, photo.camera, photo.T_world_cam)
     in_cam = photo.T_world_cam.inverse()[None] @ torch.from_numpy(scan.points)

@@ -27,7 +27,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.adt import is_adt, read_adt
 from wearcap.io.datasets.amass import read_amass
-from wearcap.io.datasets.hps import hps_names, is_hps, read_hps_sequence
+from wearcap.io.datasets.hps import hps_names, read_hps_sequence
 from wearcap.io.datasets.nymeria import is_nymeria, read_nymeria, read_xdata
 from wearcap.io.devices.aria_mps import find_mps_file, head_stream, is_mps_folder, read_closed_loop, read_mps
 from wearcap.io.formats.asf_amc import read_amc, read_asf
@@ -153,8 +153,8 @@ def _patients(path: Path) -> dict[str, Callable[[], Loaded]]:
     for is_kind, read in _FOLDERS:
         if is_kind(path):
             return {path.resolve().name: partial(read, path)}
-    if is_hps(path):
-        return {name: partial(_read_hps, path, name) for name in hps_names(path)}
+    if names := hps_names(path):
+        return {name: partial(_read_hps, path, name) for name in names}
     files = [file for file in sorted(path.rglob("*")) if file.is_file() and _kind(file) in _MOTIONS]
     if not files:
         raise WearcapError(

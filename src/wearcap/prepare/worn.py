@@ -142,7 +142,7 @@ def hcontact_tasks(
     for path in sorted(source.glob("splits/**/*.json")):
         if path.stem in names:
             subject = subject_of(path.stem)
-            trains[subject] = bool(read_hcontact_split(path).train) or trains.get(subject, False)
+            trains[subject] = bool(read_hcontact_split(path)["train"]) or trains.get(subject, False)
     tasks = []
     for name in names:
         kind = next((kind for pattern, kind in classes.items() if fnmatchcase(name, pattern)), None)

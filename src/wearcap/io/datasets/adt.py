@@ -32,8 +32,8 @@ def is_adt(folder: str | Path) -> bool:
     return (Path(folder) / "aria_trajectory.csv").is_file()
 
 
-def read_adt(folder: str | Path, *, fps: float | None = None, T_aria_cpf: Rigid | None = None) -> Recording:
-    """Recording of an ADT sequence folder: head stream (30 Hz, or at `fps`), 3D cues of body joints, moving objects.
+def read_adt(folder: str | Path) -> Recording:
+    """Recording of an ADT sequence folder: head stream (30 Hz), 3D cues of body joints, moving objects.
 
     Joints are positions only (cues, confidence 1), for the file has no rotations. Raises WearcapError for missing or
     malformed files.
@@ -46,7 +46,7 @@ def read_adt(folder: str | Path, *, fps: float | None = None, T_aria_cpf: Rigid 
     metadata = folder / "metadata.json"
     return Recording(
         name=folder.resolve().name,
-        head=head_stream(trajectory, fps=fps, T_aria_cpf=T_aria_cpf, where=folder),
+        head=head_stream(trajectory, fps=None, where=folder),
         cues=read_skeleton(skeletons[0]) if skeletons else {},
         object_motion=read_moving_objects(folder) if (folder / "scene_objects.csv").is_file() else {},
         location=str(read_json_object(metadata).get("scene", "")) if metadata.is_file() else "",

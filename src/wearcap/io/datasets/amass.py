@@ -29,11 +29,10 @@ _KEYS = ("trans", "poses", "root_orient", "pose_body", "betas", "gender", "surfa
 _SMPLX_BODY = 66
 
 
-def read_amass(path: str | Path, t_template_pelvis: tuple[float, float, float] | None = None) -> Recording:
+def read_amass(path: str | Path) -> Recording:
     """Read one AMASS file as a Recording with `motion` (smplh52 or smplx22), betas in `shape`, gender in provenance.
 
-    `t_template_pelvis` is J₀ (m) where the user's body model gives it; by default the mean body's. The skeleton keeps
-    its standard bone lengths. Raises WearcapError for missing arrays, wrong shapes, NaN, a rate of zero, or `shape.npz`.
+    J₀ is the mean body's, and the skeleton keeps its standard bone lengths. Raises WearcapError for missing arrays, wrong shapes, NaN, a rate of zero, or `shape.npz`.
     """
     path = Path(path)
     arrays = read_npz(path, _KEYS)
@@ -53,7 +52,7 @@ def read_amass(path: str | Path, t_template_pelvis: tuple[float, float, float] |
     if len(rotvec) == 0:
         raise WearcapError("no frames", path)
     skeleton = smplx22() if stageii else smplh52()
-    pelvis = arrays["trans"].astype(np.float64) + (t_template_pelvis or (PELVIS_SMPLX if stageii else PELVIS_SMPLH))
+    pelvis = arrays["trans"].astype(np.float64) + (PELVIS_SMPLX if stageii else PELVIS_SMPLH)
     times = torch.arange(len(rotvec), dtype=torch.float64) / fps
     about = {"source": path.name, "format": "amass", "gender": _text(arrays.get("gender"))}
     motion = smpl_motion(times, skeleton, rotvec, pelvis, **about)
@@ -67,14 +66,8 @@ def read_amass(path: str | Path, t_template_pelvis: tuple[float, float, float] |
     )
 
 
-def write_amass(
-    motion: Motion,
-    path: str | Path,
-    gender: str = "neutral",
-    betas: Float[Tensor, "feature"] | None = None,
-    t_template_pelvis: tuple[float, float, float] = PELVIS_SMPLH,
-) -> None:
-    """Write a motion of an SMPL skeleton as an AMASS SMPL+H file; missing hands stay flat, gaps repeat the nearest frame.
+def write_amass(motion: Motion, path: str | Path, betas: Float[Tensor, "feature"] | None = None) -> None:
+    """Write a motion of an SMPL skeleton as an AMASS SMPL+H file of neutral gender; missing hands stay flat, gaps repeat the nearest frame.
 
     Raises WearcapError for another skeleton or values that are not finite.
     """
@@ -90,7 +83,7 @@ def write_amass(
     known = [name for name in target.joint_names if name in motion.skeleton.joint_names]
     R[:, target.indices(*known)] = source[:, motion.skeleton.indices(*known)]
     R = torch.cat([R[:, :1] @ A, A.T @ R[:, 1:] @ A], 1)
-    trans = motion.t_world_root[frames].double() - torch.tensor(t_template_pelvis, dtype=torch.float64)
+    trans = motion.t_world_root[frames].double() - torch.tensor(PELVIS_SMPLH, dtype=torch.float64)
     shape = np.zeros(16)
     if betas is not None:
         shape[: len(betas[:16])] = betas[:16].double().numpy()
@@ -98,7 +91,7 @@ def write_amass(
         np.savez(
             file,
             trans=trans.numpy(),
-            gender=np.array(gender),
+            gender=np.array("neutral"),
             mocap_framerate=np.array(fps),
             betas=shape,
             dmpls=np.zeros((len(frames), 8)),

@@ -7,7 +7,7 @@ Fingers may be relative to SMPL+H's mean hand, which the files do not state.
 """
 
 import zipfile
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -102,16 +102,6 @@ def _frames(content: Any, path: Path) -> tuple[list[dict], dict]:
 ENDING = ".json.zip"
 
 
-@dataclass(frozen=True)
-class _HContactSplit:
-    """Middle frames of the training, validation and test windows, counted from the first whole window."""
-
-    window_radius: int
-    train: tuple[int, ...]
-    valid: tuple[int, ...]
-    test: tuple[int, ...]
-
-
 def hcontact_names(root: str | Path) -> list[str]:
     """Names of all sequences with a body, in order."""
     return sorted(path.name.removesuffix(ENDING) for path in Path(root).glob(f"body/*{ENDING}"))
@@ -158,8 +148,11 @@ def activity_of(name: str) -> str:
     return rest.strip("_")
 
 
-def read_hcontact_split(path: str | Path) -> _HContactSplit:
-    """Read `splits/…/NAME.json` {window_radius, train, valid, test}. Raises WearcapError for anything else."""
+def read_hcontact_split(path: str | Path) -> dict[str, list[int]]:
+    """Middle frames of the windows for "train", "valid" and "test", counted from the first whole window.
+
+    Reads `splits/…/NAME.json` {window_radius, train, valid, test}. Raises WearcapError for anything else.
+    """
     content = read_json(path)
     parts = ("train", "valid", "test")
     content = content if isinstance(content, dict) else {}
@@ -170,4 +163,4 @@ def read_hcontact_split(path: str | Path) -> _HContactSplit:
     if not sound:
         expected = '{"window_radius": 30, "train": [frame, …], "valid": […], "test": […]}'
         raise WearcapError("not a split of windows", path, expected)
-    return _HContactSplit(radius, *map(tuple, lists))
+    return dict(zip(parts, frames))

@@ -58,11 +58,11 @@ MAX_FRAMES = 1_000_000
 """Most frames (nine hours) that a file's frame numbers may span; frames that are not listed are filled in."""
 
 
-def read_hps_motion(path: str | Path, t_template_pelvis: tuple[float, float, float] = PELVIS_SMPL) -> Motion:
+def read_hps_motion(path: str | Path) -> Motion:
     """Read `hps_smpl/*.pkl` {poses (T, 72), transes (T, 3)} as a smpl24 motion at 30 Hz that begins at 0 s.
 
-    `t_template_pelvis` is the pelvis of the subject's SMPL template, where the user's body model gives it. Raises
-    WearcapError for anything but arrays in the pickle (which is never run), missing or misshapen arrays, NaN, no frames.
+    Raises WearcapError for anything but arrays in the pickle (which is never run), missing or misshapen arrays, NaN,
+    and no frames.
     """
     content = read_pickle(path)
     if not isinstance(content, dict):
@@ -73,7 +73,7 @@ def read_hps_motion(path: str | Path, t_template_pelvis: tuple[float, float, flo
         raise WearcapError("no frames", path)
     times, pelvis = torch.arange(sizes["time"], dtype=torch.float64) / FPS, arrays["transes"].astype(np.float64)
     about = {"source": Path(path).name, "format": "hps"}
-    return smpl_motion(times, smpl24(), arrays["poses"], pelvis + t_template_pelvis, **about)
+    return smpl_motion(times, smpl24(), arrays["poses"], pelvis + PELVIS_SMPL, **about)
 
 
 def read_hps_subject(path: str | Path) -> tuple[dict[str, float], dict[str, str]]:
@@ -250,9 +250,7 @@ _WITH_INNER_ROOT = 3 * (len(UNITY_JOINTS) + 1)
 """Files name the root twice: the avatar, which turns, and below it the model's own root, which does not."""
 
 
-def read_unity_motion(
-    pose_path: str | Path, trans_path: str | Path, t_template_pelvis: tuple[float, float, float] = PELVIS_SMPL
-) -> Motion:
+def read_unity_motion(pose_path: str | Path, trans_path: str | Path) -> Motion:
     """Read one sequence's `_pose.txt` and `_trans.txt` as a smpl24 motion at 30 Hz that begins at 0 s, z up.
 
     A last line that was cut short is left out. Raises WearcapError naming the line for a wrong count or what is no
@@ -270,7 +268,7 @@ def read_unity_motion(
     skeleton = smpl24()
     order = [UNITY_JOINTS.index(name) for name in skeleton.joint_names]
     t_smpl = torch.from_numpy(trans[:count]) * torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
-    t_smpl = t_smpl + torch.tensor(t_template_pelvis, dtype=torch.float64)
+    t_smpl = t_smpl + torch.tensor(PELVIS_SMPL, dtype=torch.float64)
     return Motion(
         torch.arange(count, dtype=torch.float64) / FPS,
         skeleton,
@@ -322,11 +320,6 @@ _SCAN_OF = {
 """Scan of each subject's sequences, except those that `_scan_name` handles individually."""
 FAR_M = 2.0
 """Median distance (m) of pelvis and localised camera beyond which clocks or places of the two disagree."""
-
-
-def is_hps(folder: str | Path) -> bool:
-    """Whether a folder holds the HPS data set's motions."""
-    return any(True for _ in Path(folder).glob("*hps_smpl*/*.pkl"))
 
 
 def hps_names(root: str | Path) -> list[str]:

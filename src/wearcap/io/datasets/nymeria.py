@@ -98,13 +98,11 @@ def _contacts(arrays: dict[str, np.ndarray], motion: Motion, path: str | Path) -
     return ContactTrack(motion.timestamps, FOOT_PATCHES, torch.from_numpy(contact > 0.5))
 
 
-def read_nymeria(
-    folder: str | Path, *, fps: float = 60.0, clock_offset_s: float | None = None, video: Path | None = None
-) -> Recording:
+def read_nymeria(folder: str | Path, *, fps: float = 60.0, video: Path | None = None) -> Recording:
     """Recording of one sequence folder: head stream, points, and the suit's motion in the head device's world and clock.
 
-    All streams at `fps` (Hz) on the device's clock, cut to what suit and device share. `clock_offset_s` is added to the
-    suit's (time code) timestamps; by default it is found by correlating head turns, to a few milliseconds.
+    All streams at `fps` (Hz) on the device's clock, cut to what suit and device share. The offset of the
+    suit's clock (time code) is found by correlating head turns, to a few milliseconds.
     With `video`, the head's colour camera (`recording_head/data/data.vrs`) is written there as an MP4, undistorted and
     upright; that needs projectaria-tools. Raises WearcapError when a part is missing or suit and device cannot be aligned.
     """
@@ -117,7 +115,7 @@ def read_nymeria(
     suit, contacts = read_xdata(folder / "body" / "xdata.npz")
     device = head_stream(read_closed_loop(path)[0], fps=None)
     with placed(folder):
-        motion, contact, head = _on_device(suit, contacts, device, fps, clock_offset_s)
+        motion, contact, head = _on_device(suit, contacts, device, fps)
     about, camera = read_metadata(folder), None
     if video is not None:
         between = (head.timestamps[0].item(), head.timestamps[-1].item())
@@ -138,13 +136,13 @@ def read_nymeria(
 
 
 def _on_device(
-    suit: Motion, contacts: ContactTrack | None, device: HeadStream, fps: float, clock_offset_s: float | None
+    suit: Motion, contacts: ContactTrack | None, device: HeadStream, fps: float
 ) -> tuple[Motion, ContactTrack | None, HeadStream]:
     """Suit motion and contacts in the device's world, clock and rate, and the head stream on the same frames."""
     T_suit_head = suit.joint("head")
     track = Trajectory(device.timestamps, device.R_world_device, device.t_world_device)
     own = Trajectory(suit.timestamps, T_suit_head.R, T_suit_head.t)
-    offset = clock_offset(own, track) if clock_offset_s is None else clock_offset_s
+    offset = clock_offset(own, track)
     own = Trajectory(own.timestamps + offset, own.R_world_body, own.t_world_body)
     alignment = align_head(own, track, T_HEAD_DEVICE.t)
     if alignment.residual_m > MAX_RESIDUAL_M:

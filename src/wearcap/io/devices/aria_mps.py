@@ -98,18 +98,12 @@ def turn_up(up: str) -> Float[Tensor, "3 3"]:
 
 
 def head_stream(
-    trajectory: Trajectory,
-    *,
-    fps: float | None,
-    T_aria_cpf: Rigid | None = None,
-    T_head_device: Rigid | None = None,
-    where: str | Path | None = None,
+    trajectory: Trajectory, *, fps: float | None, T_aria_cpf: Rigid | None = None, where: str | Path | None = None
 ) -> HeadStream:
     """Head stream of a trajectory of the `aria` frame, turned to head axes at the pupils' midpoint.
 
     `fps` resamples evenly from the first timestamp (Hz; None keeps the file's 1 kHz). `T_aria_cpf` defaults to the
-    nominal CAD pose, `T_head_device` to `T_HEAD_DEVICE`. Raises WearcapError, naming `where`, for poses over more than
-    half a day.
+    nominal CAD pose. Raises WearcapError, naming `where`, for poses over more than half a day.
     """
     if fps is not None:
         start, stop = trajectory.timestamps[0].item(), trajectory.timestamps[-1].item()
@@ -121,19 +115,11 @@ def head_stream(
         trajectory = resample(trajectory, start + torch.arange(count, dtype=torch.float64) / fps)
     T_aria_cpf = T_aria_cpf or nominal_T_aria_cpf()
     T_world_device = trajectory.T_world_body @ T_aria_cpf @ Rigid(R_CPF_DEVICE, torch.zeros(3))
-    T_head_device = T_head_device or T_HEAD_DEVICE
-    return HeadStream(trajectory.timestamps, T_world_device.R, T_world_device.t, T_head_device.R, T_head_device.t)
+    return HeadStream(trajectory.timestamps, T_world_device.R, T_world_device.t, T_HEAD_DEVICE.R, T_HEAD_DEVICE.t)
 
 
-def read_points(
-    path: str | Path,
-    *,
-    max_inv_dist_std: float = MAX_INV_DIST_STD,
-    max_dist_std: float = MAX_DIST_STD,
-    up: str = "z",
-    observations: str | Path | None = None,
-) -> PointCloud:
-    """Reliable semi-dense points; their confidence is 1 - inv_dist_std / max_inv_dist_std (our choice), 0 … 1.
+def read_points(path: str | Path, observations: str | Path | None = None) -> PointCloud:
+    """Reliable semi-dense points; their confidence is 1 - inv_dist_std / `MAX_INV_DIST_STD` (our choice), 0 … 1.
 
     `observations` is the file of observation times (`semidense_observations.csv`, tens of millions of rows, read in
     chunks): `first_seen` comes from it, and points without an observation are dropped.
@@ -143,7 +129,7 @@ def read_points(
     table = read_columns(path, [*position, "inv_dist_std", "dist_std"], whole=["uid"] if observations else [])
     points = np.stack([table[name] for name in position], 1)
     check_finite({"position": points}, path)
-    keep = (table["inv_dist_std"] < max_inv_dist_std) & (table["dist_std"] < max_dist_std)
+    keep = (table["inv_dist_std"] < MAX_INV_DIST_STD) & (table["dist_std"] < MAX_DIST_STD)
     first_seen = None
     if observations is not None:
         # Time of each point's first observation (s, the device's clock); infinite for points without one
@@ -161,8 +147,8 @@ def read_points(
         seen[order] = np.where(first_us < np.iinfo(np.int64).max, first_us * 1e-6, np.inf)
         keep &= np.isfinite(seen)
         first_seen = torch.from_numpy(seen[keep])
-    confidence = 1 - table["inv_dist_std"][keep] / max_inv_dist_std
-    points_world = torch.tensor(points[keep], dtype=torch.float32) @ turn_up(up).T
+    confidence = 1 - table["inv_dist_std"][keep] / MAX_INV_DIST_STD
+    points_world = torch.tensor(points[keep], dtype=torch.float32)
     return PointCloud(points_world, torch.tensor(confidence, dtype=torch.float32), first_seen)
 
 
@@ -195,7 +181,7 @@ def read_mps_points(folder: str | Path) -> PointCloud | None:
     points = find_mps_file(folder, _POINTS)
     if points is None:
         return None
-    return read_points(points, observations=find_mps_file(folder, _OBSERVATIONS))
+    return read_points(points, find_mps_file(folder, _OBSERVATIONS))
 
 
 def mps_files(folder: str | Path) -> list[Path]:

@@ -68,17 +68,16 @@ class _AsfSkeleton:
     radians: bool
 
 
-def read_asf(path: str | Path, unit_m: float | int | None = None) -> _AsfSkeleton:
+def read_asf(path: str | Path) -> _AsfSkeleton:
     """Read an .asf file (plain, .gz or .xz).
 
-    `unit_m` is the length of one unit in metres; by default an inch over the file's `length`. The skeleton is called
-    "cmu31" when its nodes are CMU's, else by the file's name; each joint is a node's START, rest is the bind pose, and
-    the ends of leaf bones are sites. Raises WearcapError naming file and line.
+    The skeleton is called "cmu31" when its nodes are CMU's, else by the file's name; each joint is a node's START, rest
+    is the bind pose, and the ends of leaf bones are sites. Raises WearcapError naming file and line.
     """
     path = Path(path)
     content = _AsfContent.read(path)
     cmu_nodes = {*_CMU_SPINE.split(), *(side + part for side in SIDES for part in _CMU_LIMBS.split())}
-    unit_m = INCH_M / content.length if unit_m is None else unit_m
+    unit_m = INCH_M / content.length
     names, parents = content.tree_order(path)
     table = [content.root, *(content.bones[name] for name in names[1:])]
     ends = torch.tensor([bone.direction for bone in table], dtype=torch.float64)

@@ -26,12 +26,12 @@ _MIN_PER_CELL = 1.5
 """Points per occupied half-metre cell below which a cloud is no dense scan (at 5 mm spacing a wall puts 10 000 there)."""
 
 
-def read_scan(path: str | Path, *, needs_colors: bool = False, metres_per_unit: float | None = None) -> Scan:
+def read_scan(path: str | Path, *, metres_per_unit: float | None = None) -> Scan:
     """Read a scene's cloud (world axes, z up) from a .ply or .pcd file.
 
     Its unit times `metres_per_unit` is m; None: it should be m, and is refused where it does not look so. Raises
-    WearcapError for another kind of file, what `read_ply` and `read_pcd` refuse, no points, extent or density of a
-    cloud that is not in metres, and, with `needs_colors`, a cloud without colour.
+    WearcapError for another kind of file, what `read_ply` and `read_pcd` refuse, no points, and extent or density of a
+    cloud that is not in metres.
     """
     path = Path(path)
     reader = {".ply": read_ply, ".pcd": read_pcd}.get(path.suffix.lower())
@@ -44,9 +44,6 @@ def read_scan(path: str | Path, *, needs_colors: bool = False, metres_per_unit: 
     if metres_per_unit is None and (fault := _unit_fault(points)):
         fix = "Give metres_per_unit=0.001 for a scan in millimetres, 1 for one that is sparse."
         raise WearcapError(fault, path, "metres", fix)
-    if needs_colors and content.colors is None:
-        fix = "Export it with colours: pictures of the scene are drawn from them."
-        raise WearcapError("the scan has no colour", path, "red, green and blue of every point", fix)
     return Scan(points, content.colors)
 
 

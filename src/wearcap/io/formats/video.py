@@ -35,14 +35,14 @@ _DAMAGE = (
 
 
 @contextmanager
-def open_image(path: str | Path, max_bytes: int | None = None) -> Iterator[Image.Image]:
+def open_image(path: str | Path) -> Iterator[Image.Image]:
     """An image whose header has been read, its pixels not yet.
 
     Raises WearcapError, while opening or inside the `with` block, when the file is missing, none of `FORMATS`, damaged,
-    or unpacks to more than `max_bytes`, by default as far as `Budget` goes.
+    or unpacks to more than `Budget` allows.
     """
-    budget = Budget(path, file_size(path, "picture"), max_bytes=max_bytes)
-    content = io.BytesIO(read_bytes(path, max_bytes))  # no chunk of it can be longer than what is there
+    budget = Budget(path, file_size(path, "picture"))
+    content = io.BytesIO(read_bytes(path))  # no chunk of it can be longer than what is there
     with understood("not a readable picture", path, "a JPEG or PNG file", "Copy it again.", errors=_DAMAGE):  # noqa: SIM117
         with Image.open(content, formats=FORMATS) as image:
             budget.spend(_PIXEL_BYTES * image.width * image.height)
