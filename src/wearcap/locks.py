@@ -154,16 +154,9 @@ def _held_by(holder: dict[str, Any], folder: Path) -> WearcapError:
     pid, host = holder.get("pid", "unknown"), holder.get("host", "unknown")
     who = f"process {pid} on {host}, {holder.get('purpose', 'unknown')}, since {holder.get('since', 'unknown')}"
     if _has_ended(holder):
-        return WearcapError(
-            f"workers of a run that has ended still write here ({who})",
-            folder,
-            "one run at a time in a folder",
-            "Run again when they have ended, or end them.",
-        )
+        what = f"workers of a run that has ended still write here ({who})"
+        expected = "one run at a time in a folder"
+        return WearcapError(what, folder, expected, "Run again when they have ended, or end them.")
     end = f"end it (kill {pid})" if host == platform.node() else f"end it on {host}"
-    return WearcapError(
-        f"another run writes here ({who})",
-        folder,
-        "one run at a time in a folder",
-        f"Wait until it has ended, {end}, or choose another folder.",
-    )
+    fix = f"Wait until it has ended, {end}, or choose another folder."
+    return WearcapError(f"another run writes here ({who})", folder, "one run at a time in a folder", fix)

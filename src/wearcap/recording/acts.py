@@ -39,11 +39,8 @@ def true_acts(recording: Recording, margin_s: float = MARGIN_S) -> list[Act]:
         if not objects:
             return []
         if len(objects) > 1:
-            raise WearcapError(
-                f"{len(objects)} objects and no interactions to choose the active one",
-                recording.name,
-                "interactions, or a single object",
-            )
+            what = f"{len(objects)} objects and no interactions to choose the active one"
+            raise WearcapError(what, recording.name, "interactions, or a single object")
         times = recording.object_motion[objects[0]].timestamps
         return [Act(objects[0], times[0].item(), times[-1].item() + 1.0)]
     spans = sorted(zip(interactions.start_s.tolist(), interactions.stop_s.tolist(), interactions.objects))

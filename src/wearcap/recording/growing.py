@@ -55,11 +55,8 @@ def follow_pieces(
         elif ended:
             return
         elif time.monotonic() - since > patience_s:
-            raise WearcapError(
-                f"no piece {number} after {patience_s:.0f} s",
-                folder,
-                f"{_piece_path(folder, number).name}, or a file named {END!r}",
-                "Is the recorder still running?",
-            )
+            what = f"no piece {number} after {patience_s:.0f} s"
+            expected = f"{_piece_path(folder, number).name}, or a file named {END!r}"
+            raise WearcapError(what, folder, expected, "Is the recorder still running?")
         else:
             time.sleep(poll_s)

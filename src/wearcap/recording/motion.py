@@ -111,9 +111,8 @@ class Motion:
         first = int(np.searchsorted(since, start_s))
         stop = len(since) if stop_s is None else int(np.searchsorted(since, stop_s, side="right"))
         if stop <= first:
-            raise WearcapError(
-                f"no frames from {start_s} s to {stop_s} s", expected=f"times from 0 to {since[-1]:.1f} s"
-            )
+            what = f"no frames from {start_s} s to {stop_s} s"
+            raise WearcapError(what, expected=f"times from 0 to {since[-1]:.1f} s")
         return self.sliced(first, stop)
 
     def moved(self, T_new_world: Rigid) -> "Motion":

@@ -68,10 +68,8 @@ def unflatten(tree: Any, fetch, known: dict[str, type] = KNOWN) -> Any:
     times = items.get("timestamps")
     for name in _over_time(kind) if isinstance(times, Tensor) else ():
         if isinstance(items.get(name), Tensor) and len(items[name]) != len(times):
-            raise WearcapError(
-                f"{kind.__name__}.{name} has {len(items[name])} rows for {len(times)} timestamps",
-                expected="a row for each timestamp",
-            )
+            what = f"{kind.__name__}.{name} has {len(items[name])} rows for {len(times)} timestamps"
+            raise WearcapError(what, expected="a row for each timestamp")
     return kind(**items)
 
 

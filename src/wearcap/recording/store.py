@@ -52,6 +52,7 @@ class Entry:
         stream = recording.motion or recording.head
         frames = len(stream.timestamps) if stream else 0
         fps = round(1 / stream.timestamps.diff().median().item(), 4) if stream and frames > 1 else 0.0
+        about = {name: getattr(recording, name) for name in ("subject", "location", "activity", "license")}
         return cls(
             file=path.relative_to(root).as_posix(),
             sha256=sha256_of(path),
@@ -59,12 +60,9 @@ class Entry:
             frames=frames,
             fps=fps,
             duration_s=round(recording.duration_s, 4),
-            subject=recording.subject,
-            location=recording.location,
-            activity=recording.activity,
             split=split,
-            license=recording.license,
             config_hash=config_hash,
+            **about,
         )
 
 
@@ -91,9 +89,8 @@ class RecordingFile:
                 raise WearcapError(f"cannot be read ({error.strerror or 'no permission'})", self.path) from error
             raise WearcapError("no such recording", self.path) from error
         except (safetensors.SafetensorError, OSError, RuntimeError) as error:
-            raise WearcapError(
-                "not a readable recording", path, "a complete .safetensors file", "Prepare this recording again."
-            ) from error
+            what = "not a readable recording"
+            raise WearcapError(what, path, "a complete .safetensors file", "Prepare this recording again.") from error
         metadata = self._file.metadata() or {}
         if "wearcap" not in metadata:
             raise WearcapError("a .safetensors file, but not a recording", path, "one that `wearcap prepare` wrote")
@@ -161,12 +158,8 @@ def _verify(path: Path) -> None:
         found = manifest.stat()
         entry = _entries(manifest, found.st_size, found.st_mtime_ns, found.st_ino).get(path.name)
         if entry is not None and (size := path.stat().st_size) != entry.bytes:
-            raise WearcapError(
-                f"{size} bytes long",
-                path,
-                f"{entry.bytes} bytes, as the manifest says",
-                "It was cut short or replaced: prepare it again.",
-            )
+            expected = f"{entry.bytes} bytes, as the manifest says"
+            raise WearcapError(f"{size} bytes long", path, expected, "It was cut short or replaced: prepare it again.")
         if entry is not None and remembered_sha256(path) != entry.sha256:
             raise _differs(path)
     except OSError as error:
@@ -174,9 +167,8 @@ def _verify(path: Path) -> None:
 
 
 def _differs(path: Path) -> WearcapError:
-    return WearcapError(
-        "its checksum differs from the manifest's", path, fix="It was damaged or replaced: prepare it again."
-    )
+    what = "its checksum differs from the manifest's"
+    return WearcapError(what, path, fix="It was damaged or replaced: prepare it again.")
 
 
 @lru_cache(maxsize=16)
@@ -210,23 +202,20 @@ class RecordingStore:
             raise WearcapError(f"cannot be read ({error.strerror or error})", path) from error
         version = manifest.get("schema_version") if isinstance(manifest, dict) else None
         if version != SCHEMA_VERSION:
-            raise WearcapError(
-                f"schema version {str(version)[:40]}", path, f"version {SCHEMA_VERSION}", "Prepare the data set again."
-            )
+            what = f"schema version {str(version)[:40]}"
+            raise WearcapError(what, path, f"version {SCHEMA_VERSION}", "Prepare the data set again.")
         try:
             self.entries |= {name: self._entry(name, entry) for name, entry in manifest["recordings"].items()}
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise WearcapError(
-                f"not a readable manifest ({str(error)[:200]})", path, fix="Delete it and prepare the data set again."
-            ) from error
+            what = f"not a readable manifest ({str(error)[:200]})"
+            raise WearcapError(what, path, fix="Delete it and prepare the data set again.") from error
 
     @classmethod
     def open(cls, root: str | Path) -> "RecordingStore":
         """Open an existing data set. Raises WearcapError if there is none."""
         if not (Path(root) / MANIFEST).is_file():
-            raise WearcapError(
-                "no data set here", root, "a folder with a manifest.json", "Make one with `wearcap prepare`."
-            )
+            what = "no data set here"
+            raise WearcapError(what, root, "a folder with a manifest.json", "Make one with `wearcap prepare`.")
         return cls(root)
 
     @property
@@ -274,11 +263,8 @@ class RecordingStore:
     def require(self, name: str) -> None:
         """Raise WearcapError when the data set has no recording of this name."""
         if name not in self.entries:
-            raise WearcapError(
-                f"no recording {name!r}",
-                self.manifest_path,
-                f"one of {len(self.entries)} recordings, as {self.names()[:3]}",
-            )
+            expected = f"one of {len(self.entries)} recordings, as {self.names()[:3]}"
+            raise WearcapError(f"no recording {name!r}", self.manifest_path, expected)
 
     def open_file(self, name: str) -> RecordingFile:
         """Open one recording for slicing. Raises WearcapError when it is missing, damaged or foreign."""
@@ -323,11 +309,8 @@ def load_recording(where: str | Path) -> Recording:
         names = RecordingStore.open(path).names()
         if len(names) == 1:
             return RecordingStore.open(path).load(names[0])
-        raise WearcapError(
-            f"a data set of {len(names)} recordings",
-            path,
-            f"one of them, such as {path / names[0] if names else path / 'NAME'}",
-        )
+        what = f"a data set of {len(names)} recordings"
+        raise WearcapError(what, path, f"one of them, such as {path / names[0] if names else path / 'NAME'}")
     if (path.parent / "manifest.json").is_file():
         return RecordingStore.open(path.parent).load(path.name)
     raise WearcapError("no recording here", path, "DATASET/NAME or a .safetensors file that `wearcap prepare` wrote")

@@ -194,11 +194,10 @@ def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], fol
     for name in ("x", "y"):
         times = torch.tensor(_numbers(marks[name], 2, name, folder / MARKS), dtype=torch.float64)
         if not ((times >= track.timestamps[0] - 1) & (times <= track.timestamps[-1] + 1)).all():
-            raise WearcapError(
-                f"{name} at {times.tolist()} s",
-                folder / MARKS,
-                f"{track.timestamps[0].item():.3f} s to {track.timestamps[-1].item():.3f} s, as the camera's path",
+            expected = (
+                f"{track.timestamps[0].item():.3f} s to {track.timestamps[-1].item():.3f} s, as the camera's path"
             )
+            raise WearcapError(f"{name} at {times.tolist()} s", folder / MARKS, expected)
         ends.append(track.t_world_body[(track.timestamps[None] - times[:, None]).abs().argmin(1)])
     return _BoardWalks(ends[0], ends[1], (length[0], length[1]), height)
 

@@ -336,13 +336,12 @@ def _check_body(motion: Motion, path: Path, unit_m: float, R_world_file: Float[T
     height = longest_path(motion.skeleton) / REACH_PER_HEIGHT
     if not HEIGHT_M[0] < height < HEIGHT_M[1]:
         name = min(UNITS_M, key=lambda name: abs(height / unit_m * UNITS_M[name] - 1.7))
-        raise WearcapError(
-            f"the body would be about {height:.3g} m tall with unit_m={unit_m:g}",
-            where=path,
-            expected="a person's size",
-            fix=f"unit_m={UNITS_M[name]:.6g} ({name}) would make it {height / unit_m * UNITS_M[name]:.2f} m; "
-            "check=False takes it as it is.",
+        what = f"the body would be about {height:.3g} m tall with unit_m={unit_m:g}"
+        fix = (
+            f"unit_m={UNITS_M[name]:.6g} ({name}) would make it {height / unit_m * UNITS_M[name]:.2f} m; "
+            "check=False takes it as it is."
         )
+        raise WearcapError(what, path, "a person's size", fix)
     rest_joints = motion.skeleton.rest_joints
     rest = rest_joints.amax(0) - rest_joints.amin(0)
     positions = motion.sliced(0, len(motion)).T_world_joint.t

@@ -251,9 +251,8 @@ class _Cursor:
         return content.decode("utf-8", errors="replace")
 
     def cut_short(self, part: str) -> WearcapError:
-        return WearcapError(
-            f"it ends inside {part}", self.path, "a whole COLMAP file", "The file was cut short: copy it again."
-        )
+        what = f"it ends inside {part}"
+        return WearcapError(what, self.path, "a whole COLMAP file", "The file was cut short: copy it again.")
 
 
 class _Binary:

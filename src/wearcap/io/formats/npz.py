@@ -23,7 +23,6 @@ MAX_BYTES = 1 << 32
 
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 _MAX_HEADER = 1 << 14
-_CHUNK = 1 << 20
 _DAMAGE = (
     *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, OSError, MemoryError),
     *(ValueError, TypeError, LookupError, AttributeError, OverflowError),
@@ -60,7 +59,7 @@ def readable(kind: str, where: str | Path, expected: str) -> Iterator[None]:
 
 
 def _read_array(file: io.BufferedIOBase, file_bytes: int, where: str, budget: Budget) -> np.ndarray:
-    """An archive's array, read chunk by chunk into its memory, so that nothing large is in memory twice."""
+    """An archive's array, whose header is checked before memory is taken."""
     head = io.BytesIO(file.read(_MAX_HEADER))
     version = npy.read_magic(head)
     if version not in _HEADERS:
@@ -77,17 +76,13 @@ def _read_array(file: io.BufferedIOBase, file_bytes: int, where: str, budget: Bu
     if size != file_bytes - head.tell():
         raise ValueError(f"an array of shape {shape} in {file_bytes} bytes")
     budget.spend(size)
-    array = np.empty(math.prod(shape), dtype)
-    view, place = memoryview(array.view(np.uint8)) if size else memoryview(b""), 0
-    while place < size:
-        content = head.read(_CHUNK) or file.read(min(_CHUNK, size - place))
-        if not content:
-            raise ValueError("its data ends too early")
-        view[place : place + len(content)] = content
-        place += len(content)
-    if dtype.kind == "U" and size and (array.view(np.dtype("u4").newbyteorder(dtype.byteorder)) > sys.maxunicode).any():
+    file.seek(0)
+    array = npy.read_array(file, allow_pickle=False)
+    array = array.copy(order="C") if fortran else array
+    points = np.dtype("u4").newbyteorder(dtype.byteorder)
+    if dtype.kind == "U" and size and (array.reshape(-1).view(points) > sys.maxunicode).any():
         raise ValueError("text with characters that are none")
-    return array.reshape(shape, order="F").copy(order="C") if fortran else array.reshape(shape)
+    return array
 
 
 def require(arrays: dict[str, np.ndarray], path: str | Path, **shapes: tuple[int | str, ...]) -> dict[str, int]:

@@ -57,12 +57,11 @@ class OCamModel:
             what = f"an image of {self.width}x{self.height} pixels with affine parameters {self.affine}"
             raise WearcapError(what, where, f"sizes of 1 to {_MAX_SIDE}, c near 1, d and e near 0")
         if not (0 <= self.row < self.height and 0 <= self.column < self.width):
-            raise WearcapError(
+            what = (
                 f"its centre, row {self.row:g} and column {self.column:g}, is outside the image of "
-                f"{self.height} rows and {self.width} columns",
-                where=where,
-                expected="row first, then column",
+                f"{self.height} rows and {self.width} columns"
             )
+            raise WearcapError(what, where, "row first, then column")
         focal = -self.pol[0]
         if focal <= 0:
             what = f"its direct polynomial begins with {self.pol[0]:g}"

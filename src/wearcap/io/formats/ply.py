@@ -177,12 +177,8 @@ def _known(table: dict[str, str], word: str) -> str:
 
 
 def _cut_short(path: str | Path, element: _Element) -> WearcapError:
-    return WearcapError(
-        f"it ends inside its {element.count} {element.name} rows",
-        path,
-        "as many rows as the header states",
-        "The file was cut short: copy it again.",
-    )
+    what = f"it ends inside its {element.count} {element.name} rows"
+    return WearcapError(what, path, "as many rows as the header states", "The file was cut short: copy it again.")
 
 
 def _read_binary(element: _Element, data: bytes, start: int, order: str, path) -> tuple[dict, int]:
