@@ -12,9 +12,8 @@ from hypothesis import given
 from wearcap.cli.main import run_verb
 from wearcap.errors import WearcapError
 from wearcap.io.datasets.hcontact import (
-    activity_of,
+    about_sequence,
     hcontact_names,
-    location_of,
     read_hcontact,
     read_hcontact_split,
     read_smpl_json,
@@ -170,9 +169,9 @@ def test_unknown_sequences_and_classes(tmp_path):
 
 
 def test_names():
-    assert location_of("SUB1_MPI_BIB_EG_sofa.06") == "MPI_BIB_EG"
-    assert activity_of("SUB1_MPI_BIB_EG_sofa.06") == "sofa"
-    assert activity_of("SUB5_TUB_0KIT_door_int2.00") == "door_int2"
+    sofa = {"subject": "SUB1", "location": "MPI_BIB_EG", "activity": "sofa"}
+    assert about_sequence("SUB1_MPI_BIB_EG_sofa.06") == sofa
+    assert about_sequence("SUB5_TUB_0KIT_door_int2.00")["activity"] == "door_int2"
 
 
 def test_splits(tmp_path):

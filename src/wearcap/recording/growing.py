@@ -18,7 +18,6 @@ END = "end"
 
 
 def _piece_path(folder: str | Path, number: int) -> Path:
-    """Path of the piece with this number."""
     return Path(folder) / f"piece-{number:06d}.safetensors"
 
 

@@ -17,7 +17,7 @@ import torch
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.datasets.hcontact import activity_of, location_of, read_smpl_json
+from wearcap.io.datasets.hcontact import about_sequence, read_smpl_json
 from wearcap.io.datasets.hps import read_hps_subject, subject_of
 from wearcap.io.formats.bounded import understood
 from wearcap.io.formats.contact_labels import LabelClock, interactions_of, labels_of, parse_labels
@@ -100,10 +100,8 @@ def read_egohoi(
         interactions=interactions,
         skeleton=motion.skeleton,
         shape=betas,
-        subject=subject_of(name),
-        location=location_of(name),
-        activity=activity_of(name),
         source="EgoHOI",
+        **about_sequence(name),
     )
     return recording, Environment(tuple(objects))
 

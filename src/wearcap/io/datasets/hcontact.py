@@ -129,23 +129,18 @@ def read_hcontact(root: str | Path, name: str, contact_class: str = "") -> Recor
         interactions=replace(contacts, classes=tuple(named or contact_class for named in contacts.classes)),
         skeleton=motion.skeleton,
         shape=shape,
-        subject=subject_of(name),
-        location=location_of(name),
-        activity=activity_of(name),
         source="H-contact",
+        **about_sequence(name),
     )
 
 
-def location_of(name: str) -> str:
-    """The scene of a sequence's name, as the published code takes it apart: MPI_Etage6, MPI_BIB_EG, TUB_2OG, …"""
-    parts = name.split(".")[0].removeprefix(f"{subject_of(name)}_").split("_")
-    return "_".join(parts[: 3 if parts[1:2] == ["BIB"] else 2])
-
-
-def activity_of(name: str) -> str:
-    """Activity in a sequence's name."""
-    rest = name.split(".")[0].removeprefix(f"{subject_of(name)}_").removeprefix(location_of(name))
-    return rest.strip("_")
+def about_sequence(name: str) -> dict[str, Any]:
+    """Subject, location and activity in a name, as the published code takes it apart: SUB1, MPI_Etage6, sofa; TUB_2OG …"""
+    subject = subject_of(name)
+    rest = name.split(".")[0].removeprefix(f"{subject}_")
+    parts = rest.split("_")
+    location = "_".join(parts[: 3 if parts[1:2] == ["BIB"] else 2])
+    return {"subject": subject, "location": location, "activity": rest.removeprefix(location).strip("_")}
 
 
 def read_hcontact_split(path: str | Path) -> dict[str, list[int]]:

@@ -41,7 +41,7 @@ from wearcap.io.formats.mvnx import read_mvnx
 from wearcap.io.formats.npz import require
 from wearcap.io.formats.ocamcalib import read_sensor_frame
 from wearcap.io.formats.poses import NORM_TOLERANCE
-from wearcap.io.formats.restricted_pickle import read_pickle
+from wearcap.io.formats.restricted_pickle import read_pickled_dict
 from wearcap.io.formats.smpl import A, shape_from_betas, smpl_motion
 from wearcap.io.formats.text import at_line, finite_floats, numbered_lines, read_json, read_json_object
 from wearcap.io.formats.video import video_info
@@ -64,9 +64,7 @@ def read_hps_motion(path: str | Path) -> Motion:
     Raises WearcapError for anything but arrays in the pickle (which is never run), missing or misshapen arrays, NaN,
     and no frames.
     """
-    content = read_pickle(path)
-    if not isinstance(content, dict):
-        raise WearcapError(f"it holds a {type(content).__name__}", path, "a dict of poses and transes")
+    content = read_pickled_dict(path, "a dict of poses and transes")
     arrays = {key: np.asarray(content[key]) for key in ("poses", "transes") if key in content}
     sizes = require(arrays, path, poses=("time", 72), transes=("time", 3))
     if not sizes["time"]:

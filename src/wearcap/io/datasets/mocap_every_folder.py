@@ -26,7 +26,7 @@ from wearcap.io.formats.bounded import understood
 from wearcap.io.formats.npz import require
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import checked_trajectory
-from wearcap.io.formats.restricted_pickle import read_pickle
+from wearcap.io.formats.restricted_pickle import read_pickle, read_pickled_dict
 from wearcap.io.formats.text import finite_floats, read_text
 from wearcap.io.formats.video import video_info
 from wearcap.recording import CameraStream, HeadStream, ImuStream, PointCloud, Recording
@@ -90,7 +90,9 @@ def read_mocap_every_folder(folder: str | Path) -> MocapEveryFolder:
     pickles that hold anything but data, and for any other file that is there and not as documented.
     """
     folder = Path(folder)
-    config, marks = _config(folder / CONFIG), _marks(folder / MARKS)
+    config = _config(folder / CONFIG)
+    # Times (s) of the calibration movements along x and y (start, stop), and of the shutter
+    marks = read_pickled_dict(folder / MARKS, "a dict of times") if (folder / MARKS).is_file() else {}
     noted = marks.get("shutter")
     noted = config.get("cam_shutter_timestamp") if noted is None else noted
     shutter_s = 0.0 if noted is None else _numbers([noted], 1, "the shutter's time", folder)[0]
@@ -170,14 +172,6 @@ def _config(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict | None):
         raise WearcapError(f"it holds a {type(content).__name__}", path, "keys with values")
     return content or {}
-
-
-def _marks(path: Path) -> dict[str, Any]:
-    """Times (s) of the calibration movements along x and y (start, stop), and of the shutter."""
-    content = read_pickle(path) if path.is_file() else {}
-    if not isinstance(content, dict):
-        raise WearcapError(f"it holds a {type(content).__name__}", path, "a dict of times")
-    return content
 
 
 def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], folder: Path) -> _BoardWalks | None:

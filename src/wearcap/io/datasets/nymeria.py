@@ -153,17 +153,14 @@ def _on_device(
     times = start + torch.arange(int((stop - start) * fps) + 1, dtype=torch.float64) / fps
     T_world_root = alignment.T_world_suit @ Rigid(suit.R_parent_joint[:, 0].double(), suit.t_world_root.double())
     R = torch.cat([T_world_root.R[:, None].float(), suit.R_parent_joint[:, 1:]], 1)
+    about = {"clock_offset_s": f"{offset:.4f}", "head_residual_m": f"{alignment.residual_m:.4f}"}
+    about["head_residual_deg"] = f"{np.degrees(alignment.residual_rad):.2f}"
     motion = Motion(
         times,
         suit.skeleton,
         slerp(own.timestamps, R, times),
         interpolate(own.timestamps, T_world_root.t, times).float(),
-        provenance=suit.provenance
-        | {
-            "clock_offset_s": f"{offset:.4f}",
-            "head_residual_m": f"{alignment.residual_m:.4f}",
-            "head_residual_deg": f"{np.degrees(alignment.residual_rad):.2f}",
-        },
+        provenance=suit.provenance | about,
     )
     contact = None
     if contacts is not None:

@@ -24,7 +24,7 @@ from wearcap.io.datasets.amass import PELVIS_SMPLX
 from wearcap.io.datasets.one_object import OneObject
 from wearcap.io.formats.npz import require
 from wearcap.io.formats.poses import are_rotations
-from wearcap.io.formats.restricted_pickle import read_pickle
+from wearcap.io.formats.restricted_pickle import read_pickled_dict
 from wearcap.io.formats.smpl import shape_from_arrays, smpl_motion
 from wearcap.io.formats.wavefront import read_obj
 from wearcap.scene.objects import centered, check_object_mesh
@@ -70,10 +70,7 @@ def read_omomo(root: str | Path) -> list[OmomoSequence]:
         raise WearcapError("no sequences", root, " or ".join(FILES), "Give OMOMO's folder as source=DIR.")
     found = []
     for path in paths:
-        content = read_pickle(path)
-        if not isinstance(content, dict):
-            raise WearcapError(f"it holds a {type(content).__name__}", path, "{number: {seq_name, trans, …}}")
-        for key, entry in content.items():
+        for key, entry in read_pickled_dict(path, "{number: {seq_name, trans, …}}").items():
             name = entry.get("seq_name") if isinstance(entry, dict) else None
             if not isinstance(name, str) or len(name.split("_")) < 3 or not name.replace("_", "").isalnum():
                 expected = "seq_name SUBJECT_OBJECT_NUMBER, such as sub1_largebox_000"

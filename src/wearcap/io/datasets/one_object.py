@@ -32,21 +32,13 @@ class OneObject:
         """The take in rotated world axes with the same origin."""
         R_joints = self.motion.R_parent_joint
         R_new = R_new_old.to(R_joints.dtype)
-        motion = replace(
-            self.motion,
-            R_parent_joint=torch.cat([R_new @ R_joints[:, :1], R_joints[:, 1:]], 1),
-            t_world_root=self.motion.t_world_root @ R_new.mT,
-        )
+        R_joints = torch.cat([R_new @ R_joints[:, :1], R_joints[:, 1:]], 1)
+        motion = replace(self.motion, R_parent_joint=R_joints, t_world_root=self.motion.t_world_root @ R_new.mT)
         path = self.path
         turned = Trajectory(path.timestamps, R_new @ path.R_world_body, path.t_world_body @ R_new.mT)
         return replace(self, motion=motion, path=turned)
 
     def frames(self, chosen: slice | Bool[Tensor, "time"]) -> "OneObject":
         """The take with the selected frames of body and object, by slice or mask."""
-        motion = replace(
-            self.motion,
-            timestamps=self.motion.timestamps[chosen],
-            R_parent_joint=self.motion.R_parent_joint[chosen],
-            t_world_root=self.motion.t_world_root[chosen],
-        )
-        return replace(self, motion=motion, path=self.path[chosen])
+        rows = {name: getattr(self.motion, name)[chosen] for name in ("timestamps", "R_parent_joint", "t_world_root")}
+        return replace(self, motion=replace(self.motion, **rows), path=self.path[chosen])

@@ -174,9 +174,7 @@ class _Figure:
             "type": _TYPE[array.shape[1:]],
         }
         if bounds:
-            accessor |= {
-                name: np.atleast_1d(value).tolist() for name, value in (("min", array.min(0)), ("max", array.max(0)))
-            }
+            accessor |= {"min": np.atleast_1d(array.min(0)).tolist(), "max": np.atleast_1d(array.max(0)).tolist()}
         self.accessors.append(accessor)
         return len(self.accessors) - 1
 

@@ -15,9 +15,9 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, parse_json
 from wearcap.geometry import rotation
-from wearcap.geometry.trajectory import Trajectory, nearest_frames
+from wearcap.geometry.trajectory import nearest_frames
 from wearcap.io.formats.npz import read_npz, require
-from wearcap.recording.motion import HANDS, Interactions, Motion
+from wearcap.recording.motion import HANDS, Motion
 from wearcap.recording.serialize import dumps, flatten, unflatten
 
 SCHEMA = 1

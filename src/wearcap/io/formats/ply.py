@@ -16,20 +16,9 @@ from wearcap.files import atomic_path
 from wearcap.geometry.mesh import Mesh
 from wearcap.io.formats.bounded import read_bytes, understood
 
-_TYPES = {
-    name: code
-    for code, names in {
-        "i1": ("char", "int8"),
-        "u1": ("uchar", "uint8"),
-        "i2": ("short", "int16"),
-        "u2": ("ushort", "uint16"),
-        "i4": ("int", "int32"),
-        "u4": ("uint", "uint32"),
-        "f4": ("float", "float32"),
-        "f8": ("double", "float64"),
-    }.items()
-    for name in names
-}
+_CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
+_C_NAMES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
+_TYPES = {np.dtype(code).name: code for code in _CODES} | dict(zip(_C_NAMES, _CODES))
 _BYTE_ORDER = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 GREY = np.array([0.7, 0.7, 0.7], np.float32)
 """Colour of meshes without one."""

@@ -67,6 +67,14 @@ def read_pickle(path: str | Path, max_bytes: int | None = None) -> Any:
         raise WearcapError(what, path, "a whole pickle file", "Fetch it again.") from error
 
 
+def read_pickled_dict(path: str | Path, expected: str) -> dict[Any, Any]:
+    """A pickle's dict. Raises WearcapError as `read_pickle` does, and naming `expected` for a file that holds something else."""
+    content = read_pickle(path)
+    if not isinstance(content, dict):
+        raise WearcapError(f"it holds a {type(content).__name__}", path, expected)
+    return content
+
+
 class _RefusedError(Exception):
     """Raised for content that is never admitted."""
 
