@@ -1,5 +1,6 @@
 """The Motion (output of a pipeline, or ground truth), and interactions: which hands hold which object at which time."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -29,6 +30,18 @@ class Interactions:
     """Names of the objects in the environment; "" if unknown."""
     classes: tuple[str, ...]
     """Contact class of each interval, of `scene.objects.CONTACT_CLASSES`; "" if unknown."""
+
+    @classmethod
+    def of(cls, rows: Iterable[tuple]) -> "Interactions":
+        """Interactions from rows of start and stop (s), the hands' values, the object's name and its contact class."""
+        columns = list(zip(*rows)) or [()] * 5
+        times = (torch.tensor(edge, dtype=torch.float64) for edge in columns[:2])
+        return cls(*times, torch.tensor(columns[2], dtype=torch.bool).reshape(-1, len(HANDS)), *columns[3:])
+
+    @property
+    def rows(self) -> list[tuple[float, float, list[bool], str, str]]:
+        """Inverse of `of`."""
+        return list(zip(self.start_s.tolist(), self.stop_s.tolist(), self.hands.tolist(), self.objects, self.classes))
 
     def __len__(self) -> int:
         return len(self.start_s)

@@ -64,11 +64,8 @@ def joined(parts: Sequence[Motion]) -> Motion | None:
         name: Trajectory(*(torch.cat([getattr(track, field) for track in each]) for field in _POSES))
         for name, each in tracks.items()
     }
-    found, interactions = [part.interactions for part in parts if part.interactions is not None], None
-    if found:
-        rows = {name: torch.cat([getattr(each, name) for each in found]) for name in ("start_s", "stop_s", "hands")}
-        names = {key: tuple(name for each in found for name in getattr(each, key)) for key in ("objects", "classes")}
-        interactions = Interactions(**rows, **names)
+    found = [part.interactions for part in parts if part.interactions is not None]
+    interactions = Interactions.of(row for each in found for row in each.rows) if found else None
     return replace(parts[0], **whole, object_motion=objects or None, interactions=interactions)
 
 

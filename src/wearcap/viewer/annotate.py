@@ -136,15 +136,12 @@ def _predicted(motion: Motion) -> Interactions | None:
     contact = active(prob, motion.timestamps, ContactSettings())
     # Start times of frames, and the end of the last.
     edges = torch.cat([motion.timestamps, motion.timestamps[-1:] + motion.timestamps.diff().median()])
-    spans, hands = [], []
+    rows = []
     for hand in range(len(HANDS)):
         alone = contact & (torch.arange(len(HANDS)) == hand)
         for held in contact_intervals(alone):
-            spans.append((edges[held.start].item(), edges[held.stop].item()))
-            hands.append(held.hands)
-    table = torch.tensor(spans, dtype=torch.float64).reshape(-1, 2)
-    which = torch.tensor(hands, dtype=torch.bool).reshape(-1, len(HANDS))
-    return Interactions(table[:, 0], table[:, 1], which, ("",) * len(spans), ("",) * len(spans))
+            rows.append((edges[held.start].item(), edges[held.stop].item(), held.hands, "", ""))
+    return Interactions.of(rows)
 
 
 _DRAWN_SITES = ("heel", "toe_tip", "fingertip")

@@ -88,7 +88,8 @@ def read_egohoi(
         paths[object_id] = annotated.trajectory
         if labels is not None:
             contacts.append(read_egohoi_contacts(labels, clock, object_id, item.freedom.contact_class))
-    interactions = _joined(contacts) if contacts else None
+    rows = sorted((row for part in contacts for row in part.rows), key=lambda row: row[0])
+    interactions = Interactions.of(rows) if contacts else None
     if interactions is not None:
         labels_of(interactions, clock)  # raises for a hand that holds two objects at once
     shape = root / "smpl_shapes" / f"{subject_of(name)}.json"
@@ -200,14 +201,3 @@ def read_egohoi_contacts(path: str | Path, clock: LabelClock, object_name: str, 
         for key, text in (("objects", object_name), ("classes", contact_class))
     }
     return interactions_of(parse_labels({"contacts": parts, **named}, clock, where=path))
-
-
-def _joined(parts: list[Interactions]) -> Interactions:
-    """Interactions of all objects, sorted by start."""
-    start, stop, hands = (torch.cat([getattr(part, key) for part in parts]) for key in ("start_s", "stop_s", "hands"))
-    names, kinds = ([text for part in parts for text in getattr(part, key)] for key in ("objects", "classes"))
-    order = torch.argsort(start, stable=True)
-    index = order.tolist()
-    return Interactions(
-        start[order], stop[order], hands[order], tuple(names[k] for k in index), tuple(kinds[k] for k in index)
-    )

@@ -21,6 +21,7 @@ import re
 import warnings
 from array import array
 from dataclasses import replace
+from functools import lru_cache
 from glob import escape
 from pathlib import Path
 from typing import Any
@@ -219,12 +220,11 @@ def read_hps_scene(folder: str | Path) -> tuple[Path, list[Photo]]:
     named = [(match, path) for path in sorted((folder / "cam").iterdir()) if (match := _PHOTO.fullmatch(path.name))]
     if not named:
         raise WearcapError("no pictures", folder / "cam", "files such as 00000-cam0.jpg")
-    photos, info, info_path = [], {}, None
+    photos, read_info = [], lru_cache(maxsize=1)(read_json)  # all pictures of a frame share a file
     for match, path in named:
         frame, name = match.groups()
-        if info_path != folder / "info" / f"{frame}-info.json":
-            info_path = folder / "info" / f"{frame}-info.json"
-            info = read_json(info_path)
+        info_path = folder / "info" / f"{frame}-info.json"
+        info = read_info(info_path)
         if not isinstance(info, dict) or name not in info:
             raise WearcapError(f"no pose of {name}", info_path, f"one for {path.name}")
         if name not in cameras:

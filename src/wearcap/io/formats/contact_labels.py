@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from jaxtyping import Float64
 from torch import Tensor
 
@@ -176,14 +175,7 @@ def interactions_of(labels: Labels) -> Interactions:
             if any(hands):
                 found.append((start, stop, hands, *item))
     found.sort(key=lambda row: row[0])
-    start, stop, hands, objects, classes = zip(*found) if found else ((),) * 5
-    return Interactions(
-        torch.tensor(start, dtype=torch.float64),
-        torch.tensor(stop, dtype=torch.float64),
-        torch.tensor(hands, dtype=torch.bool).reshape(-1, len(HANDS)),
-        tuple(objects),
-        tuple(classes),
-    )
+    return Interactions.of(found)
 
 
 def labels_of(interactions: Interactions, clock: LabelClock) -> Labels:
@@ -192,8 +184,7 @@ def labels_of(interactions: Interactions, clock: LabelClock) -> Labels:
     Raises WearcapError where a hand would hold two objects at once, or outside the recording.
     """
     labels: Labels = {}
-    times, hands_of = (interactions.start_s.tolist(), interactions.stop_s.tolist()), interactions.hands.tolist()
-    rows = sorted(zip(*times, hands_of, interactions.objects, interactions.classes), key=lambda row: row[0])
+    rows = sorted(interactions.rows, key=lambda row: row[0])
     for number, hand in enumerate(HANDS):
         joined: list[Label] = []
         for start, stop, hands, item, kind in rows:

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from wearcap.geometry.mesh import merged
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.recording.motion import HANDS, Interactions, Motion
+from wearcap.recording.motion import Interactions, Motion
 from wearcap.scene.environment import Environment
 from wearcap.simulation.handling.grips import Handling, object_motion
 from wearcap.simulation.places.builder import Piece, WorldBuilder
@@ -344,12 +344,8 @@ class House:
             ((row, handling) for handling in self.handlings for row in handling.rows if row[0] < until_s),
             key=lambda pair: pair[0][:2],
         )
-        return Interactions(
-            torch.tensor([row[0] for row, _ in rows], dtype=torch.float64),
-            torch.tensor([min(row[1], until_s) for row, _ in rows], dtype=torch.float64),
-            torch.tensor([row[2] for row, _ in rows], dtype=torch.bool).reshape(-1, len(HANDS)),
-            tuple(handling.name for _, handling in rows),
-            tuple(handling.contact_class for _, handling in rows),
+        return Interactions.of(
+            (row[0], min(row[1], until_s), row[2], handling.name, handling.contact_class) for row, handling in rows
         )
 
     def object_motion(self, motion: Motion) -> dict[str, Trajectory]:
