@@ -150,9 +150,6 @@ def _euler(angles: Float[Tensor, "*batch joint 3"], order: tuple[str, ...]) -> F
     return R
 
 
-# --- ASF -----------------------------------------------------------------------------------------------------------
-
-
 class _AsfContent:
     """Sections of an ASF file; `take` reads one line's words and raises ValueError or IndexError for what it cannot."""
 
@@ -287,9 +284,6 @@ def _sites(names: list[str], ends: Tensor, leaves: dict[str, Tensor]) -> dict[st
         if letter + "hand" in names:
             sites[f"{side}_palm"] = Site(letter + "hand", tuple(ends[names.index(letter + "hand")].tolist()))
     return sites
-
-
-# --- AMC -----------------------------------------------------------------------------------------------------------
 
 
 def _parse_amc(path: Path, asf: _AsfSkeleton) -> tuple[np.ndarray, list[int], Float64[Tensor, "time channel"]]:

@@ -155,9 +155,6 @@ def _camera(model: str, width: int, height: int, values: list[float], where: str
     return Camera(ours, width, height, fx, fy, cx - 0.5, cy - 0.5, tuple(lens))
 
 
-# Text
-
-
 def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
     """Position and words of each line, without comments but with empty lines."""
     for number, line in numbered_lines(path):
@@ -219,9 +216,6 @@ class _Text:
         return points
 
 
-# Binary (little-endian, without padding)
-
-
 class _Cursor:
     """Reads structures one after another; errors name the part of the file that ended too early."""
 
@@ -256,7 +250,7 @@ class _Cursor:
 
 
 class _Binary:
-    """A model in binary files."""
+    """A model in binary files (little-endian, without padding)."""
 
     @staticmethod
     def cameras(path: Path) -> dict[int, Camera]:

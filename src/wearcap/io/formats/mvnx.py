@@ -167,9 +167,6 @@ def read_mvnx(path: str | Path, max_bytes: int | None = None) -> Recording:
     return _recording(file)
 
 
-# --- from XML to lists ---------------------------------------------------------------------------------------
-
-
 class _Chunks:
     """Read sizes that double until an element begins or ends: expat rescans a long tag or comment with every read."""
 
@@ -210,9 +207,6 @@ def _elements(events: Iterator[tuple[str, Element]], chunks: _Chunks) -> Iterato
 
 def _plain(label: str) -> str:
     return label.replace(" ", "").replace("_", "").lower()
-
-
-# --- from lists to a Recording ---------------------------------------------------------------------------------
 
 
 def _recording(file: _File) -> Recording:

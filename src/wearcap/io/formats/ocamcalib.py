@@ -7,6 +7,7 @@ atan(w / √(u² + v²)), is a fit to the inverse of the first.
 """
 
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -80,9 +81,7 @@ class OCamModel:
     def _curve(self, determinant: float, where: str | Path) -> tuple[np.ndarray, np.ndarray]:
         """Radii ρ (pixels) up to the image's furthest corner, and their angles θ from the axis (rad)."""
         c, d, e = self.affine
-        corners = np.array(
-            [(row, column) for row in (0, self.height - 1) for column in (0, self.width - 1)], np.float64
-        )
+        corners = np.array([*product((0, self.height - 1), (0, self.width - 1))], np.float64)
         offset = corners - (self.row, self.column)
         u = (offset[:, 0] - d * offset[:, 1]) / determinant
         v = (c * offset[:, 1] - e * offset[:, 0]) / determinant

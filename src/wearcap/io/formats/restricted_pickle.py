@@ -118,9 +118,6 @@ def _require_plain(value: Any) -> None:
     raise _RefusedError(f"it holds lists within lists, {_MAX_DEPTH} deep")
 
 
-# --- replacements of the admitted names ----------------------------------------------------------------------
-
-
 class _NdarrayName:
     """The name numpy.ndarray, which is only ever an argument."""
 
