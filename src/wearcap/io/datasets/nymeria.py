@@ -86,16 +86,13 @@ def read_xdata(path: str | Path) -> tuple[Motion, ContactTrack | None]:
         position[:, 0].float(),
         provenance={"source": Path(path).name, "format": "nymeria"},
     )
-    return motion, _contacts(arrays, motion, path)
-
-
-def _contacts(arrays: dict[str, np.ndarray], motion: Motion, path: str | Path) -> ContactTrack | None:
-    if "foot_contacts" not in arrays:
-        return None
-    contact = arrays["foot_contacts"]
+    contact = arrays.get("foot_contacts")
+    if contact is None:
+        return motion, None
     if contact.shape != (len(motion), len(FOOT_PATCHES)):
-        raise WearcapError(f"foot_contacts has shape {contact.shape}", path, f"({len(motion)}, {len(FOOT_PATCHES)})")
-    return ContactTrack(motion.timestamps, FOOT_PATCHES, torch.from_numpy(contact > 0.5))
+        expected = f"({len(motion)}, {len(FOOT_PATCHES)})"
+        raise WearcapError(f"foot_contacts has shape {contact.shape}", path, expected)
+    return motion, ContactTrack(motion.timestamps, FOOT_PATCHES, torch.from_numpy(contact > 0.5))
 
 
 def read_nymeria(folder: str | Path, *, fps: float = 60.0, video: Path | None = None) -> Recording:

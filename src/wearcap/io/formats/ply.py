@@ -175,12 +175,14 @@ def _read_binary(element: _Element, data: bytes, start: int, order: str, path) -
     table, stop = _read_even_rows(element, data, start, order)
     if table is not None:
         return table, stop
-    columns = {p.name: (bytearray(), array("q")) for p in element.properties}
+    if not any(p.count_dtype for p in element.properties):
+        raise _cut_short(path, element)
+    columns = [(bytearray(), array("q")) for _ in element.properties]
     plan = [
-        (*columns[p.name], np.dtype(order + p.count_dtype) if p.count_dtype else None, np.dtype(p.dtype).itemsize)
-        for p in element.properties
+        (*column, np.dtype(order + p.count_dtype) if p.count_dtype else None, np.dtype(p.dtype).itemsize)
+        for p, column in zip(element.properties, columns)
     ]
-    for _ in range(element.count if any(p.count_dtype for p in element.properties) else 0):
+    for _ in range(element.count):
         for values, lengths, count_dtype, width in plan:
             length = 1
             if count_dtype:
@@ -192,18 +194,14 @@ def _read_binary(element: _Element, data: bytes, start: int, order: str, path) -
                 raise _cut_short(path, element)
             values += data[start:stop]
             start = stop
-    if not any(p.count_dtype for p in element.properties):
-        raise _cut_short(path, element)
-    found = {p.name: np.frombuffer(columns[p.name][0], order + p.dtype) for p in element.properties}
-    return _with_lists(element, found, {name: lengths for name, (_, lengths) in columns.items()}), start
+    found = [np.frombuffer(values, order + p.dtype) for p, (values, _) in zip(element.properties, columns)]
+    return _with_lists(element, found, [lengths for _, lengths in columns]), start
 
 
-def _with_lists(element: _Element, values: dict[str, np.ndarray], lengths: "dict[str, array[int]]") -> dict:
-    """Columns, of which those of list properties are `_Lists`."""
-    return {
-        p.name: _Lists(values[p.name], np.array(lengths[p.name], np.int64)) if p.count_dtype else values[p.name]
-        for p in element.properties
-    }
+def _with_lists(element: _Element, columns: list[np.ndarray], lengths: "list[array[int]]") -> dict:
+    """Columns by name, of which those of list properties are `_Lists`."""
+    parts = zip(element.properties, columns, lengths)
+    return {p.name: _Lists(values, np.array(each, np.int64)) if p.count_dtype else values for p, values, each in parts}
 
 
 def _length(data: bytes, place: int, dtype: np.dtype) -> int:
@@ -253,12 +251,11 @@ def _ascii_table(element: _Element, lines: Iterator[str]) -> tuple[dict, int]:
 
 
 def _ascii_lists(element: _Element, lines: Iterator[str]) -> tuple[dict, int]:
-    columns = {p.name: (array("d"), array("q")) for p in element.properties}
+    columns = [(array("d"), array("q")) for _ in element.properties]
     rows = 0
     for line in islice(lines, element.count):
         words, place = line.split(), 0
-        for p in element.properties:
-            values, lengths = columns[p.name]
+        for p, (values, lengths) in zip(element.properties, columns):
             length = 1
             if p.count_dtype:
                 length, place = int(words[place]), place + 1
@@ -268,8 +265,8 @@ def _ascii_lists(element: _Element, lines: Iterator[str]) -> tuple[dict, int]:
             values.extend(map(float, words[place : place + length]))
             place += length
         rows += 1
-    found = {name: np.array(values, np.float64) for name, (values, _) in columns.items()}
-    return _with_lists(element, found, {name: lengths for name, (_, lengths) in columns.items()}), rows
+    found = [np.array(values, np.float64) for values, _ in columns]
+    return _with_lists(element, found, [lengths for _, lengths in columns]), rows
 
 
 def _colors(vertex: dict) -> np.ndarray | None:
