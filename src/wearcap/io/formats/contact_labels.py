@@ -118,9 +118,8 @@ def parse_labels(content: Any, clock: LabelClock, *, where: str | Path) -> Label
         for key in ("objects", "classes"):
             texts = content.get(key, {})
             texts = texts.get(name, [""] * len(pairs)) if isinstance(texts, dict) else None
-            if not (
-                isinstance(texts, list) and len(texts) == len(pairs) and all(isinstance(text, str) for text in texts)
-            ):
+            plain = isinstance(texts, list) and all(isinstance(text, str) for text in texts)
+            if not plain or len(texts) != len(pairs):
                 raise WearcapError(f"{key} of {name} do not match its labels", where, f"{len(pairs)} texts")
             beside.append(texts)
         objects, classes = beside

@@ -147,11 +147,9 @@ def _row(item: SceneObject, mesh: str, where: str) -> dict[str, Any]:
         hinge = freedom.kind == "hinge"
         row["limits_deg" if hinge else "limits_m"] = [math.degrees(v) if hinge else v for v in limits]
     # The fewest digits that identify a single-precision number.
-    *R, t = [
-        [float(f"{v:.9g}") for v in line] for line in (*item.R_world_object.tolist(), item.t_world_object.tolist())
-    ]
-    values = (item.name, item.category, mesh, R, t, row)
-    return dict(zip(_KEYS, values))
+    lines = (*item.R_world_object.tolist(), item.t_world_object.tolist())
+    *R, t = [[float(f"{v:.9g}") for v in line] for line in lines]
+    return dict(zip(_KEYS, (item.name, item.category, mesh, R, t, row)))
 
 
 def _check(item: SceneObject, where: str) -> None:
