@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -95,10 +96,8 @@ class RecordingFile:
         if "wearcap" not in metadata:
             raise WearcapError("a .safetensors file, but not a recording", path, "one that `wearcap prepare` wrote")
         content = parse_json(metadata["wearcap"], path)
-        try:
+        with self._described():
             version, self._tree = content["schema_version"], dict(content["recording"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise self._unreadable(error) from error
         if version != SCHEMA_VERSION:
             raise WearcapError(f"schema version {version}", path, f"version {SCHEMA_VERSION}", "Prepare it again.")
 
@@ -122,27 +121,26 @@ class RecordingFile:
 
     def part(self, name: str):
         """One top-level part ("skeleton", "head", "motion" …), or None if the recording lacks it."""
-        part = self._built(self._tree.get(name))
-        try:
+        with self._described():
+            part = unflatten(self._tree.get(name), self.tensor)
             require_part(Recording, name, part)
-        except WearcapError as error:
-            raise self._unreadable(error) from error
-        return part
+            return part
 
     def load(self) -> Recording:
-        recording = self._built(self._tree)
-        if not isinstance(recording, Recording):
-            raise self._unreadable(TypeError("not a Recording"))
-        return recording
+        with self._described():
+            recording = unflatten(self._tree, self.tensor)
+            if not isinstance(recording, Recording):
+                raise TypeError("not a Recording")
+            return recording
 
-    def _built(self, tree):
+    @contextmanager
+    def _described(self) -> Iterator[None]:
+        """Turn what taking the description apart raises into a WearcapError."""
         try:
-            return unflatten(tree, self.tensor)
+            yield
         except (WearcapError, TypeError, ValueError, KeyError, AttributeError) as error:
-            raise self._unreadable(error) from error
-
-    def _unreadable(self, error: Exception) -> WearcapError:
-        return WearcapError(f"its description is unreadable ({error})", self.path, fix="Prepare this recording again.")
+            what = f"its description is unreadable ({error})"
+            raise WearcapError(what, self.path, fix="Prepare this recording again.") from error
 
     def _require(self, key: str) -> None:
         if key not in self.keys:
@@ -305,13 +303,13 @@ def load_recording(where: str | Path) -> Recording:
     path = Path(where)
     if path.is_file():
         return RecordingFile(path).load()
-    if (path / "manifest.json").is_file():
+    if (path / MANIFEST).is_file():
         names = RecordingStore.open(path).names()
         if len(names) == 1:
             return RecordingStore.open(path).load(names[0])
         what = f"a data set of {len(names)} recordings"
         raise WearcapError(what, path, f"one of them, such as {path / names[0] if names else path / 'NAME'}")
-    if (path.parent / "manifest.json").is_file():
+    if (path.parent / MANIFEST).is_file():
         return RecordingStore.open(path.parent).load(path.name)
     raise WearcapError("no recording here", path, "DATASET/NAME or a .safetensors file that `wearcap prepare` wrote")
 
@@ -319,7 +317,4 @@ def load_recording(where: str | Path) -> Recording:
 def dataset_folder(where: str | Path) -> Path:
     """Folder of the data set of a recording given by the user; file names in the recording are relative to it."""
     path = Path(where)
-    for folder in (path, *path.parents):
-        if (folder / "manifest.json").is_file():
-            return folder
-    return path.parent
+    return next((folder for folder in (path, *path.parents) if (folder / MANIFEST).is_file()), path.parent)
