@@ -21,7 +21,7 @@ _SEAT_PRIOR_M = 0.05
 
 @dataclass(frozen=True)
 class _Alignment:
-    """_Alignment of suit and device."""
+    """Alignment of suit and device."""
 
     T_head_device: Rigid
     """Constant pose of the device on the suit's head joint."""

@@ -210,7 +210,12 @@ class _AsfContent:
         elif self.section == ":bonedata" and words[0] == "begin":
             self.bone = _Bone("", number)
         elif self.section == ":bonedata" and words[0] == "end" and self.bone is not None:
-            self.close_bone(self.bone)
+            bone = self.bone
+            if not bone.name or bone.name == "root" or bone.name in self.bones:
+                raise ValueError(f"the bone begun in line {bone.line} has no name of its own")
+            if len(self.bones) >= MAX_BONES:
+                raise ValueError(f"more than {MAX_BONES} bones")
+            self.bones[bone.name], self.bone = bone, None
         elif self.section == ":root" or (self.section == ":bonedata" and self.bone is not None):
             for name, read in _FIELDS[self.section].get(words[0], {}).items():
                 setattr(self.bone or self.root, name, read(words[1:]))
@@ -218,13 +223,6 @@ class _AsfContent:
             self.hierarchy.append((number, words))
             if max(len(self.hierarchy), len(words)) > MAX_BONES:
                 raise ValueError(f"more than {MAX_BONES} bones")
-
-    def close_bone(self, bone: _Bone) -> None:
-        if not bone.name or bone.name == "root" or bone.name in self.bones:
-            raise ValueError(f"the bone begun in line {bone.line} has no name of its own")
-        if len(self.bones) >= MAX_BONES:
-            raise ValueError(f"more than {MAX_BONES} bones")
-        self.bones[bone.name], self.bone = bone, None
 
 
 def _three(words: list[str]) -> list[float]:
