@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
@@ -13,11 +13,45 @@ from wearcap.geometry.trajectory import interpolate
 from wearcap.models.build import build
 from wearcap.models.checkpoint import read_checkpoint
 from wearcap.recording import Motion
-from wearcap.systems.ireplica.contact_sequence import ContactSequence
-from wearcap.systems.ireplica.contact_transformer import FRAMES, REACH, ContactNetwork, ContactTransformer
 from wearcap.systems.ireplica.features import FEATURES, PoseFeatures, in_skeleton, pose_frames, worn
 
-NETWORKS = {cls.__name__: cls for cls in (ContactTransformer, ContactSequence)}
+REACH = 30
+"""Number of context frames (at 60 Hz) on each side of a predicted frame."""
+FRAMES = 2 * REACH + 1
+
+
+class ContactNetwork(nn.Module):
+    """Maps poses of consecutive frames to contact logits per hand (left, right) and class of interaction.
+
+    Of `time` frames, those from `REACH` to `time - REACH - 1` have a prediction; the others lack context.
+    """
+
+    temperature: Tensor
+    frames_per_pass: int
+    """Number of predicted frames that are best computed in one pass."""
+
+    def __init__(self, classes: int):
+        super().__init__()
+        self.classes = classes
+        self.register_buffer("temperature", torch.ones(classes))
+
+    def forward(self, pose: Float[Tensor, "batch time feature"]) -> Float[Tensor, "batch out hand class"]:
+        raise NotImplementedError
+
+    def probability(self, pose: Float[Tensor, "batch time feature"]) -> Float[Tensor, "batch out hand class"]:
+        """Calibrated probabilities: sigmoid of the logits divided by a temperature fitted on validation data."""
+        return (self(pose) / self.temperature).sigmoid()
+
+    def middle_probability(self, pose: Float[Tensor, "batch time feature"]) -> Float[Tensor, "batch hand class"]:
+        """Calibrated probabilities of the middle one of 61 frames."""
+        return self.probability(pose)[:, 0]
+
+    def normalize_on(self, pose: Float[Tensor, "batch time feature"]) -> None:
+        """Set the statistics that normalise the inputs; the thesis's network has none."""
+
+
+NETWORKS = ("ContactTransformer", "ContactSequence")
+"""Names of the subclasses that a checkpoint may hold."""
 
 
 @dataclass(frozen=True)

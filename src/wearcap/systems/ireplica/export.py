@@ -14,8 +14,7 @@ from wearcap.geometry import rotation
 from wearcap.recording import Recording
 from wearcap.recording.motion import HANDS
 from wearcap.runtime.graphs import Call, Exports, Graph, Run
-from wearcap.systems.ireplica.contact_prediction import ContactDetector, ContactStream
-from wearcap.systems.ireplica.contact_transformer import FRAMES, ContactNetwork
+from wearcap.systems.ireplica.contact_prediction import FRAMES, ContactDetector, ContactNetwork, ContactStream
 from wearcap.systems.ireplica.features import FEATURES, pose_frames
 
 

@@ -14,8 +14,7 @@ from wearcap.recording import Motion
 from wearcap.recording.motion import HANDS
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
-from wearcap.systems.ireplica.contact_intervals import ContactInterval
-from wearcap.systems.ireplica.object_tracker import PALMS, Correction, Held
+from wearcap.systems.ireplica.object_tracker import PALMS, ContactInterval, Correction, Held
 from wearcap.tracking.anchor import with_hand_moved
 
 FIT_FRAMES = 60
