@@ -53,18 +53,11 @@ def foot_contact_share(
     skeleton: Skeleton, joints: Float[Tensor, "time joint 3"], floor_height: Float[Tensor, "time"]
 ) -> Float[Tensor, ""]:
     """FC: share of frames in which an ankle is less than 10 cm, or a toe joint less than 5 cm, above the floor."""
-    return feet_down(skeleton, joints, floor_height).float().mean()
-
-
-def feet_down(
-    skeleton: Skeleton, joints: Float[Tensor, "time joint 3"], floor_height: Float[Tensor, "time"]
-) -> Bool[Tensor, "time"]:
-    """Whether any of the four foot joints is below its contact height."""
     low = []
     for name, limit in (("ankle", ANKLE_M), ("toe", TOE_M)):
         at = skeleton.indices(f"left_{name}", f"right_{name}")
         low.append(joints[:, at, 2] - floor_height[:, None] < limit)
-    return torch.cat(low, 1).any(1)
+    return torch.cat(low, 1).any(1).float().mean()
 
 
 PAUSE_S = 0.5

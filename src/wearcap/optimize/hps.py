@@ -240,25 +240,19 @@ class HpsData:
         return replace(self, start=HpsState(*start), steps=SuitSteps(*steps), **tensors)
 
 
-@dataclass(frozen=True, eq=False)
-class Ground:
-    """Nearest scene point v(n) of each patch vertex (eq. 4.6) and local plane; `found`: 1 where both exist, else 0."""
-
-    point: Float[Tensor, "time vertex 3"]
-    origin: Float[Tensor, "time vertex 3"]
-    normal: Float[Tensor, "time vertex 3"]
-    found: Float[Tensor, "time vertex"]
+_GROUND = ("ground_point", "ground_origin", "ground_normal", "ground_found")
 
 
-def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: HpsEnergy) -> Ground:
+def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: HpsEnergy) -> dict[str, Tensor]:
     """Query the scene below patch vertices in contact (m, world), as far as the energy needs it.
 
-    Each patch has one plane, that below its centroid. `found` is 0 everywhere without a scene.
+    Returns by name the nearest scene point v(n) of each vertex (eq. 4.6), origin and normal of the plane below its
+    patch's centroid, and "ground_found": 1 where these exist, else 0; without a scene it is 0 everywhere.
     """
     to_point, to_plane = energy.reading("ground_point"), energy.reading("ground_normal")
     if data.surface is None or not (to_point or to_plane):
         none = torch.zeros_like(points.detach())
-        return Ground(none, none, none, none[..., 0])
+        return dict(zip(_GROUND, (none, none, none, none[..., 0])))
     dtype, points = points.dtype, points.detach().double()
     stands, patch = data.contact > 0, data.patches.patch
     point, origin, normal = points.clone(), torch.zeros_like(points), torch.zeros_like(points)
@@ -274,23 +268,22 @@ def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: H
         origin, normal = where[:, patch], up[:, patch]
         found *= normal[..., 2] > LEAST_UPRIGHT  # False where no plane was found (NaN)
     parts = (point.nan_to_num(), origin.nan_to_num(), normal.nan_to_num(), found)
-    return Ground(*(part.to(dtype) for part in parts))
+    return {name: part.to(dtype) for name, part in zip(_GROUND, parts)}
 
 
-def data_values(data: HpsData, ground: Ground) -> dict[str, Tensor]:
-    """Values by name that do not depend on the state: those of `HpsData`, and what the terms derive from them."""
+def data_values(data: HpsData, ground: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Values by name that do not depend on the state: those of `HpsData` and `find_ground`, and what terms derive from
+    them."""
     contact, patches = data.contact, data.patches
-    t, theta_imu, soles = data.start.t_world_root, data.start.theta, ground.point
+    t, theta_imu, soles = data.start.t_world_root, data.start.theta, ground["ground_point"]
     derived = {
         "ones": torch.ones_like(t[:, 0]),
         "t_start": t,
         "theta_imu": theta_imu,
         "theta_legs_imu": theta_imu[:, _leg_columns(patches)],
         "R_localized_head": data.R_world_cam @ data.R_head_cam.T,
-        "ground_point": ground.point,
-        "ground_origin": ground.origin,
-        "ground_normal": ground.normal,
-        "on_ground": patches.share(contact) / 4 * ground.found,
+        **ground,
+        "on_ground": patches.share(contact) / 4 * ground["ground_found"],
         "stays": patches.share(contact[1:] * contact[:-1]) / 4,
         "no_slide": torch.zeros_like(soles[1:]),
         "no_step": torch.zeros_like(t[1:]),

@@ -188,25 +188,19 @@ def bent(
     return torch.cat([start, start + turned.cumsum(0)])
 
 
-def heading_change(
-    heading: Float64[Tensor, "step"], original: Float64[Tensor, "step"], clamped: bool = False
-) -> Float64[Tensor, "link"]:
-    """Change dα̂ − dα from step to step (rad, wrapped; eq. 5.1); `clamped`: with fixed steps before and after them."""
-    off = heading - original
-    if not clamped:
-        return wrapped(off.diff())
-    return wrapped(torch.cat([off[:1], off.diff(), -off[-1:]]))
-
-
 def energy_terms(
     problem: BendingProblem, turn: Float64[Tensor, "step"], shift: Float64[Tensor, "2"]
 ) -> dict[str, Float64[Tensor, ""]]:
-    """Terms of eq. 5.2, differentiable in φ (rad) and the first point's shift (m); the path is linear within steps."""
+    """Terms of eq. 5.2, differentiable in φ (rad) and the first point's shift (m); the path is linear within steps.
+
+    The change dα̂ − dα from step to step (eq. 5.1) is that of φ; with clamped ends also from and to the fixed steps.
+    """
     settings, path = problem.settings, bent(problem, turn, shift)
     at, share = problem.control_step, problem.control_share[:, None]
     offset = torch.lerp(path[at], path[at + 1], share) - problem.control_points
     off = turn[problem.leader]
-    change = heading_change(off, torch.zeros_like(off), settings.clamped_ends)
+    change = torch.cat([off[:1], off.diff(), -off[-1:]]) if settings.clamped_ends else off.diff()
+    change = wrapped(change)
     seconds = problem.link_s if settings.clamped_ends else problem.link_s[1:-1]
     tension = change**2 / seconds if settings.norm == "square" else change.abs()
     return {

@@ -1,7 +1,7 @@
 """HPS (thesis ch. 4): registers a suit's motion in a scanned scene by a head camera, without drift.
 
-The steps of the thesis in order: synchronize → localize → align → initialize → optimize. Each is a method that can be
-called alone, and a stage whose result can be cached.
+The steps of the thesis in order: synchronize → localize → align → initialize → optimize. Each can be called alone, and
+is a stage whose result can be cached.
 """
 
 from collections import Counter
@@ -29,7 +29,6 @@ from wearcap.recording.timing import resampled
 from wearcap.runtime.stages import Stage, StagedSystem
 from wearcap.runtime.system import CaptureInput
 from wearcap.scene.scan import Scan
-from wearcap.sensors.clock import Clock
 from wearcap.sensors.initialization import (
     Initialization,
     InitializationSettings,
@@ -140,14 +139,6 @@ class HPS(StagedSystem):
         """Final pieces of motion of a recording that still grows in a folder; `refused` counts unusable pieces."""
         pieces = follow_pieces(folder, refused=refused)
         return self._room("stream", "captures streams").follow(self, pieces, scan, folder, refused=refused)
-
-    def synchronize(self, recording: Recording, folder: Path) -> Clock | None:
-        """Map from the camera's clock to the suit's, by claps (thesis §4.3.4); None where they share one clock."""
-        return self.synchronization(recording, folder)
-
-    def localize(self, recording: Recording, folder: Path) -> Localization:
-        """Poses of the head camera in the scene, on its own clock (thesis §4.2.3)."""
-        return self.localization(recording, folder)
 
     def align(self, recording: Recording) -> Motion:
         """The suit's motion at `fps`, rotated about gravity and moved into the scene (thesis eq. 4.14, 4.15)."""

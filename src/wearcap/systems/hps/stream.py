@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body import skeleton
@@ -192,7 +192,12 @@ class HpsStream:
         if not len(suit):
             return None
         self._like = self._like or suit
-        localization = self._checked(localization, suit)
+        if localization is not None:
+            if fault := _localization_fault(localization, suit):
+                self.refused[f"localization: {fault}"] += 1
+                localization = None
+            elif not len(localization.timestamps):
+                localization = None
         if self.suit is None or _follows(self.suit, suit):
             self._refuse_alone()
             self._add(suit, localization)
@@ -218,16 +223,6 @@ class HpsStream:
         if self._alone is not None:
             self.refused[f"suit: {OFF_THE_CLOCK}"] += 1
             self._alone = None
-
-    def _checked(self, localization: object, suit: Motion) -> Localization | None:
-        """The localisation of a piece, or None if it is unusable."""
-        if localization is None:
-            return None
-        if fault := _localization_fault(localization, suit):
-            self.refused[f"localization: {fault}"] += 1
-            return None
-        assert isinstance(localization, Localization)
-        return localization if len(localization.timestamps) else None
 
     def _add(self, suit: Motion, localization: Localization | None) -> None:
         self.suit = joined([suit] if self.suit is None else [self.suit, suit])
@@ -275,8 +270,9 @@ class HpsStream:
         if self.seen is None:
             return False
         good = inliers(self.seen) & (self.seen.timestamps <= self.suit.timestamps[-1])
+        step = self.seen.timestamps.diff().median().item() if len(good) > 1 else 0.0
         count = int(good.sum())
-        if not count or (enough and count * _step(self.seen.timestamps) < self.settings.start_s):
+        if not count or (enough and count * step < self.settings.start_s):
             return False
         aligned, angle = align_suit(self.suit, self.seen, self.mount)
         turned = self.suit.t_world_root @ rotation.about_axis("z", angle).mT
@@ -293,7 +289,8 @@ class HpsStream:
         after = self.done.timestamps[-1].item() if self.done is not None else -torch.inf
         times = aligned.timestamps
         first = int(torch.searchsorted(times, after - settings.behind_s)) if self.done is not None else 0
-        data = self.hps.problem(self._recording(), aligned, start, self.scan, self.R_head_cam)[first:]
+        recording = replace(self.about, suit=self.suit, localization=self.seen)
+        data = self.hps.problem(recording, aligned, start, self.scan, self.R_head_cam)[first:]
         if self.done is not None:
             # Final frames constrain the window: their positions replace the camera's in the `hold` term.
             count = int((times[first:] <= self.done.timestamps[-1] + 0.5 / fps).sum())
@@ -329,10 +326,11 @@ class HpsStream:
     def _start(self, aligned: Motion) -> Initialization:
         """The window's initialisation; without localised frames the suit's motion goes on from the last final one."""
         seen = self.seen
-        if seen is not None and (_inside(seen, aligned) & inliers(seen)).any():
+        first, last = aligned.timestamps[0], aligned.timestamps[-1]
+        if seen is not None and (good := inliers(seen) & (seen.timestamps >= first) & (seen.timestamps <= last)).any():
             start = initialize(aligned, seen, self.mount.R, self.mount.t, self.hps.initialization)
             self.yaw = start.yaw_correction[-1].double()
-            sure = torch.where(inliers(seen) & _inside(seen, aligned), seen.confidence, 0.0)
+            sure = torch.where(good, seen.confidence, 0.0)
             nearest = torch.searchsorted(aligned.timestamps, seen.timestamps).clamp(max=len(aligned) - 1)
             self.R_head_cam = estimate_head_camera(
                 start.motion.joint("head").R[nearest].double(), seen.R_world_cam.double(), sure.double()
@@ -345,10 +343,6 @@ class HpsStream:
             carried = replace(carried, t_world_root=carried.t_world_root + move)
         lost = torch.zeros(len(aligned), dtype=torch.bool)
         return Initialization(carried, lost, self.yaw.expand(len(aligned)))
-
-    def _recording(self) -> Recording:
-        assert self.seen is not None
-        return replace(self.about, suit=self.suit, localization=self.seen)
 
     def _forget(self, before_s: float) -> None:
         """Drop frames that no later window needs."""
@@ -435,7 +429,7 @@ def follow(
         localization = piece.localization
         if piece.camera is not None:
             try:
-                localization = hps.localize(piece, folder)
+                localization = hps.localization(piece, folder)
             except WearcapError:
                 if fresh:
                     raise
@@ -447,11 +441,3 @@ def follow(
     last = stream.finish() if stream is not None else None
     if last is not None:
         yield last
-
-
-def _step(timestamps: Float64[Tensor, "time"]) -> float:
-    return timestamps.diff().median().item() if len(timestamps) > 1 else 0.0
-
-
-def _inside(seen: Localization, motion: Motion) -> Tensor:
-    return (seen.timestamps >= motion.timestamps[0]) & (seen.timestamps <= motion.timestamps[-1])

@@ -3,14 +3,11 @@
 No alignment is applied before measuring.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float64
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from wearcap.body.anny_body import anny_body
@@ -18,13 +15,12 @@ from wearcap.body.kinematics import site_positions
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
-from wearcap.io.formats.environment import read_environment
-from wearcap.metrics.objects import Handling, contact_mean, handlings, object_error, summary
+from wearcap.metrics.objects import Handling, contact_mean, handlings, object_error
 from wearcap.metrics.position import mpjpe_cm
-from wearcap.metrics.table import Row
+from wearcap.metrics.surface import chamfer
 from wearcap.recording import Motion, Recording
+from wearcap.recording.motion import Interactions
 from wearcap.recording.timing import at_times
-from wearcap.runtime.system import CaptureInput
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
 from wearcap.systems.ireplica.object_tracker import PALMS
@@ -84,15 +80,6 @@ def score_interactions(motion: Motion, recording: Recording, environment: Enviro
     return _InteractionScores(tuple(scored), joints, body, objects, false_moves)
 
 
-def with_interactions(row: Row, motion: Motion, source: CaptureInput, environment: str | Path | None) -> Row:
-    """A row of scores with means over handlings, for recordings with true interactions and objects."""
-    path = source.environment_file(environment)
-    if source.recording.interactions is None or path is None:
-        return row
-    scores = score_interactions(motion, source.recording, read_environment(path))
-    return replace(row, scores=row.scores | summary(scores.handlings))
-
-
 def poses_at(track: Trajectory | None, scene_object: SceneObject, timestamps: Float64[Tensor, "time"]) -> Rigid:
     """Poses of an object at given times; it is static before and after its track, and throughout without a track."""
     if track is None:
@@ -116,11 +103,12 @@ def _handling(row, rows, environment, held, timestamps, palms, found, real) -> H
     begin = int(torch.searchsorted(timestamps, start).clamp(max=len(timestamps) - 1))
     middle = _middle_of(scene_object)
     left = object_error(found[name][end], real[name][end], middle)
-    own = replace(
-        held, **_only(held, [o == name and start <= a < stop for o, a in zip(held.objects, held.start_s.tolist())])
-    )
+    own = [o == name and start <= a < stop for o, a in zip(held.objects, held.start_s.tolist())]
+    mine = torch.tensor(own, dtype=torch.bool)
+    unnamed = ("",) * int(mine.sum())
+    held = Interactions(held.start_s[mine], held.stop_s[mine], held.hands[mine], unnamed, unnamed)
     frames = slice(begin, max(int(torch.searchsorted(timestamps, stop)), begin + 1))
-    contact = own.hand_contact(timestamps[frames])
+    contact = held.hand_contact(timestamps[frames])
     apart = torch.stack(
         [environment.distance(name, palms[0][frames, hand], found[name][frames])[0] for hand in range(2)], 1
     )
@@ -141,32 +129,21 @@ def _handling(row, rows, environment, held, timestamps, palms, found, real) -> H
     )
 
 
-def _only(held, chosen: Sequence[bool]) -> dict:
-    keep = torch.tensor(chosen, dtype=torch.bool)
-    pick = lambda names: tuple(name for name, on in zip(names, chosen) if on)  # noqa: E731
-    return {
-        "start_s": held.start_s[keep],
-        "stop_s": held.stop_s[keep],
-        "hands": held.hands[keep],
-        "objects": pick(held.objects),
-        "classes": pick(held.classes),
-    }
-
-
 def _chamfer(
     motion: Motion, true: Motion, recording: Recording, rows, environment: Environment, found, real
 ) -> tuple[float, float]:
-    """Symmetric mean distances (cm) between captured and true surfaces of body and handled object, once a second."""
+    """Chamfer distances (cm) between captured and true surfaces of body and handled object, once a second."""
     body = anny_body(motion.skeleton, recording.shape or None)
+    thinned = slice(None, None, max(1, len(body.rest_vertices) // CHAMFER_POINTS))
     errors: tuple[list[float], list[float]] = ([], [])
     for name, start, stop in rows:
         times = torch.arange(start, stop, CHAMFER_EVERY_S, dtype=torch.float64)
         frames = torch.searchsorted(motion.timestamps, times).clamp(max=len(motion) - 1).tolist()
         surface = _surface_points(environment.by_name(name))
         for frame in frames:
-            bodies = [_thinned(body.vertices(m.T_world_joint[frame]).numpy()) for m in (motion, true)]
-            errors[0].append(_both_ways(*bodies))
-            errors[1].append(_both_ways(*((T[name][frame].to(torch.float32) @ surface).numpy() for T in (found, real))))
+            bodies = [body.vertices(m.T_world_joint[frame])[thinned] for m in (motion, true)]
+            errors[0].append(chamfer(*bodies).mean_cm)
+            errors[1].append(chamfer(*(T[name][frame].to(torch.float32) @ surface for T in (found, real))).mean_cm)
     return tuple(float(np.mean(part)) if part else float("nan") for part in errors)  # pyright: ignore[reportReturnType]
 
 
@@ -182,11 +159,3 @@ def _surface_points(scene_object: SceneObject) -> Float[Tensor, "point 3"]:
     u, v = rng.uniform(size=(2, CHAMFER_POINTS, 1)).astype(np.float32)
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     return torch.from_numpy(a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen])
-
-
-def _thinned(points: np.ndarray) -> np.ndarray:
-    return points[:: max(1, len(points) // CHAMFER_POINTS)]
-
-
-def _both_ways(a: np.ndarray, b: np.ndarray) -> float:
-    return 50.0 * float(KDTree(a).query(b)[0].mean() + KDTree(b).query(a)[0].mean())
