@@ -150,7 +150,11 @@ def _training_motions(stores: Sequence[RecordingStore]) -> Iterator[tuple[HeadPa
     first: tuple[tuple[str, ...], float] | None = None
     for store in stores:
         for name in store.names("train"):
-            recording, fps = _read(store, name), store.entries[name].fps
+            # Images, and clouds beside a known floor, are not read.
+            file, fps = store.open_file(name), store.entries[name].fps
+            floor = file.part("floor")
+            points = file.part("points") if floor is None else None
+            recording = Recording(name, head=file.part("head"), motion=file.part("motion"), floor=floor, points=points)
             if recording.head is None or recording.motion is None or len(recording.motion) < 2:
                 continue
             path = head_path(recording, recording.motion.skeleton, fps)
@@ -170,14 +174,6 @@ def _training_motions(stores: Sequence[RecordingStore]) -> Iterator[tuple[HeadPa
             where=", ".join(str(store.root) for store in stores),
             expected="a training split of recordings with both",
         )
-
-
-def _read(store: RecordingStore, name: str) -> Recording:
-    """The parts that baselines are fitted to; images, and clouds beside a known floor, are not read."""
-    file = store.open_file(name)
-    floor = file.part("floor")
-    points = file.part("points") if floor is None else None
-    return Recording(name, head=file.part("head"), motion=file.part("motion"), floor=floor, points=points)
 
 
 def _fps_of(path: HeadPath) -> float:

@@ -64,21 +64,12 @@ def truth_at(motion: Motion, recording: Recording, name: str) -> tuple[Motion, B
     truth, contact = recording.motion, _foot_contact(recording)
     if truth is None:
         raise WearcapError("no true motion to compare with", where=name, expected="a recording with `motion`")
-    if _within(motion, truth):
+    same = len(motion) == len(truth) and torch.allclose(motion.timestamps, truth.timestamps, rtol=0, atol=1e-6)
+    ends = truth.timestamps[[0, -1]] if len(truth) > 1 and len(motion) > 1 and not same else None
+    if ends is not None and motion.timestamps[0] >= ends[0] - 1e-6 and motion.timestamps[-1] <= ends[1] + 1e-6:
         frame = nearest_frames(truth.timestamps, motion.timestamps)
         truth, contact = at_times(truth, motion.timestamps), None if contact is None else contact[frame]
     return truth, contact
-
-
-def _within(motion: Motion, truth: Motion) -> bool:
-    """Whether a motion has other timestamps than the truth, all of them within its time span."""
-    same = len(motion) == len(truth) and torch.allclose(motion.timestamps, truth.timestamps, rtol=0, atol=1e-6)
-    ends = truth.timestamps[[0, -1]] if len(truth) > 1 and len(motion) > 1 else None
-    return (
-        not same
-        and ends is not None
-        and bool(motion.timestamps[0] >= ends[0] - 1e-6 and motion.timestamps[-1] <= ends[1] + 1e-6)
-    )
 
 
 def _foot_contact(recording: Recording) -> Bool[Tensor, "time patch"] | None:

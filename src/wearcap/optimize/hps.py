@@ -128,9 +128,16 @@ class FootPatches:
     """Index in `FOOT_PATCHES` of each vertex's patch."""
 
     @classmethod
-    def of(cls, body: BodyModel, count: int = PATCH_VERTICES) -> "FootPatches":
-        """Choose `count` evenly spread vertices of each region (all vertices of a smaller region)."""
-        chosen = [_spread(body, body.regions[name], count) for name in FOOT_REGIONS.values()]
+    def of(cls, body: BodyModel) -> "FootPatches":
+        """Choose `PATCH_VERTICES` vertices of each region by farthest-point sampling (all of a smaller region)."""
+        chosen = []
+        for name in FOOT_REGIONS.values():
+            region = body.regions[name]
+            points = body.rest_vertices[region]
+            picked = [int((points - points.mean(0)).norm(dim=1).argmax())]
+            while len(picked) < min(PATCH_VERTICES, len(region)):
+                picked.append(int(torch.cdist(points, points[picked]).min(1).values.argmax()))
+            chosen.append(region[picked])
         patch = torch.cat([torch.full((len(v),), k) for k, v in enumerate(chosen)])
         return cls(body, torch.cat(chosen), patch)
 
@@ -176,15 +183,6 @@ def chain_to(skeleton: Skeleton, joint: int) -> list[int]:
         chain.append(joint)
         joint = skeleton.parents[joint]
     return chain[::-1]
-
-
-def _spread(body: BodyModel, region: Int64[Tensor, "all"], count: int) -> Int64[Tensor, "chosen"]:
-    """Farthest-point sampling of a region's vertices."""
-    points = body.rest_vertices[region]
-    chosen = [int((points - points.mean(0)).norm(dim=1).argmax())]
-    while len(chosen) < min(count, len(region)):
-        chosen.append(int(torch.cdist(points, points[chosen]).min(1).values.argmax()))
-    return region[chosen]
 
 
 @dataclass(frozen=True, eq=False)

@@ -80,8 +80,6 @@ class BentPath:
     path: Float64[Tensor, "time 2"]
     turn: Float64[Tensor, "step"]
     """φ = α̂ − α (rad, unwrapped)."""
-    heading: Float64[Tensor, "step"]
-    """α̂ (rad, within ±π)."""
     history: list[dict[str, float]] = field(default_factory=list)
     """One entry per iteration; the state returned is the best of them."""
     reason: str = ""
@@ -165,12 +163,6 @@ def bending_problem(
     )
 
 
-def headings(path: Float64[Tensor, "time 2"]) -> Float64[Tensor, "step"]:
-    """Heading α of each step (rad, within ±π; atan2 of eq. 5.1); one of zero length takes the last moving step's."""
-    step = path.diff(dim=0)[_leaders(path)]
-    return torch.atan2(step[:, 1], step[:, 0])
-
-
 def wrapped(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """The same angle within ±π (rad); its derivative is one."""
     return angle - (2 * math.pi) * (angle.detach() / (2 * math.pi)).round()
@@ -219,8 +211,7 @@ def bent_path(
     """Build a solver's result from its unknowns."""
     turn = turn[problem.leader]
     turn = torch.cat([wrapped(turn[:1]), wrapped(turn.diff())]).cumsum(0)
-    heading = wrapped(headings(problem.path) + turn)
-    return BentPath(bent(problem, turn, shift), turn, heading, history, reason)
+    return BentPath(bent(problem, turn, shift), turn, history, reason)
 
 
 def bend_adam(problem: BendingProblem, iterations: int = 1000, learning_rate: float = 3e-3) -> BentPath:

@@ -33,7 +33,7 @@ from wearcap.scene.scan import Scan
 from wearcap.sensors.initialization import Initialization, align_suit, estimate_head_camera, initialize, inliers
 from wearcap.sensors.packets import MAX_POSITION_M, MAX_TIME_S, OFF_THE_CLOCK, WRONG_TYPE, rotation_fault, values_fault
 from wearcap.sensors.samples import SuitPiece
-from wearcap.systems.hps.pipeline import HPS
+from wearcap.systems.hps.pipeline import HPS, mount
 
 MAX_UNALIGNED_S = 600.0
 """Length (s) of suit motion that is kept until the first alignment."""
@@ -66,7 +66,7 @@ def _suit_fault(suit: object, like: Motion | None) -> str | None:
     if not isinstance(suit, Motion) or not isinstance(suit.timestamps, Tensor) or suit.timestamps.ndim != 1:
         return WRONG_TYPE
     times, count, joints = suit.timestamps, len(suit.timestamps), len(suit.skeleton)
-    contact, before = suit.contact_prob, None if like is None else like.contact_prob
+    contact = suit.contact_prob
     patches = contact.shape[-1:] if isinstance(contact, Tensor) else ()
     fault = (
         _times_fault(times, MAX_PAUSE_S)
@@ -75,12 +75,9 @@ def _suit_fault(suit: object, like: Motion | None) -> str | None:
         or (None if contact is None else values_fault(contact, (count, *patches), 1.0))
     )
     if fault is None and like is not None:
-        same = like.skeleton.joint_names == suit.skeleton.joint_names and (contact is None) == (before is None)
-        return (
-            None
-            if same and (before is None or contact is None or before.shape[1:] == contact.shape[1:])
-            else WRONG_TYPE
-        )
+        shapes = [None if part is None else part.shape[1:] for part in (contact, like.contact_prob)]
+        if like.skeleton.joint_names != suit.skeleton.joint_names or shapes[0] != shapes[1]:
+            return WRONG_TYPE
     return fault
 
 
@@ -131,7 +128,7 @@ class HpsStream:
         hps.require_scan(scan, about.name)
         self.hps, self.about, self.scan = hps, about, scan
         self.settings = settings or StreamSettings()
-        self.mount = Rigid(about.camera.R_head_cam, about.camera.t_head_cam)
+        self.mount = Rigid(*mount(about))
         self.refused: Counter[str] = Counter()
         """Number of refused pieces, or localisations of pieces, by reason such as "suit: off the clock"."""
         self._alone: tuple[Motion, Localization | None] | None = None

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Float64
@@ -16,19 +15,6 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import Motion
 from wearcap.recording.timing import resampled
-
-
-@runtime_checkable
-class PoseFeatures(Protocol):
-    """Encodes poses of a skeleton as feature vectors, frame by frame."""
-
-    @property
-    def skeleton(self) -> Skeleton: ...
-
-    @property
-    def size(self) -> int: ...
-
-    def encode(self, R_parent_joint: Float[Tensor, "*batch joint 3 3"]) -> Float[Tensor, "*batch feature"]: ...
 
 
 @dataclass(frozen=True)
@@ -121,6 +107,7 @@ class HandViews:
         return torch.cat(sides, -1), torch.cat(middle, -1)
 
 
+PoseFeatures = SmplAngles | HandViews
 FEATURES = {cls.__name__: cls for cls in (SmplAngles, HandViews)}
 
 

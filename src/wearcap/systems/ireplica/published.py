@@ -101,10 +101,6 @@ class BentSuit(PlacedSuit):
     synchronization: Synchronization = field(default_factory=Synchronization)
     localization: Localize = field(default_factory=MapLocalization)
 
-    @property
-    def placing(self) -> Callable[..., BentPath]:
-        return self.bend
-
     def place(self, recording: Recording) -> Motion:
         """Compute F_tr(l, p) of eq. 5.2; p are root positions from the localised camera positions, without outliers."""
         suit, localization, T_head_cam = required(recording)

@@ -92,8 +92,6 @@ class SnapCorrection(Correction):
         return self._targets[frames]
 
     def finish(self, held: list[Held]) -> Float[Tensor, "time 2"]:
-        if not held:
-            return self._targets
         return offset_for(self._targets, self._weights, self._timestamps, self.offset_settings)
 
 
