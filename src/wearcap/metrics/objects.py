@@ -64,22 +64,13 @@ PAUSE_S = 0.5
 """Longest pause (s) between interactions with one object that count as one handling: a change of hands."""
 
 
-@dataclass(frozen=True)
-class _PoseError:
-    """Error of an object's pose at one or several times."""
-
-    distance_cm: Float[Tensor, "*batch"]
-    """Distance between the object's captured and true centre."""
-    angle_deg: Float[Tensor, "*batch"]
-    """Angle between the captured and the true orientation."""
-
-
-def object_error(T_found: Rigid, T_true: Rigid, center: Float[Tensor, "3"]) -> _PoseError:
-    """Error of an object's poses; `center` is its centre in its own axes (m)."""
+def object_error(
+    T_found: Rigid, T_true: Rigid, center: Float[Tensor, "3"]
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """Errors of an object's poses: distance (cm) of its centre, which is given in its own axes (m), and angle (degrees)."""
     found, true = T_found.to(torch.float64), T_true.to(torch.float64)
     middles = [(T.R @ center.double()) + T.t for T in (found, true)]
-    apart = (middles[0] - middles[1]).norm(dim=-1)
-    return _PoseError(100 * apart, geodesic(found.R, true.R).rad2deg())
+    return 100 * (middles[0] - middles[1]).norm(dim=-1), rotation_difference_deg(found, true)
 
 
 @dataclass(frozen=True)

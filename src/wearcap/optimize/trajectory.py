@@ -156,11 +156,11 @@ def bending_problem(
             expected=f"times from {timestamps[0].item():.3f} s to {timestamps[-1].item():.3f} s",
         )
     path = path.double()
+    moves = path.diff(dim=0).norm(dim=1) > STILL_M
+    leader = torch.where(moves, torch.arange(len(moves)), int(moves.long().argmax())).cummax(0).values
     at = (torch.searchsorted(timestamps, control_times.contiguous(), right=True) - 1).clamp(max=len(path) - 2)
     share = (control_times - timestamps[at]) / (timestamps[at + 1] - timestamps[at])
-    return BendingProblem(
-        settings, path, timestamps, _leaders(path), at, share, control_points.double(), weights.double()
-    )
+    return BendingProblem(settings, path, timestamps, leader, at, share, control_points.double(), weights.double())
 
 
 def wrapped(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
@@ -232,10 +232,3 @@ def bend_adam(problem: BendingProblem, iterations: int = 1000, learning_rate: fl
             total.backward()
             adam.step()
     return bent_path(problem, *best, history, f"{iterations} iterations")
-
-
-def _leaders(path: Float64[Tensor, "time 2"]) -> Int64[Tensor, "step"]:
-    moves = path.diff(dim=0).norm(dim=1) > STILL_M
-    number = torch.arange(len(moves))
-    first = int(moves.long().argmax()) if len(moves) else 0
-    return torch.where(moves, number, first).cummax(0).values

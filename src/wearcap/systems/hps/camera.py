@@ -145,14 +145,8 @@ class MapLocalization:
         if file is None or stream is None:
             return [recording.localization]
         features = [self.extractor, self.matcher, self.descriptor, self.settings, self.use_prior]
-        return [
-            *features,
-            self.every or _usual_step(stream),
-            stream.timestamps,
-            stream.camera,
-            file,
-            *_pictures(recording, folder),
-        ]
+        frames = [self.every or _usual_step(stream), stream.timestamps, stream.camera]
+        return [*features, *frames, file, *_pictures(recording, folder)]
 
     def __call__(self, recording: Recording, folder: Path) -> Localization:
         """Localise every `every`-th frame; times are on the camera's clock.

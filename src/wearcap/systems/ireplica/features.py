@@ -69,16 +69,6 @@ class HandViews:
 
     def encode(self, R_parent_joint: Float[Tensor, "*batch joint 3 3"]) -> Float[Tensor, "*batch feature"]:
         """Encode poses of `skeleton`: the left hand's view (its side, other side, middle), then the right hand's."""
-        sides, middle = self._seen(R_parent_joint)
-        mirror = lambda x, signs: x * x.new_tensor(signs)  # noqa: E731
-        own, other = sides.unbind(-2)
-        flipped = mirror(other, _SIDE_SIGNS), mirror(own, _SIDE_SIGNS), mirror(middle, _MIDDLE_SIGNS)
-        return torch.cat([own, other, middle, *flipped], -1)
-
-    def _seen(
-        self, R_parent_joint: Float[Tensor, "*batch joint 3 3"]
-    ) -> tuple[Float[Tensor, "*batch side 19"], Float[Tensor, "*batch 13"]]:
-        """Features of each side (left, right) and of the middle of the body."""
         body, root = self.skeleton, R_parent_joint[..., 0, :, :]
         R_root = rotation.about_axis("z", -rotation.yaw_of(root)) @ root
         R = torch.cat([R_root[..., None, :, :], R_parent_joint[..., 1:, :, :]], -3)
@@ -90,7 +80,7 @@ class HandViews:
             body.indices(f"left_{joint}", f"right_{joint}") for joint in ("elbow", "wrist", "ankle")
         )
         palms, origin = site_positions(body, T, ("left_palm", "right_palm")), T.t[..., [chest], :]
-        sides = [
+        sides = [  # "*batch side 19"
             palms - origin,
             T.t[..., elbows, :] - origin,
             T.t[..., ankles, :],
@@ -98,13 +88,17 @@ class HandViews:
             rotation.rot6d_from_matrix(T.R[..., wrists, :, :]),
             palms[..., 2:] - floor,
         ]
-        middle = [
+        parts = [
             T.R[..., head, :, 0],
             R_root[..., 2],
             rotation.rot6d_from_matrix(T.R[..., chest, :, :]),
             -floor[..., 0],
         ]
-        return torch.cat(sides, -1), torch.cat(middle, -1)
+        own, other = torch.cat(sides, -1).unbind(-2)
+        middle = torch.cat(parts, -1)
+        mirror = lambda x, signs: x * x.new_tensor(signs)  # noqa: E731
+        flipped = mirror(other, _SIDE_SIGNS), mirror(own, _SIDE_SIGNS), mirror(middle, _MIDDLE_SIGNS)
+        return torch.cat([own, other, middle, *flipped], -1)
 
 
 PoseFeatures = SmplAngles | HandViews

@@ -277,7 +277,11 @@ class ObjectTracker:
                 contact = replace(contact, start=max(contact.start, *busy))
             if contact.start >= contact.stop:
                 continue
-            before = self._kept(held, contact, contact_class)
+            before = None  # the object that the hands already hold, if only the set of hands changes
+            for row in reversed(held[-4:]) if self.attachment.keep_object else ():
+                if row.contact_class == contact_class and contact.continues(row.interval):
+                    before = row.scene_object
+                    break
             scene_object, hands = before, torch.tensor(contact.hands)
             if scene_object is None:
                 poses = {name: state.T_world_object for name, state in states.items()}
@@ -298,15 +302,6 @@ class ObjectTracker:
             held.append(Held(contact, scene_object, contact_class, state, T))
             busy_until = [contact.stop if on else until for on, until in zip(contact.hands, busy_until)]
         return sorted(held, key=lambda row: row.interval.start)
-
-    def _kept(self, held: list[Held], contact: ContactInterval, contact_class: str) -> SceneObject | None:
-        """The object that the hands already hold, if only the set of hands changes."""
-        if not self.attachment.keep_object:
-            return None
-        for row in reversed(held[-4:]):
-            if row.contact_class == contact_class and contact.continues(row.interval):
-                return row.scene_object
-        return None
 
 
 def object_trajectories(
@@ -330,13 +325,10 @@ def object_trajectories(
 def interactions_of(held: Sequence[Held], timestamps: Float64[Tensor, "time"]) -> Interactions:
     """Interactions (object, hands, times) as a recording stores them."""
     edges = torch.cat([timestamps, timestamps[-1:] + (timestamps.diff().median() if len(timestamps) > 1 else 0.0)])
-    start = [float(edges[row.interval.start]) for row in held]
-    stop = [float(edges[row.interval.stop]) for row in held]
-    hands = torch.tensor([row.interval.hands for row in held], dtype=torch.bool).reshape(-1, 2)
     return Interactions(
-        torch.tensor(start, dtype=torch.float64),
-        torch.tensor(stop, dtype=torch.float64),
-        hands,
+        edges[[row.interval.start for row in held]],
+        edges[[row.interval.stop for row in held]],
+        torch.tensor([row.interval.hands for row in held], dtype=torch.bool).reshape(-1, 2),
         tuple(row.scene_object.name for row in held),
         tuple(row.contact_class for row in held),
     )

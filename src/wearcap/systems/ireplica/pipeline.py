@@ -24,9 +24,6 @@ from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 from wearcap.systems.ireplica.object_tracker import ObjectTracker
 from wearcap.systems.ireplica.scores import score_interactions
 
-Predictor = Callable[[Motion], dict[str, Float[Tensor, "time hand"]]]
-"""Contact probabilities by class, at a motion's frames, from its pose alone."""
-
 
 @dataclass(eq=False)
 class IReplica(StagedSystem):
@@ -34,7 +31,8 @@ class IReplica(StagedSystem):
 
     registration: StagedSystem
     """HPS, or another pipeline that registers the wearer in the scene."""
-    predictor: Predictor
+    predictor: Callable[[Motion], dict[str, Float[Tensor, "time hand"]]]
+    """Contact probabilities by class, at a motion's frames, from its pose alone."""
     tracker: ObjectTracker
     environment: str | Path | None = None
     """File of the objects; None: the recording's environment."""

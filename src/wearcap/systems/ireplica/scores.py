@@ -75,7 +75,7 @@ def score_interactions(motion: Motion, recording: Recording, environment: Enviro
     body, objects = _chamfer(motion, true, recording, rows, environment, found, real)
     joints = mpjpe_cm(motion.T_world_joint.t, true.T_world_joint.t).item()
     untouched = [scene_object for scene_object in environment.objects if scene_object.name not in held.objects]
-    ends = [object_error(found[t.name][[-1]], found[t.name][[0]], _middle_of(t)).distance_cm[0] for t in untouched]
+    ends = [object_error(found[t.name][[-1]], found[t.name][[0]], _middle_of(t))[0][0] for t in untouched]
     false_moves = float(torch.stack(ends).mean()) if ends else 0.0
     return _InteractionScores(tuple(scored), joints, body, objects, false_moves)
 
@@ -102,7 +102,7 @@ def _handling(row, rows, environment, held, timestamps, palms, found, real) -> H
     end = max(int(torch.searchsorted(timestamps, min(stop + SETTLED_S, again))) - 1, 0)
     begin = int(torch.searchsorted(timestamps, start).clamp(max=len(timestamps) - 1))
     middle = _middle_of(scene_object)
-    left = object_error(found[name][end], real[name][end], middle)
+    left_cm, left_deg = object_error(found[name][end], real[name][end], middle)
     own = [o == name and start <= a < stop for o, a in zip(held.objects, held.start_s.tolist())]
     mine = torch.tensor(own, dtype=torch.bool)
     unnamed = ("",) * int(mine.sum())
@@ -112,20 +112,20 @@ def _handling(row, rows, environment, held, timestamps, palms, found, real) -> H
     apart = torch.stack(
         [environment.distance(name, palms[0][frames, hand], found[name][frames])[0] for hand in range(2)], 1
     )
-    during = object_error(found[name][frames], real[name][frames], middle)
-    moved = object_error(real[name][[end]], real[name][[begin]], middle)
+    during_cm, during_deg = object_error(found[name][frames], real[name][frames], middle)
+    moved_cm, _ = object_error(real[name][[end]], real[name][[begin]], middle)
     return Handling(
         name,
         scene_object.category,
         start,
         stop,
-        float(left.distance_cm),
-        float(left.angle_deg),
-        float(moved.distance_cm[0]),
+        float(left_cm),
+        float(left_deg),
+        float(moved_cm[0]),
         100 * float(contact_mean(apart, contact)),
         100 * float(contact_mean((palms[0] - palms[1])[frames].norm(dim=-1), contact)),
-        float(during.distance_cm.mean()),
-        float(during.angle_deg.mean()),
+        float(during_cm.mean()),
+        float(during_deg.mean()),
     )
 
 

@@ -136,21 +136,15 @@ class IReplicaValidation(Callback):
                     if fit(recording, store.root):
                         source = CaptureInput.in_dataset(recording, store.root)
                         self._registered.append((recording, source, pipeline.registered(source)))
-            rows = [
-                handling
-                for recording, source, motion in self._registered
-                for handling in self._tracked(pipeline, recording, source, motion)
-            ]
+            rows = []
+            for recording, source, motion in self._registered:
+                environment = read_environment(pipeline.environment_file(source))
+                assert recording.suit is not None
+                captured = pipeline.interact(motion, pipeline.contacts(recording.suit), environment)
+                rows += score_interactions(captured, recording, environment).handlings
         pl_module.train(training)
         for name, value in summary(rows).items() if rows else ():
             pl_module.log(f"ireplica/{name}", value, rank_zero_only=True)
-
-    @staticmethod
-    def _tracked(pipeline: IReplica, recording: Recording, source: CaptureInput, motion: Motion):
-        environment = read_environment(pipeline.environment_file(source))
-        assert recording.suit is not None
-        captured = pipeline.interact(motion, pipeline.contacts(recording.suit), environment)
-        return score_interactions(captured, recording, environment).handlings
 
 
 def fit(recording: Recording, folder: Path) -> bool:
