@@ -32,10 +32,8 @@ def score(motion: Motion, recording: Recording, name: str, seed: int) -> Row:
 
 
 def score_in_world(motion: Motion, recording: Recording, name: str, seed: int) -> Row:
-    """All metrics of one capture in the world, without anchoring or alignment (MocapEvery §4.1).
-
-    Adds `r_mpjpe_cm` (root-relative, r.MPJPE) and `right_hand_pe_cm`.
-    """
+    """All metrics of one capture in the world, without anchoring or alignment (MocapEvery §4.1); adds `r_mpjpe_cm`
+    (root-relative, r.MPJPE) and `right_hand_pe_cm`."""
     truth, contact = truth_at(motion, recording, name)
     scores = evaluate_motion(motion, truth, contact)
     joints, joints_true = motion.T_world_joint.t, truth.T_world_joint.t
@@ -48,19 +46,13 @@ def score_in_world(motion: Motion, recording: Recording, name: str, seed: int) -
 def comparable(
     motion: Motion, recording: Recording, name: str
 ) -> tuple[Motion, Motion, Bool[Tensor, "time patch"] | None]:
-    """The capture anchored to the true head, the true motion at its frames, and true foot contact.
-
-    Raises WearcapError when the recording has no true motion.
-    """
+    """The capture anchored to the true head; true motion and foot contact at its frames. Raises as `truth_at`."""
     truth, contact = truth_at(motion, recording, name)
     return anchored_to_head(motion, truth.joint("head")), truth, contact
 
 
 def truth_at(motion: Motion, recording: Recording, name: str) -> tuple[Motion, Bool[Tensor, "time patch"] | None]:
-    """The true motion at the capture's frames, and true foot contact.
-
-    Raises WearcapError when the recording has no true motion.
-    """
+    """The true motion at the capture's frames, and true foot contact. Raises WearcapError without a true motion."""
     truth, contact = recording.motion, _foot_contact(recording)
     if truth is None:
         raise WearcapError("no true motion to compare with", where=name, expected="a recording with `motion`")

@@ -68,10 +68,8 @@ def foot_surface(
 def foot_vertices(
     body: BodyModel, T_world_joint: Rigid, contact: Bool[Tensor, "time patch"]
 ) -> tuple[Float[Tensor, "time vertex 3"], Bool[Tensor, "time vertex"]]:
-    """Vertices of the foot patches (m) and their contacts; patches in the order of `FOOT_PATCHES`.
-
-    Raises WearcapError when contacts and poses differ in length.
-    """
+    """Vertices of the foot patches (m) and their contacts; patches in the order of `FOOT_PATCHES`. Raises WearcapError
+    when contacts and poses differ in length."""
     if len(contact) != len(T_world_joint.t):
         raise WearcapError(
             f"contacts of {len(contact)} frames for poses of {len(T_world_joint.t)}", expected="as many of either"

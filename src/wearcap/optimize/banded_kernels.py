@@ -205,10 +205,8 @@ def _patch_points(R, c, leg_chains, arms, shares, patch, points):
 
 @compiled
 def _vertex_twist(R, chain, arms, shares, A):
-    """Transposed Jacobian (12, 3) of a patch vertex in the twists (v, ω) of its leg's last two joints.
-
-    Returns the number of rows used: six if the second joint has no weight.
-    """
+    """Transposed Jacobian (12, 3) of a patch vertex in the twists (v, ω) of its leg's last two joints; returns the
+    number of rows used: six if the second joint has no weight."""
     for h in range(2):
         share, joint = shares[h], chain[len(chain) - 2 + h]
         if share == 0 and h == 1:

@@ -71,10 +71,8 @@ LEAST_UPRIGHT = 0.7
 
 @dataclass(frozen=True)
 class HpsEnergy:
-    """E = Σ weight · mean of ρ(residual), by term; terms without an entry are left out.
-
-    Raises WearcapError for a term that does not exist or a negative weight.
-    """
+    """E = Σ weight · mean of ρ(residual), by term; terms without an entry are left out. Raises WearcapError for a term
+    that does not exist or a negative weight."""
 
     weights: dict[str, float]
     losses: dict[str, Loss] = field(default_factory=dict)
@@ -292,9 +290,7 @@ def data_values(data: HpsData, ground: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def state_values(data: HpsData, state: HpsState, full_mesh: bool = False) -> dict[str, Tensor]:
     """Values by name that depend on the state: translations t, rotations R (world), axis-angles θ, patch vertices.
-
-    `full_mesh` skins the whole body and takes the patches from it, as the thesis does, with the same result.
-    """
+    `full_mesh` skins the whole body and takes the patches from it, as the thesis does, with the same result."""
     patches = data.patches
     T_world_joint = forward_kinematics(patches.body.skeleton, state.R_parent_joint, state.t_world_root)
     whole = patches.body.vertices(T_world_joint)[:, patches.vertex] if full_mesh else None

@@ -183,10 +183,8 @@ def bent(
 def energy_terms(
     problem: BendingProblem, turn: Float64[Tensor, "step"], shift: Float64[Tensor, "2"]
 ) -> dict[str, Float64[Tensor, ""]]:
-    """Terms of eq. 5.2, differentiable in φ (rad) and the first point's shift (m); the path is linear within steps.
-
-    The change dα̂ − dα from step to step (eq. 5.1) is that of φ; with clamped ends also from and to the fixed steps.
-    """
+    """Terms of eq. 5.2, differentiable in φ (rad) and the first point's shift (m); the path is linear within steps. The
+    change dα̂ − dα from step to step (eq. 5.1) is that of φ, with clamped ends also from and to the fixed steps."""
     settings, path = problem.settings, bent(problem, turn, shift)
     at, share = problem.control_step, problem.control_share[:, None]
     offset = torch.lerp(path[at], path[at + 1], share) - problem.control_points

@@ -145,10 +145,8 @@ def _value_pass(turn, place, link, last_link, first, share, target, weight, kind
 
 @compiled
 def _walk(turn, place, step, gains, share, shift, new_turn, new_place):
-    """Roll out a new path: each turn changes by the gains applied to the offset from the old path so far.
-
-    `share` scales the constant part of the gains (step length); `shift` (2) moves the first point.
-    """
+    """Roll out a new path: each turn changes by the gains applied to the offset from the old path so far. `share`
+    scales the constant part of the gains (step length); `shift` (2) moves the first point."""
     new_place[0] = place[0] + shift
     change = 0.0
     for s in range(len(turn)):
@@ -172,10 +170,8 @@ def bend_banded(
     smooth_end: float = 1e-5,
     tolerance: float = 1e-6,
 ) -> BentPath:
-    """Minimise eq. 5.2 by iteratively reweighted least squares with a decreasing smoothing of norms (m, rad).
-
-    Stops when the relative decrease of the energy is below `tolerance` and the smoothing has reached its end.
-    """
+    """Minimise eq. 5.2 by iteratively reweighted least squares with a decreasing smoothing of norms (m, rad), until the
+    relative decrease of the energy is below `tolerance` and the smoothing has reached its end."""
     path = _Path(problem)
     path.begin()
     smooth = smooth_start

@@ -74,10 +74,8 @@ class HPS(StagedSystem):
     localization: Localize = field(default_factory=MapLocalization)
 
     def stages(self, source: CaptureInput) -> list[Stage]:
-        """The steps from a recording to the solution.
-
-        Raises WearcapError without suit, head camera, localisation or map, or a scan where the energy asks for one.
-        """
+        """The steps from a recording to the solution. Raises WearcapError without suit, head camera, localisation or
+        map, or a scan where the energy asks for one."""
         recording = source.recording
         require(recording, "suit", "camera")
         first = camera_stages(source, self.synchronization, self.localization)
@@ -158,10 +156,8 @@ class HPS(StagedSystem):
         scan: Scan | None,
         R_head_cam: Float[Tensor, "3 3"] | None = None,
     ) -> HpsData:
-        """Data of the energy: initial state, localised cameras, contacts, and the suit's frame-to-frame motion.
-
-        `R_head_cam` is estimated from the localised frames (HPS paper eq. 4) unless it is given.
-        """
+        """Data of the energy: initial state, localised cameras, contacts, the suit's motion from frame to frame, and
+        `R_head_cam`, estimated from the localised frames (HPS paper eq. 4) unless it is given."""
         motion, (_, localization, _) = start.motion, required(recording)
         R_cam, sure = at_frames(localization, motion)
         root, head = motion.R_parent_joint[:, 0].double(), motion.joint("head").R.double()
@@ -252,10 +248,8 @@ def turns(R_world_body: Float[Tensor, "time 3 3"]) -> Float[Tensor, "pair 3 3"]:
 
 
 def _believed_contact(suit: Motion, max_speed: float | None) -> Bool[Tensor, "time patch"]:
-    """The suit's contact flags, without those of patches that move faster than `max_speed` (m/s) in the suit's motion.
-
-    Raises WearcapError when there are no flags, or not one per frame.
-    """
+    """The suit's contact flags, without patches that are faster than `max_speed` (m/s) in the suit's motion. Raises
+    WearcapError when there are no flags, or not one per frame."""
     if suit.contact_prob is None or len(suit.contact_prob) != len(suit):
         count = "no" if suit.contact_prob is None else f"{len(suit.contact_prob)} frames of"
         raise WearcapError(

@@ -59,9 +59,7 @@ class HpsTruth:
         cls, recording: Recording, scan: Scan, visits: Sequence[Sequence[RigCloud]], fps: float = 30.0
     ) -> "HpsTruth":
         """Ground truth of a recording at `fps`; suit and true motion share their timestamps, as simulated ones do.
-
-        Raises WearcapError when the recording lacks a suit with contacts, a true motion or true contacts.
-        """
+        Raises WearcapError when the recording lacks a suit with contacts, a true motion or true contacts."""
         motion, suit, track = recording.motion, recording.suit, recording.contacts
         if motion is None or suit is None or suit.contact_prob is None or track is None:
             raise WearcapError(
@@ -135,10 +133,8 @@ def visit_times(intervals: Intervals, count: int = 10) -> Float64[Tensor, "inter
 
 
 def interval_chamfer(motion: Motion, body: BodyModel, clouds: Sequence[RigCloud]) -> tuple[Chamfer, Chamfer]:
-    """Mean Chamfer distance between clouds and the captured body: (vertices to points, points to surface).
-
-    Raises WearcapError for a cloud more than half a frame away from every frame of the motion.
-    """
+    """Mean Chamfer distance between clouds and the captured body: (vertices to points, points to surface). Raises
+    WearcapError for a cloud more than half a frame away from every frame of the motion."""
     times = torch.tensor([cloud.time_s for cloud in clouds], dtype=torch.float64)
     frames = nearest_frames(motion.timestamps, times)
     vertices = body.vertices(motion.T_world_joint[frames])

@@ -120,9 +120,7 @@ class HpsStream:
 
     def __init__(self, hps: HPS, about: Recording, scan: Scan | None, settings: StreamSettings | None = None):
         """Start a stream. `about` provides the wearer's shape and the camera with its mount; its streams are not read.
-
-        Raises WearcapError without a camera, or without a scan where the energy needs one.
-        """
+        Raises WearcapError without a camera, or without a scan where the energy needs one."""
         if about.camera is None:
             raise WearcapError("no camera in this recording", where=about.name, expected="its mount on the head")
         hps.require_scan(scan, about.name)
@@ -156,10 +154,7 @@ class HpsStream:
             self._finished.append(motion)
 
     def poses(self, ended: bool = False) -> Motion | None:
-        """Frames that became final since the last call, or None; `ended`: no more pieces will come.
-
-        Raises WearcapError as `finish` does.
-        """
+        """Frames that became final since the last call, or None; `ended`: no more pieces come. Raises as `finish`."""
         if ended and not self._finished:
             return self.finish()
         return self._finished.pop(0) if self._finished else None
@@ -178,10 +173,8 @@ class HpsStream:
         self._solved_to = -torch.inf
 
     def push(self, suit: Motion, localization: Localization | None = None) -> Motion | None:
-        """Add new suit motion and localisation; returns the frames that have become final, if any.
-
-        When a new stretch begins, the remaining frames of the previous one are returned.
-        """
+        """Add new suit motion and localisation; returns the frames that have become final, if any. When a new stretch
+        begins, the remaining frames of the previous one are returned."""
         fault = _suit_fault(suit, self._like)
         if fault is not None:
             self.refused[f"suit: {fault}"] += 1
@@ -234,10 +227,8 @@ class HpsStream:
             self.seen = Localization(*(torch.cat([getattr(part, name) for part in both]) for name in _LOCALIZED))
 
     def finish(self) -> Motion | None:
-        """Return the remaining frames at the end of the recording.
-
-        Raises WearcapError when every piece was refused, and when no piece was ever localised.
-        """
+        """Return the remaining frames at the end of the recording. Raises WearcapError when every piece was refused,
+        and when no piece was ever localised."""
         self._refuse_alone()
         if self.suit is None and self.refused:
             raise WearcapError(
@@ -373,11 +364,8 @@ class HpsSession(Session):
     def load(
         cls, path: str | Path, system: HPS, wearers: Sequence[Recording] = (), scan: Scan | None = None
     ) -> "HpsSession":
-        """Restore a saved session with the pipeline, the wearers and the scan that it ran with.
-
-        Raises WearcapError for a file that is no session or is damaged, for a pipeline with other settings, and for
-        another number of wearers.
-        """
+        """Restore a saved session with the pipeline, the wearers and the scan that it ran with. Raises WearcapError as
+        `Session.load`, and for another number of wearers."""
         session = super().load(path, system)
         assert isinstance(session, HpsSession)
         if len(wearers) != len(session.streams):

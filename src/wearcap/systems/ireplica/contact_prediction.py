@@ -101,9 +101,7 @@ class ContactDetector:
 
 class ContactPredictor:
     """Predicts contact probabilities per class of interaction, hand and frame of a motion, by one or more detectors.
-
-    The motion is padded at both ends with its first and last frame.
-    """
+    The motion is padded at both ends with its first and last frame."""
 
     def __init__(self, *detectors: ContactDetector):
         names = [name for detector in detectors for name in detector.classes]
@@ -123,10 +121,8 @@ class ContactPredictor:
 
     @torch.inference_mode()
     def __call__(self, motion: Motion) -> dict[str, Float[Tensor, "time hand"]]:
-        """Contact probabilities by class at the frames of `motion`, for any frame rate and skeleton.
-
-        Raises WearcapError for poses that are not numbers.
-        """
+        """Contact probabilities by class at the frames of `motion`, for any frame rate and skeleton. Raises
+        WearcapError for poses that are not numbers."""
         if not len(motion):
             return {name: torch.zeros(0, 2) for name in self.classes}
         result: dict[str, Tensor] = {}
@@ -156,10 +152,8 @@ class ContactStream:
 
     @torch.inference_mode()
     def push(self, R_parent_joint: Float[Tensor, "joint 3 3"]) -> dict[str, Float[Tensor, "hand"]] | None:
-        """Add a pose; returns the prediction for the frame `REACH` before it, None while there is no such frame.
-
-        Raises WearcapError for a pose that is not a number; the state is then unchanged.
-        """
+        """Add a pose; returns the prediction for the frame `REACH` before it, None while there is no such frame. Raises
+        WearcapError for a pose that is not a number; the state is then unchanged."""
         if not R_parent_joint.isfinite().all():
             raise WearcapError(f"the pose of frame {self._frames} is not a number", expected="a pose in every frame")
         features = [

@@ -97,13 +97,25 @@ def sinusoids(length: int) -> Float[Tensor, "place width"]:
 
 
 def load_released(path: str | Path, batch_axis: bool = True) -> ContactTransformer:
-    """Load the published network from a checkpoint of the released code, in evaluation mode.
-
-    Raises WearcapError that names missing or unexpected tensors and those of another size.
-    """
+    """Load the published network of a checkpoint of the released code, in evaluation mode. Raises WearcapError that
+    names missing or unexpected tensors and those of another size."""
+    released = read_weights(path)
+    # Encoder layers are recognised by `layers.0…` after any prefix, the linear layers around them by their shapes.
+    by_shape = {(_HANDS, _WIDTH): "decoder", (_HANDS, FRAMES * _HANDS): "aggregator"}
+    module = {}
+    for name, value in released.items():
+        if name.endswith(".weight") and value.ndim == 2 and "layers." not in name:
+            found = "encoder" if value.shape[0] == _WIDTH else by_shape.get(tuple(value.shape))
+            if found is not None:
+                module[name.removesuffix(".weight")] = found
     tensors = {}
-    for name, value in _renamed(read_weights(path)).items():
-        if name.rpartition(".")[2] != "pe":
+    for name, value in released.items():
+        owner, _, kind = name.rpartition(".")
+        if "layers." in name:
+            name = name[name.index("layers.") :]
+        elif owner in module:
+            name = f"{module[owner]}.{kind}"
+        if kind != "pe":
             tensors[name] = value
         elif not torch.allclose(value.flatten(0, -2), sinusoids(value.numel() // _WIDTH), atol=1e-5):
             raise WearcapError(f"the positions {name!r} are not the sinusoids of this network", where=path)
@@ -112,25 +124,3 @@ def load_released(path: str | Path, batch_axis: bool = True) -> ContactTransform
     tensors["temperature"] = network.temperature
     load_weights(network, tensors, name="iReplica's contact network", where=path)
     return network.eval()
-
-
-def _renamed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Released tensors under this module's names; tensors that do not belong to the network keep their names.
-
-    Encoder layers are recognised by `layers.0…` after any prefix, the linear layers around them by their shapes.
-    """
-    by_shape = {(_HANDS, _WIDTH): "decoder", (_HANDS, FRAMES * _HANDS): "aggregator"}
-    module = {}
-    for name, value in tensors.items():
-        if name.endswith(".weight") and value.ndim == 2 and "layers." not in name:
-            found = "encoder" if value.shape[0] == _WIDTH else by_shape.get(tuple(value.shape))
-            if found is not None:
-                module[name.removesuffix(".weight")] = found
-    result = {}
-    for name, value in tensors.items():
-        owner, _, kind = name.rpartition(".")
-        if "layers." in name:
-            result[name[name.index("layers.") :]] = value
-        else:
-            result[f"{module[owner]}.{kind}" if owner in module else name] = value
-    return result

@@ -124,9 +124,7 @@ def pose_frames(
     motion: Motion, skeleton: Skeleton, fps: float
 ) -> tuple[Float64[Tensor, "time_f"], Float[Tensor, "time_f joint 3 3"]]:
     """Timestamps and joint rotations of a motion, resampled to `fps` and retargeted to `skeleton` where necessary.
-
-    Raises WearcapError for frames that are not finite.
-    """
+    Raises WearcapError for frames that are not finite."""
     bad = ~motion.R_parent_joint.isfinite().flatten(1).all(1) | ~motion.timestamps.isfinite()
     if bad.any():
         raise WearcapError(

@@ -47,10 +47,8 @@ class _InteractionScores:
 
 
 def score_interactions(motion: Motion, recording: Recording, environment: Environment) -> _InteractionScores:
-    """Score one capture; its object motion may lack objects that never moved.
-
-    Raises WearcapError when the recording lacks a true motion, interactions or object motion, or the capture objects.
-    """
+    """Score one capture; its object motion may lack objects that never moved. Raises WearcapError when the recording
+    lacks a true motion, interactions or object motion, or the capture objects."""
     truth, held = recording.motion, recording.interactions
     if truth is None or held is None or not recording.object_motion:
         raise WearcapError(

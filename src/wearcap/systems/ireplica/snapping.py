@@ -132,10 +132,8 @@ class HandSnapping:
     """Largest displacement (m) of a hand."""
 
     def __call__(self, motion: Motion, held: Sequence[Held], environment: Environment) -> Motion:
-        """Bend the arms so that each holding palm stays at its point of the object.
-
-        That point is the object's point nearest to the palm when its hold begins. Hands keep their world orientation.
-        """
+        """Bend the arms so that each holding palm stays at its point of the object: the one nearest to it when its hold
+        begins. Hands keep their world orientation."""
         palms = site_positions(motion.skeleton, motion.T_world_joint, PALMS)
         for hand, side in enumerate(HANDS):
             targets, weights = self._targets(palms[:, hand].double(), hand, held, environment)
