@@ -421,8 +421,20 @@ def fill_system(theta, theta_imu, body, kin, forms, diagonal, below, gradient):
         _fill_trunk(j, theta, theta_imu, body, kin, forms, diagonal, gradient)
         for f in range(2):
             _fill_foot(j, f, theta, theta_imu, body, kin, forms, diagonal, below, gradient)
-        if j + 1 < len(diagonal):
-            _fill_trunk_step(j, kin, forms, below)
+        if j + 1 == len(diagonal):
+            continue
+        # Couplings of translation, root and head with the next frame's.
+        B, here, after, head = below[j], kin.R[j, 0], kin.R[j + 1, 0], forms.small_step[j, 2]
+        for i in range(3):
+            for k in range(3):
+                B[i, k] += forms.small_step[j, 0, i, k]
+                B[HEAD + i, HEAD + k] += head[i, k]
+                for m in range(3):
+                    B[HEAD + i, 3 + k] += head[i, m] * here[m, k]
+                    B[3 + i, HEAD + k] += after[m, i] * head[m, k]
+                    for l in range(3):
+                        both = forms.small_step[j, 1, m, l] + head[m, l]
+                        B[3 + i, 3 + k] += after[m, i] * both * here[l, k]
 
 
 @compiled
@@ -458,22 +470,6 @@ def _spine_form(theta, theta_imu, body, kin, j):
                 for m in range(3):
                     gram[i, k] += J[i, m] * J[k, m]
     return np.linalg.inv(gram), turn
-
-
-@compiled
-def _fill_trunk_step(j, kin, forms, below):
-    """Add the couplings of translation, root and head with the next frame's."""
-    B, here, after, head = below[j], kin.R[j, 0], kin.R[j + 1, 0], forms.small_step[j, 2]
-    for i in range(3):
-        for k in range(3):
-            B[i, k] += forms.small_step[j, 0, i, k]
-            B[HEAD + i, HEAD + k] += head[i, k]
-            for m in range(3):
-                B[HEAD + i, 3 + k] += head[i, m] * here[m, k]
-                B[3 + i, HEAD + k] += after[m, i] * head[m, k]
-                for l in range(3):
-                    both = forms.small_step[j, 1, m, l] + head[m, l]
-                    B[3 + i, 3 + k] += after[m, i] * both * here[l, k]
 
 
 @compiled

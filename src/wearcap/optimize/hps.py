@@ -13,7 +13,6 @@ from wearcap.body.model import FOOT_REGIONS, BodyModel
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.surface import SurfaceIndex
 from wearcap.optimize import costs
 from wearcap.optimize.costs import Loss
@@ -145,10 +144,6 @@ class FootPatches:
         skeleton = self.body.skeleton
         return [chain_to(skeleton, skeleton.index(f"{side}_toe")) for side in ("left", "right")]
 
-    def points(self, T_world_joint: Rigid) -> Float[Tensor, "time vertex 3"]:
-        """World positions (m) of the vertices, given the poses of all joints."""
-        return self._only.vertices(T_world_joint)
-
     def share(self, contact: Float[Tensor, "*batch patch"]) -> Float[Tensor, "*batch vertex"]:
         """Contact of each vertex's patch over its number of vertices, so that sums over vertices are patch means."""
         size = torch.bincount(self.patch, minlength=len(FOOT_REGIONS)).to(contact)
@@ -160,7 +155,7 @@ class FootPatches:
         return torch.einsum("tvi,vp->tpi", points, one / one.sum(0))
 
     @cached_property
-    def _only(self) -> BodyModel:
+    def soles(self) -> BodyModel:
         """Body model that consists of the patches only."""
         whole = self.body
         blend = None if whole.pose_blend is None else whole.pose_blend[:, self.vertex]
@@ -300,7 +295,7 @@ def state_values(data: HpsData, state: HpsState, full_mesh: bool = False) -> dic
         "R_head": T_world_joint.R[:, patches.body.skeleton.index("head")],
         "theta": state.theta,
         "theta_legs": state.theta[:, _leg_columns(patches)],
-        "soles": patches.points(T_world_joint) if whole is None else whole,
+        "soles": patches.soles.vertices(T_world_joint) if whole is None else whole,
     }
 
 
