@@ -137,23 +137,20 @@ def _chamfer(
     for name, start, stop in rows:
         times = torch.arange(start, stop, CHAMFER_EVERY_S, dtype=torch.float64)
         frames = torch.searchsorted(motion.timestamps, times).clamp(max=len(motion) - 1).tolist()
-        surface = _surface_points(environment.by_name(name))
+        # Points uniform by area on the object's surface (without faces: its vertices), always the same.
+        vertices, faces = environment.by_name(name).mesh.vertices, environment.by_name(name).mesh.faces
+        rng = np.random.default_rng(0)
+        if len(faces):
+            a, b, c = (vertices[faces[:, k]] for k in range(3))
+            area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+            chosen = rng.choice(len(faces), CHAMFER_POINTS, p=area / area.sum())
+            u, v = rng.uniform(size=(2, CHAMFER_POINTS, 1)).astype(np.float32)
+            u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+            surface = torch.from_numpy(a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen])
+        else:
+            surface = torch.from_numpy(vertices[rng.permutation(len(vertices))[:CHAMFER_POINTS]])
         for frame in frames:
             bodies = [body.vertices(m.T_world_joint[frame])[thinned] for m in (motion, true)]
             errors[0].append(chamfer(*bodies).mean_cm)
             errors[1].append(chamfer(*(T[name][frame].to(torch.float32) @ surface for T in (found, real))).mean_cm)
     return tuple(float(np.mean(part)) if part else float("nan") for part in errors)  # pyright: ignore[reportReturnType]
-
-
-def _surface_points(scene_object: SceneObject) -> Float[Tensor, "point 3"]:
-    """`CHAMFER_POINTS` points, uniform by area on an object's surface (without faces: its vertices); a fixed seed."""
-    vertices, faces = scene_object.mesh.vertices, scene_object.mesh.faces
-    rng = np.random.default_rng(0)
-    if not len(faces):
-        return torch.from_numpy(vertices[rng.permutation(len(vertices))[:CHAMFER_POINTS]])
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    chosen = rng.choice(len(faces), CHAMFER_POINTS, p=area / area.sum())
-    u, v = rng.uniform(size=(2, CHAMFER_POINTS, 1)).astype(np.float32)
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    return torch.from_numpy(a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen])
