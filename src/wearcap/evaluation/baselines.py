@@ -125,10 +125,7 @@ class NearestWindow(Baseline):
         count = len(path.timestamps)
         end = max(count - self.window, 0)
         starts = torch.unique(torch.cat([torch.arange(0, end, max(1, self.window // 2)), torch.tensor([end])]))
-        query = ((_describe(path, starts, self.window, self.sample) - self.mean) / self.scale).flatten(1)
-        half_squares = 0.5 * self.descriptor.square().sum(-1)
-        parts = query.split(QUERY_BATCH)
-        found = torch.cat([(part @ self.descriptor.T - half_squares).argmax(-1) for part in parts])
+        found = self.nearest(_describe(path, starts, self.window, self.sample))
         # Poses are cross-faded, each weighted by a triangle over its window.
         offset = torch.arange(self.window)
         source = torch.minimum(self.first_frame[found, None] + offset, self.last_frame[found, None])
@@ -141,6 +138,12 @@ class NearestWindow(Baseline):
         )
         pose = blended / total[:, None]
         return _anchored(path, rotation.matrix_from_rot6d(pose.unflatten(-1, (-1, 6))), "nearest_window")
+
+    def nearest(self, raw: Float[Tensor, "query sample channel"]) -> Int64[Tensor, "query"]:
+        """Index of the training window nearest to each described window."""
+        query = ((raw - self.mean) / self.scale).flatten(1)
+        half_squares = 0.5 * self.descriptor.square().sum(-1)
+        return torch.cat([(part @ self.descriptor.T - half_squares).argmax(-1) for part in query.split(QUERY_BATCH)])
 
 
 def _training_motions(stores: Sequence[RecordingStore]) -> Iterator[tuple[HeadPath, Tensor]]:
