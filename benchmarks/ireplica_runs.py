@@ -21,9 +21,8 @@ from wearcap.runtime.system import CaptureInput
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import CONTACT_CLASSES
 from wearcap.sensors.simulated import smooth_noise
-from wearcap.systems.ireplica.contact_intervals import ContactSettings
 from wearcap.systems.ireplica.contact_prediction import ContactPredictor
-from wearcap.systems.ireplica.object_tracker import ObjectTracker
+from wearcap.systems.ireplica.object_tracker import ContactSettings, ObjectTracker
 from wearcap.systems.ireplica.pipeline import IReplica
 from wearcap.systems.ireplica.published import held_when_near, interpolated_objects, nearness, static_objects
 from wearcap.systems.ireplica.scores import score_interactions

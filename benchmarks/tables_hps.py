@@ -6,6 +6,7 @@ Sessions, scans and the rig's clouds are kept in OUTPUT/hps/cache, pictures go t
 import argparse
 import json
 import math
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ from tabling import cell, finite, new_table, summarize
 
 from wearcap.files import write_text
 from wearcap.simulation.recordings.hps import HpsConfig, Protocol
-from wearcap.systems.hps.scores import in_order
 
 PAPER = {
     "stand": {
@@ -151,7 +151,8 @@ def _standing_slope(run: dict[str, Any], row: str) -> float:
 def _ordered(run: dict[str, Any], name: str, best: str) -> bool:
     """Whether IMU > filtered > w/o scene > `best`, by the mean over the visits after the start."""
     later = [_of_visits(run, row, name, "literal", "mean_cm")[1:] for row in (*ORDERED, best)]
-    return in_order([sum(values) / len(values) for values in later])
+    means = [sum(values) / len(values) for values in later]
+    return all(before > after for before, after in pairwise(means))
 
 
 def _over_seeds(runs: list[dict[str, Any]], rows: tuple[str, ...], part: str) -> dict[str, Any]:

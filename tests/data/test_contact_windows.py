@@ -15,7 +15,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import RecordingStore
 from wearcap.systems.ireplica.features import HandViews, SmplAngles, in_skeleton, pose_frames, worn
-from wearcap.systems.ireplica.training_windows import ContactContent, PoseNoise, pose_errors
+from wearcap.systems.ireplica.training_windows import ContactContent, PoseNoise
 
 SHIFTED = {"shift": Shift(), "stretch": TimeStretch(1.0), "drop": DropFrames(0.0)}
 ALL = {"shift": Shift(), "stretch": TimeStretch(), "drop": DropFrames(), "noise": PoseNoise(), "mirror": Mirror()}
@@ -91,7 +91,7 @@ def test_lost_frames_are_bridged():
 
 def test_errors_have_the_size_that_was_asked_for():
     random = torch.Generator().manual_seed(0)
-    sizes = [pose_errors(300, 23, 5.0, random).square().sum(-1).mean().sqrt() for _ in range(200)]
+    sizes = [PoseNoise(5.0).errors(300, 23, random).square().sum(-1).mean().sqrt() for _ in range(200)]
     assert max(sizes) < math.radians(5.6)
     assert sum(sizes) / len(sizes) == pytest.approx(math.radians(2.5), rel=0.15)
 

@@ -1,14 +1,10 @@
 """Chamfer distance: on figures where it is known, and what it refuses."""
 
-import numpy as np
 import pytest
 import torch
 
 from wearcap.errors import WearcapError
-from wearcap.geometry.camera import Camera
-from wearcap.geometry.mesh import capsules
-from wearcap.geometry.rigid import Rigid
-from wearcap.metrics.surface import Chamfer, chamfer, mean_chamfer, seen_vertices
+from wearcap.metrics.surface import Chamfer, chamfer, mean_chamfer
 
 
 def square(side: float, cells: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -34,26 +30,6 @@ def test_a_cloud_held_above_a_square_has_its_height_as_distance():
     assert result.mean_cm == pytest.approx((3.0 + result.body_to_cloud_cm) / 2, abs=1e-4)
 
 
-def test_unseen_vertices_are_left_out():
-    vertices, faces = square(1.0, 10)
-    half = vertices[vertices[:, 0] > 0.01]
-    all_of_them = chamfer(vertices, half, faces=faces)
-    seen = chamfer(vertices, half, faces=faces, seen=vertices[:, 0] > 0.01)
-    assert seen.mean_cm == pytest.approx(0.0, abs=1e-6)
-    assert all_of_them.cloud_to_body_cm == pytest.approx(0.0, abs=1e-6)
-    assert all_of_them.body_to_cloud_cm > 10
-
-
-def test_a_camera_sees_the_near_half_of_a_ball():
-    center, radius = np.array([[0.0, 0.0, 3.0]]), np.array([0.3])
-    ball = capsules(center, center, radius, radius, np.ones((1, 3)), 32)
-    vertices, faces = torch.from_numpy(ball.vertices), torch.from_numpy(ball.faces).long()
-    camera = Camera.pinhole(200, 200, 20)
-    seen = seen_vertices(vertices, faces, [camera], Rigid.identity(1))
-    assert seen[vertices[:, 2] < 2.9].all()
-    assert not seen[vertices[:, 2] > 3.05].any()
-
-
 def test_frames_are_averaged_direction_by_direction():
     mean = mean_chamfer([Chamfer(1.0, 2.0), Chamfer(3.0, 6.0)])
     assert (mean.cloud_to_body_cm, mean.body_to_cloud_cm, mean.mean_cm) == (2.0, 4.0, 3.0)
@@ -64,10 +40,10 @@ def test_frames_are_averaged_direction_by_direction():
     [
         lambda body: chamfer(body, torch.zeros(0, 3)),
         lambda body: chamfer(body, torch.full((5, 3), torch.nan)),
-        lambda body: chamfer(body, body, seen=torch.zeros(len(body), dtype=torch.bool)),
+        lambda body: chamfer(body[:0], body),
         lambda body: mean_chamfer([]),
     ],
-    ids=["empty cloud", "NaN", "none seen", "no frames"],
+    ids=["empty cloud", "NaN", "no vertex", "no frames"],
 )
 def test_what_cannot_be_measured_is_refused(call):
     vertices, _ = square(1.0, 2)

@@ -5,16 +5,10 @@ import torch
 from torch import nn
 
 from wearcap.errors import WearcapError
+from wearcap.systems.ireplica.contact_prediction import FRAMES, REACH
 from wearcap.systems.ireplica.contact_sequence import ContactSequence
-from wearcap.systems.ireplica.contact_transformer import (
-    FRAMES,
-    REACH,
-    ContactTransformer,
-    EncoderLayer,
-    fit_temperature,
-    load_released,
-    sinusoids,
-)
+from wearcap.systems.ireplica.contact_transformer import ContactTransformer, EncoderLayer, load_released, sinusoids
+from wearcap.systems.ireplica.training import fit_temperature
 
 
 def parameters(net: nn.Module) -> int:

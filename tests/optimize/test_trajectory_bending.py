@@ -12,17 +12,7 @@ from hypothesis import strategies as st
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
 from wearcap.optimize.costs import Loss
-from wearcap.optimize.trajectory import (
-    Bending,
-    bend,
-    bend_adam,
-    bending_problem,
-    bent,
-    energy_terms,
-    heading_change,
-    headings,
-    wrapped,
-)
+from wearcap.optimize.trajectory import Bending, bend, bend_adam, bending_problem, bent, energy_terms, wrapped
 from wearcap.optimize.trajectory_banded import bend_banded
 
 NOWHERE = torch.zeros(2, dtype=torch.float64)
@@ -102,19 +92,17 @@ def test_derivative_of_the_energy(settings):
     torch.testing.assert_close(slope, (total(step) - total(-step)) / (2 * step), rtol=1e-5, atol=1e-4)
 
 
-def test_headings_keep_the_last_where_nothing_moves():
+def test_steps_take_the_turn_of_the_last_one_that_moves():
     path = torch.tensor([[0.0, 0], [0, 0], [0, 1], [0, 1], [0, 1], [-1, 1]]).double()
-    torch.testing.assert_close(headings(path), torch.tensor([0.5, 0.5, 0.5, 0.5, 1.0]).double() * math.pi)
+    problem = bending_problem(path, torch.arange(6).double(), torch.zeros(0).double(), path[:0], None, Bending())
+    assert problem.leader.tolist() == [1, 1, 1, 1, 4]
 
 
 @given(st.floats(-9, 9), st.floats(-9, 9), st.integers(-2, 2))
 def test_whole_turns_do_not_count(before, after, whole):
-    heading, original = torch.tensor([before, after]).double(), torch.tensor([0.1, -0.2]).double()
-    plain = heading_change(heading, original)
-    torch.testing.assert_close(
-        heading_change(heading + 2 * math.pi * torch.tensor([0.0, whole]).double(), original).cos(), plain.cos()
-    )
-    assert plain.abs() <= math.pi + 1e-12
+    change = torch.tensor([after - before]).double()
+    torch.testing.assert_close(wrapped(change + 2 * math.pi * whole).cos(), change.cos())
+    assert wrapped(change).abs() <= math.pi + 1e-12
     assert wrapped(torch.tensor(3 * math.pi / 2)).item() == pytest.approx(-math.pi / 2, abs=1e-6)
 
 
@@ -122,7 +110,8 @@ def test_a_path_through_half_turns_is_no_bend():
     """Headings run through ±π four times; the path itself costs nothing, and turning all of it neither."""
     angle = torch.linspace(0, 8 * math.pi, 400).double()
     path, timestamps = torch.stack([angle.cos(), angle.sin()], -1), torch.arange(400).double() / 30
-    assert headings(path).diff().abs().amax() > 6
+    step = path.diff(dim=0)
+    assert torch.atan2(step[:, 1], step[:, 0]).diff().abs().amax() > 6
     problem = bending_problem(path, timestamps, timestamps[:0], path[:0], None, Bending(1000.0))
     for turn in (0.0, 3.0):
         terms = energy_terms(problem, torch.full((399,), turn).double(), NOWHERE)

@@ -93,7 +93,7 @@ def test_nearest_window_tells_fast_from_slow(store):
         query = recorded("query", speed, yaw=1.0)
         path = baselines._query_path(query, fitted.joint_names, FPS)
         raw = baselines._describe(path, torch.arange(0, 100, 10), fitted.window, fitted.sample)
-        first_frame = fitted.first_frame[fitted._nearest(raw)]
+        first_frame = fitted.first_frame[fitted.nearest(raw)]
         is_slow = first_frame >= 20 + 150  # laid down by name: brief, fast, slow
         assert is_slow.tolist() == [speed < 1] * 10
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from wearcap.errors import WearcapError
-from wearcap.systems.ireplica.contact_intervals import ContactInterval, ContactSettings, active, contact_intervals
+from wearcap.systems.ireplica.object_tracker import ContactInterval, ContactSettings, active, contact_intervals
 
 
 def times(count: int, fps: float = 60.0) -> torch.Tensor:

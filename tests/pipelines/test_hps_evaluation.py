@@ -10,25 +10,24 @@ from wearcap.body.anny_body import anny_body
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis
+from wearcap.metrics.position import joint_error_cm
 from wearcap.recording import Motion, Recording
 from wearcap.recording.recording import ContactTrack, Intervals
 from wearcap.scene.scan import Scan
 from wearcap.systems.hps.scores import (
     HpsTruth,
     RigCloud,
-    _joint_errors_cm,
-    disturbance,
     drift,
-    in_order,
     interval_chamfer,
     nearest_frames,
-    planted_outages,
     score_hps,
     travelled_m,
     visit_times,
 )
+from wearcap_testing import benchmark
 
 SECONDS, FPS, SPEED = 2.0, 60.0, 0.5
+outages = benchmark("hps_outages")
 
 
 def gliding(speed: float = SPEED) -> Motion:
@@ -116,7 +115,8 @@ def test_clouds_are_met_at_their_own_time(truth: HpsTruth):
 def test_a_captured_turn_leaves_the_root_where_it_is_and_moves_the_joints(truth: HpsTruth):
     R = truth.motion.R_parent_joint.clone()
     R[:, 0] = about_axis("z", torch.tensor(np.pi))
-    error = _joint_errors_cm(replace(truth.motion, R_parent_joint=R), truth.motion)
+    turned = replace(truth.motion, R_parent_joint=R)
+    error = joint_error_cm(turned.T_world_joint.t, truth.motion.T_world_joint.t)
     wrist = truth.motion.skeleton.index("left_wrist")
     reach = truth.motion.skeleton.rest_joints[wrist] - truth.motion.skeleton.rest_joints[0]
     assert error[:, 0].abs().max() < 1e-4
@@ -156,16 +156,16 @@ def test_instants_lie_evenly_within_their_interval():
 
 def test_outages_are_planted_in_the_middle_of_the_longest_walks():
     stops = intervals((0.0, 10.0), (10.5, 20.0), (100.0, 110.0), (310.0, 320.0))
-    short, long = planted_outages(stops, 330.0, (30.0, 60.0))
+    short, long = outages.planted_outages(stops, 330.0, (30.0, 60.0))
     assert (short.start_s, short.length_s) == (45.0, 30.0)
     assert (long.start_s, long.length_s) == (180.0, 60.0)
-    assert planted_outages(stops, 330.0, (900.0,))[0].length_s == 190.0
+    assert outages.planted_outages(stops, 330.0, (900.0,))[0].length_s == 190.0
     times = torch.arange(330, dtype=torch.float64)
     assert int(short.frames(times).sum()) == 30
     with pytest.raises(WearcapError, match="6 outages"):
-        planted_outages(stops, 330.0, (1.0,) * 6)
+        outages.planted_outages(stops, 330.0, (1.0,) * 6)
     with pytest.raises(WearcapError, match="no room"):
-        planted_outages(intervals((0.0, 10.0), (11.0, 20.0)), 21.0, (1.0,))
+        outages.planted_outages(intervals((0.0, 10.0), (11.0, 20.0)), 21.0, (1.0,))
 
 
 def test_a_disturbance_is_measured_in_its_own_frames():
@@ -175,17 +175,11 @@ def test_a_disturbance_is_measured_in_its_own_frames():
     shift = torch.zeros(len(motion), 3)
     shift[frames, 1] = 0.08
     disturbed = replace(motion, t_world_root=motion.t_world_root + shift + torch.tensor([0.0, 0.02, 0.0]))
-    within = disturbance(disturbed, moved(motion, 0.0, 0.02, 0.0), motion, frames)
+    within = outages.disturbance(disturbed, moved(motion, 0.0, 0.02, 0.0), motion, frames)
     assert within.root_cm == pytest.approx(10.0, abs=1e-3)
     assert within.root_ratio == pytest.approx(5.0, rel=1e-3)
     assert within.joint_ratio == pytest.approx(5.0, rel=1e-3)
-    assert disturbance(disturbed, motion, motion, ~frames).root_cm == pytest.approx(2.0, abs=1e-3)
-
-
-def test_an_order_has_no_ties():
-    assert in_order([60.0, 7.0, 6.5, 4.3])
-    assert not in_order([60.0, 7.0, 7.0])
-    assert not in_order([6.0, 7.0])
+    assert outages.disturbance(disturbed, motion, motion, ~frames).root_cm == pytest.approx(2.0, abs=1e-3)
 
 
 def test_captures_of_another_length_and_recordings_without_truth_are_refused(truth: HpsTruth, recording: Recording):

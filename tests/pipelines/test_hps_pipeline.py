@@ -86,7 +86,7 @@ def test_planted_errors_of_suit_and_clock_go():
     motion = pipeline(CaptureInput(recording, scan=Scan(floor_points())))
     assert motion.timestamps.diff().median().item() == pytest.approx(1 / 30)
     assert root_error_m(motion, recording).mean() < 0.05
-    clock = pipeline.synchronize(recording, Path())
+    clock = pipeline.synchronization(recording, Path())
     assert clock is not None
     assert clock.offset_s == pytest.approx(1.7, abs=0.002)
     wrong_clock = replace(PIPELINE, synchronization=Synchronization("shared"))(

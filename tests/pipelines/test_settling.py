@@ -1,6 +1,6 @@
 import torch
 
-from wearcap.systems.ireplica.contact_intervals import ContactInterval, chains, settled
+from wearcap.systems.ireplica.object_tracker import ContactInterval, chains, settled
 
 FPS = 60.0
 LEFT, RIGHT, BOTH = (True, False), (False, True), (True, True)

@@ -125,7 +125,7 @@ class NearestWindow(Baseline):
         count = len(path.timestamps)
         end = max(count - self.window, 0)
         starts = torch.unique(torch.cat([torch.arange(0, end, max(1, self.window // 2)), torch.tensor([end])]))
-        found = self._nearest(_describe(path, starts, self.window, self.sample))
+        found = self.nearest(_describe(path, starts, self.window, self.sample))
         # Poses are cross-faded, each weighted by a triangle over its window.
         offset = torch.arange(self.window)
         source = torch.minimum(self.first_frame[found, None] + offset, self.last_frame[found, None])
@@ -139,7 +139,8 @@ class NearestWindow(Baseline):
         pose = blended / total[:, None]
         return _anchored(path, rotation.matrix_from_rot6d(pose.unflatten(-1, (-1, 6))), "nearest_window")
 
-    def _nearest(self, raw: Float[Tensor, "query sample channel"]) -> Int64[Tensor, "query"]:
+    def nearest(self, raw: Float[Tensor, "query sample channel"]) -> Int64[Tensor, "query"]:
+        """Index of the training window nearest to each described window."""
         query = ((raw - self.mean) / self.scale).flatten(1)
         half_squares = 0.5 * self.descriptor.square().sum(-1)
         return torch.cat([(part @ self.descriptor.T - half_squares).argmax(-1) for part in query.split(QUERY_BATCH)])
@@ -150,7 +151,11 @@ def _training_motions(stores: Sequence[RecordingStore]) -> Iterator[tuple[HeadPa
     first: tuple[tuple[str, ...], float] | None = None
     for store in stores:
         for name in store.names("train"):
-            recording, fps = _read(store, name), store.entries[name].fps
+            # Images, and clouds beside a known floor, are not read.
+            file, fps = store.open_file(name), store.entries[name].fps
+            floor = file.part("floor")
+            points = file.part("points") if floor is None else None
+            recording = Recording(name, head=file.part("head"), motion=file.part("motion"), floor=floor, points=points)
             if recording.head is None or recording.motion is None or len(recording.motion) < 2:
                 continue
             path = head_path(recording, recording.motion.skeleton, fps)
@@ -170,14 +175,6 @@ def _training_motions(stores: Sequence[RecordingStore]) -> Iterator[tuple[HeadPa
             where=", ".join(str(store.root) for store in stores),
             expected="a training split of recordings with both",
         )
-
-
-def _read(store: RecordingStore, name: str) -> Recording:
-    """The parts that baselines are fitted to; images, and clouds beside a known floor, are not read."""
-    file = store.open_file(name)
-    floor = file.part("floor")
-    points = file.part("points") if floor is None else None
-    return Recording(name, head=file.part("head"), motion=file.part("motion"), floor=floor, points=points)
 
 
 def _fps_of(path: HeadPath) -> float:

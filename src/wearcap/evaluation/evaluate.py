@@ -75,10 +75,8 @@ class Realism:
 
     @classmethod
     def load(cls, checkpoint: str | Path, stride_s: float = 1.0) -> "Realism":
-        """The collector in the latent space of a checkpoint of experiment=motion_autoencoder.
-
-        Raises WearcapError for another checkpoint.
-        """
+        """The collector in the latent space of a checkpoint of experiment=motion_autoencoder. Raises
+        WearcapError for others."""
         module: Any = load_trained(checkpoint)[0]
         if not isinstance(module.net, MotionAutoencoder):
             raise WearcapError(

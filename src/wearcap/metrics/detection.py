@@ -91,10 +91,8 @@ def occupied_distance_mae_cm(
 def occupancy_iou(
     grids: Float[Tensor, "*batch"], grids_true: Float[Tensor, "*batch"], clip_m: float, border_m: float | None = None
 ) -> Float[Tensor, ""]:
-    """Intersection over union of occupied cells over all grids together (1 if no cell is occupied).
-
-    A reconstructed cell is occupied below `border_m`; default: `clip_m`.
-    """
+    """Intersection over union of occupied cells over all grids together (1 if no cell is occupied); a reconstructed
+    cell is occupied below `border_m`; default: `clip_m`."""
     limit = clip_m * (1 - _ROUNDING)
     occupied, occupied_true = grids < (limit if border_m is None else border_m), grids_true < limit
     union = (occupied | occupied_true).sum()

@@ -53,40 +53,24 @@ def foot_contact_share(
     skeleton: Skeleton, joints: Float[Tensor, "time joint 3"], floor_height: Float[Tensor, "time"]
 ) -> Float[Tensor, ""]:
     """FC: share of frames in which an ankle is less than 10 cm, or a toe joint less than 5 cm, above the floor."""
-    return feet_down(skeleton, joints, floor_height).float().mean()
-
-
-def feet_down(
-    skeleton: Skeleton, joints: Float[Tensor, "time joint 3"], floor_height: Float[Tensor, "time"]
-) -> Bool[Tensor, "time"]:
-    """Whether any of the four foot joints is below its contact height."""
     low = []
     for name, limit in (("ankle", ANKLE_M), ("toe", TOE_M)):
         at = skeleton.indices(f"left_{name}", f"right_{name}")
         low.append(joints[:, at, 2] - floor_height[:, None] < limit)
-    return torch.cat(low, 1).any(1)
+    return torch.cat(low, 1).any(1).float().mean()
 
 
 PAUSE_S = 0.5
 """Longest pause (s) between interactions with one object that count as one handling: a change of hands."""
 
 
-@dataclass(frozen=True)
-class _PoseError:
-    """Error of an object's pose at one or several times."""
-
-    distance_cm: Float[Tensor, "*batch"]
-    """Distance between the object's captured and true centre."""
-    angle_deg: Float[Tensor, "*batch"]
-    """Angle between the captured and the true orientation."""
-
-
-def object_error(T_found: Rigid, T_true: Rigid, center: Float[Tensor, "3"]) -> _PoseError:
-    """Error of an object's poses; `center` is its centre in its own axes (m)."""
+def object_error(
+    T_found: Rigid, T_true: Rigid, center: Float[Tensor, "3"]
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """Errors of an object's poses: distance (cm) of its centre, which is given in its own axes (m), and angle (degrees)."""
     found, true = T_found.to(torch.float64), T_true.to(torch.float64)
     middles = [(T.R @ center.double()) + T.t for T in (found, true)]
-    apart = (middles[0] - middles[1]).norm(dim=-1)
-    return _PoseError(100 * apart, geodesic(found.R, true.R).rad2deg())
+    return 100 * (middles[0] - middles[1]).norm(dim=-1), rotation_difference_deg(found, true)
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,8 @@ CONTACT_SPEED_M_S = 0.3
 
 
 def jitter_m_s3(joints: Float[Tensor, "time joint 3"], fps: float) -> Float[Tensor, ""]:
-    """Jitter (m/s³): mean over joints and frames of the length of the third difference of position times fps³.
-
-    NaN for fewer than four frames.
-    """
+    """Jitter (m/s³): mean over joints and frames of the length of the third difference of position times fps³; NaN for
+    fewer than four frames."""
     return joints.double().diff(n=3, dim=0).norm(dim=-1).mean() * fps**3
 
 
@@ -59,10 +57,8 @@ def contact_from_motion(
 def foot_skate_cm_s(
     points: Float[Tensor, "time foot point 3"], contact: Bool[Tensor, "time foot"], fps: float
 ) -> Float[Tensor, ""]:
-    """Foot skate (cm/s): mean horizontal speed of the lowest point of a foot during true contact.
-
-    Pairs of frames count if both are in contact; the point is the lowest one of the later frame. NaN without contact.
-    """
+    """Foot skate (cm/s): mean horizontal speed of a foot's lowest point (in the later frame of a pair) where both
+    frames of the pair are in true contact; NaN without contact."""
     lowest = points[1:, :, :, 2].argmin(-1)[..., None]
     speed = points[..., :2].diff(dim=0).norm(dim=-1).gather(-1, lowest)[..., 0] * (fps * 100.0)
     return speed[contact[1:] & contact[:-1]].mean()

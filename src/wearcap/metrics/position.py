@@ -20,11 +20,8 @@ def joint_error_cm(
 def mpjpe_cm(
     joints: Float[Tensor, "*batch joint 3"], joints_true: Float[Tensor, "*batch joint 3"]
 ) -> Float[Tensor, ""]:
-    """Mean per joint position error (cm): the mean over frames and joints of the joint errors.
-
-    Systems driven by the head are compared with the body anchored to the true head (thesis §6.4); the caller does that
-    first.
-    """
+    """Mean per joint position error (cm): the mean over frames and joints. The caller first anchors captures of systems
+    that are driven by the head to the true head (thesis §6.4)."""
     return joint_error_cm(joints, joints_true).mean()
 
 

@@ -32,10 +32,8 @@ def score(motion: Motion, recording: Recording, name: str, seed: int) -> Row:
 
 
 def score_in_world(motion: Motion, recording: Recording, name: str, seed: int) -> Row:
-    """All metrics of one capture in the world, without anchoring or alignment (MocapEvery §4.1).
-
-    Adds `r_mpjpe_cm` (root-relative, r.MPJPE) and `right_hand_pe_cm`.
-    """
+    """All metrics of one capture in the world, without anchoring or alignment (MocapEvery §4.1); adds `r_mpjpe_cm`
+    (root-relative, r.MPJPE) and `right_hand_pe_cm`."""
     truth, contact = truth_at(motion, recording, name)
     scores = evaluate_motion(motion, truth, contact)
     joints, joints_true = motion.T_world_joint.t, truth.T_world_joint.t
@@ -48,37 +46,22 @@ def score_in_world(motion: Motion, recording: Recording, name: str, seed: int) -
 def comparable(
     motion: Motion, recording: Recording, name: str
 ) -> tuple[Motion, Motion, Bool[Tensor, "time patch"] | None]:
-    """The capture anchored to the true head, the true motion at its frames, and true foot contact.
-
-    Raises WearcapError when the recording has no true motion.
-    """
+    """The capture anchored to the true head; true motion and foot contact at its frames. Raises as `truth_at`."""
     truth, contact = truth_at(motion, recording, name)
     return anchored_to_head(motion, truth.joint("head")), truth, contact
 
 
 def truth_at(motion: Motion, recording: Recording, name: str) -> tuple[Motion, Bool[Tensor, "time patch"] | None]:
-    """The true motion at the capture's frames, and true foot contact.
-
-    Raises WearcapError when the recording has no true motion.
-    """
+    """The true motion at the capture's frames, and true foot contact. Raises WearcapError without a true motion."""
     truth, contact = recording.motion, _foot_contact(recording)
     if truth is None:
         raise WearcapError("no true motion to compare with", where=name, expected="a recording with `motion`")
-    if _within(motion, truth):
+    same = len(motion) == len(truth) and torch.allclose(motion.timestamps, truth.timestamps, rtol=0, atol=1e-6)
+    ends = truth.timestamps[[0, -1]] if len(truth) > 1 and len(motion) > 1 and not same else None
+    if ends is not None and motion.timestamps[0] >= ends[0] - 1e-6 and motion.timestamps[-1] <= ends[1] + 1e-6:
         frame = nearest_frames(truth.timestamps, motion.timestamps)
         truth, contact = at_times(truth, motion.timestamps), None if contact is None else contact[frame]
     return truth, contact
-
-
-def _within(motion: Motion, truth: Motion) -> bool:
-    """Whether a motion has other timestamps than the truth, all of them within its time span."""
-    same = len(motion) == len(truth) and torch.allclose(motion.timestamps, truth.timestamps, rtol=0, atol=1e-6)
-    ends = truth.timestamps[[0, -1]] if len(truth) > 1 and len(motion) > 1 else None
-    return (
-        not same
-        and ends is not None
-        and bool(motion.timestamps[0] >= ends[0] - 1e-6 and motion.timestamps[-1] <= ends[1] + 1e-6)
-    )
 
 
 def _foot_contact(recording: Recording) -> Bool[Tensor, "time patch"] | None:

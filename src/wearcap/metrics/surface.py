@@ -16,9 +16,6 @@ from torch import Tensor
 from wearcap.body.model import FOOT_REGIONS, BodyModel
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
-from wearcap.geometry.camera import Camera
-from wearcap.geometry.mesh import Mesh
-from wearcap.geometry.render import render
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.surface import SurfaceIndex
 from wearcap.geometry.triangle_distance import TriangleIndex
@@ -71,10 +68,8 @@ def foot_surface(
 def foot_vertices(
     body: BodyModel, T_world_joint: Rigid, contact: Bool[Tensor, "time patch"]
 ) -> tuple[Float[Tensor, "time vertex 3"], Bool[Tensor, "time vertex"]]:
-    """Vertices of the foot patches (m) and their contacts; patches in the order of `FOOT_PATCHES`.
-
-    Raises WearcapError when contacts and poses differ in length.
-    """
+    """Vertices of the foot patches (m) and their contacts; patches in the order of `FOOT_PATCHES`. Raises WearcapError
+    when contacts and poses differ in length."""
     if len(contact) != len(T_world_joint.t):
         raise WearcapError(
             f"contacts of {len(contact)} frames for poses of {len(T_world_joint.t)}", expected="as many of either"
@@ -102,18 +97,15 @@ def chamfer(
     cloud: Float[Tensor, "point 3"],
     *,
     faces: Int64[Tensor, "face 3"] | None = None,
-    seen: Bool[Tensor, "vertex"] | None = None,
 ) -> Chamfer:
     """Bidirectional Chamfer distance of one frame, without alignment.
 
     Without `faces`: the literal form, vertices to points both ways, biased by the spacing of vertices. With `faces`
-    (ours, the better default): points are measured to the surface. The other direction uses the `seen` vertices,
-    by default all; soles and armpits, which no camera sees, then add a constant. Raises WearcapError for an empty
-    cloud, no seen vertex, or NaN.
+    (ours, the better default): points are measured to the surface. In the other direction soles and armpits, which no
+    camera sees, add a constant. Raises WearcapError for an empty cloud, no vertex, or NaN.
     """
     body, points = vertices.detach().cpu().double().numpy(), cloud.detach().cpu().double().numpy()
-    checked = body if seen is None else body[seen.cpu().numpy()]
-    for name, rows in (("the body", checked), ("the cloud", points)):
+    for name, rows in (("the body", body), ("the cloud", points)):
         if not len(rows) or not np.isfinite(rows).all():
             raise WearcapError(
                 f"{name} has {len(rows)} points" + (", some of them NaN or infinite" if len(rows) else ""),
@@ -123,22 +115,8 @@ def chamfer(
         to_body, _ = KDTree(body).query(points)
     else:
         to_body, _ = TriangleIndex.build(body, faces.cpu().numpy()).nearest(points)
-    to_cloud, _ = KDTree(points).query(checked)
+    to_cloud, _ = KDTree(points).query(body)
     return Chamfer(100 * float(np.mean(to_body)), 100 * float(np.mean(to_cloud)))
-
-
-def seen_vertices(
-    vertices: Float[Tensor, "vertex 3"], faces: Int64[Tensor, "face 3"], cameras: list[Camera], T_world_cam: Rigid
-) -> Bool[Tensor, "vertex"]:
-    """Vertices of faces visible to any of the cameras (poses "camera"), with occlusion by the body only (ours)."""
-    mesh = Mesh(
-        vertices.detach().cpu().numpy().astype(np.float32), faces.cpu().numpy().astype(np.int32), np.ones(3, np.float32)
-    )
-    seen = torch.zeros(len(vertices), dtype=torch.bool)
-    for number, camera in enumerate(cameras):
-        visible = np.unique(render(camera, T_world_cam[number], [mesh]).index)
-        seen[faces.cpu()[torch.from_numpy(visible[visible >= 0]).long()].reshape(-1)] = True
-    return seen
 
 
 def mean_chamfer(frames: list[Chamfer]) -> Chamfer:

@@ -1,6 +1,5 @@
 """The thesis's solver (§4.3.1): Adam over windows of 100 frames, neighbours sharing one frame."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -32,16 +31,8 @@ class AdamSettings:
             )
 
 
-def solve_adam_windows(
-    energy: HpsEnergy,
-    data: HpsData,
-    settings: AdamSettings = AdamSettings(),
-    progress: Callable[[int], None] = lambda frames: None,
-) -> Solution:
-    """Minimise window after window; a window's first frame is fixed to the previous window's last.
-
-    `progress` is called with the number of solved frames after each window.
-    """
+def solve_adam_windows(energy: HpsEnergy, data: HpsData, settings: AdamSettings = AdamSettings()) -> Solution:
+    """Minimise window after window; a window's first frame is fixed to the previous window's last."""
     data = data.to(settings.dtype)
     state = data.start
     theta, R, t = state.theta.clone(), state.R_world_root.clone(), state.t_world_root.clone()
@@ -53,7 +44,6 @@ def solve_adam_windows(
         solved, history = _solve_window(energy, data[window], start, begin > 0, settings)
         theta[window], R[window], t[window] = solved.theta, solved.R_world_root, solved.t_world_root
         histories.append(history)
-        progress(stop)
         if stop == len(data):
             break
         begin += settings.advance

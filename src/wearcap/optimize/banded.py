@@ -61,13 +61,10 @@ class BandedSettings:
     """Step length after the first two iterations; above 1, the reweighting of norms converges sooner."""
 
 
-DEFAULTS = BandedSettings()
-
-
 def solve_in_stretches(
     energy: HpsEnergy,
     data: HpsData,
-    settings: BandedSettings = DEFAULTS,
+    settings: BandedSettings = BandedSettings(),
     stretch: int = 1800,
     overlap: int = 150,
     jobs: int = 2,
@@ -111,7 +108,7 @@ def _spans(data: HpsData, stretch: int, overlap: int) -> Iterator[tuple[int, int
 
 
 def solve_banded(
-    energy: HpsEnergy, data: HpsData, settings: BandedSettings = DEFAULTS, start: HpsState | None = None
+    energy: HpsEnergy, data: HpsData, settings: BandedSettings = BandedSettings(), start: HpsState | None = None
 ) -> Solution:
     """Minimise an energy over all frames of `data` at once.
 

@@ -205,10 +205,8 @@ def _patch_points(R, c, leg_chains, arms, shares, patch, points):
 
 @compiled
 def _vertex_twist(R, chain, arms, shares, A):
-    """Transposed Jacobian (12, 3) of a patch vertex in the twists (v, ω) of its leg's last two joints.
-
-    Returns the number of rows used: six if the second joint has no weight.
-    """
+    """Transposed Jacobian (12, 3) of a patch vertex in the twists (v, ω) of its leg's last two joints; returns the
+    number of rows used: six if the second joint has no weight."""
     for h in range(2):
         share, joint = shares[h], chain[len(chain) - 2 + h]
         if share == 0 and h == 1:
@@ -423,8 +421,20 @@ def fill_system(theta, theta_imu, body, kin, forms, diagonal, below, gradient):
         _fill_trunk(j, theta, theta_imu, body, kin, forms, diagonal, gradient)
         for f in range(2):
             _fill_foot(j, f, theta, theta_imu, body, kin, forms, diagonal, below, gradient)
-        if j + 1 < len(diagonal):
-            _fill_trunk_step(j, kin, forms, below)
+        if j + 1 == len(diagonal):
+            continue
+        # Couplings of translation, root and head with the next frame's.
+        B, here, after, head = below[j], kin.R[j, 0], kin.R[j + 1, 0], forms.small_step[j, 2]
+        for i in range(3):
+            for k in range(3):
+                B[i, k] += forms.small_step[j, 0, i, k]
+                B[HEAD + i, HEAD + k] += head[i, k]
+                for m in range(3):
+                    B[HEAD + i, 3 + k] += head[i, m] * here[m, k]
+                    B[3 + i, HEAD + k] += after[m, i] * head[m, k]
+                    for l in range(3):
+                        both = forms.small_step[j, 1, m, l] + head[m, l]
+                        B[3 + i, 3 + k] += after[m, i] * both * here[l, k]
 
 
 @compiled
@@ -460,22 +470,6 @@ def _spine_form(theta, theta_imu, body, kin, j):
                 for m in range(3):
                     gram[i, k] += J[i, m] * J[k, m]
     return np.linalg.inv(gram), turn
-
-
-@compiled
-def _fill_trunk_step(j, kin, forms, below):
-    """Add the couplings of translation, root and head with the next frame's."""
-    B, here, after, head = below[j], kin.R[j, 0], kin.R[j + 1, 0], forms.small_step[j, 2]
-    for i in range(3):
-        for k in range(3):
-            B[i, k] += forms.small_step[j, 0, i, k]
-            B[HEAD + i, HEAD + k] += head[i, k]
-            for m in range(3):
-                B[HEAD + i, 3 + k] += head[i, m] * here[m, k]
-                B[3 + i, HEAD + k] += after[m, i] * head[m, k]
-                for l in range(3):
-                    both = forms.small_step[j, 1, m, l] + head[m, l]
-                    B[3 + i, 3 + k] += after[m, i] * both * here[l, k]
 
 
 @compiled

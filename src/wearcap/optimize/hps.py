@@ -13,7 +13,6 @@ from wearcap.body.model import FOOT_REGIONS, BodyModel
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.surface import SurfaceIndex
 from wearcap.optimize import costs
 from wearcap.optimize.costs import Loss
@@ -71,10 +70,8 @@ LEAST_UPRIGHT = 0.7
 
 @dataclass(frozen=True)
 class HpsEnergy:
-    """E = Σ weight · mean of ρ(residual), by term; terms without an entry are left out.
-
-    Raises WearcapError for a term that does not exist or a negative weight.
-    """
+    """E = Σ weight · mean of ρ(residual), by term; terms without an entry are left out. Raises WearcapError for a term
+    that does not exist or a negative weight."""
 
     weights: dict[str, float]
     losses: dict[str, Loss] = field(default_factory=dict)
@@ -128,9 +125,16 @@ class FootPatches:
     """Index in `FOOT_PATCHES` of each vertex's patch."""
 
     @classmethod
-    def of(cls, body: BodyModel, count: int = PATCH_VERTICES) -> "FootPatches":
-        """Choose `count` evenly spread vertices of each region (all vertices of a smaller region)."""
-        chosen = [_spread(body, body.regions[name], count) for name in FOOT_REGIONS.values()]
+    def of(cls, body: BodyModel) -> "FootPatches":
+        """Choose `PATCH_VERTICES` vertices of each region by farthest-point sampling (all of a smaller region)."""
+        chosen = []
+        for name in FOOT_REGIONS.values():
+            region = body.regions[name]
+            points = body.rest_vertices[region]
+            picked = [int((points - points.mean(0)).norm(dim=1).argmax())]
+            while len(picked) < min(PATCH_VERTICES, len(region)):
+                picked.append(int(torch.cdist(points, points[picked]).min(1).values.argmax()))
+            chosen.append(region[picked])
         patch = torch.cat([torch.full((len(v),), k) for k, v in enumerate(chosen)])
         return cls(body, torch.cat(chosen), patch)
 
@@ -139,10 +143,6 @@ class FootPatches:
         """Joints of the left and the right leg, from hip to toe; the patches are skinned to the last two."""
         skeleton = self.body.skeleton
         return [chain_to(skeleton, skeleton.index(f"{side}_toe")) for side in ("left", "right")]
-
-    def points(self, T_world_joint: Rigid) -> Float[Tensor, "time vertex 3"]:
-        """World positions (m) of the vertices, given the poses of all joints."""
-        return self._only.vertices(T_world_joint)
 
     def share(self, contact: Float[Tensor, "*batch patch"]) -> Float[Tensor, "*batch vertex"]:
         """Contact of each vertex's patch over its number of vertices, so that sums over vertices are patch means."""
@@ -155,7 +155,7 @@ class FootPatches:
         return torch.einsum("tvi,vp->tpi", points, one / one.sum(0))
 
     @cached_property
-    def _only(self) -> BodyModel:
+    def soles(self) -> BodyModel:
         """Body model that consists of the patches only."""
         whole = self.body
         blend = None if whole.pose_blend is None else whole.pose_blend[:, self.vertex]
@@ -176,15 +176,6 @@ def chain_to(skeleton: Skeleton, joint: int) -> list[int]:
         chain.append(joint)
         joint = skeleton.parents[joint]
     return chain[::-1]
-
-
-def _spread(body: BodyModel, region: Int64[Tensor, "all"], count: int) -> Int64[Tensor, "chosen"]:
-    """Farthest-point sampling of a region's vertices."""
-    points = body.rest_vertices[region]
-    chosen = [int((points - points.mean(0)).norm(dim=1).argmax())]
-    while len(chosen) < min(count, len(region)):
-        chosen.append(int(torch.cdist(points, points[chosen]).min(1).values.argmax()))
-    return region[chosen]
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,25 +231,19 @@ class HpsData:
         return replace(self, start=HpsState(*start), steps=SuitSteps(*steps), **tensors)
 
 
-@dataclass(frozen=True, eq=False)
-class Ground:
-    """Nearest scene point v(n) of each patch vertex (eq. 4.6) and local plane; `found`: 1 where both exist, else 0."""
-
-    point: Float[Tensor, "time vertex 3"]
-    origin: Float[Tensor, "time vertex 3"]
-    normal: Float[Tensor, "time vertex 3"]
-    found: Float[Tensor, "time vertex"]
+_GROUND = ("ground_point", "ground_origin", "ground_normal", "ground_found")
 
 
-def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: HpsEnergy) -> Ground:
+def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: HpsEnergy) -> dict[str, Tensor]:
     """Query the scene below patch vertices in contact (m, world), as far as the energy needs it.
 
-    Each patch has one plane, that below its centroid. `found` is 0 everywhere without a scene.
+    Returns by name the nearest scene point v(n) of each vertex (eq. 4.6), origin and normal of the plane below its
+    patch's centroid, and "ground_found": 1 where these exist, else 0; without a scene it is 0 everywhere.
     """
     to_point, to_plane = energy.reading("ground_point"), energy.reading("ground_normal")
     if data.surface is None or not (to_point or to_plane):
         none = torch.zeros_like(points.detach())
-        return Ground(none, none, none, none[..., 0])
+        return dict(zip(_GROUND, (none, none, none, none[..., 0])))
     dtype, points = points.dtype, points.detach().double()
     stands, patch = data.contact > 0, data.patches.patch
     point, origin, normal = points.clone(), torch.zeros_like(points), torch.zeros_like(points)
@@ -274,23 +259,22 @@ def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: H
         origin, normal = where[:, patch], up[:, patch]
         found *= normal[..., 2] > LEAST_UPRIGHT  # False where no plane was found (NaN)
     parts = (point.nan_to_num(), origin.nan_to_num(), normal.nan_to_num(), found)
-    return Ground(*(part.to(dtype) for part in parts))
+    return {name: part.to(dtype) for name, part in zip(_GROUND, parts)}
 
 
-def data_values(data: HpsData, ground: Ground) -> dict[str, Tensor]:
-    """Values by name that do not depend on the state: those of `HpsData`, and what the terms derive from them."""
+def data_values(data: HpsData, ground: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Values by name that do not depend on the state: those of `HpsData` and `find_ground`, and what terms derive from
+    them."""
     contact, patches = data.contact, data.patches
-    t, theta_imu, soles = data.start.t_world_root, data.start.theta, ground.point
+    t, theta_imu, soles = data.start.t_world_root, data.start.theta, ground["ground_point"]
     derived = {
         "ones": torch.ones_like(t[:, 0]),
         "t_start": t,
         "theta_imu": theta_imu,
         "theta_legs_imu": theta_imu[:, _leg_columns(patches)],
         "R_localized_head": data.R_world_cam @ data.R_head_cam.T,
-        "ground_point": ground.point,
-        "ground_origin": ground.origin,
-        "ground_normal": ground.normal,
-        "on_ground": patches.share(contact) / 4 * ground.found,
+        **ground,
+        "on_ground": patches.share(contact) / 4 * ground["ground_found"],
         "stays": patches.share(contact[1:] * contact[:-1]) / 4,
         "no_slide": torch.zeros_like(soles[1:]),
         "no_step": torch.zeros_like(t[1:]),
@@ -301,9 +285,7 @@ def data_values(data: HpsData, ground: Ground) -> dict[str, Tensor]:
 
 def state_values(data: HpsData, state: HpsState, full_mesh: bool = False) -> dict[str, Tensor]:
     """Values by name that depend on the state: translations t, rotations R (world), axis-angles θ, patch vertices.
-
-    `full_mesh` skins the whole body and takes the patches from it, as the thesis does, with the same result.
-    """
+    `full_mesh` skins the whole body and takes the patches from it, as the thesis does, with the same result."""
     patches = data.patches
     T_world_joint = forward_kinematics(patches.body.skeleton, state.R_parent_joint, state.t_world_root)
     whole = patches.body.vertices(T_world_joint)[:, patches.vertex] if full_mesh else None
@@ -313,7 +295,7 @@ def state_values(data: HpsData, state: HpsState, full_mesh: bool = False) -> dic
         "R_head": T_world_joint.R[:, patches.body.skeleton.index("head")],
         "theta": state.theta,
         "theta_legs": state.theta[:, _leg_columns(patches)],
-        "soles": patches.points(T_world_joint) if whole is None else whole,
+        "soles": patches.soles.vertices(T_world_joint) if whole is None else whole,
     }
 
 

@@ -80,8 +80,6 @@ class BentPath:
     path: Float64[Tensor, "time 2"]
     turn: Float64[Tensor, "step"]
     """φ = α̂ − α (rad, unwrapped)."""
-    heading: Float64[Tensor, "step"]
-    """α̂ (rad, within ±π)."""
     history: list[dict[str, float]] = field(default_factory=list)
     """One entry per iteration; the state returned is the best of them."""
     reason: str = ""
@@ -158,17 +156,11 @@ def bending_problem(
             expected=f"times from {timestamps[0].item():.3f} s to {timestamps[-1].item():.3f} s",
         )
     path = path.double()
+    moves = path.diff(dim=0).norm(dim=1) > STILL_M
+    leader = torch.where(moves, torch.arange(len(moves)), int(moves.long().argmax())).cummax(0).values
     at = (torch.searchsorted(timestamps, control_times.contiguous(), right=True) - 1).clamp(max=len(path) - 2)
     share = (control_times - timestamps[at]) / (timestamps[at + 1] - timestamps[at])
-    return BendingProblem(
-        settings, path, timestamps, _leaders(path), at, share, control_points.double(), weights.double()
-    )
-
-
-def headings(path: Float64[Tensor, "time 2"]) -> Float64[Tensor, "step"]:
-    """Heading α of each step (rad, within ±π; atan2 of eq. 5.1); one of zero length takes the last moving step's."""
-    step = path.diff(dim=0)[_leaders(path)]
-    return torch.atan2(step[:, 1], step[:, 0])
+    return BendingProblem(settings, path, timestamps, leader, at, share, control_points.double(), weights.double())
 
 
 def wrapped(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
@@ -188,25 +180,17 @@ def bent(
     return torch.cat([start, start + turned.cumsum(0)])
 
 
-def heading_change(
-    heading: Float64[Tensor, "step"], original: Float64[Tensor, "step"], clamped: bool = False
-) -> Float64[Tensor, "link"]:
-    """Change dα̂ − dα from step to step (rad, wrapped; eq. 5.1); `clamped`: with fixed steps before and after them."""
-    off = heading - original
-    if not clamped:
-        return wrapped(off.diff())
-    return wrapped(torch.cat([off[:1], off.diff(), -off[-1:]]))
-
-
 def energy_terms(
     problem: BendingProblem, turn: Float64[Tensor, "step"], shift: Float64[Tensor, "2"]
 ) -> dict[str, Float64[Tensor, ""]]:
-    """Terms of eq. 5.2, differentiable in φ (rad) and the first point's shift (m); the path is linear within steps."""
+    """Terms of eq. 5.2, differentiable in φ (rad) and the first point's shift (m); the path is linear within steps. The
+    change dα̂ − dα from step to step (eq. 5.1) is that of φ, with clamped ends also from and to the fixed steps."""
     settings, path = problem.settings, bent(problem, turn, shift)
     at, share = problem.control_step, problem.control_share[:, None]
     offset = torch.lerp(path[at], path[at + 1], share) - problem.control_points
     off = turn[problem.leader]
-    change = heading_change(off, torch.zeros_like(off), settings.clamped_ends)
+    change = torch.cat([off[:1], off.diff(), -off[-1:]]) if settings.clamped_ends else off.diff()
+    change = wrapped(change)
     seconds = problem.link_s if settings.clamped_ends else problem.link_s[1:-1]
     tension = change**2 / seconds if settings.norm == "square" else change.abs()
     return {
@@ -225,8 +209,7 @@ def bent_path(
     """Build a solver's result from its unknowns."""
     turn = turn[problem.leader]
     turn = torch.cat([wrapped(turn[:1]), wrapped(turn.diff())]).cumsum(0)
-    heading = wrapped(headings(problem.path) + turn)
-    return BentPath(bent(problem, turn, shift), turn, heading, history, reason)
+    return BentPath(bent(problem, turn, shift), turn, history, reason)
 
 
 def bend_adam(problem: BendingProblem, iterations: int = 1000, learning_rate: float = 3e-3) -> BentPath:
@@ -247,10 +230,3 @@ def bend_adam(problem: BendingProblem, iterations: int = 1000, learning_rate: fl
             total.backward()
             adam.step()
     return bent_path(problem, *best, history, f"{iterations} iterations")
-
-
-def _leaders(path: Float64[Tensor, "time 2"]) -> Int64[Tensor, "step"]:
-    moves = path.diff(dim=0).norm(dim=1) > STILL_M
-    number = torch.arange(len(moves))
-    first = int(moves.long().argmax()) if len(moves) else 0
-    return torch.where(moves, number, first).cummax(0).values

@@ -21,11 +21,12 @@ TINY = 1e-12
 
 
 @compiled
-def _stretch_freely(step, link, last_link, first, share, target, weight, free_start, place, z):
+def _stretch_freely(step, link, last_link, first, share, target, weight, distance, loss, delta, free_start, place, z):
     """Solve the convex relaxation in which a step may also stretch: complex factors z instead of turns.
 
-    Minimises Σ weight |place − target|² + Σ link |z − previous z|² exactly, and fills z (step) and place (time), both
-    complex; place[0] is the start. Control points of step s are first[s] … first[s + 1] − 1.
+    Minimises ½ Σ weight ρ'(distance) / distance |place − target|² + Σ link |z − previous z|² exactly, with the losses'
+    tips smoothed by `RELAXED_M`, and fills z (step) and place (time), both complex; place[0] is the start. Control
+    points of step s are first[s] … first[s + 1] − 1, their distances (m) those of the previous solution.
     """
     count = len(step)
     # least energy beyond a step = a|p|² + 2 Re(p* b z) + c|z|² − 2 Re(g* p + h* z)
@@ -37,7 +38,8 @@ def _stretch_freely(step, link, last_link, first, share, target, weight, free_st
         b += a * d
         h += np.conj(d) * g
         for i in range(first[s], first[s + 1]):
-            w, part = weight[i], share[i] * d
+            w = 0.5 * weight[i] * _control_form(distance[i] ** 2, loss, delta, RELAXED_M)[1]
+            part = share[i] * d
             a += w
             b += w * part
             c += w * abs(part) ** 2
@@ -76,15 +78,6 @@ def _control_form(square, loss, delta, smooth):
     """(ρ of a squared distance, its weight in reweighted least squares); a norm's tip is smoothed in both."""
     rho, weight = reweight(square, loss, delta, smooth)
     return (1.0 / weight if loss == NORM else rho), weight
-
-
-@compiled
-def _control_weights(distance, loss, delta, smooth):
-    """Weights in reweighted least squares for distances (m)."""
-    weights = np.empty_like(distance)
-    for i in range(len(distance)):
-        weights[i] = _control_form(distance[i] ** 2, loss, delta, smooth)[1]
-    return weights
 
 
 @compiled
@@ -145,10 +138,8 @@ def _value_pass(turn, place, link, last_link, first, share, target, weight, kind
 
 @compiled
 def _walk(turn, place, step, gains, share, shift, new_turn, new_place):
-    """Roll out a new path: each turn changes by the gains applied to the offset from the old path so far.
-
-    `share` scales the constant part of the gains (step length); `shift` (2) moves the first point.
-    """
+    """Roll out a new path: each turn changes by the gains applied to the offset from the old path so far. `share`
+    scales the constant part of the gains (step length); `shift` (2) moves the first point."""
     new_place[0] = place[0] + shift
     change = 0.0
     for s in range(len(turn)):
@@ -172,10 +163,8 @@ def bend_banded(
     smooth_end: float = 1e-5,
     tolerance: float = 1e-6,
 ) -> BentPath:
-    """Minimise eq. 5.2 by iteratively reweighted least squares with a decreasing smoothing of norms (m, rad).
-
-    Stops when the relative decrease of the energy is below `tolerance` and the smoothing has reached its end.
-    """
+    """Minimise eq. 5.2 by iteratively reweighted least squares with a decreasing smoothing of norms (m, rad), until the
+    relative decrease of the energy is below `tolerance` and the smoothing has reached its end."""
     path = _Path(problem)
     path.begin()
     smooth = smooth_start
@@ -242,10 +231,9 @@ class _Path:
         at = np.repeat(np.arange(len(step)), np.diff(first))
         distance = np.zeros(len(weight))
         for _ in range(RELAXED_PASSES):
-            half = 0.5 * weight * _control_weights(distance, *self.kinds[1:], RELAXED_M)
-            _stretch_freely(
-                step, soft * self.link, soft * self.last_link, first, share, complex_target, half, self.free, place, z
-            )
+            controls = first, share, complex_target, weight, distance
+            links = soft * self.link, soft * self.last_link
+            _stretch_freely(step, *links, *controls, *self.kinds[1:], self.free, place, z)
             distance = abs(place[at] + share * (place[at + 1] - place[at]) - complex_target)
         self.gains[:] = 0.0
         turn = np.angle(z * np.conj(np.concatenate([z[:1], z[:-1]]))).cumsum() + np.angle(z[0])

@@ -27,7 +27,7 @@ from wearcap.io.formats.video import video_info
 from wearcap.recording.motion import HANDS, Interactions, Motion
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import RecordingStore, dataset_folder, load_recording
-from wearcap.systems.ireplica.contact_intervals import ContactSettings, active, contact_intervals
+from wearcap.systems.ireplica.object_tracker import ContactSettings, active, contact_intervals
 
 
 def _label_path(output: str | Path, name: str) -> Path:

@@ -77,12 +77,7 @@ class Synchronization:
         if not self.by_claps(recording):
             return None
         camera, suit = recording.camera, recording.suit
-        if camera is None:
-            raise WearcapError(
-                "no camera in this recording",
-                where=recording.name,
-                expected="a head camera that hears the suit's claps",
-            )
+        assert camera is not None
         wrists = [recording.imu[name] for name in WRISTS if name in recording.imu]
         if not wrists and suit is not None:
             wrists = [synthesize_imu(suit, name, n=1) for name in WRISTS]
@@ -145,20 +140,12 @@ class MapLocalization:
         if file is None or stream is None:
             return [recording.localization]
         features = [self.extractor, self.matcher, self.descriptor, self.settings, self.use_prior]
-        return [
-            *features,
-            self.every or _usual_step(stream),
-            stream.timestamps,
-            stream.camera,
-            file,
-            *_pictures(recording, folder),
-        ]
+        frames = [self.every or _usual_step(stream), stream.timestamps, stream.camera]
+        return [*features, *frames, file, *_pictures(recording, folder)]
 
     def __call__(self, recording: Recording, folder: Path) -> Localization:
-        """Localise every `every`-th frame; times are on the camera's clock.
-
-        Raises WearcapError without localisation and map, without images, and for a map or video that cannot be read.
-        """
+        """Localise every `every`-th frame; times are on the camera's clock. Raises WearcapError as `reads`, and for a
+        map or video that cannot be read."""
         file = self.map_file(recording, folder)
         if file is None:
             assert recording.localization is not None

@@ -1,7 +1,7 @@
 """HPS (thesis ch. 4): registers a suit's motion in a scanned scene by a head camera, without drift.
 
-The steps of the thesis in order: synchronize → localize → align → initialize → optimize. Each is a method that can be
-called alone, and a stage whose result can be cached.
+The steps of the thesis in order: synchronize → localize → align → initialize → optimize. Each can be called alone, and
+is a stage whose result can be cached.
 """
 
 from collections import Counter
@@ -29,7 +29,6 @@ from wearcap.recording.timing import resampled
 from wearcap.runtime.stages import Stage, StagedSystem
 from wearcap.runtime.system import CaptureInput
 from wearcap.scene.scan import Scan
-from wearcap.sensors.clock import Clock
 from wearcap.sensors.initialization import (
     Initialization,
     InitializationSettings,
@@ -75,10 +74,8 @@ class HPS(StagedSystem):
     localization: Localize = field(default_factory=MapLocalization)
 
     def stages(self, source: CaptureInput) -> list[Stage]:
-        """The steps from a recording to the solution.
-
-        Raises WearcapError without suit, head camera, localisation or map, or a scan where the energy asks for one.
-        """
+        """The steps from a recording to the solution. Raises WearcapError without suit, head camera, localisation or
+        map, or a scan where the energy asks for one."""
         recording = source.recording
         require(recording, "suit", "camera")
         first = camera_stages(source, self.synchronization, self.localization)
@@ -141,14 +138,6 @@ class HPS(StagedSystem):
         pieces = follow_pieces(folder, refused=refused)
         return self._room("stream", "captures streams").follow(self, pieces, scan, folder, refused=refused)
 
-    def synchronize(self, recording: Recording, folder: Path) -> Clock | None:
-        """Map from the camera's clock to the suit's, by claps (thesis §4.3.4); None where they share one clock."""
-        return self.synchronization(recording, folder)
-
-    def localize(self, recording: Recording, folder: Path) -> Localization:
-        """Poses of the head camera in the scene, on its own clock (thesis §4.2.3)."""
-        return self.localization(recording, folder)
-
     def align(self, recording: Recording) -> Motion:
         """The suit's motion at `fps`, rotated about gravity and moved into the scene (thesis eq. 4.14, 4.15)."""
         suit, localization, T_head_cam = required(recording)
@@ -167,10 +156,8 @@ class HPS(StagedSystem):
         scan: Scan | None,
         R_head_cam: Float[Tensor, "3 3"] | None = None,
     ) -> HpsData:
-        """Data of the energy: initial state, localised cameras, contacts, and the suit's frame-to-frame motion.
-
-        `R_head_cam` is estimated from the localised frames (HPS paper eq. 4) unless it is given.
-        """
+        """Data of the energy: initial state, localised cameras, contacts, the suit's motion from frame to frame, and
+        `R_head_cam`, estimated from the localised frames (HPS paper eq. 4) unless it is given."""
         motion, (_, localization, _) = start.motion, required(recording)
         R_cam, sure = at_frames(localization, motion)
         root, head = motion.R_parent_joint[:, 0].double(), motion.joint("head").R.double()
@@ -261,10 +248,8 @@ def turns(R_world_body: Float[Tensor, "time 3 3"]) -> Float[Tensor, "pair 3 3"]:
 
 
 def _believed_contact(suit: Motion, max_speed: float | None) -> Bool[Tensor, "time patch"]:
-    """The suit's contact flags, without those of patches that move faster than `max_speed` (m/s) in the suit's motion.
-
-    Raises WearcapError when there are no flags, or not one per frame.
-    """
+    """The suit's contact flags, without patches that are faster than `max_speed` (m/s) in the suit's motion. Raises
+    WearcapError when there are no flags, or not one per frame."""
     if suit.contact_prob is None or len(suit.contact_prob) != len(suit):
         count = "no" if suit.contact_prob is None else f"{len(suit.contact_prob)} frames of"
         raise WearcapError(

@@ -31,11 +31,6 @@ class PlacedSuit(StagedSystem):
     synchronization: Synchronization
     localization: Localize
 
-    @property
-    @abstractmethod
-    def placing(self) -> Any:
-        """Settings that determine the placement, besides the recording and the rate, for its cache key."""
-
     @abstractmethod
     def place(self, recording: Recording) -> Motion:
         """The suit's motion in the scene."""
@@ -44,12 +39,13 @@ class PlacedSuit(StagedSystem):
         """The first two stages of HPS, then `place`. Raises WearcapError as HPS does."""
         recording = source.recording
         require(recording, "suit", "camera")
+        own = {key: value for key, value in vars(self).items() if key not in ("synchronization", "localization")}
         return [
             *camera_stages(source, self.synchronization, self.localization),
             Stage(
                 "place",
                 lambda done: self.place(on_one_clock(recording, done)),
-                lambda: (self.placing, self.fps, recording.suit, *mount(recording)),
+                lambda: (own, recording.suit, *mount(recording)),
                 ("synchronize", "localize"),
             ),
         ]
@@ -78,10 +74,6 @@ class HpsBaseline(PlacedSuit):
 
     @property
     def name(self) -> str:
-        return self.kind
-
-    @property
-    def placing(self) -> str:
         return self.kind
 
     def place(self, recording: Recording) -> Motion:

@@ -1,4 +1,4 @@
-"""Scores of captured motions against ground truth: thesis §4.5, Tables 4.1 to 4.3, drift, localisation outages.
+"""Scores of captured motions against ground truth: thesis §4.5, Tables 4.1 to 4.3, drift.
 
 No alignment is applied before measuring. Inputs are in m, errors in cm.
 """
@@ -6,7 +6,6 @@ No alignment is applied before measuring. Inputs are in m, errors in cm.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 import torch
@@ -18,6 +17,7 @@ from wearcap.body.model import BodyModel
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
 from wearcap.geometry.surface import SurfaceIndex
+from wearcap.metrics.position import joint_error_cm
 from wearcap.metrics.surface import Chamfer, FootSurface, chamfer, foot_surface, foot_vertices, mean_chamfer
 from wearcap.metrics.table import evaluate_motion
 from wearcap.recording import Motion, Recording
@@ -29,8 +29,6 @@ FEET_S, FEET_EVERY_S = 2.0, 6.0
 """Feet are scored in the first `FEET_S` of every `FEET_EVERY_S` (s): in total about the thesis's three minutes."""
 BIN_M = 20.0
 """Length of path (m) over which errors are averaged before a slope is fitted."""
-MARGIN_S = 5.0
-"""Least time (s) between a visit to the depth-camera rig and a planted outage."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,9 +59,7 @@ class HpsTruth:
         cls, recording: Recording, scan: Scan, visits: Sequence[Sequence[RigCloud]], fps: float = 30.0
     ) -> "HpsTruth":
         """Ground truth of a recording at `fps`; suit and true motion share their timestamps, as simulated ones do.
-
-        Raises WearcapError when the recording lacks a suit with contacts, a true motion or true contacts.
-        """
+        Raises WearcapError when the recording lacks a suit with contacts, a true motion or true contacts."""
         motion, suit, track = recording.motion, recording.suit, recording.contacts
         if motion is None or suit is None or suit.contact_prob is None or track is None:
             raise WearcapError(
@@ -119,7 +115,7 @@ def score_hps(motion: Motion, truth: HpsTruth) -> HpsScores:
     """Score one capture. Raises WearcapError unless it has the truth's joints and timestamps, and finite poses."""
     joints = evaluate_motion(motion, truth.motion, truth.true_contact)
     literal, surface = zip(*(interval_chamfer(motion, truth.body, clouds) for clouds in truth.visits))
-    error = _joint_errors_cm(motion, truth.motion)[:, 0]
+    error = joint_error_cm(motion.T_world_joint.t, truth.motion.T_world_joint.t)[:, 0]
     return HpsScores(
         literal,
         surface,
@@ -137,10 +133,8 @@ def visit_times(intervals: Intervals, count: int = 10) -> Float64[Tensor, "inter
 
 
 def interval_chamfer(motion: Motion, body: BodyModel, clouds: Sequence[RigCloud]) -> tuple[Chamfer, Chamfer]:
-    """Mean Chamfer distance between clouds and the captured body: (vertices to points, points to surface).
-
-    Raises WearcapError for a cloud more than half a frame away from every frame of the motion.
-    """
+    """Mean Chamfer distance between clouds and the captured body: (vertices to points, points to surface). Raises
+    WearcapError for a cloud more than half a frame away from every frame of the motion."""
     times = torch.tensor([cloud.time_s for cloud in clouds], dtype=torch.float64)
     frames = nearest_frames(motion.timestamps, times)
     vertices = body.vertices(motion.T_world_joint[frames])
@@ -168,11 +162,6 @@ def _foot_scores(motion: Motion, truth: HpsTruth, contact: Bool[Tensor, "time pa
     return foot_surface(*foot_vertices(truth.body, motion.T_world_joint, touching), truth.surface)
 
 
-def _joint_errors_cm(motion: Motion, truth: Motion) -> Float[Tensor, "time joint"]:
-    """Position error of each joint in the world (cm); the root comes first."""
-    return 100 * (motion.T_world_joint.t - truth.T_world_joint.t).norm(dim=-1)
-
-
 def travelled_m(motion: Motion) -> Float[Tensor, "time"]:
     """Horizontal path length of the root since the first frame (m)."""
     length = motion.t_world_root[:, :2].double().diff(dim=0).norm(dim=-1).cumsum(0)
@@ -194,68 +183,3 @@ def drift(distance_m: Float[Tensor, "time"], error_cm: Float[Tensor, "time"]) ->
     middle = (np.flatnonzero(count) + 0.5) * BIN_M
     slope = 100 * float(np.polyfit(middle, error, 1)[0]) if len(middle) > 1 else math.nan
     return Drift(tuple(middle.tolist()), tuple(error.tolist()), slope)
-
-
-@dataclass(frozen=True)
-class Outage:
-    """A time span without localisation (s, on the suit's clock)."""
-
-    start_s: float
-    length_s: float
-
-    def frames(self, timestamps: Float64[Tensor, "time"]) -> Bool[Tensor, "time"]:
-        """Mask of the frames within the outage."""
-        return (timestamps >= self.start_s) & (timestamps < self.start_s + self.length_s)
-
-
-def planted_outages(intervals: Intervals, end_s: float, lengths_s: Sequence[float]) -> list[Outage]:
-    """Outages centred in the walks between visits: at most one per walk, the longest in the longest walk.
-
-    An outage that does not leave `MARGIN_S` before and after it is shortened. Raises WearcapError when there are more
-    outages than walks.
-    """
-    away = torch.cat([intervals.stop_s, torch.zeros(1, dtype=torch.float64)])
-    back = torch.cat([intervals.start_s, torch.tensor([end_s], dtype=torch.float64)])
-    walks = sorted(zip(away[:-1].tolist(), back[1:].tolist()), key=lambda walk: walk[0] - walk[1])
-    if len(lengths_s) > len(walks):
-        raise WearcapError(f"{len(lengths_s)} outages", expected=f"no more than {len(walks)}, one per walk")
-    outages = []
-    for length, (start, stop) in zip(sorted(lengths_s, reverse=True), walks):
-        length = min(length, stop - start - 2 * MARGIN_S)
-        if length <= 0:
-            raise WearcapError(
-                f"no room for an outage in a walk of {stop - start:.1f} s", expected=f"more than {2 * MARGIN_S:.0f} s"
-            )
-        outages.append(Outage((start + stop - length) / 2, length))
-    return sorted(outages, key=lambda outage: outage.length_s)
-
-
-@dataclass(frozen=True)
-class _Disturbance:
-    """Mean errors (cm) with and without localisation outages, over the same frames."""
-
-    root_cm: float
-    joint_cm: float
-    undisturbed_root_cm: float
-    undisturbed_joint_cm: float
-
-    @property
-    def root_ratio(self) -> float:
-        """Error with outages divided by the error without."""
-        return self.root_cm / self.undisturbed_root_cm
-
-    @property
-    def joint_ratio(self) -> float:
-        """Error with outages divided by the error without."""
-        return self.joint_cm / self.undisturbed_joint_cm
-
-
-def disturbance(disturbed: Motion, undisturbed: Motion, truth: Motion, frames: Bool[Tensor, "time"]) -> _Disturbance:
-    """Compare captures with and without outages over the given frames."""
-    with_, without = (_joint_errors_cm(motion, truth)[frames] for motion in (disturbed, undisturbed))
-    return _Disturbance(*(float(e) for e in (with_[:, 0].mean(), with_.mean(), without[:, 0].mean(), without.mean())))
-
-
-def in_order(errors: Sequence[float]) -> bool:
-    """Whether the errors strictly decrease, as those of the thesis's baselines do (Tables 4.1 and 4.2)."""
-    return all(before > after for before, after in pairwise(errors))

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body import skeleton
@@ -33,7 +33,7 @@ from wearcap.scene.scan import Scan
 from wearcap.sensors.initialization import Initialization, align_suit, estimate_head_camera, initialize, inliers
 from wearcap.sensors.packets import MAX_POSITION_M, MAX_TIME_S, OFF_THE_CLOCK, WRONG_TYPE, rotation_fault, values_fault
 from wearcap.sensors.samples import SuitPiece
-from wearcap.systems.hps.pipeline import HPS
+from wearcap.systems.hps.pipeline import HPS, mount
 
 MAX_UNALIGNED_S = 600.0
 """Length (s) of suit motion that is kept until the first alignment."""
@@ -66,7 +66,7 @@ def _suit_fault(suit: object, like: Motion | None) -> str | None:
     if not isinstance(suit, Motion) or not isinstance(suit.timestamps, Tensor) or suit.timestamps.ndim != 1:
         return WRONG_TYPE
     times, count, joints = suit.timestamps, len(suit.timestamps), len(suit.skeleton)
-    contact, before = suit.contact_prob, None if like is None else like.contact_prob
+    contact = suit.contact_prob
     patches = contact.shape[-1:] if isinstance(contact, Tensor) else ()
     fault = (
         _times_fault(times, MAX_PAUSE_S)
@@ -75,12 +75,9 @@ def _suit_fault(suit: object, like: Motion | None) -> str | None:
         or (None if contact is None else values_fault(contact, (count, *patches), 1.0))
     )
     if fault is None and like is not None:
-        same = like.skeleton.joint_names == suit.skeleton.joint_names and (contact is None) == (before is None)
-        return (
-            None
-            if same and (before is None or contact is None or before.shape[1:] == contact.shape[1:])
-            else WRONG_TYPE
-        )
+        shapes = [None if part is None else part.shape[1:] for part in (contact, like.contact_prob)]
+        if like.skeleton.joint_names != suit.skeleton.joint_names or shapes[0] != shapes[1]:
+            return WRONG_TYPE
     return fault
 
 
@@ -123,15 +120,13 @@ class HpsStream:
 
     def __init__(self, hps: HPS, about: Recording, scan: Scan | None, settings: StreamSettings | None = None):
         """Start a stream. `about` provides the wearer's shape and the camera with its mount; its streams are not read.
-
-        Raises WearcapError without a camera, or without a scan where the energy needs one.
-        """
+        Raises WearcapError without a camera, or without a scan where the energy needs one."""
         if about.camera is None:
             raise WearcapError("no camera in this recording", where=about.name, expected="its mount on the head")
         hps.require_scan(scan, about.name)
         self.hps, self.about, self.scan = hps, about, scan
         self.settings = settings or StreamSettings()
-        self.mount = Rigid(about.camera.R_head_cam, about.camera.t_head_cam)
+        self.mount = Rigid(*mount(about))
         self.refused: Counter[str] = Counter()
         """Number of refused pieces, or localisations of pieces, by reason such as "suit: off the clock"."""
         self._alone: tuple[Motion, Localization | None] | None = None
@@ -159,10 +154,7 @@ class HpsStream:
             self._finished.append(motion)
 
     def poses(self, ended: bool = False) -> Motion | None:
-        """Frames that became final since the last call, or None; `ended`: no more pieces will come.
-
-        Raises WearcapError as `finish` does.
-        """
+        """Frames that became final since the last call, or None; `ended`: no more pieces come. Raises as `finish`."""
         if ended and not self._finished:
             return self.finish()
         return self._finished.pop(0) if self._finished else None
@@ -181,10 +173,8 @@ class HpsStream:
         self._solved_to = -torch.inf
 
     def push(self, suit: Motion, localization: Localization | None = None) -> Motion | None:
-        """Add new suit motion and localisation; returns the frames that have become final, if any.
-
-        When a new stretch begins, the remaining frames of the previous one are returned.
-        """
+        """Add new suit motion and localisation; returns the frames that have become final, if any. When a new stretch
+        begins, the remaining frames of the previous one are returned."""
         fault = _suit_fault(suit, self._like)
         if fault is not None:
             self.refused[f"suit: {fault}"] += 1
@@ -192,7 +182,12 @@ class HpsStream:
         if not len(suit):
             return None
         self._like = self._like or suit
-        localization = self._checked(localization, suit)
+        if localization is not None:
+            if fault := _localization_fault(localization, suit):
+                self.refused[f"localization: {fault}"] += 1
+                localization = None
+            elif not len(localization.timestamps):
+                localization = None
         if self.suit is None or _follows(self.suit, suit):
             self._refuse_alone()
             self._add(suit, localization)
@@ -219,16 +214,6 @@ class HpsStream:
             self.refused[f"suit: {OFF_THE_CLOCK}"] += 1
             self._alone = None
 
-    def _checked(self, localization: object, suit: Motion) -> Localization | None:
-        """The localisation of a piece, or None if it is unusable."""
-        if localization is None:
-            return None
-        if fault := _localization_fault(localization, suit):
-            self.refused[f"localization: {fault}"] += 1
-            return None
-        assert isinstance(localization, Localization)
-        return localization if len(localization.timestamps) else None
-
     def _add(self, suit: Motion, localization: Localization | None) -> None:
         self.suit = joined([suit] if self.suit is None else [self.suit, suit])
         if localization is None:
@@ -242,10 +227,8 @@ class HpsStream:
             self.seen = Localization(*(torch.cat([getattr(part, name) for part in both]) for name in _LOCALIZED))
 
     def finish(self) -> Motion | None:
-        """Return the remaining frames at the end of the recording.
-
-        Raises WearcapError when every piece was refused, and when no piece was ever localised.
-        """
+        """Return the remaining frames at the end of the recording. Raises WearcapError when every piece was refused,
+        and when no piece was ever localised."""
         self._refuse_alone()
         if self.suit is None and self.refused:
             raise WearcapError(
@@ -275,8 +258,9 @@ class HpsStream:
         if self.seen is None:
             return False
         good = inliers(self.seen) & (self.seen.timestamps <= self.suit.timestamps[-1])
+        step = self.seen.timestamps.diff().median().item() if len(good) > 1 else 0.0
         count = int(good.sum())
-        if not count or (enough and count * _step(self.seen.timestamps) < self.settings.start_s):
+        if not count or (enough and count * step < self.settings.start_s):
             return False
         aligned, angle = align_suit(self.suit, self.seen, self.mount)
         turned = self.suit.t_world_root @ rotation.about_axis("z", angle).mT
@@ -293,7 +277,8 @@ class HpsStream:
         after = self.done.timestamps[-1].item() if self.done is not None else -torch.inf
         times = aligned.timestamps
         first = int(torch.searchsorted(times, after - settings.behind_s)) if self.done is not None else 0
-        data = self.hps.problem(self._recording(), aligned, start, self.scan, self.R_head_cam)[first:]
+        recording = replace(self.about, suit=self.suit, localization=self.seen)
+        data = self.hps.problem(recording, aligned, start, self.scan, self.R_head_cam)[first:]
         if self.done is not None:
             # Final frames constrain the window: their positions replace the camera's in the `hold` term.
             count = int((times[first:] <= self.done.timestamps[-1] + 0.5 / fps).sum())
@@ -329,10 +314,11 @@ class HpsStream:
     def _start(self, aligned: Motion) -> Initialization:
         """The window's initialisation; without localised frames the suit's motion goes on from the last final one."""
         seen = self.seen
-        if seen is not None and (_inside(seen, aligned) & inliers(seen)).any():
+        first, last = aligned.timestamps[0], aligned.timestamps[-1]
+        if seen is not None and (good := inliers(seen) & (seen.timestamps >= first) & (seen.timestamps <= last)).any():
             start = initialize(aligned, seen, self.mount.R, self.mount.t, self.hps.initialization)
             self.yaw = start.yaw_correction[-1].double()
-            sure = torch.where(inliers(seen) & _inside(seen, aligned), seen.confidence, 0.0)
+            sure = torch.where(good, seen.confidence, 0.0)
             nearest = torch.searchsorted(aligned.timestamps, seen.timestamps).clamp(max=len(aligned) - 1)
             self.R_head_cam = estimate_head_camera(
                 start.motion.joint("head").R[nearest].double(), seen.R_world_cam.double(), sure.double()
@@ -345,10 +331,6 @@ class HpsStream:
             carried = replace(carried, t_world_root=carried.t_world_root + move)
         lost = torch.zeros(len(aligned), dtype=torch.bool)
         return Initialization(carried, lost, self.yaw.expand(len(aligned)))
-
-    def _recording(self) -> Recording:
-        assert self.seen is not None
-        return replace(self.about, suit=self.suit, localization=self.seen)
 
     def _forget(self, before_s: float) -> None:
         """Drop frames that no later window needs."""
@@ -382,11 +364,8 @@ class HpsSession(Session):
     def load(
         cls, path: str | Path, system: HPS, wearers: Sequence[Recording] = (), scan: Scan | None = None
     ) -> "HpsSession":
-        """Restore a saved session with the pipeline, the wearers and the scan that it ran with.
-
-        Raises WearcapError for a file that is no session or is damaged, for a pipeline with other settings, and for
-        another number of wearers.
-        """
+        """Restore a saved session with the pipeline, the wearers and the scan that it ran with. Raises WearcapError as
+        `Session.load`, and for another number of wearers."""
         session = super().load(path, system)
         assert isinstance(session, HpsSession)
         if len(wearers) != len(session.streams):
@@ -435,7 +414,7 @@ def follow(
         localization = piece.localization
         if piece.camera is not None:
             try:
-                localization = hps.localize(piece, folder)
+                localization = hps.localization(piece, folder)
             except WearcapError:
                 if fresh:
                     raise
@@ -447,11 +426,3 @@ def follow(
     last = stream.finish() if stream is not None else None
     if last is not None:
         yield last
-
-
-def _step(timestamps: Float64[Tensor, "time"]) -> float:
-    return timestamps.diff().median().item() if len(timestamps) > 1 else 0.0
-
-
-def _inside(seen: Localization, motion: Motion) -> Tensor:
-    return (seen.timestamps >= motion.timestamps[0]) & (seen.timestamps <= motion.timestamps[-1])

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
@@ -13,11 +13,45 @@ from wearcap.geometry.trajectory import interpolate
 from wearcap.models.build import build
 from wearcap.models.checkpoint import read_checkpoint
 from wearcap.recording import Motion
-from wearcap.systems.ireplica.contact_sequence import ContactSequence
-from wearcap.systems.ireplica.contact_transformer import FRAMES, REACH, ContactNetwork, ContactTransformer
 from wearcap.systems.ireplica.features import FEATURES, PoseFeatures, in_skeleton, pose_frames, worn
 
-NETWORKS = {cls.__name__: cls for cls in (ContactTransformer, ContactSequence)}
+REACH = 30
+"""Number of context frames (at 60 Hz) on each side of a predicted frame."""
+FRAMES = 2 * REACH + 1
+
+
+class ContactNetwork(nn.Module):
+    """Maps poses of consecutive frames to contact logits per hand (left, right) and class of interaction.
+
+    Of `time` frames, those from `REACH` to `time - REACH - 1` have a prediction; the others lack context.
+    """
+
+    temperature: Tensor
+    frames_per_pass: int
+    """Number of predicted frames that are best computed in one pass."""
+
+    def __init__(self, classes: int):
+        super().__init__()
+        self.classes = classes
+        self.register_buffer("temperature", torch.ones(classes))
+
+    def forward(self, pose: Float[Tensor, "batch time feature"]) -> Float[Tensor, "batch out hand class"]:
+        raise NotImplementedError
+
+    def probability(self, pose: Float[Tensor, "batch time feature"]) -> Float[Tensor, "batch out hand class"]:
+        """Calibrated probabilities: sigmoid of the logits divided by a temperature fitted on validation data."""
+        return (self(pose) / self.temperature).sigmoid()
+
+    def middle_probability(self, pose: Float[Tensor, "batch time feature"]) -> Float[Tensor, "batch hand class"]:
+        """Calibrated probabilities of the middle one of 61 frames."""
+        return self.probability(pose)[:, 0]
+
+    def normalize_on(self, pose: Float[Tensor, "batch time feature"]) -> None:
+        """Set the statistics that normalise the inputs; the thesis's network has none."""
+
+
+NETWORKS = ("ContactTransformer", "ContactSequence")
+"""Names of the subclasses that a checkpoint may hold."""
 
 
 @dataclass(frozen=True)
@@ -67,9 +101,7 @@ class ContactDetector:
 
 class ContactPredictor:
     """Predicts contact probabilities per class of interaction, hand and frame of a motion, by one or more detectors.
-
-    The motion is padded at both ends with its first and last frame.
-    """
+    The motion is padded at both ends with its first and last frame."""
 
     def __init__(self, *detectors: ContactDetector):
         names = [name for detector in detectors for name in detector.classes]
@@ -89,10 +121,8 @@ class ContactPredictor:
 
     @torch.inference_mode()
     def __call__(self, motion: Motion) -> dict[str, Float[Tensor, "time hand"]]:
-        """Contact probabilities by class at the frames of `motion`, for any frame rate and skeleton.
-
-        Raises WearcapError for poses that are not numbers.
-        """
+        """Contact probabilities by class at the frames of `motion`, for any frame rate and skeleton. Raises
+        WearcapError for poses that are not numbers."""
         if not len(motion):
             return {name: torch.zeros(0, 2) for name in self.classes}
         result: dict[str, Tensor] = {}
@@ -122,10 +152,8 @@ class ContactStream:
 
     @torch.inference_mode()
     def push(self, R_parent_joint: Float[Tensor, "joint 3 3"]) -> dict[str, Float[Tensor, "hand"]] | None:
-        """Add a pose; returns the prediction for the frame `REACH` before it, None while there is no such frame.
-
-        Raises WearcapError for a pose that is not a number; the state is then unchanged.
-        """
+        """Add a pose; returns the prediction for the frame `REACH` before it, None while there is no such frame. Raises
+        WearcapError for a pose that is not a number; the state is then unchanged."""
         if not R_parent_joint.isfinite().all():
             raise WearcapError(f"the pose of frame {self._frames} is not a number", expected="a pose in every frame")
         features = [

@@ -6,7 +6,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from wearcap.models.layers import Normalizer
-from wearcap.systems.ireplica.contact_transformer import REACH, ContactNetwork
+from wearcap.systems.ireplica.contact_prediction import REACH, ContactNetwork
 
 _HANDS = 2
 

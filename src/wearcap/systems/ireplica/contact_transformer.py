@@ -7,60 +7,13 @@ import math
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from wearcap.errors import WearcapError
 from wearcap.models.weights import load_weights, read_weights
-
-REACH = 30
-"""Number of context frames (at 60 Hz) on each side of a predicted frame."""
-FRAMES = 2 * REACH + 1
-
-
-class ContactNetwork(nn.Module):
-    """Maps poses of consecutive frames to contact logits per hand (left, right) and class of interaction.
-
-    Of `time` frames, those from `REACH` to `time - REACH - 1` have a prediction; the others lack context.
-    """
-
-    temperature: Tensor
-    frames_per_pass: int
-    """Number of predicted frames that are best computed in one pass."""
-
-    def __init__(self, classes: int):
-        super().__init__()
-        self.classes = classes
-        self.register_buffer("temperature", torch.ones(classes))
-
-    def forward(self, pose: Float[Tensor, "batch time feature"]) -> Float[Tensor, "batch out hand class"]:
-        raise NotImplementedError
-
-    def probability(self, pose: Float[Tensor, "batch time feature"]) -> Float[Tensor, "batch out hand class"]:
-        """Calibrated probabilities: sigmoid of the logits divided by a temperature fitted on validation data."""
-        return (self(pose) / self.temperature).sigmoid()
-
-    def middle_probability(self, pose: Float[Tensor, "batch time feature"]) -> Float[Tensor, "batch hand class"]:
-        """Calibrated probabilities of the middle one of 61 frames."""
-        return self.probability(pose)[:, 0]
-
-    def normalize_on(self, pose: Float[Tensor, "batch time feature"]) -> None:
-        """Set the statistics that normalise the inputs; the thesis's network has none."""
-
-
-def fit_temperature(
-    logits: Float[Tensor, "sample class"], truth: Bool[Tensor, "sample class"]
-) -> Float[Tensor, "class"]:
-    """Temperatures (1/5 … 5) with the least cross-entropy, one per class (Guo et al. 2017); 1 where a class never occurs."""
-    candidates = torch.linspace(-1.6, 1.6, 161, device=logits.device).exp()
-    target = truth.to(logits.dtype)
-    losses = torch.stack(
-        [F.binary_cross_entropy_with_logits(logits / t, target, reduction="none").mean(0) for t in candidates]
-    )
-    best = candidates[losses.argmin(0)]
-    return torch.where(truth.any(0), best, torch.ones_like(best)).to(logits.dtype)
-
+from wearcap.systems.ireplica.contact_prediction import FRAMES, ContactNetwork
 
 _WIDTH, _HEADS, _LAYERS, _HANDS = 32, 8, 3, 2
 
@@ -144,13 +97,25 @@ def sinusoids(length: int) -> Float[Tensor, "place width"]:
 
 
 def load_released(path: str | Path, batch_axis: bool = True) -> ContactTransformer:
-    """Load the published network from a checkpoint of the released code, in evaluation mode.
-
-    Raises WearcapError that names missing or unexpected tensors and those of another size.
-    """
+    """Load the published network of a checkpoint of the released code, in evaluation mode. Raises WearcapError that
+    names missing or unexpected tensors and those of another size."""
+    released = read_weights(path)
+    # Encoder layers are recognised by `layers.0…` after any prefix, the linear layers around them by their shapes.
+    by_shape = {(_HANDS, _WIDTH): "decoder", (_HANDS, FRAMES * _HANDS): "aggregator"}
+    module = {}
+    for name, value in released.items():
+        if name.endswith(".weight") and value.ndim == 2 and "layers." not in name:
+            found = "encoder" if value.shape[0] == _WIDTH else by_shape.get(tuple(value.shape))
+            if found is not None:
+                module[name.removesuffix(".weight")] = found
     tensors = {}
-    for name, value in _renamed(read_weights(path)).items():
-        if name.rpartition(".")[2] != "pe":
+    for name, value in released.items():
+        owner, _, kind = name.rpartition(".")
+        if "layers." in name:
+            name = name[name.index("layers.") :]
+        elif owner in module:
+            name = f"{module[owner]}.{kind}"
+        if kind != "pe":
             tensors[name] = value
         elif not torch.allclose(value.flatten(0, -2), sinusoids(value.numel() // _WIDTH), atol=1e-5):
             raise WearcapError(f"the positions {name!r} are not the sinusoids of this network", where=path)
@@ -159,25 +124,3 @@ def load_released(path: str | Path, batch_axis: bool = True) -> ContactTransform
     tensors["temperature"] = network.temperature
     load_weights(network, tensors, name="iReplica's contact network", where=path)
     return network.eval()
-
-
-def _renamed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Released tensors under this module's names; tensors that do not belong to the network keep their names.
-
-    Encoder layers are recognised by `layers.0…` after any prefix, the linear layers around them by their shapes.
-    """
-    by_shape = {(_HANDS, _WIDTH): "decoder", (_HANDS, FRAMES * _HANDS): "aggregator"}
-    module = {}
-    for name, value in tensors.items():
-        if name.endswith(".weight") and value.ndim == 2 and "layers." not in name:
-            found = "encoder" if value.shape[0] == _WIDTH else by_shape.get(tuple(value.shape))
-            if found is not None:
-                module[name.removesuffix(".weight")] = found
-    result = {}
-    for name, value in tensors.items():
-        owner, _, kind = name.rpartition(".")
-        if "layers." in name:
-            result[name[name.index("layers.") :]] = value
-        else:
-            result[f"{module[owner]}.{kind}" if owner in module else name] = value
-    return result

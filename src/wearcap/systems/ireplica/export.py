@@ -14,8 +14,7 @@ from wearcap.geometry import rotation
 from wearcap.recording import Recording
 from wearcap.recording.motion import HANDS
 from wearcap.runtime.graphs import Call, Exports, Graph, Run
-from wearcap.systems.ireplica.contact_prediction import ContactDetector, ContactStream
-from wearcap.systems.ireplica.contact_transformer import FRAMES, ContactNetwork
+from wearcap.systems.ireplica.contact_prediction import FRAMES, ContactDetector, ContactNetwork, ContactStream
 from wearcap.systems.ireplica.features import FEATURES, pose_frames
 
 
@@ -54,10 +53,8 @@ class _ExportedDetector(ContactDetector):
     """The detector of an exported model."""
 
     def write(self, recording: Recording, path: str | Path) -> None:
-        """Predict hand contact in a recording frame by frame, and write times and probabilities as a table (.csv).
-
-        The latency is 30 frames, and the state the last 61. Raises WearcapError for a recording without poses.
-        """
+        """Predict hand contact frame by frame (latency 30 frames, state the last 61), and write times and probabilities
+        as a table (.csv). Raises WearcapError for a recording without poses."""
         motion = recording.suit or recording.motion
         if motion is None:
             raise WearcapError("this recording has no poses", where=recording.name, expected="a suit, or a motion")

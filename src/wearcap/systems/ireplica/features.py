@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Float64
@@ -16,19 +15,6 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import Motion
 from wearcap.recording.timing import resampled
-
-
-@runtime_checkable
-class PoseFeatures(Protocol):
-    """Encodes poses of a skeleton as feature vectors, frame by frame."""
-
-    @property
-    def skeleton(self) -> Skeleton: ...
-
-    @property
-    def size(self) -> int: ...
-
-    def encode(self, R_parent_joint: Float[Tensor, "*batch joint 3 3"]) -> Float[Tensor, "*batch feature"]: ...
 
 
 @dataclass(frozen=True)
@@ -83,16 +69,6 @@ class HandViews:
 
     def encode(self, R_parent_joint: Float[Tensor, "*batch joint 3 3"]) -> Float[Tensor, "*batch feature"]:
         """Encode poses of `skeleton`: the left hand's view (its side, other side, middle), then the right hand's."""
-        sides, middle = self._seen(R_parent_joint)
-        mirror = lambda x, signs: x * x.new_tensor(signs)  # noqa: E731
-        own, other = sides.unbind(-2)
-        flipped = mirror(other, _SIDE_SIGNS), mirror(own, _SIDE_SIGNS), mirror(middle, _MIDDLE_SIGNS)
-        return torch.cat([own, other, middle, *flipped], -1)
-
-    def _seen(
-        self, R_parent_joint: Float[Tensor, "*batch joint 3 3"]
-    ) -> tuple[Float[Tensor, "*batch side 19"], Float[Tensor, "*batch 13"]]:
-        """Features of each side (left, right) and of the middle of the body."""
         body, root = self.skeleton, R_parent_joint[..., 0, :, :]
         R_root = rotation.about_axis("z", -rotation.yaw_of(root)) @ root
         R = torch.cat([R_root[..., None, :, :], R_parent_joint[..., 1:, :, :]], -3)
@@ -104,7 +80,7 @@ class HandViews:
             body.indices(f"left_{joint}", f"right_{joint}") for joint in ("elbow", "wrist", "ankle")
         )
         palms, origin = site_positions(body, T, ("left_palm", "right_palm")), T.t[..., [chest], :]
-        sides = [
+        sides = [  # "*batch side 19"
             palms - origin,
             T.t[..., elbows, :] - origin,
             T.t[..., ankles, :],
@@ -112,15 +88,20 @@ class HandViews:
             rotation.rot6d_from_matrix(T.R[..., wrists, :, :]),
             palms[..., 2:] - floor,
         ]
-        middle = [
+        parts = [
             T.R[..., head, :, 0],
             R_root[..., 2],
             rotation.rot6d_from_matrix(T.R[..., chest, :, :]),
             -floor[..., 0],
         ]
-        return torch.cat(sides, -1), torch.cat(middle, -1)
+        own, other = torch.cat(sides, -1).unbind(-2)
+        middle = torch.cat(parts, -1)
+        mirror = lambda x, signs: x * x.new_tensor(signs)  # noqa: E731
+        flipped = mirror(other, _SIDE_SIGNS), mirror(own, _SIDE_SIGNS), mirror(middle, _MIDDLE_SIGNS)
+        return torch.cat([own, other, middle, *flipped], -1)
 
 
+PoseFeatures = SmplAngles | HandViews
 FEATURES = {cls.__name__: cls for cls in (SmplAngles, HandViews)}
 
 
@@ -143,9 +124,7 @@ def pose_frames(
     motion: Motion, skeleton: Skeleton, fps: float
 ) -> tuple[Float64[Tensor, "time_f"], Float[Tensor, "time_f joint 3 3"]]:
     """Timestamps and joint rotations of a motion, resampled to `fps` and retargeted to `skeleton` where necessary.
-
-    Raises WearcapError for frames that are not finite.
-    """
+    Raises WearcapError for frames that are not finite."""
     bad = ~motion.R_parent_joint.isfinite().flatten(1).all(1) | ~motion.timestamps.isfinite()
     if bad.any():
         raise WearcapError(

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.io.formats.environment import read_environment
+from wearcap.metrics.objects import summary
 from wearcap.metrics.table import Row
 from wearcap.recording import Motion
 from wearcap.recording.timing import resampled
@@ -21,10 +22,7 @@ from wearcap.runtime.system import CaptureInput
 from wearcap.scene.environment import Environment
 from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 from wearcap.systems.ireplica.object_tracker import ObjectTracker
-from wearcap.systems.ireplica.scores import with_interactions
-
-Predictor = Callable[[Motion], dict[str, Float[Tensor, "time hand"]]]
-"""Contact probabilities by class, at a motion's frames, from its pose alone."""
+from wearcap.systems.ireplica.scores import score_interactions
 
 
 @dataclass(eq=False)
@@ -33,7 +31,8 @@ class IReplica(StagedSystem):
 
     registration: StagedSystem
     """HPS, or another pipeline that registers the wearer in the scene."""
-    predictor: Predictor
+    predictor: Callable[[Motion], dict[str, Float[Tensor, "time hand"]]]
+    """Contact probabilities by class, at a motion's frames, from its pose alone."""
     tracker: ObjectTracker
     environment: str | Path | None = None
     """File of the objects; None: the recording's environment."""
@@ -96,7 +95,11 @@ class IReplica(StagedSystem):
 
     def score(self, motion: Motion, source: CaptureInput, seed: int) -> Row:
         """The common scores, and means over handlings for recordings with true interactions (thesis Tables 5.1, 5.2)."""
-        return with_interactions(super().score(motion, source, seed), motion, source, self.environment)
+        row, path = super().score(motion, source, seed), source.environment_file(self.environment)
+        if source.recording.interactions is None or path is None:
+            return row
+        scores = score_interactions(motion, source.recording, read_environment(path))
+        return replace(row, scores=row.scores | summary(scores.handlings))
 
     def registered(self, source: CaptureInput) -> Motion:
         """The wearer's motion in the scene, without objects. Raises WearcapError as the registration does."""

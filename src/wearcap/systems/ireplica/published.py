@@ -38,10 +38,8 @@ def static_objects(motion: Motion, environment: Environment) -> Motion:
 def interpolated_objects(
     motion: Motion, environment: Environment, held: Interactions, true: dict[str, Trajectory]
 ) -> Motion:
-    """Row "HPS w/ GT": true times of handlings and true final poses of objects, interpolated in between.
-
-    Linear in the object's origin and in the rotation angle, from each handling's start to its end.
-    """
+    """Row "HPS w/ GT": true times of handlings and true final poses of objects; in between origin and rotation angle
+    are interpolated linearly, from each handling's start to its end."""
     tracks = object_trajectories(environment, [], motion.timestamps)
     for name, start, stop in handlings(held.start_s, held.stop_s, held.objects):
         scene_object, times = environment.by_name(name), motion.timestamps
@@ -64,10 +62,8 @@ def interpolated_objects(
 
 
 def held_when_near(tracker: ObjectTracker, registered: Motion, environment: Environment) -> Motion:
-    """The whole method without a contact network: hands hold objects within `NEAR_M`.
-
-    Contacts and object positions depend on each other, so both are computed alternately, `ROUNDS` times.
-    """
+    """The whole method without a contact network: hands hold objects within `NEAR_M`. Contacts and object positions
+    depend on each other and are computed alternately, `ROUNDS` times."""
     captured = static_objects(registered, environment)
     for _ in range(ROUNDS):
         near = nearness(registered, captured.object_motion or {}, environment)
@@ -100,10 +96,6 @@ class BentSuit(PlacedSuit):
     name: str = "bent_suit"
     synchronization: Synchronization = field(default_factory=Synchronization)
     localization: Localize = field(default_factory=MapLocalization)
-
-    @property
-    def placing(self) -> Callable[..., BentPath]:
-        return self.bend
 
     def place(self, recording: Recording) -> Motion:
         """Compute F_tr(l, p) of eq. 5.2; p are root positions from the localised camera positions, without outliers."""

@@ -3,14 +3,11 @@
 No alignment is applied before measuring.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float64
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from wearcap.body.anny_body import anny_body
@@ -18,13 +15,12 @@ from wearcap.body.kinematics import site_positions
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
-from wearcap.io.formats.environment import read_environment
-from wearcap.metrics.objects import Handling, contact_mean, handlings, object_error, summary
+from wearcap.metrics.objects import Handling, contact_mean, handlings, object_error
 from wearcap.metrics.position import mpjpe_cm
-from wearcap.metrics.table import Row
+from wearcap.metrics.surface import chamfer
 from wearcap.recording import Motion, Recording
+from wearcap.recording.motion import Interactions
 from wearcap.recording.timing import at_times
-from wearcap.runtime.system import CaptureInput
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
 from wearcap.systems.ireplica.object_tracker import PALMS
@@ -51,10 +47,8 @@ class _InteractionScores:
 
 
 def score_interactions(motion: Motion, recording: Recording, environment: Environment) -> _InteractionScores:
-    """Score one capture; its object motion may lack objects that never moved.
-
-    Raises WearcapError when the recording lacks a true motion, interactions or object motion, or the capture objects.
-    """
+    """Score one capture; its object motion may lack objects that never moved. Raises WearcapError when the recording
+    lacks a true motion, interactions or object motion, or the capture objects."""
     truth, held = recording.motion, recording.interactions
     if truth is None or held is None or not recording.object_motion:
         raise WearcapError(
@@ -79,18 +73,9 @@ def score_interactions(motion: Motion, recording: Recording, environment: Enviro
     body, objects = _chamfer(motion, true, recording, rows, environment, found, real)
     joints = mpjpe_cm(motion.T_world_joint.t, true.T_world_joint.t).item()
     untouched = [scene_object for scene_object in environment.objects if scene_object.name not in held.objects]
-    ends = [object_error(found[t.name][[-1]], found[t.name][[0]], _middle_of(t)).distance_cm[0] for t in untouched]
+    ends = [object_error(found[t.name][[-1]], found[t.name][[0]], _middle_of(t))[0][0] for t in untouched]
     false_moves = float(torch.stack(ends).mean()) if ends else 0.0
     return _InteractionScores(tuple(scored), joints, body, objects, false_moves)
-
-
-def with_interactions(row: Row, motion: Motion, source: CaptureInput, environment: str | Path | None) -> Row:
-    """A row of scores with means over handlings, for recordings with true interactions and objects."""
-    path = source.environment_file(environment)
-    if source.recording.interactions is None or path is None:
-        return row
-    scores = score_interactions(motion, source.recording, read_environment(path))
-    return replace(row, scores=row.scores | summary(scores.handlings))
 
 
 def poses_at(track: Trajectory | None, scene_object: SceneObject, timestamps: Float64[Tensor, "time"]) -> Rigid:
@@ -115,78 +100,57 @@ def _handling(row, rows, environment, held, timestamps, palms, found, real) -> H
     end = max(int(torch.searchsorted(timestamps, min(stop + SETTLED_S, again))) - 1, 0)
     begin = int(torch.searchsorted(timestamps, start).clamp(max=len(timestamps) - 1))
     middle = _middle_of(scene_object)
-    left = object_error(found[name][end], real[name][end], middle)
-    own = replace(
-        held, **_only(held, [o == name and start <= a < stop for o, a in zip(held.objects, held.start_s.tolist())])
-    )
+    left_cm, left_deg = object_error(found[name][end], real[name][end], middle)
+    own = [o == name and start <= a < stop for o, a in zip(held.objects, held.start_s.tolist())]
+    mine = torch.tensor(own, dtype=torch.bool)
+    unnamed = ("",) * int(mine.sum())
+    held = Interactions(held.start_s[mine], held.stop_s[mine], held.hands[mine], unnamed, unnamed)
     frames = slice(begin, max(int(torch.searchsorted(timestamps, stop)), begin + 1))
-    contact = own.hand_contact(timestamps[frames])
+    contact = held.hand_contact(timestamps[frames])
     apart = torch.stack(
         [environment.distance(name, palms[0][frames, hand], found[name][frames])[0] for hand in range(2)], 1
     )
-    during = object_error(found[name][frames], real[name][frames], middle)
-    moved = object_error(real[name][[end]], real[name][[begin]], middle)
+    during_cm, during_deg = object_error(found[name][frames], real[name][frames], middle)
+    moved_cm, _ = object_error(real[name][[end]], real[name][[begin]], middle)
     return Handling(
         name,
         scene_object.category,
         start,
         stop,
-        float(left.distance_cm),
-        float(left.angle_deg),
-        float(moved.distance_cm[0]),
+        float(left_cm),
+        float(left_deg),
+        float(moved_cm[0]),
         100 * float(contact_mean(apart, contact)),
         100 * float(contact_mean((palms[0] - palms[1])[frames].norm(dim=-1), contact)),
-        float(during.distance_cm.mean()),
-        float(during.angle_deg.mean()),
+        float(during_cm.mean()),
+        float(during_deg.mean()),
     )
-
-
-def _only(held, chosen: Sequence[bool]) -> dict:
-    keep = torch.tensor(chosen, dtype=torch.bool)
-    pick = lambda names: tuple(name for name, on in zip(names, chosen) if on)  # noqa: E731
-    return {
-        "start_s": held.start_s[keep],
-        "stop_s": held.stop_s[keep],
-        "hands": held.hands[keep],
-        "objects": pick(held.objects),
-        "classes": pick(held.classes),
-    }
 
 
 def _chamfer(
     motion: Motion, true: Motion, recording: Recording, rows, environment: Environment, found, real
 ) -> tuple[float, float]:
-    """Symmetric mean distances (cm) between captured and true surfaces of body and handled object, once a second."""
+    """Chamfer distances (cm) between captured and true surfaces of body and handled object, once a second."""
     body = anny_body(motion.skeleton, recording.shape or None)
+    thinned = slice(None, None, max(1, len(body.rest_vertices) // CHAMFER_POINTS))
     errors: tuple[list[float], list[float]] = ([], [])
     for name, start, stop in rows:
         times = torch.arange(start, stop, CHAMFER_EVERY_S, dtype=torch.float64)
         frames = torch.searchsorted(motion.timestamps, times).clamp(max=len(motion) - 1).tolist()
-        surface = _surface_points(environment.by_name(name))
+        # Points uniform by area on the object's surface (without faces: its vertices), always the same.
+        vertices, faces = environment.by_name(name).mesh.vertices, environment.by_name(name).mesh.faces
+        rng = np.random.default_rng(0)
+        if len(faces):
+            a, b, c = (vertices[faces[:, k]] for k in range(3))
+            area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+            chosen = rng.choice(len(faces), CHAMFER_POINTS, p=area / area.sum())
+            u, v = rng.uniform(size=(2, CHAMFER_POINTS, 1)).astype(np.float32)
+            u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+            surface = torch.from_numpy(a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen])
+        else:
+            surface = torch.from_numpy(vertices[rng.permutation(len(vertices))[:CHAMFER_POINTS]])
         for frame in frames:
-            bodies = [_thinned(body.vertices(m.T_world_joint[frame]).numpy()) for m in (motion, true)]
-            errors[0].append(_both_ways(*bodies))
-            errors[1].append(_both_ways(*((T[name][frame].to(torch.float32) @ surface).numpy() for T in (found, real))))
+            bodies = [body.vertices(m.T_world_joint[frame])[thinned] for m in (motion, true)]
+            errors[0].append(chamfer(*bodies).mean_cm)
+            errors[1].append(chamfer(*(T[name][frame].to(torch.float32) @ surface for T in (found, real))).mean_cm)
     return tuple(float(np.mean(part)) if part else float("nan") for part in errors)  # pyright: ignore[reportReturnType]
-
-
-def _surface_points(scene_object: SceneObject) -> Float[Tensor, "point 3"]:
-    """`CHAMFER_POINTS` points, uniform by area on an object's surface (without faces: its vertices); a fixed seed."""
-    vertices, faces = scene_object.mesh.vertices, scene_object.mesh.faces
-    rng = np.random.default_rng(0)
-    if not len(faces):
-        return torch.from_numpy(vertices[rng.permutation(len(vertices))[:CHAMFER_POINTS]])
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    chosen = rng.choice(len(faces), CHAMFER_POINTS, p=area / area.sum())
-    u, v = rng.uniform(size=(2, CHAMFER_POINTS, 1)).astype(np.float32)
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    return torch.from_numpy(a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen])
-
-
-def _thinned(points: np.ndarray) -> np.ndarray:
-    return points[:: max(1, len(points) // CHAMFER_POINTS)]
-
-
-def _both_ways(a: np.ndarray, b: np.ndarray) -> float:
-    return 50.0 * float(KDTree(a).query(b)[0].mean() + KDTree(b).query(a)[0].mean())

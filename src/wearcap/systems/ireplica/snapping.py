@@ -14,8 +14,7 @@ from wearcap.recording import Motion
 from wearcap.recording.motion import HANDS
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
-from wearcap.systems.ireplica.contact_intervals import ContactInterval
-from wearcap.systems.ireplica.object_tracker import PALMS, Correction, Held
+from wearcap.systems.ireplica.object_tracker import PALMS, ContactInterval, Correction, Held
 from wearcap.tracking.anchor import with_hand_moved
 
 FIT_FRAMES = 60
@@ -93,8 +92,6 @@ class SnapCorrection(Correction):
         return self._targets[frames]
 
     def finish(self, held: list[Held]) -> Float[Tensor, "time 2"]:
-        if not held:
-            return self._targets
         return offset_for(self._targets, self._weights, self._timestamps, self.offset_settings)
 
 
@@ -135,10 +132,8 @@ class HandSnapping:
     """Largest displacement (m) of a hand."""
 
     def __call__(self, motion: Motion, held: Sequence[Held], environment: Environment) -> Motion:
-        """Bend the arms so that each holding palm stays at its point of the object.
-
-        That point is the object's point nearest to the palm when its hold begins. Hands keep their world orientation.
-        """
+        """Bend the arms so that each holding palm stays at its point of the object: the one nearest to it when its hold
+        begins. Hands keep their world orientation."""
         palms = site_positions(motion.skeleton, motion.T_world_joint, PALMS)
         for hand, side in enumerate(HANDS):
             targets, weights = self._targets(palms[:, hand].double(), hand, held, environment)

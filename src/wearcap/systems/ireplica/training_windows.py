@@ -35,23 +35,20 @@ class PoseNoise:
 
     def __call__(self, window: Window, random: Draws) -> Window:
         frames, joints = window.values["R_parent_joint"].shape[:2]
-        return window.changed(error=pose_errors(frames, joints, self.largest_deg, random.generator))
+        return window.changed(error=self.errors(frames, joints, random.generator))
 
-
-def pose_errors(
-    frames: int, joints: int, greatest_deg: float, random: torch.Generator
-) -> Float[Tensor, "time joint 3"]:
-    """Pose noise as rotation vectors (rad) of random size: a mixture of constant, slow (1 s) and per-frame noise."""
-    size, *shares = torch.rand(4, generator=random).tolist()
-    scale = math.radians(greatest_deg * size) / math.sqrt(3 * sum(share**2 for share in shares))
-    knots = torch.randn(2 + frames // 60, 3 * joints, generator=random)
-    place = torch.linspace(0, len(knots) - 1, frames)
-    below = place.long().clamp(max=len(knots) - 2)
-    slow = torch.lerp(knots[below], knots[below + 1], (place - below)[:, None])
-    fixed = torch.randn(1, 3 * joints, generator=random)
-    quick = torch.randn(frames, 3 * joints, generator=random)
-    error = scale * (shares[0] * fixed + shares[1] * slow + shares[2] * quick)
-    return rearrange(error, "time (joint axis) -> time joint axis", axis=3)
+    def errors(self, frames: int, joints: int, random: torch.Generator) -> Float[Tensor, "time joint 3"]:
+        """Rotation vectors (rad) of one window; the slow noise changes within a second."""
+        size, *shares = torch.rand(4, generator=random).tolist()
+        scale = math.radians(self.largest_deg * size) / math.sqrt(3 * sum(share**2 for share in shares))
+        knots = torch.randn(2 + frames // 60, 3 * joints, generator=random)
+        place = torch.linspace(0, len(knots) - 1, frames)
+        below = place.long().clamp(max=len(knots) - 2)
+        slow = torch.lerp(knots[below], knots[below + 1], (place - below)[:, None])
+        fixed = torch.randn(1, 3 * joints, generator=random)
+        quick = torch.randn(frames, 3 * joints, generator=random)
+        error = scale * (shares[0] * fixed + shares[1] * slow + shares[2] * quick)
+        return rearrange(error, "time (joint axis) -> time joint axis", axis=3)
 
 
 @dataclass(frozen=True, eq=False)
