@@ -15,8 +15,7 @@ from wearcap.body.model import BodyModel
 from wearcap.body.retarget import retarget
 from wearcap.body.skeletons import smplh52
 from wearcap.body.smpl_body import smpl_body
-from wearcap.cli.conf import hydra_main
-from wearcap.cli.load import load_pipeline
+from wearcap.cli.conf import hydra_main, load_pipeline
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.io.datasets.amass import write_amass

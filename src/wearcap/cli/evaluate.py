@@ -7,8 +7,7 @@ from omegaconf import DictConfig, ListConfig
 from rich import print as show
 from rich.progress import Progress
 
-from wearcap.cli.conf import hydra_main
-from wearcap.cli.load import load_systems, trained_on
+from wearcap.cli.conf import hydra_main, load_systems, trained_on
 from wearcap.errors import WearcapError
 from wearcap.evaluation.baselines import BASELINES
 from wearcap.evaluation.evaluate import Realism, evaluate
