@@ -73,7 +73,7 @@ def _prepare(folder: Path, finished: Finished) -> None:
     done = _registered(folder)
     for turn in range(done // RECORDINGS, 1_000_000):
         tasks = [Task(f"r{k:02}", partial(_recording, k), "train", f"{turn:06}") for k in range(RECORDINGS)]
-        prepare(tasks, folder, jobs=1, progress=False)
+        prepare(tasks, folder, jobs=1)
         finished(RECORDINGS * (turn + 1))
 
 

@@ -188,18 +188,6 @@ def _dotted(config: Any, prefix: str = "") -> Iterator[str]:
                 yield from _dotted(value, f"{prefix}{key}.")
 
 
-def load(
-    pipeline: str, *overrides: str, checkpoint: str | Path | Sequence[str] | None = None, device: str = "cpu"
-) -> System:
-    """The system that `wearcap capture pipeline=… checkpoint=…` runs; without a checkpoint, the shared one's network.
-
-    `overrides` are those of the command line ("pipeline.steps=20"). Raises WearcapError for an unknown pipeline or
-    setting, and for a checkpoint that the pipeline cannot use.
-    """
-    config = compose("capture", [f"pipeline={pipeline}", *overrides, "recording=none"])
-    return load_pipeline(checkpoint, config.pipeline, device, shared=True)
-
-
 def load_pipeline(
     checkpoint: str | Path | Sequence[str] | None, pipeline: DictConfig, device: str, shared: bool = False
 ) -> System:

@@ -8,8 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from wearcap.cli.conf import compose, conf_dir, explained, nearest, splits_dir
 from wearcap.errors import WearcapError
-from wearcap.prepare.engine import Report, prepare
-from wearcap.prepare.splits import Splits
+from wearcap.prepare.engine import Report, Splits, prepare
 from wearcap.recording.store import SPLITS, RecordingStore
 
 HELP = "make a data set: wearcap prepare simulated, wearcap prepare cmu source=DIR"

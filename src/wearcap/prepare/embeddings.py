@@ -18,11 +18,7 @@ from wearcap.recording.store import Entry, RecordingFile, RecordingStore, save_r
 
 
 def embed_dataset(
-    dataset: str | Path,
-    encoder: ImageEncoder,
-    cache: str | Path | None = None,
-    overwrite: bool = False,
-    progress: bool = True,
+    dataset: str | Path, encoder: ImageEncoder, cache: str | Path | None = None, overwrite: bool = False
 ) -> Report:
     """Add embeddings by `encoder` to every recording with head-camera pictures, rewriting its file.
 
@@ -38,7 +34,7 @@ def embed_dataset(
         remove_leftovers(root, below=True)
         store = RecordingStore.open(root)
         try:
-            with progress_bar(len(store.entries), 0, progress) as advance:
+            with progress_bar(len(store.entries), 0) as advance:
                 for name in store.names():
                     try:
                         file = RecordingFile(store.path_of(name), verify=_is_registered(store, name))
@@ -69,9 +65,8 @@ def embed_dataset(
 
 def _is_current(store: RecordingStore, name: str, camera: CameraStream, embedded_by: str) -> bool:
     """Whether a recording is up to date; a file of a killed run that is not in the manifest yet is written again."""
-    known = _is_registered(store, name)
     both = camera.embedding is not None and camera.embedding_mirrored is not None
-    return known and both and camera.embedding_name == embedded_by
+    return both and camera.embedding_name == embedded_by and _is_registered(store, name)
 
 
 def _is_registered(store: RecordingStore, name: str) -> bool:
@@ -85,9 +80,8 @@ def _embed(
 ) -> Entry:
     recording, entry = file.load(), store.entries[name]
     assert recording.camera is not None
-    recording = replace(
-        recording, camera=embed_camera(recording.camera, store.root, encoder, None if cache is None else Path(cache))
-    )
+    camera = embed_camera(recording.camera, store.root, encoder, None if cache is None else Path(cache))
+    recording = replace(recording, camera=camera)
     check_recording(recording)
     save_recording(recording, store.path_of(name))
     return Entry.of(recording, store.root, entry.split, entry.config_hash)

@@ -16,9 +16,8 @@ from wearcap.io.datasets.amass import read_amass
 from wearcap.io.formats.asf_amc import read_amc, read_asf
 from wearcap.io.formats.bvh import read_bvh, read_cmu_bvh
 from wearcap.io.formats.text import read_text
-from wearcap.prepare.engine import Task, content_hash, source_folder
+from wearcap.prepare.engine import Splits, Task, content_hash, source_folder
 from wearcap.prepare.mocap import About, MocapSettings, mocap_recording, on_xsens23
-from wearcap.prepare.splits import Splits
 from wearcap.recording.recording import Recording
 
 CMU_VERSION, AMASS_VERSION = 2, 1

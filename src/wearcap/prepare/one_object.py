@@ -19,9 +19,8 @@ from wearcap.io.datasets.behave import BODY_FILE, INFO_FILE, OBJECT_FILE, behave
 from wearcap.io.datasets.omomo import OmomoSequence, omomo_mesh_path, omomo_take, read_omomo
 from wearcap.io.datasets.one_object import OneObject
 from wearcap.io.formats.environment import FILE_NAME, write_environment
-from wearcap.prepare.engine import NOTE, Task, content_hash
+from wearcap.prepare.engine import NOTE, Splits, Task, content_hash
 from wearcap.prepare.mocap import About, MocapSettings, foot_patches, mocap_recording, on_xsens23, without_glitches
-from wearcap.prepare.splits import Splits
 from wearcap.recording.recording import Recording
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject

@@ -24,8 +24,7 @@ from wearcap.geometry import rotation
 from wearcap.io.formats.environment import FILE_NAME, write_environment
 from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.io.formats.scene_folder import CLOUD
-from wearcap.prepare.engine import Task, content_hash
-from wearcap.prepare.splits import Splits
+from wearcap.prepare.engine import Splits, Task, content_hash
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import SPLITS, RecordingFile, RecordingStore
 from wearcap.sensors.slam import semidense_points

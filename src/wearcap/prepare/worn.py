@@ -25,8 +25,7 @@ from wearcap.io.datasets.mocap_every_folder import (
 from wearcap.io.datasets.nymeria import head_vrs, is_nymeria, read_metadata, read_nymeria
 from wearcap.io.devices.aria_mps import is_mps_folder, mps_files, read_mps
 from wearcap.io.formats.environment import FILE_NAME, write_environment
-from wearcap.prepare.engine import NOTE, Task, changed, content_hash, source_folder
-from wearcap.prepare.splits import Splits
+from wearcap.prepare.engine import NOTE, Splits, Task, changed, content_hash, source_folder
 from wearcap.recording.recording import Recording
 from wearcap.recording.timing import resampled
 from wearcap.sensors.camera_alignment import align_by_walks

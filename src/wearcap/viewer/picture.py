@@ -263,7 +263,6 @@ def write_video(
     body: BodyModel | None = None,
     environment: Environment | None = None,
     max_seconds: float | None = None,
-    progress: bool = True,
 ) -> None:
     """Write panels of `size` (width, height) side by side, one per motion, on their shared clock.
 
@@ -282,7 +281,7 @@ def write_video(
         stream = container.add_stream(codec, rate=round(fps))
         assert isinstance(stream, av.VideoStream)
         stream.width, stream.height, stream.pix_fmt = size[0] * len(shown), size[1], "yuv420p"
-        for time in track(times, f"video {Path(path).name}", console=Console(stderr=True), disable=not progress):
+        for time in track(times, f"video {Path(path).name}", console=Console(stderr=True)):
             frames = [int(np.abs(clock - time).argmin()) for clock in clocks]
             target = _focus(shown[0].motion, frames[0])
             panels = [
