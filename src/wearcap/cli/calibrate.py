@@ -134,11 +134,8 @@ def run_watches(config: DictConfig) -> WornCalibration | None:
     if config.guide:
         return None
     if missing:
-        raise WearcapError(
-            f"no {', '.join(missing)}",
-            expected="every step's stretch, as listed above",
-            fix="Give them as " + " ".join(f"{key}=[…]" for key in missing) + ".",
-        )
+        fix = "Give them as " + " ".join(f"{key}=[…]" for key in missing) + "."
+        raise WearcapError(f"no {', '.join(missing)}", expected="every step's stretch, as listed above", fix=fix)
     target, recording = None if config.recording is None else Path(config.recording), None
     if target is not None:
         new = target.suffix == ".safetensors" and not target.exists()

@@ -205,19 +205,14 @@ def load_systems(given: Sequence[str | Path], pipeline: DictConfig, device: str,
     made = instantiate(pipeline, _convert_="all")
     if isinstance(made, System):
         if given:
-            raise WearcapError(
-                f"a checkpoint, but {type(made).__name__} has no network",
-                where=given[0],
-                fix="Leave checkpoint=… out, or choose another pipeline=….",
-            )
+            what = f"a checkpoint, but {type(made).__name__} has no network"
+            raise WearcapError(what, where=given[0], fix="Leave checkpoint=… out, or choose another pipeline=….")
         return [made]
     kind: type[System] = made.func
     given = given or (list(kind.shared) if shared else [])
     if not given:
-        raise WearcapError(
-            f"no checkpoint, but {kind.__name__} needs a trained network",
-            fix="Give checkpoint=…, or a pipeline without one, such as pipeline=hps.",
-        )
+        fix = "Give checkpoint=…, or a pipeline without one, such as pipeline=hps."
+        raise WearcapError(f"no checkpoint, but {kind.__name__} needs a trained network", fix=fix)
     together = [given] if kind.joins_checkpoints else [[checkpoint] for checkpoint in given]
     return [kind.trained(made, checkpoints, device) for checkpoints in together]
 
@@ -229,11 +224,8 @@ def trained_on(checkpoint: str | Path) -> tuple[list[str], str]:
     """
     data = read_checkpoint(checkpoint)[0].get("data", {})
     if not data.get("sources"):
-        raise WearcapError(
-            "this checkpoint does not name the data it was trained on",
-            where=checkpoint,
-            fix="Give dataset=DIR and baselines=false.",
-        )
+        what = "this checkpoint does not name the data it was trained on"
+        raise WearcapError(what, where=checkpoint, fix="Give dataset=DIR and baselines=false.")
     sources = [source["root"] for source in data["sources"].values() if source]
     validated = [source["root"] for source in (data.get("val_sources") or data["sources"]).values() if source]
     return sources, validated[0]

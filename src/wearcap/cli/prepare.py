@@ -18,11 +18,8 @@ def run(config: DictConfig) -> Report:
     """Run the config's preparation: recordings by `tasks`, or by `rework` a change of an existing data set."""
     if "rework" in config:
         if "output" not in config.rework and Path(config.output) != Path(config.dataset):
-            raise WearcapError(
-                f"output={config.output}, but this source rewrites the recordings of its data set",
-                where=config.dataset,
-                fix="Leave output=… out, or copy the data set first.",
-            )
+            what = f"output={config.output}, but this source rewrites the recordings of its data set"
+            raise WearcapError(what, where=config.dataset, fix="Leave output=… out, or copy the data set first.")
         report = instantiate(config.rework, _convert_="all")
     else:
         listed = splits_dir() / config.splits

@@ -55,11 +55,8 @@ def embed_dataset(
         finally:
             store.register(pending)
     if len(report.notes) == len(store.entries):
-        raise WearcapError(
-            "no recording has a head camera's pictures",
-            where=store.root,
-            fix="Prepare it with them, as `wearcap prepare simulated camera=true` does.",
-        )
+        fix = "Prepare it with them, as `wearcap prepare simulated camera=true` does."
+        raise WearcapError("no recording has a head camera's pictures", where=store.root, fix=fix)
     return report
 
 

@@ -84,11 +84,8 @@ class Splits:
                     return split
                 share = int.from_bytes(hashlib.sha256(subject.encode()).digest()[:4], "big") / 2**32
                 return "val" if share < 0.05 else "test" if share < 0.20 else "train"
-        raise WearcapError(
-            f"subject {subject!r} is in no split",
-            where=self.path,
-            fix="Add a row with it, or a last row such as '*,train'.",
-        )
+        fix = "Add a row with it, or a last row such as '*,train'."
+        raise WearcapError(f"subject {subject!r} is in no split", where=self.path, fix=fix)
 
     @classmethod
     def read(cls, path: str | Path) -> "Splits":
@@ -188,11 +185,8 @@ def _collect(
                     pending, written_at = {}, time.monotonic()
                 advance()
     except BrokenExecutor as error:
-        raise WearcapError(
-            "a worker process was killed (out of memory?)",
-            where=store.root,
-            fix="What is finished is kept: run again with fewer jobs.",
-        ) from error
+        fix = "What is finished is kept: run again with fewer jobs."
+        raise WearcapError("a worker process was killed (out of memory?)", where=store.root, fix=fix) from error
     finally:
         store.register(pending)
     report.written.sort()
@@ -274,10 +268,8 @@ def _backend(backend: str, jobs: int, scheduler: str | None, lock: int | None) -
             with joblib.parallel_config(backend):
                 yield True
     except ModuleNotFoundError as error:
-        raise WearcapError(
-            f"the backend {backend!r} needs the package {error.name!r}",
-            fix=f"pip install {'wearcap[cluster]' if backend == 'dask' else 'ray'}",
-        ) from error
+        fix = f"pip install {'wearcap[cluster]' if backend == 'dask' else 'ray'}"
+        raise WearcapError(f"the backend {backend!r} needs the package {error.name!r}", fix=fix) from error
 
 
 @contextmanager
@@ -326,11 +318,8 @@ def check_recording(recording: Recording) -> None:
             raise WearcapError(f"{part} has {len(times)} frames", where=where, expected=expected)
         fps = (len(times) - 1) / duration
         if not RATES_HZ[0] <= fps <= RATES_HZ[1]:
-            raise WearcapError(
-                f"{part} runs at {fps:.4g} frames per second",
-                where=where,
-                expected=f"{RATES_HZ[0]:g} to {RATES_HZ[1]:g}",
-                fix="Give the true frame rate of the source.",
-            )
+            what = f"{part} runs at {fps:.4g} frames per second"
+            fix = "Give the true frame rate of the source."
+            raise WearcapError(what, where=where, expected=f"{RATES_HZ[0]:g} to {RATES_HZ[1]:g}", fix=fix)
     if recording.motion is None and recording.head is None:
         raise WearcapError("neither a motion nor a head path", where=where, expected="one at least")

@@ -113,11 +113,8 @@ def keypoints_dataset(
         raise WearcapError("the new data set would replace the old one", where=output, expected="another folder")
     file = detector.file if isinstance(detector, Recorded) else None
     if file is not None and Path(file).is_file() and len(store.names()) > 1:
-        raise WearcapError(
-            f"one file of keypoints for {len(store.names())} recordings",
-            where=file,
-            expected="a folder with NAME.csv for each",
-        )
+        what = f"one file of keypoints for {len(store.names())} recordings"
+        raise WearcapError(what, where=file, expected="a folder with NAME.csv for each")
     tasks = []
     for name in store.names():
         entry = store.entries[name]

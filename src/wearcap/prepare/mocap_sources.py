@@ -59,12 +59,9 @@ def _cmu_recording(
     """
     if ".amc" in file.name.lower():
         if asf is None:
-            raise WearcapError(
-                "no skeleton beside it",
-                where=file,
-                fix="An AMC file needs its subject's .asf.",
-                expected=f"{file.name.split('_')[0]}.asf, or one .asf file",
-            )
+            fix = "An AMC file needs its subject's .asf."
+            expected = f"{file.name.split('_')[0]}.asf, or one .asf file"
+            raise WearcapError("no skeleton beside it", where=file, fix=fix, expected=expected)
         motion = read_amc(read_asf(asf), file, amc_fps)
     elif CGSPEED_JOINT in read_text(file)[:4096]:
         motion = read_cmu_bvh(file)

@@ -72,11 +72,8 @@ def _tasks(
         raise WearcapError(f"no split {min(unknown)!r}", expected=f"one of {', '.join(SPLITS)}")
     for split in recordings:
         if splits.of(f"sim-{split}-person-000") != split:
-            raise WearcapError(
-                f"people of the simulated {split} split are listed elsewhere",
-                where=splits.path,
-                expected=f"a line sim-{split}-*,{split}",
-            )
+            what = f"people of the simulated {split} split are listed elsewhere"
+            raise WearcapError(what, where=splits.path, expected=f"a line sim-{split}-*,{split}")
     simulator, tasks = source_files(), []
     for split, count in recordings.items():
         for index in range(count):

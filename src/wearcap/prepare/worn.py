@@ -216,12 +216,10 @@ class MocapEverySettings:
         """Scale and T_world_slam from the calibration board, or from a given scale and a level first pose."""
         if self.scale is None:
             if read.board is None:
-                raise WearcapError(
-                    "it does not define the length of a unit of SLAM",
-                    where=folder,
-                    expected="cam_scale_origin in config.yaml, and x and y in camera_calib.pkl",
-                    fix="Measure it, and give scale=METRES_PER_UNIT.",
-                )
+                what = "it does not define the length of a unit of SLAM"
+                expected = "cam_scale_origin in config.yaml, and x and y in camera_calib.pkl"
+                fix = "Measure it, and give scale=METRES_PER_UNIT."
+                raise WearcapError(what, where=folder, expected=expected, fix=fix)
             board = read.board
             return align_by_walks(board.x_slam, board.y_slam, board.length_m, board.height_m)
         if self.scale <= 0:

@@ -141,11 +141,9 @@ def chosen(runtime: str, precision: str, device: torch.device | str) -> tuple[st
         plain = "int8" if runtime == "onnx" and precision == "narrowest" else "float32"
         precision = "bfloat16" if device.type == "cuda" else plain
     if runtime == "onnx" and (missing or device.type != "cpu"):
-        raise WearcapError(
-            f"runtime 'onnx' needs {', '.join(missing)}" if missing else f"runtime 'onnx' on {device}",
-            expected="ONNX Runtime on the CPU",
-            fix=f"{_INSTALL}, or choose pipeline.runtime=eager.",
-        )
+        what = f"runtime 'onnx' needs {', '.join(missing)}" if missing else f"runtime 'onnx' on {device}"
+        expected = "ONNX Runtime on the CPU"
+        raise WearcapError(what, expected=expected, fix=f"{_INSTALL}, or choose pipeline.runtime=eager.")
     if (precision == "int8") > (runtime == "onnx") or (precision == "bfloat16" and runtime == "onnx"):
         expected = "int8 with onnx; bfloat16 with eager or compile"
         raise WearcapError(f"no {precision} with runtime {runtime!r}", expected=expected)

@@ -106,23 +106,17 @@ def starting_labels(source: str | Path, recording: Recording, clock: LabelClock)
     """
     if str(source) == "recording":
         if recording.interactions is None:
-            raise WearcapError(
-                "no interactions to start from",
-                where=recording.name,
-                expected="a recording that has them",
-                fix="Start from a label file (.json), from a captured motion (.npz), or from nothing.",
-            )
+            what = "no interactions to start from"
+            fix = "Start from a label file (.json), from a captured motion (.npz), or from nothing."
+            raise WearcapError(what, where=recording.name, expected="a recording that has them", fix=fix)
         return labels_of(recording.interactions, clock)
     if Path(source).suffix == ".json":
         return parse_labels(read_json(source), clock, where=source)
     motion = read_motion(source)
     found = motion.interactions or _predicted(motion)
     if found is None:
-        raise WearcapError(
-            "a motion without contacts of the hands",
-            where=source,
-            expected="one that a pipeline with a contact network captured",
-        )
+        expected = "one that a pipeline with a contact network captured"
+        raise WearcapError("a motion without contacts of the hands", where=source, expected=expected)
     return labels_of(found, clock)
 
 
@@ -197,11 +191,8 @@ class Take:
         """
         shown = motion or recording.motion or recording.suit
         if shown is None:
-            raise WearcapError(
-                f"recording {recording.name!r} has no motion",
-                expected="one to look at",
-                fix="Give a captured one with --motion.",
-            )
+            what = f"recording {recording.name!r} has no motion"
+            raise WearcapError(what, expected="one to look at", fix="Give a captured one with --motion.")
         clock = LabelClock.of(recording.name, shown.timestamps)
         names, points, bones = _drawn(shown)
         notice = ""
@@ -348,11 +339,8 @@ class Desk:
         for index in range(len(self.names)):
             file = self.file(index)
             if file.path.exists():
-                raise WearcapError(
-                    "there are labels already, which are never replaced",
-                    where=file.path,
-                    fix="Leave out --from to go on with them, or give another --output.",
-                )
+                fix = "Leave out --from to go on with them, or give another --output."
+                raise WearcapError("there are labels already, which are never replaced", where=file.path, fix=fix)
             labels = starting_labels(source, self.recording(index), file.clock)
             file.save(annotation_of(labels, file.clock), "")
 
