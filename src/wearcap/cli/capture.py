@@ -87,12 +87,8 @@ def _write(
     if config.video:
         truth = with_objects(recording, environment)
         shown = {"truth": truth} if truth is not None else {}
-        write_video(
-            folder / "motion.mp4",
-            shown | {"capture": motion},
-            environment=environment,
-            max_seconds=config.video_seconds,
-        )
+        shown, seconds = shown | {"capture": motion}, config.video_seconds
+        write_video(folder / "motion.mp4", shown, environment=environment, max_seconds=seconds)
 
 
 def _with_body(motion: Motion, recording: Recording, chosen: bool | str) -> tuple[Motion, BodyModel | None]:

@@ -121,9 +121,8 @@ def _explanation(error: Exception, config_name: str, arguments: list[str]) -> We
     if isinstance(error, MissingConfigException):
         return _missing_choice(error)
     if isinstance(error, OverrideParseException):
-        return WearcapError(
-            f"cannot read the override {error.override!r}", expected="key=value", fix=f"({str(error).splitlines()[0]})"
-        )
+        what, fix = f"cannot read the override {error.override!r}", f"({str(error).splitlines()[0]})"
+        return WearcapError(what, expected="key=value", fix=fix)
     if missing := re.search(r"Missing mandatory value: (\S+)", str(error)):
         key = missing.group(1).rstrip(".")
         return WearcapError(f"{key} has no value", fix=f"Give it on the command line: {key}=…")
@@ -132,11 +131,8 @@ def _explanation(error: Exception, config_name: str, arguments: list[str]) -> We
     if isinstance(error, InstantiationException):
         return _refused(error)
     if key is None and not isinstance(error, ConfigCompositionException):
-        return WearcapError(
-            str(error).strip().splitlines()[0],
-            where=f"config {config_name!r}",
-            fix="Run again with --debug for the whole story.",
-        )
+        what, fix = str(error).strip().splitlines()[0], "Run again with --debug for the whole story."
+        return WearcapError(what, where=f"config {config_name!r}", fix=fix)
     if key is None:
         return WearcapError(" ".join(str(error).split()), where=f"config {config_name!r}")
     # What would be valid: config groups, and dotted keys of the config without the override that failed.
@@ -153,10 +149,8 @@ def _refused(error: InstantiationException) -> WearcapError:
     while cause.__cause__ is not None:
         cause = cause.__cause__
     place = re.search(r"full_key: (\S+)", str(error))
-    return WearcapError(
-        f"cannot build {place.group(1) if place else 'what the config names'}: " + " ".join(str(cause).split()[:60]),
-        fix="--debug shows where.",
-    )
+    built, why = place.group(1) if place else "what the config names", " ".join(str(cause).split()[:60])
+    return WearcapError(f"cannot build {built}: {why}", fix="--debug shows where.")
 
 
 def _missing_choice(error: MissingConfigException) -> WearcapError:

@@ -1,5 +1,6 @@
 """`wearcap prepare SOURCE`: make a data set of recordings."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -24,14 +25,9 @@ def run(config: DictConfig) -> Report:
     else:
         listed = splits_dir() / config.splits
         splits = Splits.read(listed if listed.is_file() else Path(config.splits))
-        report = prepare(
-            instantiate(config.tasks, _convert_="all", _partial_=True)(splits=splits),
-            config.output,
-            jobs=config.jobs,
-            backend=config.backend,
-            scheduler=config.scheduler,
-            overwrite=config.overwrite,
-        )
+        tasks = instantiate(config.tasks, _convert_="all", _partial_=True)(splits=splits)
+        options = {key: config[key] for key in ("jobs", "backend", "scheduler", "overwrite")}
+        report = prepare(tasks, config.output, **options)
     _show_report(report, RecordingStore.open(config.output))
     return report
 
@@ -61,12 +57,8 @@ def usage() -> str:
     """Help text that lists the sources."""
     lines = ["usage: wearcap prepare SOURCE [key=value …]     wearcap prepare SOURCE --help", ""]
     for name, path in sources().items():
-        about = next(
-            line[2:]
-            for line in path.read_text(encoding="utf-8").splitlines()
-            if line.startswith("# ") and not line.startswith("# @")
-        )
-        lines.append(f"  {name:10} {about}")
+        notes = re.findall(r"^# (?!@)(.*)", path.read_text(encoding="utf-8"), re.MULTILINE)
+        lines.append(f"  {name:10} {notes[0]}")
     return "\n".join([*lines, "", _shared_settings()])
 
 

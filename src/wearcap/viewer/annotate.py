@@ -7,7 +7,7 @@ import hashlib
 import json
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -221,12 +221,7 @@ class Take:
 
     def header(self) -> dict:
         """All data except the numbers per frame, for JSON."""
-        clock = self.clock
-        return {
-            "name": clock.name,
-            "frames": clock.frames,
-            "start_s": clock.start_s,
-            "stop_s": clock.stop_s,
+        return asdict(self.clock) | {
             "points": self.point_names,
             "bones": self.bones,
             "hands": dict(zip(HANDS, self.hands)),
@@ -262,8 +257,7 @@ def _drawn(motion: Motion) -> tuple[tuple[str, ...], Float32[np.ndarray, "time p
 def _floor(recording: Recording, motion: Motion, points: np.ndarray) -> Float32[np.ndarray, "time"]:
     """Height (m) of the floor at each frame: as recorded, else slightly below nearly all of the body."""
     if recording.floor is not None and len(recording.floor.height):
-        track = recording.floor
-        heights = np.interp(motion.timestamps, track.timestamps, track.height)
+        heights = np.interp(motion.timestamps, recording.floor.timestamps, recording.floor.height)
         return np.asarray(heights, np.float32)
     lowest = points[:: max(1, len(points) // 5000), :, 2].min(1)
     return np.full(len(points), np.quantile(lowest, 0.05), np.float32)
