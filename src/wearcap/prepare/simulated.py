@@ -103,14 +103,8 @@ def simulated_tasks(
     `world` is "flat", "outdoor" or None (drawn). Raises WearcapError for an unknown split or world, or when a
     simulated person's name belongs to another split's list.
     """
-    config = SimulationConfig(
-        duration_s=float(duration_s),
-        fps=float(fps),
-        points=points,
-        activities=tuple(activities) if activities else None,
-        world=world,
-        camera=camera,
-    )
+    length, rate, chosen = float(duration_s), float(fps), tuple(activities) if activities else None
+    config = SimulationConfig(duration_s=length, fps=rate, points=points, activities=chosen, world=world, camera=camera)
     if not config.duration_s > 0 or not config.fps > 0:
         raise WearcapError(f"recordings of {duration_s} s at {fps} Hz", expected="positive numbers")
     make = partial(simulate_recording, config)
