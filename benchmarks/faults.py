@@ -28,7 +28,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
 from wearcap.body.skeleton import xsens23
 from wearcap.cli import capture, export, train
 from wearcap.diffusion.schedule import CosineSchedule
-from wearcap.export.read import open_exported
+from wearcap.export.files import open_exported
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.bvh import read_bvh
 from wearcap.io.formats.contact_labels import LabelClock

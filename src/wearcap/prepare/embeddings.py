@@ -37,11 +37,18 @@ def embed_dataset(
             with progress_bar(len(store.entries), 0) as advance:
                 for name in store.names():
                     try:
-                        file = RecordingFile(store.path_of(name), verify=_is_registered(store, name))
+                        registered = _is_registered(store, name)
+                        file = RecordingFile(store.path_of(name), verify=registered)
                         camera = file.part("camera")
                         if not isinstance(camera, CameraStream) or not (camera.video or camera.image_files):
                             report.notes[name] = "no head camera's pictures"
-                        elif not overwrite and _is_current(store, name, camera, name_of_all):
+                        elif (
+                            registered  # a file of a killed run that is not in the manifest yet is written again
+                            and not overwrite
+                            and camera.embedding is not None
+                            and camera.embedding_mirrored is not None
+                            and camera.embedding_name == name_of_all
+                        ):
                             report.current.append(name)
                         else:
                             pending[name] = _embed(store, name, file, encoder, cache)
@@ -58,12 +65,6 @@ def embed_dataset(
         fix = "Prepare it with them, as `wearcap prepare simulated camera=true` does."
         raise WearcapError("no recording has a head camera's pictures", where=store.root, fix=fix)
     return report
-
-
-def _is_current(store: RecordingStore, name: str, camera: CameraStream, embedded_by: str) -> bool:
-    """Whether a recording is up to date; a file of a killed run that is not in the manifest yet is written again."""
-    both = camera.embedding is not None and camera.embedding_mirrored is not None
-    return both and camera.embedding_name == embedded_by and _is_registered(store, name)
 
 
 def _is_registered(store: RecordingStore, name: str) -> bool:

@@ -31,28 +31,6 @@ _DAMAGE = (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeE
 """Exceptions that restoring a damaged state may raise."""
 
 
-class WearerStream(ABC):
-    """The streaming capture of one wearer."""
-
-    @property
-    @abstractmethod
-    def dropped(self) -> int:
-        """Number of head poses that were late, duplicated or refused."""
-
-    @property
-    @abstractmethod
-    def refused(self) -> dict[str, int]:
-        """Number of refused samples, or parts of samples, by reason ("head: not a rotation")."""
-
-    @abstractmethod
-    def take(self, sample: Any) -> None:
-        """Take in one sample (`sensors.samples`)."""
-
-    @abstractmethod
-    def poses(self, ended: bool = False) -> Motion | None:
-        """Frames that became final since the last call, or None; `ended`: no more samples will come."""
-
-
 class Session(ABC):
     """A streaming capture of one or several wearers with one system; every wearer has their own clock.
 
@@ -66,7 +44,9 @@ class Session(ABC):
     """Class of the streams of single wearers."""
 
     def __init__(self, system: Any, streams: Sequence[Any]):
-        """`streams`: one for each wearer. Raises WearcapError without any."""
+        """`streams`: one for each wearer, with the properties `dropped` and `refused`, `take(sample)` for one sample, and
+        `poses(ended)` for the frames that became final since the last call, or None. Raises WearcapError without any.
+        """
         if not streams:
             raise WearcapError("a session without wearers", expected="one wearer or more")
         self.system, self.streams = system, list(streams)

@@ -64,13 +64,9 @@ class AnnotationServer(ThreadingHTTPServer):
         self._thread.start()
 
     @property
-    def port(self) -> int:
-        return self.server_port
-
-    @property
     def url(self) -> str:
         """Address to open; it contains the token without which the page does not answer."""
-        return self.guard.url(self.port)
+        return self.guard.url(self.server_port)
 
     def wait(self) -> None:
         """Serve until interrupted."""
