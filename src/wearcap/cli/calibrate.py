@@ -53,19 +53,13 @@ def run(config: DictConfig) -> Calibration:
     pictures = read_pictures(config.source, config.max_pictures)
     found = calibrate_from_pictures(pictures, board, instantiate(config.settings))
     _show_report(found)
-    write_camera(found.camera, config.output, _about(found, board, str(config.source)))
-    show(f"camera: {config.output}")
-    return found
-
-
-def _about(found: Calibration, board: Board, source: str) -> dict:
     views = [
         {"name": view.name, "rms_px": round(view.rms_px, 4), "used": used}
         for used, group in ((True, found.views), (False, found.rejected))
         for view in group
     ]
-    return {
-        "source": Path(source).name,
+    about = {
+        "source": Path(str(config.source)).name,
         "board": asdict(board),
         "rms_px": found.rms_px,
         "focal_std_px": found.focal_std_px,
@@ -74,6 +68,9 @@ def _about(found: Calibration, board: Board, source: str) -> dict:
         "pictures_with_board": found.seen,
         "views": views,
     }
+    write_camera(found.camera, config.output, about)
+    show(f"camera: {config.output}")
+    return found
 
 
 def _show_report(found: Calibration) -> None:

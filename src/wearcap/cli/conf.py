@@ -128,8 +128,13 @@ def _explanation(error: Exception, config_name: str, arguments: list[str]) -> We
         return WearcapError(f"{key} has no value", fix=f"Give it on the command line: {key}=…")
     key = re.search(r"(?:Could not override|Could not delete from config\.|Could not append) '([^']+)'", str(error))
     key = key or re.search(r"key '?([\w./@-]+)'? (?:is not in|not found)", str(error), re.IGNORECASE)
-    if isinstance(error, InstantiationException):
-        return _refused(error)
+    if isinstance(error, InstantiationException):  # a configured object's constructor refused its values
+        cause: BaseException = error
+        while cause.__cause__ is not None:
+            cause = cause.__cause__
+        place = re.search(r"full_key: (\S+)", str(error))
+        built, why = place.group(1) if place else "what the config names", " ".join(str(cause).split()[:60])
+        return WearcapError(f"cannot build {built}: {why}", fix="--debug shows where.")
     if key is None and not isinstance(error, ConfigCompositionException):
         what, fix = str(error).strip().splitlines()[0], "Run again with --debug for the whole story."
         return WearcapError(what, where=f"config {config_name!r}", fix=fix)
@@ -141,16 +146,6 @@ def _explanation(error: Exception, config_name: str, arguments: list[str]) -> We
     with suppress(HydraException, OmegaConfBaseException):
         valid |= set(_dotted(_compose(config_name, rest)))
     return WearcapError(f"config {config_name!r} has no key {wrong!r}", fix=nearest(wrong, valid))
-
-
-def _refused(error: InstantiationException) -> WearcapError:
-    """Error that a configured object's constructor raised about its values."""
-    cause: BaseException = error
-    while cause.__cause__ is not None:
-        cause = cause.__cause__
-    place = re.search(r"full_key: (\S+)", str(error))
-    built, why = place.group(1) if place else "what the config names", " ".join(str(cause).split()[:60])
-    return WearcapError(f"cannot build {built}: {why}", fix="--debug shows where.")
 
 
 def _missing_choice(error: MissingConfigException) -> WearcapError:
