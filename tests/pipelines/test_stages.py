@@ -55,7 +55,7 @@ def three(settings: Settings, made: list[str], die: bool = False) -> list[Stage]
 def run(cache, settings=Settings(), until=None):
     made, shown = [], Console(file=io.StringIO(), width=200)
     results, runs = run_stages(three(settings, made), StageCache(cache), until, shown)
-    assert [r.reused for r in runs] == [r.stage not in made for r in runs]
+    assert [r["reused"] for r in runs] == [r["stage"] not in made for r in runs]
     return results, made, shown.file.getvalue().splitlines()
 
 

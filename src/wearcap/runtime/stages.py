@@ -164,16 +164,6 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class _StageRun:
-    """How a stage's result was obtained."""
-
-    stage: str
-    seconds: float
-    """Time that computing it took, now or when it was cached."""
-    reused: bool
-
-
-@dataclass(frozen=True)
 class StageCache:
     """Cached results in a folder: a .safetensors file per stage and key, and a .json file that is written last."""
 
@@ -216,9 +206,10 @@ class StageCache:
 
 def run_stages(
     stages: list[Stage], cache: StageCache | None = None, until: str | None = None, console: Console | None = None
-) -> tuple[dict[str, Any], list[_StageRun]]:
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Results by stage, up to and including `until`, and how each was obtained; the console shows a line for each.
 
+    How: the `stage`, the `seconds` that computing it took (now or when it was cached), and whether it was `reused`.
     Cached results are reused; damaged ones are recomputed. Raises WearcapError for an unknown `until`.
     """
     names = [stage.name for stage in stages]
@@ -248,7 +239,7 @@ def run_stages(
             seconds = time.perf_counter() - begin
             if cache:
                 digests[stage.name] = cache.write(stage.name, key, results[stage.name], seconds)
-        runs.append(_StageRun(stage.name, round(seconds, 3), kept is not None))
+        runs.append({"stage": stage.name, "seconds": round(seconds, 3), "reused": kept is not None})
         console.print(f"{stage.name}: {'reused' if kept is not None else f'{seconds:.1f} s'}", highlight=False)
         if stage.name == until:
             break
@@ -286,5 +277,5 @@ class StagedSystem(System):
         name = source.recording.name
         cache = None if options.cache is None else StageCache(options.cache / name)
         results, runs = run_stages(self.stages(source), cache, options.until, options.console)
-        report = {"pipeline": self.name, "recording": name, "stages": [vars(run) for run in runs]}
+        report = {"pipeline": self.name, "recording": name, "stages": runs}
         return Captured(self.motion_of(results), report | self.report(source, results))
