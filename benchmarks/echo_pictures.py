@@ -9,8 +9,7 @@ from pathlib import Path
 import torch
 
 from wearcap.body.anny_body import anny_body
-from wearcap.cli.conf import compose
-from wearcap.cli.load import load_pipeline
+from wearcap.cli.conf import compose, load_pipeline
 from wearcap.geometry.trajectory import resample
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.recording.acts import Act, true_acts

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import torch
 
-from wearcap.cli.conf import compose
-from wearcap.cli.load import load_pipeline
+from wearcap.cli.conf import compose, load_pipeline
 from wearcap.recording import Motion, RecordingStore
 from wearcap.runtime.system import CaptureInput
 from wearcap.systems.echo.observations import BatchItem, Scenario, batch_item_of

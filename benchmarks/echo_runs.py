@@ -9,8 +9,7 @@ from hydra.utils import instantiate
 from planted import swinging
 
 from wearcap.body.skeleton import xsens23
-from wearcap.cli.conf import compose
-from wearcap.cli.load import load_pipeline
+from wearcap.cli.conf import compose, load_pipeline
 from wearcap.models.checkpoint import shared_checkpoints
 from wearcap.scene.environment import Environment
 from wearcap.simulation.places.movables import make_movable

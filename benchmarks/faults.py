@@ -28,7 +28,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
 from wearcap.body.skeleton import xsens23
 from wearcap.cli import capture, export, train
 from wearcap.diffusion.schedule import CosineSchedule
-from wearcap.export.read import open_exported
+from wearcap.export.files import open_exported
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.bvh import read_bvh
 from wearcap.io.formats.contact_labels import LabelClock
@@ -73,7 +73,7 @@ def _prepare(folder: Path, finished: Finished) -> None:
     done = _registered(folder)
     for turn in range(done // RECORDINGS, 1_000_000):
         tasks = [Task(f"r{k:02}", partial(_recording, k), "train", f"{turn:06}") for k in range(RECORDINGS)]
-        prepare(tasks, folder, jobs=1, progress=False)
+        prepare(tasks, folder, jobs=1)
         finished(RECORDINGS * (turn + 1))
 
 

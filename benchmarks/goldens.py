@@ -27,8 +27,7 @@ import torch
 from safetensors.torch import load_file
 
 from wearcap.cli import capture, evaluate, export, prepare, train
-from wearcap.cli.conf import compose
-from wearcap.cli.load import load_pipeline
+from wearcap.cli.conf import compose, load_pipeline
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.recording import Motion, Recording
 from wearcap.recording.acts import true_acts

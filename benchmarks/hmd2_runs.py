@@ -6,8 +6,7 @@ from pathlib import Path
 
 import torch
 
-from wearcap.cli.conf import compose
-from wearcap.cli.load import load_pipeline
+from wearcap.cli.conf import compose, load_pipeline
 from wearcap.evaluation.baselines import BASELINES
 from wearcap.evaluation.evaluate import Realism, evaluate
 from wearcap.metrics.scores import score

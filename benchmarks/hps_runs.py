@@ -117,7 +117,7 @@ def _captured(session: Session, pipeline: str, run: SeedRun) -> tuple[Motion, di
     made = instantiate(config, _convert_="all")
     results, stages = run_stages(made.stages(CaptureInput(session.recording, scan=session.scan)))
     error = clock.error_s(results["synchronize"])
-    return made.motion_of(results), {stage.stage: stage.seconds for stage in stages}, error
+    return made.motion_of(results), {stage["stage"]: stage["seconds"] for stage in stages}, error
 
 
 def _outages(

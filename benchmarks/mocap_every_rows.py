@@ -10,8 +10,7 @@ from torch import Tensor
 
 from wearcap.body.kinematics import site_positions
 from wearcap.body.skeleton import FOOT_PATCHES
-from wearcap.cli.conf import compose
-from wearcap.cli.load import load_pipeline
+from wearcap.cli.conf import compose, load_pipeline
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.metrics.position import joint_error_cm

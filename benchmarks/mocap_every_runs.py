@@ -8,8 +8,7 @@ from hydra.utils import instantiate
 from online import figure
 from planted import swinging
 
-from wearcap.cli.conf import compose
-from wearcap.cli.load import load_pipeline
+from wearcap.cli.conf import compose, load_pipeline
 from wearcap.models.checkpoint import shared_checkpoints
 from wearcap.recording import Recording
 from wearcap.sensors.imu import synthesize_imu

@@ -11,8 +11,7 @@ from omegaconf import OmegaConf
 from planted import swinging
 
 from wearcap.body.skeleton import xsens23
-from wearcap.cli.conf import compose
-from wearcap.cli.load import load_pipeline
+from wearcap.cli.conf import compose, load_pipeline
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.checkpoint import shared_checkpoints

@@ -63,7 +63,7 @@ def tasks(count: int, seconds: float = 0.0, **faults: str) -> list[Task]:
 
 
 def run(output: str, count: int, seconds: float = 0.0, jobs: int = 1, backend: str = "loky") -> None:
-    prepare(tasks(count, seconds), Path(output), jobs=jobs, backend=backend, progress=False)
+    prepare(tasks(count, seconds), Path(output), jobs=jobs, backend=backend)
 
 
 if __name__ == "__main__":  # python prepare_tasks.py OUTPUT COUNT SECONDS [JOBS [BACKEND]]

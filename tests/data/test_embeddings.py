@@ -156,7 +156,7 @@ def filmed(film, tmp_path) -> RecordingStore:
 
 def test_a_data_set_gets_embeddings_and_keeps_everything_else(filmed):
     before = {name: filmed.load(name) for name in filmed.names()}
-    report = embed_dataset(filmed.root, Corners(), progress=False)
+    report = embed_dataset(filmed.root, Corners())
     assert report.written == ["r0", "r1", "r3", "r4", "r5"]
     assert report.notes == {"r2": "no head camera's pictures"}
     store = RecordingStore.open(filmed.root)
@@ -185,22 +185,22 @@ def test_a_second_run_does_nothing_and_a_killed_one_goes_on(filmed, monkeypatch)
     monkeypatch.setattr(embeddings, "REGISTER_EVERY_S", 1000)
     monkeypatch.setattr(RecordingStore, "register", dies)
     with pytest.raises(Killed):
-        embed_dataset(filmed.root, Corners(), progress=False)
+        embed_dataset(filmed.root, Corners())
     monkeypatch.setattr(RecordingStore, "register", register)
     encoder = Corners()
-    assert len(embed_dataset(filmed.root, encoder, progress=False).written) == 5
+    assert len(embed_dataset(filmed.root, encoder).written) == 5
     assert encoder.seen == 0  # all from the cache
     assert all(wrong is None for _, wrong in RecordingStore.open(filmed.root).verify())
-    assert len(embed_dataset(filmed.root, encoder, progress=False).current) == 5
+    assert len(embed_dataset(filmed.root, encoder).current) == 5
     other = Corners()
     other.fingerprint = "11111111"
-    assert len(embed_dataset(filmed.root, other, progress=False).written) == 5
+    assert len(embed_dataset(filmed.root, other).written) == 5
 
 
 def test_what_cannot_be_embedded_stays_in_its_data_set(filmed):
     (filmed.root / "videos/r1.mp4").unlink()
     (filmed.root / "videos/r3.mp4").write_bytes((filmed.root / "videos/r4.mp4").read_bytes())
-    report = embed_dataset(filmed.root, Corners(), progress=False)
+    report = embed_dataset(filmed.root, Corners())
     assert set(report.failed) == {"r1", "r3"}
     assert "no such video" in report.failed["r1"]
     assert "32 pictures for 31 timestamps" in report.failed["r3"]
@@ -208,7 +208,7 @@ def test_what_cannot_be_embedded_stays_in_its_data_set(filmed):
     assert store.names() == filmed.names()
     assert all(wrong is None for _, wrong in store.verify())
     with pytest.raises(WearcapError, match="no recording has a head camera's pictures"):
-        embed_dataset(small_dataset(filmed.root / "more", frames=(60,)).root, Corners(), progress=False)
+        embed_dataset(small_dataset(filmed.root / "more", frames=(60,)).root, Corners())
 
 
 def test_the_command_embeds_by_a_checkpoint(filmed, tmp_path, capsys):

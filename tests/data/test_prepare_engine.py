@@ -27,7 +27,7 @@ def digests(root: Path) -> dict[str, str]:
 def alone(tmp_path_factory) -> Path:
     """Eight recordings made one after another in this process."""
     root = tmp_path_factory.mktemp("alone")
-    prepare(tasks(8), root, jobs=1, progress=False)
+    prepare(tasks(8), root, jobs=1)
     return root
 
 
@@ -41,7 +41,7 @@ def test_a_run_writes_what_it_reports(alone):
 
 @pytest.mark.parametrize("backend", ["loky", "threading"])
 def test_workers_give_the_same_bytes(alone, tmp_path, backend):
-    prepare(tasks(8), tmp_path, jobs=2, backend=backend, progress=False)
+    prepare(tasks(8), tmp_path, jobs=2, backend=backend)
     assert digests(tmp_path) == digests(alone)
 
 
@@ -49,31 +49,31 @@ def test_workers_give_the_same_bytes(alone, tmp_path, backend):
 def test_two_dask_workers_give_the_same_bytes(alone, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))  # where dask's workers find the tasks
-    prepare(tasks(8), tmp_path, jobs=2, backend="dask", progress=False)
+    prepare(tasks(8), tmp_path, jobs=2, backend="dask")
     assert digests(tmp_path) == digests(alone)
 
 
 def test_a_second_run_does_nothing_and_a_damaged_file_is_made_again(tmp_path):
-    assert len(prepare(tasks(3), tmp_path, jobs=1, progress=False).written) == 3
+    assert len(prepare(tasks(3), tmp_path, jobs=1).written) == 3
     before = digests(tmp_path)
-    assert prepare(tasks(3), tmp_path, jobs=1, progress=False).current == ["r00", "r01", "r02"]
+    assert prepare(tasks(3), tmp_path, jobs=1).current == ["r00", "r01", "r02"]
     file = tmp_path / "recordings/r01.safetensors"
     content = bytearray(file.read_bytes())
     content[-1] ^= 1
     file.write_bytes(content)
-    report = prepare(tasks(3), tmp_path, jobs=1, progress=False)
+    report = prepare(tasks(3), tmp_path, jobs=1)
     assert (report.written, report.current) == (["r01"], ["r00", "r02"])
     assert digests(tmp_path) == before
 
 
 def test_changed_settings_and_overwrite_make_recordings_again(tmp_path):
     first = tasks(2)
-    prepare(first, tmp_path, jobs=1, progress=False)
+    prepare(first, tmp_path, jobs=1)
     changed = [first[0], replace(first[1], hash=content_hash("other"))]
-    assert prepare(changed, tmp_path, jobs=1, progress=False).written == ["r01"]
-    assert len(prepare(changed, tmp_path, jobs=1, overwrite=True, progress=False).written) == 2
+    assert prepare(changed, tmp_path, jobs=1).written == ["r01"]
+    assert len(prepare(changed, tmp_path, jobs=1, overwrite=True).written) == 2
     moved = [replace(changed[0], split="test"), changed[1]]
-    assert prepare(moved, tmp_path, jobs=1, progress=False).written == ["r00"]
+    assert prepare(moved, tmp_path, jobs=1).written == ["r00"]
     assert RecordingStore(tmp_path).names("test") == ["r00"]
 
 
@@ -89,7 +89,7 @@ def test_changed_settings_and_overwrite_make_recordings_again(tmp_path):
     ],
 )
 def test_one_bad_recording_is_named_and_the_rest_goes_on(tmp_path, fault, reason):
-    report = prepare(tasks(3, r01=fault), tmp_path, jobs=1, progress=False)
+    report = prepare(tasks(3, r01=fault), tmp_path, jobs=1)
     assert report.written == ["r00", "r02"]
     assert list(report.failed) == ["r01"]
     assert re.search(reason, report.failed["r01"])
@@ -106,7 +106,7 @@ def test_a_kill_in_the_middle_is_resumed(alone, tmp_path):
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     (tmp_path / "recordings/.r07.tmp-0123abcd.safetensors").write_bytes(b"half")
-    report = prepare(tasks(8), tmp_path, jobs=1, progress=False)
+    report = prepare(tasks(8), tmp_path, jobs=1)
     assert report.current
     assert report.written
     assert digests(tmp_path) == digests(alone)
@@ -114,14 +114,14 @@ def test_a_kill_in_the_middle_is_resumed(alone, tmp_path):
 
 def test_a_killed_worker_is_reported_and_the_next_run_goes_on(alone, tmp_path):
     with pytest.raises(WearcapError, match=r"a worker process was killed.*fewer jobs"):
-        prepare(tasks(8, r05="killed"), tmp_path, jobs=2, progress=False)
+        prepare(tasks(8, r05="killed"), tmp_path, jobs=2)
     assert all(wrong is None for _, wrong in RecordingStore.open(tmp_path).verify())
-    prepare(tasks(8), tmp_path, jobs=1, progress=False)
+    prepare(tasks(8), tmp_path, jobs=1)
     assert digests(tmp_path) == digests(alone)
 
 
 def test_a_full_disk_stops_the_run_with_one_message(tmp_path, monkeypatch):
-    prepare(tasks(1), tmp_path, jobs=1, progress=False)
+    prepare(tasks(1), tmp_path, jobs=1)
     write = Path.write_bytes
 
     def full(path, content):
@@ -130,7 +130,7 @@ def test_a_full_disk_stops_the_run_with_one_message(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(WearcapError, match=r"r01\.safetensors: the disk is full"):
-        prepare(tasks(3), tmp_path, jobs=1, progress=False)
+        prepare(tasks(3), tmp_path, jobs=1)
     monkeypatch.undo()
     assert sorted(path.name for path in tmp_path.rglob("*.*")) == ["manifest.json", "r00.safetensors"]
     assert RecordingStore.open(tmp_path).names() == ["r00"]
@@ -142,7 +142,7 @@ def test_no_permission_is_reported_before_any_work(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "replace", refuse)
     with pytest.raises(WearcapError, match="no permission to write here"):
-        prepare(tasks(1), tmp_path / "new", jobs=1, progress=False)
+        prepare(tasks(1), tmp_path / "new", jobs=1)
     monkeypatch.undo()
     assert not list((tmp_path / "new").iterdir())
 
@@ -150,7 +150,7 @@ def test_no_permission_is_reported_before_any_work(tmp_path, monkeypatch):
 def test_an_output_below_a_file_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(WearcapError, match="cannot be written"):
-        prepare(tasks(1), tmp_path / "file" / "set", jobs=1, progress=False)
+        prepare(tasks(1), tmp_path / "file" / "set", jobs=1)
 
 
 def test_wrong_requests_are_refused(tmp_path):
@@ -161,7 +161,7 @@ def test_wrong_requests_are_refused(tmp_path):
     with pytest.raises(WearcapError, match="0 jobs"):
         prepare(tasks(1), tmp_path, jobs=0)
     with pytest.raises(WearcapError, match="no backend 'lokky'"):
-        prepare(tasks(1), tmp_path, backend="lokky", progress=False)
+        prepare(tasks(1), tmp_path, backend="lokky")
 
 
 def test_split_lists(tmp_path):

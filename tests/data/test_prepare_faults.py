@@ -103,7 +103,7 @@ def preparing(root: Path, count: int, seconds: float, jobs: int, backend: str = 
 def alone(tmp_path_factory) -> Path:
     """Twelve recordings made one after another, without a fault."""
     root = tmp_path_factory.mktemp("alone")
-    prepare(tasks(12), root, jobs=1, progress=False)
+    prepare(tasks(12), root, jobs=1)
     return root
 
 
@@ -122,7 +122,7 @@ def test_workers_end_with_a_killed_run_and_the_next_one_has_the_folder_alone(alo
         time.sleep(1.0)
         assert digests(tmp_path) == left, "nobody writes on"
         assert len(made(tmp_path)) < 12
-    prepare(tasks(12), tmp_path, jobs=1, progress=False)
+    prepare(tasks(12), tmp_path, jobs=1)
     assert digests(tmp_path) == digests(alone)
 
 
@@ -131,7 +131,7 @@ import sys
 from prepare_tasks import tasks
 from wearcap.prepare import engine
 from wearcap.prepare import prepare
-prepare(tasks(2, r00="stuck", r01="stuck"), sys.argv[1], jobs=2, progress=False)
+prepare(tasks(2, r00="stuck", r01="stuck"), sys.argv[1], jobs=2)
 """
 
 
@@ -176,14 +176,14 @@ def test_an_interrupted_run_ends_its_workers_before_it_gives_the_folder_up(tmp_p
     monkeypatch.setattr(engine, "folder_lock", noted)
     monkeypatch.setattr(engine, "progress_bar", lambda *arguments: nullcontext(interrupt))
     with pytest.raises(KeyboardInterrupt):
-        prepare(tasks(6, 0.2), tmp_path, jobs=2, progress=False)
+        prepare(tasks(6, 0.2), tmp_path, jobs=2)
     assert not after
 
 
 def test_nothing_to_do_starts_no_workers(tmp_path, monkeypatch):
-    prepare(tasks(2), tmp_path, jobs=1, progress=False)
+    prepare(tasks(2), tmp_path, jobs=1)
     monkeypatch.setattr(engine, "_backend", None)
-    assert prepare(tasks(2), tmp_path, jobs=2, backend="dask", progress=False).current == ["r00", "r01"]
+    assert prepare(tasks(2), tmp_path, jobs=2, backend="dask").current == ["r00", "r01"]
 
 
 @posix
@@ -191,7 +191,7 @@ def test_a_second_run_into_the_folder_is_refused_and_harms_nothing(alone, tmp_pa
     monkeypatch.setattr(locks, "LOCK_PATIENCE_S", 0.1)
     with preparing(tmp_path, 12, 0.2, 1) as (process, _):
         with pytest.raises(WearcapError, match=rf"another run writes here \(process {process.pid} on "):
-            prepare(tasks(12), tmp_path, jobs=1, progress=False)
+            prepare(tasks(12), tmp_path, jobs=1)
         assert all(wrong is None for _, wrong in RecordingStore.open(tmp_path).verify()), "readers go on"
         assert process.wait(60) == 0
     assert digests(tmp_path) == digests(alone)
@@ -208,11 +208,11 @@ def test_a_folder_in_which_orphans_write_is_refused(tmp_path, monkeypatch):
     process.wait()
     try:
         with pytest.raises(WearcapError, match=rf"workers of a run that has ended .+process {process.pid} on"):
-            prepare(tasks(1), tmp_path, jobs=1, progress=False)
+            prepare(tasks(1), tmp_path, jobs=1)
     finally:
         os.kill(orphan, signal.SIGKILL)
     monkeypatch.setattr(locks, "ORPHANS_PATIENCE_S", 20.0)
-    prepare(tasks(1), tmp_path, jobs=1, progress=False)
+    prepare(tasks(1), tmp_path, jobs=1)
     assert LOCK not in digests(tmp_path)
 
 
@@ -258,7 +258,7 @@ def test_kills_of_a_run_with_workers_leave_the_same_bytes(alone, tmp_path):
             process.kill()
         if moments.random() < 0.5:
             shutil.rmtree(tmp_path / "recordings")  # so that every run has work to be killed in
-    prepare(tasks(12), tmp_path, jobs=2, progress=False)
+    prepare(tasks(12), tmp_path, jobs=2)
     assert digests(tmp_path) == digests(alone)
 
 
@@ -267,5 +267,5 @@ def test_what_a_killed_run_left_anywhere_in_the_data_set_is_removed(alone, tmp_p
         (tmp_path / folder).mkdir(parents=True, exist_ok=True)
         (tmp_path / folder / ".room.tmp-0123abcd.ply").write_bytes(b"half")
     write_text(tmp_path / LOCK, '{"pid": 1}')
-    prepare(tasks(12), tmp_path, jobs=1, progress=False)
+    prepare(tasks(12), tmp_path, jobs=1)
     assert digests(tmp_path) == digests(alone)

@@ -80,10 +80,7 @@ def assert_followed(recording: Recording) -> None:
 
 def test_simulated_keypoints_come_with_a_camera(filmed, tmp_path):
     report = keypoints_dataset(
-        filmed.root,
-        tmp_path / "new",
-        Simulated(joints=("left_toe", "left_wrist", "left_hand"), noise_px=0, drop=0),
-        progress=False,
+        filmed.root, tmp_path / "new", Simulated(joints=("left_toe", "left_wrist", "left_hand"), noise_px=0, drop=0)
     )
     assert report.written == ["r0", "r1", "r2"]
     store = RecordingStore.open(tmp_path / "new")
@@ -106,10 +103,7 @@ def test_simulated_keypoints_come_with_a_camera(filmed, tmp_path):
     entry, old = store.entries["r1"], filmed.entries["r1"]
     assert (entry.split, entry.subject) == (old.split, old.subject)
     again = keypoints_dataset(
-        filmed.root,
-        store.root,
-        Simulated(joints=("left_toe", "left_wrist", "left_hand"), noise_px=0, drop=0),
-        progress=False,
+        filmed.root, store.root, Simulated(joints=("left_toe", "left_wrist", "left_hand"), noise_px=0, drop=0)
     )
     assert (len(again.current), again.written) == (3, [])
 
@@ -117,12 +111,12 @@ def test_simulated_keypoints_come_with_a_camera(filmed, tmp_path):
 def test_recorded_keypoints_are_followed_where_pictures_are(filmed, tmp_path):
     only(filmed, "r0", "r1")
     folder = written(tmp_path / "csv", filmed, slice(0, None, 10))
-    keypoints_dataset(filmed.root, tmp_path / "new", Recorded(str(folder)), progress=False)
+    keypoints_dataset(filmed.root, tmp_path / "new", Recorded(str(folder)))
     store = RecordingStore.open(tmp_path / "new")
     for name in ("r0", "r1"):
         assert_followed(store.load(name))
     (folder / "r1.csv").write_text("timestamp,joint,x,y,z,confidence\n0.1,head,0,0,1.7,1\n")
-    report = keypoints_dataset(filmed.root, tmp_path / "new", Recorded(str(folder)), progress=False)
+    report = keypoints_dataset(filmed.root, tmp_path / "new", Recorded(str(folder)))
     assert (report.current, report.written) == (["r0"], ["r1"])
     assert RecordingStore.open(tmp_path / "new").load("r1").cues["head"].points.shape == (1, 3)
 
@@ -142,9 +136,7 @@ def test_a_detector_is_shown_every_picture(filmed, tmp_path, monkeypatch):
 
     monkeypatch.setattr(keypoints, "MediaPipeHands", Every7th)
     (tmp_path / "m.task").write_bytes(b"")
-    report = keypoints_dataset(
-        filmed.root, tmp_path / "new", Found(str(tmp_path / "m.task")), backend="threading", progress=False
-    )
+    report = keypoints_dataset(filmed.root, tmp_path / "new", Found(str(tmp_path / "m.task")), backend="threading")
     assert report.written == ["r0", "r1"]
     assert "no head camera" in report.failed["r2"]
     assert_followed(RecordingStore.open(tmp_path / "new").load("r0"))
@@ -158,8 +150,8 @@ def test_what_cannot_be_is_refused(filmed, tmp_path):
         (tmp_path / "new", Found(str(tmp_path / "none.task")), "no model of MediaPipe's hands"),
     ):
         with pytest.raises(WearcapError, match=message):
-            keypoints_dataset(filmed.root, output, source, progress=False)
-    report = keypoints_dataset(filmed.root, tmp_path / "new", Recorded(str(tmp_path / "csv")), progress=False)
+            keypoints_dataset(filmed.root, output, source)
+    report = keypoints_dataset(filmed.root, tmp_path / "new", Recorded(str(tmp_path / "csv")))
     assert "r2.csv: no such file" in report.failed["r2"]
 
 

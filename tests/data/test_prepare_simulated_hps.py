@@ -8,9 +8,8 @@ from hydra.utils import instantiate
 from wearcap.cli.conf import compose, splits_dir
 from wearcap.errors import WearcapError
 from wearcap.io.formats.camera_json import read_photos
-from wearcap.prepare.engine import prepare
+from wearcap.prepare.engine import Splits, prepare
 from wearcap.prepare.simulated import simulated_hps_tasks
-from wearcap.prepare.splits import Splits
 from wearcap.recording.store import RecordingStore
 
 
@@ -33,7 +32,7 @@ def tasks_of(root: Path, **changes):
 
 def test_a_data_set_is_made_and_then_left_alone(tmp_path):
     tasks = tasks_of(tmp_path)
-    report = prepare(tasks, tmp_path, jobs=1, backend="threading", progress=False)
+    report = prepare(tasks, tmp_path, jobs=1, backend="threading")
     assert not report.failed
     recording = RecordingStore.open(tmp_path).load(tasks[0].name)
     assert recording.scene == f"scenes/{recording.location}/pointcloud.ply"
@@ -44,7 +43,7 @@ def test_a_data_set_is_made_and_then_left_alone(tmp_path):
     assert len(recording.camera.timestamps) == 4
     assert (tmp_path / recording.camera.video).stat().st_size > 10_000
     assert recording.intervals.names == ("stand", "move")
-    again = prepare(tasks, tmp_path, jobs=1, backend="threading", progress=False)
+    again = prepare(tasks, tmp_path, jobs=1, backend="threading")
     assert again.current == [tasks[0].name]
 
 

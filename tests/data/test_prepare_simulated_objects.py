@@ -6,9 +6,8 @@ import pytest
 
 from wearcap.errors import WearcapError
 from wearcap.io.formats.environment import read_environment
-from wearcap.prepare.engine import prepare
+from wearcap.prepare.engine import Splits, prepare
 from wearcap.prepare.simulated import simulated_objects_tasks
-from wearcap.prepare.splits import Splits
 from wearcap.recording.store import RecordingStore
 
 SPLITS = Splits.read(Path(__file__).parents[2] / "data_prep/splits/simulated.csv")

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from wearcap.errors import WearcapError
-from wearcap.export.read import open_pt2
+from wearcap.export.files import open_pt2
 
 
 class Pair(torch.nn.Module):

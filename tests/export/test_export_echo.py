@@ -13,8 +13,7 @@ import torch
 from carried_box import WINDOW, carried_dataset, carrying, drawn_echo, scenario_of, small_features, small_net
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
-from wearcap.export.read import load_exported
-from wearcap.export.write import write_exports
+from wearcap.export.files import load_exported, write_exports
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.models.point_encoder import PointNeXt
 from wearcap.recording.store import RecordingFile

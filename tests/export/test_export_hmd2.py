@@ -12,8 +12,8 @@ from torch import nn
 from wearcap.body.skeleton import xsens23
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
-from wearcap.export import write
-from wearcap.export.read import RUN_BY_FORMAT, load_exported, open_pt2
+from wearcap.export import files
+from wearcap.export.files import RUN_BY_FORMAT, load_exported, open_pt2
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
@@ -96,7 +96,7 @@ def exports(pipeline, tmp_path_factory):
     return {
         format: (
             folder / format / f"model.{format}",
-            write.write_exports(pipeline.exports(), folder / format / f"model.{format}", format),
+            files.write_exports(pipeline.exports(), folder / format / f"model.{format}", format),
         )
         for format in FORMATS
     }
@@ -105,7 +105,7 @@ def exports(pipeline, tmp_path_factory):
 @pytest.mark.parametrize("format", FORMATS)
 def test_toy_network_agrees_at_other_batch_sizes(tmp_path, format):
     net = Toy().train()
-    report = write.export_network(Graph(net, toy_example()), tmp_path / f"toy.{format}", format, 1e-4)
+    report = files.export_network(Graph(net, toy_example()), tmp_path / f"toy.{format}", format, 1e-4)
     assert report.max_abs_error < 1e-6
     assert report.latency_ms > 0
     assert report.bytes == (tmp_path / f"toy.{format}").stat().st_size
@@ -167,7 +167,7 @@ class Moody(nn.Module):
 
 def test_a_deviating_export_is_refused_and_leaves_nothing(tmp_path):
     with pytest.raises(WearcapError, match="differs from the eager one"):
-        write.export_network(Graph(Moody(), toy_example()), tmp_path / "toy.pt2", "pt2", 1e-4)
+        files.export_network(Graph(Moody(), toy_example()), tmp_path / "toy.pt2", "pt2", 1e-4)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -175,18 +175,18 @@ def test_not_a_number_is_refused(tmp_path):
     net = Toy()
     nn.init.constant_(net.linear.weight, math.nan)
     with pytest.raises(WearcapError, match="nan"):
-        write.export_network(Graph(net, toy_example()), tmp_path / "toy.pt2", "pt2", 1e-4)
+        files.export_network(Graph(net, toy_example()), tmp_path / "toy.pt2", "pt2", 1e-4)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_missing_library_and_wrong_names_are_reported(tmp_path, monkeypatch):
     with pytest.raises(WearcapError, match="one of onnx, pt2"):
-        write.export_network(Graph(Toy(), toy_example()), tmp_path / "toy.tflite", "tflite", 1e-4)
+        files.export_network(Graph(Toy(), toy_example()), tmp_path / "toy.tflite", "tflite", 1e-4)
     with pytest.raises(WearcapError, match=r"ends in \.pt2"):
-        write.export_network(Graph(Toy(), toy_example()), tmp_path / "toy.onnx", "pt2", 1e-4)
+        files.export_network(Graph(Toy(), toy_example()), tmp_path / "toy.onnx", "pt2", 1e-4)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(WearcapError, match=r'onnxscript.*pip install "wearcap\[export\]"'):
-        write.export_network(Graph(Toy(), toy_example()), tmp_path / "toy.onnx", "onnx", 1e-4)
+        files.export_network(Graph(Toy(), toy_example()), tmp_path / "toy.onnx", "onnx", 1e-4)
 
 
 @pytest.mark.parametrize("format", FORMATS)

@@ -11,8 +11,7 @@ import torch
 
 from watched_walk import drawn_pipeline, watched_walk
 from wearcap.errors import WearcapError
-from wearcap.export.read import load_exported
-from wearcap.export.write import write_exports
+from wearcap.export.files import load_exported, write_exports
 from wearcap.recording.store import RecordingFile, save_recording
 
 

@@ -18,7 +18,7 @@ from wearcap.io.datasets.hcontact import (
     read_hcontact_split,
     read_smpl_json,
 )
-from wearcap.prepare.splits import Splits
+from wearcap.prepare.engine import Splits
 from wearcap.prepare.worn import hcontact_tasks
 from wearcap.recording.store import RecordingStore
 

@@ -11,8 +11,7 @@ import torch
 
 from contact_motion import CLASSES, bending_dataset
 from wearcap.cli import export, train
-from wearcap.cli.conf import compose
-from wearcap.cli.load import load_pipeline
+from wearcap.cli.conf import compose, load_pipeline
 from wearcap.errors import WearcapError
 from wearcap.metrics.detection import average_precision
 from wearcap.models.checkpoint import load_trained, read_checkpoint

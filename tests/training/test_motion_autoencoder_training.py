@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from wearcap.cli import evaluate, train
-from wearcap.cli.conf import compose
-from wearcap.cli.load import load_pipeline
+from wearcap.cli.conf import compose, load_pipeline
 from wearcap.errors import WearcapError
 from wearcap.evaluation.evaluate import Realism
 from wearcap.models.checkpoint import load_trained

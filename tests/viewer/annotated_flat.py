@@ -75,9 +75,9 @@ def served(dataset: Path, output: Path, where: str = "", **options) -> Iterator[
 
 def ask(server: AnnotationServer, method: str, path: str, body: object = None, **headers: str):
     """Status, headers and body of a request, with the cookie of a page that was opened by its address."""
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=20)
     text = None if body is None else body if isinstance(body, str) else json.dumps(body)
-    given = {"Cookie": f"wearcap_token_{server.port}={server.guard.token}"}
+    given = {"Cookie": f"wearcap_token_{server.server_port}={server.guard.token}"}
     given |= ({"Content-Type": "application/json"} if text is not None else {}) | {
         key.replace("_", "-"): value for key, value in headers.items()
     }

@@ -180,8 +180,8 @@ def test_labels_outlive_a_server_that_is_away_and_another_window(dataset, tmp_pa
         browser.key("ArrowLeft", SHIFT)
         browser.key("a")
         browser.poll(lambda: "does not answer" in browser.text())
-        again = AnnotationServer(Desk(dataset / "r0", tmp_path), server.port)
-        assert again.port == server.port
+        again = AnnotationServer(Desk(dataset / "r0", tmp_path), server.server_port)
+        assert again.server_port == server.server_port
         try:
             browser.poll(lambda: "open the address that it printed" in browser.text())
             assert not on_disk_at_all(tmp_path)

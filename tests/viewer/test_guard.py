@@ -203,7 +203,7 @@ def test_saves_are_only_taken_from_the_page_itself(tmp_path):
         ):
             assert status(page, target, *headers, *kind, "", body, method="POST") == 403
         assert not list(tmp_path.glob("*.json"))
-        own = f"Origin: http://127.0.0.1:{page.port}"
+        own = f"Origin: http://127.0.0.1:{page.server_port}"
         assert status(page, path + token, own, *kind, "", body, method="POST") == 200
         assert (tmp_path / "r0.contacts.json").is_file()
         assert status(page, f"http://[::{token}") == 404, "a target that is no address is no traceback"
@@ -372,7 +372,7 @@ def test_idle_connections_hold_few_threads_and_keep_nobody_out(tmp_path):
     before = threading.active_count()
     body = {"labels": labels([(1.0, 2.0)]), "base": "", "client": "a"}
     try:
-        with idle(page.port, 200) as clients:
+        with idle(page.server_port, 200) as clients:
             until(lambda: sum(closed(client) for client in clients) >= 200 - MAX_CONNECTIONS)
             assert threading.active_count() <= before + MAX_CONNECTIONS
             assert status(page, with_token(page)) == 200
@@ -390,11 +390,11 @@ def test_idle_connections_hold_few_threads_and_keep_nobody_out(tmp_path):
 def test_a_video_on_its_way_is_not_closed_for_idle_connections(tmp_path):
     film = bytes(20_000_000)
     page = a_film_to_annotate(tmp_path, film)
-    connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=20)
+    connection = http.client.HTTPConnection("127.0.0.1", page.server_port, timeout=20)
     try:
         connection.request("GET", f"/recordings/0/video?token={page.guard.token}")
         reply = connection.getresponse()
-        with idle(page.port, 100) as clients:
+        with idle(page.server_port, 100) as clients:
             until(lambda: sum(closed(client) for client in clients) >= 100 - MAX_CONNECTIONS)
             assert reply.read() == film
     finally:
@@ -405,9 +405,9 @@ def test_a_video_on_its_way_is_not_closed_for_idle_connections(tmp_path):
 def test_idle_connections_are_closed(tmp_path, monkeypatch):
     monkeypatch.setattr(annotate_server._Handler, "timeout", 1.0)
     page = an_annotator(tmp_path)
-    connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=20)
+    connection = http.client.HTTPConnection("127.0.0.1", page.server_port, timeout=20)
     try:
-        with idle(page.port, 1) as clients:
+        with idle(page.server_port, 1) as clients:
             assert clients[0].recv(1) == b""
         connection.request("GET", with_token(page))
         connection.getresponse().read()

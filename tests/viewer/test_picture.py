@@ -72,7 +72,7 @@ def test_contacts_colour_the_feet():
 
 def test_video_has_the_frames_and_both_panels(tmp_path):
     motion = swaying_motion(60)
-    write_video(tmp_path / "v.mp4", {"a": motion, "b": motion}, fps=10, size=(96, 80), progress=False)
+    write_video(tmp_path / "v.mp4", {"a": motion, "b": motion}, fps=10, size=(96, 80))
     with av.open(str(tmp_path / "v.mp4")) as container:
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     assert len(frames) == 10

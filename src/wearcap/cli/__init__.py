@@ -1,5 +1,5 @@
 """The verbs: one module per verb with `HELP` (one line) and `main(arguments)`.
 
 Open `main.py` first: it dispatches to the verb and prints errors in one line. Hydra is used only here: `conf.py` composes
-configs, `load.py` builds pipelines from them and from checkpoints.
+configs, and builds pipelines from them and from checkpoints.
 """

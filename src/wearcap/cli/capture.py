@@ -15,8 +15,7 @@ from wearcap.body.model import BodyModel
 from wearcap.body.retarget import retarget
 from wearcap.body.skeletons import smplh52
 from wearcap.body.smpl_body import smpl_body
-from wearcap.cli.conf import hydra_main
-from wearcap.cli.load import load_pipeline
+from wearcap.cli.conf import hydra_main, load_pipeline
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.io.datasets.amass import write_amass
@@ -88,12 +87,8 @@ def _write(
     if config.video:
         truth = with_objects(recording, environment)
         shown = {"truth": truth} if truth is not None else {}
-        write_video(
-            folder / "motion.mp4",
-            shown | {"capture": motion},
-            environment=environment,
-            max_seconds=config.video_seconds,
-        )
+        shown, seconds = shown | {"capture": motion}, config.video_seconds
+        write_video(folder / "motion.mp4", shown, environment=environment, max_seconds=seconds)
 
 
 def _with_body(motion: Motion, recording: Recording, chosen: bool | str) -> tuple[Motion, BodyModel | None]:

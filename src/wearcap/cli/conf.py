@@ -1,10 +1,10 @@
-"""Configs: their location, their composition by Hydra, and suggestions for typos."""
+"""Configs: their location, their composition by Hydra, suggestions for typos, and the systems that they and checkpoints make."""
 
 import functools
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -19,11 +19,14 @@ from hydra.errors import (
     OverrideParseException,
 )
 from hydra.types import RunMode
+from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from wearcap.errors import WearcapError, nearest
 from wearcap.files import resource
+from wearcap.models.checkpoint import read_checkpoint
+from wearcap.runtime.system import System
 
 
 def conf_dir() -> Path:
@@ -118,22 +121,23 @@ def _explanation(error: Exception, config_name: str, arguments: list[str]) -> We
     if isinstance(error, MissingConfigException):
         return _missing_choice(error)
     if isinstance(error, OverrideParseException):
-        return WearcapError(
-            f"cannot read the override {error.override!r}", expected="key=value", fix=f"({str(error).splitlines()[0]})"
-        )
+        what, fix = f"cannot read the override {error.override!r}", f"({str(error).splitlines()[0]})"
+        return WearcapError(what, expected="key=value", fix=fix)
     if missing := re.search(r"Missing mandatory value: (\S+)", str(error)):
         key = missing.group(1).rstrip(".")
         return WearcapError(f"{key} has no value", fix=f"Give it on the command line: {key}=…")
     key = re.search(r"(?:Could not override|Could not delete from config\.|Could not append) '([^']+)'", str(error))
     key = key or re.search(r"key '?([\w./@-]+)'? (?:is not in|not found)", str(error), re.IGNORECASE)
-    if isinstance(error, InstantiationException):
-        return _refused(error)
+    if isinstance(error, InstantiationException):  # a configured object's constructor refused its values
+        cause: BaseException = error
+        while cause.__cause__ is not None:
+            cause = cause.__cause__
+        place = re.search(r"full_key: (\S+)", str(error))
+        built, why = place.group(1) if place else "what the config names", " ".join(str(cause).split()[:60])
+        return WearcapError(f"cannot build {built}: {why}", fix="--debug shows where.")
     if key is None and not isinstance(error, ConfigCompositionException):
-        return WearcapError(
-            str(error).strip().splitlines()[0],
-            where=f"config {config_name!r}",
-            fix="Run again with --debug for the whole story.",
-        )
+        what, fix = str(error).strip().splitlines()[0], "Run again with --debug for the whole story."
+        return WearcapError(what, where=f"config {config_name!r}", fix=fix)
     if key is None:
         return WearcapError(" ".join(str(error).split()), where=f"config {config_name!r}")
     # What would be valid: config groups, and dotted keys of the config without the override that failed.
@@ -142,18 +146,6 @@ def _explanation(error: Exception, config_name: str, arguments: list[str]) -> We
     with suppress(HydraException, OmegaConfBaseException):
         valid |= set(_dotted(_compose(config_name, rest)))
     return WearcapError(f"config {config_name!r} has no key {wrong!r}", fix=nearest(wrong, valid))
-
-
-def _refused(error: InstantiationException) -> WearcapError:
-    """Error that a configured object's constructor raised about its values."""
-    cause: BaseException = error
-    while cause.__cause__ is not None:
-        cause = cause.__cause__
-    place = re.search(r"full_key: (\S+)", str(error))
-    return WearcapError(
-        f"cannot build {place.group(1) if place else 'what the config names'}: " + " ".join(str(cause).split()[:60]),
-        fix="--debug shows where.",
-    )
 
 
 def _missing_choice(error: MissingConfigException) -> WearcapError:
@@ -183,3 +175,46 @@ def _dotted(config: Any, prefix: str = "") -> Iterator[str]:
             value = config[key]
             if not isinstance(value, ListConfig):
                 yield from _dotted(value, f"{prefix}{key}.")
+
+
+def load_pipeline(
+    checkpoint: str | Path | Sequence[str] | None, pipeline: DictConfig, device: str, shared: bool = False
+) -> System:
+    """The system of a pipeline config; one with a network (`_partial_`) takes it from checkpoints.
+
+    `shared`: without a checkpoint, the shared ones that the system names are used. Raises WearcapError for a system
+    with a network without a checkpoint, and for a checkpoint that the system cannot use.
+    """
+    given = [checkpoint] if isinstance(checkpoint, str | Path) else list(checkpoint or ())
+    return load_systems(given, pipeline, device, shared)[0]
+
+
+def load_systems(given: Sequence[str | Path], pipeline: DictConfig, device: str, shared: bool = False) -> list[System]:
+    """The system of a pipeline config with all checkpoints, or one system for each of them; raises as `load_pipeline`."""
+    made = instantiate(pipeline, _convert_="all")
+    if isinstance(made, System):
+        if given:
+            what = f"a checkpoint, but {type(made).__name__} has no network"
+            raise WearcapError(what, where=given[0], fix="Leave checkpoint=… out, or choose another pipeline=….")
+        return [made]
+    kind: type[System] = made.func
+    given = given or (list(kind.shared) if shared else [])
+    if not given:
+        fix = "Give checkpoint=…, or a pipeline without one, such as pipeline=hps."
+        raise WearcapError(f"no checkpoint, but {kind.__name__} needs a trained network", fix=fix)
+    together = [given] if kind.joins_checkpoints else [[checkpoint] for checkpoint in given]
+    return [kind.trained(made, checkpoints, device) for checkpoints in together]
+
+
+def trained_on(checkpoint: str | Path) -> tuple[list[str], str]:
+    """(folders of the training data sets, folder of the validation data set) of a checkpoint.
+
+    Raises WearcapError for a checkpoint that was shared without them.
+    """
+    data = read_checkpoint(checkpoint)[0].get("data", {})
+    if not data.get("sources"):
+        what = "this checkpoint does not name the data it was trained on"
+        raise WearcapError(what, where=checkpoint, fix="Give dataset=DIR and baselines=false.")
+    sources = [source["root"] for source in data["sources"].values() if source]
+    validated = [source["root"] for source in (data.get("val_sources") or data["sources"]).values() if source]
+    return sources, validated[0]

@@ -21,36 +21,24 @@ def main(arguments: list[str]) -> None:
     out, data, checkpoint = (options.output, options.output / "data", options.output / "train/checkpoints/last.ckpt")
     started = time.monotonic()
     _step("Simulated wearers", prepare.main, ["simulated", "preset=demo", f"output={data}"])
-    _step(
-        "Training",
-        train.main,
-        [
-            "experiment=motion_diffusion_head",
-            f"data.sources.simulated.root={data}",
-            f"data.loading.steps_per_epoch={max(1, options.steps // 2)}",
-            f"trainer.max_steps={options.steps}",
-            f"hydra.run.dir={out}/train",
-            "callbacks.capture.every_n_epochs=100",
-            "callbacks.average.decay=0.98",
-            "data.loading.batch_size=16",
-        ],
-    )
-    _step(
-        "Evaluation",
-        evaluate.main,
-        [f"checkpoint={checkpoint}", f"hydra.run.dir={out}/evaluate", "seeds=[0]", f"output={out}/table.json"],
-    )
+    training = [
+        "experiment=motion_diffusion_head",
+        f"data.sources.simulated.root={data}",
+        f"data.loading.steps_per_epoch={max(1, options.steps // 2)}",
+        f"trainer.max_steps={options.steps}",
+        f"hydra.run.dir={out}/train",
+        "callbacks.capture.every_n_epochs=100",
+        "callbacks.average.decay=0.98",
+        "data.loading.batch_size=16",
+    ]
+    _step("Training", train.main, training)
+    trained = f"checkpoint={checkpoint}"
+    table = [trained, f"hydra.run.dir={out}/evaluate", "seeds=[0]", f"output={out}/table.json"]
+    _step("Evaluation", evaluate.main, table)
     name = RecordingStore.open(data).names("test")[0]
-    _step(
-        "Capture",
-        capture.main,
-        [f"checkpoint={checkpoint}", f"recording={data}/{name}", f"hydra.run.dir={out}/capture", "video_seconds=10"],
-    )
-    _step(
-        "Export",
-        export.main,
-        [f"checkpoint={checkpoint}", f"hydra.run.dir={out}/export", f"output={out}/denoiser.onnx"],
-    )
+    motion = [trained, f"recording={data}/{name}", f"hydra.run.dir={out}/capture", "video_seconds=10"]
+    _step("Capture", capture.main, motion)
+    _step("Export", export.main, [trained, f"hydra.run.dir={out}/export", f"output={out}/denoiser.onnx"])
     show(
         f"\n[bold]Done in {(time.monotonic() - started) / 60:.1f} minutes.[/bold]\n"
         f"table    {out / 'table.json'}\nvideo    {out / 'capture/motion.mp4'}\n"

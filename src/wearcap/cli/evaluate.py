@@ -7,8 +7,7 @@ from omegaconf import DictConfig, ListConfig
 from rich import print as show
 from rich.progress import Progress
 
-from wearcap.cli.conf import hydra_main
-from wearcap.cli.load import load_systems, trained_on
+from wearcap.cli.conf import hydra_main, load_systems, trained_on
 from wearcap.errors import WearcapError
 from wearcap.evaluation.baselines import BASELINES
 from wearcap.evaluation.evaluate import Realism, evaluate
@@ -38,15 +37,24 @@ def run(config: DictConfig) -> Scores:
     realism = None if config.realism is None else Realism.load(config.realism)
     scores: Scores = {}
     with Progress(transient=True) as progress:
+
+        def scored(system: System, seeds: list[int], title: str, method: str) -> Iterable[Row]:
+            names = store.names(config.split)
+            measure = system.score if realism is None else realism.beside(system.score, method)
+            options = StageOptions(None if config.cache is None else Path(config.cache), console=progress.console)
+            place = config.scene, config.metres_per_unit
+            found = evaluate(system, store, names, seeds, config.batch_size, measure, *place, options)
+            return progress.track(found, total=len(names) * len(seeds), description=title)
+
         rows: list[Row] = []
         for index, system in enumerate(systems):
             seeds = [index * 1000 + seed for seed in config.seeds] if system.draws else list(config.seeds)[:1]
             title = Path(checkpoints[index]).parts[-3:][0] if name == OURS else name
-            rows += _rows(system, store, seeds, config, progress, title, realism, name)
+            rows += scored(system, seeds, title, name)
         scores[name] = _summaries(rows, realism, name)
         for label in baselines:
             baseline = BASELINES[label].fit([RecordingStore.open(source) for source in sources])
-            rows = list(_rows(baseline, store, [0], config, progress, label, realism, label))
+            rows = list(scored(baseline, [0], label, label))
             scores[label] = _summaries(rows, realism, label)
     about = {"dataset": str(store.root), "split": config.split, "checkpoint": ", ".join(checkpoints) or "None"}
     show(rich_table(f"{store.root.name}, {config.split} split", scores))
@@ -62,25 +70,6 @@ def _summaries(rows: list[Row], realism: Realism | None, method: str) -> dict[st
     if notice := realism.notice(method):
         show(f"[yellow]{notice}[/yellow]")
     return aggregate(rows) | realism.scores(method)
-
-
-def _rows(
-    system: System,
-    store: RecordingStore,
-    seeds: list[int],
-    config: DictConfig,
-    progress: Progress,
-    title: str,
-    realism: Realism | None,
-    method: str,
-) -> Iterable[Row]:
-    names = store.names(config.split)
-    measure = system.score if realism is None else realism.beside(system.score, method)
-    options = StageOptions(None if config.cache is None else Path(config.cache), console=progress.console)
-    rows = evaluate(
-        system, store, names, seeds, config.batch_size, measure, config.scene, config.metres_per_unit, options
-    )
-    return progress.track(rows, total=len(names) * len(seeds), description=title)
 
 
 def main(arguments: list[str]) -> None:

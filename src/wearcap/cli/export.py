@@ -3,9 +3,8 @@
 from omegaconf import DictConfig
 from rich import print as show
 
-from wearcap.cli.conf import hydra_main
-from wearcap.cli.load import load_pipeline
-from wearcap.export.write import ExportReport, write_exports
+from wearcap.cli.conf import hydra_main, load_pipeline
+from wearcap.export.files import ExportReport, write_exports
 from wearcap.models.checkpoint import load_trained, share_checkpoint
 
 HELP = "export a network: wearcap export checkpoint=… format=onnx|pt2|safetensors"

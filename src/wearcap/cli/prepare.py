@@ -1,5 +1,6 @@
 """`wearcap prepare SOURCE`: make a data set of recordings."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -8,8 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from wearcap.cli.conf import compose, conf_dir, explained, nearest, splits_dir
 from wearcap.errors import WearcapError
-from wearcap.prepare.engine import Report, prepare
-from wearcap.prepare.splits import Splits
+from wearcap.prepare.engine import Report, Splits, prepare
 from wearcap.recording.store import SPLITS, RecordingStore
 
 HELP = "make a data set: wearcap prepare simulated, wearcap prepare cmu source=DIR"
@@ -19,23 +19,15 @@ def run(config: DictConfig) -> Report:
     """Run the config's preparation: recordings by `tasks`, or by `rework` a change of an existing data set."""
     if "rework" in config:
         if "output" not in config.rework and Path(config.output) != Path(config.dataset):
-            raise WearcapError(
-                f"output={config.output}, but this source rewrites the recordings of its data set",
-                where=config.dataset,
-                fix="Leave output=… out, or copy the data set first.",
-            )
+            what = f"output={config.output}, but this source rewrites the recordings of its data set"
+            raise WearcapError(what, where=config.dataset, fix="Leave output=… out, or copy the data set first.")
         report = instantiate(config.rework, _convert_="all")
     else:
         listed = splits_dir() / config.splits
         splits = Splits.read(listed if listed.is_file() else Path(config.splits))
-        report = prepare(
-            instantiate(config.tasks, _convert_="all", _partial_=True)(splits=splits),
-            config.output,
-            jobs=config.jobs,
-            backend=config.backend,
-            scheduler=config.scheduler,
-            overwrite=config.overwrite,
-        )
+        tasks = instantiate(config.tasks, _convert_="all", _partial_=True)(splits=splits)
+        options = {key: config[key] for key in ("jobs", "backend", "scheduler", "overwrite")}
+        report = prepare(tasks, config.output, **options)
     _show_report(report, RecordingStore.open(config.output))
     return report
 
@@ -65,12 +57,8 @@ def usage() -> str:
     """Help text that lists the sources."""
     lines = ["usage: wearcap prepare SOURCE [key=value …]     wearcap prepare SOURCE --help", ""]
     for name, path in sources().items():
-        about = next(
-            line[2:]
-            for line in path.read_text(encoding="utf-8").splitlines()
-            if line.startswith("# ") and not line.startswith("# @")
-        )
-        lines.append(f"  {name:10} {about}")
+        notes = re.findall(r"^# (?!@)(.*)", path.read_text(encoding="utf-8"), re.MULTILINE)
+        lines.append(f"  {name:10} {notes[0]}")
     return "\n".join([*lines, "", _shared_settings()])
 
 

@@ -24,17 +24,14 @@ def run(config: DictConfig) -> Track:
     if config.source is None and config.from_model is None:
         raise WearcapError("nothing to track", expected="wearcap track VIDEO, or from_model=DIR")
     settings = instantiate(config.settings)
-    if not settings.fps > 0:
-        raise WearcapError(f"settings.fps={settings.fps}", expected="pictures a second, above 0")
+    fps = settings.fps
+    if not fps > 0:
+        raise WearcapError(f"settings.fps={fps}", expected="pictures a second, above 0")
     named = config.from_model or config.source
     output = Path(config.output or Path(config.paths.outputs) / "track" / Path(named).stem)
     if config.from_model is not None:
         model = read_colmap(config.from_model, config.source)
-        pictures = (
-            Pictures.of_model(model, settings.fps)
-            if config.source is None
-            else Pictures.of_folder(config.source, settings.fps)
-        )
+        pictures = Pictures.of_model(model, fps) if config.source is None else Pictures.of_folder(config.source, fps)
         found = Track.of_model(model, pictures, settings.max_gap_s, where=config.from_model)
     else:
         camera, tasks = None if config.camera is None else read_camera(config.camera), {}

@@ -40,11 +40,8 @@ def train(config: DictConfig) -> float:
         record_run(run, OmegaConf.to_yaml(config, resolve=True))
         resume = resume_path(config.resume, run, Path(config.paths.outputs) / "train" / config.name)
         data, system = instantiate(config.data, _convert_="all"), instantiate(config.model, _convert_="all")
-        callbacks = [
-            instantiate(callback, _convert_="all")
-            for callback in config.callbacks.values()
-            if callback and "_target_" in callback
-        ]
+        chosen = [callback for callback in config.callbacks.values() if callback and "_target_" in callback]
+        callbacks = [instantiate(callback, _convert_="all") for callback in chosen]
         callbacks.insert(0, ConfigInCheckpoint(OmegaConf.to_container(config, resolve=True)))
         if config.early_stop:
             callbacks.append(EarlyStopping("val/loss", patience=config.early_stop))
@@ -56,11 +53,8 @@ def train(config: DictConfig) -> float:
         fit(system, data, trainer, resume)
         last = run / "checkpoints" / "last.ckpt"
         if trainer.is_global_zero:
-            show(
-                f"checkpoint: {last}"
-                if last.is_file()
-                else f"no step was left to make: {resume} has made {trainer.global_step}"
-            )
+            nothing_new = f"no step was left to make: {resume} has made {trainer.global_step}"
+            show(f"checkpoint: {last}" if last.is_file() else nothing_new)
         return float(trainer.callback_metrics.get("val/loss", float("nan")))
 
 

@@ -32,17 +32,16 @@ def read_motions(paths: Sequence[str]) -> dict[str, Motion]:
     return {label: read_motion(file) for label, file in zip(labels, files, strict=True)}
 
 
+def add_motions(parser: argparse.ArgumentParser, purpose: str) -> None:
+    """Add the option `--motion FILE …`, whose files `read_motions` reads."""
+    text = f"captured motions (.npz that `wearcap capture` wrote) to {purpose}"
+    parser.add_argument("--motion", nargs="+", action="extend", default=[], metavar="FILE", help=text)
+
+
 def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="wearcap view", description="Show a recording in the browser.")
     parser.add_argument("recording", help="DATASET/NAME or a recording's .safetensors file")
-    parser.add_argument(
-        "--motion",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="FILE",
-        help="captured motions (.npz that `wearcap capture` wrote) to show with it; several stand side by side",
-    )
+    add_motions(parser, "show with it; several stand side by side")
     parser.add_argument(
         "--port", type=port_number, default=8080, help="port of the page (default 8080, else the next free)"
     )
@@ -54,14 +53,9 @@ def main(arguments: list[str]) -> None:
     from wearcap.runtime.system import CaptureInput
     from wearcap.viewer.page import Page
 
-    recording = load_recording(options.recording)
-    page = Page(
-        recording,
-        read_motions(options.motion),
-        folder=dataset_folder(options.recording),
-        host=options.host,
-        port=options.port,
-        environment=CaptureInput(recording, dataset_folder(options.recording)).objects(options.environment),
-    )
+    recording, folder = load_recording(options.recording), dataset_folder(options.recording)
+    captures = read_motions(options.motion)
+    environment = CaptureInput(recording, folder).objects(options.environment)
+    page = Page(recording, captures, folder=folder, host=options.host, port=options.port, environment=environment)
     print(f"{recording.name}: open {page.url} (Ctrl+C ends; space plays, J and L jump by a second)")
     page.serve()

@@ -8,7 +8,7 @@ from wearcap.body.kinematics import site_positions
 from wearcap.body.landmarks import Landmarks, landmarks
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.doctor.report import Check, Finding, has_error
-from wearcap.doctor.streams import check_rotations, check_speed, quantile
+from wearcap.doctor.streams import axis_name, check_rotations, check_speed, quantile
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory, interpolate, linear_velocity
@@ -85,8 +85,7 @@ def _check_posture(stream: str, motion: Motion, parts: Landmarks) -> list[Findin
     mean = upward.mean(0)
     evidence = "from feet to head: (" + ", ".join(f"{v:+.2f}" for v in mean.tolist()) + ") of the world, on average"
     if mean[2] < 0.5:
-        axis = int(mean.abs().argmax())
-        name = ("-" if mean[axis] < 0 else "+") + "xyz"[axis]
+        name = axis_name(mean)
         if mean.abs().max() > 0.8:
             fix = f"Read it with up='{name.lstrip('+')}', or turn the world so."
             return [check.error(f"the body stands along {name}", evidence, fix)]

@@ -14,12 +14,12 @@ from wearcap.doctor.agreement import (
     check_files,
     check_head_against_body,
     check_head_cue,
+    check_imu,
     check_localization,
     check_points,
     floor_below,
 )
 from wearcap.doctor.body import check_contact_prob, check_motion
-from wearcap.doctor.inertial import check_imu
 from wearcap.doctor.places import is_map, is_place, read_environment_file, read_map, read_place
 from wearcap.doctor.report import SEVERITIES, Check, Finding, Report, has_error, refusal
 from wearcap.doctor.streams import check_clock, check_spans, check_track
@@ -118,13 +118,7 @@ def examine_recording(recording: Recording) -> list[Finding]:
 
 
 def _clocks(recording: Recording) -> dict[str, Float64[Tensor, "_"]]:
-    streams = {
-        "head": recording.head,
-        "motion": recording.motion,
-        "suit": recording.suit,
-        "camera": recording.camera,
-        "localization": recording.localization,
-    }
+    streams = {name: getattr(recording, name) for name in ("head", "motion", "suit", "camera", "localization")}
     streams |= {f"imu {name}": imu for name, imu in recording.imu.items()}
     return {name: stream.timestamps for name, stream in streams.items() if stream is not None}
 
@@ -183,9 +177,8 @@ def _read_file(path: Path) -> Loaded:
     if isinstance(content, Trajectory):
         head = HeadStream(content.timestamps, content.R_world_body, content.t_world_body, torch.eye(3), torch.zeros(3))
         evidence, fix = "a trajectory file does not name its axes", "x forward, y left, z up is assumed."
-        return Recording(name=name, head=head), [
-            Check("head: axes").note("taken as the head's own pose", evidence, fix)
-        ]
+        note = Check("head: axes").note("taken as the head's own pose", evidence, fix)
+        return Recording(name=name, head=head), [note]
     return Recording(name=name, points=PointCloud(torch.from_numpy(content.points))), []
 
 

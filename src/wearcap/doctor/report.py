@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from functools import partialmethod
 
 from wearcap.errors import WearcapError
 
@@ -39,14 +40,9 @@ class Check:
     def ok(self, what: str, evidence: str = "") -> Finding:
         return self.found("ok", what, evidence)
 
-    def note(self, what: str, evidence: str = "", fix: str = "") -> Finding:
-        return self.found("note", what, evidence, fix)
-
-    def warning(self, what: str, evidence: str = "", fix: str = "") -> Finding:
-        return self.found("warning", what, evidence, fix)
-
-    def error(self, what: str, evidence: str = "", fix: str = "") -> Finding:
-        return self.found("error", what, evidence, fix)
+    note = partialmethod(found, "note")
+    warning = partialmethod(found, "warning")
+    error = partialmethod(found, "error")
 
 
 def has_error(findings: Iterable[Finding]) -> bool:

@@ -238,11 +238,11 @@ def _check_upright(stream: str, track: Trajectory) -> Finding:
         evidence += f"; read as {order} it is upright"
         return check.error("quaternions are read in the wrong order", evidence, f"Read the quaternions as {order}.")
     if consistent and vertical != 2 and up_world.abs().max() > 0.7:
-        name = _axis_name(up_world)
+        name = axis_name(up_world)
         fix = f"Turn the world so that {name} becomes z (reader option up, or {name} → z for poses and points alike)."
         return check.error(f"the world's {name} axis is up, not z", evidence, fix)
     if up_body.norm() > 0.8 and up_body.abs().max() > 0.7:
-        name = _axis_name(up_body)
+        name = axis_name(up_body)
         fix = "Turn the device's own axes to x forward, y left, z up (R_world_device @ R_device_head axes)."
         return check.error(f"the body's {name} axis points up, not z", f"{evidence}; its {name} axis does", fix)
     fix = "Check axes and quaternion order; lying and crawling look like this too."
@@ -255,6 +255,7 @@ def _mean_angle(angle: Tensor) -> tuple[float, float]:
     return math.atan2(sin, cos), math.hypot(cos, sin)
 
 
-def _axis_name(direction: Tensor) -> str:
+def axis_name(direction: Tensor) -> str:
+    """The axis nearest to a direction, with its sign."""
     axis = int(direction.abs().argmax())
     return ("-" if direction[axis] < 0 else "+") + "xyz"[axis]

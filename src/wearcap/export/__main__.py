@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from wearcap.errors import WearcapError
-from wearcap.export.read import load_exported
+from wearcap.export.files import load_exported
 from wearcap.recording import Recording
 from wearcap.recording.store import RecordingFile, dataset_folder, save_recording
 from wearcap.runtime.system import CaptureInput, System

@@ -4,7 +4,6 @@ Open `engine.py` first. Sources: `worn.py` (worn sensors), `mocap_sources.py` (m
 object), `simulated.py`; `embeddings.py` and `keypoints.py` add to a data set. `conf/prepare/` names what `wearcap prepare` runs.
 """
 
-from wearcap.prepare.engine import Report, Task, check_recording, content_hash, prepare
-from wearcap.prepare.splits import Splits
+from wearcap.prepare.engine import Report, Splits, Task, check_recording, content_hash, prepare
 
 __all__ = ["Report", "Splits", "Task", "check_recording", "content_hash", "prepare"]

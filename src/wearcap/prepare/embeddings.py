@@ -18,11 +18,7 @@ from wearcap.recording.store import Entry, RecordingFile, RecordingStore, save_r
 
 
 def embed_dataset(
-    dataset: str | Path,
-    encoder: ImageEncoder,
-    cache: str | Path | None = None,
-    overwrite: bool = False,
-    progress: bool = True,
+    dataset: str | Path, encoder: ImageEncoder, cache: str | Path | None = None, overwrite: bool = False
 ) -> Report:
     """Add embeddings by `encoder` to every recording with head-camera pictures, rewriting its file.
 
@@ -38,14 +34,21 @@ def embed_dataset(
         remove_leftovers(root, below=True)
         store = RecordingStore.open(root)
         try:
-            with progress_bar(len(store.entries), 0, progress) as advance:
+            with progress_bar(len(store.entries), 0) as advance:
                 for name in store.names():
                     try:
-                        file = RecordingFile(store.path_of(name), verify=_is_registered(store, name))
+                        registered = _is_registered(store, name)
+                        file = RecordingFile(store.path_of(name), verify=registered)
                         camera = file.part("camera")
                         if not isinstance(camera, CameraStream) or not (camera.video or camera.image_files):
                             report.notes[name] = "no head camera's pictures"
-                        elif not overwrite and _is_current(store, name, camera, name_of_all):
+                        elif (
+                            registered  # a file of a killed run that is not in the manifest yet is written again
+                            and not overwrite
+                            and camera.embedding is not None
+                            and camera.embedding_mirrored is not None
+                            and camera.embedding_name == name_of_all
+                        ):
                             report.current.append(name)
                         else:
                             pending[name] = _embed(store, name, file, encoder, cache)
@@ -59,19 +62,9 @@ def embed_dataset(
         finally:
             store.register(pending)
     if len(report.notes) == len(store.entries):
-        raise WearcapError(
-            "no recording has a head camera's pictures",
-            where=store.root,
-            fix="Prepare it with them, as `wearcap prepare simulated camera=true` does.",
-        )
+        fix = "Prepare it with them, as `wearcap prepare simulated camera=true` does."
+        raise WearcapError("no recording has a head camera's pictures", where=store.root, fix=fix)
     return report
-
-
-def _is_current(store: RecordingStore, name: str, camera: CameraStream, embedded_by: str) -> bool:
-    """Whether a recording is up to date; a file of a killed run that is not in the manifest yet is written again."""
-    known = _is_registered(store, name)
-    both = camera.embedding is not None and camera.embedding_mirrored is not None
-    return known and both and camera.embedding_name == embedded_by
 
 
 def _is_registered(store: RecordingStore, name: str) -> bool:
@@ -85,9 +78,8 @@ def _embed(
 ) -> Entry:
     recording, entry = file.load(), store.entries[name]
     assert recording.camera is not None
-    recording = replace(
-        recording, camera=embed_camera(recording.camera, store.root, encoder, None if cache is None else Path(cache))
-    )
+    camera = embed_camera(recording.camera, store.root, encoder, None if cache is None else Path(cache))
+    recording = replace(recording, camera=camera)
     check_recording(recording)
     save_recording(recording, store.path_of(name))
     return Entry.of(recording, store.root, entry.split, entry.config_hash)

@@ -4,6 +4,7 @@ A worker writes its recording's file; the parent enters it in the manifest as re
 moment, a data set is left with whole files and a whole manifest, and the next run does only what is missing.
 """
 
+import csv
 import hashlib
 import json
 import time
@@ -12,6 +13,7 @@ from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import BrokenExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -24,16 +26,19 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from wearcap.errors import WearcapError
 from wearcap.files import remove_leftovers, sha256_of
+from wearcap.io.formats.poses import are_rotations
 from wearcap.locks import folder_lock
 from wearcap.recording.recording import MIN_DURATION_S, Recording
 from wearcap.recording.serialize import flatten
-from wearcap.recording.store import Entry, RecordingStore, recording_path, save_recording
+from wearcap.recording.store import SPLITS, Entry, RecordingStore, recording_path, save_recording
 from wearcap.workers import bound_to_this_process
 
 BACKENDS = ("loky", "threading", "dask", "ray")
 REGISTER_EVERY_S = 1.0
 """Least interval (s) between writes of the manifest: a large data set's has megabytes."""
 
+BY_HASH = "hash"
+"""Split of a pattern's subjects by the hash of their names: 5 % val, 15 % test, the others train."""
 NOTE = "note"
 """Key of a motion's provenance that the report repeats: notes on cut, dropped or guessed data."""
 
@@ -64,6 +69,48 @@ class Report:
     notes: dict[str, str] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class Splits:
+    """Rows (subject or pattern, split) of a list; the first row that matches a subject decides."""
+
+    path: Path
+    rows: tuple[tuple[str, str], ...]
+
+    def of(self, subject: str) -> str:
+        """Split of a subject. Raises WearcapError when no row matches."""
+        for pattern, split in self.rows:
+            if fnmatchcase(subject, pattern):
+                if split != BY_HASH:
+                    return split
+                share = int.from_bytes(hashlib.sha256(subject.encode()).digest()[:4], "big") / 2**32
+                return "val" if share < 0.05 else "test" if share < 0.20 else "train"
+        fix = "Add a row with it, or a last row such as '*,train'."
+        raise WearcapError(f"subject {subject!r} is in no split", where=self.path, fix=fix)
+
+    @classmethod
+    def read(cls, path: str | Path) -> "Splits":
+        """Read a list with columns `subject,split`; lines that begin with # are comments.
+
+        A subject may be a pattern (`HumanEva/*`), a split is train, val, test, or "hash".
+        """
+        path = Path(path)
+        try:
+            lines = path.read_text(encoding="utf-8").splitlines()
+        except FileNotFoundError as error:
+            raise WearcapError(
+                "no such split list", where=path, expected="a .csv with columns subject,split"
+            ) from error
+        table = list(csv.DictReader(line for line in lines if line.strip() and not line.startswith("#")))
+        if not table or set(table[0]) != {"subject", "split"}:
+            raise WearcapError("not a split list", where=path, expected="columns subject,split")
+        for row in table:
+            if row["split"] not in (*SPLITS, BY_HASH):
+                raise WearcapError(
+                    f"no split {row['split']!r}", where=path, expected=f"one of {', '.join((*SPLITS, BY_HASH))}"
+                )
+        return cls(path, tuple((row["subject"], row["split"]) for row in table))
+
+
 def content_hash(*parts: Any) -> str:
     """Hex digest (16 digits) of settings (anything JSON can hold) and of the bytes of files given as Path."""
     plain = [sha256_of(part) if isinstance(part, Path) else part for part in parts]
@@ -90,7 +137,6 @@ def prepare(
     backend: str = "loky",
     scheduler: str | None = None,
     overwrite: bool = False,
-    progress: bool = True,
 ) -> Report:
     """Make every recording that is missing or out of date.
 
@@ -115,22 +161,16 @@ def prepare(
         todo = tasks if overwrite else [task for task in tasks if not _is_current(store, task)]
         current = sorted(names - {task.name for task in todo})
         with closing(_outcomes(todo, store.root, jobs, backend, scheduler, lock)) as outcomes:
-            return _collect(outcomes, store, current, len(tasks), progress)
+            return _collect(outcomes, store, current, len(tasks))
 
 
 def _collect(
-    outcomes: Iterator[tuple[str, Entry | str, str]],
-    store: RecordingStore,
-    current: list[str],
-    total: int,
-    progress: bool,
+    outcomes: Iterator[tuple[str, Entry | str, str]], store: RecordingStore, current: list[str], total: int
 ) -> Report:
     """Register the workers' results in the manifest, and report."""
-    report = Report(current=current)
-    pending: dict[str, Entry] = {}
-    written_at = time.monotonic()
+    report, pending, written_at = Report(current=current), dict[str, Entry](), time.monotonic()
     try:
-        with progress_bar(total, len(current), progress) as advance:
+        with progress_bar(total, len(current)) as advance:
             for name, outcome, note in outcomes:
                 if isinstance(outcome, Entry):
                     pending[name] = outcome
@@ -145,11 +185,8 @@ def _collect(
                     pending, written_at = {}, time.monotonic()
                 advance()
     except BrokenExecutor as error:
-        raise WearcapError(
-            "a worker process was killed (out of memory?)",
-            where=store.root,
-            fix="What is finished is kept: run again with fewer jobs.",
-        ) from error
+        fix = "What is finished is kept: run again with fewer jobs."
+        raise WearcapError("a worker process was killed (out of memory?)", where=store.root, fix=fix) from error
     finally:
         store.register(pending)
     report.written.sort()
@@ -193,12 +230,10 @@ def _outcomes(
         return
     with _backend(backend, jobs, scheduler, lock) as as_generator:
         chunk_size = len(todo) if as_generator else 64  # without a generator, results arrive chunk by chunk
-        parallel = joblib.Parallel(
-            n_jobs=jobs, batch_size=1, return_as="generator_unordered" if as_generator else "list"
-        )
+        results_as = "generator_unordered" if as_generator else "list"
+        parallel = joblib.Parallel(n_jobs=jobs, batch_size=1, return_as=results_as)
         for start in range(0, len(todo), chunk_size):
-            chunk = todo[start : start + chunk_size]
-            results: Any = parallel(joblib.delayed(_run)(task, root) for task in chunk)
+            results: Any = parallel(joblib.delayed(_run)(task, root) for task in todo[start : start + chunk_size])
             yield from results
 
 
@@ -212,11 +247,8 @@ def _backend(backend: str, jobs: int, scheduler: str | None, lock: int | None) -
         if backend == "dask":
             from dask.distributed import Client  # type: ignore[import-not-found]
 
-            local = {
-                "n_workers": joblib.cpu_count() if jobs < 1 else jobs,
-                "threads_per_worker": 1,
-                "dashboard_address": None,
-            }
+            workers = joblib.cpu_count() if jobs < 1 else jobs
+            local = {"n_workers": workers, "threads_per_worker": 1, "dashboard_address": None}
             with Client(scheduler) if scheduler else Client(**local), joblib.parallel_config("dask"):
                 yield True
         elif backend == "ray":
@@ -236,17 +268,15 @@ def _backend(backend: str, jobs: int, scheduler: str | None, lock: int | None) -
             with joblib.parallel_config(backend):
                 yield True
     except ModuleNotFoundError as error:
-        raise WearcapError(
-            f"the backend {backend!r} needs the package {error.name!r}",
-            fix=f"pip install {'wearcap[cluster]' if backend == 'dask' else 'ray'}",
-        ) from error
+        fix = f"pip install {'wearcap[cluster]' if backend == 'dask' else 'ray'}"
+        raise WearcapError(f"the backend {backend!r} needs the package {error.name!r}", fix=fix) from error
 
 
 @contextmanager
-def progress_bar(total: int, done: int, visible: bool) -> Iterator[Callable[[], None]]:
+def progress_bar(total: int, done: int) -> Iterator[Callable[[], None]]:
     """Progress bar of recordings on stderr; the yielded function is called for each finished one."""
     columns = (TextColumn("recordings"), BarColumn(), MofNCompleteColumn(), TextColumn("left:"), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=not visible) as bar:
+    with Progress(*columns, console=Console(stderr=True)) as bar:
         line = bar.add_task("recordings", total=total, completed=done)
         yield lambda: bar.advance(line)
 
@@ -274,14 +304,11 @@ def check_recording(recording: Recording) -> None:
             wrong = f"{key} do not rise at row {int(still[0]) + 1} (frame rate 0?)"
             raise WearcapError(wrong, where=where, expected="strictly rising seconds")
         if known and key.rpartition(".")[2].startswith("R_"):
-            R = tensor.double().reshape(-1, 3, 3)
-            away = (R.transpose(-1, -2) @ R - torch.eye(3, dtype=R.dtype)).abs().amax((-1, -2))
-            bad = (away > ORTHOGONAL_WITHIN) | (torch.linalg.det(R) < 0)
+            bad = ~are_rotations(tensor.double().reshape(-1, 3, 3), ORTHOGONAL_WITHIN)
             if bad.any():
+                wrong = f"{int(bad.sum())} matrices of {key} are no rotations"
                 expected = f"orthogonal within {ORTHOGONAL_WITHIN}, determinant +1"
-                raise WearcapError(
-                    f"{int(bad.sum())} matrices of {key} are no rotations", where=where, expected=expected
-                )
+                raise WearcapError(wrong, where=where, expected=expected)
     for part in ("motion", "head"):
         times = tensors.get(f"{part}.timestamps")
         if times is None:
@@ -291,11 +318,8 @@ def check_recording(recording: Recording) -> None:
             raise WearcapError(f"{part} has {len(times)} frames", where=where, expected=expected)
         fps = (len(times) - 1) / duration
         if not RATES_HZ[0] <= fps <= RATES_HZ[1]:
-            raise WearcapError(
-                f"{part} runs at {fps:.4g} frames per second",
-                where=where,
-                expected=f"{RATES_HZ[0]:g} to {RATES_HZ[1]:g}",
-                fix="Give the true frame rate of the source.",
-            )
+            what = f"{part} runs at {fps:.4g} frames per second"
+            fix = "Give the true frame rate of the source."
+            raise WearcapError(what, where=where, expected=f"{RATES_HZ[0]:g} to {RATES_HZ[1]:g}", fix=fix)
     if recording.motion is None and recording.head is None:
         raise WearcapError("neither a motion nor a head path", where=where, expected="one at least")

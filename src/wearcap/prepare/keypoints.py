@@ -82,11 +82,8 @@ class Simulated:
     def __call__(self, recording: Recording, folder: Path) -> Recording:
         motion = recording.motion
         if motion is None:
-            raise WearcapError(
-                "no true motion to simulate keypoints of",
-                where=recording.name,
-                expected="motion capture, or another detector",
-            )
+            what, expected = "no true motion to simulate keypoints of", "motion capture, or another detector"
+            raise WearcapError(what, where=recording.name, expected=expected)
         rng = np.random.default_rng([41, self.seed, zlib.crc32(recording.name.encode())])
         every = max(1, round(motion.fps / CAMERA_FPS))
         stream = recording.camera or action_camera(motion.timestamps[::every].contiguous())
@@ -105,17 +102,9 @@ Source = Found | Recorded | Simulated
 
 
 def keypoints_dataset(
-    dataset: str | Path,
-    output: str | Path,
-    detector: Source,
-    *,
-    jobs: int = 1,
-    backend: str = "loky",
-    scheduler: str | None = None,
-    overwrite: bool = False,
-    progress: bool = True,
+    dataset: str | Path, output: str | Path, detector: Source, *, jobs: int = 1, **options: Any
 ) -> Report:
-    """Make a data set with the recordings of another and their keypoints, in the same splits.
+    """Make a data set with the recordings of another and their keypoints, in the same splits; `options` as `prepare`'s.
 
     Raises WearcapError when both are one folder, and for one file of keypoints with several recordings.
     """
@@ -124,19 +113,14 @@ def keypoints_dataset(
         raise WearcapError("the new data set would replace the old one", where=output, expected="another folder")
     file = detector.file if isinstance(detector, Recorded) else None
     if file is not None and Path(file).is_file() and len(store.names()) > 1:
-        raise WearcapError(
-            f"one file of keypoints for {len(store.names())} recordings",
-            where=file,
-            expected="a folder with NAME.csv for each",
-        )
+        what = f"one file of keypoints for {len(store.names())} recordings"
+        raise WearcapError(what, where=file, expected="a folder with NAME.csv for each")
     tasks = []
     for name in store.names():
         entry = store.entries[name]
         make = partial(_with_keypoints, store.root / entry.file, store.root, Path(output), detector)
         tasks.append(Task(name, make, entry.split, content_hash(entry.sha256, *detector.settings(name))))
-    return prepare(
-        tasks, output, jobs=jobs, backend=backend, scheduler=scheduler, overwrite=overwrite, progress=progress
-    )
+    return prepare(tasks, output, jobs=jobs, **options)
 
 
 def _camera(recording: Recording) -> CameraStream:

@@ -88,16 +88,12 @@ def mocap_recording(motion: Motion, about: About, settings: MocapSettings) -> Re
     )
     times = motion.timestamps
     return Recording(
-        about.name,
+        **vars(about),
         head=_nominal_head(motion, settings.t_head_device),
         motion=motion,
         contacts=ContactTrack(times, FOOT_PATCHES, contact),
         floor=FloorTrack(times, torch.zeros(len(times))) if level else None,
         skeleton=motion.skeleton,
-        subject=about.subject,
-        activity=about.activity,
-        source=about.source,
-        license=about.license,
     )
 
 

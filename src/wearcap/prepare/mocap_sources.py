@@ -16,9 +16,9 @@ from wearcap.io.datasets.amass import read_amass
 from wearcap.io.formats.asf_amc import read_amc, read_asf
 from wearcap.io.formats.bvh import read_bvh, read_cmu_bvh
 from wearcap.io.formats.text import read_text
-from wearcap.prepare.engine import Task, content_hash, source_folder
+from wearcap.prepare.engine import Splits, Task, content_hash, source_folder
 from wearcap.prepare.mocap import About, MocapSettings, mocap_recording, on_xsens23
-from wearcap.prepare.splits import Splits
+from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 
 CMU_VERSION, AMASS_VERSION = 2, 1
@@ -60,12 +60,9 @@ def _cmu_recording(
     """
     if ".amc" in file.name.lower():
         if asf is None:
-            raise WearcapError(
-                "no skeleton beside it",
-                where=file,
-                fix="An AMC file needs its subject's .asf.",
-                expected=f"{file.name.split('_')[0]}.asf, or one .asf file",
-            )
+            fix = "An AMC file needs its subject's .asf."
+            expected = f"{file.name.split('_')[0]}.asf, or one .asf file"
+            raise WearcapError("no skeleton beside it", where=file, fix=fix, expected=expected)
         motion = read_amc(read_asf(asf), file, amc_fps)
     elif CGSPEED_JOINT in read_text(file)[:4096]:
         motion = read_cmu_bvh(file)
@@ -88,15 +85,8 @@ def _head_face(asf: Path, files: tuple[Path, ...], fps: float | int) -> Float[Te
         except WearcapError:  # reported by the trial's own task
             continue
         thin = slice(None, None, HEAD_FRAME_STEP)
-        motion = on_xsens23(
-            replace(
-                motion,
-                timestamps=motion.timestamps[thin],
-                R_parent_joint=motion.R_parent_joint[thin],
-                t_world_root=motion.t_world_root[thin],
-                contact_prob=None,
-            )
-        )
+        R, t = motion.R_parent_joint[thin], motion.t_world_root[thin]
+        motion = on_xsens23(Motion(motion.timestamps[thin], motion.skeleton, R, t))
         poses.append(motion.R_parent_joint)
     return head_level(motion.skeleton, torch.cat(poses)) if poses else None
 

@@ -19,9 +19,8 @@ from wearcap.io.datasets.behave import BODY_FILE, INFO_FILE, OBJECT_FILE, behave
 from wearcap.io.datasets.omomo import OmomoSequence, omomo_mesh_path, omomo_take, read_omomo
 from wearcap.io.datasets.one_object import OneObject
 from wearcap.io.formats.environment import FILE_NAME, write_environment
-from wearcap.prepare.engine import NOTE, Task, content_hash
+from wearcap.prepare.engine import NOTE, Splits, Task, content_hash
 from wearcap.prepare.mocap import About, MocapSettings, foot_patches, mocap_recording, on_xsens23, without_glitches
-from wearcap.prepare.splits import Splits
 from wearcap.recording.recording import Recording
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
@@ -70,12 +69,9 @@ def _one_object(take: OneObject, about: About, settings: MocapSettings, output: 
     feet = torch.stack([motion.joint(f"{side}_ankle").t[:, 2] for side in ("left", "right")]).mean(0)
     above = float((motion.joint("head").t[:, 2] - feet).median())
     if above < -_UPSIDE_DOWN_M:
-        raise WearcapError(
-            f"the head is {-above:.2f} m below the feet",
-            where=about.name,
-            expected="a world whose z is up",
-            fix="The source's axes are others than published.",
-        )
+        what = f"the head is {-above:.2f} m below the feet"
+        fix = "The source's axes are others than published."
+        raise WearcapError(what, where=about.name, expected="a world whose z is up", fix=fix)
     recording = mocap_recording(motion, about, settings)
     assert recording.motion is not None
     notes = "; ".join(text for text in (cut, note) if text)
@@ -136,12 +132,9 @@ def _behave(root: Path, name: str, settings: MocapSettings, license: str, output
     R = _ground_rotation(positions[speed < settings.limits.contact_speed])
     tilt = float(torch.rad2deg(torch.arccos(R[2, 2].clamp(max=1.0))))
     if tilt > MAX_TILT_DEG:
-        raise WearcapError(
-            f"the ground below the feet is tilted by {tilt:.0f}°",
-            where=take.name,
-            expected=f"at most {MAX_TILT_DEG:g}°",
-            fix="Check which of the source's axes is up.",
-        )
+        what = f"the ground below the feet is tilted by {tilt:.0f}°"
+        fix = "Check which of the source's axes is up."
+        raise WearcapError(what, where=take.name, expected=f"at most {MAX_TILT_DEG:g}°", fix=fix)
     motion = replace(motion, provenance=motion.provenance | {"tilt_deg": f"{tilt:.2f}"})
     take = replace(take, motion=motion).turned(R)
     about = About(name, take.subject, "BEHAVE", license, take.activity)

@@ -7,7 +7,7 @@ One source per system's data: `simulated` (HMD², MocapEvery), `simulated_hps`, 
 import json
 import zlib
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -24,8 +24,7 @@ from wearcap.geometry import rotation
 from wearcap.io.formats.environment import FILE_NAME, write_environment
 from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.io.formats.scene_folder import CLOUD
-from wearcap.prepare.engine import Task, content_hash
-from wearcap.prepare.splits import Splits
+from wearcap.prepare.engine import Splits, Task, content_hash
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import SPLITS, RecordingFile, RecordingStore
 from wearcap.sensors.slam import semidense_points
@@ -73,11 +72,8 @@ def _tasks(
         raise WearcapError(f"no split {min(unknown)!r}", expected=f"one of {', '.join(SPLITS)}")
     for split in recordings:
         if splits.of(f"sim-{split}-person-000") != split:
-            raise WearcapError(
-                f"people of the simulated {split} split are listed elsewhere",
-                where=splits.path,
-                expected=f"a line sim-{split}-*,{split}",
-            )
+            what = f"people of the simulated {split} split are listed elsewhere"
+            raise WearcapError(what, where=splits.path, expected=f"a line sim-{split}-*,{split}")
     simulator, tasks = source_files(), []
     for split, count in recordings.items():
         for index in range(count):
@@ -107,50 +103,37 @@ def simulated_tasks(
     `world` is "flat", "outdoor" or None (drawn). Raises WearcapError for an unknown split or world, or when a
     simulated person's name belongs to another split's list.
     """
-    config = SimulationConfig(
-        duration_s=float(duration_s),
-        fps=float(fps),
-        points=points,
-        activities=tuple(activities) if activities else None,
-        world=world,
-        camera=camera,
-    )
+    length, rate, chosen = float(duration_s), float(fps), tuple(activities) if activities else None
+    config = SimulationConfig(duration_s=length, fps=rate, points=points, activities=chosen, world=world, camera=camera)
     if not config.duration_s > 0 or not config.fps > 0:
         raise WearcapError(f"recordings of {duration_s} s at {fps} Hz", expected="positive numbers")
     make = partial(simulate_recording, config)
     return _tasks("sim", recordings, seed, splits, output, make, asdict(config))
 
 
-@dataclass(frozen=True)
-class _Video:
-    """Settings of the head camera's rendered video."""
-
-    seconds: float | None
-    """Rendered duration (s) from the recording's start; 0: nothing, None: all of it."""
-    fps: float
-    changed: float
-    """Share of the movable objects that have been moved or removed since the scan when the video is filmed."""
-
-
 def _hps(
-    config: HpsConfig, scene: SceneSettings | None, video: _Video, name: str, split: str, seed: int, root: Path
+    config: HpsConfig, scene: SceneSettings | None, video: dict[str, Any], name: str, split: str, seed: int, root: Path
 ) -> Recording:
-    """One session, the missing files of its scene, and its video; the camera's timestamps become those of the frames."""
+    """One session, the missing files of its scene, and its video; the camera's timestamps become those of the frames.
+
+    `video`: the `seconds` that are filmed from the start on (0: none, None: all), at `fps`, with a share `changed` of the
+    movable objects moved or removed since the scan.
+    """
     simulated = simulate_hps(config, name, split, seed)
     recording = simulated.recording
     if scene is not None:
         folder = Path("scenes") / recording.location
         write_scene(Scenery.of(simulated.world), root / folder, scene, 0, turn=seed)
         recording = replace(recording, scene=(folder / CLOUD).as_posix())
-    if video.seconds == 0:
+    if video["seconds"] == 0:
         return recording
     rng = np.random.default_rng([21, seed])
-    share = video.changed
+    share = video["changed"]
     world = changed_world(simulated.world, rng, 0.7 * share, 0.3 * share) if share else simulated.world
     camera, path = recording.camera, recording.object_motion[HEAD_CAMERA_TRUTH]
     assert camera is not None
-    times = camera.timestamps[:: max(1, round(config.camera_fps / video.fps))]
-    stop = np.inf if video.seconds is None else camera.timestamps[0].item() + video.seconds
+    times = camera.timestamps[:: max(1, round(config.camera_fps / video["fps"]))]
+    stop = np.inf if video["seconds"] is None else camera.timestamps[0].item() + video["seconds"]
     times = times[times < stop]
     claps = [simulated.to_camera(clap) for clap in simulated.session.claps_s]
     file = Path("videos") / f"{name}.mp4"
@@ -185,9 +168,10 @@ def simulated_hps_tasks(
     protocol = Protocol(returns_m=tuple(distances[1:-1]), end_m=distances[-1])
     config = HpsConfig(fps=float(fps), camera_fps=float(camera_fps), protocol=protocol)
     scene = None if spacing_m is None else SceneSettings(spacing_m=float(spacing_m), photo_m=float(photo_m))
-    video = _Video(None if video_s is None else float(video_s), float(video_fps), float(changed))
-    made = [asdict(part) if part else None for part in (config, scene, video)]
-    return _tasks("hps", recordings, seed, splits, output, partial(_hps, config, scene, video), *made)
+    seconds = None if video_s is None else float(video_s)
+    video = {"seconds": seconds, "fps": float(video_fps), "changed": float(changed)}
+    made = [asdict(part) if part else None for part in (config, scene)]
+    return _tasks("hps", recordings, seed, splits, output, partial(_hps, config, scene, video), *made, video)
 
 
 def _in_flat(

@@ -25,8 +25,7 @@ from wearcap.io.datasets.mocap_every_folder import (
 from wearcap.io.datasets.nymeria import head_vrs, is_nymeria, read_metadata, read_nymeria
 from wearcap.io.devices.aria_mps import is_mps_folder, mps_files, read_mps
 from wearcap.io.formats.environment import FILE_NAME, write_environment
-from wearcap.prepare.engine import NOTE, Task, changed, content_hash, source_folder
-from wearcap.prepare.splits import Splits
+from wearcap.prepare.engine import NOTE, Splits, Task, changed, content_hash, source_folder
 from wearcap.recording.recording import Recording
 from wearcap.recording.timing import resampled
 from wearcap.sensors.camera_alignment import align_by_walks
@@ -217,12 +216,10 @@ class MocapEverySettings:
         """Scale and T_world_slam from the calibration board, or from a given scale and a level first pose."""
         if self.scale is None:
             if read.board is None:
-                raise WearcapError(
-                    "it does not define the length of a unit of SLAM",
-                    where=folder,
-                    expected="cam_scale_origin in config.yaml, and x and y in camera_calib.pkl",
-                    fix="Measure it, and give scale=METRES_PER_UNIT.",
-                )
+                what = "it does not define the length of a unit of SLAM"
+                expected = "cam_scale_origin in config.yaml, and x and y in camera_calib.pkl"
+                fix = "Measure it, and give scale=METRES_PER_UNIT."
+                raise WearcapError(what, where=folder, expected=expected, fix=fix)
             board = read.board
             return align_by_walks(board.x_slam, board.y_slam, board.length_m, board.height_m)
         if self.scale <= 0:

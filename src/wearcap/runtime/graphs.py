@@ -1,6 +1,8 @@
 """Networks as graphs: one description of a network's parts, which are run eagerly, compiled or in ONNX Runtime.
 
-`wearcap export` writes the same graphs that `run_of` runs.
+`wearcap export` writes the same graphs that `run_of` runs. In a denoiser, what depends on the noise levels alone is computed
+once per level: it has `plan(level) -> LevelPlan` and `step(x_t, plan, encoded, valid[, last])`, and its graphs pass a plan as
+one tensor of columns.
 """
 
 import contextlib
@@ -12,9 +14,10 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from wearcap.body.skeleton import Site, Skeleton
@@ -27,7 +30,6 @@ take some seconds to start."""
 PRECISIONS = ("auto", "narrowest", "float32", "bfloat16", "int8")
 """Number formats; auto: bfloat16 on a GPU, else float32; narrowest: as auto, but int8 with ONNX Runtime.
 int8 (weights, and dynamically quantised activations) needs ONNX Runtime."""
-LIBRARIES = ("onnx", "onnxscript", "onnxruntime")
 Run = Callable[..., Tensor]
 """A network's output from its inputs by name."""
 _INSTALL = 'Run: pip install "wearcap[export]"'
@@ -69,6 +71,58 @@ class Call(nn.Module):
         self.forward = getattr(net, method)
 
 
+class LevelPlan(NamedTuple):
+    """The part of a denoising step that depends on the noise levels alone."""
+
+    worth: tuple[Float[Tensor, "batch #token width"], ...]
+    """Per-channel scale of the encoded x_t, for each encoder of the motion (`MotionEncoder.plan`)."""
+    blocks: tuple[Float[Tensor, "batch #token modulation"], ...]
+    """Modulation of every adaptive transformer block."""
+
+
+class PlanGraph(nn.Module):
+    """A plan's columns from levels."""
+
+    def __init__(self, net: Any):
+        super().__init__()
+        self.net = net
+
+    def forward(self, level: Float[Tensor, "batch *token"]) -> Float[Tensor, "batch #token column"]:
+        plan = self.net.plan(level)
+        return torch.cat([*plan.worth, *plan.blocks], -1)
+
+
+class StepGraph(nn.Module):
+    """x̂0 from x_t and a plan's columns."""
+
+    def __init__(self, net: Any, level: Float[Tensor, "batch *token"]):
+        """`level`: any levels, of the shape that `net.plan` takes."""
+        super().__init__()
+        self.net = net
+        with torch.no_grad():
+            plan = net.plan(level)
+        self._worths = len(plan.worth)
+        self._sizes = [part.shape[-1] for part in (*plan.worth, *plan.blocks)]
+
+    @property
+    def columns(self) -> int:
+        """Columns of a plan."""
+        return sum(self._sizes)
+
+    def forward(
+        self,
+        x_t: Float[Tensor, "batch time motion"],
+        plan: Float[Tensor, "#batch #token column"],
+        encoded: Float[Tensor, "batch token width"],
+        valid: Bool[Tensor, "batch time"],
+        last: Float[Tensor, "batch time motion"] | None = None,
+    ) -> Float[Tensor, "batch time motion"]:
+        """`last`: x̂0 of the previous step, for a network with self-conditioning."""
+        parts = plan.split(self._sizes, -1)
+        more = () if last is None else (last,)
+        return self.net.step(x_t, LevelPlan(parts[: self._worths], parts[self._worths :]), encoded, valid, *more)
+
+
 def chosen(runtime: str, precision: str, device: torch.device | str) -> tuple[str, str]:
     """Backend and number format for a device, without "auto" and "narrowest".
 
@@ -87,11 +141,9 @@ def chosen(runtime: str, precision: str, device: torch.device | str) -> tuple[st
         plain = "int8" if runtime == "onnx" and precision == "narrowest" else "float32"
         precision = "bfloat16" if device.type == "cuda" else plain
     if runtime == "onnx" and (missing or device.type != "cpu"):
-        raise WearcapError(
-            f"runtime 'onnx' needs {', '.join(missing)}" if missing else f"runtime 'onnx' on {device}",
-            expected="ONNX Runtime on the CPU",
-            fix=f"{_INSTALL}, or choose pipeline.runtime=eager.",
-        )
+        what = f"runtime 'onnx' needs {', '.join(missing)}" if missing else f"runtime 'onnx' on {device}"
+        expected = "ONNX Runtime on the CPU"
+        raise WearcapError(what, expected=expected, fix=f"{_INSTALL}, or choose pipeline.runtime=eager.")
     if (precision == "int8") > (runtime == "onnx") or (precision == "bfloat16" and runtime == "onnx"):
         expected = "int8 with onnx; bfloat16 with eager or compile"
         raise WearcapError(f"no {precision} with runtime {runtime!r}", expected=expected)
@@ -170,7 +222,7 @@ def open_onnx(path: str | Path) -> Run:
 
 def missing_libraries() -> list[str]:
     """Names of the packages for ONNX Runtime and its exporter that are not installed."""
-    return [name for name in LIBRARIES if importlib.util.find_spec(name) is None]
+    return [name for name in ("onnx", "onnxscript", "onnxruntime") if importlib.util.find_spec(name) is None]
 
 
 @contextlib.contextmanager

@@ -7,7 +7,7 @@ import hashlib
 import json
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -106,23 +106,17 @@ def starting_labels(source: str | Path, recording: Recording, clock: LabelClock)
     """
     if str(source) == "recording":
         if recording.interactions is None:
-            raise WearcapError(
-                "no interactions to start from",
-                where=recording.name,
-                expected="a recording that has them",
-                fix="Start from a label file (.json), from a captured motion (.npz), or from nothing.",
-            )
+            what = "no interactions to start from"
+            fix = "Start from a label file (.json), from a captured motion (.npz), or from nothing."
+            raise WearcapError(what, where=recording.name, expected="a recording that has them", fix=fix)
         return labels_of(recording.interactions, clock)
     if Path(source).suffix == ".json":
         return parse_labels(read_json(source), clock, where=source)
     motion = read_motion(source)
     found = motion.interactions or _predicted(motion)
     if found is None:
-        raise WearcapError(
-            "a motion without contacts of the hands",
-            where=source,
-            expected="one that a pipeline with a contact network captured",
-        )
+        expected = "one that a pipeline with a contact network captured"
+        raise WearcapError("a motion without contacts of the hands", where=source, expected=expected)
     return labels_of(found, clock)
 
 
@@ -194,11 +188,8 @@ class Take:
         """
         shown = motion or recording.motion or recording.suit
         if shown is None:
-            raise WearcapError(
-                f"recording {recording.name!r} has no motion",
-                expected="one to look at",
-                fix="Give a captured one with --motion.",
-            )
+            what = f"recording {recording.name!r} has no motion"
+            raise WearcapError(what, expected="one to look at", fix="Give a captured one with --motion.")
         clock = LabelClock.of(recording.name, shown.timestamps)
         names, points, bones = _drawn(shown)
         notice = ""
@@ -227,12 +218,7 @@ class Take:
 
     def header(self) -> dict:
         """All data except the numbers per frame, for JSON."""
-        clock = self.clock
-        return {
-            "name": clock.name,
-            "frames": clock.frames,
-            "start_s": clock.start_s,
-            "stop_s": clock.stop_s,
+        return asdict(self.clock) | {
             "points": self.point_names,
             "bones": self.bones,
             "hands": dict(zip(HANDS, self.hands)),
@@ -268,8 +254,7 @@ def _drawn(motion: Motion) -> tuple[tuple[str, ...], Float32[np.ndarray, "time p
 def _floor(recording: Recording, motion: Motion, points: np.ndarray) -> Float32[np.ndarray, "time"]:
     """Height (m) of the floor at each frame: as recorded, else slightly below nearly all of the body."""
     if recording.floor is not None and len(recording.floor.height):
-        track = recording.floor
-        heights = np.interp(motion.timestamps, track.timestamps, track.height)
+        heights = np.interp(motion.timestamps, recording.floor.timestamps, recording.floor.height)
         return np.asarray(heights, np.float32)
     lowest = points[:: max(1, len(points) // 5000), :, 2].min(1)
     return np.full(len(points), np.quantile(lowest, 0.05), np.float32)
@@ -345,11 +330,8 @@ class Desk:
         for index in range(len(self.names)):
             file = self.file(index)
             if file.path.exists():
-                raise WearcapError(
-                    "there are labels already, which are never replaced",
-                    where=file.path,
-                    fix="Leave out --from to go on with them, or give another --output.",
-                )
+                fix = "Leave out --from to go on with them, or give another --output."
+                raise WearcapError("there are labels already, which are never replaced", where=file.path, fix=fix)
             labels = starting_labels(source, self.recording(index), file.clock)
             file.save(annotation_of(labels, file.clock), "")
 

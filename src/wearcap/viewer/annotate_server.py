@@ -21,21 +21,10 @@ from wearcap.viewer.annotate import Conflict, Desk
 from wearcap.viewer.guard import Guard, Refused
 
 PAGE = Path(__file__).parent / "annotator"
-TYPES = {
-    ".html": "text/html; charset=utf-8",
-    ".js": "text/javascript; charset=utf-8",
-    ".css": "text/css; charset=utf-8",
-    ".svg": "image/svg+xml",
-}
-VIDEO_TYPES = {
-    ".mp4": "video/mp4",
-    ".m4v": "video/mp4",
-    ".mov": "video/mp4",
-    ".webm": "video/webm",
-    ".mkv": "video/x-matroska",
-    ".avi": "video/x-msvideo",
-    ".ogv": "video/ogg",
-}
+_TEXTS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
+TYPES = {suffix: f"{kind}; charset=utf-8" for suffix, kind in _TEXTS.items()} | {".svg": "image/svg+xml"}
+_CONTAINERS = {".webm": "video/webm", ".mkv": "video/x-matroska", ".avi": "video/x-msvideo", ".ogv": "video/ogg"}
+VIDEO_TYPES = dict.fromkeys((".mp4", ".m4v", ".mov"), "video/mp4") | _CONTAINERS
 MAX_SAVE_BYTES = 16 << 20
 PIECE_BYTES = 1 << 18
 MAX_CONNECTIONS = 32
@@ -75,13 +64,9 @@ class AnnotationServer(ThreadingHTTPServer):
         self._thread.start()
 
     @property
-    def port(self) -> int:
-        return self.server_port
-
-    @property
     def url(self) -> str:
         """Address to open; it contains the token without which the page does not answer."""
-        return self.guard.url(self.port)
+        return self.guard.url(self.server_port)
 
     def wait(self) -> None:
         """Serve until interrupted."""

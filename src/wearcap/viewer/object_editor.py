@@ -276,11 +276,9 @@ class ObjectEditor(ServedPage):
                 x, y, z = (direction / length).tolist()
                 self.editing.set_freedom(item.name, replace(item.freedom, axis=(x, y, z)))
         else:
-            raise WearcapError(
-                f"{item.name} {'is carried' if item.freedom.kind == 'free' else 'slides on the floor'}",
-                expected="an object with a hinge or a slide",
-                fix="Choose how it moves under Objects.",
-            )
+            what = f"{item.name} {'is carried' if item.freedom.kind == 'free' else 'slides on the floor'}"
+            expected = "an object with a hinge or a slide"
+            raise WearcapError(what, expected=expected, fix="Choose how it moves under Objects.")
         self._show_objects()
 
     def _set_pivot(self, item: SceneObject, pivot: Float[np.ndarray, "3"]) -> None:

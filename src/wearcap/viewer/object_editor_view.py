@@ -29,7 +29,6 @@ class _Shown:
     item: SceneObject
     tinted: tuple[int, bool]
     node: viser.PointCloudHandle | viser.MeshHandle
-    label: viser.LabelHandle
     points: Float[np.ndarray, "shown 3"]
     """Points in world coordinates (m), for picking."""
 
@@ -48,7 +47,7 @@ class EditorView:
         self.point_m = 1.9 * _typical_spacing(scan.points[self._thinned])
         self._center = scan.points.mean(0, dtype=np.float64)
         self.visible = scan.points[:0]
-        """Indices of the scan's points that are drawn."""
+        """The scan's points that are drawn."""
         self._objects: dict[str, _Shown] = {}
         self.box = self.scene.add_line_segments("/box", _EDGES, BOX_COLOR, thickness=0.012)
         self.box_handle = self.scene.add_transform_controls("/box_handle", scale=0.45, disable_rotations=True)
@@ -140,8 +139,8 @@ class EditorView:
                 point_shading="flat",
             )
         top = mesh.vertices[:, 2].max() + 0.1
-        label = self.scene.add_label(f"{node}/name", item.name, position=(0.0, 0.0, float(top)), anchor="bottom-center")
-        return _Shown(item, tinted, handle, label, item.points_world[::every])
+        self.scene.add_label(f"{node}/name", item.name, position=(0.0, 0.0, float(top)), anchor="bottom-center")
+        return _Shown(item, tinted, handle, item.points_world[::every])
 
     def place(self, name: str, T_world_object: Rigid) -> None:
         """Show an object at a pose (to try how it moves)."""

@@ -89,9 +89,6 @@ class _Timeline:
     def seek(self, time: float) -> None:
         self.time = min(max(time, self.start), self.stop)
 
-    def step(self, seconds: float) -> None:
-        self.seek(self.time + seconds)
-
 
 @dataclass
 class _Placed:
@@ -239,7 +236,7 @@ class Page(ServedPage):
         self._play.label = "Pause" if self.timeline.playing else "Play"
 
     def jump(self, seconds: float) -> None:
-        self.timeline.step(seconds)
+        self.timeline.seek(self.timeline.time + seconds)
         self._slider.value = self.timeline.time
         self.show()
 

@@ -75,13 +75,8 @@ def stick_body(skeleton: Skeleton) -> BodyModel:
     bone_of_vertex = torch.tensor(bones).repeat_interleave(len(mesh.vertices) // len(bones))
     weights = torch.zeros(len(bone_of_vertex), 4)
     weights[:, 0] = 1
-    return BodyModel(
-        skeleton,
-        torch.from_numpy(mesh.vertices),
-        torch.from_numpy(mesh.faces).long(),
-        bone_of_vertex[:, None].repeat(1, 4),
-        weights,
-    )
+    vertices, faces = torch.from_numpy(mesh.vertices), torch.from_numpy(mesh.faces).long()
+    return BodyModel(skeleton, vertices, faces, bone_of_vertex[:, None].repeat(1, 4), weights)
 
 
 def surface_or_sticks(skeleton: Skeleton, shape: dict[str, float]) -> BodyModel:
@@ -136,9 +131,8 @@ class FeetLayer(MotionLayer):
         clock: Float64[Tensor, "frame"],
     ):
         self.motion, self.contact, self.clock = motion, contact, clock
-        self.balls = [
-            server.scene.add_icosphere(f"/{name}/{patch}", 0.028, AIR_COLOR, subdivisions=2) for patch in FOOT_PATCHES
-        ]
+        add = server.scene.add_icosphere
+        self.balls = [add(f"/{name}/{patch}", 0.028, AIR_COLOR, subdivisions=2) for patch in FOOT_PATCHES]
         super().__init__(*self.balls)
 
     @classmethod
@@ -284,9 +278,8 @@ def with_objects(recording: Recording, environment: Environment | None = None) -
     labels = recording.interactions
     hands = None if labels is None else labels.hand_contact(truth.timestamps).to(truth.t_world_root.dtype)
     points = None if environment is None else _true_body_contact(recording, truth, environment)
-    return replace(
-        truth, object_motion=recording.object_motion or None, hand_contact_prob=hands, body_contact_prob=points
-    )
+    objects = recording.object_motion or None
+    return replace(truth, object_motion=objects, hand_contact_prob=hands, body_contact_prob=points)
 
 
 def _true_body_contact(
@@ -394,14 +387,8 @@ class ObjectsLayer(MotionLayer):
             color = 255 * np.atleast_2d(mesh.color).mean(0)
             if tint is not None:
                 color = (color + tint) / 2
-            handles.append(
-                server.scene.add_mesh_simple(
-                    f"/{name}/{item.name}",
-                    mesh.vertices,
-                    mesh.faces.astype(np.uint32),
-                    color=tuple(int(c) for c in color),
-                )
-            )
+            node, faces, rgb = f"/{name}/{item.name}", mesh.faces.astype(np.uint32), tuple(int(c) for c in color)
+            handles.append(server.scene.add_mesh_simple(node, mesh.vertices, faces, color=rgb))
         super().__init__(*handles)
 
     def show(self, time: float) -> None:

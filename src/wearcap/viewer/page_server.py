@@ -64,11 +64,9 @@ def _start_server(guard: Guard, port: int, label: str) -> viser.ViserServer:
             console.quiet = quiet
     if not hooked:  # nothing has been shown on it yet
         server.stop()
-        raise WearcapError(
-            f"viser {viser.__version__} does not let its pages be guarded against other sites",
-            expected="a viser that serves through websockets.asyncio.server.serve",
-            fix="Install the version that wearcap asks for: pip install 'viser>=1.1.1,<1.2'.",
-        )
+        what = f"viser {viser.__version__} does not let its pages be guarded against other sites"
+        fix = "Install the version that wearcap asks for: pip install 'viser>=1.1.1,<1.2'."
+        raise WearcapError(what, expected="a viser that serves through websockets.asyncio.server.serve", fix=fix)
     return server
 
 
@@ -85,11 +83,9 @@ def _check_host(host: str) -> None:
                 return probe.bind(address)
         except OSError as error:
             problem = str(error)
-    raise WearcapError(
-        f"cannot serve a page on {host!r} ({problem})",
-        expected="a name or address of this machine",
-        fix="Leave out --host for this machine alone, or give 0.0.0.0 for all of its addresses.",
-    )
+    what = f"cannot serve a page on {host!r} ({problem})"
+    fix = "Leave out --host for this machine alone, or give 0.0.0.0 for all of its addresses."
+    raise WearcapError(what, expected="a name or address of this machine", fix=fix)
 
 
 class ServedPage:

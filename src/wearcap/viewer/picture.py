@@ -141,9 +141,8 @@ def _panel(
     stage = checker_floor(ground, 3.0, 0.5, TILES, np.array(SKY))
     below = (float(target[0]), float(target[1]), float(ground[2]))
     light = Light(to_light=(0.55, -0.35, 1.0), shadow_center=below, shadow_radius=1.6)
-    return render(
-        camera, T_world_cam, [*actor.meshes(frame), stage], light=light, background=SKY, supersample=supersample
-    ).color
+    meshes = [*actor.meshes(frame), stage]
+    return render(camera, T_world_cam, meshes, light=light, background=SKY, supersample=supersample).color
 
 
 def contact_sheet(
@@ -216,9 +215,8 @@ def draw_head_path(recording: Recording, size: tuple[int, int] = (640, 520)) -> 
     cloud = np.concatenate([path, points])
     low, high = np.quantile(cloud, 0.02, 0), np.quantile(cloud, 0.98, 0)
     centre, radius = (low + high) / 2, max(0.5 * float(np.linalg.norm(high - low)), 1.0)
-    splats = Splats(
-        points.astype(np.float32), by_height(points, low[2], high[2], HEIGHT_COLORS).astype(np.float32), 0.8
-    )
+    shades = by_height(points, low[2], high[2], HEIGHT_COLORS).astype(np.float32)
+    splats = Splats(points.astype(np.float32), shades, 0.8)
     # The path is a tube, with short rods along the viewing directions.
     steps = path[:: max(1, len(path) // 300)]
     at = np.linspace(0, len(path) - 1, LOOKS).astype(int)
@@ -263,7 +261,6 @@ def write_video(
     body: BodyModel | None = None,
     environment: Environment | None = None,
     max_seconds: float | None = None,
-    progress: bool = True,
 ) -> None:
     """Write panels of `size` (width, height) side by side, one per motion, on their shared clock.
 
@@ -282,13 +279,11 @@ def write_video(
         stream = container.add_stream(codec, rate=round(fps))
         assert isinstance(stream, av.VideoStream)
         stream.width, stream.height, stream.pix_fmt = size[0] * len(shown), size[1], "yuv420p"
-        for time in track(times, f"video {Path(path).name}", console=Console(stderr=True), disable=not progress):
+        for time in track(times, f"video {Path(path).name}", console=Console(stderr=True)):
             frames = [int(np.abs(clock - time).argmin()) for clock in clocks]
             target = _focus(shown[0].motion, frames[0])
-            panels = [
-                np.asarray(captioned(_panel(actor, frame, target, size, supersample=1), actor.label))
-                for actor, frame in zip(shown, frames)
-            ]
+            images = [_panel(actor, frame, target, size, supersample=1) for actor, frame in zip(shown, frames)]
+            panels = [np.asarray(captioned(image, actor.label)) for image, actor in zip(images, shown)]
             picture = av.VideoFrame.from_ndarray(np.concatenate(panels, 1), format="rgb24")
             container.mux(stream.encode(picture))
         container.mux(stream.encode(None))

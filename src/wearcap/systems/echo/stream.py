@@ -28,8 +28,7 @@ from wearcap.recording import motion as motion_types
 from wearcap.recording.acts import SAME_S
 from wearcap.recording.timing import joined
 from wearcap.runtime.graphs import undisturbed
-from wearcap.runtime.session import Session, WearerStream
-from wearcap.runtime.snapshot import classes_of
+from wearcap.runtime.session import Session, classes_of
 from wearcap.scene.environment import Environment
 from wearcap.sensors import packets, samples
 from wearcap.sensors.packets import MAX_WAITING, Admitted, Clock, HeadInput
@@ -67,7 +66,7 @@ class EchoWearer:
     standing head. A capture of the whole recording uses later frames, too."""
 
 
-class EchoStream(WearerStream):
+class EchoStream:
     """A streaming capture of one wearer and some objects.
 
     Invalid packets (`sensors.packets`) are counted as `refused`. If the head device's clock is set back for good, the

@@ -23,8 +23,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.recording import ImuStream, Motion
 from wearcap.recording import motion as motion_types
 from wearcap.recording.timing import joined
-from wearcap.runtime.session import Session, WearerStream
-from wearcap.runtime.snapshot import classes_of
+from wearcap.runtime.session import Session, classes_of
 from wearcap.scene import floor as floor_types
 from wearcap.sensors import packets
 from wearcap.sensors import samples as sample_types
@@ -58,7 +57,7 @@ class Wearing:
     """Initial floor height (the paper's h_0); None: the first head height minus the standing head height."""
 
 
-class MocapEveryStream(WearerStream):
+class MocapEveryStream:
     """A streaming capture of one wearer.
 
     Frames are processed once both watches have delivered the samples that they need. A watch without samples for longer
