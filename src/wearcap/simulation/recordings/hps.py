@@ -270,10 +270,7 @@ class _Session:
         plan, start, rise = self.plan, self.plan.time, 0.9
         stop = start + rise + 0.2 + self.protocol.stand_s
         for side in SIDES:
-            hand = plan.hands[side]
-            hand.pose.move(start, start, A_POSE)
-            hand.pose_weight.move(start, start + rise, 1.0)
-            hand.pose_weight.move(stop, stop + rise, 0.0)
+            plan.hands[side].take(A_POSE, (start, start + rise), (stop, stop + rise))
         self.stretches.append((start + rise + 0.2, stop, "stand"))
         plan.time = stop + rise + 0.1
         plan.label(start, "stand")
@@ -299,15 +296,12 @@ class _Session:
         plan, start = self.plan, self.plan.time
         across = np.array([-ahead[1], ahead[0]])
         out, pause, back = 0.9, float(self.rng.uniform(1.2, 2.2)), 0.9
+        there, home = (start, start + out), (start + out + pause, start + out + pause + back)
         for hand_side in SIDES:
-            hand = plan.hands[hand_side]
             place = self.home[:2] + (self.spot.table_m + 0.06) * ahead + LEFT_SIGN[hand_side] * 0.22 * across
             height = self.home[2] + self.spot.table_z + 0.07
-            hand.goal.move(start, start, np.append(place, height))
-            hand.goal_weight.move(start, start + out, 1.0)
-            hand.goal_weight.move(start + out + pause, start + out + pause + back, 0.0)
-        plan.lean.move(start, start + out, (0.5, 0.0, 0.0))
-        plan.lean.move(start + out + pause, start + out + pause + back, 0.0)
+            plan.hands[hand_side].go_for(np.append(place, height), there, home)
+        plan.lean.visit((0.5, 0.0, 0.0), there, home)
         plan.time = start + out + pause + back + 0.2
         turn_to(plan, plan.heading + 1.2 * float(self.rng.choice([-1.0, 1.0])), self.rng)
         plan.label(start, "lean")
