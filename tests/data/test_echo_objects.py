@@ -9,7 +9,9 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.point_encoder import PointNeXt
 from wearcap.scene.environment import Environment
-from wearcap.systems.echo.objects import ObjectReader, body_contact, object_poses
+from wearcap.systems.echo.observations import ObjectReader
+from wearcap.systems.echo.scores import body_contact
+from wearcap.systems.echo.training_windows import object_poses
 
 POSE = Rigid(rotation.exp(torch.tensor([[0.3, -0.9, 0.4], [1.0, 0.2, 0.0]])), torch.tensor([[0.5, 2.0, 1.0], [0.0, 0.1, -0.3]]))  # fmt: skip
 

@@ -16,7 +16,8 @@ from wearcap.data.windows import Source, Windows, collate
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.systems.echo.features import POINTS
-from wearcap.systems.echo.objects import ObjectReader, ObjectShape, body_contact
+from wearcap.systems.echo.observations import ObjectReader, ObjectShape
+from wearcap.systems.echo.scores import body_contact
 from wearcap.systems.echo.training_windows import EchoContent, EchoTrack
 from wearcap_testing import small_dataset
 

@@ -18,8 +18,8 @@ from wearcap.export.write import write_exports
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.models.point_encoder import PointNeXt
 from wearcap.recording.store import RecordingFile
+from wearcap.systems.echo.contacts import Guidance
 from wearcap.systems.echo.export import condition_channels
-from wearcap.systems.echo.guidance import Guidance
 from wearcap.systems.echo.pipeline import Echo
 
 FORMATS = ("onnx", "pt2")

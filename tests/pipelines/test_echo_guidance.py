@@ -9,8 +9,8 @@ from carried_box import box_mesh, boxes, carrying, drawn_echo, scenario_of, scen
 from wearcap.body.contact_points import BODY_POINTS
 from wearcap.geometry.rigid import Rigid
 from wearcap.scene.environment import Environment
+from wearcap.systems.echo.contacts import Guidance, GuidedScene
 from wearcap.systems.echo.features import OBJECT_SIZE, Body
-from wearcap.systems.echo.guidance import Guidance, GuidedScene
 from wearcap.systems.echo.observations import Observed, batch_item_of
 from wearcap.systems.echo.pipeline import pulled_by
 from wearcap.tracking.head_path import head_path

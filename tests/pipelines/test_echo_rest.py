@@ -8,9 +8,9 @@ import torch
 from carried_box import carrying, drawn_echo, scenario_of
 from wearcap.body.contact_points import BODY_POINTS
 from wearcap.geometry import rotation
+from wearcap.systems.echo.contacts import FADE, INSIDE, StaticObjects, inside, with_static_objects
 from wearcap.systems.echo.features import CONTACTS
 from wearcap.systems.echo.queue import Conditioning, Outputs
-from wearcap.systems.echo.static_objects import FADE, INSIDE, StaticObjects, inside, with_static_objects
 
 TOUCH = 0.7
 ACTS = [-1, 0, 0, 0, 0, 0, 0, 1, 1, 1, -1, 1, 1, 1, 0, 0]

@@ -24,8 +24,8 @@ from wearcap.runtime.graphs import (
     skeleton_from_json,
     skeleton_to_json,
 )
+from wearcap.systems.echo.contacts import Guidance
 from wearcap.systems.echo.features import POINTS, EchoFeatures
-from wearcap.systems.echo.guidance import Guidance
 from wearcap.systems.echo.model import MODALITIES, EchoDenoiser
 from wearcap.systems.echo.pipeline import Echo
 

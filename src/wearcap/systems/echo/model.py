@@ -17,8 +17,7 @@ from wearcap.models.layers import (
     Widening,
     attention_mask,
 )
-from wearcap.runtime.denoising import LevelPlan, PlanGraph, StepGraph
-from wearcap.runtime.graphs import Call, Graph, chosen, run_of
+from wearcap.runtime.graphs import Call, Graph, LevelPlan, PlanGraph, StepGraph, chosen, run_of
 
 MODALITIES = ("human", "object", "contact")
 MOST_ROWS = 1024

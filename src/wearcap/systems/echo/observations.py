@@ -1,26 +1,30 @@
 """ECHO's conditioning from a recording at the model's rate: tracked points, floor, active objects, observations."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.body.contact_points import BODY_POINTS
-from wearcap.body.skeleton import FOOT_PATCHES, WRISTS
+from wearcap.body.skeleton import FOOT_PATCHES, MIRROR, WRISTS
+from wearcap.data.objects import object_cloud
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
+from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate_clamped, resample
+from wearcap.geometry.triangle_distance import TriangleIndex
+from wearcap.models.point_encoder import PointNeXt, cloud_extents
 from wearcap.recording.acts import NO_OBJECT, Act, active_at
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 from wearcap.recording.timing import at_times
 from wearcap.scene.environment import Environment
-from wearcap.systems.echo.features import CONTACTS
+from wearcap.scene.objects import SceneObject
+from wearcap.systems.echo.features import CONTACTS, EchoFeatures
 from wearcap.systems.echo.model import MODALITIES
-from wearcap.systems.echo.objects import ObjectReader, ObjectShape
 from wearcap.systems.echo.queue import Conditioning
 from wearcap.tracking.head_path import HeadPath
 
@@ -30,6 +34,90 @@ SAME_S = 1e-4
 """Times closer than this count as equal (s)."""
 SWAPPED_M = 0.02
 """Median distance of the left wrist to the right of the right wrist from which the two count as swapped (m)."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectShape:
+    """An object in its own axes, centred on its bounding box; its pose is the pose of this centre."""
+
+    name: str
+    category: str
+    mesh: Mesh
+    middle: Float[Tensor, "3"]
+    """Centre of the bounding box in coordinates of the mesh (m)."""
+    cloud: Float[Tensor, "point 3"]
+    """Surface points relative to the centre (m)."""
+    code: Float[Tensor, "code"]
+    """Condition for the network: class, extents and feature, raw or embedded (`ObjectReader`)."""
+    code_mirrored: Float[Tensor, "code"]
+    """Condition for the object mirrored along its own y axis."""
+    surface: TriangleIndex
+    """Spatial index of the mesh's triangles."""
+
+    def centred(self, T_world_object: Rigid) -> Rigid:
+        """Pose of the bounding box's centre, given the mesh's pose."""
+        return Rigid(T_world_object.R, T_world_object @ self.middle.to(T_world_object.t))
+
+    def of_mesh(self, T_world_middle: Rigid) -> Rigid:
+        """The inverse of `centred`."""
+        return Rigid(T_world_middle.R, T_world_middle @ -self.middle.to(T_world_middle.t))
+
+    @property
+    def mean(self) -> Float[Tensor, "3"]:
+        """Mean of the cloud's points (m)."""
+        return self.cloud.mean(0)
+
+    @property
+    def spread(self) -> Float[Tensor, "3 3"]:
+        """Second moment of the cloud's points (m²), which gives their mean squared displacement by a rotation."""
+        return self.cloud.mT @ self.cloud / len(self.cloud)
+
+
+class ObjectReader:
+    """Turns objects into conditions for the network; each mesh is processed once."""
+
+    def __init__(
+        self, features: EchoFeatures, encoder: PointNeXt | None, embed: Callable[[Tensor], Tensor] | None = None
+    ):
+        """`encoder` None: codes are class and extents alone, for features without shape. `embed`: the network's layer
+        on codes (`EchoDenoiser.object`), which is the same in every window; None leaves them raw."""
+        self.features, self.encoder, self._embed = features, encoder, embed
+        empty = torch.zeros(1, features.object_condition_size)
+        self.nothing: Float[Tensor, "code"] = self._embedded(empty)[0]
+        """Placeholder code for frames without an active object."""
+        self._shapes: dict[tuple[int, str], ObjectShape] = {}
+
+    @torch.inference_mode()
+    def __call__(self, item: SceneObject) -> ObjectShape:
+        """Shape and codes of an object. Raises WearcapError for a class that the model was not built for."""
+        key = (id(item.mesh), item.category)
+        if key not in self._shapes:
+            self._shapes[key] = self._read(item)
+        return replace(self._shapes[key], name=item.name)
+
+    def _read(self, item: SceneObject) -> ObjectShape:
+        one_hot = self.features.class_code(item.category)
+        cloud = object_cloud(item.mesh)
+        middle = (cloud.max(0).values + cloud.min(0).values) / 2
+        both = torch.stack([cloud - middle, (cloud - middle) * torch.tensor(MIRROR)])
+        parts = [one_hot.expand(2, -1), cloud_extents(both)]
+        if self.encoder is not None and self.features.shape_size:
+            parts.append(self.encoder(both))
+        code, code_mirrored = self._embedded(torch.cat(parts, -1)).unbind(0)
+        return ObjectShape(
+            item.name,
+            item.category,
+            item.mesh,
+            middle,
+            both[0].clone(),
+            code,
+            code_mirrored,
+            TriangleIndex.of(item.mesh),
+        )
+
+    @torch.no_grad()
+    def _embedded(self, codes: Float[Tensor, "object raw"]) -> Float[Tensor, "object code"]:
+        return (codes if self._embed is None else self._embed(codes)).clone()
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,14 +24,12 @@ from wearcap.recording.acts import Act, true_acts
 from wearcap.runtime.graphs import chosen
 from wearcap.runtime.system import CaptureInput, LearnedSystem
 from wearcap.scene.environment import Environment
+from wearcap.systems.echo.contacts import Guidance, GuidedScene, with_static_objects
 from wearcap.systems.echo.features import EchoFeatures
-from wearcap.systems.echo.guidance import Guidance, GuidedScene
 from wearcap.systems.echo.model import EchoDenoiser, EchoRunner
-from wearcap.systems.echo.objects import ObjectReader, ObjectShape
-from wearcap.systems.echo.observations import BatchItem, Scenario, batch_item_of
+from wearcap.systems.echo.observations import BatchItem, ObjectReader, ObjectShape, Scenario, batch_item_of
 from wearcap.systems.echo.queue import Conditioning, Correct, EchoQueue, Outputs, Rewindow
 from wearcap.systems.echo.scores import Truth, score_echo, truth_of
-from wearcap.systems.echo.static_objects import with_static_objects
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.head_path import HeadPath, head_path
 

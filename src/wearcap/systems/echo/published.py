@@ -17,8 +17,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.models.point_encoder import PointNeXt
 from wearcap.recording import Motion
 from wearcap.systems.echo.features import OBJECT_SIZE, Body, EchoFeatures, ThreePoints
-from wearcap.systems.echo.objects import ObjectReader
-from wearcap.systems.echo.observations import BatchItem, Scenario, batch_item_of
+from wearcap.systems.echo.observations import BatchItem, ObjectReader, Scenario, batch_item_of
 from wearcap.systems.echo.pipeline import motion_of, object_tracks
 from wearcap.systems.echo.queue import Outputs
 from wearcap.systems.echo.training_windows import EchoContent

@@ -23,7 +23,8 @@ from wearcap.recording.recording import Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
 from wearcap.scene.environment import Environment
 from wearcap.systems.echo.features import CONTACTS, EXTENTS, OBJECT_SIZE, POINTS, Body, EchoFeatures, ThreePoints
-from wearcap.systems.echo.objects import ObjectReader, ObjectShape, body_contact, foot_patches, object_poses
+from wearcap.systems.echo.observations import ObjectReader, ObjectShape
+from wearcap.systems.echo.scores import body_contact, foot_patches
 
 MIN_FRAMES = 6
 """Length of the shortest training window (frames)."""
@@ -135,6 +136,20 @@ class EchoTrack:
         wearer = floor.float(), motion.skeleton, body_size(motion.skeleton)
         truth = Body(motion.R_parent_joint[take], motion.t_world_root[take])
         return cls(points, *wearer, truth, contact, objects, active, Rigid(R, t))
+
+
+def object_poses(recording: Recording, environment: Environment, name: str, shape: ObjectShape, take: Tensor) -> Rigid:
+    """Ground-truth poses of an object's centre at frames `take` of the motion, whose clock its trajectory shares.
+
+    An object without a trajectory stays at its pose in the environment.
+    """
+    track = recording.object_motion.get(name)
+    if track is None:
+        item = environment.by_name(name)
+        T = Rigid(item.R_world_object.expand(len(take), 3, 3).clone(), item.t_world_object.expand(len(take), 3).clone())
+    else:
+        T = track.T_world_body[take]
+    return shape.centred(T)
 
 
 class EchoContent(Content):

@@ -20,8 +20,7 @@ from wearcap.models.layers import (
     Widening,
     attention_mask,
 )
-from wearcap.runtime.denoising import LevelPlan, PlanGraph, StepGraph
-from wearcap.runtime.graphs import Graph, chosen, run_of, undisturbed
+from wearcap.runtime.graphs import Graph, LevelPlan, PlanGraph, StepGraph, chosen, run_of, undisturbed
 
 
 class Conditions(NamedTuple):
