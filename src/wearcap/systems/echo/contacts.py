@@ -61,6 +61,17 @@ class Guidance:
         return x0_hat - step
 
 
+@dataclass(frozen=True)
+class ContactUse:
+    """What the predicted contacts change; without effect if the network was trained without contacts."""
+
+    guidance: Guidance | None = None
+    """None: no guidance."""
+    static_threshold: float | None = 0.7
+    """Objects stay static in frames whose largest contact probability is below this (ours); None: objects keep their
+    sampled poses (ECHO)."""
+
+
 @dataclass(frozen=True, eq=False)
 class GuidedScene:
     """Bodies, objects and conditioning of one window, against which its prediction is guided."""

@@ -71,8 +71,8 @@ class EchoStream(HeadAndWristsStream):
 
     def __init__(self, pipeline: Echo, wearer: EchoWearer, environment: Environment | None = None, seed: int = 0):
         """Raises WearcapError for a pipeline without a conveyor."""
-        if pipeline.rewindow is not None:
-            raise WearcapError(f"a stream with rewindow={pipeline.rewindow}", expected="a conveyor: rewindow=null")
+        if (rewindow := pipeline.sampling.rewindow) is not None:
+            raise WearcapError(f"a stream with rewindow={rewindow}", expected="a conveyor: rewindow=null")
         super().__init__(pipeline, 1)
         self.wearer, self.seed = wearer, seed
         self._names: list[str] = []
@@ -95,7 +95,7 @@ class EchoStream(HeadAndWristsStream):
 
     def _guide(self) -> None:
         """Give the queue the bodies and objects that guidance needs, if any."""
-        if self._queue is not None and self.pipeline.guided_by is not None:
+        if self._queue is not None and self.pipeline.contact_use.guidance is not None:
             shape, objects = dict(self.wearer.shape), list(self._shapes.values())
             self._queue.guided = pulled_by([self.wearer.skeleton], [shape], [objects])
 
@@ -109,7 +109,7 @@ class EchoStream(HeadAndWristsStream):
         self._pending: list[tuple[float, Conditioning, Rigid]] = []
         """Time, conditioning and head pose of frames that were consumed but not output yet."""
         self._floor = FloorTracker(self.wearer.skeleton.height_of("head"), self.pipeline.fps)
-        threshold = self.pipeline.static_below
+        threshold = self.pipeline.contact_use.static_threshold
         self._static = None if threshold is None else StaticObjects(threshold)
 
     def wrist(self, joint: str, timestamp: float, T_world_joint: Rigid) -> None:
@@ -343,12 +343,13 @@ class EchoSession(Session):
     @classmethod
     def settings(cls, system: Echo) -> dict[str, Any]:
         """The settings of a pipeline that a session's state depends on."""
-        return {**system.settings(), "window": system.net.window, "features": str(system.features)}
+        model = system.model
+        return {**system.settings(), "window": model.net.window, "features": str(model.features)}
 
     @classmethod
     def shared(cls, system: Echo) -> dict[str, Any]:
         """Parts of the pipeline that a session's state refers to, by name."""
-        return super().shared(system) | {"schedule": system.schedule}
+        return super().shared(system) | {"schedule": system.model.schedule}
 
     @classmethod
     def load(cls, path: str | Path, system: Echo, environment: Environment | None = None) -> "EchoSession":

@@ -19,6 +19,7 @@ from wearcap.models.point_encoder import PointNeXt
 from wearcap.systems.echo.features import CONTACTS, OBJECT_SIZE, Body, EchoFeatures
 from wearcap.systems.echo.model import EchoDenoiser
 from wearcap.systems.echo.pipeline import Echo
+from wearcap.systems.echo.queue import EchoModel
 from wearcap.systems.echo.training_windows import EchoContent, EchoWindow
 from wearcap.training import losses
 from wearcap.training.base import OptimizerOf, SchedulerOf, Training
@@ -36,7 +37,6 @@ class EchoDiffusion(Training):
 
     system = Echo
     """The system that captures with the network."""
-    parts = ("net", "features", "schedule", "skeleton", "encoder", "contacts")
 
     def __init__(
         self,
@@ -66,6 +66,10 @@ class EchoDiffusion(Training):
         self.features, self.schedule, self.skeleton, self.mix = features, schedule, skeleton, levels
         self.contacts = contacts
         self._feet = skeleton.indices("left_ankle", "left_toe", "right_ankle", "right_toe")
+
+    def pipeline_parts(self) -> dict[str, EchoModel]:
+        parts = self.net, self.features, self.schedule, self.skeleton, self.encoder, self.contacts
+        return {"model": EchoModel(*parts)}
 
     def set_statistics(self, dataset: Windows, limit: int = 1500) -> None:
         content = dataset.content
