@@ -25,9 +25,20 @@ from wearcap.metrics.table import Scores, Summary, aggregate, markdown_table
 from wearcap.recording import RecordingStore
 from wearcap.runtime.system import CaptureInput
 from wearcap.systems.echo.published import NearestEcho, RigidWrist
-from wearcap.systems.echo.scores import MEASURES, score_echo
+from wearcap.systems.echo.scores import score_echo
 
-OBJECTS = MEASURES
+OBJECTS = (
+    "mpjpe_mm",
+    "mpjve_mm",
+    "foot_contact",
+    "true_foot_contact",
+    "v2v_cm",
+    "center_cm",
+    "rotation_deg",
+    "quaternion",
+    "touch_f1",
+    "jitter_m_s3",
+)
 HUMAN = ("mpjpe_mm", "mpjve_mm", "foot_contact", "true_foot_contact", "jitter_m_s3", "true_jitter_m_s3")
 UNGUIDED = ("pipeline=echo", "pipeline.contacts.guidance=null")
 SHORT = ("experiment=echo", "trainer.max_steps=900")

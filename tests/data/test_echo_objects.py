@@ -67,12 +67,6 @@ def test_middle_and_mesh_are_two_names_of_one_pose(shape):
     torch.testing.assert_close(shape.of_mesh(centred).matrix(), POSE.matrix())
 
 
-def test_moments_are_those_of_the_cloud(shape):
-    torch.testing.assert_close(shape.mean, torch.stack(list(shape.cloud)).sum(0) / len(shape.cloud))
-    outer = sum(torch.outer(point, point) for point in shape.cloud) / len(shape.cloud)
-    torch.testing.assert_close(shape.spread, outer, atol=1e-5, rtol=1e-4)
-
-
 @pytest.mark.parametrize("within_m", [0.02, 0.05])
 def test_a_touch_is_a_distance_to_the_surface(shape, within_m):
     """Against the distance to a box as a formula, from outside and from within."""

@@ -178,7 +178,9 @@ def test_an_object_may_change_within_a_window():
     first, second = track.objects
     for k, shape in ((4, first), (5, second)):
         assert torch.equal(window.object_code[k], shape.code)
-        assert torch.equal(window.object_mean[k], shape.mean)
+        torch.testing.assert_close(window.object_mean[k], sum(shape.cloud) / len(shape.cloud))
+        outer = sum(torch.outer(point, point) for point in shape.cloud) / len(shape.cloud)
+        torch.testing.assert_close(window.object_spread[k], outer, atol=1e-5, rtol=1e-4)
         truth = shape.centred(recording.object_motion[shape.name].T_world_body[change - 5 + k : change - 4 + k])
         torch.testing.assert_close(window.t_world_object[k], truth.t[0], atol=1e-5, rtol=0)
     assert not torch.equal(window.object_spread[4], window.object_spread[5])

@@ -18,6 +18,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from wearcap.errors import WearcapError
 
+_OPTIMIZERS = "ASGD Adadelta Adagrad Adam AdamW Adamax LBFGS NAdam RAdam RMSprop SGD"
+_SCHEDULERS = (
+    "ConstantLR CosineAnnealingLR CosineAnnealingWarmRestarts CyclicLR ExponentialLR LinearLR MultiStepLR OneCycleLR "
+    "PolynomialLR StepLR"
+)
 TARGETS: dict[str, tuple[str, ...]] = {
     "wearcap.body.skeleton": ("xsens23",),
     "wearcap.systems.ireplica.features": ("HandViews", "SmplAngles"),
@@ -27,7 +32,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "wearcap.systems.hmd2.pose_regressor.features": ("TrackedPoints",),
     "wearcap.systems.mocap_every.features": ("WatchFeatures",),
     "wearcap.diffusion.levels": ("LevelMix",),
-    "wearcap.diffusion.schedule": ("CosineSchedule", "LinearSchedule"),
+    "wearcap.diffusion.schedule": ("CosineSchedule",),
     "wearcap.systems.ireplica.contact_sequence": ("ContactSequence",),
     "wearcap.systems.ireplica.contact_transformer": ("ContactTransformer",),
     "wearcap.systems.hmd2.model": ("MotionDenoiser",),
@@ -51,31 +56,8 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "wearcap.systems.hmd2.point_codes_training": ("VoxelReconstruction",),
     "wearcap.systems.mocap_every.training": ("WatchRegression",),
     "prodigyopt": ("Prodigy",),
-    "torch.optim": (
-        "ASGD",
-        "Adadelta",
-        "Adagrad",
-        "Adam",
-        "AdamW",
-        "Adamax",
-        "LBFGS",
-        "NAdam",
-        "RAdam",
-        "RMSprop",
-        "SGD",
-    ),
-    "torch.optim.lr_scheduler": (
-        "ConstantLR",
-        "CosineAnnealingLR",
-        "CosineAnnealingWarmRestarts",
-        "CyclicLR",
-        "ExponentialLR",
-        "LinearLR",
-        "MultiStepLR",
-        "OneCycleLR",
-        "PolynomialLR",
-        "StepLR",
-    ),
+    "torch.optim": tuple(_OPTIMIZERS.split()),
+    "torch.optim.lr_scheduler": tuple(_SCHEDULERS.split()),
 }
 """Classes (and functions that return plain objects) that a model's config may name, by their modules."""
 

@@ -14,7 +14,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from wearcap.errors import WearcapError
-from wearcap.models.checkpoint import load_network
 from wearcap.models.weights import load_weights, read_weights
 
 _LEAST_M = 1e-9
@@ -28,14 +27,9 @@ _NAME = re.compile(
 
 
 def bounds(points: Float[Tensor, "batch point 3"]) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch 3"]]:
-    """Half extents and centre of clouds' bounding boxes, in the points' unit."""
+    """Half extents and centre of clouds' bounding boxes, in the points' unit; `PointNeXt`'s feature has neither."""
     low, high = points.amin(1), points.amax(1)
     return (high - low) / 2, (high + low) / 2
-
-
-def cloud_extents(points: Float[Tensor, "batch point 3"]) -> Float[Tensor, "batch 6"]:
-    """Half extents and centre along the clouds' axes (m), which `PointNeXt`'s feature does not contain."""
-    return torch.cat(bounds(points), -1)
 
 
 def to_unit_sphere(
@@ -149,7 +143,7 @@ class PointNeXt(nn.Module):
             parts: list[nn.Module] = [_SetAbstraction(narrow, 2 * narrow, stride, near, most, normalized)]
             wider = near * radius_scaling
             parts += [_InvResMLP(2 * narrow, wider, most, normalized, expansion) for _ in range(count)]
-            stages.append(_Stage(parts))
+            stages.append(nn.ModuleList(parts))
         self.stages = nn.ModuleList(stages)
         self.whole = nn.ModuleList([_Layer(self.size + 3, self.size), _Layer(self.size, self.size)])
 
@@ -166,7 +160,9 @@ class PointNeXt(nn.Module):
         p = _rows_at(unit, spread_first(unit, unit.shape[1] // self.strides[0]))
         f = self.stem(p)
         for stage in self.stages:
-            p, f = stage(p, f)
+            assert isinstance(stage, nn.ModuleList)
+            for part in stage:
+                p, f = part(p, f)
         f = torch.cat([p, f], -1)
         for layer in self.whole:
             f = F.relu(layer(f))
@@ -209,17 +205,6 @@ class _InvResMLP(nn.Module):
         index = _ball_query(p, p, self.radius, self.neighbours)
         most = F.relu(self.ball(p, f, index)).max(2).values
         return p, F.relu(f + self.narrow(F.relu(self.widen(most))))
-
-
-class _Stage(nn.ModuleList):
-    """A set abstraction and the residual blocks after it."""
-
-    def forward(
-        self, p: Float[Tensor, "batch point 3"], f: Float[Tensor, "batch point feature"]
-    ) -> tuple[Float[Tensor, "batch center 3"], Float[Tensor, "batch center wide"]]:
-        for part in self:
-            p, f = part(p, f)
-        return p, f
 
 
 class _Layer(nn.Module):
@@ -269,14 +254,6 @@ class ObjectNetwork(nn.Module):
         self.category = nn.Linear(encoder.size, len(self.classes))
         self.extents = nn.Linear(encoder.size, 3)
         self.instance = nn.Linear(encoder.size, projection)
-
-
-def load_object_encoder(path: str | Path) -> PointNeXt:
-    """The encoder of a checkpoint of experiment=object_encoder (a path, or a name in `checkpoints/`), frozen.
-
-    Raises WearcapError when the checkpoint is missing, damaged or another network's.
-    """
-    return load_network(path, PointNeXt, "object_encoder", part="net.encoder").requires_grad_(False)
 
 
 def load_openpoints(path: str | Path, normalized: bool = True) -> PointNeXt:

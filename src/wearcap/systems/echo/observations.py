@@ -16,7 +16,7 @@ from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate_clamped, resample
 from wearcap.geometry.triangle_distance import TriangleIndex
-from wearcap.models.point_encoder import PointNeXt, cloud_extents
+from wearcap.models.point_encoder import PointNeXt, bounds
 from wearcap.recording.acts import NO_OBJECT, Act, active_at
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
@@ -62,16 +62,6 @@ class ObjectShape:
         """The inverse of `centred`."""
         return Rigid(T_world_middle.R, T_world_middle @ -self.middle.to(T_world_middle.t))
 
-    @property
-    def mean(self) -> Float[Tensor, "3"]:
-        """Mean of the cloud's points (m)."""
-        return self.cloud.mean(0)
-
-    @property
-    def spread(self) -> Float[Tensor, "3 3"]:
-        """Second moment of the cloud's points (m²), which gives their mean squared displacement by a rotation."""
-        return self.cloud.mT @ self.cloud / len(self.cloud)
-
 
 class ObjectReader:
     """Turns objects into conditions for the network; each mesh is processed once."""
@@ -100,7 +90,7 @@ class ObjectReader:
         cloud = object_cloud(item.mesh)
         middle = (cloud.max(0).values + cloud.min(0).values) / 2
         both = torch.stack([cloud - middle, (cloud - middle) * torch.tensor(MIRROR)])
-        parts = [one_hot.expand(2, -1), cloud_extents(both)]
+        parts = [one_hot.expand(2, -1), torch.cat(bounds(both), -1)]
         if self.encoder is not None and self.features.shape_size:
             parts.append(self.encoder(both))
         code, code_mirrored = self._embedded(torch.cat(parts, -1)).unbind(0)

@@ -127,13 +127,12 @@ class Echo(LearnedSystem):
         return ObjectReader(model.features, model.encoder, lambda codes: model.net.object(codes.to(self.device)).cpu())
 
     def motions(self, sources: Sequence[CaptureInput], seeds: Sequence[int]) -> list[Motion]:
-        """One motion per recording and seed, with the objects of the recordings' environments."""
-        once = {id(source): self.scenario_of(source) for source in sources}
-        return self.capture_scenarios([once[id(source)] for source in sources], seeds)
+        """One motion per recording and seed, with the objects of the recordings' environments.
 
-    def scenario_of(self, source: CaptureInput) -> Scenario:
-        """A recording of a data set with its active objects, according to `acts`. Raises WearcapError as `objects`."""
-        return self.scenario(source.recording, self.objects(source))
+        Raises WearcapError as `objects` and `capture_scenarios` do.
+        """
+        once = {id(source): self.scenario(source.recording, self.objects(source)) for source in sources}
+        return self.capture_scenarios([once[id(source)] for source in sources], seeds)
 
     def objects(self, source: CaptureInput) -> Environment | None:
         """The objects of a recording; each file is read once. Raises WearcapError for a file that cannot be read."""

@@ -25,19 +25,6 @@ from wearcap.systems.echo.features import CONTACTS
 from wearcap.systems.echo.model import MODALITIES
 from wearcap.systems.echo.observations import ObjectReader, ObjectShape, Observed, Scenario
 
-MEASURES = (
-    "mpjpe_mm",
-    "mpjve_mm",
-    "foot_contact",
-    "true_foot_contact",
-    "v2v_cm",
-    "center_cm",
-    "rotation_deg",
-    "quaternion",
-    "touch_f1",
-    "jitter_m_s3",
-)
-
 
 @dataclass(frozen=True, eq=False)
 class Truth:

@@ -17,7 +17,8 @@ from wearcap.data.windows import Content, Windows
 from wearcap.diffusion.levels import DRAWS
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.environment import read_environment
-from wearcap.models.point_encoder import PointNeXt, load_object_encoder
+from wearcap.models.checkpoint import load_network
+from wearcap.models.point_encoder import PointNeXt
 from wearcap.recording.acts import NO_OBJECT, active_at, true_acts
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
@@ -51,7 +52,8 @@ class EchoWindow(NamedTuple):
     t_world_object: Float[Tensor, "*batch time 3"]
     object_mean: Float[Tensor, "*batch time 3"]
     object_spread: Float[Tensor, "*batch time 3 3"]
-    """Mean (m) and second moment (m²) of the object's points about its centre (`ObjectShape`)."""
+    """Mean (m) of the object's points about its centre, and second moment (m²), which gives their mean squared
+    displacement by a rotation."""
     valid: Bool[Tensor, "*batch time"]
     """False for padding."""
     noise: Float[Tensor, "*batch time feature"]
@@ -170,10 +172,12 @@ class EchoContent(Content):
         """`encoder` is a checkpoint of experiment=object_encoder, or another PointNeXt; None: no shape feature.
 
         A body point is in contact within `within_m` of the object's surface. With `objects` False all recordings are of
-        humans alone.
+        humans alone. Raises WearcapError when the checkpoint is missing, damaged or another network's.
         """
         self.features, self.within_m, self.objects = features, within_m, objects
-        self.encoder = load_object_encoder(encoder) if isinstance(encoder, str) else encoder
+        if isinstance(encoder, str):
+            encoder = load_network(encoder, PointNeXt, "object_encoder", part="net.encoder").requires_grad_(False)
+        self.encoder = encoder
         self._reader = ObjectReader(features, self.encoder)
 
     def min_frames(self, window: int, stretch: float) -> int:
@@ -214,7 +218,10 @@ class EchoContent(Content):
         """
         active = track.active[cut.frames]
         nothing = (torch.zeros(self.features.object_condition_size), torch.zeros(3), torch.zeros(3, 3))
-        shapes = [(s.code_mirrored if window.mirrored else s.code, s.mean, s.spread) for s in track.objects]
+        shapes = [
+            (s.code_mirrored if window.mirrored else s.code, s.cloud.mean(0), s.cloud.mT @ s.cloud / len(s.cloud))
+            for s in track.objects
+        ]
         code, mean, spread = (torch.stack(rows)[active] for rows in zip(*shapes, nothing))
         if window.mirrored:
             flip = torch.tensor(MIRROR)
