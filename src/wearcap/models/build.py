@@ -134,22 +134,13 @@ def build(config: dict[str, Any], state: Mapping[str, Tensor], where: str | Path
             raise TypeError(f"a {type(rehearsed).__name__}, no network")
         check_weights(rehearsed.state_dict(), own, where)
         module: nn.Module = _made(config)
-    except WearcapError as error:
-        if error.where:
-            raise
-        raise _unbuildable(error, where) from error
     except Exception as error:  # constructors may raise anything for arguments that no release of ours wrote
-        raise _unbuildable(error, where) from error
+        if isinstance(error, WearcapError) and error.where:
+            raise
+        what = f"its model cannot be built ({' '.join(str(error).split())[:200] or type(error).__name__})"
+        raise WearcapError(what, where=where, expected="a checkpoint of this version of wearcap") from error
     module.load_state_dict(own)
     return module.eval()
-
-
-def _unbuildable(error: Exception, where: str | Path) -> WearcapError:
-    return WearcapError(
-        f"its model cannot be built ({' '.join(str(error).split())[:200] or type(error).__name__})",
-        where=where,
-        expected="a checkpoint of this version of wearcap",
-    )
 
 
 def check_weights(own: Mapping[str, Tensor], state: Mapping[str, Tensor], where: str | Path) -> None:

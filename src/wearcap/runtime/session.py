@@ -16,29 +16,7 @@ from wearcap.sensors.packets import Admitted, HeadInput, WristInput
 from wearcap.tracking.head_path import Chunk, HeadTrack
 
 
-class WearerStream(ABC):
-    """The streaming capture of one wearer."""
-
-    @property
-    @abstractmethod
-    def dropped(self) -> int:
-        """Number of head poses that were late, duplicated or refused."""
-
-    @property
-    @abstractmethod
-    def refused(self) -> dict[str, int]:
-        """Number of refused samples, or parts of samples, by reason ("head: not a rotation")."""
-
-    @abstractmethod
-    def take(self, sample: Any) -> None:
-        """Take in one sample (`sensors.samples`)."""
-
-    @abstractmethod
-    def poses(self, ended: bool = False) -> Motion | None:
-        """Frames that became final since the last call, or None; `ended`: no more samples will come."""
-
-
-class HeadAndWristsStream(WearerStream):
+class HeadAndWristsStream(ABC):
     """The streaming capture of one wearer with a head device and sensors on both wrists, on one clock.
 
     Invalid packets (`sensors.packets`) are counted as `refused`. If the head device's clock is set back for good, the
@@ -58,11 +36,17 @@ class HeadAndWristsStream(WearerStream):
 
     @property
     def dropped(self) -> int:
+        """Number of head poses that were late, duplicated or refused."""
         return self._track.dropped + self._head_input.dropped
 
     @property
     def refused(self) -> dict[str, int]:
+        """Number of refused samples, or parts of samples, by reason ("head: not a rotation")."""
         return dict(self._head_input.refused)
+
+    @abstractmethod
+    def take(self, sample: Any) -> None:
+        """Take in one sample (`sensors.samples`)."""
 
     def head(
         self, timestamp: float, T_world_device: Rigid | None, points_world: Float[Tensor, "point 3"] | None = None

@@ -81,11 +81,8 @@ class ObjectReader:
     def __call__(self, item: SceneObject) -> ObjectShape:
         """Shape and codes of an object. Raises WearcapError for a class that the model was not built for."""
         key = (id(item.mesh), item.category)
-        if key not in self._shapes:
-            self._shapes[key] = self._read(item)
-        return replace(self._shapes[key], name=item.name)
-
-    def _read(self, item: SceneObject) -> ObjectShape:
+        if key in self._shapes:
+            return replace(self._shapes[key], name=item.name)
         one_hot = self.features.class_code(item.category)
         cloud = object_cloud(item.mesh)
         middle = (cloud.max(0).values + cloud.min(0).values) / 2
@@ -94,16 +91,9 @@ class ObjectReader:
         if self.encoder is not None and self.features.shape_size:
             parts.append(self.encoder(both))
         code, code_mirrored = self._embedded(torch.cat(parts, -1)).unbind(0)
-        return ObjectShape(
-            item.name,
-            item.category,
-            item.mesh,
-            middle,
-            both[0].clone(),
-            code,
-            code_mirrored,
-            TriangleIndex.of(item.mesh),
-        )
+        made = item.name, item.category, item.mesh, middle, both[0].clone(), code, code_mirrored
+        self._shapes[key] = ObjectShape(*made, TriangleIndex.of(item.mesh))
+        return self._shapes[key]
 
     @torch.no_grad()
     def _embedded(self, codes: Float[Tensor, "object raw"]) -> Float[Tensor, "object code"]:

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from wearcap.body.anny_body import anny_body
 from wearcap.body.contact_points import BODY_POINTS, contact_points
 from wearcap.body.skeleton import Skeleton
-from wearcap.diffusion.conveyor import Denoise, RollingSchedule
+from wearcap.diffusion.conveyor import Correct, Denoise, RollingSchedule
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
@@ -25,10 +25,10 @@ from wearcap.scene.environment import Environment
 from wearcap.systems.echo.contacts import ContactUse, GuidedScene, with_static_objects
 from wearcap.systems.echo.model import EchoRunner
 from wearcap.systems.echo.observations import BatchItem, ObjectReader, ObjectShape, Scenario, batch_item_of
-from wearcap.systems.echo.queue import Conditioning, Correct, EchoModel, EchoQueue, Outputs, Rewindow
+from wearcap.systems.echo.queue import Conditioning, EchoModel, EchoQueue, Outputs, Rewindow
 from wearcap.systems.echo.scores import Truth, score_echo, truth_of
 from wearcap.tracking.anchor import anchored_to_head
-from wearcap.tracking.head_path import HeadPath, head_path
+from wearcap.tracking.head_path import head_path
 
 
 @dataclass(frozen=True)
@@ -210,13 +210,19 @@ class Echo(LearnedSystem):
             [recordings[k].shape for k, *_ in parts],
             [items[k].objects for k, *_ in parts],
         )
-        conditioning = [_padded(items[k].conditioning, start, stop, longest) for k, start, stop in parts]
-        whole = Conditioning(*(torch.cat(fields) for fields in zip(*conditioning)))
-        together = queue.run(whole)
+        conditioning, frames = [], torch.arange(longest)
+        for k, start, stop in parts:  # the last frame repeated as not valid pads a stretch
+            padded, inside = items[k].conditioning.frames((start + frames).clamp_max(stop - 1)), frames < stop - start
+            is_observed = padded.is_observed & inside[:, None]
+            conditioning.append(padded._replace(valid=padded.valid & inside, is_observed=is_observed))
+        together = queue.run(Conditioning(*(torch.cat(fields) for fields in zip(*conditioning))))
         found: list[list[Outputs]] = [[] for _ in items]
         for row, (k, start, stop) in enumerate(parts):
             found[k].append(Outputs(*(field[row : row + 1, : stop - start] for field in together)))
-        return [_bridged(outputs, item.path) for outputs, item in zip(found, items)]
+        return [
+            Outputs(*(torch.cat(fields, 1)[:, item.path.held_frames] for fields in zip(*outputs)))
+            for outputs, item in zip(found, items)
+        ]
 
     def queue(
         self,
@@ -307,17 +313,3 @@ def object_tracks(item: BatchItem, outputs: Outputs) -> dict[str, Trajectory]:
 def stretch_seed(seed: int, start: int) -> int:
     """Seed of the stretch that begins at frame `start`: every stretch of a recording has its own noise."""
     return seed + 1_000_003 * start
-
-
-def _padded(conditioning: Conditioning, start: int, stop: int, length: int) -> Conditioning:
-    """Frames start…stop-1, padded to `length` by repeating the last one as not valid."""
-    take = (start + torch.arange(length)).clamp_max(stop - 1)
-    inside = torch.arange(length) < stop - start
-    padded = conditioning.frames(take)
-    return padded._replace(valid=padded.valid & inside, is_observed=padded.is_observed & inside[:, None])
-
-
-def _bridged(outputs: list[Outputs], path: HeadPath) -> Outputs:
-    """Stretches joined into one; frames in the gaps between them repeat the frame before."""
-    whole, frames = Outputs(*(torch.cat(fields, 1) for fields in zip(*outputs))), path.held_frames
-    return Outputs(*(field[:, frames] for field in whole))

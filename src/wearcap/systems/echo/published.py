@@ -96,12 +96,11 @@ class NearestEcho:
 
     def capture_scenarios(self, scenarios: Sequence[Scenario], seeds: Sequence[int]) -> list[Motion]:
         """One motion per scenario; deterministic, seeds are ignored."""
-        reader = ObjectReader(self.features, self.encoder)
-        return [self._capture(scenario, reader) for scenario in scenarios]
+        reader, fps = ObjectReader(self.features, self.encoder), self.features.fps
+        paths = [head_path(scenario.recording, scenario.recording.skeleton, fps) for scenario in scenarios]
+        return [self._capture(batch_item_of(scenario, path, reader)) for scenario, path in zip(scenarios, paths)]
 
-    def _capture(self, scenario: Scenario, reader: ObjectReader) -> Motion:
-        recording = scenario.recording
-        item = batch_item_of(scenario, head_path(recording, recording.skeleton, self.features.fps), reader)
+    def _capture(self, item: BatchItem) -> Motion:
         conditioning, count = item.conditioning, len(item.path.timestamps)
         points = ThreePoints(*(part[0] for part in conditioning.points))
         size = body_size(item.path.skeleton)

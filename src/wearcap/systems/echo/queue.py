@@ -1,7 +1,7 @@
 """ECHO's queue of frames (ECHO §3.3): conditioning enters frame by frame, final outputs leave frame by frame; and
 overlapping windows in place of the conveyor, denoised from scratch with inpainted overlap (ECHO Fig. 3, left)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -12,16 +12,13 @@ from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
 from wearcap.data.features import body_size
-from wearcap.diffusion.conveyor import Conveyor, Denoise, Observation, RollingSchedule
+from wearcap.diffusion.conveyor import Conveyor, Correct, Denoise, Observation, RollingSchedule
 from wearcap.diffusion.process import posterior_step, step_levels
 from wearcap.diffusion.schedule import Schedule
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.point_encoder import PointNeXt
 from wearcap.systems.echo.features import Body, EchoFeatures, ThreePoints
 from wearcap.systems.echo.model import MODALITIES, EchoDenoiser
-
-Correct = Callable[[Float[Tensor, "batch frame feature"]], Float[Tensor, "batch frame feature"]]
-"""Corrects x̂0, as guidance does."""
 
 
 class Conditioning(NamedTuple):
