@@ -108,12 +108,10 @@ def read_run_file(path: str | Path) -> dict[str, Any]:
 
 def _read_run(path: Path) -> tuple[str, dict[str, Tensor]]:
     saved = read_run_file(path)
-    try:
-        text, state = saved["wearcap"]["config"], dict(saved["state_dict"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise _foreign(path) from error
+    about, state = saved.get("wearcap"), saved.get("state_dict")
+    text = about.get("config") if isinstance(about, dict) else None
     # A weight's memory is in the file: no expansion of a few numbers to any size.
-    plain = all(
+    plain = isinstance(state, dict) and all(
         isinstance(name, str)
         and isinstance(value, Tensor)
         and value.device.type == "cpu"
@@ -123,14 +121,9 @@ def _read_run(path: Path) -> tuple[str, dict[str, Tensor]]:
         for name, value in state.items()
     )
     if not isinstance(text, str) or not plain:
-        raise _foreign(path)
-    return text, state
-
-
-def _foreign(path: Path) -> WearcapError:
-    return WearcapError(
-        "a checkpoint, but not of wearcap", where=path, expected="a .ckpt file that `wearcap train` wrote"
-    )
+        expected = "a .ckpt file that `wearcap train` wrote"
+        raise WearcapError("a checkpoint, but not of wearcap", where=path, expected=expected)
+    return text, dict(state)
 
 
 def _read_shared(path: Path) -> tuple[str, dict[str, Tensor]]:

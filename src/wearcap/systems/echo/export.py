@@ -124,7 +124,6 @@ class _ExportedEchoDenoiser(EchoDenoiser):
         self.object = _Embedding(runs["objects"], self.window)
 
     def graphs(self) -> dict[str, Graph]:
-        """The exported graphs themselves."""
         runs = self._runs[0]
         return {
             name: Graph(runs[part], {}) for name, part in (("step", "model"), ("plan", "plan"), ("conditions",) * 2)

@@ -342,13 +342,11 @@ class EchoSession(Session):
 
     @classmethod
     def settings(cls, system: Echo) -> dict[str, Any]:
-        """The settings of a pipeline that a session's state depends on."""
         model = system.model
         return {**system.settings(), "window": model.net.window, "features": str(model.features)}
 
     @classmethod
     def shared(cls, system: Echo) -> dict[str, Any]:
-        """Parts of the pipeline that a session's state refers to, by name."""
         return super().shared(system) | {"schedule": system.model.schedule}
 
     @classmethod

@@ -213,7 +213,6 @@ class MocapEverySession(Session):
 
     @classmethod
     def settings(cls, system: MocapEvery) -> dict[str, Any]:
-        """The settings of a pipeline that a session's state depends on."""
         return {**system.settings(), "window": system.net.window, "fps": system.fps, "features": str(system.features)}
 
 
