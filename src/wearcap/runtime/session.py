@@ -23,13 +23,13 @@ class HeadAndWristsStream(ABC):
     capture restarts like a new session.
     """
 
-    def __init__(self, pipeline: Any, stride: int):
-        """`stride`: frames of a chunk of the head's path."""
+    def __init__(self, pipeline: Any, fps: float, stride: int):
+        """`fps`: frame rate of the poses (Hz); `stride`: frames of a chunk of the head's path."""
         pipeline.prepare()
         self.pipeline = pipeline
         self.silent = 0
         """Number of frames without samples of a wrist, counted per wrist."""
-        self._head_input, self._track = HeadInput(), HeadTrack(pipeline.fps, stride)
+        self._head_input, self._track = HeadInput(), HeadTrack(fps, stride)
         self._wrists = WristInput(self._head_input)
         self._finished: list[Motion] = []
         """Final motions with times of a previous clock, not returned yet."""

@@ -73,7 +73,7 @@ class EchoStream(HeadAndWristsStream):
         """Raises WearcapError for a pipeline without a conveyor."""
         if (rewindow := pipeline.sampling.rewindow) is not None:
             raise WearcapError(f"a stream with rewindow={rewindow}", expected="a conveyor: rewindow=null")
-        super().__init__(pipeline, 1)
+        super().__init__(pipeline, pipeline.fps, 1)
         self.wearer, self.seed = wearer, seed
         self._names: list[str] = []
         """Objects that were named so far, in order of their first use."""

@@ -65,7 +65,7 @@ class MocapEveryStream(HeadAndWristsStream):
     """
 
     def __init__(self, pipeline: MocapEvery, wearing: Wearing):
-        super().__init__(pipeline, pipeline.stride)
+        super().__init__(pipeline, pipeline.fps, pipeline.stride)
         self.wearing = wearing
         self._restart()
 
