@@ -40,10 +40,8 @@ class RollingSchedule:
 
     def __post_init__(self):
         if not 0 <= self.context < self.window:
-            raise WearcapError(
-                f"a context of {self.context} frames in a window of {self.window}",
-                expected=f"from 0 to {self.window - 1}",
-            )
+            what = f"a context of {self.context} frames in a window of {self.window}"
+            raise WearcapError(what, expected=f"from 0 to {self.window - 1}")
         if self.per_frame < 1:
             raise WearcapError(f"{self.per_frame} steps per frame", expected="at least 1")
         if self.step not in STEPS:

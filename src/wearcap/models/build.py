@@ -93,11 +93,9 @@ def check_config(config: Any, where: str | Path) -> None:
                 raise _refused(f"{_PARTIAL}: {str(value[_PARTIAL])[:80]!r}", where)
             target = value.get(_TARGET)
             if _TARGET in value and target not in (_BY_NAME if isinstance(target, str) else ()):
-                raise WearcapError(
-                    f"the model is to be made of {str(target)[:80]!r}, which is no part of wearcap's models",
-                    where=where,
-                    expected="networks, features and optimisers of wearcap and PyTorch alone",
-                )
+                what = f"the model is to be made of {str(target)[:80]!r}, which is no part of wearcap's models"
+                expected = "networks, features and optimisers of wearcap and PyTorch alone"
+                raise WearcapError(what, where=where, expected=expected)
             rest += [(key if key in _ANY_SIZE else inner, item) for inner, item in value.items()]
         elif isinstance(value, list):
             rest += [(key, item) for item in value]
@@ -147,12 +145,9 @@ def check_weights(own: Mapping[str, Tensor], state: Mapping[str, Tensor], where:
     """Raise WearcapError unless the weights of a file have the names and shapes of a model's own."""
     wrong = sorted(set(own) ^ set(state)) or [name for name in own if own[name].shape != state[name].shape]
     if wrong:
-        raise WearcapError(
-            f"{len(wrong)} weights do not fit this model, such as {wrong[0][:80]!r}",
-            where=where,
-            expected="a checkpoint of the same model",
-            fix="Check which model it was trained for.",
-        )
+        what = f"{len(wrong)} weights do not fit this model, such as {wrong[0][:80]!r}"
+        fix = "Check which model it was trained for."
+        raise WearcapError(what, where=where, expected="a checkpoint of the same model", fix=fix)
 
 
 def _made(value: Any) -> Any:

@@ -48,12 +48,8 @@ def checkpoint_file(path: str | Path) -> Path:
         return path
     shared = shared_checkpoints()
     if path.name not in shared:
-        raise WearcapError(
-            "no such checkpoint",
-            where=path.name,
-            expected="a file, or the name of a checkpoint that comes with wearcap",
-            fix=nearest(path.name, shared),
-        )
+        expected = "a file, or the name of a checkpoint that comes with wearcap"
+        raise WearcapError("no such checkpoint", where=path.name, expected=expected, fix=nearest(path.name, shared))
     return shared[path.name]
 
 
@@ -99,11 +95,9 @@ def read_run_file(path: str | Path) -> dict[str, Any]:
     except PermissionError as error:
         raise WearcapError("no permission to read it", where=path) from error
     except Exception as error:  # zipfile and torch.load may raise anything for damaged bytes
-        raise WearcapError(
-            f"not a readable checkpoint ({' '.join(str(error).split())[:120] or type(error).__name__})",
-            where=path,
-            expected="a complete .ckpt file of `wearcap train`, with tensors and plain values only",
-        ) from error
+        what = f"not a readable checkpoint ({' '.join(str(error).split())[:120] or type(error).__name__})"
+        expected = "a complete .ckpt file of `wearcap train`, with tensors and plain values only"
+        raise WearcapError(what, where=path, expected=expected) from error
 
 
 def _read_run(path: Path) -> tuple[str, dict[str, Tensor]]:
@@ -136,11 +130,8 @@ def _read_shared(path: Path) -> tuple[str, dict[str, Tensor]]:
     except (safetensors.SafetensorError, OSError, RuntimeError, ValueError, KeyError) as error:
         raise WearcapError("not a readable checkpoint", where=path, expected="a complete .safetensors file") from error
     if _KEY not in metadata:
-        raise WearcapError(
-            "a .safetensors file, but not a checkpoint of wearcap",
-            where=path,
-            expected="one that `wearcap export format=safetensors` wrote",
-        )
+        what = "a .safetensors file, but not a checkpoint of wearcap"
+        raise WearcapError(what, where=path, expected="one that `wearcap export format=safetensors` wrote")
     return metadata[_KEY], state
 
 
@@ -165,11 +156,8 @@ def load_network(path: str | Path, kind: type[Network], experiment: str, *, part
         found = found.get(key) if isinstance(found, dict) else None
     target = found.get("_target_") if isinstance(found, dict) else None
     if target != f"{kind.__module__}.{kind.__qualname__}":
-        raise WearcapError(
-            f"a checkpoint of {target or 'another model'}, not of {kind.__qualname__}",
-            where=path,
-            expected=f"one of `wearcap train experiment={experiment}`",
-        )
+        what = f"a checkpoint of {target or 'another model'}, not of {kind.__qualname__}"
+        raise WearcapError(what, where=path, expected=f"one of `wearcap train experiment={experiment}`")
     network = build({key: value for key, value in found.items() if key != "_partial_"}, state, path, prefix=f"{part}.")
     assert isinstance(network, kind)
     return network
@@ -193,12 +181,9 @@ def share_checkpoint(source: str | Path, target: str | Path, dtype: str = "float
     }
     for name, value in narrow.items():
         if value.is_floating_point() and not value.isfinite().all():
-            raise WearcapError(
-                f"weight {name!r} is not finite as {str(value.dtype).removeprefix('torch.')}",
-                where=source,
-                expected="a trained model",
-                fix="Choose dtype=float32, or another checkpoint.",
-            )
+            what = f"weight {name!r} is not finite as {str(value.dtype).removeprefix('torch.')}"
+            fix = "Choose dtype=float32, or another checkpoint."
+            raise WearcapError(what, where=source, expected="a trained model", fix=fix)
     shared = {name: config[name] for name in ("name", "model") if name in config}
     data = config.get("data") or {}
     for key in ("sources", "val_sources"):

@@ -119,10 +119,8 @@ class PointNeXt(nn.Module):
         """
         super().__init__()
         if not len(strides) == len(blocks) == len(neighbours):
-            raise WearcapError(
-                f"{len(strides)} strides, {len(blocks)} numbers of blocks and {len(neighbours)} of neighbours",
-                expected="one of each per stage",
-            )
+            what = f"{len(strides)} strides, {len(blocks)} numbers of blocks and {len(neighbours)} of neighbours"
+            raise WearcapError(what, expected="one of each per stage")
         self.size, self.strides, self.y_up = width << len(strides), tuple(strides), y_up
         self.settings = {
             "width": width,
@@ -269,11 +267,9 @@ def load_openpoints(path: str | Path, normalized: bool = True) -> PointNeXt:
     stem = tensors.get("stem.weight")
     if stem is None or stem.ndim < 2 or stem.shape[1] != 3:
         given = "a tensor of other axes" if stem is not None else "nothing"
-        raise WearcapError(
-            f"these are not the weights of PointNeXt-S: encoder.encoder.0.0.convs.0.0.weight is {given}",
-            where=path,
-            expected="a checkpoint of OpenPoints' cfgs/modelnet40ply2048/pointnext-s.yaml (in_channels: 3)",
-        )
+        what = f"these are not the weights of PointNeXt-S: encoder.encoder.0.0.convs.0.0.weight is {given}"
+        expected = "a checkpoint of OpenPoints' cfgs/modelnet40ply2048/pointnext-s.yaml (in_channels: 3)"
+        raise WearcapError(what, where=path, expected=expected)
     encoder = PointNeXt(width=len(stem), normalized=normalized, y_up=True)
     # The weights of a pointwise convolution are a matrix.
     pointwise = {name: value.ndim > 2 and value.shape[2:].numel() == 1 for name, value in tensors.items()}

@@ -181,11 +181,8 @@ def _tracked_points(
         truth = at_times(truth, times)
         poses += [truth.joint(joint) for joint in WRISTS]
     else:
-        raise WearcapError(
-            "this recording has no tracked wrists",
-            where=recording.name,
-            expected=f"`tracked` poses of {' and '.join(WRISTS)}, or a true motion",
-        )
+        expected = f"`tracked` poses of {' and '.join(WRISTS)}, or a true motion"
+        raise WearcapError("this recording has no tracked wrists", where=recording.name, expected=expected)
     R, t = torch.stack([T.R.float() for T in poses], 1), torch.stack([T.t.float() for T in poses], 1)
     if not (R.isfinite().all() and t.isfinite().all()):
         raise WearcapError("poses of wrists that are NaN or infinite", where=recording.name, expected="finite poses")
@@ -193,12 +190,9 @@ def _tracked_points(
     apart = (heading.mT @ (t[:, 1] - t[:, 2])[..., None])[:, 1, 0].median().item()
     # Wrists of a ground-truth motion cannot be swapped trackers: the wearer crosses the arms.
     if found and apart < -SWAPPED_M:
-        raise WearcapError(
-            f"the left wrist is {-100 * apart:.0f} cm to the right of the right one, by the median",
-            where=recording.name,
-            expected="the left wrist on the left",
-            fix="Swap the two trackers.",
-        )
+        what = f"the left wrist is {-100 * apart:.0f} cm to the right of the right one, by the median"
+        expected = "the left wrist on the left"
+        raise WearcapError(what, where=recording.name, expected=expected, fix="Swap the two trackers.")
     return R, t
 
 
@@ -221,21 +215,15 @@ def _require_times(times: Float64[Tensor, "frame"], path: HeadPath, what: str, w
         )
     late, early = times[0] - path.timestamps[0], path.timestamps[-1] - times[-1]
     if max(late.item(), early.item()) > 0.5:
-        raise WearcapError(
-            f"{what} from {times[0]:.2f} to {times[-1]:.2f} s",
-            where=where,
-            expected=f"all of {path.timestamps[0]:.2f} to {path.timestamps[-1]:.2f} s, as the head",
-        )
+        expected = f"all of {path.timestamps[0]:.2f} to {path.timestamps[-1]:.2f} s, as the head"
+        raise WearcapError(f"{what} from {times[0]:.2f} to {times[-1]:.2f} s", where=where, expected=expected)
 
 
 def _objects(scenario: Scenario, names: list[str], reader: ObjectReader) -> list[ObjectShape]:
     if names and scenario.environment is None:
-        raise WearcapError(
-            f"acts of {names[0]!r}, but no objects",
-            where=scenario.recording.name,
-            expected="an environment with the objects' meshes",
-            fix="Give environment=FILE.",
-        )
+        what = f"acts of {names[0]!r}, but no objects"
+        expected = "an environment with the objects' meshes"
+        raise WearcapError(what, where=scenario.recording.name, expected=expected, fix="Give environment=FILE.")
     shapes = []
     for name in names:
         assert scenario.environment is not None
@@ -261,11 +249,8 @@ def _observed(
     if seen.motion is not None:
         at = _frames(seen.motion.timestamps, path, where)
         if len(seen.motion.skeleton) != joints:
-            raise WearcapError(
-                f"an observed body of {len(seen.motion.skeleton)} joints",
-                where=where,
-                expected=f"{joints}, as the wearer has",
-            )
+            what = f"an observed body of {len(seen.motion.skeleton)} joints"
+            raise WearcapError(what, where=where, expected=f"{joints}, as the wearer has")
         R[at], root[at] = seen.motion.R_parent_joint.float(), seen.motion.t_world_root.float()
         is_observed[at, 0] = True
     for name, track in seen.object_motion.items():
@@ -288,11 +273,8 @@ def _observed(
     if seen.contact is not None and seen.contact_times is not None:
         at = _frames(seen.contact_times, path, where)
         if seen.contact.shape[1] != CONTACTS:
-            raise WearcapError(
-                f"observed contacts of {seen.contact.shape[1]} points",
-                where=where,
-                expected=f"{BODY_POINTS} of the body and {len(FOOT_PATCHES)} of the feet",
-            )
+            expected = f"{BODY_POINTS} of the body and {len(FOOT_PATCHES)} of the feet"
+            raise WearcapError(f"observed contacts of {seen.contact.shape[1]} points", where=where, expected=expected)
         contact[at] = seen.contact.float()
         is_observed[at, 2] = True
     for value in (R, root, R_object, t_object, contact):
@@ -307,9 +289,6 @@ def _frames(times: Float64[Tensor, "frame"], path: HeadPath, where: str) -> Tens
     step = (clock[1] - clock[0]).item() if len(clock) > 1 else 0.0
     beyond = ~((times >= clock[0] - step) & (times <= clock[-1] + step))
     if beyond.any():
-        raise WearcapError(
-            f"an observation at {times[beyond][0].item():.2f} s, beyond the recording",
-            where=where,
-            expected=f"times from {clock[0].item():.2f} to {clock[-1].item():.2f} s",
-        )
+        what = f"an observation at {times[beyond][0].item():.2f} s, beyond the recording"
+        raise WearcapError(what, where=where, expected=f"times from {clock[0].item():.2f} to {clock[-1].item():.2f} s")
     return ((times - clock[0]) / max(step, 1e-9)).round().long().clamp(0, len(clock) - 1)

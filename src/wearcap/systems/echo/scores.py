@@ -103,12 +103,9 @@ def foot_patches(recording: Recording) -> Bool[Tensor, "time patch"]:
     track, motion = recording.contacts, recording.motion
     assert motion is not None
     if track is None or not set(FOOT_PATCHES) <= set(track.parts) or len(track.contact) != len(motion):
-        raise WearcapError(
-            "no foot contacts beside the motion",
-            where=recording.name,
-            expected=f"contacts of {', '.join(FOOT_PATCHES)}",
-            fix="Prepare the data set again.",
-        )
+        what = "no foot contacts beside the motion"
+        expected = f"contacts of {', '.join(FOOT_PATCHES)}"
+        raise WearcapError(what, where=recording.name, expected=expected, fix="Prepare the data set again.")
     return track.contact[:, [track.parts.index(patch) for patch in FOOT_PATCHES]]
 
 
