@@ -204,7 +204,6 @@ def load_trained(checkpoint: str | Path) -> tuple[nn.Module, dict[str, Any]]:
     config, state = read_checkpoint(checkpoint)
     module = build(config["model"], state, checkpoint)
     if not hasattr(module, "training_step"):
-        raise WearcapError(
-            f"a checkpoint of {type(module).__name__} alone", where=checkpoint, expected="one of `wearcap train`"
-        )
+        what = f"a checkpoint of {type(module).__name__} alone"
+        raise WearcapError(what, where=checkpoint, expected="one of `wearcap train`")
     return module, config

@@ -148,9 +148,8 @@ class PointNeXt(nn.Module):
     def forward(self, points: Float[Tensor, "batch point 3"]) -> Float[Tensor, "batch feature"]:
         """Features of clouds (m) in their objects' own axes. Raises WearcapError for too few points."""
         if points.shape[1] < prod(self.strides):
-            raise WearcapError(
-                f"clouds of {points.shape[1]} points", expected=f"at least {prod(self.strides)}, such as 1500"
-            )
+            expected = f"at least {prod(self.strides)}, such as 1500"
+            raise WearcapError(f"clouds of {points.shape[1]} points", expected=expected)
         unit, _ = to_unit_sphere(points)
         if self.y_up:
             unit = torch.stack([unit[..., 0], unit[..., 2], -unit[..., 1]], -1)

@@ -83,9 +83,8 @@ def load_weights(network: nn.Module, tensors: Mapping[str, Tensor], *, name: str
     ]
     if shapes:
         more = f"; and {len(shapes) - _SHOWN} more" if len(shapes) > _SHOWN else ""
-        raise WearcapError(
-            f"the weights are those of another size of {name}: {'; '.join(shapes[:_SHOWN])}{more}", where=where
-        )
+        what = f"the weights are those of another size of {name}: {'; '.join(shapes[:_SHOWN])}{more}"
+        raise WearcapError(what, where=where)
     network.load_state_dict(dict(tensors))
 
 

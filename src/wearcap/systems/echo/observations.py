@@ -168,9 +168,8 @@ def _tracked_points(
     truth = recording.motion
     found = [joint for joint in WRISTS if joint in recording.tracked]
     if len(found) == 1:
-        raise WearcapError(
-            f"only {found[0]} is tracked", where=recording.name, expected=f"`tracked` poses of {' and '.join(WRISTS)}"
-        )
+        expected = f"`tracked` poses of {' and '.join(WRISTS)}"
+        raise WearcapError(f"only {found[0]} is tracked", where=recording.name, expected=expected)
     if found:
         for joint in found:
             track = recording.tracked[joint]
@@ -255,9 +254,8 @@ def _observed(
         is_observed[at, 0] = True
     for name, track in seen.object_motion.items():
         if name not in names:
-            raise WearcapError(
-                f"an observed object {name!r}", where=where, expected=f"one of {', '.join(names) or 'no objects'}"
-            )
+            expected = f"one of {', '.join(names) or 'no objects'}"
+            raise WearcapError(f"an observed object {name!r}", where=where, expected=expected)
         at, number = _frames(track.timestamps, path, where), names.index(name)
         mine = active[at] == number
         T = objects[number].centred(track.T_world_body)

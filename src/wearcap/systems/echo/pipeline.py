@@ -75,19 +75,16 @@ class Echo(LearnedSystem):
 
     def __post_init__(self):
         if isinstance(self.acts, str) and self.acts not in ("truth", "none"):
-            raise WearcapError(
-                f"unknown acts {self.acts!r}", expected="truth, none, or a list of {object, start_s, stop_s}"
-            )
+            expected = "truth, none, or a list of {object, start_s, stop_s}"
+            raise WearcapError(f"unknown acts {self.acts!r}", expected=expected)
         ramp, _ = self.rolling.ramp, self._listed_acts()
         rewindow = self.sampling.rewindow
         if rewindow is not None and not 0 < rewindow <= ramp:
-            raise WearcapError(
-                f"windows that advance by {rewindow} frames", expected=f"1 to {ramp}, the window less the context"
-            )
+            what = f"windows that advance by {rewindow} frames"
+            raise WearcapError(what, expected=f"1 to {ramp}, the window less the context")
         if rewindow is not None and self.sampling.step == "redraw":
-            raise WearcapError(
-                "step=redraw with windows that are denoised from scratch", expected="step=posterior, or rewindow=null"
-            )
+            what = "step=redraw with windows that are denoised from scratch"
+            raise WearcapError(what, expected="step=posterior, or rewindow=null")
         chosen(self.runtime, self.precision, self.device)
         self._runner: EchoRunner | None = None
         self._environments: dict[Path, Environment] = {}

@@ -168,9 +168,8 @@ class RigidWrist:
                 place[name], offset[name] = places.mean(0), offsets.mean(0)
                 turn[name] = rotation.mean_rotation(R)
         if not place:
-            raise WearcapError(
-                "these training recordings have no contact with objects", expected="recordings with objects in hands"
-            )
+            what = "these training recordings have no contact with objects"
+            raise WearcapError(what, expected="recordings with objects in hands")
         return cls(features, encoder, place, offset, turn)
 
     def attached(self, motion: Motion, item: BatchItem) -> Motion:

@@ -75,9 +75,8 @@ class EchoDiffusion(Training):
         content = dataset.content
         assert isinstance(content, EchoContent)
         if content.features != self.features:
-            raise WearcapError(
-                "windows of other features than the model's", expected="equal data.features and model.features"
-            )
+            what = "windows of other features than the model's"
+            raise WearcapError(what, expected="equal data.features and model.features")
         rows: dict[str, list[Tensor]] = {"human": [], "object": [], "condition": []}
         for batch in drawn_batches(dataset, limit, 100):
             frame = self.features.canonical(batch.points)
