@@ -51,7 +51,7 @@ class Echo(LearnedSystem):
     """Captures recordings with a rolling schedule over frames (the conveyor); batching does not change results."""
 
     model: EchoModel
-    sampling: Sampling = field(default_factory=Sampling)
+    sampling: Sampling = Sampling()
     contacts: ContactUse = field(default_factory=ContactUse)
     anchor: bool = True
     """Whether the body is anchored to the measured head (ours) or keeps its sampled position (ECHO)."""

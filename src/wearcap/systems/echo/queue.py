@@ -84,7 +84,7 @@ class EchoModel:
 
 
 @runtime_checkable
-class Pipeline(Protocol):
+class _Pipeline(Protocol):
     """The part of a pipeline that the queue uses."""
 
     model: EchoModel
@@ -101,7 +101,7 @@ class Pipeline(Protocol):
 class EchoQueue:
     """Frames of several batch items, at most a window of them; each batch item's noise comes from its own seed."""
 
-    def __init__(self, pipeline: Pipeline, skeletons: Sequence[Skeleton], seeds: Sequence[int]):
+    def __init__(self, pipeline: _Pipeline, skeletons: Sequence[Skeleton], seeds: Sequence[int]):
         self.pipeline = pipeline
         self.size = torch.stack([body_size(skeleton) for skeleton in skeletons])
         model, self.rolling = pipeline.model, pipeline.rolling
@@ -222,7 +222,7 @@ class Rewindow(EchoQueue):
     With the conveyor's context and steps, a frame sees as much of the past and future as on the conveyor.
     """
 
-    def __init__(self, pipeline: Pipeline, skeletons: Sequence, seeds: Sequence[int], stride: int = 10):
+    def __init__(self, pipeline: _Pipeline, skeletons: Sequence, seeds: Sequence[int], stride: int = 10):
         super().__init__(pipeline, skeletons, seeds)
         self.stride = stride
 
