@@ -14,7 +14,7 @@ from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import Motion
-from wearcap.runtime.digest import digest
+from wearcap.runtime.stages import digest
 from wearcap.sensors.packets import AGREEING
 from wearcap.systems.hmd2 import wearer as hmd2_wearer
 from wearcap.systems.hmd2.features import HeadFeatures

@@ -19,8 +19,7 @@ from wearcap.optimize.trajectory import Bending, bend
 from wearcap.optimize.trajectory_banded import bend_banded
 from wearcap.recording import Motion, Recording
 from wearcap.recording.motion import Interactions
-from wearcap.runtime.digest import digest
-from wearcap.runtime.stages import StagedSystem
+from wearcap.runtime.stages import StagedSystem, digest
 from wearcap.runtime.system import CaptureInput
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject

@@ -13,9 +13,8 @@ from rich.console import Console
 from torch import nn
 
 from wearcap.errors import WearcapError
-from wearcap.runtime import digest as digests
-from wearcap.runtime.digest import code_digest, digest, modules_of
-from wearcap.runtime.stages import Stage, StageCache, run_stages
+from wearcap.runtime import stages as digests
+from wearcap.runtime.stages import Stage, StageCache, code_digest, digest, modules_of, run_stages
 from wearcap.sensors.clock import Clock
 from wearcap.systems.ireplica.snapping import HandSnapping
 
@@ -202,7 +201,7 @@ def test_the_code_of_a_stage_is_all_that_its_module_imports(tmp_path, monkeypatc
     monkeypatch.setattr(digests, "PACKAGE", package)
 
     def found() -> str:
-        digests._code_digest.cache_clear()
+        digests.code_digest.cache_clear()
         digests._imports.cache_clear()
         return code_digest("wearcap.top")
 
@@ -213,14 +212,14 @@ def test_the_code_of_a_stage_is_all_that_its_module_imports(tmp_path, monkeypatc
     assert found() != before
     with pytest.raises(WearcapError, match="no module 'wearcap.none'"):
         code_digest("wearcap.none")
-    digests._code_digest.cache_clear()
+    digests.code_digest.cache_clear()
     digests._imports.cache_clear()
 
 
 def test_the_modules_of_what_a_stage_reads():
     energy = functools.partial(code_digest, HandSnapping())
     assert modules_of([energy, {"a": torch.ones(2)}, 3]) == {
-        "wearcap.runtime.digest",
+        "wearcap.runtime.stages",
         "wearcap.systems.ireplica.snapping",
         "wearcap.optimize.contact_correction",
     }

@@ -1,9 +1,8 @@
 """Networks as graphs: one description of a network's parts, which are run eagerly, compiled or in ONNX Runtime.
 
-`wearcap export` writes the same graphs that `run_of` runs.
-
-A denoiser's step is fast because what depends on its noise levels alone is computed once per level: it has
-`plan(level) -> LevelPlan` and `step(x_t, plan, encoded, valid[, last])`. The graphs pass a plan as one tensor of columns.
+`wearcap export` writes the same graphs that `run_of` runs. In a denoiser, what depends on the noise levels alone is computed
+once per level: it has `plan(level) -> LevelPlan` and `step(x_t, plan, encoded, valid[, last])`, and its graphs pass a plan as
+one tensor of columns.
 """
 
 import contextlib
@@ -31,7 +30,6 @@ take some seconds to start."""
 PRECISIONS = ("auto", "narrowest", "float32", "bfloat16", "int8")
 """Number formats; auto: bfloat16 on a GPU, else float32; narrowest: as auto, but int8 with ONNX Runtime.
 int8 (weights, and dynamically quantised activations) needs ONNX Runtime."""
-LIBRARIES = ("onnx", "onnxscript", "onnxruntime")
 Run = Callable[..., Tensor]
 """A network's output from its inputs by name."""
 _INSTALL = 'Run: pip install "wearcap[export]"'
@@ -226,7 +224,7 @@ def open_onnx(path: str | Path) -> Run:
 
 def missing_libraries() -> list[str]:
     """Names of the packages for ONNX Runtime and its exporter that are not installed."""
-    return [name for name in LIBRARIES if importlib.util.find_spec(name) is None]
+    return [name for name in ("onnx", "onnxscript", "onnxruntime") if importlib.util.find_spec(name) is None]
 
 
 @contextlib.contextmanager

@@ -5,30 +5,148 @@ and its code: the module that computes it, the modules of its inputs, and all th
 propagates to later stages only as far as results differ.
 """
 
+import ast
+import dataclasses
+import functools
+import hashlib
 import json
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import safetensors
+import numpy as np
+import torch
 from rich.console import Console
+from safetensors import SafetensorError
 from safetensors.torch import load, save
+from torch import Tensor, nn
 
 from wearcap.errors import WearcapError
-from wearcap.files import atomic_path, write_text
+from wearcap.files import atomic_path, sha256_of, write_text
 from wearcap.optimize.hps import HpsState, Solution
 from wearcap.recording import Motion, Recording
 from wearcap.recording.serialize import KNOWN, dumps, flatten, unflatten
-from wearcap.runtime.digest import code_digest, digest, modules_of
 from wearcap.runtime.system import Captured, CaptureInput, StageOptions, System
 from wearcap.sensors.clock import Clock
 from wearcap.sensors.initialization import Initialization
 
 RESULTS = KNOWN | {cls.__name__: cls for cls in (Clock, Initialization, Solution, HpsState)}
 """Classes that a cached result may contain."""
+PACKAGE = Path(__file__).parents[1]
+_DAMAGE = (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, WearcapError, SafetensorError)
+"""Exceptions that reading a damaged result may raise."""
+
+
+def digest(*values: Any) -> str:
+    """SHA-256 of settings, tensors, containers of them, and the contents of files (`Path`).
+
+    Objects are digested by class and attributes, networks by their weights. Raises WearcapError for a missing file and
+    TypeError for values without comparable content (a lambda, an open file).
+    """
+    sha = hashlib.sha256()
+    for part in _parts(values):
+        sha.update(part)
+    return sha.hexdigest()
+
+
+@functools.cache
+def code_digest(*modules: str) -> str:
+    """Digest of the sources of some modules of this package ("wearcap.systems.hps.camera") and of all that they import.
+
+    Modules outside the package do not count. Raises WearcapError for a module of the package that is not there.
+    """
+    rest, reached = sorted(modules), set(modules)
+    while rest:
+        new = _imports(rest.pop()) - reached
+        reached |= new
+        rest += sorted(new)
+    return digest([(name, _source(name)) for name in sorted(reached) if _source(name) is not None])
+
+
+def modules_of(value: Any) -> set[str]:
+    """This package's modules that define the classes and functions among some values: their code decides a result, too."""
+    modules: set[str] = set()
+    rest = [value]
+    while rest:
+        part = rest.pop()
+        if isinstance(part, functools.partial):
+            rest += [part.func, part.args, part.keywords]
+        elif isinstance(part, dict):
+            rest += part.values()
+        elif isinstance(part, list | tuple):
+            rest += part
+        elif isinstance(part, Callable) and hasattr(part, "__qualname__"):
+            modules.add(part.__module__)
+        elif not isinstance(part, Tensor | np.ndarray | Path) and type(part).__module__.startswith("wearcap."):
+            modules.add(type(part).__module__)
+            rest += list(getattr(part, "__dict__", {}).values())
+    return {name for name in modules if name.startswith("wearcap.")}
+
+
+def _source(module: str) -> Path | None:
+    """File of a module of this package; None for a name within a module."""
+    path = PACKAGE.joinpath(*module.split(".")[1:])
+    return next((file for file in (path / "__init__.py", path.with_suffix(".py")) if file.is_file()), None)
+
+
+@functools.cache
+def _imports(module: str) -> frozenset[str]:
+    """Names of this package that a module imports, of modules and of what they define."""
+    file = _source(module)
+    if file is None:
+        raise WearcapError(f"no module {module!r}", where=PACKAGE, expected="one of this package")
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module is not None:
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        elif isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+    return frozenset(name for name in found if name.startswith("wearcap.") and _source(name) is not None)
+
+
+def _parts(value: Any) -> Iterator[bytes | memoryview]:
+    yield f"<{type(value).__qualname__}>".encode()
+    if value is None or isinstance(value, bool | int | float | str | torch.dtype):
+        yield repr(value).encode()
+    elif isinstance(value, Tensor | np.ndarray):
+        array = value.detach().cpu().numpy() if isinstance(value, Tensor) else value
+        yield f"{array.dtype.str}{array.shape}".encode()
+        yield np.ascontiguousarray(array).data.cast("B") if array.size else b""
+    elif isinstance(value, Path):
+        try:
+            status = value.stat()
+            yield _unchanged_digest(value, status.st_size, status.st_mtime_ns).encode()
+        except FileNotFoundError as error:
+            raise WearcapError("no such file", where=value) from error
+    elif isinstance(value, dict):
+        for key in sorted(value):
+            yield from _parts((key, value[key]))
+    elif isinstance(value, list | tuple):
+        yield str(len(value)).encode()
+        for item in value:
+            yield from _parts(item)
+    elif isinstance(value, nn.Module):
+        yield from _parts(value.state_dict())
+    elif isinstance(value, functools.partial):
+        yield from _parts((value.func, value.args, value.keywords))
+    elif isinstance(value, Callable) and hasattr(value, "__qualname__"):
+        if "<lambda>" in value.__qualname__:
+            raise TypeError("a lambda has no digest: it cannot be distinguished from another one")
+        yield f"{value.__module__}.{value.__qualname__}".encode()
+    elif dataclasses.is_dataclass(value):
+        yield from _parts({field.name: getattr(value, field.name) for field in dataclasses.fields(value)})
+    elif hasattr(value, "__dict__"):
+        yield from _parts(vars(value))
+    else:
+        raise TypeError(f"a {type(value).__name__} has no digest")
+
+
+@functools.lru_cache(maxsize=1024)
+def _unchanged_digest(path: Path, size: int, changed_ns: int) -> str:
+    return sha256_of(path)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,16 +192,7 @@ class StageCache:
             if not note.exists():
                 return None
             raise WearcapError("incomplete", where=tensors) from None
-        except (
-            OSError,
-            ValueError,
-            KeyError,
-            TypeError,
-            AttributeError,
-            RecursionError,
-            WearcapError,
-            safetensors.SafetensorError,
-        ) as error:
+        except _DAMAGE as error:
             raise WearcapError(f"damaged ({error})", where=note) from error
         if found != expected:
             raise WearcapError("damaged (its content is not what was written)", where=tensors)
@@ -120,8 +229,15 @@ def run_stages(
     digests: dict[str, str] = {}
     runs = []
     for stage in stages:
-        key = _key(stage, digests) if cache else ""
-        kept = _kept(stage, key, cache, console)
+        key, kept = "", None
+        if cache:
+            reads, followed = list(stage.reads()), [digests[name] for name in stage.after]
+            key = digest(stage.name, code_digest(*modules_of([stage.make, reads])), reads, followed)
+            try:
+                kept = cache.read(stage.name, key)
+            except WearcapError as error:
+                damage = f"{stage.name}: {error.where} is {error.what}; it is made again"
+                console.print(damage, markup=False, soft_wrap=True)
         if kept is not None:
             results[stage.name], digests[stage.name], seconds = kept
         else:
@@ -137,22 +253,6 @@ def run_stages(
         if stage.name == until:
             break
     return results, runs
-
-
-def _key(stage: Stage, digests: dict[str, str]) -> str:
-    followed = [digests[name] for name in stage.after]
-    reads = list(stage.reads())
-    return digest(stage.name, code_digest(*modules_of([stage.make, reads])), reads, followed)
-
-
-def _kept(stage: Stage, key: str, cache: StageCache | None, console: Console) -> tuple[Any, str, float] | None:
-    if cache is None:
-        return None
-    try:
-        return cache.read(stage.name, key)
-    except WearcapError as error:
-        console.print(f"{stage.name}: {error.where} is {error.what}; it is made again", markup=False, soft_wrap=True)
-        return None
 
 
 class StagedSystem(System):

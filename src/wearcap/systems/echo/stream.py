@@ -28,8 +28,7 @@ from wearcap.recording import motion as motion_types
 from wearcap.recording.acts import SAME_S
 from wearcap.recording.timing import joined
 from wearcap.runtime.graphs import undisturbed
-from wearcap.runtime.session import HeadAndWristsStream, Session
-from wearcap.runtime.snapshot import classes_of
+from wearcap.runtime.session import HeadAndWristsStream, Session, classes_of
 from wearcap.scene.environment import Environment
 from wearcap.sensors import packets, samples
 from wearcap.sensors.packets import MAX_WAITING

@@ -17,8 +17,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
 from wearcap.recording import motion as motion_types
 from wearcap.recording.timing import joined
-from wearcap.runtime.session import Session
-from wearcap.runtime.snapshot import classes_of
+from wearcap.runtime.session import Session, classes_of
 from wearcap.scene import voxels
 from wearcap.sensors import packets, samples
 from wearcap.sensors.packets import Admitted, time_fault

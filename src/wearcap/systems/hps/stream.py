@@ -26,9 +26,8 @@ from wearcap.recording import motion as motion_types
 from wearcap.recording import recording as recording_types
 from wearcap.recording.recording import Localization
 from wearcap.recording.timing import at_times, joined
-from wearcap.runtime.digest import digest
-from wearcap.runtime.session import Session
-from wearcap.runtime.snapshot import classes_of
+from wearcap.runtime.session import Session, classes_of
+from wearcap.runtime.stages import digest
 from wearcap.scene.scan import Scan
 from wearcap.sensors.initialization import Initialization, align_suit, estimate_head_camera, initialize, inliers
 from wearcap.sensors.packets import MAX_POSITION_M, MAX_TIME_S, OFF_THE_CLOCK, WRONG_TYPE, rotation_fault, values_fault

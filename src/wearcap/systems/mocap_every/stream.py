@@ -22,8 +22,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.recording import ImuStream, Motion
 from wearcap.recording import motion as motion_types
 from wearcap.recording.timing import joined
-from wearcap.runtime.session import HeadAndWristsStream, Session
-from wearcap.runtime.snapshot import classes_of
+from wearcap.runtime.session import HeadAndWristsStream, Session, classes_of
 from wearcap.scene import floor as floor_types
 from wearcap.sensors import packets
 from wearcap.sensors import samples as sample_types
