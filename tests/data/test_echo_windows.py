@@ -168,6 +168,20 @@ def test_data_sets_of_several_rates_stand_side_by_side(root, people):
     assert torch.equal(last.t_world_root, motion.t_world_root[::every][start : start + WINDOW])
 
 
+def test_poses_are_the_recordings_or_the_environments():
+    """An object whose trajectory is missing stays at its pose in the environment."""
+    recording = carrying(2.0, carried=TWO)
+    moved = {"box_1": recording.object_motion["box_1"]}
+    track = track_of(replace(recording, object_motion=moved), boxes(TWO))
+    for number, shape in enumerate(track.objects):
+        rows = (track.active == number).nonzero()[:, 0]
+        expected = shape.middle.expand(len(rows), 3)
+        if number == 0:
+            expected = moved["box_1"].T_world_body[rows] @ shape.middle
+        assert len(rows)
+        torch.testing.assert_close(track.T_world_object.t[rows], expected)
+
+
 def test_an_object_may_change_within_a_window():
     recording = carrying(2.0, carried=TWO)
     track = track_of(recording, boxes(TWO))

@@ -129,7 +129,13 @@ class EchoTrack:
             rows = (active == number).nonzero()[:, 0]
             if not len(rows) or environment is None:
                 continue
-            T = object_poses(recording, environment, names[number], shape, take[rows])
+            # The motion and an object's trajectory share their clock; an object without one stays where it was.
+            track, still = recording.object_motion.get(names[number]), environment.by_name(names[number]).T_world_object
+            if track is None:
+                T = Rigid(still.R.expand(len(rows), 3, 3), still.t.expand(len(rows), 3))
+            else:
+                T = track.T_world_body[take[rows]]
+            T = shape.centred(T)
             R[rows], t[rows] = T.R, T.t
             skin = surface.vertices(body[take[rows]])
             contact[rows, : CONTACTS - len(FOOT_PATCHES)] = body_contact(skin, shape, T, within_m).float()
@@ -138,20 +144,6 @@ class EchoTrack:
         wearer = floor.float(), motion.skeleton, body_size(motion.skeleton)
         truth = Body(motion.R_parent_joint[take], motion.t_world_root[take])
         return cls(points, *wearer, truth, contact, objects, active, Rigid(R, t))
-
-
-def object_poses(recording: Recording, environment: Environment, name: str, shape: ObjectShape, take: Tensor) -> Rigid:
-    """Ground-truth poses of an object's centre at frames `take` of the motion, whose clock its trajectory shares.
-
-    An object without a trajectory stays at its pose in the environment.
-    """
-    track = recording.object_motion.get(name)
-    if track is None:
-        item = environment.by_name(name)
-        T = Rigid(item.R_world_object.expand(len(take), 3, 3).clone(), item.t_world_object.expand(len(take), 3).clone())
-    else:
-        T = track.T_world_body[take]
-    return shape.centred(T)
 
 
 class EchoContent(Content):
