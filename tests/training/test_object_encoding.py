@@ -8,9 +8,11 @@ import pytest
 import torch
 
 from wearcap.cli import export, train
-from wearcap.models.checkpoint import load_network, load_trained
+from wearcap.models.checkpoint import load_trained
 from wearcap.models.point_encoder import PointNeXt
+from wearcap.systems.echo.features import EchoFeatures
 from wearcap.systems.echo.object_training import ObjectEncoding, instance_loss
+from wearcap.systems.echo.training_windows import EchoContent
 from wearcap.training.run import resume_path
 from wearcap_testing import experiments
 
@@ -23,7 +25,10 @@ def data(tmp_path_factory) -> Path:
 
 
 def loaded(checkpoint: Path) -> PointNeXt:
-    return load_network(checkpoint, PointNeXt, "object_encoder", part="net.encoder")
+    """The encoder as ECHO's windows read it."""
+    encoder = EchoContent(EchoFeatures(), str(checkpoint)).encoder
+    assert encoder is not None
+    return encoder
 
 
 def trained(experiment: str, data: Path, run: Path, *more: str) -> Path:
