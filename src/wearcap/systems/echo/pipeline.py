@@ -188,26 +188,16 @@ class Echo(LearnedSystem):
             for key, scenario in once.items()
         }
         items = [item_by[id(scenario)] for scenario in scenarios]
-        # 2. Sampling with the rolling schedule: frames enter as noise one by one and leave clean.
-        outputs = self._sampled(items, [scenario.recording for scenario in scenarios], seeds)
-        # 3. Untouched objects are made static, and the body is anchored to the measured head.
-        if (threshold := self.contact_use.static_threshold) is not None:
-            outputs = [with_static_objects(item.conditioning, part, threshold) for item, part in zip(items, outputs)]
-        return [motion_of(item, part, self.anchor, self.settings()) for item, part in zip(items, outputs)]
-
-    def _sampled(
-        self, items: Sequence[BatchItem], recordings: Sequence[Recording], seeds: Sequence[int]
-    ) -> list[Outputs]:
-        """All frames of every batch item: its stretches are sampled side by side, gaps repeat the frame before them."""
+        # 2. Sampling with the rolling schedule: frames enter as noise one by one and leave clean. All stretches are
+        # sampled side by side.
         parts = [(k, *stretch) for k, item in enumerate(items) for stretch in item.path.stretches]
-        longest = max(stop - start for _, start, stop in parts)
         queue = self.queue(
             [items[k].path.skeleton for k, *_ in parts],
             [stretch_seed(seeds[k], start) for k, start, _ in parts],
-            [recordings[k].shape for k, *_ in parts],
+            [scenarios[k].recording.shape for k, *_ in parts],
             [items[k].objects for k, *_ in parts],
         )
-        conditioning, frames = [], torch.arange(longest)
+        conditioning, frames = [], torch.arange(max(stop - start for _, start, stop in parts))
         for k, start, stop in parts:  # the last frame repeated as not valid pads a stretch
             padded, inside = items[k].conditioning.frames((start + frames).clamp_max(stop - 1)), frames < stop - start
             is_observed = padded.is_observed & inside[:, None]
@@ -216,10 +206,15 @@ class Echo(LearnedSystem):
         found: list[list[Outputs]] = [[] for _ in items]
         for row, (k, start, stop) in enumerate(parts):
             found[k].append(Outputs(*(field[row : row + 1, : stop - start] for field in together)))
-        return [
-            Outputs(*(torch.cat(fields, 1)[:, item.path.held_frames] for fields in zip(*outputs)))
-            for outputs, item in zip(found, items)
+        # Gaps between stretches repeat the frame before them.
+        outputs = [
+            Outputs(*(torch.cat(fields, 1)[:, item.path.held_frames] for fields in zip(*stretches)))
+            for stretches, item in zip(found, items)
         ]
+        # 3. Untouched objects are made static, and the body is anchored to the measured head.
+        if (threshold := self.contact_use.static_threshold) is not None:
+            outputs = [with_static_objects(item.conditioning, part, threshold) for item, part in zip(items, outputs)]
+        return [motion_of(item, part, self.anchor, self.settings()) for item, part in zip(items, outputs)]
 
     def queue(
         self,
