@@ -27,8 +27,8 @@ DATASET = Path(__file__).resolve().parents[1] / "datasets" / "simulated_objects"
 
 
 def measure(items: int = 4, rounds: int = 6, recordings: int = 4, seconds: float = 20.0) -> list[dict]:
-    conveyor = pipeline_of("echo", guidance=None)
-    windows = replace(conveyor, rewindow=STRIDE)
+    conveyor = pipeline_of("echo", guided=False)
+    windows = replace(conveyor, sampling=replace(conveyor.sampling, rewindow=STRIDE))
     rows = [_time(conveyor, windows, items, rounds)]
     if NAME in shared_checkpoints() and (DATASET / "manifest.json").is_file():
         rows += _errors(conveyor, windows, recordings, seconds)
@@ -40,14 +40,14 @@ def measure(items: int = 4, rounds: int = 6, recordings: int = 4, seconds: float
 @torch.no_grad()
 def _time(conveyor: Echo, windows: Echo, items: int, rounds: int) -> dict:
     """In turn: as many frames through the queue as one window gives."""
-    window = conveyor.net.window
+    window = conveyor.model.net.window
     conditioning = conditions_of(conveyor, items, (window + STRIDE * (rounds + 1)) / conveyor.fps)
     queue, again = _queue(conveyor, items), _queue(windows, items)
     assert isinstance(again, Rewindow)
     for number in range(window):
         queue.push(conditioning.frames(slice(number, number + 1)))
     first = conditioning.frames(slice(0, window))
-    before = again.window(first, torch.zeros(items, 0, sum(conveyor.net.sizes)))[:, : conveyor.context]
+    before = again.window(first, torch.zeros(items, 0, sum(conveyor.model.net.sizes)))[:, : conveyor.sampling.context]
     ours, theirs = [], []
     for number in range(rounds):
         ours.append(_seconds(lambda start=window + STRIDE * number: _pushed(queue, conditioning, start)))
@@ -59,7 +59,7 @@ def _time(conveyor: Echo, windows: Echo, items: int, rounds: int) -> dict:
 
 def _queue(pipeline: Echo, items: int) -> EchoQueue:
     pipeline.prepare()
-    return pipeline.queue([pipeline.skeleton] * items, list(range(items)), [{}] * items, [[]] * items)
+    return pipeline.queue([pipeline.model.skeleton] * items, list(range(items)), [{}] * items, [[]] * items)
 
 
 def _pushed(queue: EchoQueue, conditioning: Conditioning, start: int) -> None:

@@ -22,7 +22,7 @@ def measure(frames: int = 200, items: tuple[int, ...] = (1, 8), device: str = "c
     if device == "cuda" and without_cuda("echo_ms_per_frame"):
         return []
     runtime = "compile" if device == "cuda" else "eager"
-    pipeline = pipeline_of("echo", device, "full/echo", runtime=runtime, guidance=None)
+    pipeline = pipeline_of("echo", device, "full/echo", runtime=runtime, guided=False)
     rows = []
     for count in items:
         value = _milliseconds(pipeline, frames, count)
@@ -35,7 +35,7 @@ def measure(frames: int = 200, items: tuple[int, ...] = (1, 8), device: str = "c
 def _milliseconds(pipeline: Echo, frames: int, items: int) -> float:
     pipeline.prepare()
     conditioning, filling = conditions_of(pipeline, items, (frames + 90) / pipeline.fps), 90
-    queue = pipeline.queue([pipeline.skeleton] * items, list(range(items)), [{}] * items, [[]] * items)
+    queue = pipeline.queue([pipeline.model.skeleton] * items, list(range(items)), [{}] * items, [[]] * items)
     for number in range(filling):
         queue.push(conditioning.frames(slice(number, number + 1)))
     begin = time.perf_counter()

@@ -15,7 +15,7 @@ REAL_TIME = 30.0
 
 def measure(frames: int = 150, repeats: int = 5) -> list[dict]:
     online = pipeline_of("echo_online")
-    offline = pipeline_of("echo", runtime=online.runtime, guidance=None)
+    offline = pipeline_of("echo", runtime=online.runtime, guided=False)
     rows = {
         "echo_online_small_fps": online,
         "echo_online_small_eager_fps": replace(online, runtime="eager"),

@@ -16,7 +16,7 @@ from wearcap.recording.acts import Act, true_acts
 from wearcap.runtime.system import CaptureInput
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import SceneObject
-from wearcap.systems.echo.objects import ObjectShape
+from wearcap.systems.echo.observations import ObjectShape
 from wearcap.systems.echo.pipeline import Echo
 from wearcap.viewer.page_layers import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png

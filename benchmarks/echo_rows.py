@@ -59,7 +59,7 @@ def captured(
         motions = echo.capture_scenarios(scenarios, [seed for _, seed in batch])
         for (name, seed), motion in zip(batch, motions):
             scenario = observed_parts[name]
-            item = batch_item_of(scenario, head_path(scenario.recording, echo.skeleton, echo.fps), reader)
+            item = batch_item_of(scenario, head_path(scenario.recording, echo.model.skeleton, echo.fps), reader)
             yield Captured(name, seed, motion, echo.truth(motion, CaptureInput(scenario.recording, store.root)), item)
 
 
@@ -68,7 +68,7 @@ def _observing(method: Method, echo: Echo, scenario: Scenario, root: Path, seed:
     if method.observed is None:
         return scenario
     recording = scenario.recording
-    path = head_path(recording, echo.skeleton, echo.fps)
+    path = head_path(recording, echo.model.skeleton, echo.fps)
     blank = Motion(path.timestamps, path.skeleton, *_still(len(path.timestamps), len(path.skeleton)))
     truth = echo.truth(blank, CaptureInput(recording, root))
     return replace(scenario, observed=observed_share(truth, *method.observed, seed))

@@ -28,11 +28,17 @@ HELD_S = 2.0
 
 
 def pipeline_of(
-    config_name: str, device: str = "cpu", experiment: str = NAME, overrides: tuple[str, ...] = (), **settings
+    config_name: str,
+    device: str = "cpu",
+    experiment: str = NAME,
+    overrides: tuple[str, ...] = (),
+    runtime: str | None = None,
+    guided: bool = True,
 ) -> Echo:
     """A pipeline config around the checkpoint of an experiment's name, or around drawn weights of its size, which is printed."""
     config = compose("capture", [f"pipeline={config_name}", "recording=none"]).pipeline
-    config.update(settings)
+    config.runtime = runtime or config.runtime
+    config.contacts.guidance = config.contacts.guidance if guided else None
     if experiment in shared_checkpoints() and not overrides:
         pipeline = load_pipeline(experiment, config, device)
         assert isinstance(pipeline, Echo)
@@ -76,7 +82,7 @@ class Streamed:
 
     def fill(self) -> "Streamed":
         """Until the window is full, and what is compiled is."""
-        for _ in range(2 * self.session.pipeline.net.window):
+        for _ in range(2 * self.session.pipeline.model.net.window):
             self.step()
         return self
 
@@ -97,7 +103,7 @@ def conditions_of(pipeline: Echo, items: int, duration_s: float) -> Conditioning
     reader, parts = pipeline.reader(), []
     for seed in range(items):
         recording = swinging(f"walk_{seed}", duration_s, seed, fps=FPS)
-        path = head_path(recording, pipeline.skeleton, pipeline.fps)
+        path = head_path(recording, pipeline.model.skeleton, pipeline.fps)
         parts.append(batch_item_of(Scenario(recording), path, reader).conditioning)
     return Conditioning(*(torch.cat(fields) for fields in zip(*parts)))
 

@@ -79,7 +79,7 @@ CAPTURES: dict[str, tuple[str | None, str, tuple[str, ...]]] = {
     "echo": (*ECHO, ()),
     "echo_paper": (*ECHO, ()),
     "echo_online": (*ECHO, ("pipeline.runtime=eager",)),
-    "echo_rewindow": (*ECHO, ("pipeline.per_frame=1",)),
+    "echo_rewindow": (*ECHO, ("pipeline.sampling.per_frame=1",)),
     "echo_search": (*ECHO, ()),
     "bodiffusion_object": (*ECHO, ()),
     "hps": (None, "hps", (SHARED,)),

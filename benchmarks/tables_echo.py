@@ -25,11 +25,22 @@ from wearcap.metrics.table import Scores, Summary, aggregate, markdown_table
 from wearcap.recording import RecordingStore
 from wearcap.runtime.system import CaptureInput
 from wearcap.systems.echo.published import NearestEcho, RigidWrist
-from wearcap.systems.echo.scores import MEASURES, score_echo
+from wearcap.systems.echo.scores import score_echo
 
-OBJECTS = MEASURES
+OBJECTS = (
+    "mpjpe_mm",
+    "mpjve_mm",
+    "foot_contact",
+    "true_foot_contact",
+    "v2v_cm",
+    "center_cm",
+    "rotation_deg",
+    "quaternion",
+    "touch_f1",
+    "jitter_m_s3",
+)
 HUMAN = ("mpjpe_mm", "mpjve_mm", "foot_contact", "true_foot_contact", "jitter_m_s3", "true_jitter_m_s3")
-UNGUIDED = ("pipeline=echo", "pipeline.guidance=null")
+UNGUIDED = ("pipeline=echo", "pipeline.contacts.guidance=null")
 SHORT = ("experiment=echo", "trainer.max_steps=900")
 TRAININGS: dict[str, tuple[str, ...]] = {
     "echo_short": SHORT,
@@ -50,7 +61,7 @@ paper's canonical frame (window) and none (world), the losses of the three modal
 and a token per frame and modality."""
 ABLATIONS: dict[str, tuple[str, ...]] = {
     "ours without guidance, as long as the others": ("echo_short", *UNGUIDED),
-    "the same, objects move untouched": ("echo_short", *UNGUIDED, "pipeline.static_threshold=null"),
+    "the same, objects move untouched": ("echo_short", *UNGUIDED, "pipeline.contacts.static_threshold=null"),
     "the same, guided by contacts": ("echo_short", "pipeline=echo"),
     "the paper's frame": ("echo_window", *UNGUIDED),
     "no canonical frame": ("echo_world", *UNGUIDED),
@@ -63,14 +74,18 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
 }
 SETTINGS = {
     "ours": ("pipeline=echo",),
-    "objects move untouched": ("pipeline=echo", "pipeline.static_threshold=null"),
+    "objects move untouched": ("pipeline=echo", "pipeline.contacts.static_threshold=null"),
     "initial object poses observed": ("pipeline=echo", "pipeline.placed=true"),
     "not guided by contacts": UNGUIDED,
     "not anchored to the head": ("pipeline=echo", "pipeline.anchor=false"),
-    "steps evenly spaced": ("pipeline=echo", "pipeline.spacing=1.0"),
-    "the stochastic posterior": ("pipeline=echo", "pipeline.eta=1.0"),
-    "noise redrawn (eq. 11 as printed)": ("pipeline=echo", "pipeline.step=redraw", "pipeline.spacing=1.0"),
-    "context of 40: latency of 20 frames": ("pipeline=echo", "pipeline.context=40"),
+    "steps evenly spaced": ("pipeline=echo", "pipeline.sampling.spacing=1.0"),
+    "the stochastic posterior": ("pipeline=echo", "pipeline.sampling.eta=1.0"),
+    "noise redrawn (eq. 11 as printed)": (
+        "pipeline=echo",
+        "pipeline.sampling.step=redraw",
+        "pipeline.sampling.spacing=1.0",
+    ),
+    "context of 40: latency of 20 frames": ("pipeline=echo", "pipeline.sampling.context=40"),
     "all as in the paper": ("pipeline=paper/echo",),
 }
 SHARES = {"human": (0.01, 0.05, 0.1, 0.25, 1.0), "object": (0.01, 0.05, 0.1, 0.25, 1.0), "contact": (0.01, 0.05, 0.1, 0.25, 1.0)}  # fmt: skip
@@ -96,7 +111,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--recordings", type=int, help="no more than so many of each data set")
     parser.add_argument("--seeds", type=int, default=4, help="runs of each row")
     parser.add_argument("--items", type=int, default=12, help="recordings that share a batch")
-    parser.add_argument("--pipeline", nargs="*", default=[], help="overrides for all rows, as pipeline.per_frame=1")
+    parser.add_argument(
+        "--pipeline", nargs="*", default=[], help="overrides for all rows, as pipeline.sampling.per_frame=1"
+    )
     parser.add_argument(
         "--parts",
         nargs="*",

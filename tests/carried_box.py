@@ -20,10 +20,12 @@ from wearcap.recording.acts import true_acts
 from wearcap.recording.motion import Interactions
 from wearcap.scene.environment import Environment
 from wearcap.scene.objects import Freedom, SceneObject
+from wearcap.systems.echo.contacts import ContactUse
 from wearcap.systems.echo.features import CONTACTS, OBJECT_SIZE, EchoFeatures
 from wearcap.systems.echo.model import EchoDenoiser
 from wearcap.systems.echo.observations import Scenario
-from wearcap.systems.echo.pipeline import Echo
+from wearcap.systems.echo.pipeline import Echo, Sampling
+from wearcap.systems.echo.queue import EchoModel
 
 WINDOW, FPS = 16, 30.0
 CLASSES = ("box", "chair")
@@ -112,8 +114,17 @@ def small_net(features: EchoFeatures, **changes) -> EchoDenoiser:
 def drawn_echo(frame: str = "own", net=None, **settings) -> Echo:
     """A small pipeline with a lookahead of seven frames and without the static-object constraint."""
     features = small_features(frame)
+    return with_settings(EchoModel(net or small_net(features), features, CosineSchedule(), xsens23()), **settings)
+
+
+def with_settings(model: EchoModel, kind: type[Echo] = Echo, **settings) -> Echo:
+    """A pipeline with settings by name, whichever part of it they belong to."""
     settings = {"context": 8, "per_frame": 1, "static_threshold": None, **settings}
-    return Echo(net or small_net(features), features, CosineSchedule(), xsens23(), **settings)
+    sampling, use = (
+        part(**{name: settings.pop(name) for name in part.__dataclass_fields__ if name in settings})
+        for part in (Sampling, ContactUse)
+    )
+    return kind(model, sampling, use, **settings)
 
 
 def scenario_of(recording: Recording, carried=CARRIED, margin_s: float = 0.1, **changes) -> Scenario:

@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-from carried_box import HALF, MIDDLE, box_mesh, carrying, scene_object, small_features
+from carried_box import HALF, MIDDLE, box_mesh, scene_object, small_features
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.point_encoder import PointNeXt
-from wearcap.scene.environment import Environment
-from wearcap.systems.echo.objects import ObjectReader, body_contact, object_poses
+from wearcap.systems.echo.observations import ObjectReader
+from wearcap.systems.echo.scores import body_contact
 
 POSE = Rigid(rotation.exp(torch.tensor([[0.3, -0.9, 0.4], [1.0, 0.2, 0.0]])), torch.tensor([[0.5, 2.0, 1.0], [0.0, 0.1, -0.3]]))  # fmt: skip
 
@@ -65,12 +65,6 @@ def test_middle_and_mesh_are_two_names_of_one_pose(shape):
     torch.testing.assert_close(shape.of_mesh(centred).matrix(), POSE.matrix())
 
 
-def test_moments_are_those_of_the_cloud(shape):
-    torch.testing.assert_close(shape.mean, torch.stack(list(shape.cloud)).sum(0) / len(shape.cloud))
-    outer = sum(torch.outer(point, point) for point in shape.cloud) / len(shape.cloud)
-    torch.testing.assert_close(shape.spread, outer, atol=1e-5, rtol=1e-4)
-
-
 @pytest.mark.parametrize("within_m", [0.02, 0.05])
 def test_a_touch_is_a_distance_to_the_surface(shape, within_m):
     """Against the distance to a box as a formula, from outside and from within."""
@@ -90,16 +84,6 @@ def test_what_is_deep_inside_does_not_touch(shape):
     inside = (POSE @ torch.tensor(MIDDLE).float())[:, None]
     assert not body_contact(inside, shape, shape.centred(POSE), 0.04).any()
     assert body_contact(inside, shape, shape.centred(POSE), 0.06).all()
-
-
-def test_poses_are_the_recordings_or_the_environments(shape):
-    recording, item = carrying(0.5), scene_object("box_1")
-    take = torch.tensor([3, 7])
-    T = object_poses(recording, Environment((item,)), "box_1", shape, take)
-    track = recording.object_motion["box_1"]
-    torch.testing.assert_close(T.t, track.T_world_body[take] @ shape.middle)
-    still = object_poses(carrying(0.5, carried=()), Environment((item,)), "box_1", shape, take)
-    torch.testing.assert_close(still.t, shape.middle.expand(2, 3))
 
 
 def test_an_unknown_class_is_named():

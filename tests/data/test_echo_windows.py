@@ -16,7 +16,8 @@ from wearcap.data.windows import Source, Windows, collate
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.systems.echo.features import POINTS
-from wearcap.systems.echo.objects import ObjectReader, ObjectShape, body_contact
+from wearcap.systems.echo.observations import ObjectReader, ObjectShape
+from wearcap.systems.echo.scores import body_contact
 from wearcap.systems.echo.training_windows import EchoContent, EchoTrack
 from wearcap_testing import small_dataset
 
@@ -167,6 +168,20 @@ def test_data_sets_of_several_rates_stand_side_by_side(root, people):
     assert torch.equal(last.t_world_root, motion.t_world_root[::every][start : start + WINDOW])
 
 
+def test_poses_are_the_recordings_or_the_environments():
+    """An object whose trajectory is missing stays at its pose in the environment."""
+    recording = carrying(2.0, carried=TWO)
+    moved = {"box_1": recording.object_motion["box_1"]}
+    track = track_of(replace(recording, object_motion=moved), boxes(TWO))
+    for number, shape in enumerate(track.objects):
+        rows = (track.active == number).nonzero()[:, 0]
+        expected = shape.middle.expand(len(rows), 3)
+        if number == 0:
+            expected = moved["box_1"].T_world_body[rows] @ shape.middle
+        assert len(rows)
+        torch.testing.assert_close(track.T_world_object.t[rows], expected)
+
+
 def test_an_object_may_change_within_a_window():
     recording = carrying(2.0, carried=TWO)
     track = track_of(recording, boxes(TWO))
@@ -177,7 +192,9 @@ def test_an_object_may_change_within_a_window():
     first, second = track.objects
     for k, shape in ((4, first), (5, second)):
         assert torch.equal(window.object_code[k], shape.code)
-        assert torch.equal(window.object_mean[k], shape.mean)
+        torch.testing.assert_close(window.object_mean[k], sum(shape.cloud) / len(shape.cloud))
+        outer = sum(torch.outer(point, point) for point in shape.cloud) / len(shape.cloud)
+        torch.testing.assert_close(window.object_spread[k], outer, atol=1e-5, rtol=1e-4)
         truth = shape.centred(recording.object_motion[shape.name].T_world_body[change - 5 + k : change - 4 + k])
         torch.testing.assert_close(window.t_world_object[k], truth.t[0], atol=1e-5, rtol=0)
     assert not torch.equal(window.object_spread[4], window.object_spread[5])

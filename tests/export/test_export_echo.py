@@ -17,8 +17,8 @@ from wearcap.export.files import load_exported, write_exports
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.models.point_encoder import PointNeXt
 from wearcap.recording.store import RecordingFile
+from wearcap.systems.echo.contacts import Guidance
 from wearcap.systems.echo.export import condition_channels
-from wearcap.systems.echo.guidance import Guidance
 from wearcap.systems.echo.pipeline import Echo
 
 FORMATS = ("onnx", "pt2")
@@ -30,7 +30,8 @@ def drawn(**settings) -> Echo:
     torch.manual_seed(1)
     encoder = PointNeXt(4, (6,), (0,), (8,), 0.3).eval()
     net = small_net(features, streams=3, blend=3)
-    return replace(drawn_echo(net=net, **settings), features=features, encoder=encoder)
+    echo = drawn_echo(net=net, **settings)
+    return replace(echo, model=replace(echo.model, features=features, encoder=encoder))
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +51,8 @@ def test_the_file_predicts_what_the_network_predicts(exports, format):
     assert report.max_abs_error < 1e-4
     # Long enough for windows that fill, run and end, and a batch item that ends before the other.
     scenarios = [scenario_of(carrying(1.3)), scenario_of(carrying(0.9))]
-    there = replace(load_exported(report.path), guidance=None)
+    there = load_exported(report.path)
+    there = replace(there, contacts=replace(there.contacts, guidance=None))
     for motion, expected in zip(*(echo.capture_scenarios(scenarios, [3, 4]) for echo in (there, eager))):
         torch.testing.assert_close(motion.T_world_joint.t, expected.T_world_joint.t, atol=1e-3, rtol=0)
         torch.testing.assert_close(motion.body_contact_prob, expected.body_contact_prob, atol=1e-3, rtol=0)
@@ -62,15 +64,15 @@ def test_the_file_predicts_what_the_network_predicts(exports, format):
 
 def test_the_sidecar_has_everything_else(exports):
     pipeline, there = drawn(guidance=Guidance(object=2.0)), load_exported(exports["pt2"].path)
-    assert isinstance(there.schedule, CosineSchedule)
-    assert (there.net.window, there.context, there.per_frame) == (WINDOW, 8, 1)
-    assert (there.settings(), there.fps, there.skeleton) == (pipeline.settings(), 30.0, pipeline.skeleton)
+    assert isinstance(there.model.schedule, CosineSchedule)
+    assert (there.model.net.window, there.sampling.context, there.sampling.per_frame) == (WINDOW, 8, 1)
+    assert (there.settings(), there.fps, there.model.skeleton) == (pipeline.settings(), 30.0, pipeline.model.skeleton)
     with open(exports["pt2"].path.replace(".pt2", ".json"), encoding="utf-8") as file:
         about = json.load(file)
     assert about["features"]["classes"] == ["box", "chair"]
-    assert len(about["condition_channels"]) == pipeline.features.condition_size
-    assert len(about["object_channels"]) == pipeline.features.object_condition_size
-    assert len(about["motion_channels"]) == sum(pipeline.net.sizes) == len(about["motion_scale"])
+    assert len(about["condition_channels"]) == pipeline.model.features.condition_size
+    assert len(about["object_channels"]) == pipeline.model.features.object_condition_size
+    assert len(about["motion_channels"]) == sum(pipeline.model.net.sizes) == len(about["motion_scale"])
     assert about["motion_channels"][3] == "pelvis.xx"
 
 
@@ -122,5 +124,6 @@ def test_files_that_do_not_belong_are_refused(exports, tmp_path):
 
 
 def test_other_schedules_are_refused():
+    echo = drawn()
     with pytest.raises(WearcapError, match="cannot be exported"):
-        replace(drawn(), schedule=lambda level: 1 - level).exports()
+        replace(echo, model=replace(echo.model, schedule=lambda level: 1 - level)).exports()

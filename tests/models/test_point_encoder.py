@@ -5,15 +5,8 @@ import torch
 from torch.nn import functional as F
 
 from wearcap.errors import WearcapError
-from wearcap.models.point_encoder import (
-    PointNeXt,
-    _ball_query,
-    _rows_at,
-    cloud_extents,
-    farthest_points,
-    load_object_encoder,
-    spread_first,
-)
+from wearcap.models.checkpoint import load_network
+from wearcap.models.point_encoder import PointNeXt, _ball_query, _rows_at, bounds, farthest_points, spread_first
 
 SMALL = {"width": 8, "strides": [4, 2], "blocks": [0, 1], "neighbours": [8, 8], "radius": 0.3}
 
@@ -47,7 +40,7 @@ def test_order_place_and_scale_do_not_change_the_feature_and_turning_does():
 
 def test_extents_are_given_beside_it():
     points = torch.tensor([[[0.0, 0.0, 0.0], [2.0, 1.0, 3.0], [1.0, 0.5, -1.0]]])
-    torch.testing.assert_close(cloud_extents(points), torch.tensor([[1.0, 0.5, 2.0, 1.0, 0.5, 1.0]]))
+    torch.testing.assert_close(torch.cat(bounds(points), -1), torch.tensor([[1.0, 0.5, 2.0, 1.0, 0.5, 1.0]]))
 
 
 def plain_farthest(points: torch.Tensor, count: int) -> list[int]:
@@ -126,4 +119,4 @@ def test_what_is_refused():
     with pytest.raises(WearcapError, match="clouds of 4 points"):
         network()(torch.zeros(1, 4, 3, dtype=torch.float64))
     with pytest.raises(WearcapError, match="another model, not of PointNeXt"):
-        load_object_encoder("voxel_autoencoder")
+        load_network("voxel_autoencoder", PointNeXt, "object_encoder", part="net.encoder")

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from carried_box import FPS, GRIP, WINDOW, boxes, carrying, drawn_echo, scenario_of
+from carried_box import FPS, GRIP, WINDOW, boxes, carrying, drawn_echo, scenario_of, with_settings
 from wearcap.body.contact_points import BODY_POINTS
 from wearcap.diffusion.process import add_noise
 from wearcap.errors import WearcapError
@@ -25,7 +25,7 @@ FRAMES = ("own", "window", "world")
 
 
 def batch_item(echo: Echo, scenario):
-    return batch_item_of(scenario, head_path(scenario.recording, echo.skeleton, echo.fps), echo.reader())
+    return batch_item_of(scenario, head_path(scenario.recording, echo.model.skeleton, echo.fps), echo.reader())
 
 
 def everything(recording) -> Observed:
@@ -111,9 +111,11 @@ def test_observed_frames_of_one_modality_enter_at_level_0(modality):
 
 def truth_of(echo: Echo, conditioning: Conditioning, frame: Rigid) -> torch.Tensor:
     """x0 in coordinates of the frame, from the observed values of the conditioning."""
-    body = echo.features.encode_body(Body(conditioning.R_parent_joint, conditioning.t_world_root), frame)
-    scene_object = echo.features.encode_object(Rigid(conditioning.R_world_object, conditioning.t_world_object), frame)
-    return echo.net.motion_normalizer(torch.cat([body, scene_object, 2 * conditioning.contact - 1], -1))
+    body = echo.model.features.encode_body(Body(conditioning.R_parent_joint, conditioning.t_world_root), frame)
+    scene_object = echo.model.features.encode_object(
+        Rigid(conditioning.R_world_object, conditioning.t_world_object), frame
+    )
+    return echo.model.net.motion_normalizer(torch.cat([body, scene_object, 2 * conditioning.contact - 1], -1))
 
 
 class Knowing(Echo):
@@ -131,9 +133,7 @@ class Knowing(Echo):
 
 
 def knowing(frame: str, **settings) -> Echo:
-    plain = drawn_echo(frame)
-    given = {"context": 8, "per_frame": 2, "anchor": False} | settings
-    return Knowing(plain.net, plain.features, plain.schedule, plain.skeleton, **given)
+    return with_settings(drawn_echo(frame).model, Knowing, **{"per_frame": 2, "anchor": False} | settings)
 
 
 @pytest.mark.parametrize("frame", FRAMES)
@@ -147,7 +147,7 @@ def test_a_perfect_denoiser_gives_the_ground_truth_in_any_frame(frame, make, ste
     echo = knowing(frame, step=step)
     conditioning = batch_item(echo, scenario_of(recording, TWO, observed=everything(recording))).conditioning
     conditioning = conditioning._replace(is_observed=torch.zeros_like(conditioning.is_observed))
-    queue = make(echo, [echo.skeleton], [0])
+    queue = make(echo, [echo.model.skeleton], [0])
     queue.seen = []
     outputs = queue.run(conditioning)
     torch.testing.assert_close(outputs.t_world_root, conditioning.t_world_root, atol=2e-4, rtol=0)
@@ -161,20 +161,20 @@ def test_a_perfect_denoiser_gives_the_ground_truth_in_any_frame(frame, make, ste
 def test_noised_frames_are_re_expressed_when_the_window_advances():
     """z' = A z + √ᾱ b equals encoding in the new frame with rotated noise."""
     echo = drawn_echo("window")
-    queue, recording = EchoQueue(echo, [echo.skeleton], [0]), carrying(1.6)
+    queue, recording = EchoQueue(echo, [echo.model.skeleton], [0]), carrying(1.6)
     conditioning = batch_item(echo, scenario_of(recording, margin_s=5.0, observed=everything(recording))).conditioning
     before, queue.conditioning = (conditioning.frames(slice(0, WINDOW)), conditioning.frames(slice(5, 5 + WINDOW)))
-    old, new = (echo.features.canonical(part.points) for part in (before, queue.conditioning))
+    old, new = (echo.model.features.canonical(part.points) for part in (before, queue.conditioning))
     queue.conveyor.age = torch.arange(WINDOW).flip(0)
     queue.conveyor.level = torch.rand(1, WINDOW, 3)
-    level = echo.net.per_feature(queue.conveyor.level)
-    noise = torch.randn(1, WINDOW, sum(echo.net.sizes))
-    queue.conveyor.x = add_noise(truth_of(echo, queue.conditioning, old), noise, level, echo.schedule)
+    level = echo.model.net.per_feature(queue.conveyor.level)
+    noise = torch.randn(1, WINDOW, sum(echo.model.net.sizes))
+    queue.conveyor.x = add_noise(truth_of(echo, queue.conditioning, old), noise, level, echo.model.schedule)
     turned, change = noise.clone(), new.R.mT @ old.R
-    first = echo.net.sizes[0]
+    first = echo.model.net.sizes[0]
     for at in (0, 3, 6, first, first + 3, first + 6):
         turned[..., at : at + 3] = (change @ noise[..., at : at + 3, None])[..., 0]
-    expected = add_noise(truth_of(echo, queue.conditioning, new), turned, level, echo.schedule)
+    expected = add_noise(truth_of(echo, queue.conditioning, new), turned, level, echo.model.schedule)
     found = queue._reexpressed(queue.conveyor.x, new.inverse() @ old, queue.conveyor.level, queue.conditioning)
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
     assert (new.t - old.t).norm() > 0.1
@@ -300,7 +300,10 @@ def test_after_a_gap_of_the_head_the_capture_restarts():
 def test_the_latency_is_the_ramp():
     echo, recording = drawn_echo(), carrying(1.0)
     assert echo.latency_s == pytest.approx(7 / FPS)
-    queue, conditioning = (EchoQueue(echo, [echo.skeleton], [0]), batch_item(echo, scenario_of(recording)).conditioning)
+    queue, conditioning = (
+        EchoQueue(echo, [echo.model.skeleton], [0]),
+        batch_item(echo, scenario_of(recording)).conditioning,
+    )
     given = [queue.push(conditioning.frames(slice(k, k + 1))) is not None for k in range(30)]
     assert given == [False] * 7 + [True] * 23
 
@@ -308,7 +311,7 @@ def test_the_latency_is_the_ramp():
 def test_a_queues_memory_is_bounded():
     echo = drawn_echo()
     queue, conditioning = (
-        EchoQueue(echo, [echo.skeleton], [0]),
+        EchoQueue(echo, [echo.model.skeleton], [0]),
         batch_item(echo, scenario_of(carrying(2.0))).conditioning,
     )
     for k in range(60):

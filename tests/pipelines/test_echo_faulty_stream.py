@@ -8,6 +8,7 @@ from carried_box import boxes, carrying, drawn_echo
 from wearcap.body.skeleton import WRISTS
 from wearcap.recording import Motion
 from wearcap.recording.timing import joined
+from wearcap.sensors import packets
 from wearcap.sensors.packets import AGREEING
 from wearcap.systems.echo import stream as echo_stream
 from wearcap.systems.echo.stream import EchoStream, EchoWearer
@@ -124,6 +125,7 @@ def test_the_active_object_stays_active_where_the_clock_goes_back(echo, recordin
 
 def test_what_waits_for_a_lost_head_is_bounded(echo, recording, monkeypatch):
     monkeypatch.setattr(echo_stream, "MAX_WAITING", 50)
+    monkeypatch.setattr(packets, "MAX_WAITING", 50)
     monkeypatch.setattr(echo_stream, "MAX_SEEN", 20)
     session, pose = opened(echo, recording), recording.head.T_world_device[0]
     for k in range(300):
@@ -132,7 +134,7 @@ def test_what_waits_for_a_lost_head_is_bounded(echo, recording, monkeypatch):
         session.activate("box_1" if k % 2 else None, k / 30)
         session.see_object("box_1", k / 30, pose)
         assert session.poses() is None
-    assert len(session._wrists["left_wrist"]) == len(session._acts) == 50
+    assert len(session._wrists.samples["left_wrist"]) == len(session._acts) == 50
     assert len(session._seen) == 20
 
 
@@ -159,6 +161,12 @@ def test_whatever_comes_it_goes_on(echo, recording, seed):
         assert motion.t_world_root.isfinite().all()
         for track in (motion.object_motion or {}).values():
             assert track.t_world_body.isfinite().all()
-    sizes = (session._chunks, session._finished, session._track._poses, session._pending, *session._wrists.values())
+    sizes = (
+        session._chunks,
+        session._finished,
+        session._track._poses,
+        session._pending,
+        *session._wrists.samples.values(),
+    )
     assert max(map(len, sizes)) < 100
     assert len(session._acts) + len(session._seen) < 300

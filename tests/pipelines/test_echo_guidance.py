@@ -9,8 +9,8 @@ from carried_box import box_mesh, boxes, carrying, drawn_echo, scenario_of, scen
 from wearcap.body.contact_points import BODY_POINTS
 from wearcap.geometry.rigid import Rigid
 from wearcap.scene.environment import Environment
+from wearcap.systems.echo.contacts import ContactUse, Guidance, GuidedScene
 from wearcap.systems.echo.features import OBJECT_SIZE, Body
-from wearcap.systems.echo.guidance import Guidance, GuidedScene
 from wearcap.systems.echo.observations import Observed, batch_item_of
 from wearcap.systems.echo.pipeline import pulled_by
 from wearcap.tracking.head_path import head_path
@@ -26,21 +26,23 @@ def scene_of(frame: str = "own", shift=(0.0, 0.0, 0.0), lift: float = 0.0, conta
     motion = recording.motion
     batch_item = batch_item_of(
         scenario_of(recording, margin_s=9.0, observed=Observed(motion, recording.object_motion)),
-        head_path(recording, echo.skeleton, echo.fps),
+        head_path(recording, echo.model.skeleton, echo.fps),
         echo.reader(),
     )
     conditioning = batch_item.conditioning.frames(slice(0, FRAMES))
-    at = echo.features.canonical(conditioning.points)
+    at = echo.model.features.canonical(conditioning.points)
     body = Body(conditioning.R_parent_joint, conditioning.t_world_root + torch.tensor([0.0, 0.0, lift]))
     box = Rigid(conditioning.R_world_object, conditioning.t_world_object + torch.tensor(shift))
     if contact is None:
         contact = torch.full((1, FRAMES, BODY_POINTS + 4), -0.9)
         contact[..., LEFT_HAND] = contact[..., BODY_POINTS:] = 0.9
-    raw = torch.cat([echo.features.encode_body(body, at), echo.features.encode_object(box, at), contact], -1)
-    scene = GuidedScene(
-        echo.net, echo.features, conditioning, at, *pulled_by([motion.skeleton], [{}], [batch_item.objects])
+    raw = torch.cat(
+        [echo.model.features.encode_body(body, at), echo.model.features.encode_object(box, at), contact], -1
     )
-    return scene, echo.net.motion_normalizer(raw)
+    scene = GuidedScene(
+        echo.model.net, echo.model.features, conditioning, at, *pulled_by([motion.skeleton], [{}], [batch_item.objects])
+    )
+    return scene, echo.model.net.motion_normalizer(raw)
 
 
 @pytest.mark.parametrize("frame", ["own", "window", "world"])
@@ -159,15 +161,14 @@ def test_a_guided_capture_is_another_one(settings):
 
 def test_a_network_without_contacts_is_not_guided():
     echo = drawn_echo(guidance=Guidance(threshold=0.0))
-    assert echo.guided_by is not None
+    assert echo.contact_use.guidance is not None
     assert "Guidance" in echo.settings()["guidance"]
-    without = replace(echo, contacts=False)
-    assert without.guided_by is None
+    without = replace(echo, model=replace(echo.model, contacts=False))
+    assert without.contact_use.guidance is None
     assert without.settings()["guidance"] == "None"
     recording = carrying(0.8)
-    plain, asked = (
-        one.capture_scenarios([scenario_of(recording)], [0])[0] for one in (replace(without, guidance=None), without)
-    )
+    unguided = replace(without, contacts=ContactUse(static_threshold=None))
+    plain, asked = (one.capture_scenarios([scenario_of(recording)], [0])[0] for one in (unguided, without))
     assert torch.equal(plain.t_world_root, asked.t_world_root)
 
 

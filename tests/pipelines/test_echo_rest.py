@@ -1,5 +1,6 @@
 """Static-object constraint: untouched objects keep their last touched pose, before their first contact its pose."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -8,9 +9,9 @@ import torch
 from carried_box import carrying, drawn_echo, scenario_of
 from wearcap.body.contact_points import BODY_POINTS
 from wearcap.geometry import rotation
+from wearcap.systems.echo.contacts import FADE, INSIDE, StaticObjects, inside, with_static_objects
 from wearcap.systems.echo.features import CONTACTS
 from wearcap.systems.echo.queue import Conditioning, Outputs
-from wearcap.systems.echo.static_objects import FADE, INSIDE, StaticObjects, inside, with_static_objects
 
 TOUCH = 0.7
 ACTS = [-1, 0, 0, 0, 0, 0, 0, 1, 1, 1, -1, 1, 1, 1, 0, 0]
@@ -194,13 +195,14 @@ def test_frame_by_frame_it_is_the_same_from_the_first_contact_on():
     )
 
 
-@pytest.mark.parametrize("settings", [{"static_threshold": None}, {"contacts": False}])
-def test_without_contacts_objects_are_as_they_are_drawn(settings):
+@pytest.mark.parametrize(("threshold", "contacts"), [(None, True), (0.0, False)])
+def test_without_contacts_objects_are_as_they_are_drawn(threshold, contacts):
     recording = carrying(1.0)
     scenario = scenario_of(recording)
-    echo = drawn_echo(**{"static_threshold": 0.0, **settings})
+    echo = drawn_echo(static_threshold=threshold)
+    echo = replace(echo, model=replace(echo.model, contacts=contacts))
     motion = echo.capture_scenarios([scenario], [0])[0]
     track = motion.object_motion["box_1"]
     active = (motion.timestamps >= 0.4) & (motion.timestamps < 1.2)
-    assert echo.static_below is None
+    assert echo.contact_use.static_threshold is None
     assert (track.t_world_body[active].diff(dim=0).norm(dim=-1) > 0).all()

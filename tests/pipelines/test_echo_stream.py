@@ -321,7 +321,7 @@ def test_a_streams_memory_is_bounded():
             session.poses()
         sizes.append(
             (
-                *(len(part) for part in session._wrists.values()),
+                *(len(part) for part in session._wrists.samples.values()),
                 len(session._acts),
                 len(session._seen),
                 len(session._pending),

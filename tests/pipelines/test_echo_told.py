@@ -25,7 +25,9 @@ TIMES = RECORDING.motion.timestamps
 
 def conditioning(scenario):
     echo = drawn_echo()
-    return batch_item_of(scenario, head_path(scenario.recording, echo.skeleton, echo.fps), echo.reader()).conditioning
+    return batch_item_of(
+        scenario, head_path(scenario.recording, echo.model.skeleton, echo.fps), echo.reader()
+    ).conditioning
 
 
 def with_mesh(vertices=None, faces=None, category: str = "box"):
@@ -223,6 +225,6 @@ def test_an_object_begins_where_its_environment_has_it():
 def test_objects_are_read_once_however_often_they_are_active():
     acts = (Act("box_1", 0.0, 0.3), Act("box_1", 0.6, 0.8))
     echo, scenario = drawn_echo(), replace(scenario_of(RECORDING), acts=acts, environment=boxes())
-    batch_item = batch_item_of(scenario, head_path(RECORDING, echo.skeleton, echo.fps), echo.reader())
+    batch_item = batch_item_of(scenario, head_path(RECORDING, echo.model.skeleton, echo.fps), echo.reader())
     assert len(batch_item.objects) == 1
     assert batch_item.conditioning.has_object[0].sum() == 9 + 6

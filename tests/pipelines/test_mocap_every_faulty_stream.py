@@ -13,6 +13,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
 from wearcap.recording.timing import joined
+from wearcap.sensors import packets
 from wearcap.sensors.packets import AGREEING
 from wearcap.systems.mocap_every import stream as mocap_every_stream
 from wearcap.systems.mocap_every.stream import MocapEveryStream, WatchSample, Wearing
@@ -175,14 +176,14 @@ def test_an_unknown_watch_is_the_callers_mistake(pipeline, recording):
 
 
 def test_what_waits_for_a_lost_head_is_bounded(pipeline, recording, monkeypatch):
-    monkeypatch.setattr(mocap_every_stream, "MAX_WAITING", 50)
+    monkeypatch.setattr(packets, "MAX_WAITING", 50)
     monkeypatch.setattr(mocap_every_stream, "MAX_POINTS", 100)
     session = opened(pipeline, recording)
     for k in range(1500):
         session.head(k / 30, None, torch.zeros(1, 3))
         session.watch("left_wrist", [WatchSample(k / 30, torch.eye(3), torch.zeros(3))])
         assert session.poses() is None
-    assert len(session._samples["left_wrist"]) == 50
+    assert len(session._wrists.samples["left_wrist"]) == 50
     assert sum(map(len, session._points)) <= 1100
 
 
@@ -209,5 +210,5 @@ def test_whatever_comes_it_goes_on(pipeline, recording, seed):
         assert motion.R_parent_joint.isfinite().all()
         assert motion.t_world_root.isfinite().all()
     assert len(session._chunks) + len(session._finished) + len(session._track._poses) < 20
-    assert max(map(len, session._samples.values())) < 300
+    assert max(map(len, session._wrists.samples.values())) < 300
     assert replace(motions[0]).skeleton == recording.skeleton

@@ -75,4 +75,4 @@ def test_samples_that_are_not_finite_are_left_out(recording):
     session = MocapEveryStream(drawn_pipeline(), wearing(recording))
     broken = WatchSample(0.1, torch.eye(3), torch.tensor([0.0, torch.nan, 0.0]))
     session.watch("left_wrist", [broken, WatchSample(0.2, torch.eye(3), torch.zeros(3))])
-    assert [sample.timestamp for sample in session._samples["left_wrist"]] == [0.2]
+    assert [sample.timestamp for sample in session._wrists.samples["left_wrist"]] == [0.2]

@@ -22,7 +22,7 @@ from wearcap.recording.timing import joined
 from wearcap.runtime.session import Session
 from wearcap.scene.scan import Scan
 from wearcap.sensors.samples import ActiveObject, HeadSample, ObjectSample, SuitPiece, WatchSample, WristSample
-from wearcap.systems.echo.guidance import Guidance
+from wearcap.systems.echo.contacts import Guidance
 from wearcap.systems.echo.stream import EchoSession, EchoStream
 from wearcap.systems.hps.stream import HpsSession
 from wearcap.systems.mocap_every.stream import MocapEverySession

@@ -280,7 +280,7 @@ def test_with_the_encoder_it_trains_is_evaluated_and_captures(data, people, tmp_
     train.main(given)
     checkpoint = run / "checkpoints" / "last.ckpt"
     assert load_trained(checkpoint)[0].features.shape_size == 256
-    common = [f"checkpoint={checkpoint}", "pipeline=echo_online", "pipeline.context=12"]
+    common = [f"checkpoint={checkpoint}", "pipeline=echo_online", "pipeline.sampling.context=12"]
     evaluate.main(
         [
             *common,

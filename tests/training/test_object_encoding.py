@@ -9,8 +9,10 @@ import torch
 
 from wearcap.cli import export, train
 from wearcap.models.checkpoint import load_trained
-from wearcap.models.point_encoder import load_object_encoder
+from wearcap.models.point_encoder import PointNeXt
+from wearcap.systems.echo.features import EchoFeatures
 from wearcap.systems.echo.object_training import ObjectEncoding, instance_loss
+from wearcap.systems.echo.training_windows import EchoContent
 from wearcap.training.run import resume_path
 from wearcap_testing import experiments
 
@@ -20,6 +22,13 @@ EXPERIMENTS = experiments("object_encoder")
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Path:
     return tmp_path_factory.mktemp("data")
+
+
+def loaded(checkpoint: Path) -> PointNeXt:
+    """The encoder as ECHO's windows read it."""
+    encoder = EchoContent(EchoFeatures(), str(checkpoint)).encoder
+    assert encoder is not None
+    return encoder
 
 
 def trained(experiment: str, data: Path, run: Path, *more: str) -> Path:
@@ -67,7 +76,7 @@ def test_it_learns_and_its_checkpoint_encodes(experiment, data, tmp_path):
             f"hydra.run.dir={tmp_path}/x",
         ]
     )
-    encoder = load_object_encoder(tmp_path / "e.safetensors")
+    encoder = loaded(tmp_path / "e.safetensors")
     assert not encoder.training
     points = torch.rand(2, 150, 3)
     feature = encoder(points)
@@ -82,7 +91,7 @@ def test_resuming_equals_training_straight_through(data, tmp_path, capsys):
     straight = trained("object_encoder", data, tmp_path / "straight", "trainer.max_steps=6", *short)
     half = trained("object_encoder", data, tmp_path / "half", "trainer.max_steps=3", *short)
     resumed = trained("object_encoder", data, tmp_path / "resumed", "trainer.max_steps=6", *short, f"resume={half}")
-    one, other = (load_object_encoder(path).state_dict() for path in (straight, resumed))
+    one, other = (loaded(path).state_dict() for path in (straight, resumed))
     assert all(torch.equal(one[name], other[name]) for name in one)
     capsys.readouterr()
     trained("object_encoder", data, tmp_path / "again", "trainer.max_steps=6", *short, f"resume={resumed}")

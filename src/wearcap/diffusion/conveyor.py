@@ -19,6 +19,8 @@ Denoise = Callable[
     [Float[Tensor, "batch frame feature"], Float[Tensor, "batch frame modality"]], Float[Tensor, "batch frame feature"]
 ]
 """x̂0 from x_t and its noise levels, for all frames on the conveyor."""
+Correct = Callable[[Float[Tensor, "batch frame feature"]], Float[Tensor, "batch frame feature"]]
+"""Corrects x̂0, as guidance does."""
 
 
 @dataclass(frozen=True)
@@ -38,10 +40,8 @@ class RollingSchedule:
 
     def __post_init__(self):
         if not 0 <= self.context < self.window:
-            raise WearcapError(
-                f"a context of {self.context} frames in a window of {self.window}",
-                expected=f"from 0 to {self.window - 1}",
-            )
+            what = f"a context of {self.context} frames in a window of {self.window}"
+            raise WearcapError(what, expected=f"from 0 to {self.window - 1}")
         if self.per_frame < 1:
             raise WearcapError(f"{self.per_frame} steps per frame", expected="at least 1")
         if self.step not in STEPS:
@@ -101,9 +101,9 @@ class Conveyor:
         denoise: Denoise,
         observation: Observation,
         noise: Float[Tensor, "step batch frame feature"],
-        correct: Callable[[Float[Tensor, "batch frame feature"]], Float[Tensor, "batch frame feature"]] | None = None,
+        correct: Correct | None = None,
     ) -> None:
-        """Take the steps between two frames; `noise` has the noise of each, `correct` changes every x̂0 (guidance).
+        """Take the steps between two frames; `noise` has the noise of each.
 
         A modality that was absent goes from noise to its frame's level in one step; one that becomes absent or is no
         longer observed becomes noise, except in final frames.

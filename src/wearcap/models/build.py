@@ -18,6 +18,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from wearcap.errors import WearcapError
 
+_OPTIMIZERS = "ASGD Adadelta Adagrad Adam AdamW Adamax LBFGS NAdam RAdam RMSprop SGD"
+_SCHEDULERS = (
+    "ConstantLR CosineAnnealingLR CosineAnnealingWarmRestarts CyclicLR ExponentialLR LinearLR MultiStepLR OneCycleLR "
+    "PolynomialLR StepLR"
+)
 TARGETS: dict[str, tuple[str, ...]] = {
     "wearcap.body.skeleton": ("xsens23",),
     "wearcap.systems.ireplica.features": ("HandViews", "SmplAngles"),
@@ -27,7 +32,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "wearcap.systems.hmd2.pose_regressor.features": ("TrackedPoints",),
     "wearcap.systems.mocap_every.features": ("WatchFeatures",),
     "wearcap.diffusion.levels": ("LevelMix",),
-    "wearcap.diffusion.schedule": ("CosineSchedule", "LinearSchedule"),
+    "wearcap.diffusion.schedule": ("CosineSchedule",),
     "wearcap.systems.ireplica.contact_sequence": ("ContactSequence",),
     "wearcap.systems.ireplica.contact_transformer": ("ContactTransformer",),
     "wearcap.systems.hmd2.model": ("MotionDenoiser",),
@@ -51,31 +56,8 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "wearcap.systems.hmd2.point_codes_training": ("VoxelReconstruction",),
     "wearcap.systems.mocap_every.training": ("WatchRegression",),
     "prodigyopt": ("Prodigy",),
-    "torch.optim": (
-        "ASGD",
-        "Adadelta",
-        "Adagrad",
-        "Adam",
-        "AdamW",
-        "Adamax",
-        "LBFGS",
-        "NAdam",
-        "RAdam",
-        "RMSprop",
-        "SGD",
-    ),
-    "torch.optim.lr_scheduler": (
-        "ConstantLR",
-        "CosineAnnealingLR",
-        "CosineAnnealingWarmRestarts",
-        "CyclicLR",
-        "ExponentialLR",
-        "LinearLR",
-        "MultiStepLR",
-        "OneCycleLR",
-        "PolynomialLR",
-        "StepLR",
-    ),
+    "torch.optim": tuple(_OPTIMIZERS.split()),
+    "torch.optim.lr_scheduler": tuple(_SCHEDULERS.split()),
 }
 """Classes (and functions that return plain objects) that a model's config may name, by their modules."""
 
@@ -111,11 +93,9 @@ def check_config(config: Any, where: str | Path) -> None:
                 raise _refused(f"{_PARTIAL}: {str(value[_PARTIAL])[:80]!r}", where)
             target = value.get(_TARGET)
             if _TARGET in value and target not in (_BY_NAME if isinstance(target, str) else ()):
-                raise WearcapError(
-                    f"the model is to be made of {str(target)[:80]!r}, which is no part of wearcap's models",
-                    where=where,
-                    expected="networks, features and optimisers of wearcap and PyTorch alone",
-                )
+                what = f"the model is to be made of {str(target)[:80]!r}, which is no part of wearcap's models"
+                expected = "networks, features and optimisers of wearcap and PyTorch alone"
+                raise WearcapError(what, where=where, expected=expected)
             rest += [(key if key in _ANY_SIZE else inner, item) for inner, item in value.items()]
         elif isinstance(value, list):
             rest += [(key, item) for item in value]
@@ -152,34 +132,22 @@ def build(config: dict[str, Any], state: Mapping[str, Tensor], where: str | Path
             raise TypeError(f"a {type(rehearsed).__name__}, no network")
         check_weights(rehearsed.state_dict(), own, where)
         module: nn.Module = _made(config)
-    except WearcapError as error:
-        if error.where:
-            raise
-        raise _unbuildable(error, where) from error
     except Exception as error:  # constructors may raise anything for arguments that no release of ours wrote
-        raise _unbuildable(error, where) from error
+        if isinstance(error, WearcapError) and error.where:
+            raise
+        what = f"its model cannot be built ({' '.join(str(error).split())[:200] or type(error).__name__})"
+        raise WearcapError(what, where=where, expected="a checkpoint of this version of wearcap") from error
     module.load_state_dict(own)
     return module.eval()
-
-
-def _unbuildable(error: Exception, where: str | Path) -> WearcapError:
-    return WearcapError(
-        f"its model cannot be built ({' '.join(str(error).split())[:200] or type(error).__name__})",
-        where=where,
-        expected="a checkpoint of this version of wearcap",
-    )
 
 
 def check_weights(own: Mapping[str, Tensor], state: Mapping[str, Tensor], where: str | Path) -> None:
     """Raise WearcapError unless the weights of a file have the names and shapes of a model's own."""
     wrong = sorted(set(own) ^ set(state)) or [name for name in own if own[name].shape != state[name].shape]
     if wrong:
-        raise WearcapError(
-            f"{len(wrong)} weights do not fit this model, such as {wrong[0][:80]!r}",
-            where=where,
-            expected="a checkpoint of the same model",
-            fix="Check which model it was trained for.",
-        )
+        what = f"{len(wrong)} weights do not fit this model, such as {wrong[0][:80]!r}"
+        fix = "Check which model it was trained for."
+        raise WearcapError(what, where=where, expected="a checkpoint of the same model", fix=fix)
 
 
 def _made(value: Any) -> Any:

@@ -168,10 +168,8 @@ class _PretrainedEncoder:
         try:
             package = importlib.import_module(self.package)
         except ModuleNotFoundError as error:
-            raise WearcapError(
-                f"{self.title} needs the package {error.name!r}",
-                fix=f"pip install {self.install}, or take encoder=egoview, which needs none.",
-            ) from error
+            fix = f"pip install {self.install}, or take encoder=egoview, which needs none."
+            raise WearcapError(f"{self.title} needs the package {error.name!r}", fix=fix) from error
         path = self.find_weights(weights)
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
@@ -216,11 +214,8 @@ class _PretrainedEncoder:
         if named := given or os.environ.get(cls.variable):
             path = Path(named).expanduser()
             if not path.is_file():
-                raise WearcapError(
-                    f"no such file of weights of {cls.title}",
-                    where=path,
-                    fix="Check weights=…" if given else f"Check the variable {cls.variable}.",
-                )
+                fix = "Check weights=…" if given else f"Check the variable {cls.variable}."
+                raise WearcapError(f"no such file of weights of {cls.title}", where=path, fix=fix)
             return path
         home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
         hugging_face = Path(os.environ.get("HF_HOME") or home / "huggingface").expanduser()

@@ -6,6 +6,7 @@ names into them.
 
 import math
 import re
+from collections import OrderedDict
 
 import torch
 from jaxtyping import Float, Int
@@ -99,24 +100,6 @@ class _CrossBlock(nn.Module):
         return self._updated(x0, seen0), self._updated(x1, seen1)
 
 
-class _Layer(nn.Module):
-    """Self-attention in each image, then cross-attention."""
-
-    def __init__(self, width: int, heads: int):
-        super().__init__()
-        self.self_attn = SelfBlock(width, heads)
-        self.cross_attn = _CrossBlock(width, heads)
-
-    def forward(
-        self,
-        x0: Float[Tensor, "batch keypoint0 width"],
-        x1: Float[Tensor, "batch keypoint1 width"],
-        turn0: Float[Tensor, "2 batch 1 keypoint0 pair"],
-        turn1: Float[Tensor, "2 batch 1 keypoint1 pair"],
-    ) -> tuple[Float[Tensor, "batch keypoint0 width"], Float[Tensor, "batch keypoint1 width"]]:
-        return self.cross_attn(self.self_attn(x0, turn0), self.self_attn(x1, turn1))
-
-
 class MatchAssignment(nn.Module):
     """Soft partial assignment (eq. 8-9): dual softmax of similarity, times both keypoints' matchability."""
 
@@ -133,17 +116,6 @@ class MatchAssignment(nn.Module):
         similarity = (self.final_proj(x0) / scale) @ (self.final_proj(x1) / scale).transpose(1, 2)
         matchable = F.logsigmoid(self.matchability(x0)) + F.logsigmoid(self.matchability(x1)).transpose(1, 2)
         return similarity.log_softmax(2) + similarity.log_softmax(1) + matchable
-
-
-class _TokenConfidence(nn.Module):
-    """Confidence of a keypoint that further layers will not change its match (eq. 10)."""
-
-    def __init__(self, width: int):
-        super().__init__()
-        self.token = nn.Sequential(nn.Linear(width, 1), nn.Sigmoid())
-
-    def forward(self, x: Float[Tensor, "batch keypoint width"]) -> Float[Tensor, "batch keypoint"]:
-        return self.token(x)[..., 0]
 
 
 def mutual_matches(
@@ -172,9 +144,16 @@ class LightGlue(nn.Module):
         super().__init__()
         self.width, self.stop_confidence = width, stop_confidence
         self.posenc = RotaryPosition(width // heads)
-        self.transformers = nn.ModuleList(_Layer(width, heads) for _ in range(layers))
+        self.transformers = nn.ModuleList(
+            nn.ModuleDict({"self_attn": SelfBlock(width, heads), "cross_attn": _CrossBlock(width, heads)})
+            for _ in range(layers)
+        )
         self.log_assignment = nn.ModuleList(MatchAssignment(width) for _ in range(layers))
-        self.token_confidence = nn.ModuleList(_TokenConfidence(width) for _ in range(layers - 1))
+        # Confidence of a keypoint that further layers will not change its match (eq. 10).
+        self.token_confidence = nn.ModuleList(
+            nn.Sequential(OrderedDict(token=nn.Sequential(nn.Linear(width, 1), nn.Sigmoid())))
+            for _ in range(layers - 1)
+        )
 
     def forward(
         self,
@@ -190,10 +169,12 @@ class LightGlue(nn.Module):
         x0, x1 = descriptors0, descriptors1
         depth = 0
         for depth, layer in enumerate(self.transformers):
-            x0, x1 = layer(x0, x1, turn0, turn1)
+            assert isinstance(layer, nn.ModuleDict)
+            x0, x1 = layer["self_attn"](x0, turn0), layer["self_attn"](x1, turn1)
+            x0, x1 = layer["cross_attn"](x0, x1)
             if self.stop_confidence is None or depth == len(self.token_confidence):
                 continue
-            confidence = torch.cat([self.token_confidence[depth](x) for x in (x0, x1)], 1)
+            confidence = torch.cat([self.token_confidence[depth](x)[..., 0] for x in (x0, x1)], 1)
             needed = 0.8 + 0.1 * math.exp(-4 * depth / len(self.transformers))
             if bool((confidence >= needed).float().mean() > self.stop_confidence):
                 break

@@ -14,7 +14,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from wearcap.errors import WearcapError
-from wearcap.models.checkpoint import load_network
 from wearcap.models.weights import load_weights, read_weights
 
 _LEAST_M = 1e-9
@@ -28,14 +27,9 @@ _NAME = re.compile(
 
 
 def bounds(points: Float[Tensor, "batch point 3"]) -> tuple[Float[Tensor, "batch 3"], Float[Tensor, "batch 3"]]:
-    """Half extents and centre of clouds' bounding boxes, in the points' unit."""
+    """Half extents and centre of clouds' bounding boxes, in the points' unit; `PointNeXt`'s feature has neither."""
     low, high = points.amin(1), points.amax(1)
     return (high - low) / 2, (high + low) / 2
-
-
-def cloud_extents(points: Float[Tensor, "batch point 3"]) -> Float[Tensor, "batch 6"]:
-    """Half extents and centre along the clouds' axes (m), which `PointNeXt`'s feature does not contain."""
-    return torch.cat(bounds(points), -1)
 
 
 def to_unit_sphere(
@@ -125,10 +119,8 @@ class PointNeXt(nn.Module):
         """
         super().__init__()
         if not len(strides) == len(blocks) == len(neighbours):
-            raise WearcapError(
-                f"{len(strides)} strides, {len(blocks)} numbers of blocks and {len(neighbours)} of neighbours",
-                expected="one of each per stage",
-            )
+            what = f"{len(strides)} strides, {len(blocks)} numbers of blocks and {len(neighbours)} of neighbours"
+            raise WearcapError(what, expected="one of each per stage")
         self.size, self.strides, self.y_up = width << len(strides), tuple(strides), y_up
         self.settings = {
             "width": width,
@@ -149,16 +141,15 @@ class PointNeXt(nn.Module):
             parts: list[nn.Module] = [_SetAbstraction(narrow, 2 * narrow, stride, near, most, normalized)]
             wider = near * radius_scaling
             parts += [_InvResMLP(2 * narrow, wider, most, normalized, expansion) for _ in range(count)]
-            stages.append(_Stage(parts))
+            stages.append(nn.ModuleList(parts))
         self.stages = nn.ModuleList(stages)
         self.whole = nn.ModuleList([_Layer(self.size + 3, self.size), _Layer(self.size, self.size)])
 
     def forward(self, points: Float[Tensor, "batch point 3"]) -> Float[Tensor, "batch feature"]:
         """Features of clouds (m) in their objects' own axes. Raises WearcapError for too few points."""
         if points.shape[1] < prod(self.strides):
-            raise WearcapError(
-                f"clouds of {points.shape[1]} points", expected=f"at least {prod(self.strides)}, such as 1500"
-            )
+            expected = f"at least {prod(self.strides)}, such as 1500"
+            raise WearcapError(f"clouds of {points.shape[1]} points", expected=expected)
         unit, _ = to_unit_sphere(points)
         if self.y_up:
             unit = torch.stack([unit[..., 0], unit[..., 2], -unit[..., 1]], -1)
@@ -166,7 +157,9 @@ class PointNeXt(nn.Module):
         p = _rows_at(unit, spread_first(unit, unit.shape[1] // self.strides[0]))
         f = self.stem(p)
         for stage in self.stages:
-            p, f = stage(p, f)
+            assert isinstance(stage, nn.ModuleList)
+            for part in stage:
+                p, f = part(p, f)
         f = torch.cat([p, f], -1)
         for layer in self.whole:
             f = F.relu(layer(f))
@@ -209,17 +202,6 @@ class _InvResMLP(nn.Module):
         index = _ball_query(p, p, self.radius, self.neighbours)
         most = F.relu(self.ball(p, f, index)).max(2).values
         return p, F.relu(f + self.narrow(F.relu(self.widen(most))))
-
-
-class _Stage(nn.ModuleList):
-    """A set abstraction and the residual blocks after it."""
-
-    def forward(
-        self, p: Float[Tensor, "batch point 3"], f: Float[Tensor, "batch point feature"]
-    ) -> tuple[Float[Tensor, "batch center 3"], Float[Tensor, "batch center wide"]]:
-        for part in self:
-            p, f = part(p, f)
-        return p, f
 
 
 class _Layer(nn.Module):
@@ -271,14 +253,6 @@ class ObjectNetwork(nn.Module):
         self.instance = nn.Linear(encoder.size, projection)
 
 
-def load_object_encoder(path: str | Path) -> PointNeXt:
-    """The encoder of a checkpoint of experiment=object_encoder (a path, or a name in `checkpoints/`), frozen.
-
-    Raises WearcapError when the checkpoint is missing, damaged or another network's.
-    """
-    return load_network(path, PointNeXt, "object_encoder", part="net.encoder").requires_grad_(False)
-
-
 def load_openpoints(path: str | Path, normalized: bool = True) -> PointNeXt:
     """PointNeXt-S with the user's own weights: a `.pth` or `.safetensors` file that OpenPoints' training of its
     `cfgs/modelnet40ply2048/pointnext-s.yaml` wrote (ECHO says PointNeXt; which one is our reading), frozen.
@@ -292,11 +266,9 @@ def load_openpoints(path: str | Path, normalized: bool = True) -> PointNeXt:
     stem = tensors.get("stem.weight")
     if stem is None or stem.ndim < 2 or stem.shape[1] != 3:
         given = "a tensor of other axes" if stem is not None else "nothing"
-        raise WearcapError(
-            f"these are not the weights of PointNeXt-S: encoder.encoder.0.0.convs.0.0.weight is {given}",
-            where=path,
-            expected="a checkpoint of OpenPoints' cfgs/modelnet40ply2048/pointnext-s.yaml (in_channels: 3)",
-        )
+        what = f"these are not the weights of PointNeXt-S: encoder.encoder.0.0.convs.0.0.weight is {given}"
+        expected = "a checkpoint of OpenPoints' cfgs/modelnet40ply2048/pointnext-s.yaml (in_channels: 3)"
+        raise WearcapError(what, where=path, expected=expected)
     encoder = PointNeXt(width=len(stem), normalized=normalized, y_up=True)
     # The weights of a pointwise convolution are a matrix.
     pointwise = {name: value.ndim > 2 and value.shape[2:].numel() == 1 for name, value in tensors.items()}

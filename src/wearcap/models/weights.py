@@ -44,23 +44,18 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
         with torch.serialization.safe_globals(_NUMBERS):
             content: object = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
-        raise WearcapError(
-            "the file is damaged, or holds more than tensors and was not opened, since loading it would run its code",
-            where=path,
-            expected="a .safetensors file, or a .pth file with tensors only",
-            fix="If you trust its origin, save its state_dict with safetensors.torch.save_file.",
-        ) from error
+        what = "the file is damaged, or holds more than tensors and was not opened, since loading it would run its code"
+        expected = "a .safetensors file, or a .pth file with tensors only"
+        fix = "If you trust its origin, save its state_dict with safetensors.torch.save_file."
+        raise WearcapError(what, where=path, expected=expected, fix=fix) from error
     except Exception as error:  # torch.load may raise anything on bytes of another format
         raise WearcapError("not a readable PyTorch file", where=path) from error
     for key in _NESTED:
         if isinstance(content, Mapping) and isinstance(content.get(key), Mapping):
             content = content[key]
     if not isinstance(content, Mapping) or not all(isinstance(value, Tensor) for value in content.values()):
-        raise WearcapError(
-            "the file does not hold a network's named tensors",
-            where=path,
-            expected="a state_dict, alone or under the key state_dict",
-        )
+        what = "the file does not hold a network's named tensors"
+        raise WearcapError(what, where=path, expected="a state_dict, alone or under the key state_dict")
     return {
         ".".join(part for part in str(name).split(".") if part != "module"): value for name, value in content.items()
     }
@@ -79,11 +74,8 @@ def load_weights(network: nn.Module, tensors: Mapping[str, Tensor], *, name: str
             for names, what in ((missing, "missing"), (unexpected, "unexpected"))
             if names
         ]
-        raise WearcapError(
-            f"these are not the weights of {name}: tensors {' and '.join(wrong)}",
-            where=where,
-            expected=f"{len(own)} tensors such as {next(iter(own))}",
-        )
+        what = f"these are not the weights of {name}: tensors {' and '.join(wrong)}"
+        raise WearcapError(what, where=where, expected=f"{len(own)} tensors such as {next(iter(own))}")
     shapes = [
         f"{key} is {_shape(tensors[key])} and should be {_shape(value)}"
         for key, value in own.items()
@@ -91,9 +83,8 @@ def load_weights(network: nn.Module, tensors: Mapping[str, Tensor], *, name: str
     ]
     if shapes:
         more = f"; and {len(shapes) - _SHOWN} more" if len(shapes) > _SHOWN else ""
-        raise WearcapError(
-            f"the weights are those of another size of {name}: {'; '.join(shapes[:_SHOWN])}{more}", where=where
-        )
+        what = f"the weights are those of another size of {name}: {'; '.join(shapes[:_SHOWN])}{more}"
+        raise WearcapError(what, where=where)
     network.load_state_dict(dict(tensors))
 
 

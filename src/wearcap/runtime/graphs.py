@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from wearcap.body.skeleton import Site, Skeleton
-from wearcap.diffusion.schedule import CosineSchedule, LinearSchedule, Schedule
+from wearcap.diffusion.schedule import CosineSchedule, Schedule
 from wearcap.errors import WearcapError, nearest
 
 RUNTIMES = ("auto", "eager", "compile", "onnx")
@@ -250,7 +250,7 @@ def quiet() -> Iterator[None]:
         logging.disable(before)
 
 
-SCHEDULES = {cls.__name__: cls for cls in (CosineSchedule, LinearSchedule)}
+SCHEDULES = {"CosineSchedule": CosineSchedule}
 ROT6D = tuple(f"{column}{axis}" for column in "xy" for axis in "xyz")
 """First two columns of a rotation matrix, one after the other."""
 

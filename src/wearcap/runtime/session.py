@@ -18,13 +18,17 @@ from typing import Any, ClassVar
 import numpy as np
 import safetensors
 import torch
+from jaxtyping import Float
 from safetensors.torch import load, save
 from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, parse_json
+from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
 from wearcap.runtime.stages import digest
+from wearcap.sensors.packets import Admitted, HeadInput, WristInput
+from wearcap.tracking.head_path import Chunk, HeadTrack
 
 _KEY, _SETTINGS, _DIGEST = "wearcap_state", "settings", "sha256"
 _DAMAGE = (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError, OverflowError, RecursionError)
@@ -115,6 +119,77 @@ class Session(ABC):
         for name, part in state.items():
             setattr(session, name, part)
         return session
+
+
+class HeadAndWristsStream(ABC):
+    """The streaming capture of one wearer with a head device and sensors on both wrists, on one clock.
+
+    Invalid packets (`sensors.packets`) are counted as `refused`. If the head device's clock is set back for good, the
+    capture restarts like a new session.
+    """
+
+    def __init__(self, pipeline: Any, fps: float, stride: int):
+        """`fps`: frame rate of the poses (Hz); `stride`: frames of a chunk of the head's path."""
+        pipeline.prepare()
+        self.pipeline = pipeline
+        self.silent = 0
+        """Number of frames without samples of a wrist, counted per wrist."""
+        self._head_input, self._track = HeadInput(), HeadTrack(fps, stride)
+        self._wrists = WristInput(self._head_input)
+        self._finished: list[Motion] = []
+        """Final motions with times of a previous clock, not returned yet."""
+
+    @property
+    def dropped(self) -> int:
+        """Number of head poses that were late, duplicated or refused."""
+        return self._track.dropped + self._head_input.dropped
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Number of refused samples, or parts of samples, by reason ("head: not a rotation")."""
+        return dict(self._head_input.refused)
+
+    @abstractmethod
+    def take(self, sample: Any) -> None:
+        """Take in one sample (`sensors.samples`)."""
+
+    def head(
+        self, timestamp: float, T_world_device: Rigid | None, points_world: Float[Tensor, "point 3"] | None = None
+    ) -> None:
+        """Take in one time step (s) of the head device: its pose (None while tracking is lost) and new points (m)."""
+        if self._head_input.timely(timestamp):
+            packet = self._head_input.pose(T_world_device), self._head_input.points(points_world)
+            self._take(self._head_input.admit(float(timestamp), packet))
+
+    def _take(self, admitted: Admitted) -> None:
+        if admitted.begins:
+            if admitted.again and (motion := self._final(ended=True)) is not None:
+                self._finished.append(motion)
+            self._restart(admitted.again)
+            self._wrists.rejoin(None if admitted.again else admitted.packets[0][0])
+        for time, (pose, _) in admitted.packets:
+            self._track.take(time, pose)
+
+    def _restart(self, again: bool = False) -> None:
+        """Restart the capture, with `again` on another clock; wrist samples and counters are kept."""
+        dropped = self._track.dropped
+        self._track = HeadTrack(self._track.fps, self._track.stride)
+        self._track.dropped = dropped
+        self._chunks: list[Chunk] = []
+
+    def poses(self, ended: bool = False) -> Motion | None:
+        """Frames that became final since the last call, or None; `ended`: no more samples will come.
+
+        After the head device's clock was set back, the frames before come first; call again for the new clock's.
+        """
+        if ended:
+            for time, (pose, _) in self._head_input.end():
+                self._track.take(time, pose)
+        return self._finished.pop(0) if self._finished else self._final(ended)
+
+    @abstractmethod
+    def _final(self, ended: bool) -> Motion | None:
+        """Frames on the present clock that became final, or None."""
 
 
 def classes_of(*modules: ModuleType) -> dict[str, type]:

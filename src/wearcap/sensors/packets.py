@@ -1,7 +1,7 @@
 """Validation of live device packets before a streaming session uses them, so that bad input cannot break a session.
 
 The `…_fault` functions return why a value is invalid, or None; `Clock` decides which timestamps are accepted;
-`HeadInput` combines both for the head device, whose clock is the session's.
+`HeadInput` combines both for the head device, whose clock is the session's, and `WristInput` buffers the wrists' samples.
 """
 
 import math
@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wearcap.body.skeleton import WRISTS
 from wearcap.geometry.rigid import Rigid
 
 MAX_TIME_S = 1e10
@@ -269,6 +270,52 @@ class HeadInput:
         if refused:
             self.refuse("head", OFF_THE_CLOCK, refused)
             self.dropped += refused
+
+
+class WristInput:
+    """Buffers of both wrists' samples in order of time; the wrists' clocks follow the head device's."""
+
+    def __init__(self, head: HeadInput):
+        self.head = head
+        self.samples: dict[str, list[Any]] = {joint: [] for joint in WRISTS}
+        """Samples of each wrist: tuples that begin with their time (s)."""
+        self._clocks = {joint: Clock(leads=False) for joint in WRISTS}
+
+    def add(self, joint: str, sample: Sequence[Any]) -> None:
+        """Buffer a sample of a wrist; repeated ones are ignored."""
+        samples = self.samples[joint]
+        admitted = self._clocks[joint].admit(sample[0], sample, self.head.clock.newest)
+        self._refuse(joint, admitted.refused)
+        if admitted.begins:
+            first = bisect_left(samples, admitted.packets[0][0], key=_time)
+            del samples[first if admitted.again else 0 :]
+        for time, accepted in admitted.packets:
+            place = bisect_left(samples, time, key=_time)
+            if place == len(samples) or samples[place][0] != time:
+                samples.insert(place, accepted)
+                del samples[:-MAX_WAITING]
+
+    def rejoin(self, time: float | None) -> None:
+        """Keep the samples that belong to the head's clock starting at a time (s); None: drop all of them."""
+        for joint, samples in self.samples.items():
+            kept = [] if time is None else samples[connected([sample[0] for sample in samples], time)]
+            refused = self._clocks[joint].set(kept[-1][0] if kept else None)
+            self._refuse(joint, refused if time is None else refused + len(samples) - len(kept))
+            self.samples[joint] = kept
+
+    def arrived(self, until_s: float, at_s: float, head_s: float, silent_s: float) -> bool:
+        """Whether both wrists have samples until `until_s`, or none within `silent_s` of the head's newest time
+        `head_s`; `at_s`: time of the frame that needs them (s)."""
+        newest = (samples[-1][0] if samples else -math.inf for samples in self.samples.values())
+        return all(last >= until_s or head_s > max(at_s, last) + silent_s for last in newest)
+
+    def _refuse(self, joint: str, count: int) -> None:
+        if count:
+            self.head.refuse(joint, OFF_THE_CLOCK, count)
+
+
+def _time(sample: Sequence[Any]) -> float:
+    return sample[0]
 
 
 def _is_float(value: object, shape: tuple[int, ...]) -> TypeGuard[Tensor]:

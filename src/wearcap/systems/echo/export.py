@@ -24,12 +24,11 @@ from wearcap.runtime.graphs import (
     skeleton_from_json,
     skeleton_to_json,
 )
+from wearcap.systems.echo.contacts import ContactUse, Guidance
 from wearcap.systems.echo.features import POINTS, EchoFeatures
-from wearcap.systems.echo.guidance import Guidance
 from wearcap.systems.echo.model import MODALITIES, EchoDenoiser
-from wearcap.systems.echo.pipeline import Echo
-
-SETTINGS = ("contacts", "context", "per_frame", "spacing", "eta", "step", "rewindow", "anchor", "static_threshold")
+from wearcap.systems.echo.pipeline import Echo, Sampling
+from wearcap.systems.echo.queue import EchoModel
 
 
 def exports(pipeline: Echo) -> Exports:
@@ -37,7 +36,8 @@ def exports(pipeline: Echo) -> Exports:
 
     Raises WearcapError for a network that is exported already, and for an unknown schedule.
     """
-    net, features, guidance, encoder = pipeline.net, pipeline.features, pipeline.guidance, pipeline.encoder
+    model, guidance = pipeline.model, pipeline.contacts.guidance
+    net, features, encoder = model.net, model.features, model.encoder
     if net.exported:
         raise WearcapError("a network that is exported already", expected="one of a checkpoint")
     about = {
@@ -52,13 +52,18 @@ def exports(pipeline: Echo) -> Exports:
             *(f"middle_{axis}" for axis in "xyz"),
             *(f"shape.{k}" for k in range(features.shape_size)),
         ],
-        "motion_channels": motion_channels(pipeline.skeleton),
+        "motion_channels": motion_channels(model.skeleton),
         "motion_mean": net.motion_normalizer.mean.tolist(),
         "motion_scale": net.motion_normalizer.scale.tolist(),
-        "schedule": schedule_to_json(pipeline.schedule),
-        "settings": {name: getattr(pipeline, name) for name in SETTINGS},
+        "schedule": schedule_to_json(model.schedule),
+        "settings": {
+            "contacts": model.contacts,
+            **vars(pipeline.sampling),
+            "anchor": pipeline.anchor,
+            "static_threshold": pipeline.contacts.static_threshold,
+        },
         "guidance": None if guidance is None else asdict(guidance),
-        "skeleton": skeleton_to_json(pipeline.skeleton),
+        "skeleton": skeleton_to_json(model.skeleton),
         "encoder": None if encoder is None else encoder.settings,
     }
     return Exports("echo", net.graphs(), about, weights={} if encoder is None else {"encoder": encoder})
@@ -119,7 +124,6 @@ class _ExportedEchoDenoiser(EchoDenoiser):
         self.object = _Embedding(runs["objects"], self.window)
 
     def graphs(self) -> dict[str, Graph]:
-        """The exported graphs themselves."""
         runs = self._runs[0]
         return {
             name: Graph(runs[part], {}) for name, part in (("step", "model"), ("plan", "plan"), ("conditions",) * 2)
@@ -128,17 +132,19 @@ class _ExportedEchoDenoiser(EchoDenoiser):
 
 def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], about: dict[str, Any]) -> Echo:
     """The pipeline of an exported model."""
-    encoder, guidance = None, about["guidance"]
+    encoder, settings = None, dict(about["settings"])
+    guidance = None if about["guidance"] is None else Guidance(**about["guidance"])
     if about["encoder"] is not None:
         encoder = PointNeXt(**about["encoder"])
         encoder.load_state_dict(weights["encoder"])
         encoder.requires_grad_(False).eval()
-    return Echo(
+    model = EchoModel(
         _ExportedEchoDenoiser(runs, about),
         EchoFeatures(**about["features"]),
         schedule_from_json(about["schedule"]),
         skeleton_from_json(about["skeleton"]),
         encoder,
-        **about["settings"],
-        guidance=None if guidance is None else Guidance(**guidance),
+        settings.pop("contacts"),
     )
+    use, anchor = ContactUse(guidance, settings.pop("static_threshold")), settings.pop("anchor")
+    return Echo(model, Sampling(**settings), use, anchor)

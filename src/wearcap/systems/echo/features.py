@@ -88,11 +88,9 @@ class EchoFeatures:
     def class_code(self, name: str) -> Float[Tensor, "class"]:
         """One-hot code of a class. Raises WearcapError for a class that the model was not built for."""
         if name not in self.classes:
-            raise WearcapError(
-                f"the model has no object class {name!r}",
-                expected=f"one of {', '.join(self.classes)}",
-                fix="Give the object's category the name of the class that is most like it.",
-            )
+            what = f"the model has no object class {name!r}"
+            fix = "Give the object's category the name of the class that is most like it."
+            raise WearcapError(what, expected=f"one of {', '.join(self.classes)}", fix=fix)
         return torch.nn.functional.one_hot(torch.tensor(list(self.classes).index(name)), len(self.classes)).float()
 
     def canonical(self, points: ThreePoints) -> Rigid:

@@ -1,26 +1,30 @@
 """ECHO's conditioning from a recording at the model's rate: tracked points, floor, active objects, observations."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.body.contact_points import BODY_POINTS
-from wearcap.body.skeleton import FOOT_PATCHES, WRISTS
+from wearcap.body.skeleton import FOOT_PATCHES, MIRROR, WRISTS
+from wearcap.data.objects import object_cloud
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
+from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate_clamped, resample
+from wearcap.geometry.triangle_distance import TriangleIndex
+from wearcap.models.point_encoder import PointNeXt, bounds
 from wearcap.recording.acts import NO_OBJECT, Act, active_at
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 from wearcap.recording.timing import at_times
 from wearcap.scene.environment import Environment
-from wearcap.systems.echo.features import CONTACTS
+from wearcap.scene.objects import SceneObject
+from wearcap.systems.echo.features import CONTACTS, EchoFeatures
 from wearcap.systems.echo.model import MODALITIES
-from wearcap.systems.echo.objects import ObjectReader, ObjectShape
 from wearcap.systems.echo.queue import Conditioning
 from wearcap.tracking.head_path import HeadPath
 
@@ -30,6 +34,70 @@ SAME_S = 1e-4
 """Times closer than this count as equal (s)."""
 SWAPPED_M = 0.02
 """Median distance of the left wrist to the right of the right wrist from which the two count as swapped (m)."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectShape:
+    """An object in its own axes, centred on its bounding box; its pose is the pose of this centre."""
+
+    name: str
+    category: str
+    mesh: Mesh
+    middle: Float[Tensor, "3"]
+    """Centre of the bounding box in coordinates of the mesh (m)."""
+    cloud: Float[Tensor, "point 3"]
+    """Surface points relative to the centre (m)."""
+    code: Float[Tensor, "code"]
+    """Condition for the network: class, extents and feature, raw or embedded (`ObjectReader`)."""
+    code_mirrored: Float[Tensor, "code"]
+    """Condition for the object mirrored along its own y axis."""
+    surface: TriangleIndex
+    """Spatial index of the mesh's triangles."""
+
+    def centred(self, T_world_object: Rigid) -> Rigid:
+        """Pose of the bounding box's centre, given the mesh's pose."""
+        return Rigid(T_world_object.R, T_world_object @ self.middle.to(T_world_object.t))
+
+    def of_mesh(self, T_world_middle: Rigid) -> Rigid:
+        """The inverse of `centred`."""
+        return Rigid(T_world_middle.R, T_world_middle @ -self.middle.to(T_world_middle.t))
+
+
+class ObjectReader:
+    """Turns objects into conditions for the network; each mesh is processed once."""
+
+    def __init__(
+        self, features: EchoFeatures, encoder: PointNeXt | None, embed: Callable[[Tensor], Tensor] | None = None
+    ):
+        """`encoder` None: codes are class and extents alone, for features without shape. `embed`: the network's layer
+        on codes (`EchoDenoiser.object`), which is the same in every window; None leaves them raw."""
+        self.features, self.encoder, self._embed = features, encoder, embed
+        empty = torch.zeros(1, features.object_condition_size)
+        self.nothing: Float[Tensor, "code"] = self._embedded(empty)[0]
+        """Placeholder code for frames without an active object."""
+        self._shapes: dict[tuple[int, str], ObjectShape] = {}
+
+    @torch.inference_mode()
+    def __call__(self, item: SceneObject) -> ObjectShape:
+        """Shape and codes of an object. Raises WearcapError for a class that the model was not built for."""
+        key = (id(item.mesh), item.category)
+        if key in self._shapes:
+            return replace(self._shapes[key], name=item.name)
+        one_hot = self.features.class_code(item.category)
+        cloud = object_cloud(item.mesh)
+        middle = (cloud.max(0).values + cloud.min(0).values) / 2
+        both = torch.stack([cloud - middle, (cloud - middle) * torch.tensor(MIRROR)])
+        parts = [one_hot.expand(2, -1), torch.cat(bounds(both), -1)]
+        if self.encoder is not None and self.features.shape_size:
+            parts.append(self.encoder(both))
+        code, code_mirrored = self._embedded(torch.cat(parts, -1)).unbind(0)
+        made = item.name, item.category, item.mesh, middle, both[0].clone(), code, code_mirrored
+        self._shapes[key] = ObjectShape(*made, TriangleIndex.of(item.mesh))
+        return self._shapes[key]
+
+    @torch.no_grad()
+    def _embedded(self, codes: Float[Tensor, "object raw"]) -> Float[Tensor, "object code"]:
+        return (codes if self._embed is None else self._embed(codes)).clone()
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,9 +168,8 @@ def _tracked_points(
     truth = recording.motion
     found = [joint for joint in WRISTS if joint in recording.tracked]
     if len(found) == 1:
-        raise WearcapError(
-            f"only {found[0]} is tracked", where=recording.name, expected=f"`tracked` poses of {' and '.join(WRISTS)}"
-        )
+        expected = f"`tracked` poses of {' and '.join(WRISTS)}"
+        raise WearcapError(f"only {found[0]} is tracked", where=recording.name, expected=expected)
     if found:
         for joint in found:
             track = recording.tracked[joint]
@@ -113,11 +180,8 @@ def _tracked_points(
         truth = at_times(truth, times)
         poses += [truth.joint(joint) for joint in WRISTS]
     else:
-        raise WearcapError(
-            "this recording has no tracked wrists",
-            where=recording.name,
-            expected=f"`tracked` poses of {' and '.join(WRISTS)}, or a true motion",
-        )
+        expected = f"`tracked` poses of {' and '.join(WRISTS)}, or a true motion"
+        raise WearcapError("this recording has no tracked wrists", where=recording.name, expected=expected)
     R, t = torch.stack([T.R.float() for T in poses], 1), torch.stack([T.t.float() for T in poses], 1)
     if not (R.isfinite().all() and t.isfinite().all()):
         raise WearcapError("poses of wrists that are NaN or infinite", where=recording.name, expected="finite poses")
@@ -125,12 +189,9 @@ def _tracked_points(
     apart = (heading.mT @ (t[:, 1] - t[:, 2])[..., None])[:, 1, 0].median().item()
     # Wrists of a ground-truth motion cannot be swapped trackers: the wearer crosses the arms.
     if found and apart < -SWAPPED_M:
-        raise WearcapError(
-            f"the left wrist is {-100 * apart:.0f} cm to the right of the right one, by the median",
-            where=recording.name,
-            expected="the left wrist on the left",
-            fix="Swap the two trackers.",
-        )
+        what = f"the left wrist is {-100 * apart:.0f} cm to the right of the right one, by the median"
+        expected = "the left wrist on the left"
+        raise WearcapError(what, where=recording.name, expected=expected, fix="Swap the two trackers.")
     return R, t
 
 
@@ -153,21 +214,15 @@ def _require_times(times: Float64[Tensor, "frame"], path: HeadPath, what: str, w
         )
     late, early = times[0] - path.timestamps[0], path.timestamps[-1] - times[-1]
     if max(late.item(), early.item()) > 0.5:
-        raise WearcapError(
-            f"{what} from {times[0]:.2f} to {times[-1]:.2f} s",
-            where=where,
-            expected=f"all of {path.timestamps[0]:.2f} to {path.timestamps[-1]:.2f} s, as the head",
-        )
+        expected = f"all of {path.timestamps[0]:.2f} to {path.timestamps[-1]:.2f} s, as the head"
+        raise WearcapError(f"{what} from {times[0]:.2f} to {times[-1]:.2f} s", where=where, expected=expected)
 
 
 def _objects(scenario: Scenario, names: list[str], reader: ObjectReader) -> list[ObjectShape]:
     if names and scenario.environment is None:
-        raise WearcapError(
-            f"acts of {names[0]!r}, but no objects",
-            where=scenario.recording.name,
-            expected="an environment with the objects' meshes",
-            fix="Give environment=FILE.",
-        )
+        what = f"acts of {names[0]!r}, but no objects"
+        expected = "an environment with the objects' meshes"
+        raise WearcapError(what, where=scenario.recording.name, expected=expected, fix="Give environment=FILE.")
     shapes = []
     for name in names:
         assert scenario.environment is not None
@@ -193,18 +248,14 @@ def _observed(
     if seen.motion is not None:
         at = _frames(seen.motion.timestamps, path, where)
         if len(seen.motion.skeleton) != joints:
-            raise WearcapError(
-                f"an observed body of {len(seen.motion.skeleton)} joints",
-                where=where,
-                expected=f"{joints}, as the wearer has",
-            )
+            what = f"an observed body of {len(seen.motion.skeleton)} joints"
+            raise WearcapError(what, where=where, expected=f"{joints}, as the wearer has")
         R[at], root[at] = seen.motion.R_parent_joint.float(), seen.motion.t_world_root.float()
         is_observed[at, 0] = True
     for name, track in seen.object_motion.items():
         if name not in names:
-            raise WearcapError(
-                f"an observed object {name!r}", where=where, expected=f"one of {', '.join(names) or 'no objects'}"
-            )
+            expected = f"one of {', '.join(names) or 'no objects'}"
+            raise WearcapError(f"an observed object {name!r}", where=where, expected=expected)
         at, number = _frames(track.timestamps, path, where), names.index(name)
         mine = active[at] == number
         T = objects[number].centred(track.T_world_body)
@@ -220,11 +271,8 @@ def _observed(
     if seen.contact is not None and seen.contact_times is not None:
         at = _frames(seen.contact_times, path, where)
         if seen.contact.shape[1] != CONTACTS:
-            raise WearcapError(
-                f"observed contacts of {seen.contact.shape[1]} points",
-                where=where,
-                expected=f"{BODY_POINTS} of the body and {len(FOOT_PATCHES)} of the feet",
-            )
+            expected = f"{BODY_POINTS} of the body and {len(FOOT_PATCHES)} of the feet"
+            raise WearcapError(f"observed contacts of {seen.contact.shape[1]} points", where=where, expected=expected)
         contact[at] = seen.contact.float()
         is_observed[at, 2] = True
     for value in (R, root, R_object, t_object, contact):
@@ -239,9 +287,6 @@ def _frames(times: Float64[Tensor, "frame"], path: HeadPath, where: str) -> Tens
     step = (clock[1] - clock[0]).item() if len(clock) > 1 else 0.0
     beyond = ~((times >= clock[0] - step) & (times <= clock[-1] + step))
     if beyond.any():
-        raise WearcapError(
-            f"an observation at {times[beyond][0].item():.2f} s, beyond the recording",
-            where=where,
-            expected=f"times from {clock[0].item():.2f} to {clock[-1].item():.2f} s",
-        )
+        what = f"an observation at {times[beyond][0].item():.2f} s, beyond the recording"
+        raise WearcapError(what, where=where, expected=f"times from {clock[0].item():.2f} to {clock[-1].item():.2f} s")
     return ((times - clock[0]) / max(step, 1e-9)).round().long().clamp(0, len(clock) - 1)

@@ -11,59 +11,30 @@ from scipy.spatial import KDTree
 from wearcap.body.anny_body import anny_body
 from wearcap.body.contact_points import BODY_POINTS, contact_points
 from wearcap.body.skeleton import Skeleton
-from wearcap.diffusion.conveyor import Denoise, RollingSchedule
-from wearcap.diffusion.schedule import Schedule
+from wearcap.diffusion.conveyor import Correct, Denoise, RollingSchedule
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.environment import read_environment
 from wearcap.metrics.table import Row
-from wearcap.models.point_encoder import PointNeXt
 from wearcap.recording import Motion, Recording
 from wearcap.recording.acts import Act, true_acts
 from wearcap.runtime.graphs import chosen
 from wearcap.runtime.system import CaptureInput, LearnedSystem
 from wearcap.scene.environment import Environment
-from wearcap.systems.echo.features import EchoFeatures
-from wearcap.systems.echo.guidance import Guidance, GuidedScene
-from wearcap.systems.echo.model import EchoDenoiser, EchoRunner
-from wearcap.systems.echo.objects import ObjectReader, ObjectShape
-from wearcap.systems.echo.observations import BatchItem, Scenario, batch_item_of
-from wearcap.systems.echo.queue import Conditioning, Correct, EchoQueue, Outputs, Rewindow
+from wearcap.systems.echo.contacts import ContactUse, GuidedScene, with_static_objects
+from wearcap.systems.echo.model import EchoRunner
+from wearcap.systems.echo.observations import BatchItem, ObjectReader, ObjectShape, Scenario, batch_item_of
+from wearcap.systems.echo.queue import Conditioning, EchoModel, EchoQueue, Outputs, Rewindow
 from wearcap.systems.echo.scores import Truth, score_echo, truth_of
-from wearcap.systems.echo.static_objects import with_static_objects
 from wearcap.tracking.anchor import anchored_to_head
-from wearcap.tracking.head_path import HeadPath, head_path
-
-SETTINGS = [
-    "context",
-    "per_frame",
-    "spacing",
-    "eta",
-    "step",
-    "rewindow",
-    "anchor",
-    "static_threshold",
-    "placed",
-    "guidance",
-    "acts",
-]
-"""Settings that a capture depends on."""
+from wearcap.tracking.head_path import head_path
 
 
-@dataclass
-class Echo(LearnedSystem):
-    """Captures recordings with a rolling schedule over frames (the conveyor); batching does not change results."""
+@dataclass(frozen=True)
+class Sampling:
+    """How frames are denoised; see `diffusion.conveyor.RollingSchedule`."""
 
-    net: EchoDenoiser
-    features: EchoFeatures
-    schedule: Schedule
-    skeleton: Skeleton
-    """Skeleton for recordings without one."""
-    encoder: PointNeXt | None = None
-    """Object encoder; None: objects are described by class and extents alone."""
-    contacts: bool = True
-    """Whether the network was trained on contacts."""
     context: int = 4
     """Clean frames kept before the ramp: a pose is final once window - context - 1 more frames have arrived."""
     per_frame: int = 2
@@ -71,16 +42,19 @@ class Echo(LearnedSystem):
     spacing: float = 2.0
     eta: float = 0.0
     step: str = "posterior"
-    """See `diffusion.conveyor.RollingSchedule`."""
     rewindow: int | None = None
     """Frames by which overlapping windows advance that are each denoised from scratch; None: a conveyor."""
+
+
+@dataclass
+class Echo(LearnedSystem):
+    """Captures recordings with a rolling schedule over frames (the conveyor); batching does not change results."""
+
+    model: EchoModel
+    sampling: Sampling = Sampling()
+    contacts: ContactUse = field(default_factory=ContactUse)
     anchor: bool = True
     """Whether the body is anchored to the measured head (ours) or keeps its sampled position (ECHO)."""
-    static_threshold: float | None = 0.7
-    """Objects stay static in frames whose largest contact probability is below this (ours); None: objects keep their
-    sampled poses (ECHO). Without effect if the network was trained without contacts."""
-    guidance: Guidance | None = None
-    """None: no guidance. Without effect if the network was trained without contacts."""
     acts: str | Sequence[Mapping[str, Any]] | Callable[[Motion, Environment], tuple[Act, ...]] = "truth"
     """Which object is active when: "truth", the recording's interactions; "none": the human alone; a list of
     {object, start_s, stop_s}; or a search."""
@@ -93,9 +67,6 @@ class Echo(LearnedSystem):
     precision: str = "float32"
     """Number format of the steps' matrix products (`runtime.graphs.PRECISIONS`)."""
     device: str = "cpu"
-    _runner: EchoRunner | None = field(default=None, init=False, repr=False, compare=False)
-    _environments: dict[Path, Environment] = field(default_factory=dict, init=False, repr=False, compare=False)
-    _reader: ObjectReader | None = field(default=None, init=False, repr=False, compare=False)
 
     name = "echo"
     experiment = "experiment=echo"
@@ -104,29 +75,31 @@ class Echo(LearnedSystem):
 
     def __post_init__(self):
         if isinstance(self.acts, str) and self.acts not in ("truth", "none"):
-            raise WearcapError(
-                f"unknown acts {self.acts!r}", expected="truth, none, or a list of {object, start_s, stop_s}"
-            )
+            expected = "truth, none, or a list of {object, start_s, stop_s}"
+            raise WearcapError(f"unknown acts {self.acts!r}", expected=expected)
         ramp, _ = self.rolling.ramp, self._listed_acts()
-        if self.rewindow is not None and not 0 < self.rewindow <= ramp:
-            raise WearcapError(
-                f"windows that advance by {self.rewindow} frames", expected=f"1 to {ramp}, the window less the context"
-            )
-        if self.rewindow is not None and self.step == "redraw":
-            raise WearcapError(
-                "step=redraw with windows that are denoised from scratch", expected="step=posterior, or rewindow=null"
-            )
+        rewindow = self.sampling.rewindow
+        if rewindow is not None and not 0 < rewindow <= ramp:
+            what = f"windows that advance by {rewindow} frames"
+            raise WearcapError(what, expected=f"1 to {ramp}, the window less the context")
+        if rewindow is not None and self.sampling.step == "redraw":
+            what = "step=redraw with windows that are denoised from scratch"
+            raise WearcapError(what, expected="step=posterior, or rewindow=null")
         chosen(self.runtime, self.precision, self.device)
+        self._runner: EchoRunner | None = None
+        self._environments: dict[Path, Environment] = {}
+        self._reader: ObjectReader | None = None
 
     @property
     def rolling(self) -> RollingSchedule:
         """The conveyor's rolling schedule."""
-        return RollingSchedule(self.net.window, self.context, self.per_frame, self.spacing, self.eta, self.step)
+        how = self.sampling
+        return RollingSchedule(self.model.net.window, how.context, how.per_frame, how.spacing, how.eta, how.step)
 
     @property
     def fps(self) -> float:
         """Frame rate of captures (Hz)."""
-        return self.features.fps
+        return self.model.features.fps
 
     @property
     def latency_s(self) -> float:
@@ -134,34 +107,29 @@ class Echo(LearnedSystem):
         return (self.rolling.ramp - 1) / self.fps
 
     @property
-    def static_below(self) -> float | None:
-        """`static_threshold`, or None for a network without contacts."""
-        return self.static_threshold if self.contacts else None
-
-    @property
-    def guided_by(self) -> Guidance | None:
-        """`guidance`, or None for a network without contacts."""
-        return self.guidance if self.contacts else None
+    def contact_use(self) -> ContactUse:
+        """`contacts`, or none of it for a network without contacts."""
+        return self.contacts if self.model.contacts else ContactUse(None, None)
 
     def prepare(self) -> None:
         """Move the network to its device and set up its runtime; exporting or compiling happens once."""
-        self.net.to(self.device).eval()
+        net = self.model.net.to(self.device).eval()
         if self._runner is None or self.runtime == "eager":
-            self._runner = EchoRunner(self.net, self.runtime, self.precision)
+            self._runner = EchoRunner(net, self.runtime, self.precision)
 
     def reader(self) -> ObjectReader:
         """A reader that turns objects into embedded conditions for the network, each once."""
         self.prepare()
-        return ObjectReader(self.features, self.encoder, lambda codes: self.net.object(codes.to(self.device)).cpu())
+        model = self.model
+        return ObjectReader(model.features, model.encoder, lambda codes: model.net.object(codes.to(self.device)).cpu())
 
     def motions(self, sources: Sequence[CaptureInput], seeds: Sequence[int]) -> list[Motion]:
-        """One motion per recording and seed, with the objects of the recordings' environments."""
-        once = {id(source): self.scenario_of(source) for source in sources}
-        return self.capture_scenarios([once[id(source)] for source in sources], seeds)
+        """One motion per recording and seed, with the objects of the recordings' environments.
 
-    def scenario_of(self, source: CaptureInput) -> Scenario:
-        """A recording of a data set with its active objects, according to `acts`. Raises WearcapError as `objects`."""
-        return self.scenario(source.recording, self.objects(source))
+        Raises WearcapError as `objects` and `capture_scenarios` do.
+        """
+        once = {id(source): self.scenario(source.recording, self.objects(source)) for source in sources}
+        return self.capture_scenarios([once[id(source)] for source in sources], seeds)
 
     def objects(self, source: CaptureInput) -> Environment | None:
         """The objects of a recording; each file is read once. Raises WearcapError for a file that cannot be read."""
@@ -216,36 +184,37 @@ class Echo(LearnedSystem):
         # 1. Conditioning: three tracked points at the model's rate and codes of the active objects, once for all seeds.
         reader, once = self.reader(), {id(scenario): scenario for scenario in scenarios}
         item_by = {
-            key: batch_item_of(scenario, head_path(scenario.recording, self.skeleton, self.fps), reader)
+            key: batch_item_of(scenario, head_path(scenario.recording, self.model.skeleton, self.fps), reader)
             for key, scenario in once.items()
         }
         items = [item_by[id(scenario)] for scenario in scenarios]
-        # 2. Sampling with the rolling schedule: frames enter as noise one by one and leave clean.
-        outputs = self._sampled(items, [scenario.recording for scenario in scenarios], seeds)
-        # 3. Untouched objects are made static, and the body is anchored to the measured head.
-        if (threshold := self.static_below) is not None:
-            outputs = [with_static_objects(item.conditioning, part, threshold) for item, part in zip(items, outputs)]
-        return [motion_of(item, part, self.anchor, self.settings()) for item, part in zip(items, outputs)]
-
-    def _sampled(
-        self, items: Sequence[BatchItem], recordings: Sequence[Recording], seeds: Sequence[int]
-    ) -> list[Outputs]:
-        """All frames of every batch item: its stretches are sampled side by side, gaps repeat the frame before them."""
+        # 2. Sampling with the rolling schedule: frames enter as noise one by one and leave clean. All stretches are
+        # sampled side by side.
         parts = [(k, *stretch) for k, item in enumerate(items) for stretch in item.path.stretches]
-        longest = max(stop - start for _, start, stop in parts)
         queue = self.queue(
             [items[k].path.skeleton for k, *_ in parts],
             [stretch_seed(seeds[k], start) for k, start, _ in parts],
-            [recordings[k].shape for k, *_ in parts],
+            [scenarios[k].recording.shape for k, *_ in parts],
             [items[k].objects for k, *_ in parts],
         )
-        conditioning = [_padded(items[k].conditioning, start, stop, longest) for k, start, stop in parts]
-        whole = Conditioning(*(torch.cat(fields) for fields in zip(*conditioning)))
-        together = queue.run(whole)
+        conditioning, frames = [], torch.arange(max(stop - start for _, start, stop in parts))
+        for k, start, stop in parts:  # the last frame repeated as not valid pads a stretch
+            padded, inside = items[k].conditioning.frames((start + frames).clamp_max(stop - 1)), frames < stop - start
+            is_observed = padded.is_observed & inside[:, None]
+            conditioning.append(padded._replace(valid=padded.valid & inside, is_observed=is_observed))
+        together = queue.run(Conditioning(*(torch.cat(fields) for fields in zip(*conditioning))))
         found: list[list[Outputs]] = [[] for _ in items]
         for row, (k, start, stop) in enumerate(parts):
             found[k].append(Outputs(*(field[row : row + 1, : stop - start] for field in together)))
-        return [_bridged(outputs, item.path) for outputs, item in zip(found, items)]
+        # Gaps between stretches repeat the frame before them.
+        outputs = [
+            Outputs(*(torch.cat(fields, 1)[:, item.path.held_frames] for fields in zip(*stretches)))
+            for stretches, item in zip(found, items)
+        ]
+        # 3. Untouched objects are made static, and the body is anchored to the measured head.
+        if (threshold := self.contact_use.static_threshold) is not None:
+            outputs = [with_static_objects(item.conditioning, part, threshold) for item, part in zip(items, outputs)]
+        return [motion_of(item, part, self.anchor, self.settings()) for item, part in zip(items, outputs)]
 
     def queue(
         self,
@@ -256,9 +225,9 @@ class Echo(LearnedSystem):
     ) -> EchoQueue:
         """An empty queue for a batch, with the bodies and objects that guidance needs, if any."""
         queue = EchoQueue(self, skeletons, seeds)
-        if self.rewindow is not None:
-            queue = Rewindow(self, skeletons, seeds, self.rewindow)
-        if self.guided_by is not None:
+        if self.sampling.rewindow is not None:
+            queue = Rewindow(self, skeletons, seeds, self.sampling.rewindow)
+        if self.contact_use.guidance is not None:
             queue.guided = pulled_by(skeletons, shapes, objects)
         return queue
 
@@ -267,23 +236,24 @@ class Echo(LearnedSystem):
 
         The condition is encoded once per call; the level-dependent part is cached between calls.
         """
-        condition = self.features.condition(conditioning.points, conditioning.floor_height, queue.size, frame)
+        condition = self.model.features.condition(conditioning.points, conditioning.floor_height, queue.size, frame)
         if self._runner is None:
             self.prepare()
         assert self._runner is not None
         denoise = self._runner.begin(condition, conditioning.object_code, conditioning.has_object, conditioning.valid)
-        guidance = self.guided_by
+        guidance = self.contact_use.guidance
         if guidance is None or queue.guided is None:
             return denoise, None
         surfaces, objects = queue.guided
-        scene = GuidedScene(self.net, self.features, conditioning, frame, surfaces, objects)
+        scene = GuidedScene(self.model.net, self.model.features, conditioning, frame, surfaces, objects)
         return denoise, lambda x0_hat: guidance.corrected(x0_hat, scene)
 
     def settings(self) -> dict[str, str]:
         """Settings that a capture depends on, for its provenance."""
-        acts = "search" if callable(self.acts) else self.acts
-        used = {"static_threshold": self.static_below, "guidance": self.guided_by, "acts": acts}
-        return {"pipeline": "echo"} | {name: str(used.get(name, getattr(self, name))) for name in SETTINGS}
+        acts, use = "search" if callable(self.acts) else self.acts, self.contact_use
+        own = {"anchor": self.anchor, "static_threshold": use.static_threshold, "placed": self.placed}
+        settings = {**vars(self.sampling), **own, "guidance": use.guidance, "acts": acts}
+        return {"pipeline": "echo"} | {name: str(value) for name, value in settings.items()}
 
 
 def motion_of(item: BatchItem, outputs: Outputs, anchor: bool, provenance: dict[str, str]) -> Motion:
@@ -335,17 +305,3 @@ def object_tracks(item: BatchItem, outputs: Outputs) -> dict[str, Trajectory]:
 def stretch_seed(seed: int, start: int) -> int:
     """Seed of the stretch that begins at frame `start`: every stretch of a recording has its own noise."""
     return seed + 1_000_003 * start
-
-
-def _padded(conditioning: Conditioning, start: int, stop: int, length: int) -> Conditioning:
-    """Frames start…stop-1, padded to `length` by repeating the last one as not valid."""
-    take = (start + torch.arange(length)).clamp_max(stop - 1)
-    inside = torch.arange(length) < stop - start
-    padded = conditioning.frames(take)
-    return padded._replace(valid=padded.valid & inside, is_observed=padded.is_observed & inside[:, None])
-
-
-def _bridged(outputs: list[Outputs], path: HeadPath) -> Outputs:
-    """Stretches joined into one; frames in the gaps between them repeat the frame before."""
-    whole, frames = Outputs(*(torch.cat(fields, 1) for fields in zip(*outputs))), path.held_frames
-    return Outputs(*(field[:, frames] for field in whole))

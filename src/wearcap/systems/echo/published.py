@@ -17,8 +17,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.models.point_encoder import PointNeXt
 from wearcap.recording import Motion
 from wearcap.systems.echo.features import OBJECT_SIZE, Body, EchoFeatures, ThreePoints
-from wearcap.systems.echo.objects import ObjectReader
-from wearcap.systems.echo.observations import BatchItem, Scenario, batch_item_of
+from wearcap.systems.echo.observations import BatchItem, ObjectReader, Scenario, batch_item_of
 from wearcap.systems.echo.pipeline import motion_of, object_tracks
 from wearcap.systems.echo.queue import Outputs
 from wearcap.systems.echo.training_windows import EchoContent
@@ -97,12 +96,11 @@ class NearestEcho:
 
     def capture_scenarios(self, scenarios: Sequence[Scenario], seeds: Sequence[int]) -> list[Motion]:
         """One motion per scenario; deterministic, seeds are ignored."""
-        reader = ObjectReader(self.features, self.encoder)
-        return [self._capture(scenario, reader) for scenario in scenarios]
+        reader, fps = ObjectReader(self.features, self.encoder), self.features.fps
+        paths = [head_path(scenario.recording, scenario.recording.skeleton, fps) for scenario in scenarios]
+        return [self._capture(batch_item_of(scenario, path, reader)) for scenario, path in zip(scenarios, paths)]
 
-    def _capture(self, scenario: Scenario, reader: ObjectReader) -> Motion:
-        recording = scenario.recording
-        item = batch_item_of(scenario, head_path(recording, recording.skeleton, self.features.fps), reader)
+    def _capture(self, item: BatchItem) -> Motion:
         conditioning, count = item.conditioning, len(item.path.timestamps)
         points = ThreePoints(*(part[0] for part in conditioning.points))
         size = body_size(item.path.skeleton)
@@ -170,9 +168,8 @@ class RigidWrist:
                 place[name], offset[name] = places.mean(0), offsets.mean(0)
                 turn[name] = rotation.mean_rotation(R)
         if not place:
-            raise WearcapError(
-                "these training recordings have no contact with objects", expected="recordings with objects in hands"
-            )
+            what = "these training recordings have no contact with objects"
+            raise WearcapError(what, expected="recordings with objects in hands")
         return cls(features, encoder, place, offset, turn)
 
     def attached(self, motion: Motion, item: BatchItem) -> Motion:

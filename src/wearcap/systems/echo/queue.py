@@ -1,7 +1,8 @@
 """ECHO's queue of frames (ECHO §3.3): conditioning enters frame by frame, final outputs leave frame by frame; and
 overlapping windows in place of the conveyor, denoised from scratch with inpainted overlap (ECHO Fig. 3, left)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -11,15 +12,13 @@ from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
 from wearcap.data.features import body_size
-from wearcap.diffusion.conveyor import Conveyor, Denoise, Observation, RollingSchedule
+from wearcap.diffusion.conveyor import Conveyor, Correct, Denoise, Observation, RollingSchedule
 from wearcap.diffusion.process import posterior_step, step_levels
 from wearcap.diffusion.schedule import Schedule
 from wearcap.geometry.rigid import Rigid
+from wearcap.models.point_encoder import PointNeXt
 from wearcap.systems.echo.features import Body, EchoFeatures, ThreePoints
 from wearcap.systems.echo.model import MODALITIES, EchoDenoiser
-
-Correct = Callable[[Float[Tensor, "batch frame feature"]], Float[Tensor, "batch frame feature"]]
-"""Corrects x̂0, as guidance does."""
 
 
 class Conditioning(NamedTuple):
@@ -69,14 +68,26 @@ class Outputs(NamedTuple):
     """64 body points on the object, then `FOOT_PATCHES` on the floor."""
 
 
-@runtime_checkable
-class Model(Protocol):
-    """The part of a pipeline that the queue uses."""
+@dataclass(frozen=True, eq=False)
+class EchoModel:
+    """A trained network, and what it was trained with."""
 
     net: EchoDenoiser
     features: EchoFeatures
     schedule: Schedule
-    contacts: bool
+    skeleton: Skeleton
+    """Skeleton for recordings without one."""
+    encoder: PointNeXt | None = None
+    """Object encoder; None: objects are described by class and extents alone."""
+    contacts: bool = True
+    """Whether the network was trained on contacts."""
+
+
+@runtime_checkable
+class _Pipeline(Protocol):
+    """The part of a pipeline that the queue uses."""
+
+    model: EchoModel
     device: str
 
     @property
@@ -90,12 +101,11 @@ class Model(Protocol):
 class EchoQueue:
     """Frames of several batch items, at most a window of them; each batch item's noise comes from its own seed."""
 
-    def __init__(self, pipeline: Model, skeletons: Sequence[Skeleton], seeds: Sequence[int]):
+    def __init__(self, pipeline: _Pipeline, skeletons: Sequence[Skeleton], seeds: Sequence[int]):
         self.pipeline = pipeline
         self.size = torch.stack([body_size(skeleton) for skeleton in skeletons])
-        net = pipeline.net
-        self.rolling = pipeline.rolling
-        self.conveyor = Conveyor(self.rolling, pipeline.schedule, net.sizes, len(seeds))
+        model, self.rolling = pipeline.model, pipeline.rolling
+        self.conveyor = Conveyor(self.rolling, model.schedule, model.net.sizes, len(seeds))
         self.conditioning: Conditioning | None = None
         self.guided: tuple[list, list] | None = None
         """Contact points of bodies and KD-trees of objects per batch item, for a pipeline with guidance."""
@@ -117,8 +127,8 @@ class EchoQueue:
         if self.conditioning is not None:
             fresh = Conditioning(*(torch.cat([a[:, int(full) :], b], 1) for a, b in zip(self.conditioning, fresh)))
         self.conditioning = fresh
-        frame = self.pipeline.features.canonical(self.conditioning.points)
-        if self.pipeline.features.moves and full:
+        frame = self.pipeline.model.features.canonical(self.conditioning.points)
+        if self.pipeline.model.features.moves and full:
             # The conveyor's frames are re-expressed in the window's new canonical frame.
             assert self._frame is not None
             change = frame.inverse() @ self._frame
@@ -154,20 +164,20 @@ class EchoQueue:
         return last._replace(valid=torch.zeros_like(last.valid), is_observed=torch.zeros_like(last.is_observed))
 
     def _noise(self, rows: int) -> Float[Tensor, "batch row feature"]:
-        width = sum(self.pipeline.net.sizes)
+        width = sum(self.pipeline.model.net.sizes)
         return torch.stack([torch.randn(rows, width, generator=random) for random in self._random])
 
     def _observation(self, conditioning: Conditioning, frame: Rigid) -> Observation:
         """Observed values in normalised space; absent modalities stay noise."""
-        observed = torch.zeros(*conditioning.valid.shape, sum(self.pipeline.net.sizes))
+        observed = torch.zeros(*conditioning.valid.shape, sum(self.pipeline.model.net.sizes))
         if conditioning.is_observed.any():
-            features = self.pipeline.features
+            features = self.pipeline.model.features
             body = features.encode_body(Body(conditioning.R_parent_joint, conditioning.t_world_root), frame)
             T_world_object = Rigid(conditioning.R_world_object, conditioning.t_world_object)
             raw = torch.cat([body, features.encode_object(T_world_object, frame), 2 * conditioning.contact - 1], -1)
-            observed = self.pipeline.net.motion_normalizer(raw.to(self.pipeline.device)).cpu()
+            observed = self.pipeline.model.net.motion_normalizer(raw.to(self.pipeline.device)).cpu()
         never = torch.zeros_like(conditioning.has_object)
-        absent = [never, ~conditioning.has_object, never if self.pipeline.contacts else ~never]
+        absent = [never, ~conditioning.has_object, never if self.pipeline.model.contacts else ~never]
         is_observed = conditioning.is_observed.clone()
         is_observed[..., 1] &= conditioning.has_object
         return Observation(observed, is_observed, torch.stack(absent, -1) & ~is_observed)
@@ -180,7 +190,7 @@ class EchoQueue:
         conditioning: Conditioning,
     ) -> Float[Tensor, "batch frame feature"]:
         """z' = A z + √ᾱ b at each modality's own level (exact: the channels of each vector share one scale)."""
-        net, alpha_bar = self.pipeline.net, self.pipeline.schedule(level).sqrt()
+        net, alpha_bar = self.pipeline.model.net, self.pipeline.model.schedule(level).sqrt()
         scale = net.motion_normalizer.scale.cpu()
         x = x.clone()
         for modality, at, present in ((0, 0, None), (1, net.sizes[0], conditioning.has_object[..., None])):
@@ -197,7 +207,7 @@ class EchoQueue:
 
     def _decoded(self, x: Float[Tensor, "batch frame feature"], part: slice, frame: Rigid) -> Outputs:
         """Some of a window's frames, converted from normalised space to world coordinates."""
-        net, features = self.pipeline.net, self.pipeline.features
+        net, features = self.pipeline.model.net, self.pipeline.model.features
         raw = net.motion_normalizer.inverse(x[:, part].to(self.pipeline.device)).cpu()
         human, scene_object, contact = raw.split(net.sizes, -1)
         at = frame if frame.t.shape[1] == 1 else Rigid(frame.R[:, part], frame.t[:, part])
@@ -212,7 +222,7 @@ class Rewindow(EchoQueue):
     With the conveyor's context and steps, a frame sees as much of the past and future as on the conveyor.
     """
 
-    def __init__(self, pipeline: Model, skeletons: Sequence, seeds: Sequence[int], stride: int = 10):
+    def __init__(self, pipeline: _Pipeline, skeletons: Sequence, seeds: Sequence[int], stride: int = 10):
         super().__init__(pipeline, skeletons, seeds)
         self.stride = stride
 
@@ -221,7 +231,7 @@ class Rewindow(EchoQueue):
         self, conditioning: Conditioning, before: Float[Tensor, "batch observed feature"]
     ) -> Float[Tensor, "batch frame feature"]:
         """A sampled window in normalised space, whose first frames are inpainted with `before`."""
-        frame = self.pipeline.features.canonical(conditioning.points)
+        frame = self.pipeline.model.features.canonical(conditioning.points)
         count, observed_frames = conditioning.valid.shape[1], before.shape[1]
         observation = self._observation(conditioning, frame)
         denoise, correct = self.pipeline.denoiser(self, conditioning, frame)
@@ -241,7 +251,9 @@ class Rewindow(EchoQueue):
             x0_hat = denoise(x, level)
             x0_hat = x0_hat if correct is None else correct(x0_hat)
             noise = self._noise(self.rolling.window)[:, :count]
-            x = posterior_step(x, x0_hat, wide(level), wide(then), noise, self.pipeline.schedule, self.rolling.eta)
+            x = posterior_step(
+                x, x0_hat, wide(level), wide(then), noise, self.pipeline.model.schedule, self.rolling.eta
+            )
         return x
 
     @torch.no_grad()
@@ -249,13 +261,13 @@ class Rewindow(EchoQueue):
         """Outputs of all frames of a batch."""
         context, count = self.rolling.context, whole.valid.shape[1]
         outputs: list[Outputs] = []
-        before, start = torch.zeros(len(whole.valid), 0, sum(self.pipeline.net.sizes)), 0
+        before, start = torch.zeros(len(whole.valid), 0, sum(self.pipeline.model.net.sizes)), 0
         while start < count:
             first = max(0, start - context)
             conditioning = whole.frames(slice(first, min(first + self.rolling.window, count)))
             before = before[:, before.shape[1] - (start - first) :]
-            frame = self.pipeline.features.canonical(conditioning.points)
-            if self._frame is not None and self.pipeline.features.moves:
+            frame = self.pipeline.model.features.canonical(conditioning.points)
+            if self._frame is not None and self.pipeline.model.features.moves:
                 change, observed = frame.inverse() @ self._frame, conditioning.frames(slice(0, start - first))
                 before = self._reexpressed(before, change, torch.zeros(1, 1, len(MODALITIES)), observed)
             self._frame = frame

@@ -1,4 +1,4 @@
-"""ECHO's tables: metrics of body, object and contacts, and sparse observations drawn from the ground truth."""
+"""ECHO's ground truth and tables: metrics of body, object and contacts, and sparse observations of the truth."""
 
 from dataclasses import dataclass
 
@@ -18,26 +18,11 @@ from wearcap.metrics.detection import detection_scores
 from wearcap.metrics.physics import jitter_m_s3
 from wearcap.metrics.position import mpjpe_cm
 from wearcap.metrics.table import Row
-from wearcap.recording import Motion
+from wearcap.recording import Motion, Recording
 from wearcap.recording.acts import active_at
 from wearcap.recording.timing import at_times
-from wearcap.systems.echo.features import CONTACTS
 from wearcap.systems.echo.model import MODALITIES
-from wearcap.systems.echo.objects import ObjectReader, ObjectShape, body_contact, foot_patches
-from wearcap.systems.echo.observations import Observed, Scenario
-
-MEASURES = (
-    "mpjpe_mm",
-    "mpjve_mm",
-    "foot_contact",
-    "true_foot_contact",
-    "v2v_cm",
-    "center_cm",
-    "rotation_deg",
-    "quaternion",
-    "touch_f1",
-    "jitter_m_s3",
-)
+from wearcap.systems.echo.observations import ObjectReader, ObjectShape, Observed, Scenario
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +75,37 @@ def truth_of(scenario: Scenario, timestamps: Float64[Tensor, "time"], reader: Ob
 def _poses_at(track: Trajectory, times: Float64[Tensor, "time"]) -> Rigid:
     inside = times.clamp(track.timestamps[0].item(), track.timestamps[-1].item())
     return resample(track, inside).T_world_body
+
+
+def body_contact(
+    points_world: Float[Tensor, "time point 3"], shape: ObjectShape, T_world_middle: Rigid, within_m: float
+) -> Tensor:
+    """Whether each contact point of the body is within τ_c (`within_m`) of the object's surface (ECHO §3.1).
+
+    Distances are to the exact surface, not to its vertices (ours), which may be further apart than τ_c.
+    """
+    T_object_world = shape.of_mesh(T_world_middle).inverse()
+    R, t = T_object_world.R.double(), T_object_world.t.double()
+    local = (R[:, None] @ points_world.double()[..., None])[..., 0] + t[:, None]
+    low, high = shape.mesh.vertices.min(0) - within_m, shape.mesh.vertices.max(0) + within_m
+    flat = local.flatten(0, 1).numpy()
+    near = np.flatnonzero(((flat >= low) & (flat <= high)).all(1))
+    touches = torch.zeros(len(flat), dtype=torch.bool)
+    if len(near):
+        distance, _ = shape.surface.nearest(np.ascontiguousarray(flat[near]))
+        touches[torch.from_numpy(near)] = torch.from_numpy(distance) <= within_m
+    return touches.unflatten(0, local.shape[:2])
+
+
+def foot_patches(recording: Recording) -> Bool[Tensor, "time patch"]:
+    """Recorded contact of `FOOT_PATCHES` with the floor. Raises WearcapError for a recording without it."""
+    track, motion = recording.contacts, recording.motion
+    assert motion is not None
+    if track is None or not set(FOOT_PATCHES) <= set(track.parts) or len(track.contact) != len(motion):
+        what = "no foot contacts beside the motion"
+        expected = f"contacts of {', '.join(FOOT_PATCHES)}"
+        raise WearcapError(what, where=recording.name, expected=expected, fix="Prepare the data set again.")
+    return track.contact[:, [track.parts.index(patch) for patch in FOOT_PATCHES]]
 
 
 def score_echo(motion: Motion, truth: Truth, name: str, seed: int) -> Row:
@@ -158,5 +174,4 @@ def observed_share(truth: Truth, modality: str, share: float, seed: int) -> Obse
             tracks[shape.name] = Trajectory(truth.motion.timestamps[rows], pose.R, pose.t)
         return Observed(object_motion=tracks)
     contact = torch.cat([truth.touch.float(), truth.foot_contact], 1)[take]
-    assert contact.shape[1] == CONTACTS == BODY_POINTS + len(FOOT_PATCHES)
     return Observed(contact_times=times, contact=contact)

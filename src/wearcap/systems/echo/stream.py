@@ -28,24 +28,23 @@ from wearcap.recording import motion as motion_types
 from wearcap.recording.acts import SAME_S
 from wearcap.recording.timing import joined
 from wearcap.runtime.graphs import undisturbed
-from wearcap.runtime.session import Session, classes_of
+from wearcap.runtime.session import HeadAndWristsStream, Session, classes_of
 from wearcap.scene.environment import Environment
 from wearcap.sensors import packets, samples
-from wearcap.sensors.packets import MAX_WAITING, Admitted, Clock, HeadInput
+from wearcap.sensors.packets import MAX_WAITING
 from wearcap.sensors.samples import ActiveObject, HeadSample, ObjectSample, WristSample
-from wearcap.systems.echo import queue, static_objects
+from wearcap.systems.echo import contacts, queue
+from wearcap.systems.echo.contacts import StaticObjects
 from wearcap.systems.echo.features import CONTACTS
 from wearcap.systems.echo.model import MODALITIES
-from wearcap.systems.echo.objects import ObjectShape
-from wearcap.systems.echo.observations import MAX_GAP_S, BatchItem, wrist_poses
+from wearcap.systems.echo.observations import MAX_GAP_S, BatchItem, ObjectShape, wrist_poses
 from wearcap.systems.echo.pipeline import Echo, motion_of, pulled_by, stretch_seed
 from wearcap.systems.echo.queue import Conditioning, EchoQueue, Outputs
-from wearcap.systems.echo.static_objects import StaticObjects
 from wearcap.tracking import floor, head_path
 from wearcap.tracking.floor import FloorTracker
-from wearcap.tracking.head_path import Chunk, HeadPath, HeadTrack
+from wearcap.tracking.head_path import Chunk, HeadPath
 
-_STATE = skeleton, motion_types, trajectory, rigid, head_path, packets, samples, floor, conveyor, queue, static_objects
+_STATE = skeleton, motion_types, trajectory, rigid, head_path, packets, samples, floor, conveyor, queue, contacts
 """Modules with the classes that a session's state consists of."""
 MAX_SEEN = 1000
 """Most object observations that are buffered; the oldest are dropped."""
@@ -66,33 +65,22 @@ class EchoWearer:
     standing head. A capture of the whole recording uses later frames, too."""
 
 
-class EchoStream:
-    """A streaming capture of one wearer and some objects.
-
-    Invalid packets (`sensors.packets`) are counted as `refused`. If the head device's clock is set back for good, the
-    capture restarts like a new session, keeping the active object; all other times refer to the new clock.
-    """
+class EchoStream(HeadAndWristsStream):
+    """A streaming capture of one wearer and some objects; the active object is kept when the clock is set back."""
 
     def __init__(self, pipeline: Echo, wearer: EchoWearer, environment: Environment | None = None, seed: int = 0):
         """Raises WearcapError for a pipeline without a conveyor."""
-        if pipeline.rewindow is not None:
-            raise WearcapError(f"a stream with rewindow={pipeline.rewindow}", expected="a conveyor: rewindow=null")
-        pipeline.prepare()
-        self.pipeline, self.wearer, self.seed = pipeline, wearer, seed
-        self.silent = 0
-        """Wrist poses that were missing, counted per frame and wrist."""
+        if (rewindow := pipeline.sampling.rewindow) is not None:
+            raise WearcapError(f"a stream with rewindow={rewindow}", expected="a conveyor: rewindow=null")
+        super().__init__(pipeline, pipeline.fps, 1)
+        self.wearer, self.seed = wearer, seed
         self._names: list[str] = []
         """Objects that were named so far, in order of their first use."""
         self._queue: EchoQueue | None = None
         self.bring(environment)
-        self._entry, self._track = HeadInput(), HeadTrack(pipeline.fps, 1)
-        self._wrists: dict[str, list[tuple[float, Tensor, Tensor]]] = {joint: [] for joint in WRISTS}
-        self._clocks = {joint: Clock(leads=False) for joint in WRISTS}
         self._acts: list[tuple[float, str | None]] = []
         self._seen: list[tuple[float, str, Rigid]] = []
-        self._finished: list[Motion] = []
-        """Final motions with times of a previous clock, not returned yet."""
-        self._begin()
+        self._restart()
 
     transient = ("_environment", "_reader", "_shapes")
 
@@ -106,100 +94,48 @@ class EchoStream:
 
     def _guide(self) -> None:
         """Give the queue the bodies and objects that guidance needs, if any."""
-        if self._queue is not None and self.pipeline.guided_by is not None:
+        if self._queue is not None and self.pipeline.contact_use.guidance is not None:
             shape, objects = dict(self.wearer.shape), list(self._shapes.values())
             self._queue.guided = pulled_by([self.wearer.skeleton], [shape], [objects])
 
-    def _begin(self) -> None:
-        """Restart the capture; wrist poses, object events and counts are kept."""
-        dropped, pipeline = self._track.dropped, self.pipeline
-        self._track = HeadTrack(pipeline.fps, 1)
-        self._track.dropped = dropped
-        self._chunks: list[Chunk] = []
+    def _restart(self, again: bool = False) -> None:
+        if again:
+            active = next((name for start, name in reversed(self._acts) if start <= self._track.newest), None)
+            self._acts = [] if active is None else [(-math.inf, active)]
+            self._seen = []
+        super()._restart(again)
         self._queue = None
         self._pending: list[tuple[float, Conditioning, Rigid]] = []
         """Time, conditioning and head pose of frames that were consumed but not output yet."""
-        self._floor = FloorTracker(self.wearer.skeleton.height_of("head"), pipeline.fps)
-        threshold = pipeline.static_below
+        self._floor = FloorTracker(self.wearer.skeleton.height_of("head"), self.pipeline.fps)
+        threshold = self.pipeline.contact_use.static_threshold
         self._static = None if threshold is None else StaticObjects(threshold)
-
-    @property
-    def dropped(self) -> int:
-        """Number of head poses that came too late, were duplicates, or were refused."""
-        return self._track.dropped + self._entry.dropped
-
-    @property
-    def refused(self) -> dict[str, int]:
-        """Number of refused packets by reason, such as "left_wrist: not a rotation"."""
-        return dict(self._entry.refused)
-
-    def head(self, timestamp: float, T_world_device: Rigid | None) -> None:
-        """Add a sample of the head device (times in s); None if tracking is lost."""
-        if self._entry.timely(timestamp):
-            self._take(self._entry.admit(float(timestamp), self._entry.pose(T_world_device)))
-
-    def _take(self, admitted: Admitted) -> None:
-        if admitted.begins:
-            if admitted.again:
-                if (motion := self._final(ended=True)) is not None:
-                    self._finished.append(motion)
-                active = next((name for start, name in reversed(self._acts) if start <= self._track.newest), None)
-                self._acts = [] if active is None else [(-math.inf, active)]
-                self._seen = []
-            self._begin()
-            for joint in self._wrists:
-                self._rejoin(joint, None if admitted.again else admitted.packets[0][0])
-        for time, pose in admitted.packets:
-            self._track.take(time, pose)
-
-    def _rejoin(self, joint: str, time: float | None) -> None:
-        """Keep the poses of a wrist that are on the clock that starts at `time`; None: no pose is."""
-        poses = self._wrists[joint]
-        kept = [] if time is None else poses[packets.connected([pose[0] for pose in poses], time)]
-        refused = self._clocks[joint].set(kept[-1][0] if kept else None)
-        self._refuse(joint, refused if time is None else refused + len(poses) - len(kept))
-        self._wrists[joint] = kept
-
-    def _refuse(self, stream: str, count: int) -> None:
-        if count:
-            self._entry.refuse(stream, packets.OFF_THE_CLOCK, count)
 
     def wrist(self, joint: str, timestamp: float, T_world_joint: Rigid) -> None:
         """Add a pose of a wrist joint; duplicates are ignored.
 
         Raises WearcapError for any other joint.
         """
-        if joint not in self._wrists:
+        if joint not in WRISTS:
             raise WearcapError(f"no tracked joint {joint!r}", expected=" or ".join(WRISTS))
         if fault := packets.time_fault(timestamp) or packets.pose_fault(T_world_joint):
-            self._entry.refuse(joint, fault)
+            self._head_input.refuse(joint, fault)
             return
-        leader = self._entry.clock.newest
-        admitted = self._clocks[joint].admit(float(timestamp), packets.owned_pose(T_world_joint), leader)
-        self._refuse(joint, admitted.refused)
-        if admitted.begins:
-            first = bisect_left(self._wrists[joint], admitted.packets[0][0], key=_time)
-            self._wrists[joint] = self._wrists[joint][: first if admitted.again else 0]
-        for time, T in admitted.packets:
-            poses = self._wrists[joint]
-            place = bisect_left(poses, time, key=_time)
-            if place == len(poses) or poses[place][0] != time:
-                poses.insert(place, (time, T.R, T.t))
-                del poses[:-MAX_WAITING]
+        self._wrists.add(joint, (float(timestamp), packets.owned(T_world_joint.R), packets.owned(T_world_joint.t)))
 
     def take(self, sample: Any) -> None:
         """Take in one sample of the head device, a wrist or an object, or the choice of the active object."""
         match sample:
             case HeadSample():
                 self.head(sample.timestamp, sample.T_world_device)
-            case WristSample() if sample.joint in self._wrists:
+            case WristSample() if sample.joint in WRISTS:
                 self.wrist(*sample)
             case ActiveObject():
                 self.activate(*sample)
             case ObjectSample():
                 self.see_object(*sample)
             case _:
-                self._entry.refuse("sample", packets.WRONG_TYPE)
+                self._head_input.refuse("sample", packets.WRONG_TYPE)
 
     def activate(self, name: str | None, timestamp: float) -> None:
         """Make an object the active one from `timestamp` (s) on; None: no object is active.
@@ -208,7 +144,7 @@ class EchoStream:
         class cannot be used.
         """
         if fault := packets.time_fault(timestamp):
-            self._entry.refuse("activate", fault)
+            self._head_input.refuse("activate", fault)
             return
         if name is not None:
             used_before = name in self._shapes
@@ -227,11 +163,11 @@ class EchoStream:
         Raises as `activate` does.
         """
         self._shape(name)
-        newest = self._entry.clock.newest
+        newest = self._head_input.clock.newest
         if fault := packets.time_fault(timestamp) or packets.pose_fault(T_world_object):
-            self._entry.refuse(name, fault)
+            self._head_input.refuse(name, fault)
         elif math.isfinite(newest) and abs(timestamp - newest) > packets.CONNECTED_S:
-            self._refuse(name, 1)
+            self._head_input.refuse(name, packets.OFF_THE_CLOCK)
         else:
             self._see(name, float(timestamp), packets.owned_pose(T_world_object))
 
@@ -252,16 +188,6 @@ class EchoStream:
             self._guide()
         return self._shapes[name]
 
-    def poses(self, ended: bool = False) -> Motion | None:
-        """Frames that became final since the last call, or None; `ended`: no more input will arrive.
-
-        After the head device's clock was set back, the frames before come first; call again for the new clock's.
-        """
-        if ended:
-            for time, pose in self._entry.end():
-                self._track.take(time, pose)
-        return self._finished.pop(0) if self._finished else self._final(ended)
-
     def _final(self, ended: bool) -> Motion | None:
         while (chunk := self._track.next(ended)) is not None:
             self._chunks.append(chunk)
@@ -275,9 +201,8 @@ class EchoStream:
 
     def _complete(self, chunk: Chunk) -> bool:
         """Whether the poses of both wrists at a frame have arrived, or count as lost."""
-        time, head = chunk.timestamps[-1].item(), self._track.newest
-        newest = [poses[-1][0] if poses else -math.inf for poses in self._wrists.values()]
-        return all(last >= time - 1e-6 or head > max(time, last) + MAX_GAP_S for last in newest)
+        time = chunk.timestamps[-1].item()
+        return self._wrists.arrived(time - 1e-6, time, self._track.newest, MAX_GAP_S)
 
     def _advance(self, chunk: Chunk) -> list[Motion]:
         motions: list[Motion] = []
@@ -363,7 +288,7 @@ class EchoStream:
         self._queue.conditioning = Conditioning(*(torch.cat(fields, 1) for fields in zip(*frames)))
 
     def _wrist_at(self, joint: str, time: float, T_world_head: Rigid) -> Rigid:
-        poses = self._wrists[joint]
+        poses = self._wrists.samples[joint]
         if not poses or poses[-1][0] < time - MAX_GAP_S:
             self.silent += 1
         if not poses:
@@ -376,8 +301,8 @@ class EchoStream:
         track = Trajectory(torch.tensor(times, dtype=torch.float64), torch.stack(R), torch.stack(t))
         pose = wrist_poses(track, torch.tensor([time], dtype=torch.float64))
         # Only the last second is needed, and one pose before it.
-        old = bisect_left(poses, time - 1.0, key=_time) - 1
-        self._wrists[joint] = poses[max(old, 0) :]
+        old = bisect_left(poses, time - 1.0, key=lambda pose: pose[0]) - 1
+        self._wrists.samples[joint] = poses[max(old, 0) :]
         return Rigid(pose.R.float(), pose.t.float())
 
     def _emit(self, outputs: Outputs | None) -> list[Motion]:
@@ -416,13 +341,12 @@ class EchoSession(Session):
 
     @classmethod
     def settings(cls, system: Echo) -> dict[str, Any]:
-        """The settings of a pipeline that a session's state depends on."""
-        return {**system.settings(), "window": system.net.window, "features": str(system.features)}
+        model = system.model
+        return {**system.settings(), "window": model.net.window, "features": str(model.features)}
 
     @classmethod
     def shared(cls, system: Echo) -> dict[str, Any]:
-        """Parts of the pipeline that a session's state refers to, by name."""
-        return super().shared(system) | {"schedule": system.schedule}
+        return super().shared(system) | {"schedule": system.model.schedule}
 
     @classmethod
     def load(cls, path: str | Path, system: Echo, environment: Environment | None = None) -> "EchoSession":
@@ -439,7 +363,3 @@ class EchoSession(Session):
 
 
 SESSION = EchoSession
-
-
-def _time(pose: tuple[float, Tensor, Tensor]) -> float:
-    return pose[0]

@@ -17,8 +17,9 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.point_encoder import PointNeXt
 from wearcap.systems.echo.features import CONTACTS, OBJECT_SIZE, Body, EchoFeatures
-from wearcap.systems.echo.model import EchoDenoiser
+from wearcap.systems.echo.model import MODALITIES, EchoDenoiser
 from wearcap.systems.echo.pipeline import Echo
+from wearcap.systems.echo.queue import EchoModel
 from wearcap.systems.echo.training_windows import EchoContent, EchoWindow
 from wearcap.training import losses
 from wearcap.training.base import OptimizerOf, SchedulerOf, Training
@@ -36,7 +37,6 @@ class EchoDiffusion(Training):
 
     system = Echo
     """The system that captures with the network."""
-    parts = ("net", "features", "schedule", "skeleton", "encoder", "contacts")
 
     def __init__(
         self,
@@ -67,13 +67,16 @@ class EchoDiffusion(Training):
         self.contacts = contacts
         self._feet = skeleton.indices("left_ankle", "left_toe", "right_ankle", "right_toe")
 
+    def pipeline_parts(self) -> dict[str, EchoModel]:
+        parts = self.net, self.features, self.schedule, self.skeleton, self.encoder, self.contacts
+        return {"model": EchoModel(*parts)}
+
     def set_statistics(self, dataset: Windows, limit: int = 1500) -> None:
         content = dataset.content
         assert isinstance(content, EchoContent)
         if content.features != self.features:
-            raise WearcapError(
-                "windows of other features than the model's", expected="equal data.features and model.features"
-            )
+            what = "windows of other features than the model's"
+            raise WearcapError(what, expected="equal data.features and model.features")
         rows: dict[str, list[Tensor]] = {"human": [], "object": [], "condition": []}
         for batch in drawn_batches(dataset, limit, 100):
             frame = self.features.canonical(batch.points)
@@ -134,25 +137,22 @@ class EchoDiffusion(Training):
         x0_hat = self.net(x_t, levels, encoded, batch.valid).float()
         # Half precision is too coarse for millimetres.
         with torch.autocast(x0_hat.device.type, enabled=False):
-            return self._compared(x0_hat, x0, batch, frame)
-
-    def _compared(self, x0_hat: Tensor, x0: Tensor, batch: EchoWindow, frame: Rigid) -> dict[str, Tensor]:
-        square = (x0_hat - x0).square() * self._counts(batch)
-        weight = batch.valid.float()
-        terms = {
-            name: losses.masked_mean(part.mean(-1), weight)
-            for name, part in zip(("human", "object", "contact"), square.split(self.net.sizes, -1))
-        }
-        if not self.contacts:
-            terms.pop("contact")
-        outputs = self.net.motion_normalizer.inverse(x0_hat)
-        terms["object_vertices"] = self.object_vertices(outputs, batch, frame)
-        body = self.features.decode_body(outputs[..., : self.net.sizes[0]], frame)
-        predicted, true = self._joints(body, batch), self._joints(batch.body, batch)
-        terms["joints"] = losses.joint_position(predicted, true, weight)
-        terms["velocity"] = losses.joint_velocity(predicted, true, weight, self.features.fps)
-        feet = predicted[:, :, self._feet].unflatten(2, (4, 1))
-        terms["skate"] = losses.foot_skate(feet, batch.contact[..., BODY_POINTS:], weight, self.features.fps)
+            square = (x0_hat - x0).square() * self._counts(batch)
+            weight = batch.valid.float()
+            terms = {
+                name: losses.masked_mean(part.mean(-1), weight)
+                for name, part in zip(MODALITIES, square.split(self.net.sizes, -1))
+            }
+            if not self.contacts:
+                terms.pop("contact")
+            outputs = self.net.motion_normalizer.inverse(x0_hat)
+            terms["object_vertices"] = self.object_vertices(outputs, batch, frame)
+            body = self.features.decode_body(outputs[..., : self.net.sizes[0]], frame)
+            predicted, true = self._joints(body, batch), self._joints(batch.body, batch)
+            terms["joints"] = losses.joint_position(predicted, true, weight)
+            terms["velocity"] = losses.joint_velocity(predicted, true, weight, self.features.fps)
+            feet = predicted[:, :, self._feet].unflatten(2, (4, 1))
+            terms["skate"] = losses.foot_skate(feet, batch.contact[..., BODY_POINTS:], weight, self.features.fps)
         return terms
 
     def _joints(self, body: Body, batch: EchoWindow) -> Float[Tensor, "batch time joint 3"]:

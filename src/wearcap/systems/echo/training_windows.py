@@ -17,13 +17,15 @@ from wearcap.data.windows import Content, Windows
 from wearcap.diffusion.levels import DRAWS
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.environment import read_environment
-from wearcap.models.point_encoder import PointNeXt, load_object_encoder
+from wearcap.models.checkpoint import load_network
+from wearcap.models.point_encoder import PointNeXt
 from wearcap.recording.acts import NO_OBJECT, active_at, true_acts
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
 from wearcap.scene.environment import Environment
 from wearcap.systems.echo.features import CONTACTS, EXTENTS, OBJECT_SIZE, POINTS, Body, EchoFeatures, ThreePoints
-from wearcap.systems.echo.objects import ObjectReader, ObjectShape, body_contact, foot_patches, object_poses
+from wearcap.systems.echo.observations import ObjectReader, ObjectShape
+from wearcap.systems.echo.scores import body_contact, foot_patches
 
 MIN_FRAMES = 6
 """Length of the shortest training window (frames)."""
@@ -50,7 +52,8 @@ class EchoWindow(NamedTuple):
     t_world_object: Float[Tensor, "*batch time 3"]
     object_mean: Float[Tensor, "*batch time 3"]
     object_spread: Float[Tensor, "*batch time 3 3"]
-    """Mean (m) and second moment (m²) of the object's points about its centre (`ObjectShape`)."""
+    """Mean (m) of the object's points about its centre, and second moment (m²), which gives their mean squared
+    displacement by a rotation."""
     valid: Bool[Tensor, "*batch time"]
     """False for padding."""
     noise: Float[Tensor, "*batch time feature"]
@@ -126,7 +129,13 @@ class EchoTrack:
             rows = (active == number).nonzero()[:, 0]
             if not len(rows) or environment is None:
                 continue
-            T = object_poses(recording, environment, names[number], shape, take[rows])
+            # The motion and an object's trajectory share their clock; an object without one stays where it was.
+            track, still = recording.object_motion.get(names[number]), environment.by_name(names[number]).T_world_object
+            if track is None:
+                T = Rigid(still.R.expand(len(rows), 3, 3), still.t.expand(len(rows), 3))
+            else:
+                T = track.T_world_body[take[rows]]
+            T = shape.centred(T)
             R[rows], t[rows] = T.R, T.t
             skin = surface.vertices(body[take[rows]])
             contact[rows, : CONTACTS - len(FOOT_PATCHES)] = body_contact(skin, shape, T, within_m).float()
@@ -155,10 +164,12 @@ class EchoContent(Content):
         """`encoder` is a checkpoint of experiment=object_encoder, or another PointNeXt; None: no shape feature.
 
         A body point is in contact within `within_m` of the object's surface. With `objects` False all recordings are of
-        humans alone.
+        humans alone. Raises WearcapError when the checkpoint is missing, damaged or another network's.
         """
         self.features, self.within_m, self.objects = features, within_m, objects
-        self.encoder = load_object_encoder(encoder) if isinstance(encoder, str) else encoder
+        if isinstance(encoder, str):
+            encoder = load_network(encoder, PointNeXt, "object_encoder", part="net.encoder").requires_grad_(False)
+        self.encoder = encoder
         self._reader = ObjectReader(features, self.encoder)
 
     def min_frames(self, window: int, stretch: float) -> int:
@@ -199,7 +210,10 @@ class EchoContent(Content):
         """
         active = track.active[cut.frames]
         nothing = (torch.zeros(self.features.object_condition_size), torch.zeros(3), torch.zeros(3, 3))
-        shapes = [(s.code_mirrored if window.mirrored else s.code, s.mean, s.spread) for s in track.objects]
+        shapes = [
+            (s.code_mirrored if window.mirrored else s.code, s.cloud.mean(0), s.cloud.mT @ s.cloud / len(s.cloud))
+            for s in track.objects
+        ]
         code, mean, spread = (torch.stack(rows)[active] for rows in zip(*shapes, nothing))
         if window.mirrored:
             flip = torch.tensor(MIRROR)

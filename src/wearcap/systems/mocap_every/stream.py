@@ -6,7 +6,6 @@ the same. Beyond the lookahead, a stream's latency includes the three future fra
 
 import math
 import sys
-from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -23,11 +22,11 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.recording import ImuStream, Motion
 from wearcap.recording import motion as motion_types
 from wearcap.recording.timing import joined
-from wearcap.runtime.session import Session, classes_of
+from wearcap.runtime.session import HeadAndWristsStream, Session, classes_of
 from wearcap.scene import floor as floor_types
 from wearcap.sensors import packets
 from wearcap.sensors import samples as sample_types
-from wearcap.sensors.packets import MAX_WAITING, Admitted, Clock, HeadInput
+from wearcap.sensors.packets import Admitted
 from wearcap.sensors.samples import HeadSample, WatchSample
 from wearcap.sensors.watches import FILTER, MAX_GAP_S, filtered
 from wearcap.systems.mocap_every import features, windows
@@ -36,7 +35,7 @@ from wearcap.systems.mocap_every.pipeline import MocapEvery
 from wearcap.systems.mocap_every.windows import EstimatorWindows, FinalPoses
 from wearcap.tracking import head_path
 from wearcap.tracking.anchor import anchored_to_head
-from wearcap.tracking.head_path import Chunk, HeadTrack
+from wearcap.tracking.head_path import Chunk
 
 _STATE = skeleton, motion_types, rigid, head_path, packets, sample_types, floor_types, features, windows
 """Modules with the classes that a session's state consists of."""
@@ -57,34 +56,20 @@ class Wearing:
     """Initial floor height (the paper's h_0); None: the first head height minus the standing head height."""
 
 
-class MocapEveryStream:
+class MocapEveryStream(HeadAndWristsStream):
     """A streaming capture of one wearer.
 
     Frames are processed once both watches have delivered the samples that they need. A watch without samples for longer
-    than `watches.MAX_GAP_S` is assumed static (last orientation, no acceleration) and counted in `silent`. Invalid
-    packets (`sensors.packets`) are counted in `refused`. When the camera's clock jumps back for good, the capture
-    restarts as in a new session; the watches share that clock.
+    than `watches.MAX_GAP_S` is assumed static (last orientation, no acceleration) and counted in `silent`.
     """
 
     def __init__(self, pipeline: MocapEvery, wearing: Wearing):
-        pipeline.prepare()
-        self.pipeline, self.wearing = pipeline, wearing
-        self.silent = 0
-        """Number of frames without samples of a watch (counted per watch)."""
-        self._head_input = HeadInput()
-        self._track = HeadTrack(pipeline.fps, pipeline.stride)
-        self._samples: dict[str, list[WatchSample]] = {joint: [] for joint in WRISTS}
-        self._clocks = {joint: Clock(leads=False) for joint in WRISTS}
-        self._finished: list[Motion] = []
-        """Motions from before the clock jumped back that were not returned yet."""
+        super().__init__(pipeline, pipeline.fps, pipeline.stride)
+        self.wearing = wearing
         self._restart()
 
-    def _restart(self) -> None:
-        """Restart the capture; watch samples and counters are kept."""
-        dropped = self._track.dropped
-        self._track = HeadTrack(self.pipeline.fps, self.pipeline.stride)
-        self._track.dropped = dropped
-        self._chunks: list[Chunk] = []
+    def _restart(self, again: bool = False) -> None:
+        super()._restart(again)
         self._windows: EstimatorWindows | None = None
         self._begin_s = 0.0
         self._points: list[Tensor] = []
@@ -92,56 +77,18 @@ class MocapEveryStream:
         self._heads = Rigid(torch.zeros(0, 3, 3), torch.zeros(0, 3))
         """Head poses of frames that were consumed but not returned yet."""
 
-    @property
-    def dropped(self) -> int:
-        """Number of head poses that came too late, twice, or were refused."""
-        return self._track.dropped + self._head_input.dropped
-
-    @property
-    def refused(self) -> dict[str, int]:
-        """Number of refused packets, or parts of packets, by reason such as "left_wrist: out of range"."""
-        return dict(self._head_input.refused)
-
-    def head(
-        self, timestamp: float, T_world_device: Rigid | None, points_world: Float[Tensor, "point 3"] | None = None
-    ) -> None:
-        """Take in one time step of the camera: its pose (None while tracking is lost) and new points."""
-        if self._head_input.timely(timestamp):
-            packet = self._head_input.pose(T_world_device), self._head_input.points(points_world)
-            self._take(self._head_input.admit(float(timestamp), packet))
-
     def _take(self, admitted: Admitted) -> None:
-        if admitted.begins:
-            if admitted.again and (motion := self._final(ended=True)) is not None:
-                self._finished.append(motion)
-            self._restart()
-            for joint in self._samples:
-                self._rejoin(joint, None if admitted.again else admitted.packets[0][0])
-        for time, (pose, points) in admitted.packets:
-            self._track.take(time, pose)
-            if points is not None and len(points):
-                self._points.append(points)
+        super()._take(admitted)
+        self._points += [points for _, (_, points) in admitted.packets if points is not None and len(points)]
         if len(self._points) > 1000:
             self._points = [torch.cat(self._points)[-MAX_POINTS:]]
-
-    def _rejoin(self, joint: str, time: float | None) -> None:
-        """Keep the samples of a watch that belong to the clock starting at a time (s); None: drop all of them."""
-        samples = self._samples[joint]
-        kept = [] if time is None else samples[packets.connected([sample.timestamp for sample in samples], time)]
-        refused = self._clocks[joint].set(kept[-1].timestamp if kept else None)
-        self._refuse(joint, refused if time is None else refused + len(samples) - len(kept))
-        self._samples[joint] = kept
-
-    def _refuse(self, joint: str, count: int) -> None:
-        if count:
-            self._head_input.refuse(joint, packets.OFF_THE_CLOCK, count)
 
     def take(self, sample: Any) -> None:
         """Take in one sample of the head camera or of a watch."""
         match sample:
             case HeadSample():
                 self.head(sample.timestamp, sample.T_world_device, sample.points_world)
-            case WatchSample() if sample.joint in self._samples:
+            case WatchSample() if sample.joint in WRISTS:
                 self.watch(sample.joint, [sample])
             case _:
                 self._head_input.refuse("sample", packets.WRONG_TYPE)
@@ -151,9 +98,8 @@ class MocapEveryStream:
 
         Raises WearcapError for joints other than the wrists.
         """
-        if joint not in self._samples:
+        if joint not in WRISTS:
             raise WearcapError(f"no watch on {joint!r}", expected=" or ".join(WRISTS))
-        clock = self._clocks[joint]
         for sample in samples:
             fault = packets.WRONG_TYPE
             if isinstance(sample, WatchSample):
@@ -162,31 +108,8 @@ class MocapEveryStream:
             if fault:
                 self._head_input.refuse(joint, fault)
                 continue
-            sample = WatchSample(
-                float(sample.timestamp), packets.owned(sample.R_world_imu), packets.owned(sample.acc_world)
-            )
-            admitted = clock.admit(sample.timestamp, sample, self._head_input.clock.newest)
-            self._refuse(joint, admitted.refused)
-            if admitted.begins:
-                first = bisect_left(self._samples[joint], admitted.packets[0][0], key=_time)
-                self._samples[joint] = self._samples[joint][: first if admitted.again else 0]
-            for time, accepted in admitted.packets:
-                kept = self._samples[joint]
-                index = bisect_left(kept, time, key=_time)
-                if index == len(kept) or kept[index].timestamp != time:
-                    kept.insert(index, accepted)
-                    del kept[:-MAX_WAITING]
-
-    def poses(self, ended: bool = False) -> Motion | None:
-        """Frames that became final since the last call; `ended`: no more input will come.
-
-        After the camera's clock jumped back, the first call returns the frames before the jump and the next call those
-        after it.
-        """
-        if ended:
-            for time, (pose, _) in self._head_input.end():
-                self._track.take(time, pose)
-        return self._finished.pop(0) if self._finished else self._final(ended)
+            values = packets.owned(sample.R_world_imu), packets.owned(sample.acc_world)
+            self._wrists.add(joint, WatchSample(float(sample.timestamp), *values))
 
     def _final(self, ended: bool) -> Motion | None:
         while (chunk := self._track.next(ended)) is not None:
@@ -204,9 +127,7 @@ class MocapEveryStream:
         """Whether both watches have delivered all samples that a chunk needs, or are silent."""
         last = chunk.timestamps[-1].item()
         needed = last + (FILTER // 2 + 0.5) / self.pipeline.fps
-        newest = [samples[-1].timestamp if samples else -math.inf for samples in self._samples.values()]
-        head = self._track.newest
-        return all(time >= needed or head > max(time, last) + MAX_GAP_S for time in newest)
+        return self._wrists.arrived(needed, last, self._track.newest, MAX_GAP_S)
 
     @torch.inference_mode()
     def _advance(self, chunk: Chunk, end_s: float) -> list[Motion]:
@@ -243,7 +164,7 @@ class MocapEveryStream:
         frames = torch.arange(-(FILTER // 2), len(chunk.timestamps) + FILTER // 2, dtype=torch.float64)
         around = (chunk.timestamps[0] + step * frames).clamp(self._begin_s, end_s)
         streams = []
-        for joint, samples in self._samples.items():
+        for joint, samples in self._wrists.samples.items():
             if not samples or samples[-1].timestamp < chunk.timestamps[-1].item() - MAX_GAP_S:
                 self.silent += len(chunk.timestamps)
                 # A static watch with its last orientation, around the chunk.
@@ -262,8 +183,8 @@ class MocapEveryStream:
                 )
             )
             oldest_s = around[-FILTER].item() - 2 * step
-            kept = self._samples[joint]
-            self._samples[joint] = [s for s in kept if s.timestamp >= oldest_s] or kept[-1:]
+            kept = self._wrists.samples[joint]
+            self._wrists.samples[joint] = [s for s in kept if s.timestamp >= oldest_s] or kept[-1:]
         return filtered(streams, chunk.timestamps, around, step)
 
     def _to_motion(self, output: FinalPoses) -> list[Motion]:
@@ -291,12 +212,7 @@ class MocapEverySession(Session):
 
     @classmethod
     def settings(cls, system: MocapEvery) -> dict[str, Any]:
-        """The settings of a pipeline that a session's state depends on."""
         return {**system.settings(), "window": system.net.window, "fps": system.fps, "features": str(system.features)}
 
 
 SESSION = MocapEverySession
-
-
-def _time(sample: WatchSample) -> float:
-    return sample.timestamp
