@@ -31,7 +31,7 @@ def test_new_frames_continue_from_observed_ones_and_fade_into_the_prediction():
 def windows(hmd2, frames: int, stride: int):
     """The sampler of a recording, window after window."""
     recording = seeing_recording(frames)
-    path = head_path(recording, hmd2.skeleton, hmd2.fps)
+    path = head_path(recording, hmd2.model.skeleton, hmd2.model.fps)
     hmd2.prepare()
     conditions, sampler = hmd2.sense(recording, path), hmd2.sampler(path.skeleton, 0, 0)
     for start in range(0, frames, stride):

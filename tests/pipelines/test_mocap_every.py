@@ -128,7 +128,8 @@ def test_without_watches_those_of_the_true_motion_are_worn(recording):
 
 def test_three_tracked_points_need_a_truth(recording):
     pipeline = drawn_pipeline()
-    pipeline.features = WatchFeatures("heading", body=True, wrists="positions")
+    features = WatchFeatures("heading", body=True, wrists="positions")
+    pipeline.model = replace(pipeline.model, features=features)
     assert pipeline(recording).R_parent_joint.isfinite().all()
     with pytest.raises(WearcapError, match="no hand positions"):
         pipeline(replace(recording, motion=None))
@@ -138,8 +139,8 @@ def test_the_last_frames_estimator(recording):
     torch.manual_seed(0)
     pipeline = drawn_pipeline(stride=1, lookahead=0, floor="fixed")
     features = WatchFeatures(frame="world", absolute=False)
-    pipeline.features = features
-    pipeline.net = LastPoseEstimator(features.size, features.motion_size, WINDOW, 32, 1, 2, 32, 0.0, 2).eval()
+    net = LastPoseEstimator(features.size, features.motion_size, WINDOW, 32, 1, 2, 32, 0.0, 2).eval()
+    pipeline.model = replace(pipeline.model, net=net, features=features)
     assert len(pipeline(recording)) == len(recording.head.timestamps)
 
 

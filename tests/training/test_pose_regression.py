@@ -178,7 +178,7 @@ def test_the_other_experiments_take_a_step(experiment, data, tmp_path):
     pipeline = (
         ["pipeline=pose_regressor"]
         if experiment != "baseline/egoego_style"
-        else ["pipeline=baseline/egoego_style", "pipeline.steps=2", "pipeline.stride=50"]
+        else ["pipeline=baseline/egoego_style", "pipeline.sampling.steps=2", "pipeline.overlap.stride=50"]
     )
     evaluate.main(
         [

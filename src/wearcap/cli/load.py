@@ -17,7 +17,7 @@ def load(
 ) -> System:
     """The system that `wearcap capture pipeline=… checkpoint=…` runs; without a checkpoint, the shared one's network.
 
-    `overrides` are those of the command line ("pipeline.steps=20"). Raises WearcapError for an unknown pipeline or
+    `overrides` are those of the command line ("pipeline.sampling.steps=20"). Raises WearcapError for an unknown pipeline or
     setting, and for a checkpoint that the pipeline cannot use.
     """
     config = compose("capture", [f"pipeline={pipeline}", *overrides, "recording=none"])

@@ -102,7 +102,7 @@ class HMD2Session(Session):
             state.take(sample)
 
     def _require_embeddings(self, samples: Sequence[Sequence[HeadSample]]) -> None:
-        size = self.system.net.image_size
+        size = self.system.model.net.image_size
         for state, part in zip(self.streams, samples):
             for sample in part:
                 embedding = getattr(sample, "embedding", None)
@@ -113,7 +113,7 @@ class HMD2Session(Session):
                     return
                 raise WearcapError(
                     f"an embedding of {len(embedding)} features at {_time(sample)}",
-                    expected=f"{size} of {self.system.image_encoder!r}, which the network was trained on",
+                    expected=f"{size} of {self.system.model.image_encoder!r}, which the network was trained on",
                 )
 
     def _run(self, wearers: Sequence[int], ended: bool) -> list[Motion | None]:
@@ -150,15 +150,19 @@ class HMD2Session(Session):
     @classmethod
     def settings(cls, system: HMD2) -> dict[str, Any]:
         """The settings of a pipeline that a session's state depends on."""
-        net = system.net
+        net, sampling, overlap = system.model.net, system.sampling, system.overlap
         return {
             "window": net.window,
             "stride": system.advance,
-            **{name: getattr(system, name) for name in ("steps", "fps", "inpaint", "fade")},
+            "steps": sampling.steps,
+            "fps": system.model.fps,
+            "inpaint": overlap.inpaint,
+            "fade": overlap.fade,
             "lookahead": system.lookahead_frames,
-            **{name: getattr(system, name) for name in ("eta", "spacing")},
+            "eta": sampling.eta,
+            "spacing": sampling.spacing,
             **{name: getattr(net, name) for name in ("motion_size", "points_size", "image_size")},
-            "features": str(system.features),
+            "features": str(system.model.features),
         }
 
     def state(self) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from wearcap.errors import WearcapError
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import Conditions, MotionDenoiser
-from wearcap.systems.hmd2.pipeline import HMD2
+from wearcap.systems.hmd2.pipeline import HMD2, DiffusionModel
 from wearcap.systems.hmd2.training_windows import HeadContent, HeadWindow
 from wearcap.training import losses
 from wearcap.training.base import OptimizerOf, SchedulerOf, Training
@@ -36,7 +36,6 @@ class MotionDiffusion(Training):
 
     system = HMD2
     """The system that captures with the network."""
-    parts = ("net", "features", "schedule", "skeleton", "fps", "place_encoder", "image_encoder")
 
     def __init__(
         self,
@@ -74,6 +73,10 @@ class MotionDiffusion(Training):
         # Methods, since compiled modules would put every weight into checkpoints a second time.
         self._denoise = torch.compile(self.net.forward) if compile else self.net.forward
         self._encode = torch.compile(self.net.encode) if compile else self.net.encode
+
+    def pipeline_parts(self) -> dict[str, DiffusionModel]:
+        parts = self.features, self.schedule, self.skeleton, self.fps, self.place_encoder, self.image_encoder
+        return {"model": DiffusionModel(self.net, *parts)}
 
     def set_statistics(self, dataset: Windows) -> None:
         """Set normalisation from a training split. Raises WearcapError unless its windows have the model's inputs."""

@@ -51,17 +51,17 @@ class WearerState:
         self.door = HeadInput()
         self.finished: list[Motion] = []
         """Motions from before the clock was set back that were not returned yet."""
-        self.track = HeadTrack(pipeline.fps, pipeline.advance)
+        self.track = HeadTrack(pipeline.model.fps, pipeline.advance)
         self.begin()
 
     def begin(self) -> None:
         """Restart the capture; only the counts of dropped and refused packets are kept."""
         pipeline, dropped = self.pipeline, self.track.dropped
-        self.track = HeadTrack(pipeline.fps, pipeline.advance)
+        self.track = HeadTrack(pipeline.model.fps, pipeline.advance)
         self.track.dropped = dropped
-        grid = VoxelGrid() if pipeline.place_encoder is None else pipeline.place_encoder.grid
+        grid = VoxelGrid() if pipeline.model.place_encoder is None else pipeline.model.place_encoder.grid
         stature = self.wearer.skeleton.height_of("head")
-        self.places = Places(grid, stature, pipeline.fps, self.memory)
+        self.places = Places(grid, stature, pipeline.model.fps, self.memory)
         self.sampler: WindowSampler | None = None
         self.times = torch.zeros(0, dtype=torch.float64)
         """Timestamps of the frames that were sampled but not output yet."""
@@ -89,7 +89,7 @@ class WearerState:
         if not door.timely(sensed.timestamp):
             return Admitted([])
         time, points = float(sensed.timestamp), None
-        if self.pipeline.net.points_size and "points" in self.pipeline.use:
+        if self.pipeline.model.net.points_size and "points" in self.pipeline.use:
             points = door.points(sensed.points_world)
         parts = points, self._embedding(sensed.embedding), self._floor_height(sensed.floor_height)
         return door.admit(time, HeadSample(time, door.pose(sensed.T_world_device), *parts))
@@ -97,11 +97,11 @@ class WearerState:
     @property
     def shows_pictures(self) -> bool:
         """Whether image embeddings condition the model."""
-        return bool(self.pipeline.net.image_size) and "images" in self.pipeline.use
+        return bool(self.pipeline.model.net.image_size) and "images" in self.pipeline.use
 
     def _embedding(self, embedding: object) -> Float[Tensor, "feature"] | None:
         """A copy of the embedding; NaN if it is faulty, so that no image is used until the next valid one."""
-        size = self.pipeline.net.image_size
+        size = self.pipeline.model.net.image_size
         if embedding is None or not self.shows_pictures:
             return None
         fault = values_fault(embedding, (size,), MAX_FEATURE)
@@ -134,11 +134,11 @@ class WearerState:
 
     def frames(self, chunk: Chunk, T_world_head: Rigid) -> Frames:
         """Conditioning of a chunk, padded to the stride by its last frame, marked as not valid."""
-        net, times, count = self.pipeline.net, chunk.timestamps, len(chunk.timestamps)
+        net, times, count = self.pipeline.model.net, chunk.timestamps, len(chunk.timestamps)
         floor = self._floor(times, T_world_head.t)
         points, points_valid = torch.zeros(count, net.points_size), torch.zeros(count, dtype=torch.bool)
-        if self.places.mapped and self.pipeline.place_encoder is not None:
-            points = self.pipeline.place_encoder.encode(self.places.grids(chunk.T_world_device, times))
+        if self.places.mapped and self.pipeline.model.place_encoder is not None:
+            points = self.pipeline.model.place_encoder.encode(self.places.grids(chunk.T_world_device, times))
             points_valid = torch.ones(count, dtype=torch.bool)
         image, image_valid = torch.zeros(count, net.image_size), torch.zeros(count, dtype=torch.bool)
         if self.pictures:

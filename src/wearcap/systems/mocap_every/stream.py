@@ -73,7 +73,7 @@ class MocapEveryStream(WearerStream):
         self.silent = 0
         """Number of frames without samples of a watch (counted per watch)."""
         self._head_input = HeadInput()
-        self._track = HeadTrack(pipeline.fps, pipeline.stride)
+        self._track = HeadTrack(pipeline.model.fps, pipeline.stride)
         self._samples: dict[str, list[WatchSample]] = {joint: [] for joint in WRISTS}
         self._clocks = {joint: Clock(leads=False) for joint in WRISTS}
         self._finished: list[Motion] = []
@@ -83,7 +83,7 @@ class MocapEveryStream(WearerStream):
     def _restart(self) -> None:
         """Restart the capture; watch samples and counters are kept."""
         dropped = self._track.dropped
-        self._track = HeadTrack(self.pipeline.fps, self.pipeline.stride)
+        self._track = HeadTrack(self.pipeline.model.fps, self.pipeline.stride)
         self._track.dropped = dropped
         self._chunks: list[Chunk] = []
         self._windows: EstimatorWindows | None = None
@@ -204,7 +204,7 @@ class MocapEveryStream(WearerStream):
     def _complete(self, chunk: Chunk) -> bool:
         """Whether both watches have delivered all samples that a chunk needs, or are silent."""
         last = chunk.timestamps[-1].item()
-        needed = last + (FILTER // 2 + 0.5) / self.pipeline.fps
+        needed = last + (FILTER // 2 + 0.5) / self.pipeline.model.fps
         newest = [samples[-1].timestamp if samples else -math.inf for samples in self._samples.values()]
         head = self._track.newest
         return all(time >= needed or head > max(time, last) + MAX_GAP_S for time in newest)
@@ -240,7 +240,7 @@ class MocapEveryStream(WearerStream):
         self, chunk: Chunk, end_s: float
     ) -> tuple[Float[Tensor, "time wrist 3 3"], Float[Tensor, "time wrist 3"]]:
         """Wrist orientations and filtered accelerations of a chunk; the filter ignores times outside the stretch."""
-        step = 1 / self.pipeline.fps
+        step = 1 / self.pipeline.model.fps
         frames = torch.arange(-(FILTER // 2), len(chunk.timestamps) + FILTER // 2, dtype=torch.float64)
         around = (chunk.timestamps[0] + step * frames).clamp(self._begin_s, end_s)
         streams = []
@@ -293,7 +293,12 @@ class MocapEverySession(Session):
     @classmethod
     def settings(cls, system: MocapEvery) -> dict[str, Any]:
         """The settings of a pipeline that a session's state depends on."""
-        return {**system.settings(), "window": system.net.window, "fps": system.fps, "features": str(system.features)}
+        return {
+            **system.settings(),
+            "window": system.model.net.window,
+            "fps": system.model.fps,
+            "features": str(system.model.features),
+        }
 
 
 SESSION = MocapEverySession

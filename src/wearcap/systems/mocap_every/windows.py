@@ -45,7 +45,7 @@ class EstimatorWindows:
         self._pipeline, self._skeleton, self.floor = pipeline, skeleton, floor
         self._size = body_size(skeleton)[None]
         self._feet = skeleton.indices(*FOOT_JOINTS)
-        window = pipeline.net.window
+        window = pipeline.model.net.window
         position = torch.arange(1, window + 1, dtype=torch.float32)
         self._weight = torch.minimum(position, window + 1 - position).square()[:, None]
         self._sensed: Sensed | None = None
@@ -112,9 +112,9 @@ class EstimatorWindows:
         if pipeline.mirror_average:
             sensed = Sensed(*(torch.cat(both) for both in zip(sensed, sensed.mirrored())))
             floor, size = floor.expand(2, -1), size.expand(2, -1)
-        canonical = pipeline.features.canonical(sensed, floor)
-        estimated = pipeline.estimate(pipeline.features.encode(sensed, floor, size, canonical))
-        R, t = pipeline.features.decode_motion(estimated.motion.float(), sensed, canonical)
+        canonical = pipeline.model.features.canonical(sensed, floor)
+        estimated = pipeline.estimate(pipeline.model.features.encode(sensed, floor, size, canonical))
+        R, t = pipeline.model.features.decode_motion(estimated.motion.float(), sensed, canonical)
         contact = estimated.contact_logit.float().sigmoid()
         if pipeline.mirror_average:
             R = torch.stack([R[0], mirrored_rotations(R[1], skeleton)])
