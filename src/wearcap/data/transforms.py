@@ -7,6 +7,7 @@ speed. All random numbers are the sample's own `Draws`.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol, runtime_checkable
@@ -167,11 +168,8 @@ class TimeTransform(Protocol):
     def retimed(self, cut: Cut, random: Draws) -> Cut: ...
 
 
-@runtime_checkable
-class Transform(Protocol):
-    """Changes the values of a window."""
-
-    def __call__(self, window: Window, random: Draws) -> Window: ...
+Transform = Callable[[Window, Draws], Window]
+"""Changes the values of a window."""
 
 
 @dataclass(frozen=True)

@@ -67,12 +67,8 @@ def _first_seconds(recording: Recording, seconds: float) -> Recording:
     assert recording.motion is not None
     stop = int(torch.searchsorted(recording.head.timestamps, recording.head.timestamps[0] + seconds))
     head, contacts = recording.head, recording.contacts
-    head = replace(
-        head,
-        timestamps=head.timestamps[:stop],
-        R_world_device=head.R_world_device[:stop],
-        t_world_device=head.t_world_device[:stop],
-    )
+    streams = "timestamps", "R_world_device", "t_world_device"
+    head = replace(head, **{name: getattr(head, name)[:stop] for name in streams})
     if contacts is not None:
         contacts = replace(contacts, timestamps=contacts.timestamps[:stop], contact=contacts.contact[:stop])
     return replace(recording, head=head, motion=recording.motion.sliced(0, stop), contacts=contacts)

@@ -107,9 +107,8 @@ class HMD2(LearnedSystem):
         window, overlap = self.model.net.window, self.overlap
         advance = (3 * window // 4 if overlap.inpaint else window // 2) if overlap.stride is None else overlap.stride
         if not 0 < advance <= window:
-            raise WearcapError(
-                f"windows of {window} frames cannot advance by {advance}", expected=f"a stride from 1 to {window}"
-            )
+            what = f"windows of {window} frames cannot advance by {advance}"
+            raise WearcapError(what, expected=f"a stride from 1 to {window}")
         return advance
 
     @property
@@ -119,10 +118,8 @@ class HMD2(LearnedSystem):
         if lookahead_frames is None:
             lookahead_frames = 0 if self.overlap.inpaint else shared // 2
         if not 0 <= lookahead_frames <= shared:
-            raise WearcapError(
-                f"windows that share {shared} frames cannot look {lookahead_frames} ahead",
-                expected=f"a lookahead from 0 to {shared}",
-            )
+            what = f"windows that share {shared} frames cannot look {lookahead_frames} ahead"
+            raise WearcapError(what, expected=f"a lookahead from 0 to {shared}")
         return lookahead_frames
 
     def prepare(self) -> None:
@@ -153,10 +150,7 @@ class HMD2(LearnedSystem):
         # 4. windows of the diffusion model, every stretch of a path separately
         poses = self._windows(paths, frames, seeds)
         # 5. anchor the body to the measured head
-        return [
-            self.motion(path.timestamps, path.skeleton, path.T_world_head, predicted)
-            for path, predicted in zip(paths, poses)
-        ]
+        return [self.motion(p.timestamps, p.skeleton, p.T_world_head, predicted) for p, predicted in zip(paths, poses)]
 
     def sense(self, recording: Recording, path: HeadPath) -> Frames:
         """Steps 2 and 3: the conditioning of a whole recording, as a batch of one.
@@ -258,9 +252,8 @@ class HMD2(LearnedSystem):
             "lookahead": str(self.lookahead_frames),
         }
         contact = poses.foot_contact.repeat_interleave(2, -1) if self.model.features.contacts else None
-        motion = Motion(
-            timestamps, skeleton, poses.R_parent_joint, torch.zeros(len(timestamps), 3), contact, provenance=settings
-        )
+        root = torch.zeros(len(timestamps), 3)
+        motion = Motion(timestamps, skeleton, poses.R_parent_joint, root, contact, provenance=settings)
         return anchored_to_head(motion, T_world_head)
 
 

@@ -52,9 +52,6 @@ class Places:
 
     def restored(self) -> None:
         """Rebuild the map and the floor tracker's points after loading."""
-        self._map = VoxelMap(self.grid)
-        for part in self._new:
-            self._map.add(*part)
         self._begin([_joined(self._tracked)])
 
     def add(self, points_world: Float[Tensor, "point 3"], first_seen: float) -> None:
@@ -72,11 +69,8 @@ class Places:
         while self._new and (not kept or count + len(self._new[-1][0]) <= self.memory.max_points):
             kept.append(self._new.pop())
             count += len(kept[-1][0])
-        tracked = [_joined(self._tracked)]
-        self._map, self._new = VoxelMap(self.grid), kept[::-1]
-        for part in self._new:
-            self._map.add(*part)
-        self._begin(tracked)
+        self._new = kept[::-1]
+        self._begin([_joined(self._tracked)])
 
     def grids(self, T_world_device: Rigid, timestamps: Float64[Tensor, "time"]) -> Float[Tensor, "time x y z"]:
         """Voxel grids (m) around the device at each frame, of the points seen by then."""
@@ -115,17 +109,15 @@ class Places:
         points, seen = points[near], seen[near]
         if len(points) > self.memory.max_points // 2:
             points, seen = points[-(self.memory.max_points // 2) :], seen[-(self.memory.max_points // 2) :]
-        self._map = VoxelMap(self.grid)
-        for part in self._new:
-            self._map.add(*part)
         self._begin([(points, seen)])
 
     def _begin(self, tracked: list[tuple[Tensor, Tensor]]) -> None:
-        """Replace the floor tracker's points by these, and add them to the map."""
-        self._tracked = tracked
+        """Replace the floor tracker's points by these, and the map by one of these and the new ones."""
+        self._map, self._tracked = VoxelMap(self.grid), tracked
         self._floor.forget()
-        for points, seen in tracked:
+        for points, seen in [*self._new, *tracked]:
             self._map.add(points, seen)
+        for points, _ in tracked:
             self._floor.see(points)
 
 

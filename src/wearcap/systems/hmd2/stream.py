@@ -65,9 +65,8 @@ class HMD2Session(Session):
         of another length than the network's as long as none of the right length has arrived; later ones are refused.
         """
         if len(samples) != len(self.streams):
-            raise WearcapError(
-                f"samples of {len(samples)} wearers", expected=f"of {len(self.streams)}, as the session has"
-            )
+            expected = f"of {len(self.streams)}, as the session has"
+            raise WearcapError(f"samples of {len(samples)} wearers", expected=expected)
         if not self.embedded:
             self._require_embeddings(samples)
         for number, part in enumerate(samples):
@@ -111,8 +110,9 @@ class HMD2Session(Session):
                 if embedding.shape == (size,):
                     self.embedded = True
                     return
+                when = "an unknown time" if time_fault(sample.timestamp) else f"{sample.timestamp:.3f} s"
                 raise WearcapError(
-                    f"an embedding of {len(embedding)} features at {_time(sample)}",
+                    f"an embedding of {len(embedding)} features at {when}",
                     expected=f"{size} of {self.system.model.image_encoder!r}, which the network was trained on",
                 )
 
@@ -171,7 +171,3 @@ class HMD2Session(Session):
 
 
 SESSION = HMD2Session
-
-
-def _time(sample: HeadSample) -> str:
-    return "an unknown time" if time_fault(sample.timestamp) else f"{sample.timestamp:.3f} s"

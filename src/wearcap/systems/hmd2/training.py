@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 import torch
 from einops import rearrange
-from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wearcap.body.skeleton import FEET, Skeleton
@@ -123,14 +122,11 @@ class MotionDiffusion(Training):
         last = guess * (batch.chance[:, 2] < 0.5)[:, None, None]
         return self._denoise(x_t, level, encoded, batch.valid, last)
 
-    def _weight(self, valid: Bool[Tensor, "batch time"]) -> Float[Tensor, "batch time"]:
-        """Loss weight of each frame; 0 on padding."""
-        left = valid.sum(1, keepdim=True) - 1 - torch.arange(valid.shape[1], device=valid.device)
-        return valid * (1 + self.tail * torch.exp(-left.clamp_min(0) / _TAIL_FRAMES))
-
     def terms(self, batch: HeadWindow) -> dict[str, Tensor]:
         """Every loss term of a batch, unweighted."""
-        weight = self._weight(batch.valid)
+        valid = batch.valid  # padding weighs nothing
+        left = valid.sum(1, keepdim=True) - 1 - torch.arange(valid.shape[1], device=valid.device)
+        weight = valid * (1 + self.tail * torch.exp(-left.clamp_min(0) / _TAIL_FRAMES))
         motion = self.features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
         x0 = self.net.motion_normalizer(motion)
         x0_hat = self._predicted(batch, x0)

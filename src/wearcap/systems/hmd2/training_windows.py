@@ -100,12 +100,8 @@ class HeadContent(Content):
     def open(self, store: RecordingStore, name: str, every: int) -> _HeadTrack:
         file = open_recording(store.path_of(name))
         if file.length("head.timestamps") != file.length("motion.timestamps"):
-            raise WearcapError(
-                "head and motion have different lengths",
-                where=file.path,
-                expected="both on one clock",
-                fix="Prepare the recording again.",
-            )
+            what, fix = "head and motion have different lengths", "Prepare the recording again."
+            raise WearcapError(what, where=file.path, expected="both on one clock", fix=fix)
         recording = file.load()
         head, motion = recording.head, recording.motion
         assert head is not None
@@ -147,9 +143,8 @@ class HeadContent(Content):
     def item(self, track: _HeadTrack, cut: Cut, window: Window, random: Draws) -> HeadWindow:
         """Raises WearcapError where points were scaled, which codes do not follow."""
         if window.scale != 1 and self.surroundings.places is not None:
-            raise WearcapError(
-                "codes of points cannot be scaled", fix="Leave out transforms.scale, or the points (surroundings=head)."
-            )
+            fix = "Leave out transforms.scale, or the points (surroundings=head)."
+            raise WearcapError("codes of points cannot be scaled", fix=fix)
         start, stop = cut.bounds
         seen = self.surroundings.read(track.store, track.name, start, stop, window.mirrored, self.image_size)
         return HeadWindow(

@@ -135,7 +135,11 @@ class WearerState:
     def frames(self, chunk: Chunk, T_world_head: Rigid) -> Frames:
         """Conditioning of a chunk, padded to the stride by its last frame, marked as not valid."""
         net, times, count = self.pipeline.model.net, chunk.timestamps, len(chunk.timestamps)
-        floor = self._floor(times, T_world_head.t)
+        floor = self.places.floor(times, T_world_head.t)
+        if self.floors:  # measured heights take the place of tracked ones
+            measured, height = (torch.tensor(part, dtype=torch.float64) for part in zip(*self.floors))
+            self.floors = self.floors[_newest(measured, times[-1].item()) :]
+            floor = interpolate_clamped(measured, height.float(), times)
         points, points_valid = torch.zeros(count, net.points_size), torch.zeros(count, dtype=torch.bool)
         if self.places.mapped and self.pipeline.model.place_encoder is not None:
             points = self.pipeline.model.place_encoder.encode(self.places.grids(chunk.T_world_device, times))
@@ -153,14 +157,6 @@ class WearerState:
         number = torch.arange(self.pipeline.advance)
         frames = Frames(*(part[number.clamp_max(count - 1)][None] for part in fields))
         return frames._replace(valid=frames.valid & (number < count))
-
-    def _floor(self, times: Float64[Tensor, "time"], t_world_head: Float[Tensor, "time 3"]) -> Float[Tensor, "time"]:
-        tracked = self.places.floor(times, t_world_head)
-        if not self.floors:
-            return tracked
-        measured, height = (torch.tensor(part, dtype=torch.float64) for part in zip(*self.floors))
-        self.floors = self.floors[_newest(measured, times[-1].item()) :]
-        return interpolate_clamped(measured, height.float(), times)
 
     def finalize(self, lookahead_frames: int) -> list[Motion]:
         """Newly final poses, all but the last `lookahead_frames`, as a list of at most one motion."""

@@ -119,7 +119,8 @@ class MocapEvery(LearnedSystem):
         sensed = self._sensed(recording, path)
         # 2. end-effectors, contacts and poses, window by window; 3. floor height from the feet in contact
         output = [self._capture_stretch(recording, path, sensed, start, stop) for start, stop in path.stretches]
-        whole = _bridged(output, path)
+        frames = path.held_frames  # in the gaps between stretches the last pose goes on, at the interpolated head
+        whole = FinalPoses(*(torch.cat(part)[frames] for part in zip(*output)))
         poses = path.timestamps, path.skeleton, whole.R_parent_joint, whole.t_world_root
         contact_prob = repeat(whole.contact_prob, "time foot -> time (foot patch)", patch=2)
         motion = Motion(*poses, contact_prob, provenance=self.settings())
@@ -166,9 +167,8 @@ class MocapEvery(LearnedSystem):
     ) -> FinalPoses:
         """Run the sliding windows over the path's frames from `start` to `stop`."""
         if (track := recording.floor) is not None:  # the measured floor, the paper's h_0
-            initial_m = interpolate_clamped(track.timestamps, track.height, path.timestamps[start : start + 1])[
-                0
-            ].item()
+            begin = path.timestamps[start : start + 1]
+            initial_m = interpolate_clamped(track.timestamps, track.height, begin).item()
         else:
             initial_m = path.floor_height[start].item()
         floor, floor_height = self.follower(path.skeleton, initial_m), None
@@ -204,9 +204,3 @@ class MocapEvery(LearnedSystem):
     def settings(self) -> dict[str, str]:
         """Settings that the motion depends on, for its provenance."""
         return {"pipeline": "mocap_every"} | {name: str(getattr(self, name)) for name in SETTINGS}
-
-
-def _bridged(output: list[FinalPoses], path: HeadPath) -> FinalPoses:
-    """Concatenated stretches; frames in the gaps between them repeat the previous pose at the interpolated head."""
-    whole, repeated = FinalPoses(*(torch.cat(part) for part in zip(*output))), path.held_frames
-    return FinalPoses(*(part[repeated] for part in whole))

@@ -57,7 +57,7 @@ class EstimatorWindows:
 
     def advance(self, new: Sensed) -> FinalPoses:
         """Take in up to `stride` new frames and return the frames that are now final."""
-        window, count = self._pipeline.net.window, len(new.t_world_head)
+        window, count = self._pipeline.model.net.window, len(new.t_world_head)
         if self._sensed is None:
             # The window before the capture is padded with its first frame.
             self._sensed = Sensed(*(part[:1].expand(window, *part.shape[1:]) for part in new))
