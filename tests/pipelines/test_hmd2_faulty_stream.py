@@ -185,7 +185,7 @@ def test_what_waits_for_a_lost_head_is_bounded(hmd2, recording, monkeypatch):
         pushed(session, [[HeadSample(k / 60, None, torch.rand(100, 3), torch.zeros(IMAGE), 0.0)]])
     state = session.streams[0]
     assert len(state.pictures) == len(state.floors) == 30
-    assert len(state.places._map) == sum(len(points) for points, _ in state.places._new) <= 4000
+    assert len(state.places.map) == sum(len(points) for points, _ in state.places._new) <= 4000
 
 
 @pytest.mark.parametrize("seed", range(3))

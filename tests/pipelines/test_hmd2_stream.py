@@ -334,7 +334,7 @@ def test_points_beyond_the_memory_are_forgotten(pipeline):
         pushed(session, [[HeadSample(i / 60, Rigid(torch.eye(3), at), points)]])
     places = session.streams[0].places
     kept = torch.cat([points for points, _ in places._tracked + places._new])
-    assert len(kept) == len(places._map) <= 2000 + 1000
+    assert len(kept) == len(places.map) <= 2000 + 1000
     assert (kept - at)[:, :2].norm(dim=-1).min() < 1.0
 
 

@@ -113,13 +113,6 @@ class Surroundings:
     images: str | None = None
     """Name of the encoder whose embeddings are read from the recordings' cameras."""
 
-    def image_size(self, stores: list[RecordingStore]) -> int:
-        """Dimension of the embeddings in the data.
-
-        Raises WearcapError when no recording has embeddings of this encoder, or when their dimensions differ.
-        """
-        return 0 if self.images is None else embeddings_of(self.images, stores)[1]
-
     def read(self, store: RecordingStore, name: str, start: int, stop: int, mirrored: bool, image_size: int) -> Seen:
         """Frames start…stop-1 of the head stream; with `mirrored`, those of the surroundings mirrored left to right.
 

@@ -7,7 +7,6 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.errors import WearcapError
-from wearcap.geometry.rigid import Rigid
 from wearcap.scene.voxels import VoxelGrid, VoxelMap
 from wearcap.tracking.floor import LOOK_FRAMES, FloorTracker
 
@@ -40,7 +39,7 @@ class Places:
         self.grid, self.memory = grid, memory
         self.mapped = False
         """Whether any packet of points arrived, even an empty one."""
-        self._map, self._floor = VoxelMap(grid), FloorTracker(stature, fps)
+        self.map, self._floor = VoxelMap(grid), FloorTracker(stature, fps)
         self._tracked: list[tuple[Tensor, Tensor]] = []
         """Points and the times they were first seen, as far as the floor tracker has them."""
         self._new: list[tuple[Tensor, Tensor]] = []
@@ -48,7 +47,7 @@ class Places:
         self._center: Tensor | None = None
         """Head position at which distant points were dropped last (m)."""
 
-    transient = ("_map",)
+    transient = ("map",)
 
     def restored(self) -> None:
         """Rebuild the map and the floor tracker's points after loading."""
@@ -60,9 +59,9 @@ class Places:
         points = points[points.isfinite().all(-1)]
         seen = torch.full((len(points),), first_seen, dtype=torch.float64)
         self.mapped = True
-        self._map.add(points, seen)
+        self.map.add(points, seen)
         self._new.append((points, seen))
-        if len(self._map) <= MANY * self.memory.max_points:
+        if len(self.map) <= MANY * self.memory.max_points:
             return
         # No frame arrives that would drop distant points: only the newest packets of new ones are kept.
         kept, count = [], 0
@@ -71,10 +70,6 @@ class Places:
             count += len(kept[-1][0])
         self._new = kept[::-1]
         self._begin([_joined(self._tracked)])
-
-    def grids(self, T_world_device: Rigid, timestamps: Float64[Tensor, "time"]) -> Float[Tensor, "time x y z"]:
-        """Voxel grids (m) around the device at each frame, of the points seen by then."""
-        return self._map.voxelize(T_world_device, timestamps)
 
     def floor(
         self, timestamps: Float64[Tensor, "time"], t_world_head: Float[Tensor, "time 3"]
@@ -101,7 +96,7 @@ class Places:
         """Drop distant and old points once the wearer has walked far or there are too many points."""
         center = t_world_head if self._center is None else self._center
         self._center, moved = center, float((t_world_head - center)[:2].norm())
-        if moved < 0.5 * self.memory.radius_m and len(self._map) <= self.memory.max_points:
+        if moved < 0.5 * self.memory.radius_m and len(self.map) <= self.memory.max_points:
             return
         self._center = t_world_head
         points, seen = _joined(self._tracked)
@@ -113,10 +108,10 @@ class Places:
 
     def _begin(self, tracked: list[tuple[Tensor, Tensor]]) -> None:
         """Replace the floor tracker's points by these, and the map by one of these and the new ones."""
-        self._map, self._tracked = VoxelMap(self.grid), tracked
+        self.map, self._tracked = VoxelMap(self.grid), tracked
         self._floor.forget()
         for points, seen in [*self._new, *tracked]:
-            self._map.add(points, seen)
+            self.map.add(points, seen)
         for points, _ in tracked:
             self._floor.see(points)
 

@@ -142,7 +142,7 @@ class WearerState:
             floor = interpolate_clamped(measured, height.float(), times)
         points, points_valid = torch.zeros(count, net.points_size), torch.zeros(count, dtype=torch.bool)
         if self.places.mapped and self.pipeline.model.place_encoder is not None:
-            points = self.pipeline.model.place_encoder.encode(self.places.grids(chunk.T_world_device, times))
+            points = self.pipeline.model.place_encoder.encode(self.places.map.voxelize(chunk.T_world_device, times))
             points_valid = torch.ones(count, dtype=torch.bool)
         image, image_valid = torch.zeros(count, net.image_size), torch.zeros(count, dtype=torch.bool)
         if self.pictures:

@@ -13,7 +13,8 @@ from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import at_times
 from wearcap.runtime.system import CaptureInput, LearnedSystem
-from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, decode_pose, pasts
+from wearcap.systems.hmd2.features import HeadFeatures
+from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, pasts
 from wearcap.tracking.anchor import anchored_to_head, with_hand_moved
 from wearcap.tracking.head_path import HeadPath, head_path
 
@@ -60,10 +61,11 @@ class PoseRegressorCapture(LearnedSystem):
             for ends in torch.arange(b - a).split(self.frames_per_pass):
                 past, exists = pasts(features, ends[None], self.net.window)
                 predicted.append(self.net(past[0].to(self.device), exists[0].to(self.device)))
-        R_parent_joint = decode_pose(torch.cat(predicted).float().cpu(), path.T_world_head.R)
+        poses = HeadFeatures(joints=len(path.skeleton))
+        R_parent_joint, _ = poses.decode(torch.cat(predicted).float().cpu()[None], path.T_world_head.R[None])
         names = self.points.points
         about = {"pipeline": "pose_regressor", "points": ",".join(names), "reach": str(self.reach)}
-        motion = Motion(path.timestamps, path.skeleton, R_parent_joint, torch.zeros(count, 3), provenance=about)
+        motion = Motion(path.timestamps, path.skeleton, R_parent_joint[0], torch.zeros(count, 3), provenance=about)
         motion = anchored_to_head(motion, path.T_world_head)
         for index, name in enumerate(names if self.reach else ()):
             side, _, joint = name.partition("_")
@@ -77,11 +79,8 @@ class PoseRegressorCapture(LearnedSystem):
         if len(self.points.points) == 1:
             return self.points.poses(path.skeleton, path.T_world_head)
         if truth is None:
-            raise WearcapError(
-                "no tracked hands in this recording",
-                where=recording.name,
-                expected="a recording with `motion`, or a checkpoint of the head alone",
-            )
+            expected = "a recording with `motion`, or a checkpoint of the head alone"
+            raise WearcapError("no tracked hands in this recording", where=recording.name, expected=expected)
         if len(truth) != len(path.timestamps) or (truth.timestamps - path.timestamps).abs().max() > 1e-6:
             truth = at_times(truth, path.timestamps)
         return self.points.poses(path.skeleton, path.T_world_head, truth.R_parent_joint)
