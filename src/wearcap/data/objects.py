@@ -54,11 +54,9 @@ def object_class(name: str) -> str:
     if name not in _CLASS_OF:
         near = nearest(name, _CLASS_OF)
         hint = near if near.startswith("Did you mean") else ""
-        raise WearcapError(
-            f"no class for the object {name!r}",
-            expected=f"one of {', '.join(sorted(_CLASS_OF))}",
-            fix=f"{hint} A new name belongs into data/objects.py.".strip(),
-        )
+        expected = f"one of {', '.join(sorted(_CLASS_OF))}"
+        fix = f"{hint} A new name belongs into data/objects.py.".strip()
+        raise WearcapError(f"no class for the object {name!r}", expected=expected, fix=fix)
     return _CLASS_OF[name]
 
 

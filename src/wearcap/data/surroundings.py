@@ -4,7 +4,7 @@ import hashlib
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -122,7 +122,7 @@ class Surroundings:
         points, points_valid = torch.zeros(count, 0), torch.zeros(count, dtype=torch.bool)
         if self.places is not None:
             points = torch.zeros(count, self.places.size)
-            codes = _codes(self.places.file_of(store.root, store.entries[name]))
+            codes = _codes(str(self.places.file_of(store.root, store.entries[name])))
             rows = codes.get_slice("code_mirrored" if mirrored else "code")
             if rows.get_shape()[0]:
                 points, points_valid = rows[start:stop].float(), torch.ones(count, dtype=torch.bool)
@@ -157,18 +157,14 @@ def embeddings_of(encoder: str, stores: list[RecordingStore]) -> tuple[str, int]
             kinds.add((full, file.tensor("camera.embedding").shape[1]))
     if len(kinds) != 1:
         found = ", ".join(f"{name} with {size} features" for name, size in sorted(kinds))
-        raise WearcapError(
-            f"embeddings of several kinds: {found}" if kinds else f"no recording has embeddings of {encoder!r}",
-            where=", ".join(str(store.root) for store in stores),
-            expected=f"embeddings of one {encoder!r}",
-            fix=f"Run: wearcap prepare embeddings dataset=DIR encoder={encoder.split('-')[0]}",
-        )
+        what = f"embeddings of several kinds: {found}" if kinds else f"no recording has embeddings of {encoder!r}"
+        expected = f"embeddings of one {encoder!r}"
+        fix = f"Run: wearcap prepare embeddings dataset=DIR encoder={encoder.split('-')[0]}"
+        raise WearcapError(what, where=", ".join(str(store.root) for store in stores), expected=expected, fix=fix)
     return kinds.pop()
 
 
-@cache
-def _codes(path: Path):
-    return safetensors.safe_open(str(path), framework="pt")
+_codes = cache(partial(safetensors.safe_open, framework="pt"))
 
 
 @cache

@@ -168,12 +168,10 @@ class HMD2(LearnedSystem):
         if net.image_size and "images" in self.use and camera is not None and camera.embedding is not None:
             size = camera.embedding.shape[1]
             if (camera.embedding_name, size) != (self.model.image_encoder, net.image_size):
-                raise WearcapError(
-                    f"embeddings of {camera.embedding_name!r} with {size} features",
-                    where=recording.name,
-                    expected=f"{net.image_size} of {self.model.image_encoder!r}, which the network was trained on",
-                    fix="Prepare its embeddings with that encoder, or leave images out: pipeline.use=[points].",
-                )
+                what = f"embeddings of {camera.embedding_name!r} with {size} features"
+                expected = f"{net.image_size} of {self.model.image_encoder!r}, which the network was trained on"
+                fix = "Prepare its embeddings with that encoder, or leave images out: pipeline.use=[points]."
+                raise WearcapError(what, where=recording.name, expected=expected, fix=fix)
             number, image_valid = latest_before(camera.timestamps, path.timestamps)
             image = camera.embedding[number].float()
             image_valid &= image.isfinite().all(-1)

@@ -84,11 +84,9 @@ class MotionDiffusion(Training):
         net, places, images = self.net, content.surroundings.places, content.surroundings.images
         points_size = 0 if places is None else places.size
         if (net.points_size, net.image_size) != (points_size, content.image_size):
-            raise WearcapError(
-                f"windows with points of {points_size} and images of {content.image_size} features",
-                expected=f"{net.points_size} and {net.image_size}, as the model has",
-                fix="Set data.dataset.content.surroundings and model.{place_encoder,image_encoder,image_size} alike.",
-            )
+            what = f"windows with points of {points_size} and images of {content.image_size} features"
+            fix = "Set data.dataset.content.surroundings and model.{place_encoder,image_encoder,image_size} alike."
+            raise WearcapError(what, expected=f"{net.points_size} and {net.image_size}, as the model has", fix=fix)
         if self.image_encoder != images and net.image_size:
             raise WearcapError(f"embeddings of {images!r}", expected=self.image_encoder)
         statistics = feature_statistics(dataset, self.features)

@@ -151,11 +151,8 @@ class MocapEvery(LearnedSystem):
         truth = recording.motion
         if self.model.features.wrists == "positions" or (not recording.imu and truth is not None):
             if truth is None:
-                raise WearcapError(
-                    "no hand positions in this recording",
-                    where=recording.name,
-                    expected="a recording with `motion`, or a checkpoint for watches",
-                )
+                expected = "a recording with `motion`, or a checkpoint for watches"
+                raise WearcapError("no hand positions in this recording", where=recording.name, expected=expected)
             truth = at_times(truth, path.timestamps)
             return Sensed(
                 R, t, *synthetic_wrists(truth.skeleton, truth.R_parent_joint, truth.t_world_root, self.model.fps)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from einops import rearrange, reduce
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from wearcap.body.skeleton import FEET, FOOT_JOINTS, Skeleton
@@ -93,7 +93,11 @@ class VisualCues:
         `T_world_head` holds the measured head poses at the motion's frames.
         """
         cues = [at_frames(cue, motion.timestamps) for cue in recording.cues.values() if cue.joint in motion.skeleton]
-        poses = [_view_at_frames(view, motion.timestamps) for view in views]
+        poses = []
+        for view in views:  # as `at_frames` takes cues
+            nearest, near = _nearest(view.motion.timestamps, motion.timestamps)
+            R_parent_joint = view.motion.R_parent_joint[nearest]
+            poses.append(energy.PoseCue(R_parent_joint, view.confidence[nearest] * near[:, None]))
         confidence = [cue.confidence for cue in cues] + [pose.confidence.amax(-1) for pose in poses]
         if not confidence or not torch.stack(confidence).any():
             return motion, []
@@ -188,24 +192,24 @@ class _Blend:
         return replace(motion, R_parent_joint=R, t_world_root=(self._roots + left * motion.t_world_root) / whole)
 
 
+def _nearest(
+    observed: Float64[Tensor, "observation"], timestamps: Float64[Tensor, "time"]
+) -> tuple[Int64[Tensor, "time"], Bool[Tensor, "time"]]:
+    """Index of the nearest observation to each time, and whether it is within half a frame."""
+    nearest = nearest_frames(observed, timestamps)
+    step = timestamps.diff().median() if len(timestamps) > 1 else 1.0
+    return nearest, (observed[nearest] - timestamps).abs() <= 0.5 * step + 1e-6
+
+
 def at_frames(cue: Cue, timestamps: Float64[Tensor, "time"]) -> Cue:
     """Resample a cue to a motion's frames: the nearest observation within half a frame, else confidence 0."""
     if not len(cue.timestamps):
         empty = torch.zeros(len(timestamps), cue.points.shape[-1])
         return replace(cue, timestamps=timestamps, points=empty, confidence=torch.zeros(len(timestamps)))
-    nearest = nearest_frames(cue.timestamps, timestamps)
-    step = timestamps.diff().median() if len(timestamps) > 1 else 1.0
+    nearest, near = _nearest(cue.timestamps, timestamps)
     points = cue.points[nearest]
-    near = ((cue.timestamps[nearest] - timestamps).abs() <= 0.5 * step + 1e-6) & points.isfinite().all(-1)
+    near &= points.isfinite().all(-1)
     return replace(cue, timestamps=timestamps, points=points.nan_to_num(), confidence=cue.confidence[nearest] * near)
-
-
-def _view_at_frames(view: View, timestamps: Float64[Tensor, "time"]) -> energy.PoseCue:
-    """A view's rotations and confidence at a motion's frames (without a batch axis), as `at_frames` takes them."""
-    nearest = nearest_frames(view.motion.timestamps, timestamps)
-    step = timestamps.diff().median() if len(timestamps) > 1 else 1.0
-    near = (view.motion.timestamps[nearest] - timestamps).abs() <= 0.5 * step + 1e-6
-    return energy.PoseCue(view.motion.R_parent_joint[nearest], view.confidence[nearest] * near[:, None])
 
 
 def _observations(
@@ -255,22 +259,6 @@ def capture_session(
     `capture` must return motions anchored to the measured head, as the pipelines do. Raises WearcapError for recordings
     that share no session or no time, for views of an unknown recording, and for views with another skeleton.
     """
-    _require_one_session(recordings)
-    if unknown := set(views) - {recording.name for recording in recordings}:
-        raise WearcapError(f"views of {min(unknown)!r}", expected=f"of {', '.join(r.name for r in recordings)}")
-    motions = {}
-    for recording in recordings:
-        motion, own_views = capture(recording), views.get(recording.name, ())
-        for view in own_views:
-            if view.motion.skeleton.joint_names != motion.skeleton.joint_names:
-                what = f"a view with the joints of {view.motion.skeleton.name}"
-                expected = f"those of {motion.skeleton.name}, as captured"
-                raise WearcapError(what, where=recording.name, expected=expected)
-        motions[recording.name], _ = cues.edit(motion, recording, motion.joint("head"), own_views)
-    return motions
-
-
-def _require_one_session(recordings: Sequence[Recording]) -> None:
     for recording in recordings:
         if recording.session is None or recording.session != recordings[0].session:
             expected = f"that of {recordings[0].name}, {recordings[0].session!r}"
@@ -287,3 +275,15 @@ def _require_one_session(recordings: Sequence[Recording]) -> None:
     if spans and max(start for start, _ in spans) > min(stop for _, stop in spans):
         what = "recordings of one session at different times"
         raise WearcapError(what, where=recordings[0].session, expected="one clock")
+    if unknown := set(views) - {recording.name for recording in recordings}:
+        raise WearcapError(f"views of {min(unknown)!r}", expected=f"of {', '.join(r.name for r in recordings)}")
+    motions = {}
+    for recording in recordings:
+        motion, own_views = capture(recording), views.get(recording.name, ())
+        for view in own_views:
+            if view.motion.skeleton.joint_names != motion.skeleton.joint_names:
+                what = f"a view with the joints of {view.motion.skeleton.name}"
+                expected = f"those of {motion.skeleton.name}, as captured"
+                raise WearcapError(what, where=recording.name, expected=expected)
+        motions[recording.name], _ = cues.edit(motion, recording, motion.joint("head"), own_views)
+    return motions
