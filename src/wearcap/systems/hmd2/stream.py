@@ -74,11 +74,6 @@ class HMD2Session(Session):
                 self._take(number, self.streams[number].admit(sample))
 
     def poses(self, ended: bool = False) -> list[Motion | None]:
-        """Each wearer's frames that became final since the last call; `ended`: no more samples will come.
-
-        After a wearer's clock was set back, the frames before that come first, and the next call returns those after
-        it.
-        """
         begun = [number for number, state in enumerate(self.streams) if state.finished]
         others = [number for number in range(len(self.streams)) if number not in begun]
         for number in others if ended else ():
@@ -149,7 +144,6 @@ class HMD2Session(Session):
 
     @classmethod
     def settings(cls, system: HMD2) -> dict[str, Any]:
-        """The settings of a pipeline that a session's state depends on."""
         net, sampling, overlap = system.model.net, system.sampling, system.overlap
         return {
             "window": net.window,
@@ -166,7 +160,6 @@ class HMD2Session(Session):
         }
 
     def state(self) -> dict[str, Any]:
-        """Everything that future poses depend on, except the pipeline."""
         return super().state() | {"embedded": self.embedded}
 
 

@@ -34,7 +34,6 @@ class MotionDiffusion(Training):
     """
 
     system = HMD2
-    """The system that captures with the network."""
 
     def __init__(
         self,
@@ -121,7 +120,6 @@ class MotionDiffusion(Training):
         return self._denoise(x_t, level, encoded, batch.valid, last)
 
     def terms(self, batch: HeadWindow) -> dict[str, Tensor]:
-        """Every loss term of a batch, unweighted."""
         valid = batch.valid  # padding weighs nothing
         left = valid.sum(1, keepdim=True) - 1 - torch.arange(valid.shape[1], device=valid.device)
         weight = valid * (1 + self.tail * torch.exp(-left.clamp_min(0) / _TAIL_FRAMES))

@@ -14,16 +14,8 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.recording import Motion
 from wearcap.scene.voxels import VoxelGrid
-from wearcap.sensors.packets import (
-    MAX_FEATURE,
-    MAX_POSITION_M,
-    WRONG_TYPE,
-    Admitted,
-    HeadInput,
-    number_fault,
-    owned,
-    values_fault,
-)
+from wearcap.sensors import packets
+from wearcap.sensors.packets import Admitted, HeadInput
 from wearcap.sensors.samples import HeadSample
 from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.places import Memory, Places
@@ -84,7 +76,7 @@ class WearerState:
         """Check a packet; returns the packets that are accepted now."""
         door = self.door
         if not isinstance(sensed, HeadSample):
-            door.refuse("head", WRONG_TYPE)
+            door.refuse("head", packets.WRONG_TYPE)
             return Admitted([])
         if not door.timely(sensed.timestamp):
             return Admitted([])
@@ -104,17 +96,17 @@ class WearerState:
         size = self.pipeline.model.net.image_size
         if embedding is None or not self.shows_pictures:
             return None
-        fault = values_fault(embedding, (size,), MAX_FEATURE)
+        fault = packets.values_fault(embedding, (size,), packets.MAX_FEATURE)
         if fault is None:
             assert isinstance(embedding, Tensor)
-            return owned(embedding)
+            return packets.owned(embedding)
         self.door.refuse("embedding", fault)
         return torch.full((size,), torch.nan)
 
     def _floor_height(self, height: object) -> float | None:
         if height is None:
             return None
-        if fault := number_fault(height, MAX_POSITION_M):
+        if fault := packets.number_fault(height, packets.MAX_POSITION_M):
             self.door.refuse("floor height", fault)
             return None
         assert isinstance(height, SupportsFloat)

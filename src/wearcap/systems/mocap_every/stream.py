@@ -292,7 +292,6 @@ class MocapEverySession(Session):
 
     @classmethod
     def settings(cls, system: MocapEvery) -> dict[str, Any]:
-        """The settings of a pipeline that a session's state depends on."""
         return {
             **system.settings(),
             "window": system.model.net.window,

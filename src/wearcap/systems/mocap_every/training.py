@@ -31,7 +31,6 @@ class WatchRegression(Training):
     _joint_weights: Tensor
 
     system = MocapEvery
-    """The system that captures with the network."""
 
     def __init__(
         self,
@@ -89,7 +88,6 @@ class WatchRegression(Training):
         return (canonical.R.mT[:, :, None] @ (ends - canonical.t[:, :, None])[..., None])[..., 0] - origin[:, :, None]
 
     def terms(self, batch: WatchWindow) -> dict[str, Tensor]:
-        """Unweighted loss terms of a batch."""
         features, true, canonical = self._inputs(batch)
         output = self.net(features)
         last = output.motion.shape[1]

@@ -28,7 +28,6 @@ class PoseRegression(Training):
     """
 
     system = PoseRegressorCapture
-    """The system that captures with the network."""
     parts = ("net", "points", "skeleton", "fps")
 
     def __init__(
@@ -71,7 +70,6 @@ class PoseRegression(Training):
         return torch.stack([last - 1, last], -1).flatten(1).expand(count, -1)
 
     def terms(self, batch: HeadWindow) -> dict[str, Tensor]:
-        """Every loss term of a batch, unweighted."""
         ends = self.frame_pairs(batch)
         rows = torch.arange(len(ends), device=ends.device)[:, None]
         features, exists = pasts(self._features(batch), ends, self.net.window)
