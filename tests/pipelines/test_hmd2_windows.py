@@ -54,7 +54,7 @@ def test_every_window_sees_the_same_noise_at_the_same_moment():
 def test_final_poses_stay_and_lookahead_frames_are_re_denoised():
     final_poses, lookahead = [], []
     for sampler in windows(pipeline(fade=8), 100, 10):
-        poses = sampler.finalize(20).poses.R_parent_joint[0]
+        poses = sampler.finalize(20)[0].R_parent_joint[0]
         if len(poses):
             final = sampler.final
             assert torch.equal(sampler.predicted.R_parent_joint[0, final - len(poses) : final], poses)

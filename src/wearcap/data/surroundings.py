@@ -6,11 +6,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import NamedTuple
 
 import safetensors
 import torch
-from jaxtyping import Bool, Float, Float16, Float64, Int64
+from jaxtyping import Bool, Float16, Float64, Int64
 from rich.progress import track
 from safetensors.torch import save
 from torch import Tensor
@@ -96,15 +95,6 @@ class PlaceCodes:
         return code, code_mirrored
 
 
-class Seen(NamedTuple):
-    """Point codes and image embeddings of some frames, and which frames have them."""
-
-    points: Float[Tensor, "*batch time point_feature"]
-    points_valid: Bool[Tensor, "*batch time"]
-    image: Float[Tensor, "*batch time image_feature"]
-    image_valid: Bool[Tensor, "*batch time"]
-
-
 @dataclass(frozen=True)
 class Surroundings:
     """Modalities that windows contain; None leaves one out (no columns)."""
@@ -113,8 +103,11 @@ class Surroundings:
     images: str | None = None
     """Name of the encoder whose embeddings are read from the recordings' cameras."""
 
-    def read(self, store: RecordingStore, name: str, start: int, stop: int, mirrored: bool, image_size: int) -> Seen:
-        """Frames start…stop-1 of the head stream; with `mirrored`, those of the surroundings mirrored left to right.
+    def read(
+        self, store: RecordingStore, name: str, start: int, stop: int, mirrored: bool, image_size: int
+    ) -> dict[str, Tensor]:
+        """Point codes ("points") and image embeddings ("image") of frames start…stop-1 of the head stream, and which
+        frames have them ("points_valid", "image_valid"); with `mirrored`, of the surroundings mirrored left to right.
 
         Raises WearcapError as `PlaceCodes.file_of` does.
         """
@@ -134,7 +127,7 @@ class Surroundings:
                 first, last = picture[image_valid][[0, -1]].tolist()
                 shown = open_recording(path).window(key, first, last + 1).float()
                 image = shown[(picture - first).clamp(0, len(shown) - 1)]
-        return Seen(points, points_valid, image, image_valid)
+        return {"points": points, "points_valid": points_valid, "image": image, "image_valid": image_valid}
 
 
 NOTHING = Surroundings()

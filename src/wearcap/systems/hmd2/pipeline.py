@@ -228,8 +228,8 @@ class HMD2(LearnedSystem):
             for i, start, stop, sampler in items:
                 ended = start + passed >= stop
                 left = 0 if ended else lookahead_frames
-                final, end = sampler.finalize(left), min(start + passed, stop) - left
-                for target, part in zip(whole[i], final.poses):
+                (final, _), end = sampler.finalize(left), min(start + passed, stop) - left
+                for target, part in zip(whole[i], final):
                     target[0, end - part.shape[1] : end] = part[0]
             items = [item for item in items if item[1] + passed < item[2]]
         return [_bridged(Poses(*(part[0] for part in poses)), path.stretches) for poses, path in zip(whole, paths)]

@@ -101,10 +101,8 @@ class Places:
         self._center = t_world_head
         points, seen = _joined(self._tracked)
         near = (points - t_world_head)[:, :2].norm(dim=-1) <= self.memory.radius_m
-        points, seen = points[near], seen[near]
-        if len(points) > self.memory.max_points // 2:
-            points, seen = points[-(self.memory.max_points // 2) :], seen[-(self.memory.max_points // 2) :]
-        self._begin([(points, seen)])
+        newest = slice(-(self.memory.max_points // 2), None)
+        self._begin([(points[near][newest], seen[near][newest])])
 
     def _begin(self, tracked: list[tuple[Tensor, Tensor]]) -> None:
         """Replace the floor tracker's points by these, and the map by one of these and the new ones."""

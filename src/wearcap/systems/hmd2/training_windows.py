@@ -43,7 +43,7 @@ class HeadWindow(NamedTuple):
     points_valid: Bool[Tensor, "*batch time"]
     image: Float[Tensor, "*batch time image_feature"]
     image_valid: Bool[Tensor, "*batch time"]
-    """Points and images: see `Surroundings`; no columns for a modality that is left out."""
+    """Points and images: see `Surroundings.read`; no columns for a modality that is left out."""
     noise: Float[Tensor, "*batch time motion"]
     level: Float[Tensor, "*batch 1"]
     chance: Float[Tensor, "*batch 3"]
@@ -135,7 +135,7 @@ class HeadContent(Content):
         return HeadWindow(
             **window.values,
             valid=cut.valid,
-            **{name: part[cut.frames - start] for name, part in seen._asdict().items()},
+            **{name: part[cut.frames - start] for name, part in seen.items()},
             noise=torch.randn(cut.count, 6 * len(track.constants["t_parent_joint"]) + FEET, generator=random.generator),
             level=torch.rand(1, generator=random.generator),
             chance=torch.rand(3, generator=random.generator),

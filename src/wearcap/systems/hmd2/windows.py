@@ -44,13 +44,6 @@ class Poses(NamedTuple):
     foot_contact: Float[Tensor, "batch time foot"]
 
 
-class _FinalFrames(NamedTuple):
-    """Final poses of a batch item's next frames, with their head poses ("time")."""
-
-    poses: Poses
-    T_world_head: Rigid
-
-
 def no_poses(pipeline: "HMD2", count: int) -> Poses:
     """Placeholder poses (identity rotations, no contact) for frames without a prediction."""
     joints = pipeline.model.features.joints
@@ -104,15 +97,15 @@ class WindowSampler:
         self.predicted = Poses(*_appended(self.predicted, first, no_poses(self.pipeline, new)))
         self.frames = fresh if self.frames is None else Frames(*_appended(self.frames, first, fresh))
 
-    def finalize(self, lookahead_frames: int) -> _FinalFrames:
-        """Mark all predictions but the last `lookahead_frames` as final; returns the newly final frames."""
+    def finalize(self, lookahead_frames: int) -> tuple[Poses, Rigid]:
+        """Mark all predictions but the last `lookahead_frames` as final; returns the newly final ones with their head poses."""
         assert self.frames is not None
         # Frames after a recording's end are not valid and never output.
         until = max(self.final, int(self.frames.valid.sum()) - lookahead_frames)
         part = slice(self.final, until)
         self.final = until
         head = Rigid(self.frames.R_world_head[0, part], self.frames.t_world_head[0, part])
-        return _FinalFrames(Poses(*(poses[:, part] for poses in self.predicted)), head)
+        return Poses(*(poses[:, part] for poses in self.predicted)), head
 
 
 @torch.inference_mode()

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from einops import rearrange, reduce
+from einops import reduce
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
@@ -164,32 +164,25 @@ class _Blend:
     """Blends overlapping windows with Hann weights; frames without windows stay as captured."""
 
     def __init__(self, motion: Motion, window: int):
-        self._motion = motion
-        self._weight = torch.hann_window(window, periodic=True)
-        self._rotations = torch.zeros(len(motion), 6 * len(motion.skeleton))
-        self._roots, self._shares = torch.zeros(len(motion), 3), torch.zeros(len(motion))
+        self._motion, self._weight = motion, torch.hann_window(window, periodic=True)
+        self._sums, self._shares = torch.zeros(len(motion), 6 * len(motion.skeleton) + 3), torch.zeros(len(motion))
 
     def add(self, frames: Tensor, R: Tensor, root: Tensor) -> None:
         """Add windows "window time" at frame numbers, which may extend past the motion."""
         exists = (frames >= 0) & (frames < len(self._shares))
         weight = (self._weight * exists).flatten()
         at = frames.flatten().clamp(0, len(self._shares) - 1)
-        rotations = rearrange(rotation.rot6d_from_matrix(R), "window time joint entry -> (window time) (joint entry)")
-        self._rotations.index_add_(0, at, weight[:, None] * rotations)
-        self._roots.index_add_(0, at, weight[:, None] * rearrange(root, "window time xyz -> (window time) xyz"))
+        values = torch.cat([rotation.rot6d_from_matrix(R).flatten(-2), root], -1).flatten(0, 1)
+        self._sums.index_add_(0, at, weight[:, None] * values)
         self._shares.index_add_(0, at, weight)
 
     def motion(self) -> Motion:
         """The blended motion."""
-        motion = self._motion
-        left = (1 - self._shares).clamp_min(0)[:, None]
-        whole = self._shares[:, None] + left
-        captured = rearrange(
-            rotation.rot6d_from_matrix(motion.R_parent_joint), "time joint entry -> time (joint entry)"
-        )
-        blended = (self._rotations + left * captured) / whole
-        R = rotation.matrix_from_rot6d(rearrange(blended, "time (joint entry) -> time joint entry", entry=6))
-        return replace(motion, R_parent_joint=R, t_world_root=(self._roots + left * motion.t_world_root) / whole)
+        motion, left = self._motion, (1 - self._shares).clamp_min(0)[:, None]
+        captured = torch.cat([rotation.rot6d_from_matrix(motion.R_parent_joint).flatten(-2), motion.t_world_root], -1)
+        blended = (self._sums + left * captured) / (self._shares[:, None] + left)
+        R = rotation.matrix_from_rot6d(blended[:, :-3].unflatten(-1, (-1, 6)))
+        return replace(motion, R_parent_joint=R, t_world_root=blended[:, -3:])
 
 
 def _nearest(
@@ -223,11 +216,9 @@ def _observations(
 ) -> energy.Seen:
     """Observations of a batch of windows; frames outside the capture have confidence 0."""
     camera = recording.camera
-    rows: dict[int, list[tuple[int, Tensor, Tensor]]] = {2: [], 3: []}
-    for cue in cues:
-        row = skeleton.index(cue.joint), cue.points[frames], cue.confidence[frames] * exists
-        rows.setdefault(cue.points.shape[-1], []).append(row)
-    pixels, places = tuple(energy.PixelCue(*row) for row in rows[2]), tuple(energy.PlaceCue(*row) for row in rows[3])
+    rows = [(skeleton.index(cue.joint), cue.points[frames], cue.confidence[frames] * exists) for cue in cues]
+    pixels = tuple(energy.PixelCue(*row) for row in rows if row[1].shape[-1] == 2)
+    places = tuple(energy.PlaceCue(*row) for row in rows if row[1].shape[-1] == 3)
     viewed = tuple(energy.PoseCue(R[frames], confidence[frames] * exists[..., None]) for R, confidence in poses)
     if camera is None:
         return energy.Seen(head, None, None, (), places, viewed)

@@ -72,7 +72,7 @@ class EstimatorWindows:
         self._sum[-last:] += self._weight[-last:] * torch.cat([output, torch.ones(last, 1)], -1)
         R, t, contact = _parts(output[-count:])
         self.floor.follow(contact, forward_kinematics(self._skeleton, R, t).t[:, self._feet])
-        return self._return_final(self._pipeline.lookahead)
+        return self.finish(self._pipeline.lookahead)
 
     def correct(self, T_world_head: Rigid) -> None:
         """Replace the latest head poses, which repeated an earlier pose while tracking was lost."""
@@ -88,11 +88,7 @@ class EstimatorWindows:
         """Height of the floor (m) at the latest frame."""
         return self._floors[-1].item()
 
-    def finish(self) -> FinalPoses:
-        """Return the remaining frames."""
-        return self._return_final(0)
-
-    def _return_final(self, lookahead: int) -> FinalPoses:
+    def finish(self, lookahead: int = 0) -> FinalPoses:
         """Frames that were not returned yet, except for the last `lookahead` ones."""
         window, count = len(self._sum), self._consumed - lookahead - self._returned
         stop = window - lookahead
