@@ -66,13 +66,11 @@ class MotionFeatures:
         Raises WearcapError for a motion of other joints, or at another rate than `fps`.
         """
         if motion.skeleton.joint_names != self.skeleton.joint_names:
-            raise WearcapError(
-                f"a motion of skeleton {motion.skeleton.name!r}", expected=f"the joints of {self.skeleton.name!r}"
-            )
+            what = f"a motion of skeleton {motion.skeleton.name!r}"
+            raise WearcapError(what, expected=f"the joints of {self.skeleton.name!r}")
         if len(motion) > 1 and abs(motion.fps - self.fps) > 0.01 * self.fps:
-            raise WearcapError(
-                f"a motion of {motion.fps:.2f} frames per second", expected=f"{self.fps}", fix="Resample it first."
-            )
+            what = f"a motion of {motion.fps:.2f} frames per second"
+            raise WearcapError(what, expected=f"{self.fps}", fix="Resample it first.")
         seen = slice(None, None, self.every)
         R = motion.R_parent_joint[seen]
         joints = forward_kinematics(motion.skeleton, R, motion.t_world_root[seen]).t

@@ -150,15 +150,9 @@ def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], abo
     places, settings = None, dict(about["settings"])
     if "places" in runs:
         places = _ExportedPlaces(runs["places"], VoxelGrid(**about["grid"]), about["points_size"])
-    model = DiffusionModel(
-        _ExportedDenoiser(runs, about),
-        HeadFeatures(**about["features"]),
-        graphs.schedule_from_json(about["schedule"]),
-        graphs.skeleton_from_json(about["skeleton"]),
-        about["fps"],
-        places,
-        about["image_encoder"],
-    )
+    net, features = _ExportedDenoiser(runs, about), HeadFeatures(**about["features"])
+    schedule, skeleton = graphs.schedule_from_json(about["schedule"]), graphs.skeleton_from_json(about["skeleton"])
+    model = DiffusionModel(net, features, schedule, skeleton, about["fps"], places, about["image_encoder"])
     sampling, overlap = (
         kind(**{field.name: settings.pop(field.name) for field in fields(kind) if field.name in settings})
         for kind in (Sampling, Overlap)

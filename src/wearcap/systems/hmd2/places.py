@@ -25,10 +25,8 @@ class Memory:
 
     def __post_init__(self):
         if not self.radius_m >= 5.0 or self.max_points < 1000:
-            raise WearcapError(
-                f"a memory of {self.max_points} points within {self.radius_m} m",
-                expected="at least 1000 points within at least 5 m",
-            )
+            what = f"a memory of {self.max_points} points within {self.radius_m} m"
+            raise WearcapError(what, expected="at least 1000 points within at least 5 m")
 
 
 class Places:

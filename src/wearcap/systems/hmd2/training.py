@@ -135,10 +135,8 @@ class MotionDiffusion(Training):
             terms["joints"] = losses.joint_position(predicted, true, weight)
             terms["velocity"] = losses.joint_velocity(predicted, true, weight, self.fps)
             feet = predicted[:, :, self._feet]
-            feet = (
-                rearrange(feet, "batch time (foot point) axis -> batch time foot point axis", foot=FEET)
-                + batch.t_world_head[:, :, None, None]
-            )
+            feet = rearrange(feet, "batch time (foot point) axis -> batch time foot point axis", foot=FEET)
+            feet = feet + batch.t_world_head[:, :, None, None]
             terms["skate"] = losses.foot_skate(feet, batch.foot_contact, weight, self.fps)
         return terms
 

@@ -91,10 +91,9 @@ class MocapEvery(LearnedSystem):
             raise WearcapError(f"no floor {self.floor!r}", expected=f"one of {', '.join(FLOORS)}")
         window = self.model.net.window
         if not 0 < self.stride <= window or not 0 <= self.lookahead <= window - self.stride:
-            raise WearcapError(
-                f"windows of {window} frames with stride {self.stride} and lookahead {self.lookahead}",
-                expected="a stride from 1 to the window, and a lookahead of at most the overlap of two windows",
-            )
+            what = f"windows of {window} frames with stride {self.stride} and lookahead {self.lookahead}"
+            expected = "a stride from 1 to the window, and a lookahead of at most the overlap of two windows"
+            raise WearcapError(what, expected=expected)
 
     def prepare(self) -> None:
         """Move the network to its device and set up its runtime, compiled or exported once."""

@@ -83,13 +83,8 @@ class TrackedPoints:
         position = (R_heading_world @ (t_world_point - origin)[..., None])[..., 0]
         if self.height == "stature":
             position = position / stature[:, None, None, None]
-        parts = [
-            rotation.rot6d_from_matrix(R_heading_point),
-            _after_first(rotation.rot6d_from_matrix(step) * fps),
-            position,
-            _after_first(velocity * fps),
-        ]
-        return torch.cat(parts, -1).flatten(-2)
+        turned, change = rotation.rot6d_from_matrix(R_heading_point), rotation.rot6d_from_matrix(step) * fps
+        return torch.cat([turned, _after_first(change), position, _after_first(velocity * fps)], -1).flatten(-2)
 
 
 def _after_first(change: Float[Tensor, "batch step point value"]) -> Float[Tensor, "batch time point value"]:
