@@ -29,6 +29,7 @@ class PoseRegressorCapture(LearnedSystem):
     fps: float
     reach: bool = True
     """Whether arms are adjusted by inverse kinematics to reach tracked wrists, AvatarPoser's last step."""
+    frames_per_pass: int = 4096
     device: str = "cpu"
 
     name = "pose_regressor"
@@ -65,7 +66,7 @@ class PoseRegressorCapture(LearnedSystem):
             features = self.points.encode(
                 tracked.R[None, a:b], tracked.t[None, a:b], path.floor_height[None, a:b], stature, self.fps
             )
-            for ends in torch.arange(b - a).split(4096):
+            for ends in torch.arange(b - a).split(self.frames_per_pass):
                 past, exists = pasts(features, ends[None], self.net.window)
                 predicted.append(self.net(past[0].to(self.device), exists[0].to(self.device)))
         poses = HeadFeatures(joints=len(path.skeleton))
