@@ -53,7 +53,7 @@ class MotionManifold(nn.Module):
 
     def __init__(self, size: int, channels: int = 256, width: int = 25, layers: int = 3):
         super().__init__()
-        self.normalizer = Normalizer(size)
+        self.size, self.normalizer = size, Normalizer(size)
         half = width // 2
         down: list[nn.Module] = []
         up: list[nn.Module] = []
