@@ -38,7 +38,7 @@ from wearcap.prepare.engine import Task, prepare
 from wearcap.recording import RecordingStore
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
-from wearcap.systems.hmd2.pipeline import HMD2
+from wearcap.systems.hmd2.pipeline import HMD2, DiffusionModel, Overlap, Sampling
 from wearcap.systems.hmd2.stream import HeadSample, HMD2Session, Wearer
 from wearcap.training.loggers import read_metrics
 from wearcap.training.run import RunCheckpointIO
@@ -154,7 +154,7 @@ def _capture(folder: Path, finished: Finished) -> None:
                 [
                     "pipeline=hmd2",
                     "checkpoint=hmd2",
-                    "pipeline.steps=1",
+                    "pipeline.sampling.steps=1",
                     f"recording={data}/r2",
                     "video=false",
                     f"hydra.run.dir={folder}",
@@ -220,7 +220,8 @@ def _pipeline() -> HMD2:
     torch.manual_seed(0)
     features = HeadFeatures(contacts=True, body=True)
     net = MotionDenoiser(features.motion_size, features.condition_size, 60, 32, 1, 4, 64, frames_per_token=4)
-    return HMD2(net, features, CosineSchedule(), xsens23(), 60.0, steps=1, stride=10, lookahead=0, live=True)
+    model = DiffusionModel(net, features, CosineSchedule(), xsens23(), 60.0)
+    return HMD2(model, Sampling(steps=1), Overlap(stride=10, lookahead=0), live=True)
 
 
 def _stream(folder: Path, finished: Finished) -> None:

@@ -71,7 +71,7 @@ CAPTURES: dict[str, tuple[str | None, str, tuple[str, ...]]] = {
     "hmd2_paper": (*HMD2, ()),
     "hmd2_mean": (*HMD2, ()),
     "hmd2_online": (*HMD2, ()),
-    "egoego_style": (*HMD2, ("pipeline.steps=4",)),
+    "egoego_style": (*HMD2, ("pipeline.sampling.steps=4",)),
     "mocap_every": (*WATCHES, ()),
     "mocap_every_paper": (*WATCHES, ()),
     "mocap_every_cues": (*WATCHES, ()),

@@ -8,5 +8,5 @@ from online import figure, frames_per_second, pipeline_of
 
 
 def measure(pushes: int = 40) -> list[dict]:
-    value = frames_per_second(pipeline_of("small", stride=10), pushes)
+    value = frames_per_second(pipeline_of("small"), pushes)
     return [figure("hmd2_online_small_fps", value, 60.0, 2.5)]

@@ -5,7 +5,7 @@ runtime and precision of `pipeline=hmd2_online`. value and baseline: frames per 
 ratio = value / baseline, to be at least `goal`. The second figure is the small model.
 """
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 from online import Streamed, figure, pipeline_of
 
@@ -29,7 +29,7 @@ class _Loop(StepRunner):
 def measure(pushes: int = 15) -> list[dict]:
     figures = []
     for size in ("full", "small"):
-        ours = pipeline_of(size, stride=10)
+        ours = pipeline_of(size)
         ours, plain = Streamed(ours).fill(), Streamed(_plain(ours)).fill()
         for _ in range(pushes):
             ours.step()
@@ -42,9 +42,10 @@ def measure(pushes: int = 15) -> list[dict]:
 class _Plain(HMD2):
     def prepare(self) -> None:
         super().prepare()
-        self._steps = _Loop(self.net, step_levels(self.steps)[:-1])
+        self._steps = _Loop(self.model.net, step_levels(self.sampling.steps)[:-1])
 
 
 def _plain(pipeline: HMD2) -> HMD2:
-    conditions = {entry.name: getattr(pipeline, entry.name) for entry in fields(pipeline) if entry.init}
-    return _Plain(**conditions | {"steps": STEPS, "spacing": 1.0, "runtime": "eager", "precision": "float32"})
+    given = {entry.name: getattr(pipeline, entry.name) for entry in fields(pipeline)}
+    sampling = replace(pipeline.sampling, steps=STEPS, spacing=1.0)
+    return _Plain(**given | {"sampling": sampling, "runtime": "eager", "precision": "float32"})

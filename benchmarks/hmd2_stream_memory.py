@@ -15,7 +15,7 @@ from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
-from wearcap.systems.hmd2.pipeline import HMD2
+from wearcap.systems.hmd2.pipeline import HMD2, DiffusionModel, Overlap, Sampling
 from wearcap.systems.hmd2.places import Memory
 from wearcap.systems.hmd2.stream import HMD2Session, Wearer
 
@@ -35,9 +35,8 @@ def measure(minutes: int = 60, settle: int = 10, max_points: int = 100_000) -> l
         points_size=VoxelAutoencoder().size,
         image_size=8,
     )
-    pipeline = HMD2(
-        net, features, CosineSchedule(), xsens23(), 60.0, VoxelAutoencoder(), "any", steps=1, stride=60, lookahead=0
-    )
+    model = DiffusionModel(net, features, CosineSchedule(), xsens23(), 60.0, VoxelAutoencoder(), "any")
+    pipeline = HMD2(model, Sampling(steps=1), Overlap(stride=60, lookahead=0))
     session = HMD2Session(pipeline, [Wearer(xsens23())], [0], Memory(max_points=max_points))
     walk, early, predicted = Walk(pipeline, new_points=10, forever=True), 0.0, 0
     for second in range(60 * minutes):

@@ -35,7 +35,7 @@ def _rate(pipeline: MocapEvery, recording: Recording) -> float:
     session = MocapEveryStream(
         pipeline, Wearing(recording.motion.skeleton, head.R_head_device, head.t_head_device, floor_m=0.0)
     )
-    full, begin = 2 * pipeline.net.window, 0.0
+    full, begin = 2 * pipeline.model.net.window, 0.0
     for number, moment in enumerate(head.timestamps.tolist()):
         if number == full:
             begin = time.perf_counter()

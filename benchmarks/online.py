@@ -3,11 +3,9 @@
 import statistics
 import sys
 import time
-from dataclasses import replace
 
 import torch
 from hydra.utils import instantiate
-from omegaconf import OmegaConf
 from planted import swinging
 
 from wearcap.body.skeleton import xsens23
@@ -18,7 +16,7 @@ from wearcap.models.checkpoint import shared_checkpoints
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
-from wearcap.systems.hmd2.pipeline import HMD2
+from wearcap.systems.hmd2.pipeline import HMD2, DiffusionModel
 from wearcap.systems.hmd2.stream import HeadSample, HMD2Session, Wearer
 
 EXPERIMENTS = {"small": "hmd2", "full": "full/hmd2"}
@@ -28,28 +26,19 @@ LAP_S = 20.0
 """The walk leads there and back, over and over."""
 
 
-def pipeline_of(size: str, device: str = "cpu", **settings) -> HMD2:
+def pipeline_of(size: str, device: str = "cpu", *overrides: str) -> HMD2:
     """The online pipeline around a checkpoint of the project, or around random weights of that size, which is printed."""
-    config = compose("capture", ["pipeline=hmd2_online", "recording=none"]).pipeline
+    config = compose("capture", ["pipeline=hmd2_online", *overrides, "recording=none"]).pipeline
     if EXPERIMENTS[size] in shared_checkpoints():
         pipeline = load_pipeline(EXPERIMENTS[size], config, device)
         assert isinstance(pipeline, HMD2)
     else:
-        given = {name: value for name, value in OmegaConf.to_container(config).items() if name[0] != "_"}
-        pipeline = HMD2(
-            random_net(size),
-            _FEATURES,
-            CosineSchedule(),
-            xsens23(),
-            60.0,
-            VoxelAutoencoder(),
-            "any",
-            **given,
-            device=device,
-        )
-        count = sum(parameter.numel() for parameter in pipeline.net.parameters()) / 1e6
+        net = random_net(size)
+        model = DiffusionModel(net, _FEATURES, CosineSchedule(), xsens23(), 60.0, VoxelAutoencoder(), "any")
+        pipeline = instantiate(config, _convert_="all")(model=model, device=device)
+        count = sum(parameter.numel() for parameter in net.parameters()) / 1e6
         print(f"no checkpoint {EXPERIMENTS[size]!r}: random weights, {count:.1f} M parameters", file=sys.stderr)
-    return replace(pipeline, **settings)
+    return pipeline
 
 
 _FEATURES = HeadFeatures(contacts=True, body=True)
@@ -86,7 +75,7 @@ class Walk:
         pose = self.lap[place]
         count = self.new_points if self.forever or number < len(self.lap.t) else 0
         points = pose.t + 4 * torch.rand(count, 3, generator=self._random) - torch.tensor([2.0, 2.0, 3.0])
-        shown = torch.randn(self.pipeline.net.image_size, generator=self._random) if number % 2 == 0 else None
+        shown = torch.randn(self.pipeline.model.net.image_size, generator=self._random) if number % 2 == 0 else None
         return HeadSample(number / 60, pose, points, shown)
 
 
@@ -109,7 +98,7 @@ class Streamed:
 
     def fill(self) -> "Streamed":
         """Until windows are full, and what is compiled is."""
-        while self.number < self.session.pipeline.net.window + 3 * self.stride:
+        while self.number < self.session.system.model.net.window + 3 * self.stride:
             self.step()
         self.seconds.clear()
         return self
@@ -142,7 +131,8 @@ def beside_paper(name: str, stride: int, paper: float, pushes: int) -> list[dict
     """Full model on a GPU at one stride in 20 steps, beside the paper's frames per second; nothing without a GPU."""
     if without_cuda(name):
         return []
-    pipeline = pipeline_of("full", "cuda", stride=stride, steps=20, spacing=1.0, runtime="auto", precision="auto")
+    sampling = "pipeline.sampling.steps=20", "pipeline.sampling.spacing=1.0", "pipeline.precision=auto"
+    pipeline = pipeline_of("full", "cuda", f"pipeline.overlap.stride={stride}", *sampling)
     return [figure(name, frames_per_second(pipeline, pushes), paper, 10.0)]
 
 

@@ -105,7 +105,11 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
         if options.quick
         else [
             ("Table 6.5: latency", short, [method for h in options.strides for method in _latencies(options, h)]),
-            ("Table 6.7: steps", short, [_ours(options, f"{n} steps", f"pipeline.steps={n}") for n in options.steps]),
+            (
+                "Table 6.7: steps",
+                short,
+                [_ours(options, f"{n} steps", f"pipeline.sampling.steps={n}") for n in options.steps],
+            ),
         ]
     )
     jobs = [("Tables 6.1 and 6.3", case, _methods(options, console)), *sweeps]
@@ -167,11 +171,13 @@ def _ours(options: argparse.Namespace, name: str, *overrides: str, pipeline: str
 def _latencies(options: argparse.Namespace, h: int) -> list[Method]:
     """A stride of Table 6.5 as in the paper, and as ours, in as many steps."""
     ahead = min(LOOKAHEAD, 240 - h)
-    both = (f"pipeline.stride={h}", "pipeline.steps=5", "pipeline.live=true")
+    both = (f"pipeline.overlap.stride={h}", "pipeline.sampling.steps=5", "pipeline.live=true")
     return [
         _ours(options, f"h = {h}, the paper's", *both, pipeline="paper/hmd2"),
-        _ours(options, f"h = {h}", *both, "pipeline.fade=10", "pipeline.lookahead=0"),
-        _ours(options, f"h = {h}, {ahead} ahead", *both, "pipeline.fade=10", f"pipeline.lookahead={ahead}"),
+        _ours(options, f"h = {h}", *both, "pipeline.overlap.fade=10", "pipeline.overlap.lookahead=0"),
+        _ours(
+            options, f"h = {h}, {ahead} ahead", *both, "pipeline.overlap.fade=10", f"pipeline.overlap.lookahead={ahead}"
+        ),
     ]
 
 

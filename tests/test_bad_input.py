@@ -135,7 +135,7 @@ def training(data: Path, out: Path, *more: str) -> list[str]:
 
 def with_checkpoint(verb: str, checkpoint: Path, out: Path, *more: str) -> list[str]:
     written = {"evaluate": f"output={out}/table.json", "export": f"output={out}/d.onnx", "capture": "video=false"}
-    return [verb, f"checkpoint={checkpoint}", f"hydra.run.dir={out}", "pipeline.steps=2", written[verb], *more]
+    return [verb, f"checkpoint={checkpoint}", f"hydra.run.dir={out}", "pipeline.sampling.steps=2", written[verb], *more]
 
 
 def hps(data: Path, out: Path, *more: str) -> list[str]:

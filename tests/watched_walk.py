@@ -7,7 +7,7 @@ from wearcap.body.skeleton import FOOT_PATCHES, xsens23
 from wearcap.recording import ContactTrack, FloorTrack, HeadStream, Recording
 from wearcap.systems.mocap_every.features import WatchFeatures
 from wearcap.systems.mocap_every.model import TwoStageEstimator
-from wearcap.systems.mocap_every.pipeline import MocapEvery
+from wearcap.systems.mocap_every.pipeline import MocapEvery, WatchModel
 
 WINDOW, FPS = 16, 30.0
 
@@ -18,7 +18,7 @@ def drawn_pipeline(multi_stage: bool = True, **settings) -> MocapEvery:
     features = WatchFeatures("heading", body=True)
     net = TwoStageEstimator(features.size, features.motion_size, WINDOW, 32, 1, 2, 32, 16, 0.0, multi_stage, 2)
     given = {"stride": 4, "lookahead": 8, **settings}
-    return MocapEvery(net.eval(), features, xsens23(), FPS, **given)
+    return MocapEvery(WatchModel(net.eval(), features, xsens23(), FPS), **given)
 
 
 def watched_walk(seconds: float = 4.0, watch_hz: float = 100.0) -> Recording:

@@ -39,7 +39,7 @@ def test_a_window_holds_the_recordings_own_frames(store):
     assert torch.equal(window.R_parent_joint, truth.R_parent_joint[60:180])
     assert torch.allclose(window.t_world_head, truth.joint("head").t[60:180], atol=1e-5)
     assert window.valid.all()
-    assert window.stature.item() == pytest.approx(xsens23().height_of("head"))
+    assert window.size[0].item() == pytest.approx(xsens23().height_of("head"))
 
 
 def test_a_clip_shorter_than_a_window_is_padded_with_its_last_frame(store):

@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import nn
 
+from small_hmd2 import hmd2_of
 from wearcap.body.skeleton import xsens23
-from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
 from wearcap.export import files
 from wearcap.export.files import RUN_BY_FORMAT, load_exported, open_pt2
@@ -66,7 +66,7 @@ def pipeline() -> HMD2:
     size = features.motion_size
     net.motion_normalizer.set(torch.randn(size) * 0.1, torch.rand(size) + 0.5)
     net.condition_encoder.normalizer.set(torch.randn(17) * 0.1, torch.rand(17) + 0.5)
-    return HMD2(net, features, CosineSchedule(), xsens23(), 60.0, places, "eyes", steps=3, stride=16, guidance=1.5)
+    return hmd2_of(net, features, None, places, "eyes", steps=3, stride=16, guidance=1.5)
 
 
 @pytest.fixture(scope="module")
@@ -140,10 +140,12 @@ def test_runner_equals_the_eager_pipeline(pipeline, recording, exports, format):
 
 def test_runner_restores_settings(pipeline, exports):
     loaded = load_exported(exports["onnx"][0])
-    assert loaded.skeleton == pipeline.skeleton
-    assert loaded.features == pipeline.features
-    assert (loaded.fps, loaded.steps, loaded.stride, loaded.eta) == (60.0, 3, 16, 1.0)
-    assert loaded.schedule.offset == pipeline.schedule.offset
+    assert loaded.model.skeleton == pipeline.model.skeleton
+    assert loaded.model.features == pipeline.model.features
+    assert loaded.model.fps == 60.0
+    assert (loaded.sampling, loaded.overlap) == (pipeline.sampling, pipeline.overlap)
+    assert (loaded.sampling.steps, loaded.overlap.stride, loaded.sampling.eta) == (3, 16, 1.0)
+    assert loaded.model.schedule.offset == pipeline.model.schedule.offset
 
 
 @pytest.mark.slow

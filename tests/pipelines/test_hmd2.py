@@ -5,8 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from wearcap.body.skeleton import xsens23
-from wearcap.diffusion.schedule import CosineSchedule
+from small_hmd2 import hmd2_of
 from wearcap.errors import WearcapError
 from wearcap.evaluation.evaluate import evaluate
 from wearcap.geometry.camera import Camera
@@ -41,7 +40,7 @@ def pipeline(frame: str = "heading", **changes) -> HMD2:
     for parameter in net.parameters():
         torch.nn.init.normal_(parameter, std=0.05)
     settings = {"place_encoder": places.eval(), "image_encoder": "toy", "steps": 3, "stride": 40}
-    return HMD2(net, features, CosineSchedule(), xsens23(), 60.0, **settings | changes)
+    return hmd2_of(net, features, **settings | changes)
 
 
 def seeing_recording(frames: int = 150, seed: int = 0) -> Recording:

@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save_file
 from test_hmd2_stream import IMAGE, WINDOW, moments, stream, surrounded, wearer
 
 from bad_packets import TIMES, VECTORS, Mutator, bad_poses, unchecked
-from wearcap.diffusion.schedule import CosineSchedule
+from small_hmd2 import hmd2_of
 from wearcap.errors import WearcapError
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import Motion
@@ -19,7 +19,6 @@ from wearcap.sensors.packets import AGREEING
 from wearcap.systems.hmd2 import wearer as hmd2_wearer
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
-from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.places import Memory
 from wearcap.systems.hmd2.stream import HeadSample, HMD2Session
 from wearcap_testing import pushed
@@ -49,7 +48,7 @@ def hmd2():
     for parameter in net.parameters():
         torch.nn.init.normal_(parameter, std=0.05)
     given = {"place_encoder": places, "image_encoder": "eyes", "live": True, "fade": 6, "lookahead": 0}
-    return HMD2(net, features, CosineSchedule(), wearer(surrounded(4)).skeleton, 60.0, stride=10, steps=2, **given)
+    return hmd2_of(net, features, wearer(surrounded(4)).skeleton, stride=10, steps=2, **given)
 
 
 @pytest.fixture(scope="module")
@@ -186,7 +185,7 @@ def test_what_waits_for_a_lost_head_is_bounded(hmd2, recording, monkeypatch):
         pushed(session, [[HeadSample(k / 60, None, torch.rand(100, 3), torch.zeros(IMAGE), 0.0)]])
     state = session.streams[0]
     assert len(state.pictures) == len(state.floors) == 30
-    assert len(state.places._map) == sum(len(points) for points, _ in state.places._new) <= 4000
+    assert len(state.places.map) == sum(len(points) for points, _ in state.places._new) <= 4000
 
 
 @pytest.mark.parametrize("seed", range(3))

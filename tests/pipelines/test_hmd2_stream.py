@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from small_hmd2 import hmd2_of
 from wearcap.body.skeleton import xsens23
-from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
@@ -62,7 +62,7 @@ def pipeline(places):
             "fade": 6,
             "lookahead": 0,
         } | changes
-        return HMD2(net, features, CosineSchedule(), xsens23(), 60.0, stride=stride, **conditions)
+        return hmd2_of(net, features, stride=stride, **conditions)
 
     return make
 
@@ -273,7 +273,7 @@ def test_other_rates_are_brought_to_the_pipelines(pipeline, fps):
 @pytest.mark.parametrize("lookahead", [0, 13])
 def test_after_gaps_and_jumps_it_begins_anew_as_offline(pipeline, broken, lookahead):
     recording, hmd2 = surrounded(150), pipeline(points=False, lookahead=lookahead)
-    hmd2.features = replace(hmd2.features, height="relative")
+    hmd2.model = replace(hmd2.model, features=replace(hmd2.model.features, height="relative"))
     keep = [i for i in range(150) if broken == "jump" or not 44 <= i < 90]
     head = head_of(recording, keep)
     if broken == "jump":
@@ -334,7 +334,7 @@ def test_points_beyond_the_memory_are_forgotten(pipeline):
         pushed(session, [[HeadSample(i / 60, Rigid(torch.eye(3), at), points)]])
     places = session.streams[0].places
     kept = torch.cat([points for points, _ in places._tracked + places._new])
-    assert len(kept) == len(places._map) <= 2000 + 1000
+    assert len(kept) == len(places.map) <= 2000 + 1000
     assert (kept - at)[:, :2].norm(dim=-1).min() < 1.0
 
 

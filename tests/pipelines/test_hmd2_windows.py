@@ -31,7 +31,7 @@ def test_new_frames_continue_from_observed_ones_and_fade_into_the_prediction():
 def windows(hmd2, frames: int, stride: int):
     """The sampler of a recording, window after window."""
     recording = seeing_recording(frames)
-    path = head_path(recording, hmd2.skeleton, hmd2.fps)
+    path = head_path(recording, hmd2.model.skeleton, hmd2.model.fps)
     hmd2.prepare()
     conditions, sampler = hmd2.sense(recording, path), hmd2.sampler(path.skeleton, 0, 0)
     for start in range(0, frames, stride):
@@ -54,7 +54,7 @@ def test_every_window_sees_the_same_noise_at_the_same_moment():
 def test_final_poses_stay_and_lookahead_frames_are_re_denoised():
     final_poses, lookahead = [], []
     for sampler in windows(pipeline(fade=8), 100, 10):
-        poses = sampler.finalize(20).poses.R_parent_joint[0]
+        poses = sampler.finalize(20)[0].R_parent_joint[0]
         if len(poses):
             final = sampler.final
             assert torch.equal(sampler.predicted.R_parent_joint[0, final - len(poses) : final], poses)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from watched_walk import WINDOW, drawn_pipeline, watched_walk
-from wearcap.data.transforms import mirrored_name
+from wearcap.data.transforms import joint_twins
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis
 from wearcap.metrics.scores import score_in_world
@@ -71,7 +71,7 @@ def test_with_mirror_augmentation_left_and_right_are_treated_alike(recording):
     seen = replace(recording, head=seen_head, imu=imu)
     pipeline = drawn_pipeline(floor="fixed", mirror_average=True)
     here, there = pipeline(recording), pipeline(seen)
-    twins = [here.skeleton.index(mirrored_name(name)) for name in here.skeleton.joint_names]
+    twins = joint_twins(here.skeleton)
     torch.testing.assert_close(here.T_world_joint.t * flip, there.T_world_joint.t[:, twins], atol=2e-3, rtol=0)
     plain = drawn_pipeline(floor="fixed", mirror_average=False)
     assert not torch.allclose(plain(recording).T_world_joint.t * flip, plain(seen).T_world_joint.t[:, twins], atol=2e-3)
@@ -128,7 +128,8 @@ def test_without_watches_those_of_the_true_motion_are_worn(recording):
 
 def test_three_tracked_points_need_a_truth(recording):
     pipeline = drawn_pipeline()
-    pipeline.features = WatchFeatures("heading", body=True, wrists="positions")
+    features = WatchFeatures("heading", body=True, wrists="positions")
+    pipeline.model = replace(pipeline.model, features=features)
     assert pipeline(recording).R_parent_joint.isfinite().all()
     with pytest.raises(WearcapError, match="no hand positions"):
         pipeline(replace(recording, motion=None))
@@ -138,8 +139,8 @@ def test_the_last_frames_estimator(recording):
     torch.manual_seed(0)
     pipeline = drawn_pipeline(stride=1, lookahead=0, floor="fixed")
     features = WatchFeatures(frame="world", absolute=False)
-    pipeline.features = features
-    pipeline.net = LastPoseEstimator(features.size, features.motion_size, WINDOW, 32, 1, 2, 32, 0.0, 2).eval()
+    net = LastPoseEstimator(features.size, features.motion_size, WINDOW, 32, 1, 2, 32, 0.0, 2).eval()
+    pipeline.model = replace(pipeline.model, net=net, features=features)
     assert len(pipeline(recording)) == len(recording.head.timestamps)
 
 

@@ -8,7 +8,8 @@ import torch
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.models.pose_regressor import PoseRegressor
-from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, encode_pose
+from wearcap.systems.hmd2.features import HeadFeatures
+from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints
 from wearcap.systems.hmd2.pose_regressor.pipeline import PoseRegressorCapture
 from wearcap_testing import recording_of, swaying_motion
 
@@ -20,7 +21,8 @@ def pipeline(points: tuple[str, ...] = ("head",), **changes) -> PoseRegressorCap
     tracked = TrackedPoints(points, "world")  # a floor from the whole path would give away the future
     net = PoseRegressor(tracked.size, 138, 40, 32, 2, 4, 64, frames_per_token=4)
     # Bends of some degrees about the rest pose, as a trained one tells them.
-    net.motion_normalizer.set(encode_pose(torch.eye(3).expand(23, 3, 3), torch.eye(3)), torch.full((138,), 0.2))
+    rest = HeadFeatures().encode(torch.eye(3).expand(1, 1, 23, 3, 3), torch.eye(3)[None, None], torch.zeros(1, 1, 2))
+    net.motion_normalizer.set(rest[0, 0], torch.full((138,), 0.2))
     return PoseRegressorCapture(net, tracked, xsens23(), 60.0, **changes)
 
 

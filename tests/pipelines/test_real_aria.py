@@ -9,8 +9,8 @@ import torch
 from PIL import Image
 from scipy.spatial import cKDTree
 
+from small_hmd2 import hmd2_of
 from wearcap.body.skeleton import xsens23
-from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.doctor import examine
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
@@ -185,7 +185,7 @@ def hmd2() -> HMD2:
     )
     for parameter in net.parameters():
         torch.nn.init.normal_(parameter, std=0.05)
-    return HMD2(net, features, CosineSchedule(), xsens23(), 60.0, place_encoder=places.eval(), steps=2, stride=40)
+    return hmd2_of(net, features, place_encoder=places.eval(), steps=2, stride=40)
 
 
 @pytest.mark.real

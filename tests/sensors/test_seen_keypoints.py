@@ -9,7 +9,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording import Motion
-from wearcap.sensors.keypoints import ACTION_CAMERA, action_camera, camera_path, seen_joints, seen_wearer
+from wearcap.sensors.keypoints import ACTION_CAMERA, action_camera, camera_path, seen_joints
 from wearcap.sensors.slam import R_DEVICE_CAM
 from wearcap_testing import swaying_motion
 
@@ -95,26 +95,3 @@ def test_what_lies_behind_is_not_seen(motion, path):
 def test_a_clock_of_its_own_is_refused(motion):
     with pytest.raises(WearcapError, match="0 pictures of the head camera during the motion"):
         camera_path(motion, action_camera(motion.timestamps + 1e4))
-
-
-def test_another_wearer_is_seen_in_range_and_whole(motion):
-    short = motion.sliced(0, 40)
-    rng = np.random.default_rng(0)
-    seen, confidence = seen_wearer(short, watching(short, 3.0), ACTION_CAMERA, 5.0, rng)
-    assert len(seen) == 20
-    assert (confidence[:, short.skeleton.index("t8")] > 0.5).all()
-    for distance, up in ((9.0, 1.5), (0.4, 1.5), (3.0, 6.0), (-3.0, 1.5)):
-        _, unseen = seen_wearer(short, watching(short, distance, up), ACTION_CAMERA, 5.0, rng)
-        assert not unseen.any()
-    _, near = seen_wearer(short, watching(short, 1.6, 1.6), ACTION_CAMERA, 5.0, rng)
-    assert (near[:, short.skeleton.index("t8")] > 0).all()
-    assert not near[:, short.skeleton.index("left_ankle")].any()
-
-
-def test_the_estimated_pose_is_off_by_some_degrees_that_last(motion):
-    seen, _ = seen_wearer(motion, watching(motion, 3.0), ACTION_CAMERA, 5.0, np.random.default_rng(0))
-    angle = rotation.geodesic(seen.R_parent_joint, motion.R_parent_joint[::2]).rad2deg()
-    assert angle.square().mean().sqrt() == pytest.approx(5.0, rel=0.1)
-    off = motion.R_parent_joint[::2].mT @ seen.R_parent_joint
-    assert rotation.geodesic(off[1:], off[:-1]).rad2deg().mean() < 1.0
-    assert (seen.t_world_root - motion.t_world_root[::2]).norm(dim=-1).mean() < 0.4

@@ -17,7 +17,8 @@ from wearcap.data.windows import Source, Windows, collate
 from wearcap.errors import WearcapError
 from wearcap.models.checkpoint import load_trained
 from wearcap.models.pose_regressor import PoseRegressor
-from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, encode_pose
+from wearcap.systems.hmd2.features import HeadFeatures
+from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints
 from wearcap.systems.hmd2.pose_regressor.training import PoseRegression
 from wearcap.systems.hmd2.training_windows import HeadContent
 from wearcap_testing import small_dataset
@@ -86,13 +87,17 @@ class Oracle(nn.Module):
         return self.answer
 
 
+def encoded(R_parent_joint: torch.Tensor, R_world_head: torch.Tensor) -> torch.Tensor:
+    return HeadFeatures().encode(R_parent_joint, R_world_head, torch.zeros(*R_world_head.shape[:2], 2))
+
+
 @pytest.mark.parametrize("mirror", [False, True])
 def test_the_truth_costs_nothing_and_another_pose_does(data, mirror):
     module, windows = system(net=Oracle).eval(), batch(data, mirror=mirror)
     ends = module.frame_pairs(windows)
     assert ends[0].tolist() == [14, 15, 44, 45]
     rows = torch.arange(16)[:, None]
-    truth = encode_pose(windows.R_parent_joint[rows, ends], windows.R_world_head[rows, ends]).flatten(0, 1)
+    truth = encoded(windows.R_parent_joint[rows, ends], windows.R_world_head[rows, ends]).flatten(0, 1)
     module.net.answer = truth
     assert all(term < 1e-5 for term in module.terms(windows).values())
     module.net.answer = truth + 0.2 * torch.randn(truth.shape, generator=torch.Generator().manual_seed(0))
@@ -107,7 +112,7 @@ def test_padding_is_no_lesson(data):
     module = system(net=Oracle).eval()
     ends = module.frame_pairs(one)
     assert one.valid[0, ends[0]].tolist() == [True, True, True, False]
-    answer = encode_pose(one.R_parent_joint[:, ends[0]], one.R_world_head[:, ends[0]])[0]
+    answer = encoded(one.R_parent_joint[:, ends[0]], one.R_world_head[:, ends[0]])[0]
     answer[3] += 1.0
     module.net.answer = answer
     assert all(term < 1e-5 for term in module.terms(one).values())
@@ -178,7 +183,7 @@ def test_the_other_experiments_take_a_step(experiment, data, tmp_path):
     pipeline = (
         ["pipeline=pose_regressor"]
         if experiment != "baseline/egoego_style"
-        else ["pipeline=baseline/egoego_style", "pipeline.steps=2", "pipeline.stride=50"]
+        else ["pipeline=baseline/egoego_style", "pipeline.sampling.steps=2", "pipeline.overlap.stride=50"]
     )
     evaluate.main(
         [

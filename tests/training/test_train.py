@@ -198,7 +198,7 @@ def test_overfits_one_batch(data, tmp_path):
 
 
 def test_evaluate_capture_and_export(checkpoint, data, tmp_path):
-    common = [f"checkpoint={checkpoint}", "pipeline.steps=2"]
+    common = [f"checkpoint={checkpoint}", "pipeline.sampling.steps=2"]
     evaluate.main([*common, f"hydra.run.dir={tmp_path}/e", f"output={tmp_path}/table.json", "seeds=[0,1]"])
     table = json.loads((tmp_path / "table.json").read_text())
     assert set(table["methods"]) == {"wearcap", "mean pose", "nearest window"}

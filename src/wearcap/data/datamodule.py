@@ -13,7 +13,7 @@ from wearcap.data.windows import FixedSampler, SeededSampler, Source, collate
 
 
 @runtime_checkable
-class Drawn(Protocol):
+class _Drawn(Protocol):
     """A data set with sampling weights, indexed by (sample, seed)."""
 
     weights: Tensor
@@ -42,7 +42,7 @@ class WindowsModule(lightning.LightningDataModule):
 
     def __init__(
         self,
-        dataset: Callable[[list[Source], str, bool], Drawn],
+        dataset: Callable[[list[Source], str, bool], _Drawn],
         loading: Loading,
         sources: dict[str, dict | None] | None = None,
         val_sources: dict[str, dict | None] | None = None,
@@ -60,7 +60,7 @@ class WindowsModule(lightning.LightningDataModule):
         self.dataset = cache(self._made)
         """The data set of a split; the statistics' is the training's own."""
 
-    def _made(self, split: str) -> Drawn:
+    def _made(self, split: str) -> _Drawn:
         train = split == "train"
         return self._dataset(self.sources if train else self.val_sources, split, train and self.augment)
 
@@ -77,7 +77,7 @@ class WindowsModule(lightning.LightningDataModule):
     def val_dataloader(self) -> DataLoader:
         return self._loader(self.val, FixedSampler(len(self.val), self.loading.val_windows))
 
-    def _loader(self, dataset: Drawn, sampler: SeededSampler | FixedSampler) -> DataLoader:
+    def _loader(self, dataset: _Drawn, sampler: SeededSampler | FixedSampler) -> DataLoader:
         workers = self.loading.workers
         return DataLoader(
             dataset,  # pyright: ignore[reportArgumentType]

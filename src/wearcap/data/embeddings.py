@@ -45,12 +45,9 @@ def embed_camera(camera: CameraStream, folder: Path, encoder: ImageEncoder, cach
             temporary.write_bytes(save(embeddings))  # save_file would leave a file of its own when killed
     count = len(embeddings["embedding"])
     if count != len(camera.timestamps):
-        raise WearcapError(
-            f"{count} pictures for {len(camera.timestamps)} timestamps",
-            where=files[0],
-            expected="a picture for each timestamp of the camera",
-            fix="The video was cut or belongs to another recording: prepare the data set again.",
-        )
+        what = f"{count} pictures for {len(camera.timestamps)} timestamps"
+        fix = "The video was cut or belongs to another recording: prepare the data set again."
+        raise WearcapError(what, where=files[0], expected="a picture for each timestamp of the camera", fix=fix)
     return replace(camera, **embeddings, embedding_name=name)
 
 
@@ -67,19 +64,14 @@ def _files(camera: CameraStream, folder: Path) -> list[Path]:
     """The video, or the image files. Raises WearcapError where there is none, or one is missing."""
     names = [camera.video] if camera.video is not None else list(camera.image_files or ())
     if not names:
-        raise WearcapError(
-            "this camera stream has no pictures",
-            where=folder,
-            expected="a video or image files",
-            fix="Prepare the data set with its camera.",
-        )
+        what = "this camera stream has no pictures"
+        fix = "Prepare the data set with its camera."
+        raise WearcapError(what, where=folder, expected="a video or image files", fix=fix)
     files = [folder / name for name in names]
     if missing := [file for file in files if not file.is_file()]:
-        raise WearcapError(
-            "no such video" if camera.video is not None else f"{len(missing)} of {len(files)} pictures are missing",
-            where=missing[0],
-            expected="the files that the recording names, below the data set's folder",
-        )
+        what = "no such video" if camera.video is not None else f"{len(missing)} of {len(files)} pictures are missing"
+        expected = "the files that the recording names, below the data set's folder"
+        raise WearcapError(what, where=missing[0], expected=expected)
     return files
 
 

@@ -66,13 +66,11 @@ class MotionFeatures:
         Raises WearcapError for a motion of other joints, or at another rate than `fps`.
         """
         if motion.skeleton.joint_names != self.skeleton.joint_names:
-            raise WearcapError(
-                f"a motion of skeleton {motion.skeleton.name!r}", expected=f"the joints of {self.skeleton.name!r}"
-            )
+            what = f"a motion of skeleton {motion.skeleton.name!r}"
+            raise WearcapError(what, expected=f"the joints of {self.skeleton.name!r}")
         if len(motion) > 1 and abs(motion.fps - self.fps) > 0.01 * self.fps:
-            raise WearcapError(
-                f"a motion of {motion.fps:.2f} frames per second", expected=f"{self.fps}", fix="Resample it first."
-            )
+            what = f"a motion of {motion.fps:.2f} frames per second"
+            raise WearcapError(what, expected=f"{self.fps}", fix="Resample it first.")
         seen = slice(None, None, self.every)
         R = motion.R_parent_joint[seen]
         joints = forward_kinematics(motion.skeleton, R, motion.t_world_root[seen]).t
@@ -90,20 +88,14 @@ class MotionFeatures:
         local = (R_heading_world @ (joints - ground)[..., None])[..., 0]
         velocity = (R_heading_world @ (first_repeated(joints.diff(dim=1)) * rate)[..., None])[..., 0]
         yaw_rate = rotation.wrap_angle(first_repeated(yaw.diff(dim=1))) * rate
-        contact = self._contact(local[..., 2], velocity.norm(dim=-1))
+        speed, contact = velocity.norm(dim=-1), []
+        for side in ("left", "right"):
+            for name, highest in CONTACT_HEIGHT_M.items():
+                joint = self.skeleton.index(f"{side}_{name}")
+                contact.append((local[:, :, joint, 2] < highest) & (speed[:, :, joint] < CONTACT_SPEED_M_S))
         root = [yaw_rate[..., None], velocity[:, :, 0, :2], local[:, :, 0, 2:]]
-        return torch.cat([*root, local[:, :, 1:].flatten(-2), velocity.flatten(-2), contact], -1)
-
-    def _contact(
-        self, height: Float[Tensor, "window frame joint"], speed: Float[Tensor, "window frame joint"]
-    ) -> Float[Tensor, "window frame 4"]:
-        feet = [
-            (self.skeleton.index(f"{side}_{name}"), highest)
-            for side in ("left", "right")
-            for name, highest in CONTACT_HEIGHT_M.items()
-        ]
-        found = [(height[..., joint] < top) & (speed[..., joint] < CONTACT_SPEED_M_S) for joint, top in feet]
-        return torch.stack(found, -1).to(height.dtype)
+        feet = torch.stack(contact, -1).to(local.dtype)
+        return torch.cat([*root, local[:, :, 1:].flatten(-2), velocity.flatten(-2), feet], -1)
 
     def joints(self, features: Float[Tensor, "window frame feature"]) -> Float[Tensor, "window frame joint 3"]:
         """Joint positions (m) decoded from features, in the heading frame with origin on the floor below the root."""

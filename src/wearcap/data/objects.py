@@ -11,48 +11,39 @@ from wearcap.geometry.mesh import Mesh
 POINTS = 1500
 """Number of points of a cloud."""
 
-OBJECT_CLASSES: tuple[str, ...] = (
-    "backpack",
-    "ball",
-    "bottle",
-    "box",
-    "cabinet_door",
-    "chair",
-    "clothesstand",
-    "container",
-    "door",
-    "drawer",
-    "floorlamp",
-    "keyboard",
-    "monitor",
-    "mop",
-    "sofa",
-    "stool",
-    "suitcase",
-    "table",
-    "tool",
-    "toolbox",
-    "trashcan",
-    "tripod",
-    "vacuum",
-    "window",
-    "yogamat",
-)
-"""All classes in alphabetical order; a class's index is its position here."""
-
-_OTHER_NAMES = {
+_NAMES: dict[str, tuple[str, ...]] = {
+    "backpack": (),
     "ball": ("basketball", "yogaball"),
+    "bottle": (),
     "box": ("boxlarge", "boxlong", "boxmedium", "boxsmall", "boxtiny", "largebox", "plasticbox", "smallbox"),
+    "cabinet_door": (),
     "chair": ("chairblack", "chairwood", "whitechair", "woodchair"),
+    "clothesstand": (),
     "container": ("plasticcontainer",),
+    "door": (),
+    "drawer": (),
+    "floorlamp": (),
+    "keyboard": (),
+    "monitor": (),
+    "mop": (),
+    "sofa": (),
+    "stool": (),
+    "suitcase": (),
     "table": ("largetable", "smalltable", "tablesmall", "tablesquare"),
+    "tool": (),
+    "toolbox": (),
     "trashcan": ("trashbin",),
+    "tripod": (),
+    "vacuum": (),
+    "window": (),
+    "yogamat": (),
 }
-"""BEHAVE's and OMOMO's names by class, where they differ from the class's name."""
+"""All classes in alphabetical order, with BEHAVE's and OMOMO's other names for them."""
 
-_CLASS_OF = {name: name for name in OBJECT_CLASSES} | {
-    name: kind for kind, names in _OTHER_NAMES.items() for name in names
-}
+OBJECT_CLASSES: tuple[str, ...] = tuple(_NAMES)
+"""A class's index is its position here."""
+
+_CLASS_OF = {name: kind for kind, others in _NAMES.items() for name in (kind, *others)}
 
 
 def object_class(name: str) -> str:
@@ -63,11 +54,9 @@ def object_class(name: str) -> str:
     if name not in _CLASS_OF:
         near = nearest(name, _CLASS_OF)
         hint = near if near.startswith("Did you mean") else ""
-        raise WearcapError(
-            f"no class for the object {name!r}",
-            expected=f"one of {', '.join(sorted(_CLASS_OF))}",
-            fix=f"{hint} A new name belongs into data/objects.py.".strip(),
-        )
+        expected = f"one of {', '.join(sorted(_CLASS_OF))}"
+        fix = f"{hint} A new name belongs into data/objects.py.".strip()
+        raise WearcapError(f"no class for the object {name!r}", expected=expected, fix=fix)
     return _CLASS_OF[name]
 
 

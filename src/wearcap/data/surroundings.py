@@ -4,13 +4,12 @@ import hashlib
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import NamedTuple
 
 import safetensors
 import torch
-from jaxtyping import Bool, Float, Float16, Float64, Int64
+from jaxtyping import Bool, Float16, Float64, Int64
 from rich.progress import track
 from safetensors.torch import save
 from torch import Tensor
@@ -96,15 +95,6 @@ class PlaceCodes:
         return code, code_mirrored
 
 
-class Seen(NamedTuple):
-    """Point codes and image embeddings of some frames, and which frames have them."""
-
-    points: Float[Tensor, "*batch time point_feature"]
-    points_valid: Bool[Tensor, "*batch time"]
-    image: Float[Tensor, "*batch time image_feature"]
-    image_valid: Bool[Tensor, "*batch time"]
-
-
 @dataclass(frozen=True)
 class Surroundings:
     """Modalities that windows contain; None leaves one out (no columns)."""
@@ -113,15 +103,11 @@ class Surroundings:
     images: str | None = None
     """Name of the encoder whose embeddings are read from the recordings' cameras."""
 
-    def image_size(self, stores: list[RecordingStore]) -> int:
-        """Dimension of the embeddings in the data.
-
-        Raises WearcapError when no recording has embeddings of this encoder, or when their dimensions differ.
-        """
-        return 0 if self.images is None else embeddings_of(self.images, stores)[1]
-
-    def read(self, store: RecordingStore, name: str, start: int, stop: int, mirrored: bool, image_size: int) -> Seen:
-        """Frames start…stop-1 of the head stream; with `mirrored`, those of the surroundings mirrored left to right.
+    def read(
+        self, store: RecordingStore, name: str, start: int, stop: int, mirrored: bool, image_size: int
+    ) -> dict[str, Tensor]:
+        """Point codes ("points") and image embeddings ("image") of frames start…stop-1 of the head stream, and which
+        frames have them ("points_valid", "image_valid"); with `mirrored`, of the surroundings mirrored left to right.
 
         Raises WearcapError as `PlaceCodes.file_of` does.
         """
@@ -129,7 +115,7 @@ class Surroundings:
         points, points_valid = torch.zeros(count, 0), torch.zeros(count, dtype=torch.bool)
         if self.places is not None:
             points = torch.zeros(count, self.places.size)
-            codes = _codes(self.places.file_of(store.root, store.entries[name]))
+            codes = _codes(str(self.places.file_of(store.root, store.entries[name])))
             rows = codes.get_slice("code_mirrored" if mirrored else "code")
             if rows.get_shape()[0]:
                 points, points_valid = rows[start:stop].float(), torch.ones(count, dtype=torch.bool)
@@ -141,7 +127,7 @@ class Surroundings:
                 first, last = picture[image_valid][[0, -1]].tolist()
                 shown = open_recording(path).window(key, first, last + 1).float()
                 image = shown[(picture - first).clamp(0, len(shown) - 1)]
-        return Seen(points, points_valid, image, image_valid)
+        return {"points": points, "points_valid": points_valid, "image": image, "image_valid": image_valid}
 
 
 NOTHING = Surroundings()
@@ -164,18 +150,14 @@ def embeddings_of(encoder: str, stores: list[RecordingStore]) -> tuple[str, int]
             kinds.add((full, file.tensor("camera.embedding").shape[1]))
     if len(kinds) != 1:
         found = ", ".join(f"{name} with {size} features" for name, size in sorted(kinds))
-        raise WearcapError(
-            f"embeddings of several kinds: {found}" if kinds else f"no recording has embeddings of {encoder!r}",
-            where=", ".join(str(store.root) for store in stores),
-            expected=f"embeddings of one {encoder!r}",
-            fix=f"Run: wearcap prepare embeddings dataset=DIR encoder={encoder.split('-')[0]}",
-        )
+        what = f"embeddings of several kinds: {found}" if kinds else f"no recording has embeddings of {encoder!r}"
+        expected = f"embeddings of one {encoder!r}"
+        fix = f"Run: wearcap prepare embeddings dataset=DIR encoder={encoder.split('-')[0]}"
+        raise WearcapError(what, where=", ".join(str(store.root) for store in stores), expected=expected, fix=fix)
     return kinds.pop()
 
 
-@cache
-def _codes(path: Path):
-    return safetensors.safe_open(str(path), framework="pt")
+_codes = cache(partial(safetensors.safe_open, framework="pt"))
 
 
 @cache

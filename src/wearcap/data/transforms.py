@@ -7,6 +7,8 @@ speed. All random numbers are the sample's own `Draws`.
 """
 
 import math
+import re
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol, runtime_checkable
@@ -167,11 +169,8 @@ class TimeTransform(Protocol):
     def retimed(self, cut: Cut, random: Draws) -> Cut: ...
 
 
-@runtime_checkable
-class Transform(Protocol):
-    """Changes the values of a window."""
-
-    def __call__(self, window: Window, random: Draws) -> Window: ...
+Transform = Callable[[Window, Draws], Window]
+"""Changes the values of a window."""
 
 
 @dataclass(frozen=True)
@@ -334,13 +333,7 @@ def mirrored_rotations(
 
 
 def joint_twins(skeleton: Skeleton) -> list[int]:
-    """Index of each joint's counterpart on the other side."""
-    return [skeleton.index(mirrored_name(name)) for name in skeleton.joint_names]
-
-
-def mirrored_name(name: str) -> str:
-    """The name with left and right exchanged; unchanged for joints on the midline."""
-    for side, other in (("left", "right"), ("right", "left")):
-        if name.startswith(side):
-            return other + name.removeprefix(side)
-    return name
+    """Index of each joint's counterpart on the other side; joints on the midline are their own."""
+    other = {"left": "right", "right": "left"}
+    names = [re.sub("^(left|right)", lambda side: other[side[0]], name) for name in skeleton.joint_names]
+    return skeleton.indices(*names)

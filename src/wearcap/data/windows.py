@@ -124,11 +124,9 @@ class Windows(Dataset):
                     weights += [source.weight * count ** (power - 1) / total] * count
                 self.recordings.append((store, name, rate))
         if not starts:
-            raise WearcapError(
-                f"no windows in split {split!r}",
-                where=", ".join(source.root for source in sources),
-                expected=f"recordings of at least {least} frames{content.requires}",
-            )
+            what = f"no windows in split {split!r}"
+            expected = f"recordings of at least {least} frames{content.requires}"
+            raise WearcapError(what, where=", ".join(source.root for source in sources), expected=expected)
         self.starts, self.weights = torch.tensor(starts), torch.tensor(weights, dtype=torch.float64)
 
     def __len__(self) -> int:
@@ -169,21 +167,15 @@ def _rows(store: RecordingStore, split: str, fps: float, every: int | None) -> t
     if every is None:
         rate = next(iter(rates), fps)
         if len(rates) > 1 or abs(rate / fps - round(rate / fps)) > 0.01:
-            raise WearcapError(
-                f"recordings of {', '.join(f'{each:g}' for each in sorted(rates))} frames per second",
-                where=store.root,
-                expected=f"one rate that is a whole multiple of {fps:g}",
-                fix="Prepare the data set at such a rate.",
-            )
+            what = f"recordings of {', '.join(f'{each:g}' for each in sorted(rates))} frames per second"
+            expected = f"one rate that is a whole multiple of {fps:g}"
+            raise WearcapError(what, where=store.root, expected=expected, fix="Prepare the data set at such a rate.")
         every = round(rate / fps)
     for name, entry in zip(store.names(split), entries):
         if abs(entry.fps - fps * every) > 0.01 * fps * every:
-            raise WearcapError(
-                f"recording {name!r} has {entry.fps} frames per second",
-                where=store.root,
-                expected=f"{fps * every}",
-                fix="Prepare the data set at that rate.",
-            )
+            what = f"recording {name!r} has {entry.fps} frames per second"
+            fix = "Prepare the data set at that rate."
+            raise WearcapError(what, where=store.root, expected=f"{fps * every}", fix=fix)
     return every, [(name, entry.frames) for name, entry in zip(store.names(split), entries)]
 
 

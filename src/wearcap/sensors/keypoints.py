@@ -4,7 +4,6 @@ Only the image borders limit visibility; occlusion by walls, furniture and the b
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -16,7 +15,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.trajectory import Trajectory, interpolate, nearest_frames, resample
+from wearcap.geometry.trajectory import Trajectory, interpolate, resample
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import CameraStream, Cue
 from wearcap.sensors.simulated import smooth_noise
@@ -30,10 +29,6 @@ BURST_S = 0.2
 """Typical duration (s) of a burst of missed detections."""
 NEAR_M = 0.05
 """Smallest visible distance from the lens (m)."""
-TRUNK = ("head", "left_shoulder", "right_shoulder", "left_hip", "right_hip")
-"""Joints that must be visible for a pose estimate."""
-DEPTH_SHARE = 0.05
-"""Relative standard deviation of a person's estimated distance: a single image does not determine scale."""
 
 
 def action_camera(timestamps: Float64[Tensor, "time"]) -> CameraStream:
@@ -85,52 +80,6 @@ def seen_joints(
         if found.any():
             cues[joint] = Cue(T_world_cam.timestamps[found], joint, off[found].float(), confidence[found])
     return cues
-
-
-def seen_wearer(
-    motion: Motion,
-    T_world_cam: Trajectory,
-    camera: Camera,
-    noise_deg: float,
-    rng: np.random.Generator,
-    period_s: float = 1.0,
-    range_m: float = 8.0,
-) -> tuple[Motion, Float[Tensor, "time joint"]]:
-    """Simulated monocular pose estimate of a person in another wearer's camera, and its confidence.
-
-    Local rotations have errors of `noise_deg` (root mean square) that vary over about `period_s`; the root has an error
-    in distance. Confidence is above 0 for frames with trunk and head in the image and nearer than `range_m`, and for
-    joints that are in the image with their children. Both recordings need one clock and one world.
-    """
-    times = T_world_cam.timestamps
-    joints = interpolate(motion.timestamps, motion.T_world_joint.t, times)
-    _, seen = _in_picture(joints, T_world_cam, camera)
-    away = joints[:, 0] - T_world_cam.t_world_body
-    distance = away.norm(dim=-1)
-    skeleton, fps, count = motion.skeleton, _rate(T_world_cam), len(times)
-    found = seen[:, skeleton.indices(*TRUNK)].all(-1) & (distance < range_m)
-    clear = seen.clone()
-    for joint, parent in enumerate(skeleton.parents):
-        if parent >= 0:
-            clear[:, parent] &= seen[:, joint]
-    confidence = (1 - 0.5 * (distance / range_m).clamp_max(1))[:, None] * (clear & found[:, None])
-    nearest = nearest_frames(motion.timestamps, times)
-    turn = smooth_noise(rng, count, 3 * len(skeleton), period_s, fps).unflatten(-1, (-1, 3))
-    R = motion.R_parent_joint[nearest] @ rotation.exp(np.deg2rad(noise_deg) / np.sqrt(3) * turn)
-    deeper = DEPTH_SHARE * smooth_noise(rng, count, 1, period_s, fps)
-    estimate = replace(
-        motion,
-        timestamps=times,
-        R_parent_joint=R,
-        t_world_root=joints[:, 0] + deeper * away,
-        contact_prob=None,
-        hand_contact_prob=None,
-        body_contact_prob=None,
-        object_motion=None,
-        interactions=None,
-        provenance={"source": "simulated pose estimator"},
-    )
-    return estimate, confidence.float()
 
 
 def _in_picture(

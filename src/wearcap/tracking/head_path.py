@@ -76,46 +76,32 @@ def head_path(recording: Recording, fallback: Skeleton, fps: float) -> HeadPath:
     if not (times.diff() > 0).all():
         fix = "Sort the head stream by time and leave repeated poses out."
         raise WearcapError("head poses whose timestamps do not grow", where=recording.name, fix=fix)
-    _require_plausible(head.R_world_device[finite], times, fps, recording.name)
+    R_world_device, span = head.R_world_device[finite], (times[-1] - times[0]).item()
+    skewed = (R_world_device.transpose(-1, -2) @ R_world_device - torch.eye(3)).abs().amax((-1, -2)) > 0.05
+    if skewed.any():
+        what = f"the head pose at {times[skewed][0].item():.3f} s is no rotation"
+        fix = "Run `wearcap doctor` on the recording."
+        raise WearcapError(what, where=recording.name, expected="orthonormal matrices", fix=fix)
+    if span * fps > MAX_FILL * len(times):
+        what = f"{len(times)} head poses over {span:.0f} s"
+        fix = "Give timestamps in seconds, or cut the recording at its pauses."
+        raise WearcapError(what, where=recording.name, expected=f"one in {MAX_FILL / fps:.0f} s at least", fix=fix)
     skeleton = recording.skeleton or (recording.motion.skeleton if recording.motion else fallback)
-    trajectory = Trajectory(times, head.R_world_device[finite], head.t_world_device[finite])
+    trajectory = Trajectory(times, R_world_device, head.t_world_device[finite])
     broken = _breaks(trajectory)
-    count = int((times[-1] - times[0]).item() * fps + 1e-3) + 1
+    count = int(span * fps + 1e-3) + 1
     timestamps = times[0] + torch.arange(count, dtype=torch.float64) / fps
     if count != len(times) or (timestamps - times).abs().max() > 1e-4:
         trajectory = resample(trajectory, timestamps.clamp_max(times[-1].item()))
-    T_device_head = Rigid(head.R_head_device, head.t_head_device).inverse()
-    T_world_head = trajectory.T_world_body @ T_device_head
+    T_world_head = trajectory.T_world_body @ Rigid(head.R_head_device, head.t_head_device).inverse()
     floor = floor_from_path(timestamps, T_world_head.t, skeleton.height_of("head"))
     stretches, first = [], 0
     for before, after in broken:
         stretches.append((first, int(torch.searchsorted(timestamps, before + 1e-6))))
         first = int(torch.searchsorted(timestamps, after - 1e-6))
     stretches.append((first, count))
-    return HeadPath(
-        timestamps,
-        T_world_head,
-        trajectory.T_world_body,
-        floor,
-        skeleton,
-        tuple((start, stop) for start, stop in stretches if stop > start),
-    )
-
-
-def _require_plausible(
-    R_world_device: Float[Tensor, "time 3 3"], times: Float64[Tensor, "time"], fps: float, name: str
-) -> None:
-    """Raise WearcapError for matrices that are not rotations, and for timestamps that are not in seconds."""
-    skewed = (R_world_device.transpose(-1, -2) @ R_world_device - torch.eye(3)).abs().amax((-1, -2)) > 0.05
-    if skewed.any():
-        what = f"the head pose at {times[skewed][0].item():.3f} s is no rotation"
-        fix = "Run `wearcap doctor` on the recording."
-        raise WearcapError(what, where=name, expected="orthonormal matrices", fix=fix)
-    span = (times[-1] - times[0]).item()
-    if span * fps > MAX_FILL * len(times):
-        what = f"{len(times)} head poses over {span:.0f} s"
-        fix = "Give timestamps in seconds, or cut the recording at its pauses."
-        raise WearcapError(what, where=name, expected=f"one in {MAX_FILL / fps:.0f} s at least", fix=fix)
+    whole = tuple((start, stop) for start, stop in stretches if stop > start)
+    return HeadPath(timestamps, T_world_head, trajectory.T_world_body, floor, skeleton, whole)
 
 
 def _breaks(trajectory: Trajectory) -> list[tuple[float, float]]:

@@ -17,6 +17,8 @@ class Training(lightning.LightningModule):
     By default the loss is the sum of `terms` times `loss_weights`; a term without a weight is only logged.
     """
 
+    system: ClassVar[type | None] = None
+    """The system that captures with the network; None: none does."""
     parts: ClassVar[tuple[str, ...]] = ()
     """Attributes that are constructor arguments of the system's pipeline."""
 

@@ -10,7 +10,7 @@ from lightning.pytorch import Callback
 
 from wearcap.metrics.scores import score
 from wearcap.metrics.table import aggregate
-from wearcap.recording import Motion, Recording, RecordingStore
+from wearcap.recording import Motion, RecordingStore
 from wearcap.runtime.system import System
 from wearcap.training.base import Training
 
@@ -50,7 +50,17 @@ class CaptureValidation(Callback):
         # Some, evenly chosen, and their first seconds only: this does not replace an evaluation.
         names = store.names("val")
         chosen = names[:: max(1, len(names) // self.recordings)][: self.recordings]
-        recordings = [_first_seconds(store.load(name), self.max_seconds) for name in chosen]
+        recordings = []
+        for recording in map(store.load, chosen):
+            head, motion, contacts = recording.head, recording.motion, recording.contacts
+            assert head is not None
+            assert motion is not None
+            stop = int(torch.searchsorted(head.timestamps, head.timestamps[0] + self.max_seconds))
+            streams = "timestamps", "R_world_device", "t_world_device"
+            head = replace(head, **{name: getattr(head, name)[:stop] for name in streams})
+            if contacts is not None:
+                contacts = replace(contacts, timestamps=contacts.timestamps[:stop], contact=contacts.contact[:stop])
+            recordings.append(replace(recording, head=head, motion=motion.sliced(0, stop), contacts=contacts))
         motions = [captured.motion for captured in pipeline.capture(recordings, [0] * len(recordings))]
         rows = [score(m, r, r.name, 0) for m, r in zip(motions, recordings)]
         for key, summary in aggregate(rows).items():
@@ -59,20 +69,3 @@ class CaptureValidation(Callback):
         if self.draw is not None:
             path = self.folder / f"step_{trainer.global_step:06d}_{recordings[0].name}.png"
             self.draw(path, {"truth": recordings[0].motion, "capture": motions[0]})
-
-
-def _first_seconds(recording: Recording, seconds: float) -> Recording:
-    """The beginning of a recording's head path, motion and contacts."""
-    assert recording.head is not None
-    assert recording.motion is not None
-    stop = int(torch.searchsorted(recording.head.timestamps, recording.head.timestamps[0] + seconds))
-    head, contacts = recording.head, recording.contacts
-    head = replace(
-        head,
-        timestamps=head.timestamps[:stop],
-        R_world_device=head.R_world_device[:stop],
-        t_world_device=head.t_world_device[:stop],
-    )
-    if contacts is not None:
-        contacts = replace(contacts, timestamps=contacts.timestamps[:stop], contact=contacts.contact[:stop])
-    return replace(recording, head=head, motion=recording.motion.sliced(0, stop), contacts=contacts)

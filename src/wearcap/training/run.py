@@ -85,11 +85,8 @@ def require_resumable(path: str | Path, own: Mapping[str, Tensor]) -> None:
     saved = read_run_file(path)
     missing = [key for key in TRAINING_STATE if key not in saved]
     if missing or not isinstance(saved["state_dict"], dict):
-        raise WearcapError(
-            f"a checkpoint without {missing[0] if missing else 'weights'}",
-            where=path,
-            expected="a run's .ckpt file, as `wearcap train` writes it",
-        )
+        what = f"a checkpoint without {missing[0] if missing else 'weights'}"
+        raise WearcapError(what, where=path, expected="a run's .ckpt file, as `wearcap train` writes it")
     check_weights(own, saved["state_dict"], path)
 
 
@@ -113,11 +110,8 @@ def resume_path(resume: str | None, own: Path, runs: Path) -> Path | None:
         return None
     if resume != "auto":
         if not Path(resume).is_file():
-            raise WearcapError(
-                "no such checkpoint to resume from",
-                where=resume,
-                expected="a run's .ckpt file, or resume=auto for the newest",
-            )
+            expected = "a run's .ckpt file, or resume=auto for the newest"
+            raise WearcapError("no such checkpoint to resume from", where=resume, expected=expected)
         return Path(resume)
     if (mine := own / "checkpoints" / "last.ckpt").is_file():
         return mine

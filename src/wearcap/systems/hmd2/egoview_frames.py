@@ -103,11 +103,9 @@ class EgoFrames(Dataset):
                 intrinsics.append(torch.tensor([lens.fx, lens.fy, lens.cx, lens.cy]).expand(len(frames), 4))
                 self._pictures.append(frames)
         if not points:
-            raise WearcapError(
-                f"no head camera images in split {split!r}",
-                where=", ".join(s.root for s in sources),
-                fix="Prepare a data set with them: wearcap prepare simulated camera=true",
-            )
+            what = f"no head camera images in split {split!r}"
+            fix = "Prepare a data set with them: wearcap prepare simulated camera=true"
+            raise WearcapError(what, where=", ".join(s.root for s in sources), fix=fix)
         self.point_cam, self.visible, self.weights = torch.cat(points), torch.cat(visible), torch.cat(weights)
         self.intrinsics = torch.cat(intrinsics)
         shown = self.visible[:, [POINTS.index(name) for name in HANDS]].any(-1)
@@ -149,11 +147,8 @@ def decoded(camera: CameraStream, root: Path, every: int) -> UInt8[np.ndarray, "
             if (count - 1) % every == 0:
                 chosen.append(picture)
         if count != len(camera.timestamps) or len({picture.shape for picture in chosen}) != 1:
-            raise WearcapError(
-                f"{count} pictures for {len(camera.timestamps)} timestamps",
-                where=first,
-                expected="a picture for each timestamp, all of one size",
-            )
+            what = f"{count} pictures for {len(camera.timestamps)} timestamps"
+            raise WearcapError(what, where=first, expected="a picture for each timestamp, all of one size")
         with atomic_path(path) as temporary:
             np.save(temporary, np.stack(chosen), allow_pickle=False)
     return _array(path)

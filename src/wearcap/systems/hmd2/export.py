@@ -1,33 +1,23 @@
 """HMD²'s networks as exported graphs. Windows, features and sampler are the pipeline's own: the same noise gives the
 same motion."""
 
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from wearcap.body.skeleton import Skeleton
 from wearcap.data.features import LIMBS
 from wearcap.errors import WearcapError
 from wearcap.models.layers import Normalizer
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
-from wearcap.runtime.graphs import (
-    ROT6D,
-    Call,
-    Exports,
-    Graph,
-    Run,
-    schedule_from_json,
-    schedule_to_json,
-    skeleton_from_json,
-    skeleton_to_json,
-)
+from wearcap.runtime import graphs
+from wearcap.runtime.graphs import ROT6D, Call, Exports, Graph, Run
 from wearcap.scene.voxels import VoxelGrid
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import Conditions, MotionDenoiser
-from wearcap.systems.hmd2.pipeline import HMD2
+from wearcap.systems.hmd2.pipeline import HMD2, DiffusionModel, Overlap, Sampling
 
 SETTINGS = ("steps", "stride", "eta", "spacing", "guidance", "inpaint", "fade", "lookahead", "live", "use")
 
@@ -65,39 +55,42 @@ def exports(pipeline: HMD2) -> Exports:
 
     Raises WearcapError for a network that is exported already, and for an unknown schedule.
     """
-    net, features, random = pipeline.net, pipeline.features, torch.Generator().manual_seed(0)
+    model, random = pipeline.model, torch.Generator().manual_seed(0)
+    net, features = model.net, model.features
     if isinstance(net, _ExportedDenoiser):
         raise WearcapError("a network that is exported already", expected="one of a checkpoint")
     shape = 2, net.window
-    graphs = net.graphs()
-    valid, normalizer = graphs["step"].inputs["valid"], net.condition_encoder.normalizer
+    made = net.graphs()
+    valid, normalizer = made["step"].inputs["valid"], net.condition_encoder.normalizer
     noise = torch.randn(*shape, len(normalizer.scale), generator=random)
     inputs = {"head": normalizer.mean.cpu() + normalizer.scale.cpu() * noise, "valid": valid}
     for name, size in (("points", net.points_size), ("image", net.image_size)):
         if size:
             present = valid & (torch.rand(shape, generator=random) < 0.7)
             inputs |= {name: torch.randn(*shape, size, generator=random), f"{name}_valid": present}
-    graphs["conditions"] = Graph(_ConditionGraph(net), inputs)
-    if pipeline.place_encoder is not None and net.points_size:
-        grid = pipeline.place_encoder.grid
+    made["conditions"] = Graph(_ConditionGraph(net), inputs)
+    if model.place_encoder is not None and net.points_size:
+        grid = model.place_encoder.grid
         grids = grid.clip_m * torch.rand(2, *[grid.cells] * 3, generator=random)
-        graphs["places"] = Graph(Call(pipeline.place_encoder, "encode"), {"grids": grids})
+        made["places"] = Graph(Call(model.place_encoder, "encode"), {"grids": grids})
+    feet = ["left_foot.contact", "right_foot.contact"] if features.contacts else []
+    settings = asdict(pipeline.sampling) | asdict(pipeline.overlap) | {"live": pipeline.live, "use": list(pipeline.use)}
     about = {
         "window": net.window,
-        "fps": pipeline.fps,
-        "settings": {name: getattr(pipeline, name) for name in SETTINGS} | {"use": list(pipeline.use)},
-        "schedule": schedule_to_json(pipeline.schedule),
+        "fps": model.fps,
+        "settings": {name: settings[name] for name in SETTINGS},
+        "schedule": graphs.schedule_to_json(model.schedule),
         "features": asdict(features),
         "condition_channels": condition_channels(features),
-        "motion_channels": motion_channels(features, pipeline.skeleton),
+        "motion_channels": [*(f"{joint}.{entry}" for joint in model.skeleton.joint_names for entry in ROT6D), *feet],
         "motion_mean": net.motion_normalizer.mean.tolist(),
         "motion_scale": net.motion_normalizer.scale.tolist(),
         **{name: getattr(net, name) for name in ("condition_size", "points_size", "image_size", "self_conditioning")},
-        "image_encoder": pipeline.image_encoder,
-        "grid": None if pipeline.place_encoder is None else asdict(pipeline.place_encoder.grid),
-        "skeleton": skeleton_to_json(pipeline.skeleton),
+        "image_encoder": model.image_encoder,
+        "grid": None if model.place_encoder is None else asdict(model.place_encoder.grid),
+        "skeleton": graphs.skeleton_to_json(model.skeleton),
     }
-    return Exports("hmd2", graphs, about)
+    return Exports("hmd2", made, about)
 
 
 def condition_channels(features: HeadFeatures) -> list[str]:
@@ -111,12 +104,6 @@ def condition_channels(features: HeadFeatures) -> list[str]:
         *(f"angular_velocity_{axis}" for axis in "xyz"),
         *(f"size.{limb}" for limb in LIMBS if features.body),
     ]
-
-
-def motion_channels(features: HeadFeatures, skeleton: Skeleton) -> list[str]:
-    """Names of the motion's channels in order."""
-    feet = ["left_foot.contact", "right_foot.contact"] if features.contacts else []
-    return [*(f"{joint}.{entry}" for joint in skeleton.joint_names for entry in ROT6D), *feet]
 
 
 class _ExportedDenoiser(MotionDenoiser):
@@ -160,16 +147,14 @@ class _ExportedPlaces(VoxelAutoencoder):
 
 def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], about: dict[str, Any]) -> HMD2:
     """The pipeline of an exported model."""
-    places = None
+    places, settings = None, dict(about["settings"])
     if "places" in runs:
         places = _ExportedPlaces(runs["places"], VoxelGrid(**about["grid"]), about["points_size"])
-    return HMD2(
-        net=_ExportedDenoiser(runs, about),
-        features=HeadFeatures(**about["features"]),
-        schedule=schedule_from_json(about["schedule"]),
-        skeleton=skeleton_from_json(about["skeleton"]),
-        fps=about["fps"],
-        place_encoder=places,
-        image_encoder=about["image_encoder"],
-        **about["settings"],
+    net, features = _ExportedDenoiser(runs, about), HeadFeatures(**about["features"])
+    schedule, skeleton = graphs.schedule_from_json(about["schedule"]), graphs.skeleton_from_json(about["skeleton"])
+    model = DiffusionModel(net, features, schedule, skeleton, about["fps"], places, about["image_encoder"])
+    sampling, overlap = (
+        kind(**{field.name: settings.pop(field.name) for field in fields(kind) if field.name in settings})
+        for kind in (Sampling, Overlap)
     )
+    return HMD2(model, sampling, overlap, **settings)

@@ -34,9 +34,8 @@ class HeadFeatures:
     def __post_init__(self):
         for name, allowed in (("frame", ("heading", "window")), ("height", ("stature", "floor", "relative"))):
             if getattr(self, name) not in allowed:
-                raise WearcapError(
-                    f"head features have no {name} {getattr(self, name)!r}", expected=f"one of {', '.join(allowed)}"
-                )
+                what = f"head features have no {name} {getattr(self, name)!r}"
+                raise WearcapError(what, expected=f"one of {', '.join(allowed)}")
 
     @property
     def condition_size(self) -> int:

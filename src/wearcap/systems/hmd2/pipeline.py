@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
@@ -18,7 +18,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
-from wearcap.recording import Motion, Recording
+from wearcap.recording import Motion, PointCloud, Recording
 from wearcap.runtime.system import CaptureInput, LearnedSystem
 from wearcap.scene.voxels import voxelize
 from wearcap.systems.hmd2.features import HeadFeatures
@@ -31,9 +31,9 @@ from wearcap.tracking.head_path import HeadPath, head_path
 MODALITIES = ("points", "images")
 
 
-@dataclass
-class HMD2(LearnedSystem):
-    """Captures whole recordings in overlapping windows (thesis eq. 6.5); its fields also set up streams."""
+@dataclass(frozen=True, eq=False)
+class DiffusionModel:
+    """What a training gives a capture: the network, and what it was trained with."""
 
     net: MotionDenoiser
     features: HeadFeatures
@@ -44,63 +44,82 @@ class HMD2(LearnedSystem):
     place_encoder: VoxelAutoencoder | None = None
     image_encoder: str | None = None
     """Name of the encoder whose embeddings the network was trained on."""
-    use: Sequence[str] = MODALITIES
-    """Modalities that condition the model, of those that it was trained on and the recording contains."""
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How a window is denoised."""
+
     steps: int = 5
     """Number of denoising steps."""
-    stride: int | None = None
-    """Frames by which windows advance; None: half a window, or with `inpaint` three quarters (thesis: 180 of 240)."""
     eta: float = 1.0
     """Stochasticity of the steps: 1 samples the posterior (thesis eq. 6.2, 6.3), 0 is DDIM."""
-    guidance: float = 1.0
-    """Scale of classifier-free guidance by points and images (Ho & Salimans 2022; ours); 1 turns it off."""
-    live: bool = False
-    """Whether the floor at a frame is estimated from earlier data only, as it must be in a stream."""
     spacing: float = 1.0
     """Spacing of the steps' noise levels (`diffusion.process.step_levels`)."""
+    guidance: float = 1.0
+    """Scale of classifier-free guidance by points and images (Ho & Salimans 2022; ours); 1 turns it off."""
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """How successive windows continue each other."""
+
+    stride: int | None = None
+    """Frames by which windows advance; None: half a window, or with `inpaint` three quarters (thesis: 180 of 240)."""
+    lookahead: int | None = None
+    """Frames that must follow a pose before it is final (ours): the next frames show where the feet are going.
+    None: half of the overlap, so that poses come from the windows' middle; with `inpaint` none."""
     inpaint: bool = False
     """Whether steps overwrite the overlap with the last window's poses (thesis eq. 6.5) or re-denoise it (ours)."""
     fade: int = 20
     """Frames over which the difference between successive windows fades out after their seam (without `inpaint`)."""
-    lookahead: int | None = None
-    """Frames that must follow a pose before it is final (ours): the next frames show where the feet are going.
-    None: half of the overlap, so that poses come from the windows' middle; with `inpaint` none."""
+
+
+@dataclass
+class HMD2(LearnedSystem):
+    """Captures whole recordings in overlapping windows (thesis eq. 6.5); its fields also set up streams."""
+
+    model: DiffusionModel
+    sampling: Sampling = Sampling()
+    overlap: Overlap = Overlap()
+    use: Sequence[str] = MODALITIES
+    """Modalities that condition the model, of those that it was trained on and the recording contains."""
+    live: bool = False
+    """Whether the floor at a frame is estimated from earlier data only, as it must be in a stream."""
     runtime: str = "eager"
     """Backend of the denoising steps (`runtime.graphs.RUNTIMES`)."""
     precision: str = "auto"
     """Number format of the steps' matrix products (`runtime.graphs.PRECISIONS`)."""
     device: str = "cpu"
-    _steps: StepRunner | None = field(default=None, init=False, repr=False, compare=False)
 
     name = "hmd2"
     experiment = "experiment=hmd2"
     shared = ("hmd2",)
 
     def __post_init__(self):
+        self._steps: StepRunner | None = None
         if unknown := set(self.use) - set(MODALITIES):
             raise WearcapError(f"no modality {min(unknown)!r}", expected=f"some of {', '.join(MODALITIES)}")
 
     @property
     def advance(self) -> int:
         """Frames by which windows advance. Raises WearcapError when successive windows would leave a gap."""
-        window = self.net.window
-        advance = (3 * window // 4 if self.inpaint else window // 2) if self.stride is None else self.stride
+        window, overlap = self.model.net.window, self.overlap
+        advance = (3 * window // 4 if overlap.inpaint else window // 2) if overlap.stride is None else overlap.stride
         if not 0 < advance <= window:
-            raise WearcapError(
-                f"windows of {window} frames cannot advance by {advance}", expected=f"a stride from 1 to {window}"
-            )
+            what = f"windows of {window} frames cannot advance by {advance}"
+            raise WearcapError(what, expected=f"a stride from 1 to {window}")
         return advance
 
     @property
     def lookahead_frames(self) -> int:
         """Frames at a window's end that the next one re-denoises. Raises WearcapError when the overlap is shorter."""
-        shared = self.net.window - self.advance
-        lookahead_frames = (0 if self.inpaint else shared // 2) if self.lookahead is None else self.lookahead
+        shared, lookahead_frames = self.model.net.window - self.advance, self.overlap.lookahead
+        if lookahead_frames is None:
+            lookahead_frames = 0 if self.overlap.inpaint else shared // 2
         if not 0 <= lookahead_frames <= shared:
-            raise WearcapError(
-                f"windows that share {shared} frames cannot look {lookahead_frames} ahead",
-                expected=f"a lookahead from 0 to {shared}",
-            )
+            what = f"windows that share {shared} frames cannot look {lookahead_frames} ahead"
+            raise WearcapError(what, expected=f"a lookahead from 0 to {shared}")
         return lookahead_frames
 
     def prepare(self) -> None:
@@ -108,10 +127,10 @@ class HMD2(LearnedSystem):
 
         Compilation or export happens once, with the weights of that moment.
         """
-        self.net.to(self.device).eval()
+        self.model.net.to(self.device).eval()
         if self._steps is None or self.runtime == "eager":
-            levels = step_levels(self.steps, self.spacing)[:-1]
-            self._steps = StepRunner(self.net, levels, self.runtime, self.precision)
+            levels = step_levels(self.sampling.steps, self.sampling.spacing)[:-1]
+            self._steps = StepRunner(self.model.net, levels, self.runtime, self.precision)
 
     def undisturbed(self) -> AbstractContextManager[None]:
         """A context for small batches, after `prepare`, in which other threads leave the cores to the steps."""
@@ -125,82 +144,56 @@ class HMD2(LearnedSystem):
         recordings = [source.recording for source in sources]
         # 1. head path and floor; 2. codes of the points around the body; 3. image embeddings; once for all seeds
         once = {id(recording): recording for recording in recordings}
-        path_of = {key: head_path(recording, self.skeleton, self.fps) for key, recording in once.items()}
+        path_of = {key: head_path(recording, self.model.skeleton, self.model.fps) for key, recording in once.items()}
         sensed = {key: self.sense(recording, path_of[key]) for key, recording in once.items()}
         paths, frames = zip(*((path_of[id(recording)], sensed[id(recording)]) for recording in recordings))
         # 4. windows of the diffusion model, every stretch of a path separately
         poses = self._windows(paths, frames, seeds)
         # 5. anchor the body to the measured head
-        return [
-            self.motion(path.timestamps, path.skeleton, path.T_world_head, predicted)
-            for path, predicted in zip(paths, poses)
-        ]
+        return [self.motion(p.timestamps, p.skeleton, p.T_world_head, predicted) for p, predicted in zip(paths, poses)]
 
     def sense(self, recording: Recording, path: HeadPath) -> Frames:
         """Steps 2 and 3: the conditioning of a whole recording, as a batch of one.
 
         Raises WearcapError for embeddings of an encoder that the network was not trained on.
         """
-        count = len(path.timestamps)
-        points, points_valid = self._points(recording, path)
-        image, image_valid = torch.zeros(count, self.net.image_size), torch.zeros(count, dtype=torch.bool)
-        camera = recording.camera
-        if self.net.image_size and "images" in self.use and camera is not None and camera.embedding is not None:
+        count, net, camera = len(path.timestamps), self.model.net, recording.camera
+        cloud = recording.points if net.points_size and "points" in self.use else None
+        points, points_valid = torch.zeros(count, net.points_size), torch.zeros(count, dtype=torch.bool)
+        if cloud is not None and (encoder := self.model.place_encoder) is not None:  # what had been seen by each frame
+            grid = voxelize(cloud.points_world, path.T_world_device, encoder.grid, cloud.first_seen, path.timestamps)
+            points = torch.cat([encoder.encode(part) for part in grid.split(2048)])
+            points_valid = torch.ones(count, dtype=torch.bool)
+        image, image_valid = torch.zeros(count, net.image_size), torch.zeros(count, dtype=torch.bool)
+        if net.image_size and "images" in self.use and camera is not None and camera.embedding is not None:
             size = camera.embedding.shape[1]
-            if (camera.embedding_name, size) != (self.image_encoder, self.net.image_size):
-                raise WearcapError(
-                    f"embeddings of {camera.embedding_name!r} with {size} features",
-                    where=recording.name,
-                    expected=f"{self.net.image_size} of {self.image_encoder!r}, which the network was trained on",
-                    fix="Prepare its embeddings with that encoder, or leave images out: pipeline.use=[points].",
-                )
+            if (camera.embedding_name, size) != (self.model.image_encoder, net.image_size):
+                what = f"embeddings of {camera.embedding_name!r} with {size} features"
+                expected = f"{net.image_size} of {self.model.image_encoder!r}, which the network was trained on"
+                fix = "Prepare its embeddings with that encoder, or leave images out: pipeline.use=[points]."
+                raise WearcapError(what, where=recording.name, expected=expected, fix=fix)
             number, image_valid = latest_before(camera.timestamps, path.timestamps)
             image = camera.embedding[number].float()
             image_valid &= image.isfinite().all(-1)
             image = image.nan_to_num(0.0, 0.0, 0.0)
-        frames = Frames(
-            path.T_world_head.R,
-            path.T_world_head.t,
-            self._floor(recording, path),
-            points,
-            points_valid,
-            image,
-            image_valid,
-            torch.ones(count, dtype=torch.bool),
-        )
-        return Frames(*(part[None] for part in frames))
+        head, floor, valid = path.T_world_head, self._floor(cloud, path), torch.ones(count, dtype=torch.bool)
+        fields = head.R, head.t, floor, points, points_valid, image, image_valid, valid
+        return Frames(*(part[None] for part in fields))
 
-    def _uses_points(self, recording: Recording) -> bool:
-        return bool(self.net.points_size) and "points" in self.use and recording.points is not None
-
-    def _points(
-        self, recording: Recording, path: HeadPath
-    ) -> tuple[Float[Tensor, "time feature"], Bool[Tensor, "time"]]:
-        """Codes of the points around the body that had been seen by each frame, and which frames have them."""
-        count, cloud = len(path.timestamps), recording.points
-        if not self._uses_points(recording) or self.place_encoder is None or cloud is None:
-            return torch.zeros(count, self.net.points_size), torch.zeros(count, dtype=torch.bool)
-        grid = voxelize(
-            cloud.points_world, path.T_world_device, self.place_encoder.grid, cloud.first_seen, path.timestamps
-        )
-        code = torch.cat([self.place_encoder.encode(part) for part in grid.split(2048)])
-        return code, torch.ones(count, dtype=torch.bool)
-
-    def _floor(self, recording: Recording, path: HeadPath) -> Float[Tensor, "time"]:
+    def _floor(self, cloud: PointCloud | None, path: HeadPath) -> Float[Tensor, "time"]:
         """Floor height (m) below the head: from the points where they are used, else from the head's path."""
-        cloud = recording.points if self._uses_points(recording) else None
         if self.live:
-            return tracked_floor(cloud, path.timestamps, path.T_world_head.t, path.stature, self.fps)
+            return tracked_floor(cloud, path.timestamps, path.T_world_head.t, path.stature, self.model.fps)
         floor = floor_from_points(cloud, path.T_world_head.t, path.stature)
         return path.floor_height if floor is None else floor
 
     def denoiser(self, conditions: Conditions, valid: Bool[Tensor, "batch time"]) -> Denoise:
         """x̂0 as a function of x_t, to be called once per sampling step in order; conditions are encoded once."""
-        encoded = self.net.encode(conditions, valid)
-        unguided = None
-        if self.guidance != 1.0:
+        net, guidance = self.model.net, self.sampling.guidance
+        encoded, unguided = net.encode(conditions, valid), None
+        if guidance != 1.0:
             none = torch.zeros_like(valid)
-            unguided = self.net.encode(conditions._replace(points_valid=none, image_valid=none), valid)
+            unguided = net.encode(conditions._replace(points_valid=none, image_valid=none), valid)
         steps, number, last = self._steps, 0, None
         assert steps is not None
 
@@ -209,8 +202,8 @@ class HMD2(LearnedSystem):
             x0_hat = steps(number, x_t, encoded, valid, last)
             if unguided is not None:
                 plain = steps(number, x_t, unguided, valid, last)
-                x0_hat = plain + self.guidance * (x0_hat - plain)
-            last, number = x0_hat if self.net.self_conditioning else None, number + 1
+                x0_hat = plain + guidance * (x0_hat - plain)
+            last, number = x0_hat if net.self_conditioning else None, number + 1
             return x0_hat
 
         return denoise
@@ -235,8 +228,8 @@ class HMD2(LearnedSystem):
             for i, start, stop, sampler in items:
                 ended = start + passed >= stop
                 left = 0 if ended else lookahead_frames
-                final, end = sampler.finalize(left), min(start + passed, stop) - left
-                for target, part in zip(whole[i], final.poses):
+                (final, _), end = sampler.finalize(left), min(start + passed, stop) - left
+                for target, part in zip(whole[i], final):
                     target[0, end - part.shape[1] : end] = part[0]
             items = [item for item in items if item[1] + passed < item[2]]
         return [_bridged(Poses(*(part[0] for part in poses)), path.stretches) for poses, path in zip(whole, paths)]
@@ -251,15 +244,14 @@ class HMD2(LearnedSystem):
         """Step 5: poses (without the batch axis) as a motion that is anchored to the measured head."""
         settings = {
             "pipeline": "hmd2",
-            "steps": str(self.steps),
+            "steps": str(self.sampling.steps),
             "stride": str(self.advance),
-            "eta": str(self.eta),
+            "eta": str(self.sampling.eta),
             "lookahead": str(self.lookahead_frames),
         }
-        contact = poses.foot_contact.repeat_interleave(2, -1) if self.features.contacts else None
-        motion = Motion(
-            timestamps, skeleton, poses.R_parent_joint, torch.zeros(len(timestamps), 3), contact, provenance=settings
-        )
+        contact = poses.foot_contact.repeat_interleave(2, -1) if self.model.features.contacts else None
+        root = torch.zeros(len(timestamps), 3)
+        motion = Motion(timestamps, skeleton, poses.R_parent_joint, root, contact, provenance=settings)
         return anchored_to_head(motion, T_world_head)
 
 

@@ -7,7 +7,6 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.errors import WearcapError
-from wearcap.geometry.rigid import Rigid
 from wearcap.scene.voxels import VoxelGrid, VoxelMap
 from wearcap.tracking.floor import LOOK_FRAMES, FloorTracker
 
@@ -26,10 +25,8 @@ class Memory:
 
     def __post_init__(self):
         if not self.radius_m >= 5.0 or self.max_points < 1000:
-            raise WearcapError(
-                f"a memory of {self.max_points} points within {self.radius_m} m",
-                expected="at least 1000 points within at least 5 m",
-            )
+            what = f"a memory of {self.max_points} points within {self.radius_m} m"
+            raise WearcapError(what, expected="at least 1000 points within at least 5 m")
 
 
 class Places:
@@ -40,7 +37,7 @@ class Places:
         self.grid, self.memory = grid, memory
         self.mapped = False
         """Whether any packet of points arrived, even an empty one."""
-        self._map, self._floor = VoxelMap(grid), FloorTracker(stature, fps)
+        self.map, self._floor = VoxelMap(grid), FloorTracker(stature, fps)
         self._tracked: list[tuple[Tensor, Tensor]] = []
         """Points and the times they were first seen, as far as the floor tracker has them."""
         self._new: list[tuple[Tensor, Tensor]] = []
@@ -48,13 +45,10 @@ class Places:
         self._center: Tensor | None = None
         """Head position at which distant points were dropped last (m)."""
 
-    transient = ("_map",)
+    transient = ("map",)
 
     def restored(self) -> None:
         """Rebuild the map and the floor tracker's points after loading."""
-        self._map = VoxelMap(self.grid)
-        for part in self._new:
-            self._map.add(*part)
         self._begin([_joined(self._tracked)])
 
     def add(self, points_world: Float[Tensor, "point 3"], first_seen: float) -> None:
@@ -63,24 +57,17 @@ class Places:
         points = points[points.isfinite().all(-1)]
         seen = torch.full((len(points),), first_seen, dtype=torch.float64)
         self.mapped = True
-        self._map.add(points, seen)
+        self.map.add(points, seen)
         self._new.append((points, seen))
-        if len(self._map) <= MANY * self.memory.max_points:
+        if len(self.map) <= MANY * self.memory.max_points:
             return
         # No frame arrives that would drop distant points: only the newest packets of new ones are kept.
         kept, count = [], 0
         while self._new and (not kept or count + len(self._new[-1][0]) <= self.memory.max_points):
             kept.append(self._new.pop())
             count += len(kept[-1][0])
-        tracked = [_joined(self._tracked)]
-        self._map, self._new = VoxelMap(self.grid), kept[::-1]
-        for part in self._new:
-            self._map.add(*part)
-        self._begin(tracked)
-
-    def grids(self, T_world_device: Rigid, timestamps: Float64[Tensor, "time"]) -> Float[Tensor, "time x y z"]:
-        """Voxel grids (m) around the device at each frame, of the points seen by then."""
-        return self._map.voxelize(T_world_device, timestamps)
+        self._new = kept[::-1]
+        self._begin([_joined(self._tracked)])
 
     def floor(
         self, timestamps: Float64[Tensor, "time"], t_world_head: Float[Tensor, "time 3"]
@@ -107,25 +94,21 @@ class Places:
         """Drop distant and old points once the wearer has walked far or there are too many points."""
         center = t_world_head if self._center is None else self._center
         self._center, moved = center, float((t_world_head - center)[:2].norm())
-        if moved < 0.5 * self.memory.radius_m and len(self._map) <= self.memory.max_points:
+        if moved < 0.5 * self.memory.radius_m and len(self.map) <= self.memory.max_points:
             return
         self._center = t_world_head
         points, seen = _joined(self._tracked)
         near = (points - t_world_head)[:, :2].norm(dim=-1) <= self.memory.radius_m
-        points, seen = points[near], seen[near]
-        if len(points) > self.memory.max_points // 2:
-            points, seen = points[-(self.memory.max_points // 2) :], seen[-(self.memory.max_points // 2) :]
-        self._map = VoxelMap(self.grid)
-        for part in self._new:
-            self._map.add(*part)
-        self._begin([(points, seen)])
+        newest = slice(-(self.memory.max_points // 2), None)
+        self._begin([(points[near][newest], seen[near][newest])])
 
     def _begin(self, tracked: list[tuple[Tensor, Tensor]]) -> None:
-        """Replace the floor tracker's points by these, and add them to the map."""
-        self._tracked = tracked
+        """Replace the floor tracker's points by these, and the map by one of these and the new ones."""
+        self.map, self._tracked = VoxelMap(self.grid), tracked
         self._floor.forget()
-        for points, seen in tracked:
-            self._map.add(points, seen)
+        for points, seen in [*self._new, *tracked]:
+            self.map.add(points, seen)
+        for points, _ in tracked:
             self._floor.see(points)
 
 

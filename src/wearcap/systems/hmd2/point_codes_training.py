@@ -1,17 +1,16 @@
 """Training of the autoencoder of the points around the body (thesis §6.2.1, §6.4), and its windows of voxel grids."""
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.data.transforms import Cut, Draws, Window
 from wearcap.data.windows import Content, Windows, drawn_batches
-from wearcap.geometry.rigid import Rigid
 from wearcap.metrics.detection import distance_mae_cm, occupancy_iou, occupied_distance_mae_cm
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
+from wearcap.recording import HeadStream
 from wearcap.recording.store import RecordingFile, RecordingStore
 from wearcap.scene.voxels import VoxelGrid, VoxelMap, mirrored
 from wearcap.training.base import OptimizerOf, SchedulerOf, Training
@@ -23,17 +22,11 @@ class Places(NamedTuple):
     grids: Float[Tensor, "*batch time x y z"]
 
 
-@dataclass(frozen=True, eq=False)
-class _Surveyed:
-    """A recording's map of points, and the device's path through it."""
-
-    map: VoxelMap
-    T_world_device: Rigid
-    timestamps: Float64[Tensor, "time"]
-
-
 class PlaceContent(Content):
-    """Voxel grids of `frames` random frames of each window, of recordings that have points."""
+    """Voxel grids of `frames` random frames of each window, of recordings that have points.
+
+    A track is a recording's map of points, and its head stream.
+    """
 
     requires = " with points that tracking found"
     tracks_at_once = 512
@@ -48,18 +41,18 @@ class PlaceContent(Content):
     def min_frames(self, window: int, stretch: float) -> int:
         return 1
 
-    def open(self, store: RecordingStore, name: str, every: int) -> _Surveyed:
+    def open(self, store: RecordingStore, name: str, every: int) -> tuple[VoxelMap, HeadStream]:
         file = RecordingFile(store.path_of(name))
         cloud, head, surroundings = file.part("points"), file.part("head"), VoxelMap(self.grid)
         surroundings.add(cloud.points_world, cloud.first_seen)
-        return _Surveyed(surroundings, head.T_world_device, head.timestamps)
+        return surroundings, head
 
-    def read(self, track: _Surveyed, cut: Cut, random: Draws) -> Window:
-        valid = int(cut.valid.sum())
+    def read(self, track: tuple[VoxelMap, HeadStream], cut: Cut, random: Draws) -> Window:
+        (surroundings, head), valid = track, int(cut.valid.sum())
         chosen = cut.frames[torch.randint(valid, (self.frames,), generator=random.generator)]
-        return Window({"grids": track.map.voxelize(track.T_world_device[chosen], track.timestamps[chosen])})
+        return Window({"grids": surroundings.voxelize(head.T_world_device[chosen], head.timestamps[chosen])})
 
-    def item(self, track: _Surveyed, cut: Cut, window: Window, random: Draws) -> Places:
+    def item(self, track: tuple[VoxelMap, HeadStream], cut: Cut, window: Window, random: Draws) -> Places:
         return Places(mirrored(window.values["grids"]) if window.mirrored else window.values["grids"])
 
 

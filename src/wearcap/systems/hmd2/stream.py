@@ -64,9 +64,8 @@ class HMD2Session(Session):
         of another length than the network's as long as none of the right length has arrived; later ones are refused.
         """
         if len(samples) != len(self.streams):
-            raise WearcapError(
-                f"samples of {len(samples)} wearers", expected=f"of {len(self.streams)}, as the session has"
-            )
+            expected = f"of {len(self.streams)}, as the session has"
+            raise WearcapError(f"samples of {len(samples)} wearers", expected=expected)
         if not self.embedded:
             self._require_embeddings(samples)
         for number, part in enumerate(samples):
@@ -74,11 +73,6 @@ class HMD2Session(Session):
                 self._take(number, self.streams[number].admit(sample))
 
     def poses(self, ended: bool = False) -> list[Motion | None]:
-        """Each wearer's frames that became final since the last call; `ended`: no more samples will come.
-
-        After a wearer's clock was set back, the frames before that come first, and the next call returns those after
-        it.
-        """
         begun = [number for number, state in enumerate(self.streams) if state.finished]
         others = [number for number in range(len(self.streams)) if number not in begun]
         for number in others if ended else ():
@@ -101,7 +95,7 @@ class HMD2Session(Session):
             state.take(sample)
 
     def _require_embeddings(self, samples: Sequence[Sequence[HeadSample]]) -> None:
-        size = self.system.net.image_size
+        size = self.system.model.net.image_size
         for state, part in zip(self.streams, samples):
             for sample in part:
                 embedding = getattr(sample, "embedding", None)
@@ -110,9 +104,10 @@ class HMD2Session(Session):
                 if embedding.shape == (size,):
                     self.embedded = True
                     return
+                when = "an unknown time" if time_fault(sample.timestamp) else f"{sample.timestamp:.3f} s"
                 raise WearcapError(
-                    f"an embedding of {len(embedding)} features at {_time(sample)}",
-                    expected=f"{size} of {self.system.image_encoder!r}, which the network was trained on",
+                    f"an embedding of {len(embedding)} features at {when}",
+                    expected=f"{size} of {self.system.model.image_encoder!r}, which the network was trained on",
                 )
 
     def _run(self, wearers: Sequence[int], ended: bool) -> list[Motion | None]:
@@ -148,25 +143,23 @@ class HMD2Session(Session):
 
     @classmethod
     def settings(cls, system: HMD2) -> dict[str, Any]:
-        """The settings of a pipeline that a session's state depends on."""
-        net = system.net
+        net, sampling, overlap = system.model.net, system.sampling, system.overlap
         return {
             "window": net.window,
             "stride": system.advance,
-            **{name: getattr(system, name) for name in ("steps", "fps", "inpaint", "fade")},
+            "steps": sampling.steps,
+            "fps": system.model.fps,
+            "inpaint": overlap.inpaint,
+            "fade": overlap.fade,
             "lookahead": system.lookahead_frames,
-            **{name: getattr(system, name) for name in ("eta", "spacing")},
+            "eta": sampling.eta,
+            "spacing": sampling.spacing,
             **{name: getattr(net, name) for name in ("motion_size", "points_size", "image_size")},
-            "features": str(system.features),
+            "features": str(system.model.features),
         }
 
     def state(self) -> dict[str, Any]:
-        """Everything that future poses depend on, except the pipeline."""
         return super().state() | {"embedded": self.embedded}
 
 
 SESSION = HMD2Session
-
-
-def _time(sample: HeadSample) -> str:
-    return "an unknown time" if time_fault(sample.timestamp) else f"{sample.timestamp:.3f} s"

@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 import torch
 from einops import rearrange
-from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wearcap.body.skeleton import FEET, Skeleton
@@ -15,7 +14,7 @@ from wearcap.errors import WearcapError
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import Conditions, MotionDenoiser
-from wearcap.systems.hmd2.pipeline import HMD2
+from wearcap.systems.hmd2.pipeline import HMD2, DiffusionModel
 from wearcap.systems.hmd2.training_windows import HeadContent, HeadWindow
 from wearcap.training import losses
 from wearcap.training.base import OptimizerOf, SchedulerOf, Training
@@ -35,8 +34,6 @@ class MotionDiffusion(Training):
     """
 
     system = HMD2
-    """The system that captures with the network."""
-    parts = ("net", "features", "schedule", "skeleton", "fps", "place_encoder", "image_encoder")
 
     def __init__(
         self,
@@ -75,6 +72,10 @@ class MotionDiffusion(Training):
         self._denoise = torch.compile(self.net.forward) if compile else self.net.forward
         self._encode = torch.compile(self.net.encode) if compile else self.net.encode
 
+    def pipeline_parts(self) -> dict[str, DiffusionModel]:
+        parts = self.features, self.schedule, self.skeleton, self.fps, self.place_encoder, self.image_encoder
+        return {"model": DiffusionModel(self.net, *parts)}
+
     def set_statistics(self, dataset: Windows) -> None:
         """Set normalisation from a training split. Raises WearcapError unless its windows have the model's inputs."""
         content = dataset.content
@@ -82,11 +83,9 @@ class MotionDiffusion(Training):
         net, places, images = self.net, content.surroundings.places, content.surroundings.images
         points_size = 0 if places is None else places.size
         if (net.points_size, net.image_size) != (points_size, content.image_size):
-            raise WearcapError(
-                f"windows with points of {points_size} and images of {content.image_size} features",
-                expected=f"{net.points_size} and {net.image_size}, as the model has",
-                fix="Set data.dataset.content.surroundings and model.{place_encoder,image_encoder,image_size} alike.",
-            )
+            what = f"windows with points of {points_size} and images of {content.image_size} features"
+            fix = "Set data.dataset.content.surroundings and model.{place_encoder,image_encoder,image_size} alike."
+            raise WearcapError(what, expected=f"{net.points_size} and {net.image_size}, as the model has", fix=fix)
         if self.image_encoder != images and net.image_size:
             raise WearcapError(f"embeddings of {images!r}", expected=self.image_encoder)
         statistics = feature_statistics(dataset, self.features)
@@ -120,14 +119,10 @@ class MotionDiffusion(Training):
         last = guess * (batch.chance[:, 2] < 0.5)[:, None, None]
         return self._denoise(x_t, level, encoded, batch.valid, last)
 
-    def _weight(self, valid: Bool[Tensor, "batch time"]) -> Float[Tensor, "batch time"]:
-        """Loss weight of each frame; 0 on padding."""
-        left = valid.sum(1, keepdim=True) - 1 - torch.arange(valid.shape[1], device=valid.device)
-        return valid * (1 + self.tail * torch.exp(-left.clamp_min(0) / _TAIL_FRAMES))
-
     def terms(self, batch: HeadWindow) -> dict[str, Tensor]:
-        """Every loss term of a batch, unweighted."""
-        weight = self._weight(batch.valid)
+        valid = batch.valid  # padding weighs nothing
+        left = valid.sum(1, keepdim=True) - 1 - torch.arange(valid.shape[1], device=valid.device)
+        weight = valid * (1 + self.tail * torch.exp(-left.clamp_min(0) / _TAIL_FRAMES))
         motion = self.features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
         x0 = self.net.motion_normalizer(motion)
         x0_hat = self._predicted(batch, x0)
@@ -140,10 +135,8 @@ class MotionDiffusion(Training):
             terms["joints"] = losses.joint_position(predicted, true, weight)
             terms["velocity"] = losses.joint_velocity(predicted, true, weight, self.fps)
             feet = predicted[:, :, self._feet]
-            feet = (
-                rearrange(feet, "batch time (foot point) axis -> batch time foot point axis", foot=FEET)
-                + batch.t_world_head[:, :, None, None]
-            )
+            feet = rearrange(feet, "batch time (foot point) axis -> batch time foot point axis", foot=FEET)
+            feet = feet + batch.t_world_head[:, :, None, None]
             terms["skate"] = losses.foot_skate(feet, batch.foot_contact, weight, self.fps)
         return terms
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import FEET, Skeleton
 from wearcap.data.features import body_size, true_foot_contact
-from wearcap.data.surroundings import NOTHING, Surroundings
+from wearcap.data.surroundings import NOTHING, Surroundings, embeddings_of
 from wearcap.data.transforms import Cut, Draws, Window, joint_twins
 from wearcap.data.windows import Content, open_recording
 from wearcap.errors import WearcapError
@@ -43,17 +43,12 @@ class HeadWindow(NamedTuple):
     points_valid: Bool[Tensor, "*batch time"]
     image: Float[Tensor, "*batch time image_feature"]
     image_valid: Bool[Tensor, "*batch time"]
-    """Points and images: see `Surroundings`; no columns for a modality that is left out."""
+    """Points and images: see `Surroundings.read`; no columns for a modality that is left out."""
     noise: Float[Tensor, "*batch time motion"]
     level: Float[Tensor, "*batch 1"]
     chance: Float[Tensor, "*batch 3"]
     """Diffusion noise and level, and uniform random numbers that decide on dropped modalities and self-conditioning;
     drawn here so that they depend on seed and step, not on the process."""
-
-    @property
-    def stature(self) -> Float[Tensor, "*batch"]:
-        """Height of the head joint in the rest pose (m)."""
-        return self.size[..., 0]
 
     def joints_from_head(
         self, skeleton: Skeleton, R_parent_joint: Float[Tensor, "batch frame joint 3 3"]
@@ -66,18 +61,15 @@ class HeadWindow(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _HeadTrack:
-    """A recording's open file, values that all of its windows share, and values per frame that are small."""
+    """A recording's open file, and by the names of `HeadWindow` small values per frame and those of all windows."""
 
     store: RecordingStore
     name: str
     file: RecordingFile
-    skeleton: Skeleton
-    twins: dict[str, list[int]]
     T_device_head: Rigid
-    size: Float[Tensor, "limb"]
-    floor_height: Float[Tensor, "time"]
-    floor_from_head: Float[Tensor, "time"]
-    foot_contact: Float[Tensor, "time foot"]
+    values: dict[str, Tensor]
+    constants: dict[str, Tensor]
+    twins: dict[str, list[int]]
 
 
 class HeadContent(Content):
@@ -92,7 +84,8 @@ class HeadContent(Content):
         if self.surroundings.places is not None:
             for store in stores:
                 self.surroundings.places.prepare(store, store.names(split))
-        self.image_size = self.surroundings.image_size([*stores])
+        if self.surroundings.images is not None:
+            _, self.image_size = embeddings_of(self.surroundings.images, [*stores])
 
     def min_frames(self, window: int, stretch: float) -> int:
         return MIN_FRAMES
@@ -100,12 +93,8 @@ class HeadContent(Content):
     def open(self, store: RecordingStore, name: str, every: int) -> _HeadTrack:
         file = open_recording(store.path_of(name))
         if file.length("head.timestamps") != file.length("motion.timestamps"):
-            raise WearcapError(
-                "head and motion have different lengths",
-                where=file.path,
-                expected="both on one clock",
-                fix="Prepare the recording again.",
-            )
+            what, fix = "head and motion have different lengths", "Prepare the recording again."
+            raise WearcapError(what, where=file.path, expected="both on one clock", fix=fix)
         recording = file.load()
         head, motion = recording.head, recording.motion
         assert head is not None
@@ -113,19 +102,15 @@ class HeadContent(Content):
         stature, t_world_head = motion.skeleton.height_of("head"), head.T_world_head.t
         from_path = floor_from_path(head.timestamps, t_world_head, stature)
         from_points = floor_from_points(recording.points, t_world_head, stature)
-        twins = joint_twins(motion.skeleton)
-        return _HeadTrack(
-            store,
-            name,
-            file,
-            motion.skeleton,
-            dict.fromkeys(("R_parent_joint", "t_parent_joint"), twins) | {"foot_contact": [1, 0]},
-            Rigid(head.R_head_device, head.t_head_device).inverse(),
-            body_size(motion.skeleton),
-            from_path if from_points is None else from_points,
-            from_path,
-            true_foot_contact(recording).float(),
-        )
+        values = {
+            "floor_height": from_path if from_points is None else from_points,
+            "floor_from_head": from_path,
+            "foot_contact": true_foot_contact(recording).float(),
+        }
+        constants = {"t_parent_joint": motion.skeleton.t_parent_joint, "size": body_size(motion.skeleton)}
+        twins = dict.fromkeys(("R_parent_joint", "t_parent_joint"), joint_twins(motion.skeleton))
+        T_device_head = Rigid(head.R_head_device, head.t_head_device).inverse()
+        return _HeadTrack(store, name, file, T_device_head, values, constants, twins | {"foot_contact": [1, 0]})
 
     def read(self, track: _HeadTrack, cut: Cut, random: Draws) -> Window:
         start, stop = cut.bounds
@@ -136,27 +121,22 @@ class HeadContent(Content):
             "R_parent_joint": cut.take("R_parent_joint", local, start),
             "R_world_head": cut.take("R_world_head", head.R, start, sensed=True),
             "t_world_head": cut.take("t_world_head", head.t, start, sensed=True),
-            "floor_height": cut.take("floor_height", track.floor_height, sensed=True),
-            "floor_from_head": cut.take("floor_from_head", track.floor_from_head, sensed=True),
-            "t_parent_joint": track.skeleton.t_parent_joint,
-            "size": track.size,
-            "foot_contact": cut.take("foot_contact", track.foot_contact),
         }
-        return Window(values, track.twins)
+        values |= {name: cut.take(name, part, sensed=name != "foot_contact") for name, part in track.values.items()}
+        return Window(values | track.constants, track.twins)
 
     def item(self, track: _HeadTrack, cut: Cut, window: Window, random: Draws) -> HeadWindow:
         """Raises WearcapError where points were scaled, which codes do not follow."""
         if window.scale != 1 and self.surroundings.places is not None:
-            raise WearcapError(
-                "codes of points cannot be scaled", fix="Leave out transforms.scale, or the points (surroundings=head)."
-            )
+            fix = "Leave out transforms.scale, or the points (surroundings=head)."
+            raise WearcapError("codes of points cannot be scaled", fix=fix)
         start, stop = cut.bounds
         seen = self.surroundings.read(track.store, track.name, start, stop, window.mirrored, self.image_size)
         return HeadWindow(
             **window.values,
             valid=cut.valid,
-            **{name: part[cut.frames - start] for name, part in seen._asdict().items()},
-            noise=torch.randn(cut.count, 6 * len(track.skeleton) + FEET, generator=random.generator),
+            **{name: part[cut.frames - start] for name, part in seen.items()},
+            noise=torch.randn(cut.count, 6 * len(track.constants["t_parent_joint"]) + FEET, generator=random.generator),
             level=torch.rand(1, generator=random.generator),
             chance=torch.rand(3, generator=random.generator),
         )

@@ -14,16 +14,8 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.recording import Motion
 from wearcap.scene.voxels import VoxelGrid
-from wearcap.sensors.packets import (
-    MAX_FEATURE,
-    MAX_POSITION_M,
-    WRONG_TYPE,
-    Admitted,
-    HeadInput,
-    number_fault,
-    owned,
-    values_fault,
-)
+from wearcap.sensors import packets
+from wearcap.sensors.packets import Admitted, HeadInput
 from wearcap.sensors.samples import HeadSample
 from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.places import Memory, Places
@@ -51,17 +43,17 @@ class WearerState:
         self.door = HeadInput()
         self.finished: list[Motion] = []
         """Motions from before the clock was set back that were not returned yet."""
-        self.track = HeadTrack(pipeline.fps, pipeline.advance)
+        self.track = HeadTrack(pipeline.model.fps, pipeline.advance)
         self.begin()
 
     def begin(self) -> None:
         """Restart the capture; only the counts of dropped and refused packets are kept."""
         pipeline, dropped = self.pipeline, self.track.dropped
-        self.track = HeadTrack(pipeline.fps, pipeline.advance)
+        self.track = HeadTrack(pipeline.model.fps, pipeline.advance)
         self.track.dropped = dropped
-        grid = VoxelGrid() if pipeline.place_encoder is None else pipeline.place_encoder.grid
+        grid = VoxelGrid() if pipeline.model.place_encoder is None else pipeline.model.place_encoder.grid
         stature = self.wearer.skeleton.height_of("head")
-        self.places = Places(grid, stature, pipeline.fps, self.memory)
+        self.places = Places(grid, stature, pipeline.model.fps, self.memory)
         self.sampler: WindowSampler | None = None
         self.times = torch.zeros(0, dtype=torch.float64)
         """Timestamps of the frames that were sampled but not output yet."""
@@ -84,12 +76,12 @@ class WearerState:
         """Check a packet; returns the packets that are accepted now."""
         door = self.door
         if not isinstance(sensed, HeadSample):
-            door.refuse("head", WRONG_TYPE)
+            door.refuse("head", packets.WRONG_TYPE)
             return Admitted([])
         if not door.timely(sensed.timestamp):
             return Admitted([])
         time, points = float(sensed.timestamp), None
-        if self.pipeline.net.points_size and "points" in self.pipeline.use:
+        if self.pipeline.model.net.points_size and "points" in self.pipeline.use:
             points = door.points(sensed.points_world)
         parts = points, self._embedding(sensed.embedding), self._floor_height(sensed.floor_height)
         return door.admit(time, HeadSample(time, door.pose(sensed.T_world_device), *parts))
@@ -97,24 +89,24 @@ class WearerState:
     @property
     def shows_pictures(self) -> bool:
         """Whether image embeddings condition the model."""
-        return bool(self.pipeline.net.image_size) and "images" in self.pipeline.use
+        return bool(self.pipeline.model.net.image_size) and "images" in self.pipeline.use
 
     def _embedding(self, embedding: object) -> Float[Tensor, "feature"] | None:
         """A copy of the embedding; NaN if it is faulty, so that no image is used until the next valid one."""
-        size = self.pipeline.net.image_size
+        size = self.pipeline.model.net.image_size
         if embedding is None or not self.shows_pictures:
             return None
-        fault = values_fault(embedding, (size,), MAX_FEATURE)
+        fault = packets.values_fault(embedding, (size,), packets.MAX_FEATURE)
         if fault is None:
             assert isinstance(embedding, Tensor)
-            return owned(embedding)
+            return packets.owned(embedding)
         self.door.refuse("embedding", fault)
         return torch.full((size,), torch.nan)
 
     def _floor_height(self, height: object) -> float | None:
         if height is None:
             return None
-        if fault := number_fault(height, MAX_POSITION_M):
+        if fault := packets.number_fault(height, packets.MAX_POSITION_M):
             self.door.refuse("floor height", fault)
             return None
         assert isinstance(height, SupportsFloat)
@@ -134,11 +126,15 @@ class WearerState:
 
     def frames(self, chunk: Chunk, T_world_head: Rigid) -> Frames:
         """Conditioning of a chunk, padded to the stride by its last frame, marked as not valid."""
-        net, times, count = self.pipeline.net, chunk.timestamps, len(chunk.timestamps)
-        floor = self._floor(times, T_world_head.t)
+        net, times, count = self.pipeline.model.net, chunk.timestamps, len(chunk.timestamps)
+        floor = self.places.floor(times, T_world_head.t)
+        if self.floors:  # measured heights take the place of tracked ones
+            measured, height = (torch.tensor(part, dtype=torch.float64) for part in zip(*self.floors))
+            self.floors = self.floors[_newest(measured, times[-1].item()) :]
+            floor = interpolate_clamped(measured, height.float(), times)
         points, points_valid = torch.zeros(count, net.points_size), torch.zeros(count, dtype=torch.bool)
-        if self.places.mapped and self.pipeline.place_encoder is not None:
-            points = self.pipeline.place_encoder.encode(self.places.grids(chunk.T_world_device, times))
+        if self.places.mapped and self.pipeline.model.place_encoder is not None:
+            points = self.pipeline.model.place_encoder.encode(self.places.map.voxelize(chunk.T_world_device, times))
             points_valid = torch.ones(count, dtype=torch.bool)
         image, image_valid = torch.zeros(count, net.image_size), torch.zeros(count, dtype=torch.bool)
         if self.pictures:
@@ -153,14 +149,6 @@ class WearerState:
         number = torch.arange(self.pipeline.advance)
         frames = Frames(*(part[number.clamp_max(count - 1)][None] for part in fields))
         return frames._replace(valid=frames.valid & (number < count))
-
-    def _floor(self, times: Float64[Tensor, "time"], t_world_head: Float[Tensor, "time 3"]) -> Float[Tensor, "time"]:
-        tracked = self.places.floor(times, t_world_head)
-        if not self.floors:
-            return tracked
-        measured, height = (torch.tensor(part, dtype=torch.float64) for part in zip(*self.floors))
-        self.floors = self.floors[_newest(measured, times[-1].item()) :]
-        return interpolate_clamped(measured, height.float(), times)
 
     def finalize(self, lookahead_frames: int) -> list[Motion]:
         """Newly final poses, all but the last `lookahead_frames`, as a list of at most one motion."""

@@ -8,18 +8,19 @@ Captures of whole recordings and streams both use this module, so that the same 
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wearcap.body.skeleton import FEET
-from wearcap.diffusion.process import Denoise, sample
-from wearcap.diffusion.schedule import Schedule
+from wearcap.diffusion.process import sample
 from wearcap.geometry.rigid import Rigid
-from wearcap.systems.hmd2.features import HeadFeatures
-from wearcap.systems.hmd2.model import Conditions, MotionDenoiser
+from wearcap.systems.hmd2.model import Conditions
+
+if TYPE_CHECKING:
+    from wearcap.systems.hmd2.pipeline import HMD2
 
 
 class Frames(NamedTuple):
@@ -43,34 +44,9 @@ class Poses(NamedTuple):
     foot_contact: Float[Tensor, "batch time foot"]
 
 
-class _FinalFrames(NamedTuple):
-    """Final poses of a batch item's next frames, with their head poses ("time")."""
-
-    poses: Poses
-    T_world_head: Rigid
-
-
-@runtime_checkable
-class Model(Protocol):
-    """The model and settings that windows are sampled with; `HMD2` has these fields."""
-
-    net: MotionDenoiser
-    features: HeadFeatures
-    schedule: Schedule
-    fps: float
-    steps: int
-    eta: float
-    spacing: float
-    inpaint: bool
-    fade: int
-    device: str
-
-    def denoiser(self, conditions: Conditions, valid: Bool[Tensor, "batch time"]) -> Denoise: ...
-
-
-def no_poses(pipeline: Model, count: int) -> Poses:
+def no_poses(pipeline: "HMD2", count: int) -> Poses:
     """Placeholder poses (identity rotations, no contact) for frames without a prediction."""
-    joints = pipeline.features.joints
+    joints = pipeline.model.features.joints
     return Poses(torch.eye(3).repeat(1, count, joints, 1, 1), torch.zeros(1, count, FEET))
 
 
@@ -85,13 +61,13 @@ class WindowSampler:
     The first windows grow: they contain the frames so far, left-aligned, and the remaining frames are masked.
     """
 
-    def __init__(self, pipeline: Model, size: Float[Tensor, "limb"], seed: int):
+    def __init__(self, pipeline: "HMD2", size: Float[Tensor, "limb"], seed: int):
         self.pipeline, self.size = pipeline, size
         self.frames: Frames | None = None
         """Conditioning of the last window's frames."""
         self.predicted = no_poses(pipeline, 0)
         """Poses of the last window's frames."""
-        self.noise = torch.zeros(1, 0, pipeline.steps, pipeline.features.motion_size)
+        self.noise = torch.zeros(1, 0, pipeline.sampling.steps, pipeline.model.features.motion_size)
         """Noise of the last window's frames for every sampling step: "1 time step feature"."""
         self.final = 0
         """Number of the last window's frames whose poses are final; the next windows re-denoise the others."""
@@ -114,22 +90,22 @@ class WindowSampler:
     def join(self, fresh: Frames) -> None:
         """Append new frames to the window and drop the oldest beyond its length."""
         new = fresh.valid.shape[1]
-        first = max(0, self.count + new - self.pipeline.net.window)
+        first = max(0, self.count + new - self.pipeline.model.net.window)
         self.final = max(0, self.final - first)
         noise = torch.randn(1, new, *self.noise.shape[2:], generator=self._random)
         self.noise = torch.cat([self.noise[:, first:], noise], 1)
         self.predicted = Poses(*_appended(self.predicted, first, no_poses(self.pipeline, new)))
         self.frames = fresh if self.frames is None else Frames(*_appended(self.frames, first, fresh))
 
-    def finalize(self, lookahead_frames: int) -> _FinalFrames:
-        """Mark all predictions but the last `lookahead_frames` as final; returns the newly final frames."""
+    def finalize(self, lookahead_frames: int) -> tuple[Poses, Rigid]:
+        """Mark all predictions but the last `lookahead_frames` as final; returns the newly final ones with their head poses."""
         assert self.frames is not None
         # Frames after a recording's end are not valid and never output.
         until = max(self.final, int(self.frames.valid.sum()) - lookahead_frames)
         part = slice(self.final, until)
         self.final = until
         head = Rigid(self.frames.R_world_head[0, part], self.frames.t_world_head[0, part])
-        return _FinalFrames(Poses(*(poses[:, part] for poses in self.predicted)), head)
+        return Poses(*(poses[:, part] for poses in self.predicted)), head
 
 
 @torch.inference_mode()
@@ -141,7 +117,7 @@ def advance(samplers: Sequence[WindowSampler], fresh: Sequence[Frames]) -> None:
     for sampler, new in zip(samplers, fresh):
         sampler.join(new)
     pipeline = samplers[0].pipeline
-    net, features, device = pipeline.net, pipeline.features, pipeline.device
+    net, features, device = pipeline.model.net, pipeline.model.features, pipeline.device
     frames = Frames(*_padded([sampler.frames for sampler in samplers], net.window))
     predicted = Poses(*_padded([sampler.predicted for sampler in samplers], net.window))
     noise, *_ = _padded([(sampler.noise,) for sampler in samplers], net.window)
@@ -149,7 +125,7 @@ def advance(samplers: Sequence[WindowSampler], fresh: Sequence[Frames]) -> None:
     is_observed = number < torch.tensor([[sampler.final] for sampler in samplers])
     valid = frames.valid & (number < torch.tensor([[sampler.count] for sampler in samplers]))
     size = torch.stack([sampler.size for sampler in samplers])
-    head = features.condition(frames.R_world_head, frames.t_world_head, frames.floor_height, size, pipeline.fps)
+    head = features.condition(frames.R_world_head, frames.t_world_head, frames.floor_height, size, pipeline.model.fps)
     parts = head, frames.points, frames.points_valid, frames.image, frames.image_valid
     conditions = Conditions(*(part.to(device) for part in parts))
     # The last window's poses are re-expressed in this window's canonical frame, which may have moved.
@@ -160,13 +136,13 @@ def advance(samplers: Sequence[WindowSampler], fresh: Sequence[Frames]) -> None:
     x0 = sample(
         pipeline.denoiser(conditions, valid.to(device)),
         noise.movedim(2, 0).to(device),
-        pipeline.schedule,
-        eta=pipeline.eta,
-        spacing=pipeline.spacing,
+        pipeline.model.schedule,
+        eta=pipeline.sampling.eta,
+        spacing=pipeline.sampling.spacing,
         observed=observed,
-        is_observed=is_observed_on_device if pipeline.inpaint else None,
+        is_observed=is_observed_on_device if pipeline.overlap.inpaint else None,
     )
-    x0 = blended(x0, observed, is_observed_on_device, pipeline.fade)
+    x0 = blended(x0, observed, is_observed_on_device, pipeline.overlap.fade)
     motion = net.motion_normalizer.inverse(x0.float()).cpu()
     poses = [
         torch.where(is_observed.reshape(*is_observed.shape, *[1] * (old.ndim - 2)), old, new)

@@ -11,7 +11,7 @@ from wearcap.errors import WearcapError
 from wearcap.runtime.graphs import Exports, Run, skeleton_from_json, skeleton_to_json
 from wearcap.systems.mocap_every.features import WatchFeatures
 from wearcap.systems.mocap_every.model import Estimate, WatchEstimator
-from wearcap.systems.mocap_every.pipeline import SETTINGS, MocapEvery
+from wearcap.systems.mocap_every.pipeline import SETTINGS, MocapEvery, WatchModel
 
 
 def exports(pipeline: MocapEvery) -> Exports:
@@ -19,7 +19,7 @@ def exports(pipeline: MocapEvery) -> Exports:
 
     Raises WearcapError for a network that is exported already.
     """
-    net, features = pipeline.net, pipeline.features
+    net, features = pipeline.model.net, pipeline.model.features
     if isinstance(net, _ExportedEstimator):
         raise WearcapError("a network that is exported already", expected="one of a checkpoint")
     about = {
@@ -27,8 +27,8 @@ def exports(pipeline: MocapEvery) -> Exports:
         "feature_size": features.size,
         "motion_size": features.motion_size,
         "window": net.window,
-        "fps": pipeline.fps,
-        "skeleton": skeleton_to_json(pipeline.skeleton),
+        "fps": pipeline.model.fps,
+        "skeleton": skeleton_to_json(pipeline.model.skeleton),
         "settings": {name: getattr(pipeline, name) for name in SETTINGS},
     }
     return Exports("mocap_every", {"network": net.graph(features.size)}, about)
@@ -48,10 +48,6 @@ class _ExportedEstimator(WatchEstimator):
 
 def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], about: dict[str, Any]) -> MocapEvery:
     """The pipeline of an exported model."""
-    return MocapEvery(
-        _ExportedEstimator(runs["model"], about["window"]),
-        WatchFeatures(**about["features"]),
-        skeleton_from_json(about["skeleton"]),
-        about["fps"],
-        **about["settings"],
-    )
+    net, features = _ExportedEstimator(runs["model"], about["window"]), WatchFeatures(**about["features"])
+    model = WatchModel(net, features, skeleton_from_json(about["skeleton"]), about["fps"])
+    return MocapEvery(model, **about["settings"])

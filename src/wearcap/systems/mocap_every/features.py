@@ -95,9 +95,8 @@ class WatchFeatures:
     def __post_init__(self):
         for name, allowed in (("frame", FRAMES), ("wrists", TRACKED), ("root", ROOTS)):
             if getattr(self, name) not in allowed:
-                raise WearcapError(
-                    f"watch features have no {name} {getattr(self, name)!r}", expected=f"one of {', '.join(allowed)}"
-                )
+                what = f"watch features have no {name} {getattr(self, name)!r}"
+                raise WearcapError(what, expected=f"one of {', '.join(allowed)}")
 
     @property
     def size(self) -> int:
@@ -139,12 +138,8 @@ class WatchFeatures:
         R_canonical_wrist = R_canonical_world[:, :, None] @ sensed.R_world_wrist
         vectors = sensed.acc_world_wrist if self.wrists == "watches" else sensed.t_world_wrist - t[:, :, None]
         vectors = (R_canonical_world[:, :, None] @ vectors[..., None])[..., 0]
-        parts = [
-            rotation.rot6d_from_matrix(R_canonical_head),
-            self._path(sensed, canonical),
-            rotation.rot6d_from_matrix(R_canonical_wrist).flatten(-2),
-            vectors.flatten(-2),
-        ]
+        head, wrists = rotation.rot6d_from_matrix(R_canonical_head), rotation.rot6d_from_matrix(R_canonical_wrist)
+        parts = [head, self._path(sensed, canonical), wrists.flatten(-2), vectors.flatten(-2)]
         if self.absolute:
             height = (sensed.t_world_head[..., 2] - floor_height)[..., None]
             up = R_canonical_head if self.frame == "heading" else sensed.R_world_head

@@ -48,13 +48,12 @@ class MotionManifold(nn.Module):
     """Strided convolutions over time and a transposed decoder (the paper: 3 layers, width 25, stride 2, 256 channels).
 
     Frames have `size` features: contact of both feet, root translation, 6D rotations (137 with 22 joints). A window's
-    number of frames must be a multiple of `multiple`.
+    number of frames must be a multiple of 2 to the power of `layers`.
     """
 
     def __init__(self, size: int, channels: int = 256, width: int = 25, layers: int = 3):
         super().__init__()
-        self.size, self.halvings = size, layers
-        self.normalizer = Normalizer(size)
+        self.size, self.normalizer = size, Normalizer(size)
         half = width // 2
         down: list[nn.Module] = []
         up: list[nn.Module] = []
@@ -65,11 +64,6 @@ class MotionManifold(nn.Module):
             if layer < layers - 1:
                 up = [nn.LeakyReLU(0.2), *up]
         self.encoder, self.decoder = nn.Sequential(*down[:-1]), nn.Sequential(*up)
-
-    @property
-    def multiple(self) -> int:
-        """Factor that a window's number of frames must be divisible by."""
-        return 2**self.halvings
 
     def encode(self, motion: Float[Tensor, "batch time feature"]) -> Float[Tensor, "batch channel short"]:
         """Latents z of motions (raw features)."""

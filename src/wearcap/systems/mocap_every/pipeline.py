@@ -1,7 +1,7 @@
 """MocapEvery (Lee and Joo 2024): full-body motion from two watches and a head-mounted camera, on stairs and hills."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from einops import repeat
@@ -45,9 +45,9 @@ class CapturedWithFloor:
     """Solutions of the editing by visual cues, one per batch of windows."""
 
 
-@dataclass
-class MocapEvery(LearnedSystem):
-    """Captures recordings: the estimator runs on overlapping windows, the floor is updated from window to window."""
+@dataclass(frozen=True, eq=False)
+class WatchModel:
+    """What a training gives a capture: the estimator, and what it was trained with."""
 
     net: WatchEstimator
     features: WatchFeatures
@@ -55,6 +55,13 @@ class MocapEvery(LearnedSystem):
     """Skeleton for recordings without their own."""
     fps: float
     """Frame rate of the estimator (Hz)."""
+
+
+@dataclass
+class MocapEvery(LearnedSystem):
+    """Captures recordings: the estimator runs on overlapping windows, the floor is updated from window to window."""
+
+    model: WatchModel
     stride: int = 20
     """Frames by which windows advance; 1: frame by frame."""
     lookahead: int = 20
@@ -72,27 +79,27 @@ class MocapEvery(LearnedSystem):
     precision: str = "float32"
     """Number format of the network's matrix products (`runtime.graphs.PRECISIONS`)."""
     device: str = "cpu"
-    _run: Run | None = field(default=None, init=False, repr=False, compare=False)
 
     name = "mocap_every"
     experiment = "experiment=mocap_every"
     shared = ("mocap_every",)
 
     def __post_init__(self):
+        self._run: Run | None = None
         self._backend = chosen(self.runtime, self.precision, self.device)
         if self.floor not in FLOORS:
             raise WearcapError(f"no floor {self.floor!r}", expected=f"one of {', '.join(FLOORS)}")
-        if not 0 < self.stride <= self.net.window or not 0 <= self.lookahead <= self.net.window - self.stride:
-            raise WearcapError(
-                f"windows of {self.net.window} frames with stride {self.stride} and lookahead {self.lookahead}",
-                expected="a stride from 1 to the window, and a lookahead of at most the overlap of two windows",
-            )
+        window = self.model.net.window
+        if not 0 < self.stride <= window or not 0 <= self.lookahead <= window - self.stride:
+            what = f"windows of {window} frames with stride {self.stride} and lookahead {self.lookahead}"
+            expected = "a stride from 1 to the window, and a lookahead of at most the overlap of two windows"
+            raise WearcapError(what, expected=expected)
 
     def prepare(self) -> None:
         """Move the network to its device and set up its runtime, compiled or exported once."""
-        self.net.to(self.device).eval()
+        self.model.net.to(self.device).eval()
         if self._run is None and self._backend != ("eager", "float32"):
-            self._run = run_of(self.net.graph(self.features.size), *self._backend)
+            self._run = run_of(self.model.net.graph(self.model.features.size), *self._backend)
 
     @torch.inference_mode()
     def motions(self, sources: Sequence[CaptureInput], seeds: Sequence[int]) -> list[Motion]:
@@ -107,11 +114,12 @@ class MocapEvery(LearnedSystem):
         """Capture one recording, with floor and editing results. Raises as `capture` does."""
         self.prepare()
         # 1. head path and watches on a common clock
-        path = head_path(recording, self.skeleton, self.fps)
+        path = head_path(recording, self.model.skeleton, self.model.fps)
         sensed = self._sensed(recording, path)
         # 2. end-effectors, contacts and poses, window by window; 3. floor height from the feet in contact
         output = [self._capture_stretch(recording, path, sensed, start, stop) for start, stop in path.stretches]
-        whole = _bridged(output, path)
+        frames = path.held_frames  # in the gaps between stretches the last pose goes on, at the interpolated head
+        whole = FinalPoses(*(torch.cat(part)[frames] for part in zip(*output)))
         poses = path.timestamps, path.skeleton, whole.R_parent_joint, whole.t_world_root
         contact_prob = repeat(whole.contact_prob, "time foot -> time (foot patch)", patch=2)
         motion = Motion(*poses, contact_prob, provenance=self.settings())
@@ -133,22 +141,21 @@ class MocapEvery(LearnedSystem):
         if self._run is not None:
             output = self._run(features=features.to(self.device)).cpu()
             return Estimate(output[..., :-FEET], output[..., -FEET:], None)
-        output = self.net(features.to(self.device))
+        output = self.model.net(features.to(self.device))
         return Estimate(*(part if part is None else part.cpu() for part in output))
 
     def _sensed(self, recording: Recording, path: HeadPath) -> Sensed:
         """Sensor inputs at the path's times; a recording with true motion but no watches gets synthetic IMUs."""
         R, t = path.T_world_head.R.float(), path.T_world_head.t.float()
         truth = recording.motion
-        if self.features.wrists == "positions" or (not recording.imu and truth is not None):
+        if self.model.features.wrists == "positions" or (not recording.imu and truth is not None):
             if truth is None:
-                raise WearcapError(
-                    "no hand positions in this recording",
-                    where=recording.name,
-                    expected="a recording with `motion`, or a checkpoint for watches",
-                )
+                expected = "a recording with `motion`, or a checkpoint for watches"
+                raise WearcapError("no hand positions in this recording", where=recording.name, expected=expected)
             truth = at_times(truth, path.timestamps)
-            return Sensed(R, t, *synthetic_wrists(truth.skeleton, truth.R_parent_joint, truth.t_world_root, self.fps))
+            return Sensed(
+                R, t, *synthetic_wrists(truth.skeleton, truth.R_parent_joint, truth.t_world_root, self.model.fps)
+            )
         return Sensed(R, t, *watches_at(recording.imu, path.timestamps, recording.name), torch.zeros(len(t), 2, 3))
 
     def _capture_stretch(
@@ -156,9 +163,8 @@ class MocapEvery(LearnedSystem):
     ) -> FinalPoses:
         """Run the sliding windows over the path's frames from `start` to `stop`."""
         if (track := recording.floor) is not None:  # the measured floor, the paper's h_0
-            initial_m = interpolate_clamped(track.timestamps, track.height, path.timestamps[start : start + 1])[
-                0
-            ].item()
+            begin = path.timestamps[start : start + 1]
+            initial_m = interpolate_clamped(track.timestamps, track.height, begin).item()
         else:
             initial_m = path.floor_height[start].item()
         floor, floor_height = self.follower(path.skeleton, initial_m), None
@@ -188,33 +194,9 @@ class MocapEvery(LearnedSystem):
         if self.floor == "update":
             return FloorUpdate(initial_m)
         if self.floor == "follow":
-            return FloorFollow(initial_m, skeleton.height_of("left_toe"), self.fps)
+            return FloorFollow(initial_m, skeleton.height_of("left_toe"), self.model.fps)
         return FloorFixed(initial_m)
-
-    def _floor_from_points(self, recording: Recording, path: HeadPath) -> Float[Tensor, "time"]:
-        """Floor height (m) below the head from points, or from the head path where there are too few."""
-        height = floor_from_points(recording.points, path.T_world_head.t, path.stature)
-        return path.floor_height if height is None else height
-
-    def _add_points(self, recording: Recording, floor: FloorFollower, seen_until: float, until: float) -> float:
-        """Pass the points first seen between two times (s) to the follower; returns `until`."""
-        cloud = recording.points
-        if cloud is None or self.floor not in ("follow", "update"):
-            return until
-        when = cloud.first_seen
-        if when is None:
-            if seen_until == -torch.inf:
-                floor.see(cloud.points_world)
-        elif ((when > seen_until) & (when <= until)).any():
-            floor.see(cloud.points_world[(when > seen_until) & (when <= until)])
-        return until
 
     def settings(self) -> dict[str, str]:
         """Settings that the motion depends on, for its provenance."""
         return {"pipeline": "mocap_every"} | {name: str(getattr(self, name)) for name in SETTINGS}
-
-
-def _bridged(output: list[FinalPoses], path: HeadPath) -> FinalPoses:
-    """Concatenated stretches; frames in the gaps between them repeat the previous pose at the interpolated head."""
-    whole, repeated = FinalPoses(*(torch.cat(part) for part in zip(*output))), path.held_frames
-    return FinalPoses(*(part[repeated] for part in whole))

@@ -64,7 +64,7 @@ class MocapEveryStream(HeadAndWristsStream):
     """
 
     def __init__(self, pipeline: MocapEvery, wearing: Wearing):
-        super().__init__(pipeline, pipeline.fps, pipeline.stride)
+        super().__init__(pipeline, pipeline.model.fps, pipeline.stride)
         self.wearing = wearing
         self._restart()
 
@@ -126,7 +126,7 @@ class MocapEveryStream(HeadAndWristsStream):
     def _complete(self, chunk: Chunk) -> bool:
         """Whether both watches have delivered all samples that a chunk needs, or are silent."""
         last = chunk.timestamps[-1].item()
-        needed = last + (FILTER // 2 + 0.5) / self.pipeline.fps
+        needed = last + (FILTER // 2 + 0.5) / self.pipeline.model.fps
         return self._wrists.arrived(needed, last, self._track.newest, MAX_GAP_S)
 
     @torch.inference_mode()
@@ -160,7 +160,7 @@ class MocapEveryStream(HeadAndWristsStream):
         self, chunk: Chunk, end_s: float
     ) -> tuple[Float[Tensor, "time wrist 3 3"], Float[Tensor, "time wrist 3"]]:
         """Wrist orientations and filtered accelerations of a chunk; the filter ignores times outside the stretch."""
-        step = 1 / self.pipeline.fps
+        step = 1 / self.pipeline.model.fps
         frames = torch.arange(-(FILTER // 2), len(chunk.timestamps) + FILTER // 2, dtype=torch.float64)
         around = (chunk.timestamps[0] + step * frames).clamp(self._begin_s, end_s)
         streams = []
@@ -212,7 +212,8 @@ class MocapEverySession(Session):
 
     @classmethod
     def settings(cls, system: MocapEvery) -> dict[str, Any]:
-        return {**system.settings(), "window": system.net.window, "fps": system.fps, "features": str(system.features)}
+        model = system.model
+        return {**system.settings(), "window": model.net.window, "fps": model.fps, "features": str(model.features)}
 
 
 SESSION = MocapEverySession

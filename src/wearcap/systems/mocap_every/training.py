@@ -14,7 +14,7 @@ from wearcap.data.windows import Windows, drawn_batches, standardize
 from wearcap.geometry.rigid import Rigid
 from wearcap.systems.mocap_every.features import ENDS, WatchFeatures
 from wearcap.systems.mocap_every.model import TrainedEstimator
-from wearcap.systems.mocap_every.pipeline import MocapEvery
+from wearcap.systems.mocap_every.pipeline import MocapEvery, WatchModel
 from wearcap.systems.mocap_every.training_windows import WatchWindow
 from wearcap.training.base import OptimizerOf, SchedulerOf, Training
 from wearcap.training.losses import EPSILON_M2
@@ -31,8 +31,6 @@ class WatchRegression(Training):
     _joint_weights: Tensor
 
     system = MocapEvery
-    """The system that captures with the network."""
-    parts = ("net", "features", "skeleton", "fps")
 
     def __init__(
         self,
@@ -54,6 +52,9 @@ class WatchRegression(Training):
         weights = torch.ones(len(skeleton))
         weights[self._ends] = end_weight
         self.register_buffer("_joint_weights", weights / weights.mean(), persistent=False)
+
+    def pipeline_parts(self) -> dict[str, WatchModel]:
+        return {"model": WatchModel(self.net, self.features, self.skeleton, self.fps)}
 
     def set_statistics(self, dataset: Windows, limit: int = 1500) -> None:
         (batch,) = drawn_batches(dataset, limit)
@@ -87,7 +88,6 @@ class WatchRegression(Training):
         return (canonical.R.mT[:, :, None] @ (ends - canonical.t[:, :, None])[..., None])[..., 0] - origin[:, :, None]
 
     def terms(self, batch: WatchWindow) -> dict[str, Tensor]:
-        """Unweighted loss terms of a batch."""
         features, true, canonical = self._inputs(batch)
         output = self.net(features)
         last = output.motion.shape[1]

@@ -4,14 +4,13 @@ the views of other wearers' cameras, whose recordings share a session name, a cl
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import permutations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from einops import rearrange, reduce
-from jaxtyping import Float, Float64, Int64
+from einops import reduce
+from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from wearcap.body.skeleton import FEET, FOOT_JOINTS, Skeleton
@@ -25,7 +24,6 @@ from wearcap.io.formats.npz import read_npz, require
 from wearcap.models.checkpoint import load_trained
 from wearcap.recording import Motion, Recording
 from wearcap.recording.recording import Cue
-from wearcap.sensors.keypoints import camera_path, seen_wearer
 from wearcap.systems.mocap_every import energy
 from wearcap.systems.mocap_every.energy import LatentSolution, LatentSolver, LatentWeights
 from wearcap.systems.mocap_every.manifold import MotionManifold, Posed
@@ -95,8 +93,12 @@ class VisualCues:
         `T_world_head` holds the measured head poses at the motion's frames.
         """
         cues = [at_frames(cue, motion.timestamps) for cue in recording.cues.values() if cue.joint in motion.skeleton]
-        views = [_view_at_frames(view, motion.timestamps) for view in views]
-        confidence = [cue.confidence for cue in cues] + [view.confidence.amax(-1) for view in views]
+        poses = []
+        for view in views:  # as `at_frames` takes cues
+            nearest, near = _nearest(view.motion.timestamps, motion.timestamps)
+            R_parent_joint = view.motion.R_parent_joint[nearest]
+            poses.append(energy.PoseCue(R_parent_joint, view.confidence[nearest] * near[:, None]))
+        confidence = [cue.confidence for cue in cues] + [pose.confidence.amax(-1) for pose in poses]
         if not confidence or not torch.stack(confidence).any():
             return motion, []
         # First frames of the windows with observations, on a grid of half windows that extends past the motion.
@@ -108,7 +110,7 @@ class VisualCues:
         edited, solutions = _Blend(motion, self.window), []
         for first in starts.split(self.batch):
             frames = first[:, None] + torch.arange(self.window)
-            R, root, solution = self._edit_windows(motion, recording, T_world_head, frames, cues, views)
+            R, root, solution = self._edit_windows(motion, recording, T_world_head, frames, cues, poses)
             edited.add(frames, R, root)
             solutions.append(solution)
         return anchored_to_head(edited.motion(), T_world_head), solutions
@@ -120,15 +122,18 @@ class VisualCues:
         T_world_head: Rigid,
         frames: Int64[Tensor, "window time"],
         cues: list[Cue],
-        views: list[View],
+        poses: list[energy.PoseCue],
     ) -> tuple[Tensor, Tensor, LatentSolution]:
         """Optimise the latents of a batch of windows; returns local rotations, root translation and the solution."""
         skeleton = motion.skeleton
         exists = (frames >= 0) & (frames < len(motion))
         frames = frames.clamp(0, len(motion) - 1)
-        window = Posed(motion.R_parent_joint[frames], motion.t_world_root[frames], _foot_contact(motion)[frames])
+        contact = torch.zeros(len(motion), FEET)
+        if motion.contact_prob is not None:  # the maximum over a foot's patches
+            contact = reduce(motion.contact_prob, "time (foot patch) -> time foot", "max", foot=FEET)
+        window = Posed(motion.R_parent_joint[frames], motion.t_world_root[frames], contact[frames])
         head = Rigid(T_world_head.R[frames], T_world_head.t[frames])
-        seen = _observations(recording, skeleton, head, frames, exists, cues, views)
+        seen = _observations(recording, skeleton, head, frames, exists, cues, poses)
         origin = window.origin()
         X0 = window.encode(origin)
         feet = skeleton.indices(*FOOT_JOINTS)
@@ -159,32 +164,34 @@ class _Blend:
     """Blends overlapping windows with Hann weights; frames without windows stay as captured."""
 
     def __init__(self, motion: Motion, window: int):
-        self._motion = motion
-        self._weight = torch.hann_window(window, periodic=True)
-        self._rotations = torch.zeros(len(motion), 6 * len(motion.skeleton))
-        self._roots, self._shares = torch.zeros(len(motion), 3), torch.zeros(len(motion))
+        self._motion, self._weight = motion, torch.hann_window(window, periodic=True)
+        self._sums, self._shares = torch.zeros(len(motion), 6 * len(motion.skeleton) + 3), torch.zeros(len(motion))
 
     def add(self, frames: Tensor, R: Tensor, root: Tensor) -> None:
         """Add windows "window time" at frame numbers, which may extend past the motion."""
         exists = (frames >= 0) & (frames < len(self._shares))
         weight = (self._weight * exists).flatten()
         at = frames.flatten().clamp(0, len(self._shares) - 1)
-        rotations = rearrange(rotation.rot6d_from_matrix(R), "window time joint entry -> (window time) (joint entry)")
-        self._rotations.index_add_(0, at, weight[:, None] * rotations)
-        self._roots.index_add_(0, at, weight[:, None] * rearrange(root, "window time xyz -> (window time) xyz"))
+        values = torch.cat([rotation.rot6d_from_matrix(R).flatten(-2), root], -1).flatten(0, 1)
+        self._sums.index_add_(0, at, weight[:, None] * values)
         self._shares.index_add_(0, at, weight)
 
     def motion(self) -> Motion:
         """The blended motion."""
-        motion = self._motion
-        left = (1 - self._shares).clamp_min(0)[:, None]
-        whole = self._shares[:, None] + left
-        captured = rearrange(
-            rotation.rot6d_from_matrix(motion.R_parent_joint), "time joint entry -> time (joint entry)"
-        )
-        blended = (self._rotations + left * captured) / whole
-        R = rotation.matrix_from_rot6d(rearrange(blended, "time (joint entry) -> time joint entry", entry=6))
-        return replace(motion, R_parent_joint=R, t_world_root=(self._roots + left * motion.t_world_root) / whole)
+        motion, left = self._motion, (1 - self._shares).clamp_min(0)[:, None]
+        captured = torch.cat([rotation.rot6d_from_matrix(motion.R_parent_joint).flatten(-2), motion.t_world_root], -1)
+        blended = (self._sums + left * captured) / (self._shares[:, None] + left)
+        R = rotation.matrix_from_rot6d(blended[:, :-3].unflatten(-1, (-1, 6)))
+        return replace(motion, R_parent_joint=R, t_world_root=blended[:, -3:])
+
+
+def _nearest(
+    observed: Float64[Tensor, "observation"], timestamps: Float64[Tensor, "time"]
+) -> tuple[Int64[Tensor, "time"], Bool[Tensor, "time"]]:
+    """Index of the nearest observation to each time, and whether it is within half a frame."""
+    nearest = nearest_frames(observed, timestamps)
+    step = timestamps.diff().median() if len(timestamps) > 1 else 1.0
+    return nearest, (observed[nearest] - timestamps).abs() <= 0.5 * step + 1e-6
 
 
 def at_frames(cue: Cue, timestamps: Float64[Tensor, "time"]) -> Cue:
@@ -192,29 +199,10 @@ def at_frames(cue: Cue, timestamps: Float64[Tensor, "time"]) -> Cue:
     if not len(cue.timestamps):
         empty = torch.zeros(len(timestamps), cue.points.shape[-1])
         return replace(cue, timestamps=timestamps, points=empty, confidence=torch.zeros(len(timestamps)))
-    nearest = nearest_frames(cue.timestamps, timestamps)
-    step = timestamps.diff().median() if len(timestamps) > 1 else 1.0
+    nearest, near = _nearest(cue.timestamps, timestamps)
     points = cue.points[nearest]
-    near = ((cue.timestamps[nearest] - timestamps).abs() <= 0.5 * step + 1e-6) & points.isfinite().all(-1)
+    near &= points.isfinite().all(-1)
     return replace(cue, timestamps=timestamps, points=points.nan_to_num(), confidence=cue.confidence[nearest] * near)
-
-
-def _view_at_frames(view: View, timestamps: Float64[Tensor, "time"]) -> View:
-    """Resample a view to a motion's frames, as `at_frames` does."""
-    nearest = nearest_frames(view.motion.timestamps, timestamps)
-    step = timestamps.diff().median() if len(timestamps) > 1 else 1.0
-    near = (view.motion.timestamps[nearest] - timestamps).abs() <= 0.5 * step + 1e-6
-    motion = replace(
-        view.motion,
-        timestamps=timestamps,
-        R_parent_joint=view.motion.R_parent_joint[nearest],
-        t_world_root=view.motion.t_world_root[nearest],
-        contact_prob=None,
-        hand_contact_prob=None,
-        body_contact_prob=None,
-        object_motion=None,
-    )
-    return View(motion, view.confidence[nearest] * near[:, None])
 
 
 def _observations(
@@ -224,28 +212,17 @@ def _observations(
     frames: Tensor,
     exists: Tensor,
     cues: list[Cue],
-    views: list[View],
+    poses: list[energy.PoseCue],
 ) -> energy.Seen:
     """Observations of a batch of windows; frames outside the capture have confidence 0."""
     camera = recording.camera
-    rows: dict[int, list[tuple[int, Tensor, Tensor]]] = {2: [], 3: []}
-    for cue in cues:
-        row = skeleton.index(cue.joint), cue.points[frames], cue.confidence[frames] * exists
-        rows.setdefault(cue.points.shape[-1], []).append(row)
-    pixels, places = tuple(energy.PixelCue(*row) for row in rows[2]), tuple(energy.PlaceCue(*row) for row in rows[3])
-    poses = tuple(
-        energy.PoseCue(v.motion.R_parent_joint[frames], v.confidence[frames] * exists[..., None]) for v in views
-    )
+    rows = [(skeleton.index(cue.joint), cue.points[frames], cue.confidence[frames] * exists) for cue in cues]
+    pixels = tuple(energy.PixelCue(*row) for row in rows if row[1].shape[-1] == 2)
+    places = tuple(energy.PlaceCue(*row) for row in rows if row[1].shape[-1] == 3)
+    viewed = tuple(energy.PoseCue(R[frames], confidence[frames] * exists[..., None]) for R, confidence in poses)
     if camera is None:
-        return energy.Seen(head, None, None, (), places, poses)
-    return energy.Seen(head, camera.camera, Rigid(camera.R_head_cam, camera.t_head_cam), pixels, places, poses)
-
-
-def _foot_contact(motion: Motion) -> Float[Tensor, "time foot"]:
-    """Contact probability of each foot, the maximum over its patches."""
-    if motion.contact_prob is None:
-        return torch.zeros(len(motion), FEET)
-    return reduce(motion.contact_prob, "time (foot patch) -> time foot", "max", foot=FEET)
+        return energy.Seen(head, None, None, (), places, viewed)
+    return energy.Seen(head, camera.camera, Rigid(camera.R_head_cam, camera.t_head_cam), pixels, places, viewed)
 
 
 def load_visual_cues(
@@ -257,9 +234,8 @@ def load_visual_cues(
     """
     net = getattr(load_trained(manifold)[0], "net", None)
     if not isinstance(net, MotionManifold):
-        raise WearcapError(
-            "cues need a motion manifold", where=manifold, expected="a checkpoint of experiment=motion_manifold"
-        )
+        expected = "a checkpoint of experiment=motion_manifold"
+        raise WearcapError("cues need a motion manifold", where=manifold, expected=expected)
     return VisualCues(net, weights or LatentWeights(), solver or LatentSolver(), **settings)
 
 
@@ -274,7 +250,22 @@ def capture_session(
     `capture` must return motions anchored to the measured head, as the pipelines do. Raises WearcapError for recordings
     that share no session or no time, for views of an unknown recording, and for views with another skeleton.
     """
-    _require_one_session(recordings)
+    for recording in recordings:
+        if recording.session is None or recording.session != recordings[0].session:
+            expected = f"that of {recordings[0].name}, {recordings[0].session!r}"
+            raise WearcapError(f"session {recording.session!r}", where=recording.name, expected=expected)
+    if repeated := [name for name, count in Counter(r.name for r in recordings).items() if count > 1]:
+        raise WearcapError(f"two recordings are called {repeated[0]!r}", expected="unique names")
+    spans = []
+    for recording in recordings:
+        stream = recording.head or recording.motion
+        if stream is None or not len(stream.timestamps):
+            what = "neither head poses nor a motion"
+            raise WearcapError(what, where=recording.name, expected="at least one of the two")
+        spans.append((stream.timestamps[0].item(), stream.timestamps[-1].item()))
+    if spans and max(start for start, _ in spans) > min(stop for _, stop in spans):
+        what = "recordings of one session at different times"
+        raise WearcapError(what, where=recordings[0].session, expected="one clock")
     if unknown := set(views) - {recording.name for recording in recordings}:
         raise WearcapError(f"views of {min(unknown)!r}", expected=f"of {', '.join(r.name for r in recordings)}")
     motions = {}
@@ -282,57 +273,8 @@ def capture_session(
         motion, own_views = capture(recording), views.get(recording.name, ())
         for view in own_views:
             if view.motion.skeleton.joint_names != motion.skeleton.joint_names:
-                raise WearcapError(
-                    f"a view with the joints of {view.motion.skeleton.name}",
-                    where=recording.name,
-                    expected=f"those of {motion.skeleton.name}, as captured",
-                )
+                what = f"a view with the joints of {view.motion.skeleton.name}"
+                expected = f"those of {motion.skeleton.name}, as captured"
+                raise WearcapError(what, where=recording.name, expected=expected)
         motions[recording.name], _ = cues.edit(motion, recording, motion.joint("head"), own_views)
     return motions
-
-
-def simulated_views(
-    recordings: Sequence[Recording], rng: np.random.Generator, noise_deg: float = 5.0
-) -> dict[str, list[View]]:
-    """Simulated pose estimates of each wearer from the others' cameras, made from the true motions (`seen_wearer`).
-
-    Raises WearcapError for recordings that share no session or no time, or lack a camera or a true motion.
-    """
-    _require_one_session(recordings)
-    for recording in recordings:
-        if recording.motion is None or recording.camera is None:
-            raise WearcapError("no true motion or no camera", where=recording.name, expected="both, as simulated")
-    views: dict[str, list[View]] = {recording.name: [] for recording in recordings}
-    for seen, observer in permutations(recordings, 2):
-        assert seen.motion is not None
-        assert observer.motion is not None
-        assert observer.camera is not None
-        path = camera_path(observer.motion, observer.camera)
-        start, stop = seen.motion.timestamps[0], seen.motion.timestamps[-1]
-        path = path[(path.timestamps >= start) & (path.timestamps <= stop)]
-        views[seen.name].append(View(*seen_wearer(seen.motion, path, observer.camera.camera, noise_deg, rng)))
-    return views
-
-
-def _require_one_session(recordings: Sequence[Recording]) -> None:
-    for recording in recordings:
-        if recording.session is None or recording.session != recordings[0].session:
-            raise WearcapError(
-                f"session {recording.session!r}",
-                where=recording.name,
-                expected=f"that of {recordings[0].name}, {recordings[0].session!r}",
-            )
-    if repeated := [name for name, count in Counter(r.name for r in recordings).items() if count > 1]:
-        raise WearcapError(f"two recordings are called {repeated[0]!r}", expected="unique names")
-    spans = []
-    for recording in recordings:
-        stream = recording.head or recording.motion
-        if stream is None or not len(stream.timestamps):
-            raise WearcapError(
-                "neither head poses nor a motion", where=recording.name, expected="at least one of the two"
-            )
-        spans.append((stream.timestamps[0].item(), stream.timestamps[-1].item()))
-    if spans and max(start for start, _ in spans) > min(stop for _, stop in spans):
-        raise WearcapError(
-            "recordings of one session at different times", where=recordings[0].session, expected="one clock"
-        )

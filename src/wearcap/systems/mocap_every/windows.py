@@ -45,7 +45,7 @@ class EstimatorWindows:
         self._pipeline, self._skeleton, self.floor = pipeline, skeleton, floor
         self._size = body_size(skeleton)[None]
         self._feet = skeleton.indices(*FOOT_JOINTS)
-        window = pipeline.net.window
+        window = pipeline.model.net.window
         position = torch.arange(1, window + 1, dtype=torch.float32)
         self._weight = torch.minimum(position, window + 1 - position).square()[:, None]
         self._sensed: Sensed | None = None
@@ -57,7 +57,7 @@ class EstimatorWindows:
 
     def advance(self, new: Sensed) -> FinalPoses:
         """Take in up to `stride` new frames and return the frames that are now final."""
-        window, count = self._pipeline.net.window, len(new.t_world_head)
+        window, count = self._pipeline.model.net.window, len(new.t_world_head)
         if self._sensed is None:
             # The window before the capture is padded with its first frame.
             self._sensed = Sensed(*(part[:1].expand(window, *part.shape[1:]) for part in new))
@@ -72,7 +72,7 @@ class EstimatorWindows:
         self._sum[-last:] += self._weight[-last:] * torch.cat([output, torch.ones(last, 1)], -1)
         R, t, contact = _parts(output[-count:])
         self.floor.follow(contact, forward_kinematics(self._skeleton, R, t).t[:, self._feet])
-        return self._return_final(self._pipeline.lookahead)
+        return self.finish(self._pipeline.lookahead)
 
     def correct(self, T_world_head: Rigid) -> None:
         """Replace the latest head poses, which repeated an earlier pose while tracking was lost."""
@@ -88,11 +88,7 @@ class EstimatorWindows:
         """Height of the floor (m) at the latest frame."""
         return self._floors[-1].item()
 
-    def finish(self) -> FinalPoses:
-        """Return the remaining frames."""
-        return self._return_final(0)
-
-    def _return_final(self, lookahead: int) -> FinalPoses:
+    def finish(self, lookahead: int = 0) -> FinalPoses:
         """Frames that were not returned yet, except for the last `lookahead` ones."""
         window, count = len(self._sum), self._consumed - lookahead - self._returned
         stop = window - lookahead
@@ -112,9 +108,9 @@ class EstimatorWindows:
         if pipeline.mirror_average:
             sensed = Sensed(*(torch.cat(both) for both in zip(sensed, sensed.mirrored())))
             floor, size = floor.expand(2, -1), size.expand(2, -1)
-        canonical = pipeline.features.canonical(sensed, floor)
-        estimated = pipeline.estimate(pipeline.features.encode(sensed, floor, size, canonical))
-        R, t = pipeline.features.decode_motion(estimated.motion.float(), sensed, canonical)
+        canonical = pipeline.model.features.canonical(sensed, floor)
+        estimated = pipeline.estimate(pipeline.model.features.encode(sensed, floor, size, canonical))
+        R, t = pipeline.model.features.decode_motion(estimated.motion.float(), sensed, canonical)
         contact = estimated.contact_logit.float().sigmoid()
         if pipeline.mirror_average:
             R = torch.stack([R[0], mirrored_rotations(R[1], skeleton)])

@@ -73,7 +73,7 @@ class TrackedPoints:
         fps: float,
     ) -> Float[Tensor, "batch time feature"]:
         """Features of the points' paths. Changes are from the previous frame (per second), 0 in the first frame."""
-        R_heading_world = _heading(R_world_point[:, :, 0]).mT[:, :, None]
+        R_heading_world = rotation.about_axis("z", rotation.yaw_of(R_world_point[:, :, 0])).mT[:, :, None]
         R_heading_point = R_heading_world @ R_world_point
         step = R_world_point[:, :-1].mT @ R_world_point[:, 1:] - torch.eye(3).to(R_world_point)
         velocity = (R_heading_world[:, 1:] @ t_world_point.diff(dim=1)[..., None])[..., 0]
@@ -83,35 +83,8 @@ class TrackedPoints:
         position = (R_heading_world @ (t_world_point - origin)[..., None])[..., 0]
         if self.height == "stature":
             position = position / stature[:, None, None, None]
-        parts = [
-            rotation.rot6d_from_matrix(R_heading_point),
-            _after_first(rotation.rot6d_from_matrix(step) * fps),
-            position,
-            _after_first(velocity * fps),
-        ]
-        return torch.cat(parts, -1).flatten(-2)
-
-
-def encode_pose(
-    R_parent_joint: Float[Tensor, "*batch joint 3 3"], R_world_head: Float[Tensor, "*batch 3 3"]
-) -> Float[Tensor, "*batch motion"]:
-    """Local rotations as 6D, the root's relative to the head's heading."""
-    R_root = _heading(R_world_head).mT @ R_parent_joint[..., 0, :, :]
-    R = torch.cat([R_root[..., None, :, :], R_parent_joint[..., 1:, :, :]], -3)
-    return rotation.rot6d_from_matrix(R).flatten(-2)
-
-
-def decode_pose(
-    motion: Float[Tensor, "*batch motion"], R_world_head: Float[Tensor, "*batch 3 3"]
-) -> Float[Tensor, "*batch joint 3 3"]:
-    """The inverse of `encode_pose`: R_parent_joint, the root's entry in the world."""
-    R = rotation.matrix_from_rot6d(motion.unflatten(-1, (-1, 6)))
-    R_root = _heading(R_world_head) @ R[..., 0, :, :]
-    return torch.cat([R_root[..., None, :, :], R[..., 1:, :, :]], -3)
-
-
-def _heading(R_world_head: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
-    return rotation.about_axis("z", rotation.yaw_of(R_world_head))
+        turned, change = rotation.rot6d_from_matrix(R_heading_point), rotation.rot6d_from_matrix(step) * fps
+        return torch.cat([turned, _after_first(change), position, _after_first(velocity * fps)], -1).flatten(-2)
 
 
 def _after_first(change: Float[Tensor, "batch step point value"]) -> Float[Tensor, "batch time point value"]:

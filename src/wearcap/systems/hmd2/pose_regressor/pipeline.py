@@ -8,14 +8,14 @@ import torch
 
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
-from wearcap.geometry.rigid import Rigid
 from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import at_times
 from wearcap.runtime.system import CaptureInput, LearnedSystem
-from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, decode_pose, pasts
+from wearcap.systems.hmd2.features import HeadFeatures
+from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, pasts
 from wearcap.tracking.anchor import anchored_to_head, with_hand_moved
-from wearcap.tracking.head_path import HeadPath, head_path
+from wearcap.tracking.head_path import head_path
 
 
 @dataclass
@@ -47,7 +47,16 @@ class PoseRegressorCapture(LearnedSystem):
 
     def _captured(self, recording: Recording) -> Motion:
         path = head_path(recording, self.skeleton, self.fps)
-        tracked = self._tracked(recording, path)
+        names, truth = self.points.points, recording.motion
+        if len(names) == 1:
+            tracked = self.points.poses(path.skeleton, path.T_world_head)
+        elif truth is None:
+            expected = "a recording with `motion`, or a checkpoint of the head alone"
+            raise WearcapError("no tracked hands in this recording", where=recording.name, expected=expected)
+        else:  # poses of the hands come from the true motion
+            if len(truth) != len(path.timestamps) or (truth.timestamps - path.timestamps).abs().max() > 1e-6:
+                truth = at_times(truth, path.timestamps)
+            tracked = self.points.poses(path.skeleton, path.T_world_head, truth.R_parent_joint)
         stature = torch.tensor([path.stature])
         # After a gap or a jump of the tracking the past starts empty.
         count = len(path.timestamps)
@@ -60,28 +69,13 @@ class PoseRegressorCapture(LearnedSystem):
             for ends in torch.arange(b - a).split(self.frames_per_pass):
                 past, exists = pasts(features, ends[None], self.net.window)
                 predicted.append(self.net(past[0].to(self.device), exists[0].to(self.device)))
-        R_parent_joint = decode_pose(torch.cat(predicted).float().cpu(), path.T_world_head.R)
-        names = self.points.points
+        poses = HeadFeatures(joints=len(path.skeleton))
+        R_parent_joint, _ = poses.decode(torch.cat(predicted).float().cpu()[None], path.T_world_head.R[None])
         about = {"pipeline": "pose_regressor", "points": ",".join(names), "reach": str(self.reach)}
-        motion = Motion(path.timestamps, path.skeleton, R_parent_joint, torch.zeros(count, 3), provenance=about)
+        motion = Motion(path.timestamps, path.skeleton, R_parent_joint[0], torch.zeros(count, 3), provenance=about)
         motion = anchored_to_head(motion, path.T_world_head)
         for index, name in enumerate(names if self.reach else ()):
             side, _, joint = name.partition("_")
             if joint == "wrist":
                 motion = with_hand_moved(motion, side, tracked.t[:, index] - motion.joint(name).t)
         return motion
-
-    def _tracked(self, recording: Recording, path: HeadPath) -> Rigid:
-        """World poses "time point" of the tracked points; those of the hands come from the true motion."""
-        truth = recording.motion
-        if len(self.points.points) == 1:
-            return self.points.poses(path.skeleton, path.T_world_head)
-        if truth is None:
-            raise WearcapError(
-                "no tracked hands in this recording",
-                where=recording.name,
-                expected="a recording with `motion`, or a checkpoint of the head alone",
-            )
-        if len(truth) != len(path.timestamps) or (truth.timestamps - path.timestamps).abs().max() > 1e-6:
-            truth = at_times(truth, path.timestamps)
-        return self.points.poses(path.skeleton, path.T_world_head, truth.R_parent_joint)

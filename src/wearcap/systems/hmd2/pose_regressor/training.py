@@ -11,7 +11,8 @@ from wearcap.body.skeleton import Skeleton
 from wearcap.data.windows import Windows, drawn_batches, standardize
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.pose_regressor import PoseRegressor
-from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, decode_pose, encode_pose, pasts
+from wearcap.systems.hmd2.features import HeadFeatures
+from wearcap.systems.hmd2.pose_regressor.features import TrackedPoints, pasts
 from wearcap.systems.hmd2.pose_regressor.pipeline import PoseRegressorCapture
 from wearcap.systems.hmd2.training_windows import HeadWindow
 from wearcap.training.base import OptimizerOf, SchedulerOf, Training
@@ -27,7 +28,6 @@ class PoseRegression(Training):
     """
 
     system = PoseRegressorCapture
-    """The system that captures with the network."""
     parts = ("net", "points", "skeleton", "fps")
 
     def __init__(
@@ -44,21 +44,22 @@ class PoseRegression(Training):
     ):
         super().__init__(optimizer, scheduler, loss_weights, seed)
         self.net = net(feature_size=points.size, motion_size=6 * len(skeleton))
-        self.points, self.skeleton, self.fps = points, skeleton, fps
-        self.pairs = pairs
+        self.points, self.skeleton, self.fps, self.pairs = points, skeleton, fps, pairs
+        self.poses = HeadFeatures(joints=len(skeleton))
 
     def set_statistics(self, dataset: Windows, limit: int = 500) -> None:
         features, motion = [], []
         for batch in drawn_batches(dataset, limit, 64):
             features.append(self._features(batch)[batch.valid])
-            motion.append(encode_pose(batch.R_parent_joint, batch.R_world_head)[batch.valid])
+            poses = self.poses.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact)
+            motion.append(poses[batch.valid])
         standardize(self.net.feature_normalizer, torch.cat(features))
         standardize(self.net.motion_normalizer, torch.cat(motion))
 
     def _features(self, batch: HeadWindow) -> Float[Tensor, "batch time feature"]:
         T_world_head = Rigid(batch.R_world_head, batch.t_world_head)
         poses = self.points.poses(self.skeleton, T_world_head, batch.R_parent_joint, batch.t_parent_joint[:, None])
-        return self.points.encode(poses.R, poses.t, batch.floor_from_head, batch.stature, self.fps)
+        return self.points.encode(poses.R, poses.t, batch.floor_from_head, batch.size[:, 0], self.fps)
 
     def frame_pairs(self, batch: HeadWindow) -> Int64[Tensor, "batch end"]:
         """Indices of pairs of neighbouring frames, spread evenly over each window, in training with a random shift."""
@@ -69,15 +70,14 @@ class PoseRegression(Training):
         return torch.stack([last - 1, last], -1).flatten(1).expand(count, -1)
 
     def terms(self, batch: HeadWindow) -> dict[str, Tensor]:
-        """Every loss term of a batch, unweighted."""
         ends = self.frame_pairs(batch)
         rows = torch.arange(len(ends), device=ends.device)[:, None]
         features, exists = pasts(self._features(batch), ends, self.net.window)
         motion = self.net(features.flatten(0, 1), exists.flatten(0, 1)).unflatten(0, ends.shape).float()
         R_true, R_head = batch.R_parent_joint[rows, ends], batch.R_world_head[rows, ends]
         valid = batch.valid[rows, ends].float()
-        error = (motion - encode_pose(R_true, R_head)).abs()
-        poses = decode_pose(motion, R_head), R_true
+        error = (motion - self.poses.encode(R_true, R_head, batch.foot_contact[rows, ends])).abs()
+        poses = self.poses.decode(motion, R_head)[0], R_true
         predicted, true = (batch.joints_from_head(self.skeleton, R) for R in poses)
         in_pairs = (
             rearrange(x, "batch (pair two) ... -> (batch pair) two ...", two=2) for x in (predicted, true, valid)

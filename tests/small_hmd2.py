@@ -1,0 +1,27 @@
+"""HMD² around a small network: settings by their own names, without the groups that a config has."""
+
+from dataclasses import fields
+
+from wearcap.body.skeleton import Skeleton, xsens23
+from wearcap.diffusion.schedule import CosineSchedule
+from wearcap.models.voxel_autoencoder import VoxelAutoencoder
+from wearcap.systems.hmd2.features import HeadFeatures
+from wearcap.systems.hmd2.model import MotionDenoiser
+from wearcap.systems.hmd2.pipeline import HMD2, DiffusionModel, Overlap, Sampling
+
+
+def hmd2_of(
+    net: MotionDenoiser,
+    features: HeadFeatures,
+    skeleton: Skeleton | None = None,
+    place_encoder: VoxelAutoencoder | None = None,
+    image_encoder: str | None = None,
+    **settings,
+) -> HMD2:
+    skeleton = skeleton or xsens23()
+    model = DiffusionModel(net, features, CosineSchedule(), skeleton, 60.0, place_encoder, image_encoder)
+    sampling, overlap = (
+        kind(**{field.name: settings.pop(field.name) for field in fields(kind) if field.name in settings})
+        for kind in (Sampling, Overlap)
+    )
+    return HMD2(model, sampling, overlap, **settings)
