@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from wearcap.diffusion.process import add_noise, posterior_step, sample
-from wearcap.diffusion.schedule import CosineSchedule
+from wearcap.diffusion.schedule import CosineSchedule, LinearSchedule
 
-SCHEDULES = [CosineSchedule()]
+SCHEDULES = [CosineSchedule(), LinearSchedule()]
 
 
 @pytest.mark.parametrize("schedule", SCHEDULES)

@@ -32,7 +32,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "wearcap.systems.hmd2.pose_regressor.features": ("TrackedPoints",),
     "wearcap.systems.mocap_every.features": ("WatchFeatures",),
     "wearcap.diffusion.levels": ("LevelMix",),
-    "wearcap.diffusion.schedule": ("CosineSchedule",),
+    "wearcap.diffusion.schedule": ("CosineSchedule", "LinearSchedule"),
     "wearcap.systems.ireplica.contact_sequence": ("ContactSequence",),
     "wearcap.systems.ireplica.contact_transformer": ("ContactTransformer",),
     "wearcap.systems.hmd2.model": ("MotionDenoiser",),

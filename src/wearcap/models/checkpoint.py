@@ -114,10 +114,10 @@ def _read_run(path: Path) -> tuple[str, dict[str, Tensor]]:
         and value.numel() * value.element_size() <= value.untyped_storage().nbytes()
         for name, value in state.items()
     )
-    if not isinstance(text, str) or not plain:
+    if not isinstance(text, str) or not isinstance(state, dict) or not plain:
         expected = "a .ckpt file that `wearcap train` wrote"
         raise WearcapError("a checkpoint, but not of wearcap", where=path, expected=expected)
-    return text, dict(state)
+    return text, dict[str, Tensor](state)
 
 
 def _read_shared(path: Path) -> tuple[str, dict[str, Tensor]]:

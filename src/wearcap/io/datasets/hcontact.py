@@ -158,4 +158,4 @@ def read_hcontact_split(path: str | Path) -> dict[str, list[int]]:
     if not sound:
         expected = '{"window_radius": 30, "train": [frame, …], "valid": […], "test": […]}'
         raise WearcapError("not a split of windows", path, expected)
-    return dict(zip(parts, lists))
+    return dict(zip(parts, frames))

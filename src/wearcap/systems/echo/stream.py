@@ -225,6 +225,7 @@ class EchoStream(HeadAndWristsStream):
             self._update_pending()
         time = chunk.timestamps[0].item()
         conditioning = self._frame(time, T_world_head)
+        assert self._queue is not None
         outputs = self._queue.push(conditioning)
         self._pending.append((time, conditioning, T_world_head))
         return motions + self._emit(outputs)
