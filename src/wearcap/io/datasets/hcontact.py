@@ -149,10 +149,10 @@ def read_hcontact_split(path: str | Path) -> dict[str, list[int]]:
     Reads `splits/…/NAME.json` {window_radius, train, valid, test}. Raises WearcapError for anything else.
     """
     content = read_json(path)
-    parts = ("train", "valid", "test")
+    parts: tuple[str, ...] = ("train", "valid", "test")
     content = content if isinstance(content, dict) else {}
     radius, lists = content.get("window_radius"), [content.get(part) for part in parts]
-    frames = [windows if isinstance(windows, list) else [None] for windows in lists]
+    frames: list[list[Any]] = [windows if isinstance(windows, list) else [None] for windows in lists]
     sound = type(radius) is int and radius > 0
     sound = sound and all(type(k) is int and 0 <= k < 1 << 40 for windows in frames for k in windows)
     if not sound:
