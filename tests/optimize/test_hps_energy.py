@@ -287,6 +287,13 @@ def test_a_term_that_is_added_to_the_table_finds_its_planted_answer(solve, off_m
     assert solution.history[-1]["gaze"] < 0.1 * solution.history[0]["gaze"]
 
 
+def test_a_term_that_is_added_is_solved_in_parallel_stretches(monkeypatch):
+    monkeypatch.setitem(TERMS, "beacon", Term(beacon_distance, ("t_root",), reach=1))
+    data, energy = still_data(40, 0.01), HpsEnergy({"self": 10.0, "pose": 20.0, "hold": 5.0, "beacon": 10.0})
+    one, two = (solve_in_stretches(energy, data, stretch=5, overlap=4, jobs=jobs).state for jobs in (1, 4))
+    assert torch.equal(one.t_world_root, two.t_world_root)
+
+
 def test_the_banded_solver_refuses_a_new_term_of_the_spine(monkeypatch):
     monkeypatch.setitem(TERMS, "stiff", Term(lambda theta: theta.flatten(1), ("theta",), reach=1))
     with pytest.raises(WearcapError, match="cannot minimise the term 'stiff'"):

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
+from threading import Lock
 
 import numpy as np
 import torch
@@ -42,6 +43,10 @@ _VALUES = {
 }
 """What the compiled kernels know the derivative of, by its name in `hps.state_values`; poses in addition where they
 are compared with the suit's: all joints' frame by frame, the legs' from frame to frame."""
+
+
+_FORWARD_MODE = Lock()
+"""PyTorch's forward mode has one level for all threads: stretches that are solved at the same time take turns."""
 
 
 @dataclass(frozen=True)
@@ -263,7 +268,8 @@ class Stretch:
         for group in range(term.reach):
             tangents[group, unknown, group :: term.reach, unknown] = 1.0
         forward = torch.func.vmap(lambda tangent: torch.func.jvp(residuals, (still,), (tangent,))[1])
-        all_groups = forward(tangents.flatten(0, 1)).unflatten(0, (term.reach, n))
+        with _FORWARD_MODE:
+            all_groups = forward(tangents.flatten(0, 1)).unflatten(0, (term.reach, n))
         jacobian = torch.stack([all_groups[(frame + k) % term.reach, :, frame] for k in range(term.reach)])
         share = self.values[term.share][: len(residual)].reshape(len(residual), -1).expand(residual.shape[:2])
         weight = torch.empty(residual.shape[:2], dtype=torch.float64)
