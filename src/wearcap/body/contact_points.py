@@ -8,7 +8,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from wearcap.body.anny_body import anny_body
-from wearcap.body.kinematics import forward_kinematics
+from wearcap.body.kinematics import forward_kinematics, local_rotations
 from wearcap.body.landmarks import t_pose
 from wearcap.body.model import BodyModel
 from wearcap.body.skeleton import MIRROR, xsens23
@@ -73,12 +73,8 @@ def contact_points(body: BodyModel) -> BodyModel:
 
 def _in_t_pose(body: BodyModel) -> Float[Tensor, "vertex 3"]:
     """The surface with legs straight down and arms straight sideways, the root at the origin (m)."""
-    pose = t_pose(body.skeleton)
-    R_parent_joint = pose.R.clone()
-    parents = torch.tensor(body.skeleton.parents[1:])
-    R_parent_joint[1:] = pose.R[parents].mT @ pose.R[1:]
-    world = forward_kinematics(body.skeleton, R_parent_joint.float(), torch.zeros(3))
-    return body.vertices(world)
+    R_parent_joint = local_rotations(body.skeleton, t_pose(body.skeleton).R)
+    return body.vertices(forward_kinematics(body.skeleton, R_parent_joint.float(), torch.zeros(3)))
 
 
 def _farthest(at: Float[Tensor, "vertex 3"], among: Int64[Tensor, "candidate"], count: int) -> Int64[Tensor, "count"]:

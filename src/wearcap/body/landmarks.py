@@ -125,6 +125,12 @@ class TPose:
     def hip_centre(self) -> Float[Tensor, "3"]:
         return (self.t[self.marks.limb["left_leg"][0]] + self.t[self.marks.limb["right_leg"][0]]) / 2
 
+    def site(self, skeleton: Skeleton, name: str, scale: float = 1.0) -> Float[Tensor, "3"]:
+        """Position (m) of one of the skeleton's sites, its offset from the joint scaled."""
+        site = skeleton.sites[name]
+        joint = skeleton.index(site.joint)
+        return self.t[joint] + scale * (self.R[joint] @ torch.tensor(site.t_joint_site, dtype=torch.float64))
+
 
 def t_pose(skeleton: Skeleton) -> TPose:
     """The T-pose, whatever the bind pose: legs straight down, arms straight sideways, all else as in the bind pose."""

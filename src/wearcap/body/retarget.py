@@ -19,14 +19,6 @@ from wearcap.geometry.rotation import swing_between
 _SIDES = ("left", "right")
 
 
-# ------------------------------------------------------------------------------------------------ rotations
-
-
-def _knots(pose: TPose, joints: tuple[int, ...], end: int) -> Float[Tensor, "knot"]:
-    """Arc length at each joint of a chain and at its end."""
-    return _arc_lengths(pose.t[[*joints, end]])
-
-
 def _arc_lengths(points: Float[Tensor, "point 3"]) -> Float[Tensor, "point"]:
     steps = (points[1:] - points[:-1]).norm(dim=-1)
     return torch.cat([steps.new_zeros(1), steps.cumsum(0)])
@@ -43,8 +35,10 @@ def _carry(
         """Give each target segment the mean turn of the source's, weighted by how much of its length they overlap."""
         if not joints_s or not joints_t:
             return
-        knots_s, knots_t = _knots(source, joints_s, end_s), _knots(target, joints_t, end_t)
-        knots_s, knots_t = knots_s / knots_s[-1].clamp_min(1e-9), knots_t / knots_t[-1].clamp_min(1e-9)
+        knots_s, knots_t = (
+            knots / knots[-1].clamp_min(1e-9)
+            for knots in (_arc_lengths(source.t[[*joints_s, end_s]]), _arc_lengths(target.t[[*joints_t, end_t]]))
+        )
         low = torch.maximum(knots_t[:-1, None], knots_s[None, :-1])
         high = torch.minimum(knots_t[1:, None], knots_s[None, 1:])
         share = (high - low).clamp_min(0) + 1e-9
@@ -135,9 +129,6 @@ def reach(
     return swing_between(middle - start, elbow - start), swing_between(end - middle, hand - elbow)
 
 
-# ---------------------------------------------------------------------------------------------- proportions
-
-
 def fit_offsets(source: Skeleton, target: Skeleton) -> Skeleton:
     """The target's tree with the size of the source's wearer: hips, spine, collars, neck, arms, legs, feet.
 
@@ -156,8 +147,25 @@ def fit_offsets(source: Skeleton, target: Skeleton) -> Skeleton:
     offsets = torch.zeros_like(t)
     above = list(target.parents[1:])
     offsets[1:] = (pose_t.R[above].transpose(-1, -2) @ (t[1:] - t[above])[..., None])[..., 0]
-    fitted = replace(target, t_parent_joint=offsets.to(target.t_parent_joint), sites={})
-    return replace(fitted, sites=_fitted_sites(source, target, pose_s, replace(pose_t, t=t), float(scale)))
+    # Crowns and fingertips are never copied: files end those bones anywhere (CMU's head at its markers).
+    pose_t = replace(pose_t, t=t)
+    at = {name: pose_t.site(target, name, float(scale)) for name in target.sites}
+    for side in _SIDES:
+        heel, tip = f"{side}_heel", f"{side}_toe_tip"
+        if not {heel, tip} <= set(at):
+            continue
+        if {heel, tip} <= set(source.sites):
+            ankle_s, ankle_t = (pose.t[pose.marks.limb[f"{side}_leg"][2]] for pose in (pose_s, pose_t))
+            at |= {name: pose_s.site(source, name) - ankle_s + ankle_t for name in (heel, tip)}
+        # One flat sole: toe joints and the ends of toe bones lie at different heights in every file.
+        sole = at[heel][2] if heel not in source.sites else torch.minimum(at[heel][2], at[tip][2])
+        at |= {name: torch.cat([at[name][:2], sole[None]]) for name in (heel, tip)}
+    sites = {}
+    for name, site in target.sites.items():
+        joint = target.index(site.joint)
+        x, y, z = (pose_t.R[joint].T @ (at[name] - pose_t.t[joint])).tolist()
+        sites[name] = Site(site.joint, (x, y, z))
+    return replace(target, t_parent_joint=offsets.to(target.t_parent_joint), sites=sites)
 
 
 def _head_height(pose: TPose) -> Tensor:
@@ -179,8 +187,7 @@ def _places(source: TPose, target: TPose, scale: float) -> dict[int, Tensor]:
 
     def chain(points: Tensor, joints: tuple[int, ...], end: int) -> None:
         """Place a chain's joints on a polyline, at the fractions of its length that they have in the target."""
-        knots = _knots(target, joints, end)
-        arc = _arc_lengths(points)
+        knots, arc = _arc_lengths(target.t[[*joints, end]]), _arc_lengths(points)
         wanted = (knots[:-1] / knots[-1].clamp_min(1e-9) * arc[-1]).contiguous()
         after = torch.searchsorted(arc, wanted).clamp(1, len(points) - 1)
         steps = (points[1:] - points[:-1]).norm(dim=-1)
@@ -189,8 +196,7 @@ def _places(source: TPose, target: TPose, scale: float) -> dict[int, Tensor]:
 
     if len(to.spine) > 1:
         chain(column, to.spine[:-1], to.spine[-1])
-    top = to.spine[len(to.spine) - 1]
-    places[top] = column[-1] if len(to.spine) > 1 else column[0]
+    places[to.spine[-1]] = column[-1] if len(to.spine) > 1 else column[0]
     if to.neck:
         chain(at_s[[neck_s, *from_s.neck[1:], from_s.head]], to.neck, to.head)
     for side in _SIDES:
@@ -210,34 +216,3 @@ def _places(source: TPose, target: TPose, scale: float) -> dict[int, Tensor]:
         if toe_s is not None and toe_t is not None:
             places[toe_t] = places[to.limb[f"{side}_leg"][2]] + source.t[toe_s] - source.t[ankle_s]
     return places
-
-
-def _fitted_sites(source: Skeleton, target: Skeleton, pose_s: TPose, pose_t: TPose, scale: float) -> dict[str, Site]:
-    """The target's sites on the fitted body: scaled, the feet's copied where the source has them.
-
-    Crowns and fingertips are never copied: files end those bones anywhere (CMU's head at its markers).
-    """
-    at = {
-        name: pose_t.t[target.index(site.joint)]
-        + scale * (pose_t.R[target.index(site.joint)] @ torch.tensor(site.t_joint_site, dtype=torch.float64))
-        for name, site in target.sites.items()
-    }
-    for side in _SIDES:
-        heel, tip = f"{side}_heel", f"{side}_toe_tip"
-        if not {heel, tip} <= set(at):
-            continue
-        if {heel, tip} <= set(source.sites):
-            ankle_s, ankle_t = (pose.marks.limb[f"{side}_leg"][2] for pose in (pose_s, pose_t))
-            for name in (heel, tip):  # the same offset from the ankle
-                site, joint = source.sites[name], source.index(source.sites[name].joint)
-                offset = pose_s.R[joint] @ torch.tensor(site.t_joint_site, dtype=torch.float64)
-                at[name] = pose_s.t[joint] + offset - pose_s.t[ankle_s] + pose_t.t[ankle_t]
-        # One flat sole: toe joints and the ends of toe bones lie at different heights in every file.
-        sole = at[heel][2] if heel not in source.sites else torch.minimum(at[heel][2], at[tip][2])
-        at |= {name: torch.cat([at[name][:2], sole[None]]) for name in (heel, tip)}
-    sites = {}
-    for name, site in target.sites.items():
-        joint = target.index(site.joint)
-        x, y, z = (pose_t.R[joint].T @ (at[name] - pose_t.t[joint])).tolist()
-        sites[name] = Site(site.joint, (x, y, z))
-    return sites
