@@ -14,8 +14,7 @@ from wearcap.geometry.trajectory import resample
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.recording.acts import Act, true_acts
 from wearcap.runtime.system import CaptureInput
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import SceneObject
+from wearcap.scene.objects import Environment, SceneObject
 from wearcap.systems.echo.observations import ObjectShape
 from wearcap.systems.echo.pipeline import Echo
 from wearcap.viewer.page_layers import with_objects

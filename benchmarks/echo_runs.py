@@ -11,7 +11,7 @@ from planted import swinging
 from wearcap.body.skeleton import xsens23
 from wearcap.cli.conf import compose, load_pipeline
 from wearcap.models.checkpoint import shared_checkpoints
-from wearcap.scene.environment import Environment
+from wearcap.scene.objects import Environment
 from wearcap.simulation.places.movables import make_movable
 from wearcap.systems.echo.observations import Scenario, batch_item_of
 from wearcap.systems.echo.pipeline import Echo

@@ -15,7 +15,7 @@ from wearcap.body.anny_body import anny_body
 from wearcap.metrics.objects import handlings
 from wearcap.recording import Motion, RecordingStore
 from wearcap.recording.timing import at_times
-from wearcap.scene.environment import Environment
+from wearcap.scene.objects import Environment
 from wearcap.viewer.page_layers import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png
 

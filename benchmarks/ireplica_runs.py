@@ -18,8 +18,7 @@ from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.recording.motion import Interactions
 from wearcap.recording.timing import resampled
 from wearcap.runtime.system import CaptureInput
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import CONTACT_CLASSES
+from wearcap.scene.objects import CONTACT_CLASSES, Environment
 from wearcap.sensors.simulated import smooth_noise
 from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 from wearcap.systems.ireplica.object_tracker import ContactSettings, ObjectTracker

@@ -18,8 +18,7 @@ from wearcap.io.formats.environment import write_environment
 from wearcap.recording import ContactTrack, FloorTrack, HeadStream, Recording, RecordingStore
 from wearcap.recording.acts import true_acts
 from wearcap.recording.motion import Interactions
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import Freedom, SceneObject
+from wearcap.scene.objects import Environment, Freedom, SceneObject
 from wearcap.systems.echo.contacts import ContactUse
 from wearcap.systems.echo.features import CONTACTS, OBJECT_SIZE, EchoFeatures
 from wearcap.systems.echo.model import EchoDenoiser

@@ -14,8 +14,7 @@ from wearcap.cli import main as cli
 from wearcap.geometry.mesh import Mesh
 from wearcap.io.formats.environment import write_environment
 from wearcap.recording import ImuStream, Localization, RecordingStore
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import Freedom, SceneObject
+from wearcap.scene.objects import Environment, Freedom, SceneObject
 from wearcap_testing import recording_of, suited, swaying_motion
 
 

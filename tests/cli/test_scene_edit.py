@@ -9,8 +9,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.io.formats.environment import write_environment
 from wearcap.io.formats.ply import Ply, write_ply
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import Freedom, SceneObject
+from wearcap.scene.objects import Environment, Freedom, SceneObject
 from wearcap.viewer.object_editor import ObjectEditor
 
 

@@ -14,8 +14,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.io.formats.environment import read_environment, write_environment
 from wearcap.io.formats.ply import Ply, read_ply, write_ply
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import Freedom, SceneObject
+from wearcap.scene.objects import Environment, Freedom, SceneObject
 
 TETRA = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]], np.int32)

@@ -12,8 +12,7 @@ from wearcap.cli.main import run_verb
 from wearcap.doctor import Finding, examine
 from wearcap.doctor.places import _check_environment
 from wearcap.io.formats.environment import write_environment
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import Freedom, SceneObject
+from wearcap.scene.objects import Environment, Freedom, SceneObject
 
 
 def scene_object(name, size=(1.0, 0.6, 0.8), at=(0.0, 0.0, 0.0), freedom=Freedom("plane"), origin=0.0) -> SceneObject:

@@ -8,7 +8,7 @@ import torch
 from carried_box import box_mesh, boxes, carrying, drawn_echo, scenario_of, scene_object
 from wearcap.body.contact_points import BODY_POINTS
 from wearcap.geometry.rigid import Rigid
-from wearcap.scene.environment import Environment
+from wearcap.scene.objects import Environment
 from wearcap.systems.echo.contacts import ContactUse, Guidance, GuidedScene
 from wearcap.systems.echo.features import OBJECT_SIZE, Body
 from wearcap.systems.echo.observations import Observed, batch_item_of

@@ -12,7 +12,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
 from wearcap.recording.acts import active_at
 from wearcap.recording.timing import joined
-from wearcap.scene.environment import Environment
+from wearcap.scene.objects import Environment
 from wearcap.systems.echo.stream import EchoStream, EchoWearer
 
 TWO = (("box_1", "left", 0.1, 0.4), ("box_2", "right", 0.7, 0.9))

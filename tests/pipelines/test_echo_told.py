@@ -14,7 +14,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording.acts import Act
-from wearcap.scene.environment import Environment
+from wearcap.scene.objects import Environment
 from wearcap.systems.echo.features import CONTACTS
 from wearcap.systems.echo.observations import Observed, batch_item_of, wrist_poses
 from wearcap.tracking.head_path import head_path

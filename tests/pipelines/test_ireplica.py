@@ -21,8 +21,7 @@ from wearcap.recording import Motion, Recording
 from wearcap.recording.motion import Interactions
 from wearcap.runtime.stages import StagedSystem, digest
 from wearcap.runtime.system import CaptureInput
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import Freedom, SceneObject
+from wearcap.scene.objects import Environment, Freedom, SceneObject
 from wearcap.systems.ireplica.object_tracker import PALMS, AttachmentSettings, ObjectTracker
 from wearcap.systems.ireplica.pipeline import IReplica
 from wearcap.systems.ireplica.published import held_when_near, interpolated_objects, static_objects

@@ -12,8 +12,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rotation import about_axis
 from wearcap.scene.editing import Footprint, ObjectEditing, _floor_below, _usual_freedom, hinge_places, snapped
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import Freedom, SceneObject
+from wearcap.scene.objects import Environment, Freedom, SceneObject
 from wearcap.scene.scan import Box, Scan, SlicedCloud, first_hit
 
 FLOOR_M = 0.3

@@ -19,8 +19,7 @@ from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.environment import write_environment
 from wearcap.recording import CameraStream, Localization, Recording, RecordingStore
 from wearcap.runtime.stages import StagedSystem
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import Freedom, SceneObject
+from wearcap.scene.objects import Environment, Freedom, SceneObject
 from wearcap.systems.ireplica.contact_sequence import ContactSequence
 from wearcap.systems.ireplica.features import HandViews
 from wearcap.systems.ireplica.object_tracker import PALMS, ObjectTracker

@@ -17,8 +17,7 @@ from wearcap.io.formats.contact_labels import Label, read_contact_labels
 from wearcap.io.formats.environment import write_environment
 from wearcap.io.formats.motion_npz import write_motion
 from wearcap.recording import Motion, Recording, RecordingStore
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import Freedom, SceneObject
+from wearcap.scene.objects import Environment, Freedom, SceneObject
 from wearcap.viewer.annotate import AnnotationFile, Conflict, Take, starting_labels
 from wearcap.viewer.annotate_server import AnnotationServer, _byte_range
 from wearcap_testing import recording_of, swaying_motion

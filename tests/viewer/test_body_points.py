@@ -19,8 +19,7 @@ from wearcap.io.formats.environment import write_environment
 from wearcap.io.formats.motion_npz import write_motion
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.recording.motion import Interactions
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import Freedom, SceneObject
+from wearcap.scene.objects import Environment, Freedom, SceneObject
 from wearcap.viewer.page import FLESH_M, Page, _spacing_m
 from wearcap.viewer.page_layers import (
     BALL_M,

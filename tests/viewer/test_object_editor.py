@@ -16,7 +16,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.formats.environment import read_environment, write_environment
 from wearcap.scene.editing import hinge_places
-from wearcap.scene.environment import Environment
+from wearcap.scene.objects import Environment
 from wearcap.scene.scan import Box, Scan
 from wearcap.viewer.object_editor import ObjectEditor
 from wearcap.viewer.object_editor_view import HINTS, TOOLS, _typical_spacing

@@ -27,7 +27,7 @@ from wearcap.io.formats.smpl import read_smpl
 from wearcap.recording import Motion, Recording
 from wearcap.recording.store import dataset_folder, load_recording
 from wearcap.runtime.system import CaptureInput, StageOptions, System
-from wearcap.scene.environment import Environment
+from wearcap.scene.objects import Environment
 from wearcap.viewer.page_layers import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png, write_video
 

@@ -20,8 +20,7 @@ from wearcap.io.formats.scene_folder import read_scan
 from wearcap.io.formats.video import open_image
 from wearcap.localization.visual_map import VisualMap
 from wearcap.recording import PointCloud, Recording
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import FREEDOMS, SceneObject
+from wearcap.scene.objects import FREEDOMS, Environment, SceneObject
 from wearcap.scene.scan import Photo, Scan
 
 SPARSE_M = 0.03

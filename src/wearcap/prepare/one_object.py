@@ -22,8 +22,7 @@ from wearcap.io.formats.environment import FILE_NAME, write_environment
 from wearcap.prepare.engine import NOTE, Splits, Task, content_hash
 from wearcap.prepare.mocap import About, MocapSettings, foot_patches, mocap_recording, on_xsens23, without_glitches
 from wearcap.recording.recording import Recording
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import Freedom, SceneObject
+from wearcap.scene.objects import Environment, Freedom, SceneObject
 
 VERSION = 1
 """Version of both conversions, increased when the same source and settings yield another recording."""

@@ -24,7 +24,7 @@ from wearcap.metrics.table import Row
 from wearcap.models.checkpoint import load_trained
 from wearcap.recording import Motion, Recording
 from wearcap.runtime.graphs import Exports
-from wearcap.scene.environment import Environment
+from wearcap.scene.objects import Environment
 from wearcap.scene.scan import Scan
 
 

@@ -14,8 +14,7 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.triangle_distance import TriangleIndex
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import Freedom, SceneObject
+from wearcap.scene.objects import Environment, Freedom, SceneObject
 from wearcap.scene.scan import Box, Scan, SlicedCloud
 
 USUAL_KIND = {

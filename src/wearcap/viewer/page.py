@@ -18,8 +18,7 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory, nearest_frames
 from wearcap.recording import Motion, Recording
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import SceneObject
+from wearcap.scene.objects import Environment, SceneObject
 from wearcap.viewer.page_layers import (
     BodyLayer,
     BodyPointsLayer,

@@ -26,8 +26,7 @@ from wearcap.geometry.trajectory import Trajectory, nearest_frames
 from wearcap.recording.acts import NO_OBJECT, active_at, true_acts
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import ContactTrack, HeadStream, PointCloud, Recording
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import SceneObject
+from wearcap.scene.objects import Environment, SceneObject
 
 MAX_POINTS = 200_000
 LABEL_ABOVE_M = 0.3

@@ -26,7 +26,7 @@ from wearcap.geometry.render import Light, Splats, render
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording.motion import HANDS, Motion
 from wearcap.recording.recording import Recording
-from wearcap.scene.environment import Environment
+from wearcap.scene.objects import Environment
 from wearcap.viewer.page_layers import by_height, lit_points, posed_meshes, stick_body
 
 PALETTE = np.array([[0.45, 0.55, 0.66], [0.86, 0.55, 0.30], [0.44, 0.62, 0.42], [0.62, 0.45, 0.62]])

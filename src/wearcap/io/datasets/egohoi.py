@@ -26,8 +26,7 @@ from wearcap.io.formats.poses import checked_trajectory
 from wearcap.io.formats.text import read_json
 from wearcap.recording.motion import HANDS, Interactions
 from wearcap.recording.recording import Recording
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import Freedom, SceneObject
+from wearcap.scene.objects import Environment, Freedom, SceneObject
 
 MOTION_TYPES = ("hinge", "along_floor", "free", "absent")
 """Motion types of the published configurations, and "absent" for objects that were mapped but not present."""

@@ -19,8 +19,7 @@ from wearcap.io.formats.bounded import placed
 from wearcap.io.formats.ply import Ply, read_ply, write_ply
 from wearcap.io.formats.poses import are_rotations
 from wearcap.io.formats.text import read_json
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import FREEDOMS, Freedom, SceneObject
+from wearcap.scene.objects import FREEDOMS, Environment, Freedom, SceneObject
 
 SCHEMA = 1
 FILE_NAME = "environment.json"

@@ -16,7 +16,7 @@ from wearcap.geometry.mesh import merged
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording.motion import Interactions, Motion
-from wearcap.scene.environment import Environment
+from wearcap.scene.objects import Environment
 from wearcap.simulation.handling.grips import Handling, object_motion
 from wearcap.simulation.places.builder import Piece, WorldBuilder
 from wearcap.simulation.places.flat import lay_out

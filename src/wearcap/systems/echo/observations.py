@@ -21,8 +21,7 @@ from wearcap.recording.acts import NO_OBJECT, Act, active_at
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 from wearcap.recording.timing import at_times
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import SceneObject
+from wearcap.scene.objects import Environment, SceneObject
 from wearcap.systems.echo.features import CONTACTS, EchoFeatures
 from wearcap.systems.echo.model import MODALITIES
 from wearcap.systems.echo.queue import Conditioning

@@ -21,7 +21,7 @@ from wearcap.recording import Motion, Recording
 from wearcap.recording.acts import Act, true_acts
 from wearcap.runtime.graphs import chosen
 from wearcap.runtime.system import CaptureInput, LearnedSystem
-from wearcap.scene.environment import Environment
+from wearcap.scene.objects import Environment
 from wearcap.systems.echo.contacts import ContactUse, GuidedScene, with_static_objects
 from wearcap.systems.echo.model import EchoRunner
 from wearcap.systems.echo.observations import BatchItem, ObjectReader, ObjectShape, Scenario, batch_item_of

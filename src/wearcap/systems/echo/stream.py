@@ -29,7 +29,7 @@ from wearcap.recording.acts import SAME_S
 from wearcap.recording.timing import joined
 from wearcap.runtime.graphs import undisturbed
 from wearcap.runtime.session import HeadAndWristsStream, Session, classes_of
-from wearcap.scene.environment import Environment
+from wearcap.scene.objects import Environment
 from wearcap.sensors import packets, samples
 from wearcap.sensors.packets import MAX_WAITING
 from wearcap.sensors.samples import ActiveObject, HeadSample, ObjectSample, WristSample

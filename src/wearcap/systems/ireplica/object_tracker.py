@@ -22,8 +22,7 @@ from wearcap.recording import Motion
 from wearcap.recording.acts import MARGIN_S, Act, spread_acts
 from wearcap.recording.motion import Interactions
 from wearcap.recording.timing import at_times, resampled
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import ANCHORS, CONTACT_CLASSES, ObjectState, SceneObject, follow_hands
+from wearcap.scene.objects import ANCHORS, CONTACT_CLASSES, Environment, ObjectState, SceneObject, follow_hands
 from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 
 

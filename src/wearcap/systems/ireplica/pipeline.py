@@ -19,7 +19,7 @@ from wearcap.recording import Motion
 from wearcap.recording.timing import resampled
 from wearcap.runtime.stages import Stage, StagedSystem, run_stages
 from wearcap.runtime.system import CaptureInput
-from wearcap.scene.environment import Environment
+from wearcap.scene.objects import Environment
 from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 from wearcap.systems.ireplica.object_tracker import ObjectTracker
 from wearcap.systems.ireplica.scores import score_interactions

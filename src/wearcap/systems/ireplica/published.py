@@ -15,8 +15,7 @@ from wearcap.optimize.trajectory import BentPath
 from wearcap.recording import Motion, Recording
 from wearcap.recording.motion import Interactions
 from wearcap.recording.timing import resampled
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import CONTACT_CLASSES
+from wearcap.scene.objects import CONTACT_CLASSES, Environment
 from wearcap.sensors.initialization import align_suit, body_camera, inliers
 from wearcap.systems.hps.camera import Localize, MapLocalization, Synchronization
 from wearcap.systems.hps.pipeline import required

@@ -21,8 +21,7 @@ from wearcap.metrics.surface import chamfer
 from wearcap.recording import Motion, Recording
 from wearcap.recording.motion import Interactions
 from wearcap.recording.timing import at_times
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import SceneObject
+from wearcap.scene.objects import Environment, SceneObject
 from wearcap.systems.ireplica.object_tracker import PALMS
 
 SETTLED_S = 0.6

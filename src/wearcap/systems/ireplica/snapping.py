@@ -12,8 +12,7 @@ from wearcap.optimize.contact_correction import OffsetSettings, bend_contacts, o
 from wearcap.optimize.trajectory import BentPath
 from wearcap.recording import Motion
 from wearcap.recording.motion import HANDS
-from wearcap.scene.environment import Environment
-from wearcap.scene.objects import SceneObject
+from wearcap.scene.objects import Environment, SceneObject
 from wearcap.systems.ireplica.object_tracker import PALMS, ContactInterval, Correction, Held
 from wearcap.tracking.anchor import with_hand_moved
 
