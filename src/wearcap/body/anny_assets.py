@@ -23,6 +23,7 @@ from scipy import sparse
 
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
+from wearcap.geometry.mesh import face_normals
 
 LEVELS = {
     "gender": ("male", "female"),
@@ -219,11 +220,10 @@ def _decimate(
     """
     vertices, faces = vertices.astype(np.float64), faces.astype(np.int64)
     importance = np.ones(len(vertices)) if importance is None else importance
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    normal = np.cross(b - a, c - a)
+    normal = face_normals(vertices[faces])
     area = np.linalg.norm(normal, axis=1, keepdims=True)
     normal = normal / np.maximum(area, 1e-20)
-    plane = np.concatenate([normal, -(normal * a).sum(1, keepdims=True)], 1)
+    plane = np.concatenate([normal, -(normal * vertices[faces[:, 0]]).sum(1, keepdims=True)], 1)
     outer = plane[:, :, None] * plane[:, None, :] * area[:, :, None]
     quadric = np.zeros((len(vertices), 4, 4))  # of the planes of each vertex's faces, weighted by area
     for corner in range(3):
@@ -276,7 +276,7 @@ def _cheapest(vertices, faces, quadric, importance, rim) -> tuple[np.ndarray, np
     target, cost = np.arange(count), np.full(count, np.inf)
     target[vertex], cost[vertex] = edges[order[first], 1], error[order[first]]
     # Not those whose fall would turn one of their faces over, or nearly so.
-    before = np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]])
+    before = face_normals(vertices[faces])
     for corner in range(3):
         vertex, left, right = (faces[:, (corner + k) % 3] for k in range(3))
         onto = target[vertex]

@@ -10,6 +10,7 @@ from jaxtyping import Float32
 
 from wearcap.doctor.report import Check, Finding, refusal
 from wearcap.errors import WearcapError
+from wearcap.geometry.mesh import face_normals, random_points
 from wearcap.geometry.triangle_distance import TriangleIndex
 from wearcap.io.datasets.hps import CLOUD, is_hps_scene, read_hps_scene
 from wearcap.io.formats.camera_json import PHOTOS_FILE as PHOTOS
@@ -285,12 +286,9 @@ def _check_overlaps(objects: tuple[SceneObject, ...]) -> list[Finding]:
         rng = np.random.default_rng(0)
         vertices, faces = inner.mesh.vertices.astype(np.float64), inner.mesh.faces
         if len(faces):
-            first, second, third = (vertices[faces[:, corner]] for corner in range(3))
-            area = np.linalg.norm(np.cross(second - first, third - first), axis=1) + 1e-12
-            face = rng.choice(len(faces), _SAMPLES, p=area / area.sum())
-            u, v = rng.random((2, _SAMPLES, 1))
-            u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-            sample = first[face] + u * (second - first)[face] + v * (third - first)[face]
+            corners = vertices[faces]
+            area = np.linalg.norm(face_normals(corners), axis=1) + 1e-12
+            sample = random_points(corners[rng.choice(len(faces), _SAMPLES, p=area / area.sum())], rng)
         else:
             sample = vertices[:: len(vertices) // _SAMPLES + 1]
         points = sample @ inner.R_world_object.double().numpy().T + inner.t_world_object.double().numpy()

@@ -41,8 +41,7 @@ class Mesh:
     @cached_property
     def vertex_normals(self) -> Float32[np.ndarray, "vertex 3"]:
         """Unit normals at the vertices: the mean of the faces', weighted by area (zero at loose vertices)."""
-        a, b, c = (self.vertices[self.faces[:, corner]] for corner in range(3))
-        face = np.cross(b - a, c - a)
+        face = face_normals(self.vertices[self.faces])
         total = np.stack(
             [np.bincount(self.faces.ravel(), np.repeat(face[:, axis], 3), len(self.vertices)) for axis in range(3)], -1
         )
@@ -64,6 +63,19 @@ def merged(meshes: Sequence[Mesh]) -> Mesh:
         meshes[0].smooth,
         meshes[0].casts_shadow,
     )
+
+
+def face_normals(corners: Float[np.ndarray, "face 3 3"]) -> Float[np.ndarray, "face 3"]:
+    """Normals of triangles (counter-clockwise from outside), as long as twice their area."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def random_points(corners: Float[np.ndarray, "point 3 3"], rng: np.random.Generator) -> Float[np.ndarray, "point 3"]:
+    """A point on each triangle, drawn evenly over its area, in the corners' precision."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    u, v = rng.random((2, len(corners), 1)).astype(corners.dtype)
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    return a + u * (b - a) + v * (c - a)
 
 
 def capsules(

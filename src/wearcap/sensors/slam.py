@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
-from wearcap.geometry.mesh import Mesh
+from wearcap.geometry.mesh import Mesh, face_normals, random_points
 from wearcap.geometry.render import render
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording.recording import HeadStream, PointCloud
@@ -94,16 +94,13 @@ def textured_points(
     mesh: Mesh, face_texture: Float[np.ndarray, "face"], rng: np.random.Generator, limit: int
 ) -> tuple[Float[np.ndarray, "point 3"], Float[np.ndarray, "point 3"]]:
     """Points on the surface, as dense as its texture, at most about `limit`; and the surface's unit normals there."""
-    a, b, c = (mesh.vertices[mesh.faces[:, corner]].astype(np.float64) for corner in range(3))
-    normal = np.cross(b - a, c - a)
+    corners = mesh.vertices.astype(np.float64)[mesh.faces]
+    normal = face_normals(corners)
     area = 0.5 * np.linalg.norm(normal, axis=1)
     expected = area * face_texture
     expected *= min(1.0, limit / max(expected.sum(), 1e-9))
     face = np.repeat(np.arange(len(area)), rng.poisson(expected))
-    u, v = rng.random((2, len(face), 1))
-    flip = u + v > 1
-    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
-    return a[face] + u * (b - a)[face] + v * (c - a)[face], normal[face] / (2 * area[face, None])
+    return random_points(corners[face], rng), normal[face] / (2 * area[face, None])
 
 
 def keyframes(head: HeadStream, settings: SlamPoints) -> list[int]:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from PIL import Image
 
 from wearcap.errors import WearcapError
@@ -19,6 +19,7 @@ from wearcap.files import atomic_path, write_text
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.compiled import compiled
+from wearcap.geometry.mesh import face_normals, random_points
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.camera_json import PHOTOS_FILE, write_photos
 from wearcap.io.formats.ply import Ply, write_ply
@@ -97,7 +98,8 @@ def scan_world(
     survey = (stations, order[within], first, CELL_M, origin, shape, nearness)
     # Most faces of a world are inside or below others: a face is sampled if some of a few random points are seen.
     probed = np.repeat(np.arange(len(scenery.faces)), PROBES)
-    _, kept = _measured(scenery, survey, scanner, probed, _on_faces(scenery, probed, rng), rng)
+    corners = scenery.vertices.astype(np.float64)[scenery.faces[probed]]
+    _, kept = _measured(scenery, survey, scanner, probed, random_points(corners, rng), rng)
     points, colors = [], []
     for face, place in _samples(scenery, spacing_m, kept.reshape(-1, PROBES).any(1), rng):
         measured, kept = _measured(scenery, survey, scanner, face, place, rng)
@@ -131,24 +133,13 @@ def place_stations(world: World, spacing_m: float, clearance_m: float = 0.45) ->
 
 def _samples(scenery: Scenery, spacing_m: float, wanted: Bool[np.ndarray, "face"], rng: np.random.Generator):
     """(faces, points) of samples of the wanted faces as dense as the spacing asks, `CHUNK` or so at a time."""
-    a, b, c = (scenery.vertices[scenery.faces[:, corner]].astype(np.float64) for corner in range(3))
-    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    corners = scenery.vertices.astype(np.float64)[scenery.faces]
+    area = 0.5 * np.linalg.norm(face_normals(corners), axis=1)
     ends = rng.poisson(wanted * area / spacing_m**2).cumsum()
     for start in range(0, int(ends[-1]), CHUNK):
         number = np.arange(start, min(start + CHUNK, int(ends[-1])))
         face = np.searchsorted(ends, number, side="right")
-        yield face, _on_faces(scenery, face, rng)
-
-
-def _on_faces(
-    scenery: Scenery, face: Int[np.ndarray, "point"], rng: np.random.Generator
-) -> Float[np.ndarray, "point 3"]:
-    """A random point on each face."""
-    a, b, c = (scenery.vertices[scenery.faces[face, corner]].astype(np.float64) for corner in range(3))
-    u, v = rng.random((2, len(face), 1))
-    flip = u + v > 1
-    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
-    return a + u * (b - a) + v * (c - a)
+        yield face, random_points(corners[face], rng)
 
 
 @compiled

@@ -13,6 +13,7 @@ from torch import Tensor
 from wearcap.body.anny_body import anny_body
 from wearcap.body.kinematics import site_positions
 from wearcap.errors import WearcapError
+from wearcap.geometry.mesh import face_normals, random_points
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
 from wearcap.metrics.objects import Handling, contact_mean, handlings, object_error
@@ -140,12 +141,10 @@ def _chamfer(
         vertices, faces = environment.by_name(name).mesh.vertices, environment.by_name(name).mesh.faces
         rng = np.random.default_rng(0)
         if len(faces):
-            a, b, c = (vertices[faces[:, k]] for k in range(3))
-            area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+            corners = vertices[faces]
+            area = np.linalg.norm(face_normals(corners), axis=1)
             chosen = rng.choice(len(faces), CHAMFER_POINTS, p=area / area.sum())
-            u, v = rng.uniform(size=(2, CHAMFER_POINTS, 1)).astype(np.float32)
-            u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-            surface = torch.from_numpy(a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen])
+            surface = torch.from_numpy(random_points(corners[chosen], rng))
         else:
             surface = torch.from_numpy(vertices[rng.permutation(len(vertices))[:CHAMFER_POINTS]])
         for frame in frames:
