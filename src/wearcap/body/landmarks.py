@@ -60,14 +60,6 @@ def _plain(name: str) -> str:
     return re.sub(r"^(.*?)(left|right)$", r"\2\1", plain)
 
 
-def _ancestors(skeleton: Skeleton, joint: int) -> list[int]:
-    """The joint and all its ancestors, the root last."""
-    chain = [joint]
-    while skeleton.parents[chain[-1]] >= 0:
-        chain.append(skeleton.parents[chain[-1]])
-    return chain
-
-
 def _limb(by_name: dict[str, int], side: str, limb: str, skeleton: Skeleton) -> tuple[int, int, int]:
     alternatives = [names.split() for names in (_LEGS if limb == "leg" else _ARMS).split(",")]
     for names in alternatives:
@@ -100,12 +92,12 @@ def landmarks(skeleton: Skeleton) -> Landmarks:
         below = [joint for joint, parent in enumerate(skeleton.parents) if parent == limb[f"{side}_leg"][2]]
         toe[side] = max(below, key=lambda joint: skeleton.t_parent_joint[joint, 0].item(), default=None)
         forearm[side] = skeleton.parents[limb[f"{side}_arm"][2]]
-    above_head = _ancestors(skeleton, head)
-    top = next(j for j in _ancestors(skeleton, limb["left_arm"][0]) if j in above_head)
+    above_head = skeleton.ancestors(head)
+    top = next(j for j in skeleton.ancestors(limb["left_arm"][0]) if j in above_head)
     for side in ("left", "right"):
         above = skeleton.parents[limb[f"{side}_arm"][0]]
         collar[side] = above if above not in above_head else None
-    spine = _ancestors(skeleton, top)[-2::-1]
+    spine = skeleton.ancestors(top)[-2::-1]
     if not spine:
         raise WearcapError(f"skeleton {skeleton.name!r} has no spine", expected="a joint between root and arms")
     neck = above_head[1 : above_head.index(top)][::-1]

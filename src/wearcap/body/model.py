@@ -116,8 +116,5 @@ def contact_regions(
 
 def _carried_by(skeleton: Skeleton, weights: Float[Tensor, "vertex joint"], joint: int) -> Bool[Tensor, "vertex"]:
     """Vertices whose skinning weights on a joint and its descendants sum to more than one half."""
-    below = [joint]
-    for other in range(joint + 1, len(skeleton)):  # parents come before their children
-        if skeleton.parents[other] in below:
-            below.append(other)
+    below = [other for other in range(len(skeleton)) if joint in skeleton.ancestors(other)]
     return weights[:, below].sum(1) > 0.5

@@ -106,6 +106,13 @@ class Skeleton:
     def __contains__(self, name: str) -> bool:
         return name in self._index_of or _ALIASES.get(name) in self._index_of
 
+    def ancestors(self, joint: int) -> list[int]:
+        """The joint and all its ancestors, the root last."""
+        chain = [joint]
+        while self.parents[chain[-1]] >= 0:
+            chain.append(self.parents[chain[-1]])
+        return chain
+
     @cached_property
     def levels(self) -> tuple[tuple[int, ...], ...]:
         """Joints by depth in the tree, the root's level first, for one batched step per level."""

@@ -30,7 +30,6 @@ from wearcap.optimize.hps import (
     HpsState,
     Solution,
     Term,
-    chain_to,
     data_values,
     find_ground,
 )
@@ -345,7 +344,7 @@ def _active_body(patches: FootPatches) -> tuple[tuple[int, ...], Body]:
     body, skeleton, legs = patches.body, patches.body.skeleton, patches.legs
     if body.pose_blend is not None:
         raise WearcapError("this body's feet change shape with the pose", fix="Use the solver adam_windows for it.")
-    head = chain_to(skeleton, skeleton.index("head"))
+    head = skeleton.ancestors(skeleton.index("head"))[-2::-1]
     joints = tuple(sorted({*head, *legs[0], *legs[1]}))
     number = {joint: k + 1 for k, joint in enumerate(joints)} | {0: 0}
     weights = torch.zeros(len(patches.vertex), len(skeleton), dtype=torch.float64)

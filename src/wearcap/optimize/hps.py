@@ -10,7 +10,6 @@ from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.model import FOOT_REGIONS, BodyModel
-from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.surface import SurfaceIndex
@@ -142,7 +141,7 @@ class FootPatches:
     def legs(self) -> list[list[int]]:
         """Joints of the left and the right leg, from hip to toe; the patches are skinned to the last two."""
         skeleton = self.body.skeleton
-        return [chain_to(skeleton, skeleton.index(f"{side}_toe")) for side in ("left", "right")]
+        return [skeleton.ancestors(skeleton.index(f"{side}_toe"))[-2::-1] for side in ("left", "right")]
 
     def share(self, contact: Float[Tensor, "*batch patch"]) -> Float[Tensor, "*batch vertex"]:
         """Contact of each vertex's patch over its number of vertices, so that sums over vertices are patch means."""
@@ -167,15 +166,6 @@ class FootPatches:
             whole.skin_weights[self.vertex],
             pose_blend=blend,
         )
-
-
-def chain_to(skeleton: Skeleton, joint: int) -> list[int]:
-    """Joints on the chain from the root (excluded) to `joint`."""
-    chain = []
-    while joint > 0:
-        chain.append(joint)
-        joint = skeleton.parents[joint]
-    return chain[::-1]
 
 
 @dataclass(frozen=True, eq=False)
