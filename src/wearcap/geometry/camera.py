@@ -142,8 +142,17 @@ class Camera:
 
     def _lens(self, plane: Float[Tensor, "*batch 2"]) -> tuple[Tensor, Tensor]:
         """Distorted plane coordinates "*batch 2" and their Jacobian "*batch 2 2"."""
-        terms = self.lens_terms
-        bent, d_bent = _radial(plane, terms.radial, of_square=self.model != "ocam")
+        terms, of_square = self.lens_terms, self.model != "ocam"
+        # bent = plane (1 + k1 s + k2 s² + …), s = |plane|² or, not `of_square`, |plane|
+        s = (plane**2).sum(-1, keepdim=True) if of_square else plane.norm(dim=-1, keepdim=True)
+        gain, slope = torch.zeros_like(s), torch.zeros_like(s)
+        for k in reversed((1.0, *terms.radial)):
+            slope = slope * s + gain
+            gain = gain * s + k
+        identity = torch.eye(2, dtype=plane.dtype, device=plane.device)
+        along = 2 * slope if of_square else slope / s.clamp(min=torch.finfo(plane.dtype).tiny)
+        d_bent = gain[..., None] * identity + along[..., None] * plane[..., :, None] * plane[..., None, :]
+        bent = plane * gain
         if self.model == "ocam":
             e, d, c = terms.affine
             affine = plane.new_tensor([[1.0, e], [d, c]])  # OCamCalib counts rows first, we count columns first
@@ -157,7 +166,6 @@ class Camera:
         first, second = bent.new_tensor(terms.prism[0::2]), bent.new_tensor(terms.prism[1::2])
         tilt = first * s + second * s**2
         d_tilt = (2 * first + 4 * second * s)[..., :, None] * bent[..., None, :]
-        identity = torch.eye(2, dtype=plane.dtype, device=plane.device)
         return bent + shift + tilt, (identity + d_shift + d_tilt) @ d_bent
 
     @cached_property
@@ -177,18 +185,6 @@ class Camera:
         return _LensTerms(
             radial, tangential, prism, affine, min([math.pi**2 if self.is_fisheye else math.inf, *rising])
         )
-
-
-def _radial(m: Tensor, coefficients: tuple[float, ...], of_square: bool) -> tuple[Tensor, Tensor]:
-    """m (1 + k1 s + k2 s² + …), s = |m|² or, not `of_square`, |m|; and its Jacobian."""
-    s = (m**2).sum(-1, keepdim=True) if of_square else m.norm(dim=-1, keepdim=True)
-    gain, slope = torch.zeros_like(s), torch.zeros_like(s)
-    for k in reversed((1.0, *coefficients)):
-        slope = slope * s + gain
-        gain = gain * s + k
-    identity = torch.eye(2, dtype=m.dtype, device=m.device)
-    along = 2 * slope if of_square else slope / s.clamp(min=torch.finfo(m.dtype).tiny)
-    return m * gain, gain[..., None] * identity + along[..., None] * m[..., :, None] * m[..., None, :]
 
 
 def _tangential(m: Tensor, coefficients: tuple[float, float]) -> tuple[Tensor, Tensor]:

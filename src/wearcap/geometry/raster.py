@@ -230,19 +230,30 @@ def draw_splats(blocks, pose, planes, lens, radius, metric, offset, nearness, in
 
 
 @compiled
-def _hit(rx, ry, rz, vertices, a, b, c):
-    """Barycentric weights of corners b and c where the ray through the camera's centre meets the triangle."""
+def _hit(rx, ry, rz, a, b, c, vertices, normals, smooth):
+    """Where the ray through the camera's centre meets a triangle: barycentric weights of corners b and c, and the unit
+    normal, the triangle's or between its corners', on the side that the ray meets: that side is lit."""
     ax, ay, az = vertices[a, 0], vertices[a, 1], vertices[a, 2]
     ux, uy, uz = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
     vx, vy, vz = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
     px, py, pz = ry * vz - rz * vy, rz * vx - rx * vz, rx * vy - ry * vx
     det = ux * px + uy * py + uz * pz
-    if abs(det) < 1e-20:
-        return 0.0, 0.0
-    qx, qy, qz = -ay * uz + az * uy, -az * ux + ax * uz, -ax * uy + ay * ux
-    second = min(1.0, max(0.0, -(ax * px + ay * py + az * pz) / det))
-    third = min(1.0 - second, max(0.0, (rx * qx + ry * qy + rz * qz) / det))
-    return second, third
+    second, third = 0.0, 0.0
+    if not abs(det) < 1e-20:
+        qx, qy, qz = -ay * uz + az * uy, -az * ux + ax * uz, -ax * uy + ay * ux
+        second = min(1.0, max(0.0, -(ax * px + ay * py + az * pz) / det))
+        third = min(1.0 - second, max(0.0, (rx * qx + ry * qy + rz * qz) / det))
+    if smooth:
+        first = 1.0 - second - third
+        nx = first * normals[a, 0] + second * normals[b, 0] + third * normals[c, 0]
+        ny = first * normals[a, 1] + second * normals[b, 1] + third * normals[c, 1]
+        nz = first * normals[a, 2] + second * normals[b, 2] + third * normals[c, 2]
+    else:
+        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    length = math.sqrt(nx * nx + ny * ny + nz * nz) + 1e-30
+    if nx * rx + ny * ry + nz * rz > 0:
+        length = -length
+    return second, third, nx / length, ny / length, nz / length
 
 
 @compiled
@@ -285,25 +296,6 @@ def _contact_shade(x, y, z, axes, scale, contact, fade):
 
 
 @compiled
-def _seen_normal(face, a, b, c, second, third, rx, ry, rz, vertices, normals, smooth):
-    """Unit normal of a face, or between its corners' normals, on the side that the ray meets: that side is lit."""
-    if smooth[face]:
-        first = 1.0 - second - third
-        nx = first * normals[a, 0] + second * normals[b, 0] + third * normals[c, 0]
-        ny = first * normals[a, 1] + second * normals[b, 1] + third * normals[c, 1]
-        nz = first * normals[a, 2] + second * normals[b, 2] + third * normals[c, 2]
-    else:
-        ax, ay, az = vertices[a, 0], vertices[a, 1], vertices[a, 2]
-        ux, uy, uz = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
-        vx, vy, vz = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
-        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-    length = math.sqrt(nx * nx + ny * ny + nz * nz) + 1e-30
-    if nx * rx + ny * ry + nz * rz > 0:
-        length = -length
-    return nx / length, ny / length, nz / length
-
-
-@compiled
 def resolve(
     nearness, index, rays, samples, pose, scene, point_colors, light, shadows, background, color, depth, number
 ):
@@ -330,9 +322,8 @@ def resolve(
                     continue
                 rx, ry, rz = rays[v, u, 0], rays[v, u, 1], rays[v, u, 2]
                 a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
-                second, third = _hit(rx, ry, rz, vertices, a, b, c)
+                second, third, nx, ny, nz = _hit(rx, ry, rz, a, b, c, vertices, normals, smooth[face])
                 first = 1.0 - second - third
-                nx, ny, nz = _seen_normal(face, a, b, c, second, third, rx, ry, rz, vertices, normals, smooth)
                 wx = pose[0, 0] * nx + pose[0, 1] * ny + pose[0, 2] * nz
                 wy = pose[1, 0] * nx + pose[1, 1] * ny + pose[1, 2] * nz
                 wz = pose[2, 0] * nx + pose[2, 1] * ny + pose[2, 2] * nz
