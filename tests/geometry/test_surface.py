@@ -15,13 +15,13 @@ def test_nearest_agrees_with_a_tree(count, cell_m):
     rng = np.random.default_rng(count)
     points = rng.uniform(-2, 2, (count, 3)).astype(np.float32)
     queries = rng.uniform(-2.5, 2.5, (300, 3))
-    distance, index = SurfaceIndex.build(points, cell_m).nearest(queries, reach_m=0.3)
+    distance, point = SurfaceIndex.build(points, cell_m).nearest(queries, reach_m=0.3)
     true, _ = KDTree(points.astype(np.float64)).query(queries)
     near = true < 0.3
     assert np.allclose(distance[near], true[near], atol=1e-6)
-    assert np.allclose(np.linalg.norm(points[index[near]] - queries[near], axis=1), true[near], atol=1e-6)
+    assert np.allclose(np.linalg.norm(point[near] - queries[near], axis=1), true[near], atol=1e-6)
     assert np.isinf(distance[~near]).all()
-    assert (index[~near] == -1).all()
+    assert np.isnan(point[~near]).all()
 
 
 def test_planes_of_a_tilted_noisy_floor_look_up():

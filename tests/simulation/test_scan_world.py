@@ -49,7 +49,7 @@ def test_what_no_station_sees_is_not_scanned(scenery, scan):
 def test_a_few_points_are_plainly_wrong(scenery):
     scans = [scan_world(scenery, 0.12, np.random.default_rng(0), Scanner(wrong=w, mixed=0.0)) for w in (0.0, 0.02)]
     dense = scan_world(scenery, 0.04, np.random.default_rng(1), Scanner(wrong=0.0, mixed=0.0, noise_m=0.0))
-    far = [float((dense.surface.nearest(s.points[::7].astype(np.float64), 0.25)[1] < 0).mean()) for s in scans]
+    far = [float((np.isinf(dense.surface.nearest(s.points[::7].astype(np.float64), 0.25)[0])).mean()) for s in scans]
     assert far[0] < 0.005 < far[1] < 0.03
 
 

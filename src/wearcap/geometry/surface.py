@@ -25,8 +25,6 @@ class SurfaceIndex:
 
     points: Float32[np.ndarray, "point 3"]
     """Ordered by cell."""
-    order: Int64[np.ndarray, "point"]
-    """Index of each of `points` in the original cloud."""
     cell_m: float
     origin: Float64[np.ndarray, "3"]
     keys: Int64[np.ndarray, "slot"]
@@ -52,27 +50,15 @@ class SurfaceIndex:
         slots = 1 << int(2 * len(cells)).bit_length()
         table = np.full(slots, -1), np.zeros(slots, np.int64), np.zeros(slots, np.int64)
         _fill_table(cells, first.astype(np.int64), count.astype(np.int64), *table)
-        return cls(points[order], order, size, origin, *table)
+        return cls(points[order], size, origin, *table)
 
     def nearest(
         self, queries: Float64[np.ndarray, "query 3"], reach_m: float = 0.5
-    ) -> tuple[Float64[np.ndarray, "query"], Int64[np.ndarray, "query"]]:
-        """Distance (m) to the nearest point and its index in the cloud; infinity and -1 beyond `reach_m`."""
-        distance, row = self._search(queries, reach_m)
-        return distance, np.where(row >= 0, self.order[row], -1)
-
-    def nearest_points(
-        self, queries: Float64[np.ndarray, "query 3"], reach_m: float = 0.5
-    ) -> Float64[np.ndarray, "query 3"]:
-        """Position of the nearest point (m); NaN beyond `reach_m`."""
-        _, row = self._search(queries, reach_m)
-        return np.where(row[:, None] >= 0, self.points[row], np.nan).astype(np.float64)
-
-    def _search(self, queries: np.ndarray, reach_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """Distance (m) to the nearest point and its row in `points`; infinity and -1 beyond the reach."""
+    ) -> tuple[Float64[np.ndarray, "query"], Float64[np.ndarray, "query 3"]]:
+        """Distance (m) to the nearest point, and its position; infinity and NaN beyond `reach_m`."""
         distance, row = np.empty(len(queries)), np.empty(len(queries), np.int64)
         _nearest_all(queries, reach_m, self._grid, distance, row)
-        return distance, row
+        return distance, np.where(row[:, None] >= 0, self.points[row], np.nan).astype(np.float64)
 
     def plane(
         self, queries: Float64[np.ndarray, "query 3"], radius_m: float = 0.06, reach_m: float = 0.5

@@ -31,8 +31,6 @@ class TriangleIndex:
     """A mesh's triangles (m), ready for nearest-point queries. Build it with `TriangleIndex.build`."""
 
     tree: _Tree
-    order: Int64[np.ndarray, "face"]
-    """Index in the mesh of each of the tree's faces."""
 
     @classmethod
     def build(cls, vertices: Float64[np.ndarray, "vertex 3"], faces: Int64[np.ndarray, "face 3"]) -> "TriangleIndex":
@@ -46,7 +44,7 @@ class TriangleIndex:
         low, high, span = np.empty((nodes, 3)), np.empty((nodes, 3)), np.zeros((nodes, 3), np.int64)
         order = np.arange(len(faces))
         used = _build(corners.mean(1), corners.min(1), corners.max(1), order, low, high, span)
-        return cls(_Tree(np.ascontiguousarray(corners[order]), low[:used], high[:used], span[:used]), order)
+        return cls(_Tree(np.ascontiguousarray(corners[order]), low[:used], high[:used], span[:used]))
 
     @classmethod
     def of(cls, mesh: Mesh) -> "TriangleIndex":
@@ -58,23 +56,11 @@ class TriangleIndex:
 
     def nearest(
         self, queries: Float64[np.ndarray, "query 3"]
-    ) -> tuple[Float64[np.ndarray, "query"], Int64[np.ndarray, "query"]]:
-        """Distance (m) from each point to the surface, and the index of the nearest face (NaN and 0 for points with
-        NaN)."""
-        distance, face, _ = self._search(queries)
-        return distance, face
-
-    def nearest_points(
-        self, queries: Float64[np.ndarray, "query 3"]
     ) -> tuple[Float64[np.ndarray, "query"], Float64[np.ndarray, "query 3"]]:
         """Distance (m) from each point to the surface, and the nearest surface point (NaN for points with NaN)."""
-        distance, _, point = self._search(queries)
+        distance, point = np.empty(len(queries)), np.empty((len(queries), 3))
+        _nearest_all(queries, self.tree, distance, point)
         return distance, point
-
-    def _search(self, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        distance, face, point = (np.empty(len(queries)), np.empty(len(queries), np.int64), np.empty((len(queries), 3)))
-        _nearest_all(queries, self.tree, distance, face, point)
-        return distance, self.order[face], point
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +210,7 @@ def _nearest_face(p, root, best, tree, stack, reach):
 
 
 @compiled
-def _nearest_all(queries, tree, distance, face, point):
+def _nearest_all(queries, tree, distance, point):
     """Neighbouring queries are often near each other, as along a path: the last one's face bounds the search."""
     corners = tree.corners
     stack, reach = np.empty(128, np.int64), np.empty(128)
@@ -232,13 +218,13 @@ def _nearest_all(queries, tree, distance, face, point):
     for q in range(len(queries)):
         p = queries[q]
         if not (np.isfinite(p[0]) and np.isfinite(p[1]) and np.isfinite(p[2])):
-            distance[q], face[q], point[q] = np.nan, 0, np.nan
+            distance[q], point[q] = np.nan, np.nan
             continue
         best, _, _ = _triangle_nearest(p, corners[last])
         best, found = _nearest_face(p, 0, best, tree, stack, reach)
         last = found if found >= 0 else last
         _, s, t = _triangle_nearest(p, corners[last])
-        distance[q], face[q] = np.sqrt(best), last
+        distance[q] = np.sqrt(best)
         for axis in range(3):
             a = corners[last, 0, axis]
             point[q, axis] = a + s * (corners[last, 1, axis] - a) + t * (corners[last, 2, axis] - a)

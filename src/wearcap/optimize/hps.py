@@ -240,7 +240,7 @@ def find_ground(data: HpsData, points: Float[Tensor, "time vertex 3"], energy: H
     found = stands[:, patch].double()
     if to_point:
         seek = stands[:, patch]
-        point[seek] = torch.from_numpy(data.surface.nearest_points(points[seek].numpy(), SURFACE_REACH_M))
+        point[seek] = torch.from_numpy(data.surface.nearest(points[seek].numpy(), SURFACE_REACH_M)[1])
         found *= point.isfinite().all(-1)
     if to_plane:
         where, up = (torch.zeros(*stands.shape, 3, dtype=torch.float64) for _ in range(2))

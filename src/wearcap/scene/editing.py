@@ -227,7 +227,7 @@ class ObjectEditing:
         if not len(item.mesh.faces):
             return around[KDTree(points).query(there, distance_upper_bound=_SAME_M)[0] <= _SAME_M]
         R, t = item.R_world_object.double().numpy(), item.t_world_object.double().numpy()
-        distance, _ = TriangleIndex.of(item.mesh).nearest_points((there - t) @ R)
+        distance, _ = TriangleIndex.of(item.mesh).nearest((there - t) @ R)
         return around[distance <= _SURFACE_M]
 
 

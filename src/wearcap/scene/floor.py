@@ -206,10 +206,6 @@ class _Cloud:
             self._trees.append(KDTree(points))
         self._points = [np.asarray(tree.data) for tree in self._trees]
 
-    @property
-    def empty(self) -> bool:
-        return not self._trees
-
     def within(self, position: np.ndarray, radius_m: float) -> np.ndarray:
         """Heights (m) of all points within a radius of a position."""
         found = [tree.data[tree.query_ball_point(position, radius_m), 2] for tree in self._trees]
@@ -329,15 +325,12 @@ class FloorFollow:
         weight = (contact_prob.detach().cpu().numpy() - self.CONTACT).clip(0) / (1 - self.CONTACT)
         # Floor height (m) at the feet, from points where there are enough, else from the soles.
         feet = t_world_foot.detach().cpu().double().numpy()
-        height = feet[..., 2] - self._sole
-        from_points = np.zeros(height.shape, bool)
-        if not self._cloud.empty:
-            positions = np.concatenate([feet[..., :2], height[..., None]], -1).reshape(-1, 3)
-            heights = self._cloud.nearest(positions, float(np.hypot(self.RADIUS_M, self.REACH_M)), self.POINTS)
-            heights[np.abs(heights - positions[:, 2:]) > self.REACH_M] = np.nan
-            few = np.isfinite(heights).sum(1, keepdims=True) < self.MIN_POINTS
-            heights = np.where(few, positions[:, 2:], heights)
-            height, from_points = np.nanmedian(heights, 1).reshape(height.shape), ~few.reshape(height.shape)
+        positions = np.concatenate([feet[..., :2], feet[..., 2:] - self._sole], -1).reshape(-1, 3)
+        heights = self._cloud.nearest(positions, float(np.hypot(self.RADIUS_M, self.REACH_M)), self.POINTS)
+        heights[np.abs(heights - positions[:, 2:]) > self.REACH_M] = np.nan
+        few = np.isfinite(heights).sum(1, keepdims=True) < self.MIN_POINTS
+        heights = np.where(few, positions[:, 2:], heights)
+        height, from_points = (part.reshape(feet.shape[:-1]) for part in (np.nanmedian(heights, 1), ~few))
         weight = weight * np.where(from_points, self.GAIN_POINTS, self.GAIN)
         total = weight.sum(1)
         target = (weight * height).sum(1) / np.where(total > 0, total, 1)

@@ -285,7 +285,7 @@ class Environment:
         """
         shape, R, t = self._shapes[self.index(name)], T_world_object.R.double(), T_world_object.t.double()
         local = (R.mT @ (points_world.double() - t)[..., None])[..., 0]
-        distance, point = shape.nearest_points(local.contiguous().numpy())
+        distance, point = shape.nearest(local.contiguous().numpy())
         closest = (R @ torch.from_numpy(point)[..., None])[..., 0] + t
         return torch.from_numpy(distance).to(points_world.dtype), closest.to(points_world.dtype)
 
