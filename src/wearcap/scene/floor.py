@@ -2,7 +2,6 @@
 appendix D.2)."""
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -162,24 +161,6 @@ def _cheapest_path(cost: np.ndarray, change_cost: float) -> np.ndarray:
     for row in best[-2::-1]:
         chosen.append(int((row + np.abs(ramp - ramp[chosen[-1]])).argmin()))
     return np.array(chosen[::-1])
-
-
-@runtime_checkable
-class FloorFollower(Protocol):
-    """Estimates the floor height during a capture. For each block of frames `ahead` predicts the height from the head,
-    then `follow` corrects it from the estimated feet."""
-
-    def see(self, points_world: Float[Tensor, "point 3"]) -> None:
-        """Take in points of the surroundings (m)."""
-        ...
-
-    def ahead(self, t_world_head: Float[Tensor, "time 3"]) -> Float[Tensor, "time"]:
-        """Predicted floor height (m) of the next frames, before their feet are estimated."""
-        ...
-
-    def follow(self, contact_prob: Float[Tensor, "time foot"], t_world_foot: Float[Tensor, "time foot 3"]) -> None:
-        """Take in the same frames' contact probabilities and foot joint positions (m)."""
-        ...
 
 
 class _Cloud:
@@ -354,3 +335,11 @@ class FloorFixed:
 
     def follow(self, contact_prob: Float[Tensor, "time foot"], t_world_foot: Float[Tensor, "time foot 3"]) -> None:
         """Nothing changes."""
+
+
+FloorFollower = FloorUpdate | FloorFollow | FloorFixed
+"""Estimates the floor height during a capture.
+
+`see` takes in points of the surroundings (m). For each block of frames `ahead` predicts the floor heights (m) from the
+head, before the feet are estimated; then `follow` corrects them from the same frames' contact probabilities and foot
+joint positions (m)."""
