@@ -7,13 +7,7 @@ import pytest
 import torch
 
 from wearcap.body import kinematics
-from wearcap.body.kinematics import (
-    _can_fuse,
-    _fused_forward_kinematics,
-    forward_kinematics,
-    level_forward_kinematics,
-    local_rotations,
-)
+from wearcap.body.kinematics import _can_fuse, forward_kinematics, level_forward_kinematics, local_rotations
 from wearcap.body.skeletons import skeleton_by_name
 from wearcap.geometry import rotation
 
@@ -27,6 +21,11 @@ def sample(skeleton, batch, dtype, per_sample_offsets=False):
     return R, torch.randn(*batch, 3, dtype=dtype), offsets
 
 
+def fused(*inputs):
+    T_world = forward_kinematics(*inputs)
+    return T_world.R, T_world.t
+
+
 @pytest.mark.parametrize("name", ["xsens23", "smplh52"])
 @pytest.mark.parametrize("batch", [(), (1,), (5,), (2, 3), (0,)])
 @pytest.mark.parametrize("per_sample", [False, True])
@@ -34,18 +33,18 @@ def sample(skeleton, batch, dtype, per_sample_offsets=False):
 def test_equals_the_level_version(name, batch, per_sample, dtype):
     skeleton = skeleton_by_name(name)
     R, t, offsets = sample(skeleton, batch, dtype, per_sample)
-    fused = _fused_forward_kinematics(skeleton, R, t, offsets)
+    R_world, t_world = fused(skeleton, R, t, offsets)
     level = level_forward_kinematics(skeleton, R, t, offsets)
-    torch.testing.assert_close(fused[0], level.R)
-    torch.testing.assert_close(fused[1], level.t)
-    torch.testing.assert_close(local_rotations(skeleton, fused[0]), R, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(R_world, level.R)
+    torch.testing.assert_close(t_world, level.t)
+    torch.testing.assert_close(local_rotations(skeleton, R_world), R, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("per_sample", [False, True])
 def test_gradient_is_that_of_finite_differences(per_sample):
     skeleton = skeleton_by_name("xsens23")
     inputs = [x.requires_grad_() for x in sample(skeleton, (2,), torch.float64, per_sample)]
-    assert torch.autograd.gradcheck(lambda *x: _fused_forward_kinematics(skeleton, *x), inputs)
+    assert torch.autograd.gradcheck(lambda *x: fused(skeleton, *x), inputs)
 
 
 def test_gradient_equals_the_level_versions_for_strided_inputs():
@@ -53,11 +52,11 @@ def test_gradient_equals_the_level_versions_for_strided_inputs():
     R, t, offsets = sample(skeleton, (6,), torch.float64, True)
     seeds = torch.randn(6, 24, 3, 3, dtype=torch.float64), torch.randn(6, 24, 3, dtype=torch.float64)
     gradients = []
-    for version in (_fused_forward_kinematics, lambda *x: vars(level_forward_kinematics(*x)).values()):
+    for version in (fused, lambda *x: vars(level_forward_kinematics(*x)).values()):
         leaves = [x.transpose(0, -1).contiguous().transpose(0, -1).requires_grad_() for x in (R, t, offsets)]
         gradients.append(torch.autograd.grad(tuple(version(skeleton, *leaves)), leaves, seeds))
-    for fused, level in zip(*gradients):
-        torch.testing.assert_close(fused, level)
+    for one, other in zip(*gradients):
+        torch.testing.assert_close(one, other)
 
 
 @pytest.mark.parametrize("per_sample", [False, True])
@@ -70,7 +69,7 @@ def test_threads_share_the_work_exactly(per_sample, monkeypatch):
         for count in (1, 3):
             torch.set_num_threads(count)
             leaves = [x.clone().requires_grad_() for x in inputs]
-            R, t = _fused_forward_kinematics(skeleton, *leaves)
+            R, t = fused(skeleton, *leaves)
             results.append((R, t, *torch.autograd.grad((R.square().sum() + t.square().sum()), leaves)))
     finally:
         torch.set_num_threads(threads)
@@ -79,7 +78,7 @@ def test_threads_share_the_work_exactly(per_sample, monkeypatch):
 
 
 def joints_in_threads(inputs, results):
-    results.put(_fused_forward_kinematics(*inputs)[1].sum().item())
+    results.put(fused(*inputs)[1].sum().item())
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="needs fork")
@@ -89,7 +88,7 @@ def test_a_forked_process_has_threads_of_its_own(monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     skeleton = skeleton_by_name("xsens23")
     inputs = skeleton, *sample(skeleton, (9,), torch.float64)
-    expected = _fused_forward_kinematics(*inputs)[1].sum().item()
+    expected = fused(*inputs)[1].sum().item()
     context = multiprocessing.get_context("fork")
     results = context.SimpleQueue()
     child = context.Process(target=joints_in_threads, args=(inputs, results))
@@ -104,7 +103,7 @@ def test_what_does_not_fit_is_refused():
     R, t, offsets = sample(skeleton, (4,), torch.float32)
     for wrong in ((R[:, 1:], t, offsets), (R, t[:3], offsets), (R, t, offsets[1:])):
         with pytest.raises((RuntimeError, TypeError)):
-            _fused_forward_kinematics(skeleton, *wrong)
+            fused(skeleton, *wrong)
 
 
 def test_unused_outputs_and_repeated_backward():

@@ -37,9 +37,14 @@ def forward_kinematics(
     """
     offsets = skeleton.t_parent_joint if t_parent_joint is None else t_parent_joint
     offsets = offsets.to(R_parent_joint)
-    if _can_fuse(R_parent_joint, t_world_root, offsets):
-        return Rigid(*_fused_forward_kinematics(skeleton, R_parent_joint, t_world_root, offsets))
-    return level_forward_kinematics(skeleton, R_parent_joint, t_world_root, offsets)
+    if not _can_fuse(R_parent_joint, t_world_root, offsets):
+        return level_forward_kinematics(skeleton, R_parent_joint, t_world_root, offsets)
+    batch, joints = R_parent_joint.shape[:-3], len(skeleton)
+    # Expanding raises on shapes that do not fit: the kernels check nothing.
+    R_local, t_root = R_parent_joint.expand(*batch, joints, 3, 3), t_world_root.expand(*batch, 3)
+    shared = offsets.numel() == 3 * joints
+    rows = offsets if shared else offsets.expand(*batch, joints, 3)
+    return Rigid(*_Fused.apply(R_local, t_root, rows, np.array(skeleton.parents)))
 
 
 def level_forward_kinematics(
@@ -107,22 +112,9 @@ def _can_fuse(*tensors: Tensor) -> bool:
     return plain and first.dtype in (torch.float32, torch.float64) and not traced and not transformed
 
 
-def _fused_forward_kinematics(
-    skeleton: Skeleton,
-    R_parent_joint: Float[Tensor, "*batch joint 3 3"],
-    t_world_root: Float[Tensor, "*batch 3"],
-    offsets: Float[Tensor, "*#batch joint 3"],
-) -> tuple[Float[Tensor, "*batch joint 3 3"], Float[Tensor, "*batch joint 3"]]:
-    """World rotations and positions (m) of all joints; differentiable once in all three inputs."""
-    batch, joints = R_parent_joint.shape[:-3], len(skeleton)
-    # Expanding raises on shapes that do not fit: the kernels check nothing.
-    R_local, t_root = R_parent_joint.expand(*batch, joints, 3, 3), t_world_root.expand(*batch, 3)
-    shared = offsets.numel() == 3 * joints
-    rows = offsets if shared else offsets.expand(*batch, joints, 3)
-    return _Fused.apply(R_local, t_root, rows, np.array(skeleton.parents))
-
-
 class _Fused(torch.autograd.Function):
+    """World rotations and positions (m) of all joints; differentiable once in all three inputs."""
+
     @staticmethod
     def forward(ctx, R_local: Tensor, t_root: Tensor, offsets: Tensor, parents: np.ndarray):
         R_local, t_root, offsets = R_local.contiguous(), t_root.contiguous(), offsets.contiguous()
