@@ -56,10 +56,10 @@ def estimate_floor(
 ) -> _FloorEstimate:
     """Floor below a moving head: everywhere the lowest strong horizontal layer, with as little change as possible.
 
-    The path is cut into steps of 0.15 m; each step votes for heights with the points within 0.8 m (2.4 m
-    where they are few), and dynamic programming picks the sequence of heights with the best votes and the least
-    change, so stairs are followed (within a step) and tables are not. `standing_m` is the
-    head's height above the floor when upright; by default it is read off a first pass.
+    The path is cut into steps of 0.15 m; each step votes for heights with the points within 0.8 m (2.4 m where they
+    are few), and dynamic programming picks the sequence of heights with the best votes and the least change, so stairs
+    are followed (within a step) and tables are not. `standing_m` is the head's height above the floor when upright; by
+    default it is read off a first pass.
     Raises WearcapError without a head path or when no point lies below it.
     """
     head = t_world_head.detach().cpu().double().numpy()
@@ -84,20 +84,25 @@ def estimate_floor(
     # Cost of each height: how weak its layer is beside the strongest there, and the share of points below it.
     layer = gaussian_filter1d(votes, 1.5, axis=1)
     strength = (layer + _FAINT) / (layer.max(1, keepdims=True) + _FAINT)
-    margin = int(0.08 / _BIN_M)
-    below = np.pad(votes.cumsum(1), ((0, 0), (margin, 0)))[:, :bins]
+    below = np.pad(votes.cumsum(1), ((0, 0), (int(0.08 / _BIN_M), 0)))[:, :bins]
     share = below / np.maximum(votes.sum(1, keepdims=True), 1)  # a single point below is no evidence
     evidence = -np.log(strength) + 6.0 * share.clip(max=0.4)
     if standing_m is None:
         first = _cheapest_path(evidence + _posture_cost(clearance, 1.9, 20.0), _CHANGE_COST * _BIN_M)
-        standing_m = _usual_clearance(np.take_along_axis(clearance, first[:, None], 1)[:, 0])
+        # The head's height while walking: the lowest of its common values near the commonest.
+        values = np.take_along_axis(clearance, first[:, None], 1)[:, 0]
+        counts = gaussian_filter1d(np.histogram(values, np.arange(0.0, 2.6, 0.01))[0].astype(float), 2.0)
+        peak = int(counts.argmax())
+        common = np.arange(max(peak - 25, 0), peak + 1)
+        inner = counts[common]
+        summit = (inner >= np.r_[0.0, inner[:-1]]) & (inner >= np.r_[inner[1:], 0.0]) & (inner > 0.3 * counts[peak])
+        standing_m = float(0.01 * (common[summit][0] + 0.5))
     # With the wearer's height, a ceiling below an upper floor is no longer mistaken for that floor.
     chosen = _cheapest_path(evidence + _posture_cost(clearance, standing_m + 0.03, 40.0), _CHANGE_COST * _BIN_M)
     support = layer[np.arange(len(keys)), chosen] * (1.5 * np.sqrt(2 * np.pi))
     # The mean height of the points within two bins of the chosen one (the bin's middle where there are none).
     around = chosen[:, None] + np.arange(-2, 3)
-    exists = (around >= 0) & (around < bins)
-    around = around.clip(0, bins - 1)
+    exists, around = (around >= 0) & (around < bins), around.clip(0, bins - 1)
     weight = np.take_along_axis(votes, around, 1) * exists
     total = weight.sum(1)
     mean = (weight * heights[around]).sum(1) / np.where(total > 0, total, 1)
@@ -137,16 +142,6 @@ def _posture_cost(clearance: np.ndarray, tallest: float, slope: float) -> np.nda
     """Cost of the head's height above a floor: free from sitting to `tallest`, rising by `slope` per metre above."""
     cost = 3.0 * np.maximum(1.1 - clearance, 0) + slope * np.maximum(clearance - tallest, 0)
     return np.where((clearance < _CLEARANCE_M[0]) | (clearance > _CLEARANCE_M[1]), 1e3, cost)
-
-
-def _usual_clearance(clearance: np.ndarray) -> float:
-    """Height of the head above the floor while walking: the lowest of its common values near the commonest."""
-    counts = gaussian_filter1d(np.histogram(clearance, np.arange(0.0, 2.6, 0.01))[0].astype(float), 2.0)
-    peak = int(counts.argmax())
-    near = np.arange(max(peak - 25, 0), peak + 1)
-    inner = counts[near]
-    summit = (inner >= np.r_[0.0, inner[:-1]]) & (inner >= np.r_[inner[1:], 0.0]) & (inner > 0.3 * counts[peak])
-    return float(0.01 * (near[summit][0] + 0.5))
 
 
 def _cheapest_path(cost: np.ndarray, change_cost: float) -> np.ndarray:

@@ -233,20 +233,14 @@ class Environment:
         return {item.name: k for k, item in enumerate(self.objects)}
 
     @cached_property
-    def _shapes(self) -> list[TriangleIndex]:
-        """One tree per object; objects of one mesh share it."""
-        meshes = {id(item.mesh): item.mesh for item in self.objects}
-        built = {key: TriangleIndex.of(mesh) for key, mesh in meshes.items()}
-        return [built[id(item.mesh)] for item in self.objects]
-
-    @cached_property
-    def _at_rest(self) -> tuple[BodiesIndex, np.ndarray, np.ndarray]:
-        """Index of all objects, and their initial rotations and positions in double precision."""
-        shapes = list(dict.fromkeys(self._shapes))
-        of_body = np.array([shapes.index(shape) for shape in self._shapes], np.int64)
+    def _at_rest(self) -> tuple[list[TriangleIndex], BodiesIndex, np.ndarray, np.ndarray]:
+        """Tree of each object, shared by those of one mesh; index of all; their initial rotations and positions."""
+        meshes = list({id(item.mesh): item.mesh for item in self.objects}.values())
+        of_body = np.array([[mesh is item.mesh for mesh in meshes].index(True) for item in self.objects], np.int64)
+        shapes = [TriangleIndex.of(mesh) for mesh in meshes]
         R = np.array([item.R_world_object.tolist() for item in self.objects], np.float64)
         t = np.array([item.t_world_object.tolist() for item in self.objects], np.float64)
-        return BodiesIndex.build(shapes, of_body), R, t
+        return [shapes[k] for k in of_body], BodiesIndex.build(shapes, of_body), R, t
 
     def nearest(
         self,
@@ -267,7 +261,7 @@ class Environment:
         if not len(chosen):
             nothing = torch.full((len(points_world),), -1)
             return Nearest(nothing, torch.full_like(nothing, torch.inf, dtype=points_world.dtype))
-        bodies, R, t = self._at_rest
+        _, bodies, R, t = self._at_rest
         R, t = R.copy(), t.copy()
         for k, pose in moved.items():
             R[k], t[k] = pose.R.numpy(), pose.t.numpy()
@@ -283,7 +277,7 @@ class Environment:
 
         `T_world_object` is the object's pose at each time, or one pose for all. NaN where the point is NaN.
         """
-        shape, R, t = self._shapes[self.index(name)], T_world_object.R.double(), T_world_object.t.double()
+        shape, R, t = self._at_rest[0][self.index(name)], T_world_object.R.double(), T_world_object.t.double()
         local = (R.mT @ (points_world.double() - t)[..., None])[..., 0]
         distance, point = shape.nearest(local.contiguous().numpy())
         closest = (R @ torch.from_numpy(point)[..., None])[..., 0] + t

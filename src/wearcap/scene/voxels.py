@@ -78,27 +78,23 @@ class VoxelMap:
 
     def __init__(self, grid: VoxelGrid = VoxelGrid()):
         self.grid = grid
-        self.count, self.dropped = 0, 0
-        """Points kept, and points left out because they were not finite."""
+        self._count = 0
         self._used = np.zeros(2, np.int64)
         self._tiles = _free_tiles(1 << 10)
         self._blocks = _free_blocks(1 << 9)
 
     def __len__(self) -> int:
-        return self.count
+        return self._count
 
     def add(self, points_world: Float[Tensor, "point 3"], first_seen: Float64[Tensor, "point"] | None = None) -> None:
-        """Take in points (m), seen at `first_seen` (s), or always."""
+        """Take in points (m), seen at `first_seen` (s), or always; points that are not finite are left out."""
         points = points_world.detach().cpu().to(torch.float32)
         seen = (
             first_seen.cpu() if first_seen is not None else torch.full((len(points),), -math.inf, dtype=torch.float64)
         )
         usable = points.isfinite().all(-1) & ~seen.isnan()
-        if not usable.all():
-            self.dropped += int((~usable).sum())
-            points, seen = points[usable], seen[usable]
-        self.count += len(points)
-        rows, times, start = points.contiguous().numpy(), seen.contiguous().numpy(), 0
+        rows, times, start = points[usable].numpy(), seen[usable].numpy(), 0
+        self._count += len(rows)
         while start < len(rows):
             tiles, blocks = self._used.tolist()
             if 2 * tiles >= len(self._tiles[0]):
