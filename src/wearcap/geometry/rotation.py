@@ -54,6 +54,13 @@ def geodesic(R_a: Float[Tensor, "*batch 3 3"], R_b: Float[Tensor, "*batch 3 3"])
     return torch.atan2(axis.norm(dim=-1), turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
 
 
+def between(
+    R_a: Float[Tensor, "*#batch 3 3"], R_b: Float[Tensor, "*#batch 3 3"], share: Float[Tensor, "*#batch"]
+) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation at a share (0…1) of the turn from R_a to R_b."""
+    return R_a @ exp(share[..., None] * log(R_a.mT @ R_b))
+
+
 def about_axis(axis: str, angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation by `angle` (rad) about the named axis "x", "y" or "z"."""
     i = "xyz".index(axis)

@@ -83,8 +83,7 @@ def slerp(
 ) -> Float[Tensor, "new_time *rest 3 3"]:
     """Rotations at any times, at constant angular velocity between frames; beyond the ends they are constant."""
     before, after, blend = _brackets(timestamps, at)
-    turn = rotation.log(R[before].mT @ R[after])
-    return R[before] @ rotation.exp(blend.to(R.dtype).reshape(-1, *[1] * (R.ndim - 2)) * turn)
+    return rotation.between(R[before], R[after], blend.to(R.dtype).reshape(-1, *[1] * (R.ndim - 3)))
 
 
 def interpolate_clamped(

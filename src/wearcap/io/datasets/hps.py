@@ -177,11 +177,10 @@ def resampled_localization(localization: Localization, fps: float | int) -> Loca
     sure = torch.where(blend == 0, localization.confidence[before], sure)
     sure = torch.where(blend == 1, localization.confidence[after], sure)
     R, t = localization.R_world_cam, localization.t_world_cam
-    turn = rotation.exp(blend[:, None] * rotation.log(R[before].mT @ R[after]))
     found = (sure > 0)[:, None]
     return Localization(
         times,
-        torch.where(found[..., None], R[before] @ turn, torch.eye(3)),
+        torch.where(found[..., None], rotation.between(R[before], R[after], blend), torch.eye(3)),
         torch.where(found, torch.lerp(t[before], t[after], blend[:, None]), torch.zeros(3)),
         sure,
     )

@@ -307,8 +307,8 @@ class HeldObject(Held):
             for pose, R_pose in ((choice.start, R_first), (choice.stop, R_last))
         )
         near, off = (on_the_way.near, on_the_way.off) if choice.long else (lift, lower)
-        R = _between(R_first.expand_as(R), R, near)
-        R = _between(R, R_last.expand_as(R), off)
+        R = rotation.between(R_first.expand_as(R), R, near)
+        R = rotation.between(R, R_last.expand_as(R), off)
         t = on_the_way.point(point, first, last) - R @ middle
         # it keeps off the floor, smoothly
         soft = (LONG_LIFTED_M if choice.long else LIFTED_M) * lift * (1 - lower)
@@ -333,13 +333,6 @@ class _OnTheWay:
         up = torch.stack([self.near, self.near, self.lift], -1)
         down = torch.stack([self.off, self.off, self.lower], -1)
         return held + (1 - up) * (first - held) + down * (last - held)
-
-
-def _between(
-    R: Float[Tensor, "time 3 3"], R_other: Float[Tensor, "time 3 3"], share: Float[Tensor, "time"]
-) -> Float[Tensor, "time 3 3"]:
-    """Interpolation between two rotations by a share."""
-    return R @ rotation.exp(share[:, None] * rotation.log(R.transpose(-1, -2) @ R_other))
 
 
 def carry_options(

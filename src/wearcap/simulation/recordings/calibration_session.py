@@ -22,7 +22,7 @@ from torch import Tensor
 
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.trajectory import Trajectory, finite_difference
+from wearcap.geometry.trajectory import Trajectory, finite_difference, slerp
 from wearcap.recording.recording import ImuStream
 from wearcap.sensors.imu import GRAVITY, angular_rate
 from wearcap.sensors.simulated import smooth_noise
@@ -174,9 +174,7 @@ def _held(time: np.ndarray, holds: list[tuple[float, float]]) -> np.ndarray:
 
 def _between(keys: Float64[Tensor, "key 3 3"], place: np.ndarray) -> Float64[Tensor, "time 3 3"]:
     """Rotations at fractional indices among keys."""
-    first = torch.from_numpy(np.floor(place).clip(0, len(keys) - 2).astype(np.int64))
-    blend = torch.from_numpy(place) - first
-    return keys[first] @ rotation.exp(rotation.log(keys[first].mT @ keys[first + 1]) * blend[:, None])
+    return slerp(torch.arange(len(keys), dtype=torch.float64), keys, torch.from_numpy(place))
 
 
 def _centred(wobble: Tensor, time: np.ndarray, stretch: Stretch) -> Tensor:

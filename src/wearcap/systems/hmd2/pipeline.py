@@ -261,6 +261,5 @@ def _bridged(poses: Poses, stretches: tuple[tuple[int, int], ...]) -> Poses:
         if after > before:
             R = poses.R_parent_joint
             share = torch.linspace(0, 1, after - before + 2)[1:-1]
-            turn = rotation.log(R[before - 1].transpose(-1, -2) @ R[after])
-            R[before:after] = R[before - 1] @ rotation.exp(share[:, None, None] * turn)
+            R[before:after] = rotation.between(R[before - 1], R[after], share[:, None])
     return poses
