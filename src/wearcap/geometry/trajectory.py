@@ -146,6 +146,16 @@ def _central(trajectory: Trajectory) -> tuple[Tensor, Tensor, Tensor]:
     return first, last, torch.where(span > 0, span, 1.0).to(trajectory.t_world_body.dtype)[:, None]
 
 
+def pieces(cut: Bool[Tensor, "step"]) -> tuple[Int64[Tensor, "frame"], Int64[Tensor, "piece"], Bool[Tensor, "piece"]]:
+    """Piece of each frame of a track that is cut at some steps, the pieces' numbers of frames, and which of them are not
+    longer than their neighbours (never the longest one)."""
+    piece = torch.cat([cut.new_zeros(1), cut]).cumsum(0)
+    length = torch.bincount(piece)
+    wall = length.new_full((1,), len(piece) + 1)
+    left, right = torch.cat([wall, length[:-1]]), torch.cat([length[1:], wall])
+    return piece, length, ((length <= left) & (length <= right)).index_fill(0, length.argmax(), False)
+
+
 def outlier_mask(trajectory: Trajectory, max_speed: float) -> Bool[Tensor, "time"]:
     """Mask of valid frames: neighbouring valid frames are at most as far apart as `max_speed` (m/s) allows.
 
@@ -162,12 +172,8 @@ def outlier_mask(trajectory: Trajectory, max_speed: float) -> Bool[Tensor, "time
         cut = position[kept].diff(dim=0).norm(dim=-1) > max_speed * time[kept].diff()
         if not cut.any():
             break
-        piece = torch.cat([cut.new_zeros(1), cut]).cumsum(0)
-        length = torch.bincount(piece)
-        wall = length.new_full((1,), len(kept) + 1)
-        left, right = torch.cat([wall, length[:-1]]), torch.cat([length[1:], wall])
-        dropped = ((length <= left) & (length <= right)).index_fill(0, length.argmax(), False)
-        kept = kept[~dropped[piece]]
+        piece, _, short = pieces(cut)
+        kept = kept[~short[piece]]
     valid = torch.zeros_like(finite)
     valid[kept] = True
     if not len(kept):

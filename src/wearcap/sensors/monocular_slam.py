@@ -20,7 +20,7 @@ from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import swing_between
-from wearcap.geometry.trajectory import Trajectory, filled, find_gaps, interpolate, require_rising, resample
+from wearcap.geometry.trajectory import Trajectory, filled, find_gaps, interpolate, pieces, require_rising, resample
 from wearcap.recording.recording import ImuStream
 from wearcap.sensors.imu import GRAVITY, acceleration
 from wearcap.sensors.stillness import Stretch, during
@@ -60,14 +60,10 @@ def clean_track(
         raise WearcapError("no pose of the trajectory is finite", expected="camera positions in metres")
     kept = valid.nonzero()[:, 0]
     while (cut := _jump_acceleration(position[kept], time[kept]) > max_acceleration).any():
-        piece = torch.cat([cut.new_zeros(1), cut]).cumsum(0)
-        length = torch.bincount(piece)
+        piece, length, short = pieces(cut)
         end = length.cumsum(0)
         span = time[kept][end - 1] - time[kept][end - length]
-        wall = length.new_full((1,), len(kept) + 1)
-        left, right = torch.cat([wall, length[:-1]]), torch.cat([length[1:], wall])
-        short = (length <= left) & (length <= right) & (span <= max_burst_s)
-        dropped = short.index_fill(0, length.argmax(), False)[piece]
+        dropped = (short & (span <= max_burst_s))[piece]
         if not dropped.any():
             break
         kept = kept[~dropped]
