@@ -12,7 +12,7 @@ from bad_packets import ROTATIONS, VECTORS, bad_poses, broken
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.sensors import packets
-from wearcap.sensors.packets import AGREEING, Clock, HeadInput
+from wearcap.sensors.packets import AGREEING, HeadInput, PacketClock
 
 
 @pytest.mark.parametrize("name", VECTORS)
@@ -84,7 +84,7 @@ def test_a_lone_pose_far_away_is_refused_and_several_are_believed():
     assert found == [True, False, True, *[False] * (AGREEING - 1), True, True, False]
 
 
-def run(clock: Clock, times: list[float]) -> tuple[list[float], int, list[bool]]:
+def run(clock: PacketClock, times: list[float]) -> tuple[list[float], int, list[bool]]:
     """Times that are taken, how many are refused, and where the clock begins."""
     admitted = [clock.admit(time, None) for time in times]
     taken = [time for part in admitted for time, _ in part.packets]
@@ -96,20 +96,20 @@ STEADY = [k / 30 for k in range(30)]
 
 @pytest.mark.parametrize("odd", [1e9, 5.0, 2.0])
 def test_a_lone_packet_ahead_is_refused(odd):
-    clock = Clock()
+    clock = PacketClock()
     taken, refused, begins = run(clock, [*STEADY, odd, *(1 + time for time in STEADY)])
     assert (taken, refused) == ([*STEADY, *(1 + time for time in STEADY)], 1)
     assert begins == [True] + 60 * [False]
 
 
 def test_a_late_packet_is_passed_on_as_late():
-    taken, refused, begins = run(Clock(), [*(5 + time for time in STEADY), 1.0, 6.0])
+    taken, refused, begins = run(PacketClock(), [*(5 + time for time in STEADY), 1.0, 6.0])
     assert (taken[-2:], refused, sum(begins)) == ([1.0, 6.0], 0, 1)
 
 
 @pytest.mark.parametrize(("step", "anew"), [(-100.0, True), (-3.0, True), (100.0, False)])
 def test_several_that_agree_have_moved_the_clock(step, anew):
-    clock, later = Clock(), [time + 10 + step for time in STEADY]
+    clock, later = PacketClock(), [time + 10 + step for time in STEADY]
     taken, refused, begins = run(clock, [*(9 + time for time in STEADY), *later])
     assert (taken[30:], refused) == (later, 0)
     assert begins[30:] == [k == AGREEING - 1 and anew for k in range(30)]
@@ -117,7 +117,7 @@ def test_several_that_agree_have_moved_the_clock(step, anew):
 
 
 def test_a_beginning_at_a_wrong_time_is_not_believed():
-    clock = Clock()
+    clock = PacketClock()
     last = [clock.admit(time, None) for time in [1e9, *STEADY]][AGREEING]
     assert last.begins
     assert not last.again
@@ -126,7 +126,7 @@ def test_a_beginning_at_a_wrong_time_is_not_believed():
 
 def test_who_does_not_lead_goes_back_only_where_the_leader_is():
     for leader, believed in ((100.0, 0), (0.1, AGREEING)):
-        clock = Clock(leads=False)
+        clock = PacketClock(leads=False)
         for k in range(30):
             clock.admit(99 + k / 30, None, 99 + k / 30)
         admitted = [clock.admit(time, None, leader) for time in STEADY[:AGREEING]]
@@ -136,7 +136,7 @@ def test_who_does_not_lead_goes_back_only_where_the_leader_is():
 
 @given(st.lists(st.floats(-1e9, 1e9) | st.floats(0, 3), max_size=60))
 def test_a_clock_never_holds_many_and_loses_none(times):
-    clock, taken, refused = Clock(), 0, 0
+    clock, taken, refused = PacketClock(), 0, 0
     for time in times:
         admitted = clock.admit(time, None)
         taken, refused = taken + len(admitted.packets), refused + admitted.refused

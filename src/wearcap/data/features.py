@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
+from wearcap.body.skeleton import Skeleton
 from wearcap.metrics import physics
 from wearcap.recording.recording import Recording
 
@@ -32,10 +32,10 @@ def first_repeated(step: Float[Tensor, "batch step *rest"]) -> Float[Tensor, "ba
 
 def true_foot_contact(recording: Recording) -> Bool[Tensor, "time foot"]:
     """Contact of the left and right foot at the motion's frames, as recorded or else estimated from the true motion."""
-    motion, track = recording.motion, recording.contacts
+    motion, feet = recording.motion, None if recording.contacts is None else recording.contacts.feet
     assert motion is not None
-    if track is not None and set(FOOT_PATCHES) <= set(track.parts) and len(track.contact) == len(motion):
-        return physics.foot_contact(track.contact[:, [track.parts.index(patch) for patch in FOOT_PATCHES]])
+    if feet is not None and len(feet) == len(motion):
+        return physics.foot_contact(feet)
     pose = motion.T_world_joint
     points = physics.foot_points(motion.skeleton, pose)
     return physics.contact_from_motion(points, physics.local_floor(pose.t, motion.fps), motion.fps)

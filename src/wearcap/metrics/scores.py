@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import interpolate, nearest_frames
 from wearcap.metrics.position import joint_error_cm, mpjpe_cm, root_error_cm
@@ -53,7 +52,7 @@ def comparable(
 
 def truth_at(motion: Motion, recording: Recording, name: str) -> tuple[Motion, Bool[Tensor, "time patch"] | None]:
     """The true motion at the capture's frames, and true foot contact. Raises WearcapError without a true motion."""
-    truth, contact = recording.motion, _foot_contact(recording)
+    truth, contact = recording.motion, None if recording.contacts is None else recording.contacts.feet
     if truth is None:
         raise WearcapError("no true motion to compare with", where=name, expected="a recording with `motion`")
     same = len(motion) == len(truth) and torch.allclose(motion.timestamps, truth.timestamps, rtol=0, atol=1e-6)
@@ -62,14 +61,6 @@ def truth_at(motion: Motion, recording: Recording, name: str) -> tuple[Motion, B
         frame = nearest_frames(truth.timestamps, motion.timestamps)
         truth, contact = at_times(truth, motion.timestamps), None if contact is None else contact[frame]
     return truth, contact
-
-
-def _foot_contact(recording: Recording) -> Bool[Tensor, "time patch"] | None:
-    """True contact of the foot patches, None if the recording does not track all of them."""
-    track = recording.contacts
-    if track is None or not set(FOOT_PATCHES) <= set(track.parts):
-        return None
-    return track.contact[:, [track.parts.index(patch) for patch in FOOT_PATCHES]]
 
 
 def cue_errors_cm(motion: Motion, cues: Mapping[str, Cue]) -> dict[str, Float[Tensor, "_"]]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
@@ -111,6 +111,13 @@ class ContactTrack:
     timestamps: Float64[Tensor, "time"]
     parts: tuple[str, ...]
     contact: Bool[Tensor, "time part"]
+
+    @property
+    def feet(self) -> Bool[Tensor, "time patch"] | None:
+        """Contact of `FOOT_PATCHES` in their order; None if the track lacks one of them."""
+        if not set(FOOT_PATCHES) <= set(self.parts):
+            return None
+        return self.contact[:, [self.parts.index(patch) for patch in FOOT_PATCHES]]
 
 
 @dataclass(frozen=True)

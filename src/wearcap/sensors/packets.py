@@ -1,6 +1,6 @@
 """Validation of live device packets before a streaming session uses them, so that bad input cannot break a session.
 
-The `…_fault` functions return why a value is invalid, or None; `Clock` decides which timestamps are accepted;
+The `…_fault` functions return why a value is invalid, or None; `PacketClock` decides which timestamps are accepted;
 `HeadInput` combines both for the head device, whose clock is the session's, and `WristInput` buffers the wrists' samples.
 """
 
@@ -144,7 +144,7 @@ class Admitted(NamedTuple):
     """Whether the packets before a restart were valid; otherwise they were a few packets with a wrong time."""
 
 
-class Clock:
+class PacketClock:
     """Clock of one stream. A single packet far from the others is refused; several consistent ones move the clock.
 
     `leads`: this is the session's clock; other clocks jump back only to the session's time.
@@ -204,7 +204,7 @@ class HeadInput:
     """Number of refused packets by reason, such as "head: not a rotation"."""
     dropped: int = 0
     """Number of refused head poses."""
-    clock: Clock = field(default_factory=Clock)
+    clock: PacketClock = field(default_factory=PacketClock)
     place: tuple[float, float, float] | None = None
     """Position (m) of the last accepted pose."""
     far: int = 0
@@ -279,7 +279,7 @@ class WristInput:
         self.head = head
         self.samples: dict[str, list[Any]] = {joint: [] for joint in WRISTS}
         """Samples of each wrist: tuples that begin with their time (s)."""
-        self._clocks = {joint: Clock(leads=False) for joint in WRISTS}
+        self._clocks = {joint: PacketClock(leads=False) for joint in WRISTS}
 
     def add(self, joint: str, sample: Sequence[Any]) -> None:
         """Buffer a sample of a wrist; repeated ones are ignored."""

@@ -142,10 +142,9 @@ class FeetLayer(MotionLayer):
             return None
         if motion.contact_prob is not None:
             return cls(server, name, motion, motion.contact_prob > 0.5, motion.timestamps)
-        if track is None or not set(FOOT_PATCHES) <= set(track.parts):
+        if track is None or track.feet is None:
             return None
-        columns = [track.parts.index(patch) for patch in FOOT_PATCHES]
-        return cls(server, name, motion, track.contact[:, columns], track.timestamps)
+        return cls(server, name, motion, track.feet, track.timestamps)
 
     def show(self, time: float) -> None:
         frame = nearest_frame(self.motion.timestamps, time)

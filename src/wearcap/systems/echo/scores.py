@@ -99,13 +99,13 @@ def body_contact(
 
 def foot_patches(recording: Recording) -> Bool[Tensor, "time patch"]:
     """Recorded contact of `FOOT_PATCHES` with the floor. Raises WearcapError for a recording without it."""
-    track, motion = recording.contacts, recording.motion
+    feet, motion = None if recording.contacts is None else recording.contacts.feet, recording.motion
     assert motion is not None
-    if track is None or not set(FOOT_PATCHES) <= set(track.parts) or len(track.contact) != len(motion):
+    if feet is None or len(feet) != len(motion):
         what = "no foot contacts beside the motion"
         expected = f"contacts of {', '.join(FOOT_PATCHES)}"
         raise WearcapError(what, where=recording.name, expected=expected, fix="Prepare the data set again.")
-    return track.contact[:, [track.parts.index(patch) for patch in FOOT_PATCHES]]
+    return feet
 
 
 def score_echo(motion: Motion, truth: Truth, name: str, seed: int) -> Row:

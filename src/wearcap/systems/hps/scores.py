@@ -14,7 +14,6 @@ from torch import Tensor
 
 from wearcap.body.anny_body import anny_body
 from wearcap.body.model import BodyModel
-from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
 from wearcap.geometry.surface import SurfaceIndex
 from wearcap.metrics.position import joint_error_cm
@@ -61,14 +60,14 @@ class HpsTruth:
         """Ground truth of a recording at `fps`; suit and true motion share their timestamps, as simulated ones do.
         Raises WearcapError when the recording lacks a suit with contacts, a true motion or true contacts."""
         motion, suit, track = recording.motion, recording.suit, recording.contacts
-        if motion is None or suit is None or suit.contact_prob is None or track is None:
+        feet = None if track is None else track.feet
+        if motion is None or suit is None or suit.contact_prob is None or feet is None:
             raise WearcapError(
                 "nothing to measure a capture against",
                 where=recording.name,
                 expected="a true motion, true contacts, and a suit with contacts",
             )
-        columns = [track.parts.index(patch) for patch in FOOT_PATCHES]
-        touching = replace(motion, contact_prob=track.contact[:, columns].float())
+        touching = replace(motion, contact_prob=feet.float())
         true = resampled(touching, fps)
         detected = resampled(suit, fps).contact_prob
         assert true.contact_prob is not None
