@@ -94,9 +94,6 @@ class CalibrationSettings:
     """Smallest tilt of the boards from their mean direction; with less the focal length is not observable."""
 
 
-SETTINGS = CalibrationSettings()
-
-
 @dataclass(frozen=True)
 class Calibration:
     """A calibrated camera with quality measures."""
@@ -119,7 +116,7 @@ class Calibration:
 def calibrate_from_pictures(
     pictures: Iterable[tuple[str, UInt8[np.ndarray, "height width 3"]]],
     board: Board,
-    settings: CalibrationSettings = SETTINGS,
+    settings: CalibrationSettings = CalibrationSettings(),
 ) -> Calibration:
     """Calibrate from named RGB pictures (all of one size), of which some show the board.
 

@@ -109,16 +109,15 @@ def _nearest_word(descriptors: torch.Tensor, centers: torch.Tensor) -> torch.Ten
 
 
 class Vlad:
-    """Vector of locally aggregated descriptors (thesis eq. 2.1).
+    """Vector of locally aggregated descriptors (thesis eq. 2.1): sums of the residuals of local descriptors to their
+    nearest word, of unit length over all words.
 
-    Sum of the residuals of local descriptors to their nearest word, of unit length over all words. `intra`: each
-    word's residuals are made of unit length first, so that a repeated pattern does not drown the others (Arandjelović
-    and Zisserman 2013); `signed_root`: each number is replaced by its signed square root. Both are ours to choose.
+    Each word's sum is made of unit length first, so that a repeated pattern does not drown the others (Arandjelović and
+    Zisserman 2013), which is our choice.
     """
 
-    def __init__(self, vocabulary: Float32[np.ndarray, "word feature"], intra: bool = True, signed_root: bool = False):
-        self.vocabulary, self.intra, self.signed_root = vocabulary, intra, signed_root
-        self.name = f"vlad{len(vocabulary)}{'-intra' if intra else ''}{'-root' if signed_root else ''}"
+    def __init__(self, vocabulary: Float32[np.ndarray, "word feature"]):
+        self.vocabulary, self.name = vocabulary, f"vlad{len(vocabulary)}-intra"
 
     @classmethod
     def trained(cls, descriptors: Float32[np.ndarray, "sample feature"], words: int = 64) -> "Vlad":
@@ -157,10 +156,7 @@ class Vlad:
         centers, local = torch.from_numpy(self.vocabulary), torch.from_numpy(descriptors)
         word = _nearest_word(local, centers)
         total = torch.zeros_like(centers).index_add_(0, word, local - centers[word])
-        if self.intra:
-            total = torch.nn.functional.normalize(total, dim=1)
-        if self.signed_root:
-            total = total.sign() * total.abs().sqrt()
+        total = torch.nn.functional.normalize(total, dim=1)
         return torch.nn.functional.normalize(total.flatten(), dim=0).numpy()
 
 

@@ -58,11 +58,6 @@ def _place(network: nn.Module, device: str) -> None:
         raise WearcapError(what, expected="cpu, or cuda on a machine with a GPU") from error
 
 
-def _identity(network: str, weights: str | Path | None) -> str:
-    """Name of a network with these weights; other weights give another name."""
-    return f"{network}-{sha256_of(Path(str(weights)).expanduser())[:12]}"
-
-
 def _shrunk(image: UInt8[np.ndarray, "height width *channel"], max_side: int | None) -> np.ndarray:
     height, width = image.shape[:2]
     if min(height, width) < _SMALLEST:
@@ -100,7 +95,7 @@ class SuperPointExtractor:
         _place(network, device)
         self.network, self.device = network, device
         self.threshold, self.max_side = threshold, max_side
-        self.name = _identity("superpoint", weights)
+        self.name = f"superpoint-{sha256_of(Path(str(weights)).expanduser())[:12]}"
 
     def __call__(self, image: UInt8[np.ndarray, "height width 3"]) -> Features:
         height, width = image.shape[:2]
@@ -172,7 +167,7 @@ class NetVladDescriptor:
         load_weights(network, tensors, name="NetVLAD over VGG16", where=str(weights))
         _place(network, device)
         self.network, self.device, self.max_side = network, device, max_side
-        self.name = _identity("netvlad", weights)
+        self.name = f"netvlad-{sha256_of(Path(str(weights)).expanduser())[:12]}"
 
     def __call__(
         self, image: UInt8[np.ndarray, "height width 3"], features: Features

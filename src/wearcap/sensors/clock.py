@@ -188,13 +188,13 @@ class SwingClock:
     clock: Clock
     std_s: float
 
-    def checks(self, joint: str, min_swings: int = 5, max_std_s: float = 0.005) -> list[StepCheck]:
+    def checks(self, joint: str) -> list[StepCheck]:
         """Quality checks of the swings."""
         more = "Swing ten times, and give the frames in which the hands are nearest to the camera."
         step = f"arm swings, {joint}"
         return [
-            StepCheck(step, "seen by both clocks", self.clock.claps, min_swings, "", more, at_least=True),
-            StepCheck(step, "deviation of the offset", 1000 * self.std_s, 1000 * max_std_s, "ms", more),
+            StepCheck(step, "seen by both clocks", self.clock.claps, 5, "", more, at_least=True),
+            StepCheck(step, "deviation of the offset", 1000 * self.std_s, 5.0, "ms", more),
         ]
 
 
@@ -240,10 +240,7 @@ def swing_peaks(stream: ImuStream, stretch: Stretch | None = None) -> Float64[Te
 
 
 def fit_swing_clock(
-    camera_s: Float64[Tensor, "swing_camera"],
-    watch_s: Float64[Tensor, "swing_watch"],
-    frame_s: float,
-    max_offset_s: float = 600.0,
+    camera_s: Float64[Tensor, "swing_camera"], watch_s: Float64[Tensor, "swing_watch"], frame_s: float
 ) -> SwingClock:
     """Fit the clock that maps the watch's swings to the camera's, whose times are accurate to half a frame.
 
@@ -252,7 +249,7 @@ def fit_swing_clock(
     offset more tightly than their mean does (for 10 at 30 Hz 2 ms, not 3 ms). Raises WearcapError as `fit_clock` does.
     """
     try:
-        clock = fit_clock(camera_s, watch_s, max_offset_s)
+        clock = fit_clock(camera_s, watch_s)
     except WearcapError as error:
         raise WearcapError(
             error.what.replace("clap", "swing").replace("suit", "watch"),

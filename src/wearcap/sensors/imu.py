@@ -64,7 +64,6 @@ def synthesize_imu(
     motion: Motion,
     joint: str,
     *,
-    t_joint_imu: Float[Tensor, "3"] | None = None,
     R_joint_imu: Float[Tensor, "3 3"] | None = None,
     noise: ImuNoise | None = None,
     rng: np.random.Generator | None = None,
@@ -72,12 +71,11 @@ def synthesize_imu(
 ) -> ImuStream:
     """What a sensor fixed to a joint measures: orientation, free acceleration, specific force, angular rate.
 
-    The mounting defaults to the joint's own frame. With `noise`, `rng` draws attitude error, heading drift, bias,
+    The sensor sits at the joint; its axes default to the joint's own. With `noise`, `rng` draws attitude error, heading drift, bias,
     white noise, a loose strap and a clock that is off. Nothing is filtered: see `mean_filter`.
     """
     T_world_joint = motion.joint(joint)
     R_joint_imu = torch.eye(3) if R_joint_imu is None else R_joint_imu
-    position = T_world_joint.t if t_joint_imu is None else T_world_joint @ t_joint_imu
     gravity = torch.tensor([0.0, 0.0, GRAVITY])
     worn = R_joint_imu
     if noise is not None:
@@ -85,7 +83,7 @@ def synthesize_imu(
         strap = np.deg2rad(noise.strap_deg) * rng.standard_normal(3) / np.sqrt(3)
         worn = R_joint_imu @ rotation.exp(torch.from_numpy(strap).float())
     fps, times = motion.fps, motion.timestamps
-    path = Trajectory(times, T_world_joint.R @ worn, position)
+    path = Trajectory(times, T_world_joint.R @ worn, T_world_joint.t)
     if noise is not None and rng is not None and (noise.clock_offset_s or noise.clock_ppm):
         # The path is sampled when the sensor's clock shows the recording's timestamps.
         offset = float(rng.uniform(-1, 1)) * noise.clock_offset_s

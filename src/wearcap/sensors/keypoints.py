@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Float64
 from scipy.stats import norm
 from torch import Tensor
 
@@ -66,11 +66,13 @@ def seen_joints(
     a second; the noise level (median `noise_px`) varies over the same time, and confidence decreases with it. Cues hold
     the frames in which their joint is detected; joints that are never detected are left out.
     """
-    count, fps = len(T_world_cam), _rate(T_world_cam)
+    count, fps = len(T_world_cam), 1.0 / T_world_cam.timestamps.diff().median().item()
     cues = {}
     for joint in joints:
         t_world = interpolate(motion.timestamps, motion.joint(joint).t, T_world_cam.timestamps)
-        pixels, seen = _in_picture(t_world[:, None], T_world_cam, camera)
+        p_cam = T_world_cam.T_world_body.inverse()[:, None] @ t_world[:, None]
+        pixels, seen = camera.project(p_cam)
+        seen = seen & (torch.linalg.vector_norm(p_cam, dim=-1) > NEAR_M)
         missed = smooth_noise(rng, count, 1, BURST_S, fps)[:, 0] > norm.isf(drop)
         deviation = noise_px * (0.4 * smooth_noise(rng, count, 1, 1.0, fps)).exp()
         noise = (smooth_noise(rng, count, 2, 1.0, fps) + smooth_noise(rng, count, 2, 0.0, fps)) / np.sqrt(2)
@@ -80,15 +82,3 @@ def seen_joints(
         if found.any():
             cues[joint] = Cue(T_world_cam.timestamps[found], joint, off[found].float(), confidence[found])
     return cues
-
-
-def _in_picture(
-    t_world: Float[Tensor, "time point 3"], T_world_cam: Trajectory, camera: Camera
-) -> tuple[Float[Tensor, "time point 2"], Bool[Tensor, "time point"]]:
-    p_cam = T_world_cam.T_world_body.inverse()[:, None] @ t_world
-    pixels, seen = camera.project(p_cam)
-    return pixels, seen & (torch.linalg.vector_norm(p_cam, dim=-1) > NEAR_M)
-
-
-def _rate(path: Trajectory) -> float:
-    return 1.0 / path.timestamps.diff().median().item()

@@ -9,6 +9,7 @@ from bisect import bisect_left
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
@@ -253,23 +254,21 @@ class HeadInput:
     def admit(self, time: float, packet: Any) -> Admitted:
         """The packets to process now, given a new one."""
         admitted = self.clock.admit(time, packet)
-        self._count(admitted.refused)
+        self.refuse("head", OFF_THE_CLOCK, admitted.refused)
+        self.dropped += admitted.refused
         return admitted
 
     def end(self) -> list[tuple[float, Any]]:
         """End of input: the waiting packets that were merely late."""
         late, refused = self.clock.dismiss()
-        self._count(refused)
+        self.refuse("head", OFF_THE_CLOCK, refused)
+        self.dropped += refused
         return late
 
     def refuse(self, stream: str, fault: str, count: int = 1) -> None:
-        """Count packets of a stream as refused."""
-        self.refused[f"{stream}: {fault}"] += count
-
-    def _count(self, refused: int) -> None:
-        if refused:
-            self.refuse("head", OFF_THE_CLOCK, refused)
-            self.dropped += refused
+        """Count packets of a stream as refused; none leave no entry."""
+        if count:
+            self.refused[f"{stream}: {fault}"] += count
 
 
 class WristInput:
@@ -285,12 +284,12 @@ class WristInput:
         """Buffer a sample of a wrist; repeated ones are ignored."""
         samples = self.samples[joint]
         admitted = self._clocks[joint].admit(sample[0], sample, self.head.clock.newest)
-        self._refuse(joint, admitted.refused)
+        self.head.refuse(joint, OFF_THE_CLOCK, admitted.refused)
         if admitted.begins:
-            first = bisect_left(samples, admitted.packets[0][0], key=_time)
+            first = bisect_left(samples, admitted.packets[0][0], key=itemgetter(0))
             del samples[first if admitted.again else 0 :]
         for time, accepted in admitted.packets:
-            place = bisect_left(samples, time, key=_time)
+            place = bisect_left(samples, time, key=itemgetter(0))
             if place == len(samples) or samples[place][0] != time:
                 samples.insert(place, accepted)
                 del samples[:-MAX_WAITING]
@@ -300,7 +299,8 @@ class WristInput:
         for joint, samples in self.samples.items():
             kept = [] if time is None else samples[connected([sample[0] for sample in samples], time)]
             refused = self._clocks[joint].set(kept[-1][0] if kept else None)
-            self._refuse(joint, refused if time is None else refused + len(samples) - len(kept))
+            count = refused if time is None else refused + len(samples) - len(kept)
+            self.head.refuse(joint, OFF_THE_CLOCK, count)
             self.samples[joint] = kept
 
     def arrived(self, until_s: float, at_s: float, head_s: float, silent_s: float) -> bool:
@@ -308,14 +308,6 @@ class WristInput:
         `head_s`; `at_s`: time of the frame that needs them (s)."""
         newest = (samples[-1][0] if samples else -math.inf for samples in self.samples.values())
         return all(last >= until_s or head_s > max(at_s, last) + silent_s for last in newest)
-
-    def _refuse(self, joint: str, count: int) -> None:
-        if count:
-            self.head.refuse(joint, OFF_THE_CLOCK, count)
-
-
-def _time(sample: Sequence[Any]) -> float:
-    return sample[0]
 
 
 def _is_float(value: object, shape: tuple[int, ...]) -> TypeGuard[Tensor]:

@@ -286,8 +286,8 @@ class WatchSession:
         return replace(recording, head=head, floor=floor)
 
 
-_WATCH = ("board_still_deg", "board_tilt_deg", "pose_still_deg")
-_CAMERA = ("scale", "residual_m", "scale_spread", "corner_deg")
+_WATCH = ("R_world_ref", "R_joint_imu", "board_still_deg", "board_tilt_deg", "pose_still_deg")
+_CAMERA = ("scale", "residual_m", "scale_spread", "corner_deg", "R_world_slam", "t_world_slam")
 
 
 def write_watch_calibration(
@@ -295,11 +295,7 @@ def write_watch_calibration(
 ) -> None:
     """Write a calibration, its checks and its metadata (plain numbers, text, lists), atomically."""
     content: dict[str, Any] = {
-        "watches": {
-            joint: {"R_world_ref_wxyz": _wxyz(one.R_world_ref), "R_joint_imu_wxyz": _wxyz(one.R_joint_imu)}
-            | {name: getattr(one, name) for name in _WATCH}
-            for joint, one in found.watches.items()
-        },
+        "watches": {joint: _row(one, _WATCH) for joint, one in found.watches.items()},
         "clocks": {
             joint: {
                 "camera_s": one.clock.camera_s.tolist(),
@@ -313,21 +309,19 @@ def write_watch_calibration(
         },
     }
     if found.camera is not None:
-        content["camera"] = {name: getattr(found.camera, name) for name in _CAMERA} | {
-            "R_world_slam_wxyz": _wxyz(found.camera.R_world_slam),
-            "t_world_slam": found.camera.t_world_slam.tolist(),
-        }
+        content["camera"] = _row(found.camera, _CAMERA)
     if found.head is not None:
-        content["head"] = {
-            "R_head_cam_wxyz": _wxyz(found.head.R_head_cam),
-            "t_head_cam": found.head.t_head_cam.tolist(),
-            "still_deg": found.head.still_deg,
-        }
-    content["checks"] = [
-        {"step": c.step, "what": c.what, "measured": c.measured, "expected": c.expected, "ok": c.ok} for c in checks
-    ]
+        content["head"] = _row(found.head, ("R_head_cam", "t_head_cam", "still_deg"))
+    content["checks"] = [_row(check, ("step", "what", "measured", "expected", "ok")) for check in checks]
     write_text(path, json.dumps(content | ({"about": about} if about else {}), indent=1) + "\n")
 
 
-def _wxyz(R: Tensor) -> list[float]:
-    return quat_wxyz_from_matrix(R.double()).tolist()
+def _row(one: object, names: Sequence[str]) -> dict[str, Any]:
+    """Attributes by name; rotations as unit quaternions, scalar first, and other tensors as lists."""
+    row = {}
+    for name in names:
+        value = getattr(one, name)
+        if name.startswith("R_"):
+            name, value = f"{name}_wxyz", quat_wxyz_from_matrix(value.double())
+        row[name] = value.tolist() if isinstance(value, Tensor) else value
+    return row
