@@ -96,7 +96,9 @@ def walk(count: int) -> list[Rigid]:
 
 
 def picture(mapper: PointMapper, camera: Camera, pose: Rigid) -> np.ndarray:
-    return cv2.GaussianBlur(mapper.color_picture(mapper(camera, pose)), (0, 0), 0.6)
+    index = mapper(camera, pose).index
+    colors = np.where(index[..., None] >= 0, mapper.scan.colors[np.maximum(index, 0)], 0)
+    return cv2.GaussianBlur(colors.astype(np.uint8), (0, 0), 0.6)
 
 
 def mapped(mapper: PointMapper, scan: Scan) -> VisualMap:

@@ -229,7 +229,7 @@ def test_a_map_of_learned_features_finds_where_its_photo_was_taken(lightglue, ne
     spread_descriptors(network, image)
     extract = SuperPointExtractor(_saved(network, tmp_path), max_keypoints=200)
     describe = NetVladDescriptor(netvlad, max_side=96)
-    scan = Scan(mapper.points)
+    scan = Scan(mapper.scan.points)
     room_map = build_map(photos, scan, extract, descriptor=describe, settings=MapSettings(splat_m=0.015))
     assert (room_map.extractor, room_map.descriptor) == (extract.name, describe.name)
     pose = Localizer(room_map, extract, LightGlueMatcher(lightglue), descriptor=describe)(image, CAMERA)

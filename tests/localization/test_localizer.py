@@ -37,7 +37,7 @@ def photos(mapper, tmp_path_factory) -> list[Photo]:
 
 @pytest.fixture(scope="module")
 def room_map(mapper, photos) -> VisualMap:
-    return build_map(photos, Scan(mapper.points), EXTRACTOR, settings=SETTINGS)
+    return build_map(photos, Scan(mapper.scan.points), EXTRACTOR, settings=SETTINGS)
 
 
 def errors(pose, truth) -> tuple[float, float]:
@@ -105,7 +105,7 @@ def test_a_map_survives_its_file(mapper, room_map, tmp_path):
 
 
 def test_an_extended_map_knows_both_parts(mapper, photos, room_map):
-    scan = Scan(mapper.points)
+    scan = Scan(mapper.scan.points)
     half = build_map(photos[:12], scan, EXTRACTOR, settings=SETTINGS)
     both = extended(half, photos[12:], scan, EXTRACTOR, settings=SETTINGS)
     both.check()
@@ -133,7 +133,7 @@ def test_retrieval_finds_what_shows_the_same_wall(mapper, room_map):
 def test_a_fisheye_map_and_a_fisheye_query(mapper, tmp_path):
     fisheye = Camera("fisheye", 420, 420, 130.0, 130.0, 210.0, 209.0, (0.01, -0.004, 0.001, 0.0))
     photos = take_photos(mapper, fisheye, photo_poses(8), tmp_path)
-    visual_map = build_map(photos, Scan(mapper.points), EXTRACTOR, settings=SETTINGS)
+    visual_map = build_map(photos, Scan(mapper.scan.points), EXTRACTOR, settings=SETTINGS)
     assert {camera.model for camera in visual_map.cameras} == {"pinhole"}
     truth = planted(2)[1]
     pose = Localizer(visual_map, EXTRACTOR)(photograph(mapper, fisheye, truth), fisheye)
@@ -216,7 +216,7 @@ def test_the_nearest_pictures_look_the_same_way(room_map):
 def test_photos_of_another_size_than_their_calibration(mapper, photos):
     wrong = [Photo(photos[0].file, replace(CAMERA, width=640), photos[0].T_world_cam)]
     with pytest.raises(WearcapError, match=r"00000.png: a picture of 400x300 pixels with a calibration for 640x300"):
-        build_map(wrong, Scan(mapper.points), EXTRACTOR, settings=SETTINGS)
+        build_map(wrong, Scan(mapper.scan.points), EXTRACTOR, settings=SETTINGS)
 
 
 def test_queries_of_another_size_and_without_intrinsics(room_map):
@@ -229,20 +229,20 @@ def test_queries_of_another_size_and_without_intrinsics(room_map):
 
 def test_no_photos_and_photos_that_do_not_see_the_scan(mapper, photos, room_map):
     with pytest.raises(WearcapError, match="no photos"):
-        extended(room_map, [], Scan(mapper.points), EXTRACTOR, settings=SETTINGS)
+        extended(room_map, [], Scan(mapper.scan.points), EXTRACTOR, settings=SETTINGS)
     with pytest.raises(WearcapError, match="no photos"):
-        build_map([], Scan(mapper.points), EXTRACTOR)
+        build_map([], Scan(mapper.scan.points), EXTRACTOR)
     with pytest.raises(WearcapError, match=r"would be empty.*one unit"):
-        build_map(photos[:3], Scan(mapper.points - 100), EXTRACTOR, settings=SETTINGS)
+        build_map(photos[:3], Scan(mapper.scan.points - 100), EXTRACTOR, settings=SETTINGS)
 
 
 def test_missing_and_unreadable_photos(mapper, photos, tmp_path):
     absent = [Photo(tmp_path / "none.jpg", CAMERA, photos[0].T_world_cam)]
     with pytest.raises(WearcapError, match="none.jpg: no such picture"):
-        build_map(absent, Scan(mapper.points), EXTRACTOR)
+        build_map(absent, Scan(mapper.scan.points), EXTRACTOR)
     (tmp_path / "none.jpg").write_bytes(b"\xff\xd8 no more")
     with pytest.raises(WearcapError, match="not a readable picture"):
-        build_map(absent, Scan(mapper.points), EXTRACTOR)
+        build_map(absent, Scan(mapper.scan.points), EXTRACTOR)
 
 
 def test_a_map_of_other_features(room_map):
@@ -284,12 +284,10 @@ def test_files_that_are_no_maps(room_map, tmp_path):
         VisualMap.load(path)
 
 
-def test_a_cloud_without_colour_maps_but_is_not_pictured(mapper):
-    bare = PointMapper(Scan(mapper.points), SPLAT_M)
+def test_a_cloud_without_colour_maps(mapper):
+    bare = PointMapper(Scan(mapper.scan.points), SPLAT_M)
     point_map = bare(CAMERA, looking((2.0, 2.0, 1.5), 0.0))
     assert (point_map.index >= 0).mean() > 0.99
-    with pytest.raises(WearcapError, match="no colours"):
-        bare.color_picture(point_map)
 
 
 def test_an_image_file_reads_as_rgb(tmp_path):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from textured_room import CAMERA, SIZE, looking, textured_room
+from textured_room import CAMERA, SIZE, color_picture, looking, textured_room
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
@@ -105,7 +105,7 @@ def test_a_fisheye_and_its_point_map_are_undistorted_alike():
     apart = np.linalg.norm(scan.points[flat.index[seen]] - scan.points[direct.index[seen]], axis=1)
     assert np.median(apart) < 0.025
     assert np.median(np.abs(flat.depth - direct.depth)[seen]) < 0.015
-    picture, other = remap.image(mapper.color_picture(mapper(FISHEYE, pose))), mapper.color_picture(direct)
+    picture, other = remap.image(color_picture(mapper, FISHEYE, pose)), color_picture(mapper, flat.camera, pose)
     assert np.abs(picture.astype(int) - other)[seen].mean() < 35  # shifted pictures differ by 60 and more
     keypoints = np.random.default_rng(0).uniform(40, 260, (200, 2)).astype(np.float32)
     positions, valid = flat.lift(scan.points, keypoints)

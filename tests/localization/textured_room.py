@@ -54,10 +54,16 @@ def looking(position: tuple[float, float, float], yaw: float, pitch: float = 0.0
     return Rigid(torch.tensor(np.stack([right, down, forward], 1)), torch.tensor(position, dtype=torch.float64))
 
 
+def color_picture(mapper: PointMapper, camera: Camera, T_world_cam: Rigid) -> np.ndarray:
+    """The scan's colours as the camera sees them, black where nothing is."""
+    index = mapper(camera, T_world_cam).index
+    return np.where(index[..., None] >= 0, mapper.scan.colors[np.maximum(index, 0)], 0).astype(np.uint8)
+
+
 def photograph(mapper: PointMapper, camera: Camera, T_world_cam: Rigid) -> np.ndarray:
     """The scan's colours, drawn at twice the size and averaged."""
     fine = camera.scaled(2 * camera.width, 2 * camera.height)
-    picture = mapper.color_picture(mapper(fine, T_world_cam))
+    picture = color_picture(mapper, fine, T_world_cam)
     return cv2.resize(picture, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
 
 

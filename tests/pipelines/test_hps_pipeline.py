@@ -221,7 +221,7 @@ def filmed(tmp_path_factory):
     (root / "scene").mkdir()
     mapper = PointMapper(textured_room(), 0.01)
     photos = take_photos(mapper, CAMERA, photo_poses(10), root / "scene")
-    build_map(photos, Scan(mapper.points), RootSift(400), settings=MapSettings(splat_m=0.01, words=8)).save(
+    build_map(photos, Scan(mapper.scan.points), RootSift(400), settings=MapSettings(splat_m=0.01, words=8)).save(
         root / "scene/map.safetensors"
     )
     poses = [looking((2.0 + 0.05 * k, 2.0, 1.6), 0.3 + 0.02 * k, 0.1) for k in range(6)]

@@ -44,12 +44,6 @@ def test_going_round_measures_the_centripetal_acceleration_and_the_rate():
     )
 
 
-def test_a_lever_arm_is_felt():
-    rate, radius, arm = 0.8, 1.5, 0.5
-    stream = synthesize_imu(carousel(rate=rate, radius=radius), "pelvis", t_joint_imu=torch.tensor([arm, 0.0, 0.0]))
-    assert stream.acc_imu[20:-20, 0].mean() == pytest.approx(-(rate**2) * (radius + arm), abs=2e-3)
-
-
 def test_a_mounting_turns_what_is_measured():
     motion = swaying_motion(120)
     mounted = rotation.about_axis("x", torch.tensor(math.pi / 2))

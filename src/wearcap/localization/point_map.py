@@ -77,19 +77,11 @@ class PointMapper:
     def __init__(self, scan: Scan, splat_m: float = 0.015):
         if not splat_m > 0:
             raise WearcapError(f"splats of {splat_m} m", expected="a positive radius")
-        self.points, self.colors, self.splat_m = scan.points, scan.colors, splat_m
+        self.scan, self.splat_m = scan, splat_m
         self._cloud = SplatCloud.build(scan.points)
 
     def __call__(self, camera: Camera, T_world_cam: Rigid) -> _PointMap:
         return _PointMap(camera, T_world_cam, *self._cloud.draw(camera, T_world_cam, self.splat_m))
-
-    def color_picture(self, point_map: _PointMap) -> UInt8[np.ndarray, "height width 3"]:
-        """The scan's colours as the camera sees them, black where nothing is. Raises WearcapError without colours."""
-        if self.colors is None:
-            what = "the scan has no colours, so no picture of it can be drawn"
-            raise WearcapError(what, expected="a coloured point cloud (point maps need none)")
-        seen = point_map.index >= 0
-        return np.where(seen[..., None], self.colors[np.where(seen, point_map.index, 0)], 0).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,6 +23,8 @@ SCHEMA_VERSION = 1
 STEPS = 254.0
 """Quantisation of unit-length descriptors to bytes: round(254 d), so components beyond ±0.5 are clipped."""
 _CHUNK = 1 << 18
+_MIN_COSINE = 0.85
+"""Smallest similarity of descriptors that are merged."""
 _AGAIN = "Build it again: wearcap scene."
 
 
@@ -204,10 +206,7 @@ def from_bytes(descriptors: Int8[np.ndarray, "keypoint feature"]) -> Float32[np.
 
 
 def merge(
-    positions: Float32[np.ndarray, "observation 3"],
-    descriptors: Int8[np.ndarray, "observation feature"],
-    cell_m: float,
-    min_cosine: float = 0.85,
+    positions: Float32[np.ndarray, "observation 3"], descriptors: Int8[np.ndarray, "observation feature"], cell_m: float
 ) -> tuple[_Landmarks, Int32[np.ndarray, "observation"]]:
     """Landmarks, and the one that each observation belongs to.
 
@@ -217,8 +216,24 @@ def merge(
     if not len(positions):
         return _Landmarks(positions, descriptors), np.zeros(0, np.int32)
     place = positions if cell_m == 0 else np.floor(positions / cell_m).astype(np.int64)
-    _, cell = np.unique(place, axis=0, return_inverse=True)
-    group = cell.ravel() if cell_m == 0 else _leaders(cell.ravel(), descriptors, min_cosine)
+    group = np.unique(place, axis=0, return_inverse=True)[1].ravel()
+    if cell_m > 0:
+        # Each observation's group is its leader: repeatedly, the first remaining one of each cell collects the similar
+        # ones of that cell.
+        cell, group, left = group, np.arange(len(group)), np.arange(len(group))
+        for _ in range(12):
+            _, first = np.unique(cell[left], return_index=True)
+            lead_of_cell = np.full(cell.max() + 1, -1)
+            lead_of_cell[cell[left[first]]] = left[first]
+            lead = lead_of_cell[cell[left]]
+            chunks = [slice(k, k + _CHUNK) for k in range(0, len(left), _CHUNK)]
+            pairs = ((from_bytes(descriptors[left[part]]), from_bytes(descriptors[lead[part]])) for part in chunks)
+            alike = np.concatenate([np.einsum("nd,nd->n", *pair) for pair in pairs]) >= _MIN_COSINE
+            alike[first] = True
+            group[left[alike]] = lead[alike]
+            left = left[~alike]
+            if not len(left):
+                break
     _, landmark, count = np.unique(group, return_inverse=True, return_counts=True)
     order = np.argsort(landmark, kind="stable")
     start = np.cumsum(count) - count
@@ -226,25 +241,3 @@ def merge(
     total = np.add.reduceat(descriptors[order].astype(np.float32), start)
     total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-6)
     return _Landmarks(mean.astype(np.float32), to_bytes(total)), landmark.astype(np.int32)
-
-
-def _leaders(cell: np.ndarray, descriptors: np.ndarray, min_cosine: float) -> np.ndarray:
-    """For each observation the leader of its group: repeatedly, the first remaining one of each cell collects the
-    similar ones of that cell."""
-    leader = np.full(len(cell), -1)
-    left = np.arange(len(cell))
-    for _ in range(12):
-        _, first = np.unique(cell[left], return_index=True)
-        lead_of_cell = np.full(cell.max() + 1, -1)
-        lead_of_cell[cell[left[first]]] = left[first]
-        lead = lead_of_cell[cell[left]]
-        chunks = [slice(k, k + _CHUNK) for k in range(0, len(left), _CHUNK)]
-        pairs = ((from_bytes(descriptors[left[part]]), from_bytes(descriptors[lead[part]])) for part in chunks)
-        alike = np.concatenate([np.einsum("nd,nd->n", *pair) for pair in pairs]) >= min_cosine
-        alike[first] = True
-        leader[left[alike]] = lead[alike]
-        left = left[~alike]
-        if not len(left):
-            return leader
-    leader[left] = left
-    return leader

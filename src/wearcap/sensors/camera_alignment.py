@@ -96,11 +96,6 @@ class HeadMount:
     still_deg: float
     """Root mean square angle to the mean while standing."""
 
-    @property
-    def view_deg(self) -> float:
-        """Angle between the optical axis and straight ahead."""
-        return math.degrees(math.acos(min(max(self.R_head_cam[0, 2].item(), -1.0), 1.0)))
-
     def apply(self, T_world_cam: Trajectory) -> HeadStream:
         """The camera's path as a head stream, with the device axes rotated to the head's."""
         R = T_world_cam.R_world_body
@@ -117,9 +112,10 @@ class HeadMount:
         calm = "Stand upright and look ahead for 10 s, or give a calmer stretch."
         face = "Face the board's y while standing, or give the direction that you faced (facing_deg)."
         ahead = "optical axis away from straight ahead"
+        view_deg = math.degrees(math.acos(min(max(self.R_head_cam[0, 2].item(), -1.0), 1.0)))
         return [
             StepCheck("standing", "not still", self.still_deg, limits.stand_still_deg, "°", calm),
-            StepCheck("standing", ahead, self.view_deg, limits.view_deg, "°", face),
+            StepCheck("standing", ahead, view_deg, limits.view_deg, "°", face),
         ]
 
 

@@ -71,8 +71,8 @@ def synthesize_imu(
 ) -> ImuStream:
     """What a sensor fixed to a joint measures: orientation, free acceleration, specific force, angular rate.
 
-    The sensor sits at the joint; its axes default to the joint's own. With `noise`, `rng` draws attitude error, heading drift, bias,
-    white noise, a loose strap and a clock that is off. Nothing is filtered: see `mean_filter`.
+    The sensor sits at the joint; its axes default to the joint's own. With `noise`, `rng` draws attitude error, heading
+    drift, bias, white noise, a loose strap and a clock that is off. Nothing is filtered: see `mean_filter`.
     """
     T_world_joint = motion.joint(joint)
     R_joint_imu = torch.eye(3) if R_joint_imu is None else R_joint_imu

@@ -69,16 +69,6 @@ class WatchCalibration:
     pose_still_deg: float
 
     @property
-    def face_up_deg(self) -> float:
-        """Angle of the watch's face (its z axis) to the vertical in the T-pose."""
-        return _angle_deg(self.R_joint_imu[2, 2])
-
-    @property
-    def arm_level_deg(self) -> float:
-        """Slope of the watch's x axis, which lies along the forearm, in the T-pose."""
-        return abs(90.0 - _angle_deg(self.R_joint_imu[2, 0]))
-
-    @property
     def arm_facing_deg(self) -> float:
         """Horizontal angle of the forearm to the side direction of a wearer who faces the board's y."""
         x = self.R_joint_imu[:, 0]
@@ -137,12 +127,14 @@ def watch_checks(
     facing = "Face the board's y in the T-pose; on the board the 12 o'clock of both watches points along y."
     rows = []
     for joint, one in found.items():
+        # In the T-pose the watch's x axis lies along the forearm, its face's z axis points up.
+        slope_deg, face_up_deg = abs(90.0 - _angle_deg(one.R_joint_imu[2, 0])), _angle_deg(one.R_joint_imu[2, 2])
         for step, what, measured, limit, fix in (
             ("board", "not still", one.board_still_deg, limits.board_still_deg, still),
             ("board", "tilt of its z against gravity", one.board_tilt_deg, limits.board_tilt_deg, flat),
             ("T-pose", "not still", one.pose_still_deg, limits.pose_still_deg, steady),
-            ("T-pose", "slope of the forearm", one.arm_level_deg, limits.arm_level_deg, level),
-            ("T-pose", "face of the watch looks away from up", one.face_up_deg, limits.face_up_deg, palms),
+            ("T-pose", "slope of the forearm", slope_deg, limits.arm_level_deg, level),
+            ("T-pose", "face of the watch looks away from up", face_up_deg, limits.face_up_deg, palms),
             ("T-pose", "forearm away from the wearer's side", one.arm_facing_deg, limits.arm_facing_deg, facing),
         ):
             rows.append(StepCheck(f"{step}, {joint}", what, measured, limit, "°", fix))

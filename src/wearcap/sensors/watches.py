@@ -34,11 +34,32 @@ def watches_at(
         if joint not in streams:
             fix = "Give both watches, or capture with the head alone: pipeline=hmd2."
             raise WearcapError(f"no watch on {joint}", where=where, expected=" and ".join(WRISTS), fix=fix)
-        stream = streams[joint]
+        stream, place = streams[joint], f"{where}, {joint}"
+        times = stream.timestamps
         if stream.R_world_imu is None or stream.acc_world is None:
             what = "a watch without orientation or free acceleration"
-            raise WearcapError(what, where=f"{where}, {joint}", expected="both")
-        _require_no_gaps(stream.timestamps, timestamps, f"{where}, {joint}")
+            raise WearcapError(what, where=place, expected="both")
+        steps = times.diff()
+        if len(times) < 2 or (steps <= 0).any():
+            fix = "Sort its samples by time and leave repeated ones out."
+            raise WearcapError("times of a watch that do not grow", where=place, fix=fix)
+        early, late = (times[0] - timestamps[0]).item(), (timestamps[-1] - times[-1]).item()
+        if early > MAX_GAP_S or late > MAX_GAP_S:
+            what = f"the watch logged from {times[0].item():.2f} s to {times[-1].item():.2f} s"
+            expected = f"{timestamps[0].item():.2f} s to {timestamps[-1].item():.2f} s, as the camera did"
+            fix = "Put both on one clock (wearcap calibrate), or cut the recording to what they share."
+            raise WearcapError(what, where=place, expected=expected, fix=fix)
+        gaps = find_gaps(times, MAX_GAP_S)
+        inside = [g for g in gaps.tolist() if times[g + 1] > timestamps[0] and times[g] < timestamps[-1]]
+        if inside:
+            first = inside[0]
+            raise WearcapError(
+                f"the watch is silent, or its clock jumps, for {steps[first].item():.2f} s at {times[first].item():.2f} s "
+                f"({len(inside)} such gaps)",
+                where=place,
+                expected=f"no gap above {MAX_GAP_S} s",
+                fix="Cut the recording there.",
+            )
         worn.append(stream)
     step = timestamps.diff().median().item() if len(timestamps) > 1 else 0.0
     frames = torch.arange(-(FILTER // 2), len(timestamps) + FILTER // 2).clamp(0, len(timestamps) - 1)
@@ -93,28 +114,3 @@ def require_sides(R_world_wrist: Float[Tensor, "time wrist 3 3"], where: str) ->
         what = "the watches seem to be swapped: both forearms would point up most of the time"
         fix = "Exchange the logs of the left and the right watch, or calibrate them again."
         raise WearcapError(what, where=where, fix=fix)
-
-
-def _require_no_gaps(times: Tensor, requested: Tensor, where: str) -> None:
-    """Raise WearcapError when the watch has no samples at some of the requested times."""
-    step = times.diff()
-    if len(times) < 2 or (step <= 0).any():
-        fix = "Sort its samples by time and leave repeated ones out."
-        raise WearcapError("times of a watch that do not grow", where=where, fix=fix)
-    early, late = (times[0] - requested[0]).item(), (requested[-1] - times[-1]).item()
-    if early > MAX_GAP_S or late > MAX_GAP_S:
-        what = f"the watch logged from {times[0].item():.2f} s to {times[-1].item():.2f} s"
-        expected = f"{requested[0].item():.2f} s to {requested[-1].item():.2f} s, as the camera did"
-        fix = "Put both on one clock (wearcap calibrate), or cut the recording to what they share."
-        raise WearcapError(what, where=where, expected=expected, fix=fix)
-    gaps = find_gaps(times, MAX_GAP_S)
-    inside = [g for g in gaps.tolist() if times[g + 1] > requested[0] and times[g] < requested[-1]]
-    if inside:
-        first = inside[0]
-        raise WearcapError(
-            f"the watch is silent, or its clock jumps, for {step[first].item():.2f} s at {times[first].item():.2f} s "
-            f"({len(inside)} such gaps)",
-            where=where,
-            expected=f"no gap above {MAX_GAP_S} s",
-            fix="Cut the recording there.",
-        )
