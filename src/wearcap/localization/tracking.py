@@ -212,20 +212,18 @@ def _pictures_in(folder: Path) -> list[str]:
 def _frames(video: Path, output: Path, fps: float, advance: Advance) -> Pictures:
     """Frames of a video nearest to an even clock, as JPEGs in `output`/frames, with the video's timestamps."""
     folder, listed = output / FRAMES, output / FRAMES / "times.json"
-    if listed.is_file():
-        rows = read_json(listed)
-        return Pictures(folder, tuple(rows), torch.tensor(list(rows.values()), dtype=torch.float64))
-    info = video_info(video)
-    expected = max(int(info.frames / info.fps * fps), 1)
-    folder.mkdir(parents=True, exist_ok=True)
-    rows: dict[str, float] = {}
-    for time, picture in read_frames(video):
-        if time * fps + 0.5 * fps / info.fps < len(rows):
-            continue
-        name = f"{len(rows):06d}.jpg"
-        with atomic_path(folder / name) as temporary:
-            Image.fromarray(picture).save(temporary, quality=95)
-        rows[name] = time
-        advance("pictures", min(len(rows), expected), expected)
-    write_text(listed, json.dumps(rows, indent=0) + "\n")
+    rows: dict[str, float] = read_json(listed) if listed.is_file() else {}
+    if not rows:
+        info = video_info(video)
+        expected = max(int(info.frames / info.fps * fps), 1)
+        folder.mkdir(parents=True, exist_ok=True)
+        for time, picture in read_frames(video):
+            if time * fps + 0.5 * fps / info.fps < len(rows):
+                continue
+            name = f"{len(rows):06d}.jpg"
+            with atomic_path(folder / name) as temporary:
+                Image.fromarray(picture).save(temporary, quality=95)
+            rows[name] = time
+            advance("pictures", min(len(rows), expected), expected)
+        write_text(listed, json.dumps(rows, indent=0) + "\n")
     return Pictures(folder, tuple(rows), torch.tensor(list(rows.values()), dtype=torch.float64))

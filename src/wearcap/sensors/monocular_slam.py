@@ -25,11 +25,6 @@ from wearcap.recording.recording import ImuStream
 from wearcap.sensors.imu import GRAVITY, acceleration
 from wearcap.sensors.stillness import Stretch, during
 
-MAX_ACCELERATION = 40.0
-"""m/s² at the usual 30 Hz: a jump of 4.5 cm between two frames. A running head stays below 30 (ours: the paper gives
-no number)."""
-MAX_BURST_S = 1.0
-"""Longest burst of outliers; longer deviating segments are jumps of the SLAM system to another place."""
 _HALF_S = 0.25
 """Half span of the second differences: longer ones reduce jitter, shorter ones keep more of the gait."""
 _BLOCK_S = 1.0
@@ -42,15 +37,15 @@ _ROUNDS = 20
 
 
 def clean_track(
-    trajectory: Trajectory, max_acceleration: float = MAX_ACCELERATION, max_burst_s: float = MAX_BURST_S
+    trajectory: Trajectory, max_acceleration: float, max_burst_s: float
 ) -> tuple[Trajectory, Bool[Tensor, "time"], Float64[Tensor, "jump"]]:
     """Drop outliers of position (m) by their acceleration, and fill them by linear interpolation and slerp: trajectory
     on the same timestamps, the frames that were kept, and the times before jumps that are not short bursts.
 
     A jump between two frames accelerates both of them, there and back; a hard step or a turn only one. Where both
-    exceed `max_acceleration` (m/s²) the track is cut, a piece not longer than those beside it nor than `max_burst_s` is
+    exceed `max_acceleration` (m/s²; the paper gives no number, a running head stays below 30) the track is cut, a piece not longer than those beside it nor than `max_burst_s` is
     dropped, its neighbours are joined, and so on. A burst of any shape is thus dropped as a whole, and longer good
-    pieces beside it stay. Frames that are not finite are never valid. Raises WearcapError for timestamps that do not
+    pieces beside it stay; longer deviating ones are jumps of the SLAM system to another place. Frames that are not finite are never valid. Raises WearcapError for timestamps that do not
     rise, and when no pose is finite.
     """
     require_rising(trajectory.timestamps)
