@@ -43,10 +43,11 @@ def clean_track(
     on the same timestamps, the frames that were kept, and the times before jumps that are not short bursts.
 
     A jump between two frames accelerates both of them, there and back; a hard step or a turn only one. Where both
-    exceed `max_acceleration` (m/s²; the paper gives no number, a running head stays below 30) the track is cut, a piece not longer than those beside it nor than `max_burst_s` is
-    dropped, its neighbours are joined, and so on. A burst of any shape is thus dropped as a whole, and longer good
-    pieces beside it stay; longer deviating ones are jumps of the SLAM system to another place. Frames that are not finite are never valid. Raises WearcapError for timestamps that do not
-    rise, and when no pose is finite.
+    exceed `max_acceleration` (m/s²; the paper gives no number, a running head stays below 30) the track is cut, a piece
+    not longer than those beside it nor than `max_burst_s` is dropped, its neighbours are joined, and so on. A burst of
+    any shape is thus dropped as a whole; longer deviating pieces are jumps of the SLAM system to another place and stay.
+    Frames that are not finite are never valid. Raises WearcapError for timestamps that do not rise, and when no pose is
+    finite.
     """
     require_rising(trajectory.timestamps)
     position, time = trajectory.t_world_body.double(), trajectory.timestamps

@@ -59,8 +59,8 @@ class HpsTruth:
     ) -> "HpsTruth":
         """Ground truth of a recording at `fps`; suit and true motion share their timestamps, as simulated ones do.
         Raises WearcapError when the recording lacks a suit with contacts, a true motion or true contacts."""
-        motion, suit, track = recording.motion, recording.suit, recording.contacts
-        feet = None if track is None else track.feet
+        motion, suit = recording.motion, recording.suit
+        feet = None if recording.contacts is None else recording.contacts.feet
         if motion is None or suit is None or suit.contact_prob is None or feet is None:
             raise WearcapError(
                 "nothing to measure a capture against",
