@@ -131,13 +131,8 @@ class Matches:
         """
         if len(self.pixels) < 4:
             return None
-        options = {
-            "max_reproj_error": max_error_px,
-            "max_iterations": 20_000,
-            "min_iterations": 50,
-            "success_prob": 0.9999,
-            "seed": 0,
-        }
+        options = {"max_reproj_error": max_error_px, "max_iterations": 20_000, "min_iterations": 50}
+        options |= {"success_prob": 0.9999, "seed": 0}
         pixels, points = self.pixels.astype(np.float64), self.points_world.astype(np.float64)
         pose, report = poselib.estimate_absolute_pose(pixels, points, self._lens(), options, {})
         inlier = np.asarray(report["inliers"], bool)

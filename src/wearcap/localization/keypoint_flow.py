@@ -192,15 +192,8 @@ def _followed(track: _Track, before: np.ndarray, after: np.ndarray, settings: Fl
 def _flow(
     before: np.ndarray, after: np.ndarray, start: Float32[np.ndarray, "keypoint 2"], settings: FlowSettings
 ) -> tuple[Float32[np.ndarray, "keypoint 2"], Bool[np.ndarray, "keypoint"]]:
-    side = settings.window_px
-    end, status, _ = cv2.calcOpticalFlowPyrLK(
-        before,
-        after,
-        start[:, None],
-        None,
-        winSize=(side, side),
-        maxLevel=settings.levels,  # type: ignore[call-overload]
-    )
+    size, levels, points = (settings.window_px, settings.window_px), settings.levels, start[:, None]
+    end, status, _ = cv2.calcOpticalFlowPyrLK(before, after, points, None, winSize=size, maxLevel=levels)  # type: ignore[call-overload]
     return end[:, 0], status[:, 0] == 1
 
 

@@ -49,8 +49,9 @@ def _read(weights: str | Path | None, absent: tuple[str, str]) -> dict[str, Tens
     return read_weights(weights)
 
 
-def _place(network: nn.Module, device: str) -> None:
-    """Move a network to its device, for inference only."""
+def _load(network: nn.Module, tensors: dict[str, Tensor], name: str, weights: str | Path | None, device: str) -> None:
+    """Fill a network with weights and move it to its device, for inference only."""
+    load_weights(network, tensors, name=name, where=str(weights))
     try:
         network.to(device).eval().requires_grad_(False)
     except (RuntimeError, AssertionError) as error:
@@ -90,10 +91,8 @@ class SuperPointExtractor:
             what = f"SuperPoint with {max_keypoints} keypoints, threshold {threshold}, radius {nms_radius}"
             raise WearcapError(what, expected="at least one keypoint, a threshold in [0, 1), a radius of 0 or more")
         tensors = _read(weights, _SUPERPOINT)
-        network = SuperPoint(nms_radius, border=4, max_keypoints=max_keypoints)
-        load_weights(network, tensors, name="SuperPoint", where=str(weights))
-        _place(network, device)
-        self.network, self.device = network, device
+        self.network, self.device = SuperPoint(nms_radius, border=4, max_keypoints=max_keypoints), device
+        _load(self.network, tensors, "SuperPoint", weights, device)
         self.threshold, self.max_side = threshold, max_side
         self.name = f"superpoint-{sha256_of(Path(str(weights)).expanduser())[:12]}"
 
@@ -123,10 +122,8 @@ class LightGlueMatcher:
         device: str = "cpu",
     ):
         tensors = renamed(_read(weights, _LIGHTGLUE))
-        network = LightGlue(stop_confidence=stop_confidence)
-        load_weights(network, tensors, name="LightGlue for SuperPoint", where=str(weights))
-        _place(network, device)
-        self.network, self.device = network, device
+        self.network, self.device = LightGlue(stop_confidence=stop_confidence), device
+        _load(self.network, tensors, "LightGlue for SuperPoint", weights, device)
         self.min_probability = min_probability
 
     def _inputs(self, features: Features) -> tuple[Tensor, Tensor, Tensor]:
@@ -164,8 +161,7 @@ class NetVladDescriptor:
             whitened=_rows(tensors.get("WPCA.0.weight"), 0),
             bias="pool.conv.bias" in tensors,
         )
-        load_weights(network, tensors, name="NetVLAD over VGG16", where=str(weights))
-        _place(network, device)
+        _load(network, tensors, "NetVLAD over VGG16", weights, device)
         self.network, self.device, self.max_side = network, device, max_side
         self.name = f"netvlad-{sha256_of(Path(str(weights)).expanduser())[:12]}"
 
