@@ -113,7 +113,7 @@ def test_a_changed_world_keeps_its_walls_and_loses_some_things(scenery):
 def glance(scenery):
     """Two seconds of turning at the spot, at 30 Hz, on a clock that starts at 7 s."""
     time = 7.0 + torch.arange(61, dtype=torch.float64) / 30
-    x, y, z = scenery.world.spots[0].position
+    x, y, z = scenery.world.places.spots[0].position
     turn = rotation.about_axis("z", 1.2 * (time - 7).float())
     return Trajectory(time, turn @ R_DEVICE_CAM, torch.tensor([[x, y, z + 1.6]]).repeat(61, 1))
 

@@ -27,7 +27,7 @@ def scenery() -> Scenery:
 
 
 def pose(scenery: Scenery, yaw: float, pitch: float = 0.1, shift=(0.0, 0.0)) -> Rigid:
-    x, y, z = scenery.world.spots[0].position
+    x, y, z = scenery.world.places.spots[0].position
     turn = rotation.about_axis("z", torch.tensor(yaw)) @ rotation.about_axis("y", torch.tensor(pitch))
     return Rigid(turn @ R_DEVICE_CAM, torch.tensor([x + shift[0], y + shift[1], z + 1.65]))
 

@@ -15,7 +15,7 @@ def flat(request):
 
 
 def test_the_floor_of_a_flight_rises_step_by_step(stairs_flat):
-    (flight,) = stairs_flat.flights
+    (flight,) = stairs_flat.places.flights
     along = np.array([np.cos(flight.direction), np.sin(flight.direction)])
     step = np.arange(1, flight.steps)
     middles = np.array(flight.start) + ((step - 0.5) * flight.tread)[:, None] * along
@@ -68,19 +68,21 @@ def test_no_way_into_the_void(flat):
 
 
 def test_doors_are_wide_enough_and_open(flat):
-    assert flat.doors
-    for door in flat.doors:
+    assert flat.places.doors
+    for door in flat.places.doors:
         assert 0.79 < door.width < 0.96
         middle = np.array([door.position[:3]], dtype=np.float64)
         assert flat.clearance(middle)[0] > 0.28
 
 
 def test_every_seat_and_target_can_be_reached(flat):
-    assert flat.seats
-    assert flat.reach_targets
+    assert flat.places.seats
+    assert flat.places.reach_targets
     rng = np.random.default_rng(0)
     start = flat.sample_floor(rng, 1)[0]
-    for point in [seat.standing_point() for seat in flat.seats] + [np.array(t.stand) for t in flat.reach_targets]:
+    for point in [seat.standing_point() for seat in flat.places.seats] + [
+        np.array(t.stand) for t in flat.places.reach_targets
+    ]:
         assert flat.plan_path(start, point, rng) is not None
 
 

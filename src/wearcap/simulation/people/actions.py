@@ -103,7 +103,7 @@ def follow(plan: Plan, world: World, rng: np.random.Generator, path: np.ndarray,
     start = plan.time
     if path_length(path) > 0.25:
         speed = plan.style.gait.speed * float(np.exp(rng.normal(0.0, 0.13)))
-        walk_along(plan, path, rng, speed, world.flights)
+        walk_along(plan, path, rng, speed, world.places.flights)
         look_about(plan, start + 1.0, plan.time, rng, spread=0.22, pause_s=3.0)
     if heading is not None and abs(wrap(heading - plan.heading)) > 0.2:
         turn_to(plan, heading, rng)
@@ -243,9 +243,10 @@ def _carry_along(plan: Plan, world: World, rng: np.random.Generator) -> bool:
 @_activity("reach", weight=2.5)
 def _reach(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     """Go to a shelf, table or handle and take hold of a point there, crouching or leaning as it needs."""
-    if not world.reach_targets:
+    targets = world.places.reach_targets
+    if not targets:
         return False
-    target = world.reach_targets[rng.integers(len(world.reach_targets))]
+    target = targets[rng.integers(len(targets))]
     if not approach(plan, world, rng, np.array(target.stand), target.heading):
         return False
     for _ in range(rng.integers(1, 4)):
@@ -289,9 +290,10 @@ def _sit(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     The trunk leans forward 40–45°, the hips go back and down, it leans back; in reverse order to get up (Schenkman et
     al. 1990).
     """
-    if not world.seats:
+    seats = world.places.seats
+    if not seats:
         return False
-    seat = world.seats[rng.integers(len(world.seats))]
+    seat = seats[rng.integers(len(seats))]
     if not approach(plan, world, rng, seat.standing_point(), seat.heading):
         return False
     down, up = rng.uniform(1.5, 2.2, 2) / plan.style.briskness

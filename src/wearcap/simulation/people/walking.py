@@ -3,7 +3,7 @@
 Small steps carry the body along any path: forwards, backwards, sideways, turning.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from wearcap.simulation.people.gait import advance, bump, climb
 from wearcap.simulation.people.plan import LEFT_SIGN, OTHER, SIDES, STEP_M, Footprint, Plan, wrap
 from wearcap.simulation.people.track import blur, ease
 from wearcap.simulation.places.outline import turn
+from wearcap.simulation.places.world import Flight
 
 SPACING_M = 0.02
 RUN_SPEED = 2.1
@@ -63,7 +64,9 @@ class _Course:
     """Speed (m/s) from which on the gait is running."""
 
     @classmethod
-    def of(cls, plan: Plan, path: Float[np.ndarray, "waypoint 3"], speed: float, flights: tuple) -> "_Course":
+    def of(
+        cls, plan: Plan, path: Float[np.ndarray, "waypoint 3"], speed: float, flights: Sequence[Flight]
+    ) -> "_Course":
         """Speed, time and step phase along a path. Steps fall on the treads of the flights that it takes."""
         # evenly spaced points of the path with rounded corners, and its unwrapped heading
         run = np.concatenate([[0.0], np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).cumsum()])
@@ -129,7 +132,11 @@ class _Course:
 
 
 def walk_along(
-    plan: Plan, path: Float[np.ndarray, "waypoint 3"], rng: np.random.Generator, speed: float, flights: tuple = ()
+    plan: Plan,
+    path: Float[np.ndarray, "waypoint 3"],
+    rng: np.random.Generator,
+    speed: float,
+    flights: Sequence[Flight] = (),
 ) -> None:
     """Turn towards a path's start, walk (or run, above 2.1 m/s) along it and stop at its end, feet together."""
     course = _Course.of(plan, path, speed, flights)
@@ -187,7 +194,7 @@ def _walk_step(plan: Plan, side: str, lift: float, land: float, print_: Footprin
     plan.step(side, lift, land, lift_pitch, replace(print_, **swing))
 
 
-def _tread_anchors(points: np.ndarray, flight, foot: float) -> list[tuple[float, int, float]]:
+def _tread_anchors(points: np.ndarray, flight: Flight, foot: float) -> list[tuple[float, int, float]]:
     """(arc length, 1 up or -1 down, tread) of the places on a path where a foot must stand on a flight.
 
     `foot` is how far the toes are ahead of the ankle (m).

@@ -130,7 +130,7 @@ class _Builder(WorldBuilder):
     def door_leaves(self, static: World) -> list[Openable]:
         """Door leaves in the gaps, mostly opening into rooms, on whichever side they have the space to."""
         leaves, rng = [], self.rng
-        for door in self.doors:
+        for door in self.places.doors:
             variants = list(product((-1.0, 1.0), repeat=2))
             into_hall = np.array([_room_at(static, door, side).startswith("hallway") for side, _ in variants])
             order = np.argsort(rng.random(4) + np.where(into_hall, rng.choice([0.0, 1.0], p=[0.2, 0.8]), 0.0))
@@ -273,7 +273,7 @@ def _place_loose(plan: Plan, category: str, rng: np.random.Generator) -> None:
 def _room_at(static: World, gap: Door, side: float) -> str:
     """Name of the room half a metre away from a gap, "" outside."""
     point = np.array(gap.position[:2]) + side * 0.5 * turn(gap.heading)[:, 0]
-    names = [room.name for room in static.rooms if points_in_convex(point[None], room.polygon)[0]]
+    names = [room.name for room in static.places.rooms if points_in_convex(point[None], room.polygon)[0]]
     return names[0] if names else ""
 
 
@@ -308,12 +308,12 @@ class House:
             away = np.linalg.norm(grid.node_points[:, :2] - np.array(point)[:2], axis=1)
             return bool((away < NEAR_WALKABLE_M).any())
 
-        now = replace(
-            static,
-            objects=(*static.objects, *extra),
-            seats=tuple(seat for seat in static.seats if near(seat.standing_point())),
-            reach_targets=tuple(target for target in static.reach_targets if near(target.stand)),
+        places = replace(
+            static.places,
+            seats=[seat for seat in static.places.seats if near(seat.standing_point())],
+            reach_targets=[target for target in static.places.reach_targets if near(target.stand)],
         )
+        now = replace(static, objects=(*static.objects, *extra), places=places)
         now.__dict__["navigation"] = grid
         return now
 

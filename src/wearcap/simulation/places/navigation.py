@@ -223,7 +223,7 @@ def _keep_off(objects: tuple, origin: np.ndarray, cell: float, height: np.ndarra
 
 def plan_path(
     grid: NavigationGrid,
-    flights: tuple,
+    flights: list,
     start: Float[np.ndarray, "3"],
     goal: Float[np.ndarray, "3"],
     rng: np.random.Generator,

@@ -192,7 +192,7 @@ def _build_borders(builder: WorldBuilder, layout: _Layout, rng: np.random.Genera
         at = x + half
         if not crossing.lowered:
             start, direction = builder.point(x, street), builder.heading + np.pi / 2
-            builder.flights.append(Flight(start, direction, 1, kerb, KERB_TREAD_M, crossing.width, 0.0))
+            builder.places.flights.append(Flight(start, direction, 1, kerb, KERB_TREAD_M, crossing.width, 0.0))
         for side in (-1, 1) if crossing.lowered else ():
             beside = x + side * (half + 0.06)
             sloped_rail(builder, (beside, street), (beside, street + crossing.drop), kerb, (kerb, kerb), 0.6)

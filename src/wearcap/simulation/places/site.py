@@ -175,7 +175,7 @@ def _build_open_air(builder: WorldBuilder, layout: _Layout, rng: np.random.Gener
 
 
 def _furnish(builder: WorldBuilder, layout: _Layout, rng: np.random.Generator) -> None:
-    free, margin = [before_gap(builder, door) for door in builder.doors], THICKNESS / 2 + 0.01
+    free, margin = [before_gap(builder, door) for door in builder.places.doors], THICKNESS / 2 + 0.01
     kinds = rng.permutation([*ROOM_KINDS, *ROOM_KINDS])
     for box, kind in zip(layout.rooms, kinds):
         plan = Plan(builder, inset(box, margin), 0.0, list(free))
@@ -233,7 +233,7 @@ def _add_capture_spot(plan: Plan, rng: np.random.Generator) -> None:
     plan.kept_free.append((x - half, y - half, x + half, y + half))
     builder = plan.builder
     spot = CaptureSpot(builder.point(x, y, plan.z), builder.heading + float(heading), SPOT_M, half, table.z_range[1])
-    builder.spots.append(spot)
+    builder.places.spots.append(spot)
 
 
 def changed_world(
@@ -249,7 +249,7 @@ def changed_world(
         luck = rng.random()
         shift, angle = rng.uniform(-most_m, most_m, 2) / np.sqrt(2), rng.normal(0.0, 0.4)
         here = np.array(item.position[:2])
-        at_spot = any(np.linalg.norm(here - spot.position[:2]) < spot.size for spot in world.spots)
+        at_spot = any(np.linalg.norm(here - spot.position[:2]) < spot.size for spot in world.places.spots)
         if item.kind not in MOVABLE or luck > moved + removed or at_spot:
             continue
         own = world.face_object == number

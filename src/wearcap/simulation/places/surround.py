@@ -220,7 +220,7 @@ class _FreePlan(Plan):
                 wall.windows += [(wall.length * (k + 0.5) / count, float(rng.uniform(0.9, 1.4))) for k in range(count)]
             wall.build(builder, color, rng)
         self.room = inset(box, 0.07)
-        self.kept_free += [before_gap(builder, door) for door in builder.doors]
+        self.kept_free += [before_gap(builder, door) for door in builder.places.doors]
         self.place_beside(NEAR_INDOORS, path, rng)
         self.furnish(str(rng.choice(list(ROOM_KINDS))), rng)
 

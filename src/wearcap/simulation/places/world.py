@@ -6,7 +6,7 @@ A builder (`flat.build_flat`, `outdoor.build_outdoor`, `site.build_site`) fills 
 needs no change there.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -154,6 +154,18 @@ class Door:
     width: float
 
 
+@dataclass(frozen=True)
+class Places:
+    """Where one sits, reaches, climbs, passes, and returns to in a recording."""
+
+    seats: list[Seat] = field(default_factory=list)
+    reach_targets: list[ReachTarget] = field(default_factory=list)
+    flights: list[Flight] = field(default_factory=list)
+    rooms: list[Room] = field(default_factory=list)
+    doors: list[Door] = field(default_factory=list)
+    spots: list[CaptureSpot] = field(default_factory=list)
+
+
 @dataclass(frozen=True, kw_only=True)
 class World:
     """Seeded surroundings. `face_object` gives each face of `mesh` its object (index), or -1 for the shell."""
@@ -165,12 +177,7 @@ class World:
     """Visual features per m² of each face: near 0 on blank walls, hundreds on book spines."""
     objects: tuple[WorldObject, ...]
     surfaces: tuple[Surface, ...]
-    seats: tuple[Seat, ...] = ()
-    reach_targets: tuple[ReachTarget, ...] = ()
-    flights: tuple[Flight, ...] = ()
-    rooms: tuple[Room, ...] = ()
-    doors: tuple[Door, ...] = ()
-    spots: tuple[CaptureSpot, ...] = ()
+    places: Places
     cell: float = 0.1
     """Side of a cell of the planning grid (m)."""
     outdoors: bool = False
@@ -202,7 +209,7 @@ class World:
     def on_stairs(self, points: Float[np.ndarray, "point 3"]) -> Bool[np.ndarray, "point"]:
         """Whether floor points lie on a flight or within a step of its ends."""
         near = np.zeros(len(points), bool)
-        for flight in self.flights:
+        for flight in self.places.flights:
             run, side = flight.up_and_left(points[:, :2])
             near |= (run > -0.8) & (run < flight.length + 0.8) & (np.abs(side) < flight.width / 2 + 0.1)
         return near
@@ -216,7 +223,7 @@ class World:
         off obstacles, except on the last steps to a start or goal that is nearer to one itself (a seat).
         `rng` varies how far from walls this walk likes to be. None when no path leads there.
         """
-        path = plan_path(self.navigation, self.flights, start, goal, rng)
+        path = plan_path(self.navigation, self.places.flights, start, goal, rng)
         if path is not None:
             floor = self.floor_height(path[:, :2], path[:, 2])
             path[:, 2] = np.where(np.isnan(floor), path[:, 2], floor)

@@ -167,7 +167,7 @@ class _Session:
 
     def __init__(self, world: World, person: Person, rng: np.random.Generator, protocol: Protocol):
         self.world, self.rng, self.protocol = world, rng, protocol
-        self.spot: CaptureSpot = world.spots[0]
+        self.spot: CaptureSpot = world.places.spots[0]
         self.home = np.array(self.spot.position)
         self.plan = Plan(person, self.home.copy(), self.spot.heading, world.floor_height)
         self.plan.time = 0.8

@@ -126,7 +126,7 @@ def _materials(
     kinds = np.array([entry.kind for entry in world.objects] + [""])[item]
     out[np.isin(kinds, ("wall", "pillar")) & ~shell] = kernels.PLASTER
     before = (middle + 0.3 * normal)[:, :2]
-    rooms = [] if world.outdoors else [room.polygon for room in world.rooms if not room.open_air]
+    rooms = [] if world.outdoors else [room.polygon for room in world.places.rooms if not room.open_air]
     indoors = np.any([np.zeros(len(before), bool), *(points_in_convex(before, room) for room in rooms)], axis=0)
     out[(kinds == "wall") & upright & ~indoors] = kernels.BRICK
     out[np.isin(kinds, _STONY)] = kernels.BRICK
