@@ -14,7 +14,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.sensors.slam import R_DEVICE_CAM
 from wearcap.simulation.places.site import build_site
 from wearcap.simulation.rendering import texture_kernels as kernels
-from wearcap.simulation.rendering.views import Development, Scenery, render_view, view_depth
+from wearcap.simulation.rendering.views import Development, Scenery, exposed, render_view
 
 PINHOLE = Camera("pinhole", 160, 96, 75.0, 75.0, 79.5, 47.5)
 HEAD = Camera("opencv", 160, 96, 75.0, 76.0, 80.0, 47.0, (-0.08, 0.02, 0.001, -0.0005))
@@ -35,7 +35,7 @@ def pose(scenery: Scenery, yaw: float, pitch: float = 0.1, shift=(0.0, 0.0)) -> 
 @pytest.mark.parametrize("camera", [PINHOLE, HEAD, FISHEYE], ids=lambda camera: camera.model)
 def test_depth_is_the_renderers(scenery, camera):
     T = pose(scenery, 0.7)
-    ours = view_depth(scenery, camera, T)
+    ours = exposed(scenery, camera, T)[1]
     grid = torch.stack(torch.meshgrid(torch.arange(camera.width), torch.arange(camera.height), indexing="xy"), -1)
     rays = camera.unproject(grid.double())
     pinhole = render(PINHOLE, T, [scenery.world.mesh]).depth
@@ -51,7 +51,7 @@ def test_depth_is_the_renderers(scenery, camera):
 
 def test_a_pixel_has_the_colour_of_the_point_that_it_shows(scenery):
     T = pose(scenery, 2.0)
-    picture, depth = render_view(scenery, HEAD, T), view_depth(scenery, HEAD, T)
+    picture, depth = render_view(scenery, HEAD, T), exposed(scenery, HEAD, T)[1]
     row, column = 60, 90
     point = T @ (HEAD.unproject(torch.tensor([float(column), float(row)])) * float(depth[row, column]))
     vertices = scenery.world.mesh.vertices[scenery.world.mesh.faces].astype(np.float64)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from PIL import Image
 
 from wearcap.errors import WearcapError
@@ -98,8 +98,13 @@ def scan_world(
     # Most faces of a world are inside or below others: a face is sampled if some of a few random points are seen.
     probed = np.repeat(np.arange(len(scenery.faces)), PROBES)
     _, kept = _measured(scenery, survey, scanner, probed, _on_faces(scenery, probed, rng), rng)
+    a, b, c = (scenery.vertices[scenery.faces[:, corner]].astype(np.float64) for corner in range(3))
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    ends = rng.poisson(kept.reshape(-1, PROBES).any(1) * area / spacing_m**2).cumsum()
     points, colors = [], []
-    for face, place in _samples(scenery, spacing_m, kept.reshape(-1, PROBES).any(1), rng):
+    for start in range(0, int(ends[-1]), CHUNK):
+        face = np.searchsorted(ends, np.arange(start, min(start + CHUNK, int(ends[-1]))), side="right")
+        place = _on_faces(scenery, face, rng)
         measured, kept = _measured(scenery, survey, scanner, face, place, rng)
         points.append(measured[kept].astype(np.float32))
         footprint = np.full(int(kept.sum()), max(spacing_m, 0.01))
@@ -127,17 +132,6 @@ def place_stations(world: World, spacing_m: float, clearance_m: float = 0.45) ->
         chosen.append(int(left.argmax()))
         left &= np.linalg.norm(points - points[chosen[-1]], axis=1) >= spacing_m
     return points[chosen]
-
-
-def _samples(scenery: Scenery, spacing_m: float, wanted: Bool[np.ndarray, "face"], rng: np.random.Generator):
-    """(faces, points) of samples of the wanted faces as dense as the spacing asks, `CHUNK` or so at a time."""
-    a, b, c = (scenery.vertices[scenery.faces[:, corner]].astype(np.float64) for corner in range(3))
-    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    ends = rng.poisson(wanted * area / spacing_m**2).cumsum()
-    for start in range(0, int(ends[-1]), CHUNK):
-        number = np.arange(start, min(start + CHUNK, int(ends[-1])))
-        face = np.searchsorted(ends, number, side="right")
-        yield face, _on_faces(scenery, face, rng)
 
 
 def _on_faces(
