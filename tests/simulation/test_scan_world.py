@@ -68,7 +68,7 @@ def test_stations_cover_the_floor(scenery):
     gaps = np.linalg.norm(stations[:, None] - stations[None], axis=-1) + 9 * np.eye(len(stations))
     assert gaps.min() >= 2.0
     free = scenery.world.navigation.node_points
-    free = free[scenery.world.clearance(free) > 0.45]
+    free = free[scenery.world.navigation.clearance_at(free) > 0.45]
     assert np.linalg.norm(free[:, None] - stations[None], axis=-1).min(1).max() <= 2.0
 
 

@@ -40,7 +40,7 @@ def test_the_capture_spot_is_free_and_beside_a_table(site):
     grid = np.stack(np.meshgrid(*2 * [np.linspace(-0.4, 0.4, 9) * spot.size]), -1).reshape(-1, 2)
     points = np.concatenate([grid + np.array(spot.position[:2]), np.full((len(grid), 1), spot.position[2])], 1)
     inside = np.linalg.norm(grid, axis=1) < spot.size / 2 - 0.3
-    assert (site.clearance(points[inside]) > 0.2).all()
+    assert (site.navigation.clearance_at(points[inside]) > 0.2).all()
     ahead = np.array([np.cos(spot.heading), np.sin(spot.heading)])
     table = min(
         (item for item in site.objects if item.kind == "table"),

@@ -74,7 +74,7 @@ def start_place(world: World, rng: np.random.Generator) -> tuple[Float[np.ndarra
 def _free_point(world: World, rng: np.random.Generator, beside_z: float | None = None) -> Float[np.ndarray, "3"]:
     """A random free place to stand; outdoors, often one that is higher or lower than `beside_z` (m)."""
     points = world.sample_floor(rng, 24)
-    free = (world.clearance(points) > FREE_M) & ~world.on_stairs(points)
+    free = (world.navigation.clearance_at(points) > FREE_M) & ~world.on_stairs(points)
     if world.outdoors and beside_z is not None and rng.random() < ELSEWHERE:
         other = free & (np.abs(points[:, 2] - beside_z) > 0.3)
         free = other if other.any() else free

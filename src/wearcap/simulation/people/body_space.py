@@ -70,7 +70,13 @@ class BodySpace:
             points = (start + share * (end - start)).reshape(-1, 3)
             points[:, 2] += SOLE_M if part == "foot" else 0.0
             groups.setdefault((radius, PARTS.index(part)), []).append(points)
-        thinned = {kind: _thinned(np.concatenate(points)) for kind, points in groups.items()}
+        thinned = {}
+        for kind, parts in groups.items():  # one point for each cube of side `VOXEL_M` that contains any
+            points = np.concatenate(parts)
+            cube = np.floor(points / VOXEL_M).astype(np.int64)
+            cube -= cube.min(0)
+            key = (cube[:, 0] * (cube[:, 1].max() + 1) + cube[:, 1]) * (cube[:, 2].max() + 1) + cube[:, 2]
+            thinned[kind] = points[np.unique(key, return_index=True)[1]]
         counts = [len(points) for points in thinned.values()]
         radius, part = (np.repeat(column, counts) for column in zip(*thinned))
         return cls(np.concatenate(list(thinned.values())), radius, part)
@@ -125,14 +131,6 @@ def mass_center(motion: Motion) -> Float[np.ndarray, "time 3"]:
 def foot_points(motion: Motion) -> Float[np.ndarray, "time patch 3"]:
     """Positions of `FOOT_PATCHES` (m)."""
     return site_positions(motion.skeleton, motion.T_world_joint, FOOT_PATCHES).double().numpy()
-
-
-def _thinned(points: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "kept 3"]:
-    """One point for each cube of side `VOXEL_M` that contains any."""
-    cube = np.floor(points / VOXEL_M).astype(np.int64)
-    cube -= cube.min(0)
-    key = (cube[:, 0] * (cube[:, 1].max() + 1) + cube[:, 1]) * (cube[:, 2].max() + 1) + cube[:, 2]
-    return points[np.unique(key, return_index=True)[1]]
 
 
 @dataclass(frozen=True, eq=False)

@@ -144,7 +144,16 @@ def walk_along(
     if abs(wrap(ahead - plan.heading)) > np.deg2rad(50):
         turn_to(plan, ahead - np.sign(wrap(ahead - plan.heading)) * np.deg2rad(15), rng)
     steps = round(course.phase[-1])
-    side = _first_foot(plan, wrap(course.at_phase("heading", 1.0) - plan.heading), rng)
+    # first the foot behind, else the inner one of a turn, else either
+    turned = wrap(course.at_phase("heading", 1.0) - plan.heading)
+    apart = (plan.prints["left"][-1].ground - plan.prints["right"][-1].ground)[:2]
+    leads = apart @ turn(plan.heading)[:, 0]
+    if abs(leads) > 0.1:
+        side = "right" if leads > 0 else "left"
+    elif abs(turned) > 0.2:
+        side = "left" if turned > 0 else "right"
+    else:
+        side = SIDES[int(rng.random() < 0.5)]
     lands = np.array([course.at_phase("time", k - 0.5) for k in range(1, steps + 1)])
     tempo = np.diff(lands, append=lands[-1] + 0.55) if steps > 1 else np.array([0.6])
     lands = lands + plan.style.gait.variability * rng.standard_normal(steps) * np.clip(tempo, 0, 0.6) * 0.6
@@ -222,17 +231,6 @@ def _tread_anchors(points: np.ndarray, flight: Flight, foot: float) -> list[tupl
     return [(float(place), up, flight.tread) for place in places]
 
 
-def _first_foot(plan: Plan, turned: float, rng: np.random.Generator) -> str:
-    """The foot behind, else the inner one of a turn by an angle (rad), else either."""
-    apart = (plan.prints["left"][-1].ground - plan.prints["right"][-1].ground)[:2]
-    ahead = apart @ turn(plan.heading)[:, 0]
-    if abs(ahead) > 0.1:
-        return "right" if ahead > 0 else "left"
-    if abs(turned) > 0.2:
-        return "left" if turned > 0 else "right"
-    return SIDES[int(rng.random() < 0.5)]
-
-
 def turn_to(plan: Plan, heading: float, rng: np.random.Generator) -> None:
     """Turn on the spot to a heading (rad) in steps of at most about 55 degrees, the inner foot first."""
     start, center = plan.heading, plan.position
@@ -274,9 +272,6 @@ class _BodyPath:
 
     def at(self, name: str, time: float) -> float:
         return float(np.interp(time, self.times, getattr(self, name)))
-
-    def place_at(self, time: float) -> Float[np.ndarray, "3"]:
-        return np.array([np.interp(time, self.times, column) for column in self.place.T])
 
     def landings(
         self, plan: Plan, rng: np.random.Generator
@@ -321,7 +316,7 @@ class _BodyPath:
     ) -> None:
         """One step whose stance has its middle at a time; `timing` is its landing, swing and the steps' interval (s)."""
         land, swing, beat = timing
-        gait, (x, y, heading) = plan.style.gait, self.place_at(middle)
+        gait, (x, y, heading) = plan.style.gait, (np.interp(middle, self.times, column) for column in self.place.T)
         across, ahead = abs(self.at("aside", middle)) * beat, self.at("ahead", middle)
         half = max(gait.stance_width, across + CLOSE_M) / 2 * (1.0 + gait.variability * rng.standard_normal())
         center = np.array([x, y, plan.position[2]])

@@ -118,7 +118,8 @@ class NavigationGrid:
 
     def layer_of(self, points: Float[np.ndarray, "*batch 3"]) -> Int[np.ndarray, "*batch"]:
         """Index of the layer whose floor is nearest in height to each point."""
-        i, j = np.moveaxis(self._index_of(points[..., :2]), -1, 0)
+        index = np.floor((points[..., :2] - self.origin) / self.cell).astype(int)
+        i, j = np.moveaxis(np.clip(index, 0, np.array(self.height.shape[1:]) - 1), -1, 0)
         gap = np.abs(self.height[:, i, j] - points[..., 2])
         return np.where(np.isnan(gap), np.inf, gap).argmin(0)
 
@@ -135,10 +136,6 @@ class NavigationGrid:
         near = (1 - v) * self.clearance[layer, i, j] + v * self.clearance[layer, i, j + 1]
         far = (1 - v) * self.clearance[layer, i + 1, j] + v * self.clearance[layer, i + 1, j + 1]
         return (1 - u) * near + u * far
-
-    def _index_of(self, points_xy: np.ndarray) -> np.ndarray:
-        index = np.floor((points_xy - self.origin) / self.cell).astype(int)
-        return np.clip(index, 0, np.array(self.height.shape[1:]) - 1)
 
     def nearest_node(self, point: Float[np.ndarray, "3"]) -> int | None:
         """The walkable cell nearest to a floor point, within 1.5 m and on its storey; None when there is none."""

@@ -75,12 +75,12 @@ class _Layout:
     """From left to right."""
 
     @classmethod
-    def drawn(cls, rng: np.random.Generator, ramp_slope: float | None) -> "_Layout":
+    def drawn(cls, rng: np.random.Generator) -> "_Layout":
         kerb, street = rng.uniform(0.10, 0.15), rng.uniform(3.6, 5.5)
         pavement = street + rng.uniform(2.2, 3.2)
         steps, rise, tread = int(rng.integers(3, 7)), rng.uniform(0.15, 0.17), rng.uniform(0.30, 0.32)
         height = steps * rise
-        slope = float(np.clip(ramp_slope or rng.uniform(0.07, 0.10), height / LONGEST_RAMP_M, 0.10))
+        slope = float(np.clip(rng.uniform(0.07, 0.10), height / LONGEST_RAMP_M, 0.10))
         run, ramp_width = height / slope, rng.uniform(1.6, 2.1)
         long, deep = rng.uniform(4.5, 6.5), rng.uniform(2.8, 3.6)
         depth = pavement + deep + (steps - 1) * tread + rng.uniform(2.2, 3.5)
@@ -112,10 +112,10 @@ class _Layout:
         )
 
 
-def build_outdoor(rng: np.random.Generator, name: str, ramp_slope: float | None = None) -> World:
-    """An open place with kerbs of 10–15 cm, stairs and a ramp of 7–10 % (`ramp_slope` None leaves it to chance)."""
+def build_outdoor(rng: np.random.Generator, name: str) -> World:
+    """An open place with kerbs of 10–15 cm, stairs and a ramp of 7–10 %."""
     builder = WorldBuilder.drawn(name, rng, outdoors=True)
-    layout = _Layout.drawn(rng, ramp_slope)
+    layout = _Layout.drawn(rng)
     _build_ground(builder, layout, rng)
     _build_terrace(builder, layout)
     _build_borders(builder, layout, rng)

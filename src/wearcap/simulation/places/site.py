@@ -41,6 +41,7 @@ MOVABLE = (
     *("desk", "cabinet", "sofa", "planter"),
 )
 """Kinds of objects that may stand elsewhere, or be gone, some days later."""
+MOST_M = 0.5
 
 
 @dataclass(frozen=True)
@@ -236,18 +237,16 @@ def _add_capture_spot(plan: Plan, rng: np.random.Generator) -> None:
     builder.places.spots.append(spot)
 
 
-def changed_world(
-    world: World, rng: np.random.Generator, moved: float = 0.4, removed: float = 0.15, most_m: float = 0.5
-) -> World:
+def changed_world(world: World, rng: np.random.Generator, moved: float = 0.4, removed: float = 0.15) -> World:
     """The world with these shares of its movable objects shifted (and turned), or removed.
 
-    Walkers keep to the world as it was: objects are moved by at most `most_m`. The capture spots' tables stay.
+    Walkers keep to the world as it was: objects are moved by at most `MOST_M`. The capture spots' tables stay.
     """
     vertices, kept = world.mesh.vertices.copy(), np.ones(len(world.mesh.faces), bool)
     objects = list(world.objects)
     for number, item in enumerate(world.objects):
         luck = rng.random()
-        shift, angle = rng.uniform(-most_m, most_m, 2) / np.sqrt(2), rng.normal(0.0, 0.4)
+        shift, angle = rng.uniform(-MOST_M, MOST_M, 2) / np.sqrt(2), rng.normal(0.0, 0.4)
         here = np.array(item.position[:2])
         at_spot = any(np.linalg.norm(here - spot.position[:2]) < spot.size for spot in world.places.spots)
         if item.kind not in MOVABLE or luck > moved + removed or at_spot:

@@ -260,7 +260,13 @@ def surround(motion: Motion, rng: np.random.Generator, name: str) -> World:
     fast = float(np.linalg.norm(path[-1] - path[0])) / max(duration_s, 0.1) > FAST
     tall = bool((body.points[:, 2] + body.radius).max() > TALL_M)
     outdoors = bool(rng.uniform() < (0.75 if fast else 0.12)) | tall
-    builder = WorldBuilder(name, _heading(path, rng), tuple(path.mean(0).tolist()), outdoors)
+    offset = path - path.mean(0)
+    if np.ptp(offset, axis=0).max() < 2.0:  # the body stays in one place
+        heading = float(rng.uniform(-np.pi, np.pi))
+    else:  # roughly along the path
+        along = np.linalg.svd(offset, full_matrices=False)[2][0]
+        heading = float(np.arctan2(along[1], along[0]) + rng.normal(0.0, 0.12))
+    builder = WorldBuilder(name, heading, tuple(path.mean(0).tolist()), outdoors)
     turned = body.points.copy()
     turned[:, :2] = builder.from_world(turned[:, :2])
     here = BodySpace(turned, body.radius, body.part)
@@ -274,15 +280,6 @@ def surround(motion: Motion, rng: np.random.Generator, name: str) -> World:
     reach = around(np.concatenate([here.points[:, :2] + side * here.radius[:, None] for side in (-1, 1)]))
     (plan.build_street if outdoors else plan.build_room)(reach, builder.from_world(path), rng)
     return builder.finish()
-
-
-def _heading(path: Float[np.ndarray, "time 2"], rng: np.random.Generator) -> float:
-    """Heading of a room: roughly along the path; random for a body that stays in one place."""
-    offset = path - path.mean(0)
-    if np.ptp(offset, axis=0).max() < 2.0:
-        return float(rng.uniform(-np.pi, np.pi))
-    along = np.linalg.svd(offset, full_matrices=False)[2][0]
-    return float(np.arctan2(along[1], along[0]) + rng.normal(0.0, 0.12))
 
 
 def find_sits(motion: Motion) -> list[_Sit]:

@@ -202,10 +202,6 @@ class World:
         """The planning grid, built at first use."""
         return NavigationGrid.build(self.surfaces, self.objects, self.cell)
 
-    def clearance(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
-        """Distance (m, to about a cell) from floor points to the nearest obstacle; 0 inside one."""
-        return self.navigation.clearance_at(points)
-
     def on_stairs(self, points: Float[np.ndarray, "point 3"]) -> Bool[np.ndarray, "point"]:
         """Whether floor points lie on a flight or within a step of its ends."""
         near = np.zeros(len(points), bool)

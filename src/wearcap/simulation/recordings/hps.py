@@ -216,7 +216,7 @@ class _Session:
     def wander(self, until_m: float) -> None:
         """Walk from place to place as long as the path home leaves room for it."""
         points = self.world.navigation.node_points
-        free = (self.world.clearance(points) > FREE_M) & ~self.world.on_stairs(points)
+        free = (self.world.navigation.clearance_at(points) > FREE_M) & ~self.world.on_stairs(points)
         while True:
             there = self.world.navigation.lengths_from(self.plan.position)
             left = until_m - self.travelled

@@ -166,7 +166,15 @@ def ego_frames(
     world: World, motion: Motion, shape: dict[str, float], stream: CameraStream, rng: np.random.Generator
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """The image at each timestamp of the stream, which must be timestamps of the motion."""
-    scenery, body, lens = Scenery.of(world), _Body.dressed(motion.skeleton, shape, rng), _lens()
+    scenery, body = Scenery.of(world), _Body.dressed(motion.skeleton, shape, rng)
+    camera = EGO_CAMERA
+    x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    plane = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy], -1)
+    rays = np.concatenate([plane, np.ones((*x.shape, 1))], -1).reshape(-1, 3).astype(np.float32)
+    length = np.linalg.norm(rays, axis=-1)
+    view = View(np.eye(3), camera.fx, camera.cx, camera.cy, camera.width, camera.height)
+    # one sample per pixel
+    lens = Lens(rays / length[:, None], np.arange(len(rays), dtype=np.int32), length, 1.0 / camera.fx, (view,))
     rows = torch.searchsorted(motion.timestamps, stream.timestamps.contiguous())
     T_head_cam = Rigid(stream.R_head_cam, stream.t_head_cam)
     shot = _Shot.drawn(len(rows), rng)
@@ -179,17 +187,6 @@ def ego_frames(
             light *= shot.gain * shot.exposure[first + number]
             light += shot.noise * rng.standard_normal(light.shape, np.float32) + 0.5
             yield np.clip(light, 0, 255).astype(np.uint8)
-
-
-def _lens() -> Lens:
-    """The lens of `EGO_CAMERA`, one sample per pixel."""
-    x, y = np.meshgrid(np.arange(EGO_CAMERA.width), np.arange(EGO_CAMERA.height))
-    plane = np.stack([(x - EGO_CAMERA.cx) / EGO_CAMERA.fx, (y - EGO_CAMERA.cy) / EGO_CAMERA.fy], -1)
-    rays = np.concatenate([plane, np.ones((*x.shape, 1))], -1).reshape(-1, 3).astype(np.float32)
-    length = np.linalg.norm(rays, axis=-1)
-    view = View(np.eye(3), EGO_CAMERA.fx, EGO_CAMERA.cx, EGO_CAMERA.cy, EGO_CAMERA.width, EGO_CAMERA.height)
-    slots = np.arange(len(rays), dtype=np.int32)
-    return Lens(rays / length[:, None], slots, length, 1.0 / EGO_CAMERA.fx, (view,))
 
 
 def _drawn(

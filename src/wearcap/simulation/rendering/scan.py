@@ -124,7 +124,7 @@ def _measured(scenery: Scenery, survey: tuple, scanner: Scanner, face, place, rn
 def place_stations(world: World, spacing_m: float, clearance_m: float = 0.45) -> Float[np.ndarray, "station 3"]:
     """Floor points (m) that cover the walkable area, none nearer to another than the spacing; always the same."""
     points = world.navigation.node_points
-    free = points[world.clearance(points) > clearance_m]
+    free = points[world.navigation.clearance_at(points) > clearance_m]
     points = free if len(free) else points
     left = np.ones(len(points), bool)
     chosen = []

@@ -87,20 +87,16 @@ def render_view(
     T_world_cam: Rigid,
     development: Development = Development(),
     rng: np.random.Generator | None = None,
-    samples: int = 1,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """The image of a camera; several poses ("frame 3 3", "frame 3") are averaged: motion blur.
 
-    `samples` n averages n x n rays per pixel (smooth outlines). `rng` is needed for noise alone.
+    `rng` is needed for noise alone.
     """
     poses = T_world_cam if T_world_cam.R.ndim == 3 else T_world_cam[None]
-    fine = camera.scaled(samples * camera.width, samples * camera.height) if samples > 1 else camera
-    light = np.zeros((fine.height, fine.width, 3), np.float32)
+    light = np.zeros((camera.height, camera.width, 3), np.float32)
     for number in range(len(poses.t)):
-        light += exposed(scenery, fine, poses[number])[0]
+        light += exposed(scenery, camera, poses[number])[0]
     light /= len(poses.t)
-    if samples > 1:
-        light = light.reshape(camera.height, samples, camera.width, samples, 3).mean((1, 3))
     if development.contrast != 1.0:
         light = light.mean() + development.contrast * (light - light.mean())
     if development.exposure != 1.0:
