@@ -100,6 +100,42 @@ class _Layout:
             walls.append(between)
         return walls
 
+    def build_open_air(self, builder: WorldBuilder, rng: np.random.Generator) -> None:
+        """Terrace, stairs and ramp with their railings, the yard's paving and lawn, walls and a house around it."""
+        x_low, y_low, x_high, edge = self.terrace
+        paving, gray = (0.62, 0.60, 0.56), float(rng.uniform(0.34, 0.46))
+        builder.add_slab("floor", self.terrace, 0.0, -BASE + 0.05, STONE, 6.0)
+        builder.add_slab("ramp", self.ramp, 0.0, -BASE, paving, 6.0, (0.0, -RAMP_SLOPE, RAMP_SLOPE * edge))
+        start = (self.stair_x, edge + (RISERS - 1) * TREAD_M)
+        build_flight(builder, Flight(start, -np.pi / 2, RISERS, RISE_M, TREAD_M, self.stair_width, BASE), color=STONE)
+        half = self.stair_width / 2
+        gaps = sorted([(self.ramp[0], self.ramp[2]), (self.stair_x - half - 0.03, self.stair_x + half + 0.03)])
+        ends = [x_low + 0.05, *(x for gap in gaps for x in gap), x_high - 0.05]
+        for a, b in zip(ends[::2], ends[1::2]):
+            if b - a > 0.1:
+                sloped_rail(builder, (a, edge - 0.05), (b, edge - 0.05), BASE, (0.0, 0.0))
+        for x in (self.ramp[0] + 0.05, self.ramp[2] - 0.05):
+            sloped_rail(builder, (x, edge), (x, self.ramp[3]), BASE, (0.0, BASE))
+        far = self.yard[3]
+        lawn = edge + (far - edge) * 0.62
+        builder.add_slab("floor", (x_low, edge, x_high, lawn), BASE, 0.05, (gray, gray, 1.04 * gray), 3.0)
+        builder.add_slab("floor", (x_low, lawn, x_high, far), BASE, 0.05, (0.30, 0.46, 0.22), 12.0)
+        builder.add_room("terrace", self.terrace, 0.0, open_air=True)
+        builder.add_room("yard", self.yard, BASE, open_air=True)
+        doors = [(float(x_high * share), BASE) for share in (0.3, 0.75)]
+        build_facade(builder, (x_low - 2, far, x_high + 2, far + 0.4), rng.uniform(5.5, 8.0), doors, BASE, rng)
+        for x in (x_low - 0.2, x_high + 0.2):
+            for y, next_y in pairwise(np.linspace(y_low + 0.1, far, 5)):
+                tall, hedge = rng.uniform(1.3, 2.4), rng.uniform() < 0.4
+                center, size = (x, (y + next_y) / 2, BASE + tall / 2), (0.3, next_y - y, tall)
+                if hedge:
+                    builder.add_block("hedge", center, size, (0.24, 0.42, 0.2), 35.0)
+                else:
+                    color = tuple(rng.uniform(0.4, 0.75) * np.array((1.0, 0.82, 0.72)))
+                    builder.add_block("garden_wall", center, size, color, 9.0)
+        ground = ((x_low + x_high) / 2, far / 2, BASE - 0.11)
+        builder.add_box(ground, (self.width + 30.0, far + 30.0, 0.1), (0.40, 0.50, 0.30), 1.0)
+
 
 def build_site(rng: np.random.Generator, name: str, scale: float = 1.0) -> World:
     """A site with its capture spot in the first hall; `scale` below 1 makes it smaller (0.6: about a third)."""
@@ -121,7 +157,7 @@ def build_site(rng: np.random.Generator, name: str, scale: float = 1.0) -> World
         for x in np.arange(box[0] + 1.3, box[2] - 1.0, 2.8):
             for y in np.arange(box[1] + 1.2, box[3] - 0.8, 2.6):
                 builder.add_box((float(x), float(y), HEIGHT - 0.03), (1.25, 0.28, 0.06), (1.0, 1.0, 0.97), 8.0)
-    _build_open_air(builder, layout, rng)
+    layout.build_open_air(builder, rng)
     _furnish(builder, layout, rng)
     return builder.finish()
 
@@ -136,43 +172,6 @@ def _row(box: Box, spacing: float, width: float) -> list[tuple[float, float]]:
     """Windows spread over a room's length."""
     count = max(int((box[2] - box[0] - 0.8) / spacing), 1)
     return [(box[0] + (k + 0.5) * (box[2] - box[0]) / count, float(width)) for k in range(count)]
-
-
-def _build_open_air(builder: WorldBuilder, layout: _Layout, rng: np.random.Generator) -> None:
-    """Terrace, stairs and ramp with their railings, the yard's paving and lawn, walls and a house around it."""
-    x_low, y_low, x_high, edge = layout.terrace
-    paving, gray = (0.62, 0.60, 0.56), float(rng.uniform(0.34, 0.46))
-    builder.add_slab("floor", layout.terrace, 0.0, -BASE + 0.05, STONE, 6.0)
-    builder.add_slab("ramp", layout.ramp, 0.0, -BASE, paving, 6.0, (0.0, -RAMP_SLOPE, RAMP_SLOPE * edge))
-    start = (layout.stair_x, edge + (RISERS - 1) * TREAD_M)
-    build_flight(builder, Flight(start, -np.pi / 2, RISERS, RISE_M, TREAD_M, layout.stair_width, BASE), color=STONE)
-    half = layout.stair_width / 2
-    gaps = sorted([(layout.ramp[0], layout.ramp[2]), (layout.stair_x - half - 0.03, layout.stair_x + half + 0.03)])
-    ends = [x_low + 0.05, *(x for gap in gaps for x in gap), x_high - 0.05]
-    for a, b in zip(ends[::2], ends[1::2]):
-        if b - a > 0.1:
-            sloped_rail(builder, (a, edge - 0.05), (b, edge - 0.05), BASE, (0.0, 0.0))
-    for x in (layout.ramp[0] + 0.05, layout.ramp[2] - 0.05):
-        sloped_rail(builder, (x, edge), (x, layout.ramp[3]), BASE, (0.0, BASE))
-    far = layout.yard[3]
-    lawn = edge + (far - edge) * 0.62
-    builder.add_slab("floor", (x_low, edge, x_high, lawn), BASE, 0.05, (gray, gray, 1.04 * gray), 3.0)
-    builder.add_slab("floor", (x_low, lawn, x_high, far), BASE, 0.05, (0.30, 0.46, 0.22), 12.0)
-    builder.add_room("terrace", layout.terrace, 0.0, open_air=True)
-    builder.add_room("yard", layout.yard, BASE, open_air=True)
-    doors = [(float(x_high * share), BASE) for share in (0.3, 0.75)]
-    build_facade(builder, (x_low - 2, far, x_high + 2, far + 0.4), rng.uniform(5.5, 8.0), doors, BASE, rng)
-    for x in (x_low - 0.2, x_high + 0.2):
-        for y, next_y in pairwise(np.linspace(y_low + 0.1, far, 5)):
-            tall, hedge = rng.uniform(1.3, 2.4), rng.uniform() < 0.4
-            center, size = (x, (y + next_y) / 2, BASE + tall / 2), (0.3, next_y - y, tall)
-            if hedge:
-                builder.add_block("hedge", center, size, (0.24, 0.42, 0.2), 35.0)
-            else:
-                color = tuple(rng.uniform(0.4, 0.75) * np.array((1.0, 0.82, 0.72)))
-                builder.add_block("garden_wall", center, size, color, 9.0)
-    ground = ((x_low + x_high) / 2, far / 2, BASE - 0.11)
-    builder.add_box(ground, (layout.width + 30.0, far + 30.0, 0.1), (0.40, 0.50, 0.30), 1.0)
 
 
 def _furnish(builder: WorldBuilder, layout: _Layout, rng: np.random.Generator) -> None:
