@@ -3,6 +3,7 @@
 import colorsys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -79,11 +80,11 @@ def hue(rng: np.random.Generator, saturation: tuple[float, float] = (0.15, 0.7))
     return colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(*saturation), rng.uniform(0.45, 0.9))
 
 
-def entered(table: dict[str, Callable], name: str) -> Callable:
-    """Decorator that enters a maker in a table under a name."""
+def entered(table: dict[str, Callable], *kinds: str) -> Callable:
+    """Decorator that enters a maker in a table under a kind; a maker of several kinds is given its `kind`."""
 
     def enter(maker: Callable) -> Callable:
-        table[name] = maker
+        table.update({kind: partial(maker, kind=kind) if len(kinds) > 1 else maker for kind in kinds})
         return maker
 
     return enter

@@ -7,7 +7,6 @@ of floor so that they overlap nothing, block no door and are usable from their f
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 
@@ -74,6 +73,7 @@ def _chair(rng: np.random.Generator) -> Piece:
     return Piece("chair", (depth, width), (0.0, back), parts_of(rows), seats=((0.0, 0.0, seat, 0.0, depth / 2),))
 
 
+@entered(MAKERS, "armchair", "sofa")
 def _upholstered(rng: np.random.Generator, kind: str) -> Piece:
     places = 1 if kind == "armchair" else int(rng.integers(2, 4))
     depth, arm, seat = rng.uniform(0.80, 0.90), 0.16, rng.uniform(0.42, 0.46)
@@ -108,6 +108,7 @@ def _bed(rng: np.random.Generator) -> Piece:
     return Piece("bed", (width, length), (0.0, 1.0), parts_of(rows), seats=seats)
 
 
+@entered(MAKERS, *TABLES)
 def _laid_table(rng: np.random.Generator, kind: str) -> Piece:
     """A table with props on it, a desk also with a screen; its first five parts are the legs and the top."""
     depth, width, top = (rng.uniform(*span) for span in TABLES[kind])
@@ -123,10 +124,6 @@ def _laid_table(rng: np.random.Generator, kind: str) -> Piece:
         props.append(Part((-depth / 4, 0, top + 0.28), (0.03, 0.55, 0.34), DARK, 30.0))
         high += 0.45
     return Piece(kind, (depth, width), (0.0, high), (*parts_of(rows), *props), reaches=reaches)
-
-
-MAKERS |= {kind: partial(_upholstered, kind=kind) for kind in ("armchair", "sofa")}
-MAKERS |= {kind: partial(_laid_table, kind=kind) for kind in TABLES}
 
 
 @entered(MAKERS, "shelf")

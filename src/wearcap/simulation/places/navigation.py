@@ -93,10 +93,6 @@ class NavigationGrid:
         return NavigationGrid(self.origin, self.cell, self.height, clearance, walkable)
 
     @cached_property
-    def _cells(self) -> Int[np.ndarray, "node 3"]:
-        return np.argwhere(self.walkable)
-
-    @cached_property
     def _graph(self) -> tuple[scipy.sparse.csr_array, np.ndarray, np.ndarray]:
         """Links with their lengths (m, climbs included), and the two nodes of each link in the matrix's order."""
         first, second = _links(self.height, self.walkable)
@@ -112,9 +108,8 @@ class NavigationGrid:
 
     @cached_property
     def node_points(self) -> Float[np.ndarray, "node 3"]:
-        layer, i, j = self._cells.T
-        xy = self.origin + (self._cells[:, 1:] + 0.5) * self.cell
-        return np.concatenate([xy, self.height[layer, i, j][:, None]], 1)
+        xy = self.origin + (np.argwhere(self.walkable)[:, 1:] + 0.5) * self.cell
+        return np.concatenate([xy, self.height[self.walkable][:, None]], 1)
 
     def layer_of(self, points: Float[np.ndarray, "*batch 3"]) -> Int[np.ndarray, "*batch"]:
         """Index of the layer whose floor is nearest in height to each point."""
@@ -143,12 +138,6 @@ class NavigationGrid:
         distance = np.linalg.norm(offset[:, :2], axis=1) + np.where(np.abs(offset[:, 2]) < 0.6, 0.0, np.inf)
         nearest = int(distance.argmin())
         return nearest if distance[nearest] < SNAP_M else None
-
-    def sample(self, rng: np.random.Generator, count: int) -> Float[np.ndarray, "count 3"]:
-        """Random positions within walkable cells (m)."""
-        points = self.node_points[rng.integers(len(self.node_points), size=count)]
-        points[:, :2] += rng.uniform(-0.5, 0.5, (count, 2)) * self.cell
-        return points
 
     def lengths_from(self, start: Float[np.ndarray, "3"]) -> Float[np.ndarray, "node"]:
         """Length (m) of the shortest path from a floor point to every walkable cell (`node_points`)."""

@@ -186,7 +186,20 @@ def _furnish(builder: WorldBuilder, layout: _Layout, rng: np.random.Generator) -
     for number, box in enumerate(layout.halls):
         plan = Plan(builder, inset(box, margin), 0.0, list(free))
         if number == 0:
-            _add_capture_spot(plan, rng)
+            # the capture spot: a free square in the middle of the hall, a table at one side of it
+            x_low, y_low, x_high, y_high = plan.room
+            table, half = MAKERS["table"](rng), SPOT_M / 2
+            x, y = float(rng.uniform(x_low + half + 0.8, x_high - half - 0.8)), (y_low + y_high) / 2
+            for heading in rng.permutation(4) * np.pi / 2:
+                ahead = np.array([np.cos(heading), np.sin(heading)])
+                place = np.array([x, y]) + (half + table.size[0] / 2) * ahead
+                if plan.try_place(table, float(place[0]), float(place[1]), float(heading + np.pi)):
+                    break
+            else:
+                raise AssertionError("a hall always has room for the capture spot's table")
+            plan.kept_free.append((x - half, y - half, x + half, y + half))
+            at, facing = builder.point(x, y, plan.z), builder.heading + float(heading)
+            builder.places.spots.append(CaptureSpot(at, facing, SPOT_M, half, table.z_range[1]))
         # columns down the middle, out of the walkers' path, with notices on them
         y, color = (plan.room[1] + plan.room[3]) / 2, hue(rng, (0.0, 0.1))
         for x in np.arange(plan.room[0] + 2.5, plan.room[2] - 1.5, 4.2):
@@ -214,26 +227,6 @@ def _furnish(builder: WorldBuilder, layout: _Layout, rng: np.random.Generator) -
         plan = Plan(builder, box, z, [stairs, ramp, *free])
         for kind in kinds:
             plan.somewhere(kind, rng)
-
-
-def _add_capture_spot(plan: Plan, rng: np.random.Generator) -> None:
-    """A free square in the middle of a hall, a table at one side of it."""
-    x_low, y_low, x_high, y_high = plan.room
-    table, half = MAKERS["table"](rng), SPOT_M / 2
-    depth = table.size[0] / 2
-    x = float(rng.uniform(x_low + half + 0.8, x_high - half - 0.8))
-    y = (y_low + y_high) / 2
-    for heading in rng.permutation(4) * np.pi / 2:
-        ahead = np.array([np.cos(heading), np.sin(heading)])
-        place = np.array([x, y]) + (half + depth) * ahead
-        if plan.try_place(table, float(place[0]), float(place[1]), float(heading + np.pi)):
-            break
-    else:
-        raise AssertionError("a hall always has room for the capture spot's table")
-    plan.kept_free.append((x - half, y - half, x + half, y + half))
-    builder = plan.builder
-    spot = CaptureSpot(builder.point(x, y, plan.z), builder.heading + float(heading), SPOT_M, half, table.z_range[1])
-    builder.places.spots.append(spot)
 
 
 def changed_world(world: World, rng: np.random.Generator, moved: float = 0.4, removed: float = 0.15) -> World:

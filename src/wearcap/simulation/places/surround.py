@@ -10,14 +10,14 @@ both feet are off the floor, sits; a lower foot at rest above the floor while th
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations, product
+from itertools import product
 
 import numpy as np
 import scipy.ndimage
 from jaxtyping import Bool, Float
 
 from wearcap.recording.motion import Motion
-from wearcap.simulation.people.body_space import BodySpace, SweptFloor, foot_points, mass_center
+from wearcap.simulation.people.body_space import BodySpace, SweptFloor, foot_points, mass_center, off_balance
 from wearcap.simulation.places.builder import Piece, WorldBuilder, entered, hue
 from wearcap.simulation.places.furniture import BOTH, IRON, MAKERS, ROOM_KINDS, Plan, parts_of, wood
 from wearcap.simulation.places.outdoor import MEADOW, PAVEMENT_KINDS, SQUARE_KINDS
@@ -287,14 +287,13 @@ def find_sits(motion: Motion) -> list[_Sit]:
     feet = foot_points(motion)
     pelvis = motion.joint("pelvis")
     place = pelvis.t.double().numpy()
-    off_balance = _outside(mass_center(motion)[:, :2], feet[..., :2]) > OFF_BALANCE_M
-    hanging = feet[..., 2].min(1) > LOWEST_STEP_M
+    unsupported = (off_balance(motion) > OFF_BALANCE_M) | (feet[..., 2].min(1) > LOWEST_STEP_M)
     still = _speed(motion, place) < STILL
     angles = []  # of the thighs from vertical
     for side in ("left", "right"):
         thigh = (motion.joint(f"{side}_knee").t - motion.joint(f"{side}_hip").t).double().numpy()
         angles.append(np.arccos(np.clip(-thigh[:, 2] / np.linalg.norm(thigh, axis=1), -1.0, 1.0)))
-    sitting = still & (np.minimum(*angles) > np.deg2rad(BENT_DEG)) & (off_balance | hanging)
+    sitting = still & (np.minimum(*angles) > np.deg2rad(BENT_DEG)) & unsupported
     forward = pelvis.R[..., 0].double().numpy()
     sits: list[_Sit] = []
     for start, stop in sorted(_stretches(sitting, motion, SIT_S), key=lambda span: span[0] - span[1]):
@@ -428,22 +427,3 @@ def _stretches(holds: Bool[np.ndarray, "time"], motion: Motion, least_s: float) 
     """First frame and end of every run of true frames that lasts long enough."""
     edges = np.flatnonzero(np.diff(np.pad(holds, 1).astype(np.int8)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2]) if (b - a) / motion.fps >= least_s]
-
-
-def _outside(
-    points: Float[np.ndarray, "time 2"], corners: Float[np.ndarray, "time corner 2"]
-) -> Float[np.ndarray, "time"]:
-    """Distance (m) of each point from the convex hull of its corners."""
-    count = corners.shape[1]
-    best = np.full(len(points), np.inf)
-    for i, j in combinations(range(count), 2):
-        edge, offset = corners[:, j] - corners[:, i], points - corners[:, i]
-        share = np.clip((offset * edge).sum(1) / np.maximum((edge * edge).sum(1), 1e-12), 0.0, 1.0)
-        best = np.minimum(best, np.linalg.norm(offset - share[:, None] * edge, axis=1))
-    for three in combinations(range(count), 3):
-        sides = []
-        for a, b in zip(three, (*three[1:], three[0])):
-            edge, offset = corners[:, b] - corners[:, a], points - corners[:, a]
-            sides.append(edge[:, 0] * offset[:, 1] - edge[:, 1] * offset[:, 0])
-        best[(np.min(sides, 0) >= 0) | (np.max(sides, 0) <= 0)] = 0.0
-    return best

@@ -18,6 +18,7 @@ from wearcap.simulation.places.outline import points_in_convex
 
 STEP_UP_M = 0.35
 """Largest height above the last floor at which a foot finds a floor."""
+CALF_TO_EDGE_M = 0.12
 
 
 @dataclass(frozen=True)
@@ -61,15 +62,10 @@ class Seat:
     depth: float
     """Distance from `position` forward to the seat's front edge (m)."""
 
-    @property
-    def floor_z(self) -> float:
-        return self.position[2] - self.height
-
-    def standing_point(self, calf_to_edge: float = 0.12) -> Float[np.ndarray, "3"]:
+    def standing_point(self) -> Float[np.ndarray, "3"]:
         """Floor point below the pelvis of someone who stands in front of the seat, ready to sit down (m)."""
-        x, y, _ = self.position
-        reach = self.depth + calf_to_edge
-        return np.array([x + reach * np.cos(self.heading), y + reach * np.sin(self.heading), self.floor_z])
+        (x, y, z), reach = self.position, self.depth + CALF_TO_EDGE_M
+        return np.array([x + reach * np.cos(self.heading), y + reach * np.sin(self.heading), z - self.height])
 
 
 @dataclass(frozen=True)
@@ -227,6 +223,8 @@ class World:
 
     def sample_floor(self, rng: np.random.Generator, count: int) -> Float[np.ndarray, "count 3"]:
         """Random floor points (m) in the largest connected walkable part."""
-        points = self.navigation.sample(rng, count)
+        nodes = self.navigation.node_points
+        points = nodes[rng.integers(len(nodes), size=count)]
+        points[:, :2] += rng.uniform(-0.5, 0.5, (count, 2)) * self.cell
         points[:, 2] = self.floor_height(points[:, :2], points[:, 2])
         return points

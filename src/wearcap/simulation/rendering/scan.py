@@ -146,25 +146,6 @@ def _on_faces(
 
 
 @compiled
-def _cube_pixel(x, y, z, size):
-    """Side of the cube around a station, row and column, and depth before that side, of an offset from it."""
-    ax, ay, az = abs(x), abs(y), abs(z)
-    if az >= ax and az >= ay:
-        side, depth = (0 if z > 0 else 5), az
-        u, v = (x if z > 0 else -x), y
-    elif ax >= ay:
-        side, depth = (1 if x > 0 else 2), ax
-        u, v = (-z if x > 0 else z), y
-    else:
-        side, depth = (3 if y > 0 else 4), ay
-        u, v = x, (-z if y > 0 else z)
-    depth = max(depth, 1e-6)
-    column = int(min(size - 1.0, max(0.0, math.floor(0.5 * size * (1.0 + u / depth)))))
-    row = int(min(size - 1.0, max(0.0, math.floor(0.5 * size * (1.0 + v / depth)))))
-    return side, row, column, depth
-
-
-@compiled
 def _measure(points, normals, survey, draws, errors, out, kept):
     """Measured position of every point that a station sees; `kept` is their mask.
 
@@ -191,7 +172,17 @@ def _measure(points, normals, survey, draws, errors, out, kept):
             facing = -(dx * normals[k, 0] + dy * normals[k, 1] + dz * normals[k, 2]) / distance
             if distance > max_m or distance < 0.3 or facing < 0.03:
                 continue
-            side, row, column, depth = _cube_pixel(dx, dy, dz, size)
+            # side of the cube around the station, depth before that side, row and column
+            ax, ay, az = abs(dx), abs(dy), abs(dz)
+            if az >= ax and az >= ay:
+                side, depth, u, v = (0 if dz > 0 else 5), az, (dx if dz > 0 else -dx), dy
+            elif ax >= ay:
+                side, depth, u, v = (1 if dx > 0 else 2), ax, (-dz if dx > 0 else dz), dy
+            else:
+                side, depth, u, v = (3 if dy > 0 else 4), ay, dx, (-dz if dy > 0 else dz)
+            depth = max(depth, 1e-6)
+            column = int(min(size - 1.0, max(0.0, math.floor(0.5 * size * (1.0 + u / depth)))))
+            row = int(min(size - 1.0, max(0.0, math.floor(0.5 * size * (1.0 + v / depth)))))
             drawn = nearness[station, side, row, column]
             if drawn * depth > 1.02 + 0.08 * (1.0 - min(1.0, 4.0 * facing)):
                 continue

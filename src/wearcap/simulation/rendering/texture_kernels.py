@@ -251,21 +251,6 @@ def _asphalt(a, b, red, green, blue, seed, footprint):
 
 
 @compiled
-def _paint(a, b, red, green, blue, seed, footprint):
-    """Lacquered wood, plastic or metal: even, with a few marks, labels and scratches."""
-    tone = 1.0 + 0.03 * _noise(a, b, 0.5, seed, footprint) + 0.03 * _noise(a, b, 0.06, seed + 1, footprint)
-    i, j = math.floor(a / 0.3), math.floor(b / 0.3)
-    if _chance(i, j, seed + 2) < 0.3:
-        x = a - (i + 0.2 + 0.6 * _chance(i, j, seed + 3)) * 0.3
-        y = b - (j + 0.2 + 0.6 * _chance(i, j, seed + 4)) * 0.3
-        half_x, half_y = 0.01 + 0.04 * _chance(i, j, seed + 5), 0.004 + 0.025 * _chance(i, j, seed + 6)
-        mark = 0.6 * _inside(min(half_x - abs(x), half_y - abs(y)), footprint) * _fade(4.0 * half_y, footprint)
-        to = 0.05 + 0.9 * _chance(i, j, seed + 7)
-        return _covered(red * tone, green * tone, blue * tone, to, to, to, mark)
-    return red * tone, green * tone, blue * tone
-
-
-@compiled
 def _ceiling(a, b, red, green, blue, seed, footprint):
     """Panels of 62 cm; some have a grille, a sprinkler or a stain."""
     size = 0.625
@@ -331,7 +316,18 @@ def _pattern(material, a, b, extent, red, green, blue, seed, footprint):
         return _asphalt(a, b, red, green, blue, seed, footprint)
     if material == CEILING:
         return _ceiling(a, b, red, green, blue, seed, footprint)
-    return _paint(a, b, red, green, blue, seed, footprint)
+    # lacquered wood, plastic or metal: even, with a few marks, labels and scratches
+    tone = 1.0 + 0.03 * _noise(a, b, 0.5, seed, footprint) + 0.03 * _noise(a, b, 0.06, seed + 1, footprint)
+    red, green, blue = red * tone, green * tone, blue * tone
+    i, j = math.floor(a / 0.3), math.floor(b / 0.3)
+    if _chance(i, j, seed + 2) >= 0.3:
+        return red, green, blue
+    x = a - (i + 0.2 + 0.6 * _chance(i, j, seed + 3)) * 0.3
+    y = b - (j + 0.2 + 0.6 * _chance(i, j, seed + 4)) * 0.3
+    half_x, half_y = 0.01 + 0.04 * _chance(i, j, seed + 5), 0.004 + 0.025 * _chance(i, j, seed + 6)
+    mark = 0.6 * _inside(min(half_x - abs(x), half_y - abs(y)), footprint) * _fade(4.0 * half_y, footprint)
+    to = 0.05 + 0.9 * _chance(i, j, seed + 7)
+    return _covered(red, green, blue, to, to, to, mark)
 
 
 @compiled
