@@ -125,16 +125,31 @@ def hold(
 
 
 def squat(
-    plan: Plan, rng: np.random.Generator, depth: float, lean: float, down: tuple[float, float], up: tuple[float, float]
-) -> None:
-    """Bend knees (m) and trunk (rad, forwards), and straighten them; `down` and `up` are starts and durations (s)."""
-    start, leave = down[0], up[0]
-    out, back = (start, start + down[1]), (leave, leave + up[1])
+    plan: Plan,
+    rng: np.random.Generator,
+    depths: tuple[float, float],
+    leans: tuple[float, float],
+    quickest_s: float,
+    longest_s: float,
+) -> tuple[float, float, float, float]:
+    """Bend knees and trunk, stay for up to `longest_s`, and straighten them.
+
+    `depths` is a range of shares of the hip height, `leans` one of forward leans (rad) of a flat squat, which would
+    take about `quickest_s`. Returns the starts and durations of both ways (s).
+    """
+    start = plan.time + 0.1
+    depth = rng.uniform(*depths) * plan.hip_height
+    down = (quickest_s + 1.1 * depth) * rng.uniform(0.9, 1.3) / plan.style.briskness
+    leave = start + down + rng.uniform(0.4, longest_s)
+    up = down * rng.uniform(1.0, 1.25)
+    lean = rng.uniform(*leans) + 0.5 * depth
+    out, back = (start, start + down), (leave, leave + up)
     plan.crouch.visit(depth, out, back)
     plan.lean.visit((lean, 0.0, rng.normal(0.0, 0.08)), out, back)
     if depth > DEEP * plan.hip_height:
         for side in SIDES:
-            plan.heel_lift[side].visit(HEELS_RAD, (start + 0.3 * down[1], out[1]), (leave, leave + 0.6 * up[1]))
+            plan.heel_lift[side].visit(HEELS_RAD, (start + 0.3 * down, out[1]), (leave, leave + 0.6 * up))
+    return start, down, leave, up
 
 
 @_activity("stand", weight=2.0)
@@ -325,12 +340,7 @@ def _sit(plan: Plan, world: World, rng: np.random.Generator) -> bool:
 @_activity("crouch", weight=1.2)
 def _crouch(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     """Bend knees and trunk, often to touch an object before the feet with one hand, and come up again."""
-    start = plan.time + 0.1
-    depth = rng.uniform(0.18, 0.44) * plan.hip_height
-    down = (0.6 + 1.1 * depth) * rng.uniform(0.9, 1.3) / plan.style.briskness
-    leave = start + down + rng.uniform(0.4, 3.5)
-    up = down * rng.uniform(1.0, 1.25)
-    squat(plan, rng, depth, rng.uniform(0.35, 0.6) + 0.5 * depth, (start, down), (leave, up))
+    start, down, leave, up = squat(plan, rng, (0.18, 0.44), (0.35, 0.6), 0.6, 3.5)
     if rng.random() < 0.7:
         side = str(rng.choice(SIDES))
         angle = plan.heading + rng.normal(0.0, 0.3) + (0.25 if side == "left" else -0.25)

@@ -163,6 +163,33 @@ class NavigationGrid:
             path.append(int(came_from[path[-1]]))
         return self.node_points[path]
 
+    def path(
+        self, start: Float[np.ndarray, "3"], goal: Float[np.ndarray, "3"], flights: list, rng: np.random.Generator
+    ) -> Float[np.ndarray, "waypoint 3"] | None:
+        """A smooth path off obstacles, straight on `flights`, waypoints about 0.1 m apart; heights only to a cell."""
+        cells = self.shortest(start, goal, shyness=rng.uniform(1.0, 4.0))
+        if cells is None:
+            return None
+        points = _evenly(np.concatenate([start[None], cells, goal[None]]))
+        if len(points) < 4:
+            return points
+        layer = self.layer_of(points)
+        sides = [rng.uniform(-1, 1) * max(flight.width / 2 - 0.35, 0.0) for flight in flights]
+        for _ in range(SMOOTHING_PASSES):
+            moved = points.copy()
+            moved[1:-1, :2] += 0.5 * ((points[:-2, :2] + points[2:, :2]) / 2 - points[1:-1, :2])
+            for flight, side in zip(flights, sides):  # drawn to a line beside the flight's middle
+                run, off = flight.up_and_left(moved[:, :2])
+                on = (run > -STAIR_APPROACH_M) & (run < flight.length + STAIR_APPROACH_M)
+                on &= (np.abs(off) < flight.width / 2) & (moved[:, 2] > flight.base_z - 0.3)
+                on &= moved[:, 2] < flight.top_z + 0.3
+                on[[0, -1]] = False
+                moved[on, :2] += ((side - off[on]) * 0.5)[:, None] * flight.left
+            clear = self.clearance_in(layer, moved[:, :2])
+            tight = (clear < CLEARANCE_M) & (clear < self.clearance_in(layer, points[:, :2]))
+            points = np.where(tight[:, None], points, moved)
+        return _evenly(points)
+
 
 def _window(outline: np.ndarray, origin: np.ndarray, cell: float, shape: tuple, margin: float) -> tuple:
     low = np.floor((outline.min(0) - margin - origin) / cell).astype(int)
@@ -205,40 +232,6 @@ def _keep_off(objects: tuple, origin: np.ndarray, cell: float, height: np.ndarra
         for floor, clear in zip(height, clearance):
             bars = (item.z_range[0] < floor[window] + HEADROOM_M) & (item.z_range[1] > floor[window] + LOW_M)
             clear[window] = np.where(bars, np.minimum(clear[window], distance), clear[window])
-
-
-def plan_path(
-    grid: NavigationGrid,
-    flights: list,
-    start: Float[np.ndarray, "3"],
-    goal: Float[np.ndarray, "3"],
-    rng: np.random.Generator,
-) -> Float[np.ndarray, "waypoint 3"] | None:
-    """A smooth path from start to goal, waypoints about 0.1 m apart; heights only to a cell. None without a path.
-
-    It keeps off obstacles and is straight on stairs.
-    """
-    cells = grid.shortest(start, goal, shyness=rng.uniform(1.0, 4.0))
-    if cells is None:
-        return None
-    points = _evenly(np.concatenate([start[None], cells, goal[None]]))
-    if len(points) < 4:
-        return points
-    layer = grid.layer_of(points)
-    sides = [rng.uniform(-1, 1) * max(flight.width / 2 - 0.35, 0.0) for flight in flights]
-    for _ in range(SMOOTHING_PASSES):
-        moved = points.copy()
-        moved[1:-1, :2] += 0.5 * ((points[:-2, :2] + points[2:, :2]) / 2 - points[1:-1, :2])
-        for flight, side in zip(flights, sides):  # drawn to a line beside the flight's middle
-            run, off = flight.up_and_left(moved[:, :2])
-            on = (run > -STAIR_APPROACH_M) & (run < flight.length + STAIR_APPROACH_M) & (np.abs(off) < flight.width / 2)
-            on &= (moved[:, 2] > flight.base_z - 0.3) & (moved[:, 2] < flight.top_z + 0.3)
-            on[[0, -1]] = False
-            moved[on, :2] += ((side - off[on]) * 0.5)[:, None] * flight.left
-        clear = grid.clearance_in(layer, moved[:, :2])
-        tight = (clear < CLEARANCE_M) & (clear < grid.clearance_in(layer, points[:, :2]))
-        points = np.where(tight[:, None], points, moved)
-    return _evenly(points)
 
 
 def _evenly(points: np.ndarray) -> np.ndarray:

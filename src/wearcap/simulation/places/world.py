@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from wearcap.geometry.mesh import Mesh
-from wearcap.simulation.places.navigation import NavigationGrid, plan_path
+from wearcap.simulation.places.navigation import NavigationGrid
 from wearcap.simulation.places.outline import points_in_convex
 
 STEP_UP_M = 0.35
@@ -215,7 +215,7 @@ class World:
         off obstacles, except on the last steps to a start or goal that is nearer to one itself (a seat).
         `rng` varies how far from walls this walk likes to be. None when no path leads there.
         """
-        path = plan_path(self.navigation, self.places.flights, start, goal, rng)
+        path = self.navigation.path(start, goal, self.places.flights, rng)
         if path is not None:
             floor = self.floor_height(path[:, :2], path[:, 2])
             path[:, 2] = np.where(np.isnan(floor), path[:, 2], floor)
