@@ -14,7 +14,7 @@ from wearcap.simulation.people.plan import LEFT_SIGN, SIDES, Plan, wrap
 from wearcap.simulation.people.posture import look_about, look_at, turn_head
 from wearcap.simulation.people.walking import turn_to, walk_along
 from wearcap.simulation.places.outline import turn
-from wearcap.simulation.places.world import ReachTarget, World
+from wearcap.simulation.places.world import World
 
 Act = Callable[[Plan, World, np.random.Generator], bool]
 Pose = tuple[float, ...]
@@ -265,37 +265,34 @@ def _reach(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     if not approach(plan, world, rng, np.array(target.stand), target.heading):
         return False
     for _ in range(rng.integers(1, 4)):
-        _grasp(plan, target, rng)
+        # one reach with the nearer hand: minimum-jerk out, a pause, and back (0.4–1.2 s each way)
+        ahead, across = turn(plan.heading).T
+        off = np.append(0.08 * rng.standard_normal() * across, 0.04 * rng.standard_normal())
+        touched = np.array(target.position) + off
+        aside = float((touched[:2] - plan.position[:2]) @ across) + 0.1 * rng.standard_normal()
+        side = "left" if aside > 0 else "right"
+        arm, shoulder = plan.arm_length, 1.52 * plan.hip_height
+        # the wrist's goal is where the fingers of a straight hand touch the point
+        fingers = float(np.linalg.norm(plan.skeleton.sites["left_fingertip"].t_joint_site))
+        arm_vector = touched - plan.position - np.append(LEFT_SIGN[side] * 0.17 * across, shoulder)
+        point = touched - FINGERS_USED * fingers * arm_vector / np.linalg.norm(arm_vector)
+        low = shoulder - (point[2] - plan.position[2])
+        far = float((point[:2] - plan.position[:2]) @ ahead)
+        crouch = float(np.clip(low - 1.05 * arm, 0.0, 0.42 * plan.hip_height))
+        left_over = np.hypot(max(far, 0.0), max(low - crouch, -0.6)) - 0.90 * arm
+        lean = float(np.clip(left_over / 0.45, 0.0, 0.9)) + 0.6 * crouch
+        start = plan.time
+        out = float(np.clip(0.45 + 0.55 * np.hypot(far, low) + 0.8 * crouch, 0.5, 1.6)) / plan.style.briskness
+        hold_s, back = rng.uniform(0.3, 1.4), out * rng.uniform(1.0, 1.3)
+        leave = start + out + hold_s
+        there, home = (start, start + out), (leave, leave + back)
+        inner = LEFT_SIGN[side] * np.clip(0.25 * lean, 0.0, 0.2)
+        plan.lean.visit((lean, 0.0, -inner), there, home)
+        plan.crouch.visit(crouch, there, home)
+        plan.hands[side].go_for(point, there, home)
+        look_at(plan, touched, (start, start + 0.45), (leave, leave + 0.5), 1.0)
+        plan.time = leave + back + rng.uniform(0.05, 0.6)
     return True
-
-
-def _grasp(plan: Plan, target: ReachTarget, rng: np.random.Generator) -> None:
-    """One reach with the nearer hand: minimum-jerk out, a pause, and back (0.4–1.2 s each way)."""
-    ahead, across = turn(plan.heading).T
-    touched = np.array(target.position) + np.append(0.08 * rng.standard_normal() * across, 0.04 * rng.standard_normal())
-    aside = float((touched[:2] - plan.position[:2]) @ across) + 0.1 * rng.standard_normal()
-    side = "left" if aside > 0 else "right"
-    arm, shoulder = plan.arm_length, 1.52 * plan.hip_height
-    # the wrist's goal is where the fingers of a straight hand touch the point
-    fingers = float(np.linalg.norm(plan.skeleton.sites["left_fingertip"].t_joint_site))
-    arm_vector = touched - plan.position - np.append(LEFT_SIGN[side] * 0.17 * across, shoulder)
-    point = touched - FINGERS_USED * fingers * arm_vector / np.linalg.norm(arm_vector)
-    low = shoulder - (point[2] - plan.position[2])
-    far = float((point[:2] - plan.position[:2]) @ ahead)
-    crouch = float(np.clip(low - 1.05 * arm, 0.0, 0.42 * plan.hip_height))
-    left_over = np.hypot(max(far, 0.0), max(low - crouch, -0.6)) - 0.90 * arm
-    lean = float(np.clip(left_over / 0.45, 0.0, 0.9)) + 0.6 * crouch
-    start = plan.time
-    out = float(np.clip(0.45 + 0.55 * np.hypot(far, low) + 0.8 * crouch, 0.5, 1.6)) / plan.style.briskness
-    hold_s, back = rng.uniform(0.3, 1.4), out * rng.uniform(1.0, 1.3)
-    leave = start + out + hold_s
-    there, home = (start, start + out), (leave, leave + back)
-    inner = LEFT_SIGN[side] * np.clip(0.25 * lean, 0.0, 0.2)
-    plan.lean.visit((lean, 0.0, -inner), there, home)
-    plan.crouch.visit(crouch, there, home)
-    plan.hands[side].go_for(point, there, home)
-    look_at(plan, touched, (start, start + 0.45), (leave, leave + 0.5), 1.0)
-    plan.time = leave + back + rng.uniform(0.05, 0.6)
 
 
 @_activity("sit", weight=2.0)
