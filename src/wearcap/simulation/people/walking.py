@@ -64,9 +64,7 @@ class _Course:
     """Speed (m/s) from which on the gait is running."""
 
     @classmethod
-    def of(
-        cls, plan: Plan, path: Float[np.ndarray, "waypoint 3"], speed: float, flights: Sequence[Flight]
-    ) -> "_Course":
+    def of(cls, plan: Plan, path: Float[np.ndarray, "waypoint 3"], speed: float, flights: Sequence) -> "_Course":
         """Speed, time and step phase along a path. Steps fall on the treads of the flights that it takes."""
         # evenly spaced points of the path with rounded corners, and its unwrapped heading
         run = np.concatenate([[0.0], np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).cumsum()])
@@ -132,11 +130,7 @@ class _Course:
 
 
 def walk_along(
-    plan: Plan,
-    path: Float[np.ndarray, "waypoint 3"],
-    rng: np.random.Generator,
-    speed: float,
-    flights: Sequence[Flight] = (),
+    plan: Plan, path: Float[np.ndarray, "waypoint 3"], rng: np.random.Generator, speed: float, flights: Sequence = ()
 ) -> None:
     """Turn towards a path's start, walk (or run, above 2.1 m/s) along it and stop at its end, feet together."""
     course = _Course.of(plan, path, speed, flights)

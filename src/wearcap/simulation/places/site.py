@@ -42,6 +42,7 @@ MOVABLE = (
 )
 """Kinds of objects that may stand elsewhere, or be gone, some days later."""
 MOST_M = 0.5
+"""Largest displacement of such an object (m)."""
 
 
 @dataclass(frozen=True)
