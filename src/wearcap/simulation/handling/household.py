@@ -216,15 +216,16 @@ class Household:
     def _drawn(self, items: Mapping[str, Movable | Openable]) -> str:
         """Name of the next object to use; near ones are preferred."""
         kinds = Counter(item.category for item in items.values())
-        weight = dict(self.habits.weights)
-        if self.habits.even:
-            for kind in kinds:
-                spans = [h.stop_s - h.start_s for h in self.house.handlings if self.items[h.name].category == kind]
-                weight[kind] /= EVEN_S + sum(spans)
         away = [np.linalg.norm(self.place_of(name)[:2] - self.plan.position[:2]) for name in items]
         weights = np.exp(-np.array(away) / self.habits.near_m)
-        weights *= [weight[item.category] / kinds[item.category] for item in items.values()]
+        weights *= [self._weight(item.category) / kinds[item.category] for item in items.values()]
         return str(self.rng.choice(list(items), p=weights / weights.sum()))
+
+    def _weight(self, category: str) -> float:
+        if not self.habits.even:
+            return self.habits.weights[category]
+        spans = [h.stop_s - h.start_s for h in self.house.handlings if self.items[h.name].category == category]
+        return self.habits.weights[category] / (EVEN_S + sum(spans))
 
     def _side(self, door: Openable) -> int:
         """Index of the handle on the side where one stands: 0 where the leaf opens to."""
