@@ -108,7 +108,7 @@ def _rig_clouds(
     frames = nearest_frames(motion.timestamps, times.flatten())
     vertices = body.vertices(motion.T_world_joint[frames]).numpy().astype(np.float32)
     faces = body.faces.numpy().astype(np.int32)
-    spot = np.array(world.spots[0].position)
+    spot = np.array(world.places.spots[0].position)
     true = place_rig(world, spot)
     people = [Mesh(v, faces, np.ones(3, np.float32)) for v in vertices]
     rig = simulate_rig([world.mesh], people, true, rng)

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 
 import torch
+from calibration_session import MARKS, STANDING, SWINGS_S, CalibrationSession, simulate_calibration
 
 from wearcap.geometry import rotation
 from wearcap.metrics.table import Scores, Summary
@@ -11,13 +12,6 @@ from wearcap.sensors.camera_alignment import align_by_marks, mark_positions, mou
 from wearcap.sensors.clock import fit_swing_clock, swing_peaks
 from wearcap.sensors.monocular_slam import _GravityScale, by_floor, by_head_imu
 from wearcap.sensors.watch_calibration import measure_watches, require_watches
-from wearcap.simulation.recordings.calibration_session import (
-    MARKS,
-    STANDING,
-    SWINGS_S,
-    CalibrationSession,
-    simulate_calibration,
-)
 
 GOALS = {
     "watch_world_deg": 0.5,

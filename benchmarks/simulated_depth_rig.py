@@ -77,7 +77,7 @@ def place_rig(
     turn = np.deg2rad(np.arange(0, 360, 5))
     direction = np.stack([np.cos(turn), np.sin(turn), 0 * turn], -1)
     along = spot + direction[:, None] * reach[:, None]
-    free = world.clearance(along.astype(np.float64)) > _CLEARANCE_M
+    free = world.navigation.clearance_at(along.astype(np.float64)) > _CLEARANCE_M
     room = reach[np.cumprod(free, 1).sum(1).clip(min=1) - 1]
     apart = len(turn) // count
     worst = np.min([np.roll(room, -k * apart) for k in range(count)], 0)

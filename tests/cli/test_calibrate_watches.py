@@ -16,15 +16,11 @@ from wearcap.recording import ImuStream, RecordingStore
 from wearcap.recording.store import load_recording
 from wearcap.sensors.clock import Clock
 from wearcap.sensors.watches import watches_at
-from wearcap.simulation.recordings.calibration_session import (
-    MARKS,
-    STANDING,
-    SWINGS_S,
-    CalibrationSession,
-    simulate_calibration,
-)
-from wearcap_testing import recording_of, swaying_motion
+from wearcap_testing import benchmark, recording_of, swaying_motion
 
+simulated = benchmark("calibration_session")
+CalibrationSession = simulated.CalibrationSession
+MARKS, STANDING, SWINGS_S = simulated.MARKS, simulated.STANDING, simulated.SWINGS_S
 G = 9.80665
 
 
@@ -46,7 +42,7 @@ def write_sensor_log(watch: ImuStream, path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def made() -> CalibrationSession:
-    return simulate_calibration(0, watch_fps=50.0, walk_s=0.0)
+    return simulated.simulate_calibration(0, watch_fps=50.0, walk_s=0.0)
 
 
 @pytest.fixture(scope="module")

@@ -8,14 +8,16 @@ from wearcap.geometry import rotation
 from wearcap.recording import ImuStream
 from wearcap.sensors.stillness import Stretch
 from wearcap.sensors.watch_calibration import WatchCalibration, measure_watches, require_watches
-from wearcap.simulation.recordings.calibration_session import CalibrationSession, simulate_calibration
+from wearcap_testing import benchmark
 
+simulated = benchmark("calibration_session")
+CalibrationSession = simulated.CalibrationSession
 SEEDS = range(5)
 
 
 @lru_cache
 def session(seed: int) -> CalibrationSession:
-    return simulate_calibration(seed, walk_s=2.0)
+    return simulated.simulate_calibration(seed, walk_s=2.0)
 
 
 def calibrated(watches: dict[str, ImuStream], board: Stretch, t_pose: Stretch) -> dict[str, WatchCalibration]:

@@ -10,8 +10,9 @@ from wearcap.geometry import rotation
 from wearcap.recording import ImuStream
 from wearcap.sensors.clock import fit_swing_clock, swing_peaks
 from wearcap.sensors.stillness import require
-from wearcap.simulation.recordings.calibration_session import SWINGS_S
+from wearcap_testing import benchmark
 
+SWINGS_S = benchmark("calibration_session").SWINGS_S
 MIDDLE = torch.tensor([SWINGS_S + 8], dtype=torch.float64)
 
 

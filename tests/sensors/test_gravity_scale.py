@@ -12,19 +12,17 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import ImuStream
 from wearcap.sensors.monocular_slam import _GravityScale, by_floor, by_head_imu
-from wearcap.simulation.recordings.calibration_session import (
-    STANDING,
-    CalibrationSession,
-    SessionNoise,
-    simulate_calibration,
-)
+from wearcap_testing import benchmark
 
+simulated = benchmark("calibration_session")
+CalibrationSession = simulated.CalibrationSession
+STANDING = simulated.STANDING
 SEEDS = range(4)
 
 
 @lru_cache
 def walked(seed: int) -> CalibrationSession:
-    return simulate_calibration(seed, camera_fps=30.0, walk_s=120.0)
+    return simulated.simulate_calibration(seed, camera_fps=30.0, walk_s=120.0)
 
 
 def tilt_deg(found: _GravityScale, made: CalibrationSession) -> float:
@@ -55,8 +53,8 @@ def test_the_floor_tells_scale_and_vertical(seed):
 
 @pytest.fixture(scope="module")
 def exact() -> CalibrationSession:
-    silent = SessionNoise(acc_noise=0.0, acc_bias=0.0, jitter_m=0.0, jitter_deg=0.0)
-    return simulate_calibration(9, silent, walk_s=15.0)
+    silent = simulated.SessionNoise(acc_noise=0.0, acc_bias=0.0, jitter_m=0.0, jitter_deg=0.0)
+    return simulated.simulate_calibration(9, silent, walk_s=15.0)
 
 
 def test_without_noise_the_filter_is_the_same_on_both_sides(exact):

@@ -15,15 +15,15 @@ def world(request):
 
 
 def test_terraces_lie_four_metres_apart(world):
-    heights = sorted(room.z for room in world.rooms)
+    heights = sorted(room.z for room in world.places.rooms)
     assert len(heights) == 3
     assert all(3.3 < step <= 4.01 for step in np.diff(heights))
     assert heights[1] == 0.0
 
 
 def test_stairs_and_ramps_meet_the_terraces(world):
-    rooms = sorted(room.z for room in world.rooms)
-    for flight, (low, high) in zip(sorted(world.flights, key=lambda f: f.base_z), itertools.pairwise(rooms)):
+    rooms = sorted(room.z for room in world.places.rooms)
+    for flight, (low, high) in zip(sorted(world.places.flights, key=lambda f: f.base_z), itertools.pairwise(rooms)):
         assert flight.base_z == pytest.approx(low)
         assert flight.top_z == pytest.approx(high)
         assert 0.15 <= flight.rise <= 0.17

@@ -46,7 +46,7 @@ def test_the_recording_is_complete_and_can_be_stored(simulated):
 
 
 def test_the_wearer_is_back_at_the_spot_when_due(simulated, site):
-    recording, spot = simulated.recording, site.spots[0]
+    recording, spot = simulated.recording, site.places.spots[0]
     way = recording.motion.t_world_root[:, :2].diff(dim=0).norm(dim=-1).sum()
     assert float(way) == pytest.approx(80.0, abs=8.0)
     distance = recording.intervals.distance_m

@@ -48,7 +48,8 @@ def test_a_closed_leaf_fills_its_gap_and_an_open_one_clears_it(flats):
     for flat in flats:
         for door in (item for item in flat.openables if item.category == "door"):
             gap = min(
-                flat.static.doors, key=lambda d: np.linalg.norm(door.footprint(door.closed).mean(0) - d.position[:2])
+                flat.static.places.doors,
+                key=lambda d: np.linalg.norm(door.footprint(door.closed).mean(0) - d.position[:2]),
             )
             middle = np.array(gap.position[:2])
             assert distance_to_convex(middle, door.footprint(door.closed)) < 0.08

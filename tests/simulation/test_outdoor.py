@@ -59,11 +59,11 @@ def test_kerbs_ramps_and_stairs_have_street_sizes(place):
         a, b, _ = surface.plane
         assert np.hypot(a, b) <= 0.1001
         assert (np.hypot(a, b) > 0.05) == (surface.kind == "ramp")
-    flights = [f for f in place.flights if f.steps > 1]
+    flights = [f for f in place.places.flights if f.steps > 1]
     assert len(flights) == 1
     assert 0.149 < flights[0].rise < 0.171
     assert 0.299 < flights[0].tread < 0.321
-    kerbs = [f for f in place.flights if f.steps == 1]
+    kerbs = [f for f in place.places.flights if f.steps == 1]
     assert kerbs
     assert all(0.099 < kerb.rise < 0.151 for kerb in kerbs)
     assert {s.kind for s in place.surfaces} == {"floor", "kerb", "ramp", "stairs_step"}
@@ -72,8 +72,8 @@ def test_kerbs_ramps_and_stairs_have_street_sizes(place):
 def test_the_ramp_meets_the_ground_and_the_terrace(place):
     ramp = max((s for s in place.surfaces if s.kind == "ramp"), key=lambda s: np.ptp(s.height(s.polygon)))
     height = ramp.height(ramp.polygon)
-    top = next(f.top_z for f in place.flights if f.steps > 1)
-    kerb = next(f.rise for f in place.flights if f.steps == 1)
+    top = next(f.top_z for f in place.places.flights if f.steps > 1)
+    kerb = next(f.rise for f in place.places.flights if f.steps == 1)
     np.testing.assert_allclose([height.min(), height.max()], [kerb, top], atol=1e-6)
     inner = ramp.polygon.mean(0) + 0.9 * (ramp.polygon - ramp.polygon.mean(0))
     np.testing.assert_allclose(place.floor_height(inner, ramp.height(inner)), ramp.height(inner), atol=1e-9)
@@ -87,9 +87,9 @@ def test_terrace_street_and_seats_hang_together(place):
     path = place.plan_path(low, high, rng)
     assert path is not None
     assert np.abs(np.diff(path[:, 2])).max() < 0.18, "one step at a time"
-    assert place.seats
-    assert place.reach_targets
-    for seat in place.seats:
+    assert place.places.seats
+    assert place.places.reach_targets
+    for seat in place.places.seats:
         assert place.plan_path(low, seat.standing_point(), rng) is not None
 
 
@@ -101,7 +101,7 @@ def test_kerbs_are_stepped_over_only_where_they_can(place):
     cells = np.argwhere(edge)
     points = grid.origin + (cells + np.array([1.0, 0.5])) * grid.cell
     known = np.zeros(len(points), bool)
-    for flight in place.flights:
+    for flight in place.places.flights:
         run, side = flight.up_and_left(points)
         known |= (run > -0.2) & (run < flight.length + 0.2) & (np.abs(side) < flight.width / 2)
     assert len(points)

@@ -21,7 +21,7 @@ def scan(scenery):
 
 
 def test_the_floor_is_scanned_where_it_is(scenery, scan):
-    hall = next(room for room in scenery.world.rooms if room.name == "hall 0")
+    hall = next(room for room in scenery.world.places.rooms if room.name == "hall 0")
     middle = hall.polygon.mean(0)
     inner = middle + 0.85 * (hall.polygon - middle)
     over_hall = scan.points[points_in_convex(scan.points[:, :2].astype(float), inner)]
@@ -33,7 +33,7 @@ def test_the_floor_is_scanned_where_it_is(scenery, scan):
 
 
 def test_points_are_as_dense_as_asked_near_the_stations(scenery, scan):
-    spot = np.array(scenery.world.spots[0].position)
+    spot = np.array(scenery.world.places.spots[0].position)
     near = (np.linalg.norm(scan.points[:, :2] - spot[:2], axis=1) < 1.5) & (np.abs(scan.points[:, 2]) < 0.03)
     assert near.sum() == pytest.approx(np.pi * 1.5**2 / 0.08**2, rel=0.15)
 
@@ -68,7 +68,7 @@ def test_stations_cover_the_floor(scenery):
     gaps = np.linalg.norm(stations[:, None] - stations[None], axis=-1) + 9 * np.eye(len(stations))
     assert gaps.min() >= 2.0
     free = scenery.world.navigation.node_points
-    free = free[scenery.world.clearance(free) > 0.45]
+    free = free[scenery.world.navigation.clearance_at(free) > 0.45]
     assert np.linalg.norm(free[:, None] - stations[None], axis=-1).min(1).max() <= 2.0
 
 

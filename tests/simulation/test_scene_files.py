@@ -20,7 +20,7 @@ from wearcap.sensors.slam import R_DEVICE_CAM
 from wearcap.simulation.places.site import MOVABLE, build_site, changed_world
 from wearcap.simulation.rendering.head_camera import HEAD_CAMERA, Filming, film, write_head_video
 from wearcap.simulation.rendering.scan import SceneSettings, plan_photos, write_scene
-from wearcap.simulation.rendering.views import Scenery, render_view, view_depth
+from wearcap.simulation.rendering.views import Scenery, exposed, render_view
 
 COARSE = SceneSettings(spacing_m=0.15, photo_m=6.0, photo_size=128)
 SMALL = HEAD_CAMERA.scaled(160, 90)
@@ -54,7 +54,7 @@ def test_a_photo_shows_the_scan_where_it_is_registered(scenery, folder):
     """Points of the scan that are not hidden have the colour of the pixel that they fall on."""
     photos, scan = read_photos(folder), read_scan(folder / "pointcloud.ply")
     photo = photos[4]
-    depth = view_depth(scenery, photo.camera, photo.T_world_cam)
+    depth = exposed(scenery, photo.camera, photo.T_world_cam)[1]
     in_cam = photo.T_world_cam.inverse()[None] @ torch.from_numpy(scan.points)
     pixels, valid = photo.camera.project(in_cam)
     column, row = pixels.nan_to_num(0.0).round().long().clamp(0, 127).numpy().T
@@ -113,7 +113,7 @@ def test_a_changed_world_keeps_its_walls_and_loses_some_things(scenery):
 def glance(scenery):
     """Two seconds of turning at the spot, at 30 Hz, on a clock that starts at 7 s."""
     time = 7.0 + torch.arange(61, dtype=torch.float64) / 30
-    x, y, z = scenery.world.spots[0].position
+    x, y, z = scenery.world.places.spots[0].position
     turn = rotation.about_axis("z", 1.2 * (time - 7).float())
     return Trajectory(time, turn @ R_DEVICE_CAM, torch.tensor([[x, y, z + 1.6]]).repeat(61, 1))
 

@@ -67,10 +67,10 @@ def test_approximate_poses_are_as_far_off_as_asked():
 
 def test_the_rig_stands_on_free_floor_and_sees_from_feet_to_crown(stairs_flat: World):
     candidates = stairs_flat.sample_floor(np.random.default_rng(0), 400)
-    spot = candidates[stairs_flat.clearance(candidates).argmax()]
+    spot = candidates[stairs_flat.navigation.clearance_at(candidates).argmax()]
     poses = place_rig(stairs_flat, spot)
     flat = poses.t.numpy() * [1, 1, 0] + [0, 0, spot[2]]
-    assert (stairs_flat.clearance(flat) > 0.15).all()
+    assert (stairs_flat.navigation.clearance_at(flat) > 0.15).all()
     person = torch.from_numpy(spot) + torch.tensor([[0.0, 0.0, 0.02], [0.0, 0.0, 1.9]]).double()
     for number in range(3):
         _, valid = KINECT.project(poses[number].inverse() @ person)
@@ -81,7 +81,7 @@ def test_the_rig_stands_on_free_floor_and_sees_from_feet_to_crown(stairs_flat: W
 
 def test_a_narrow_place_is_refused(stairs_flat: World):
     candidates = stairs_flat.sample_floor(np.random.default_rng(0), 400)
-    corner = candidates[stairs_flat.clearance(candidates).argmin()]
+    corner = candidates[stairs_flat.navigation.clearance_at(candidates).argmin()]
     with pytest.raises(WearcapError, match="no room for 3 cameras"):
         place_rig(stairs_flat, corner)
 

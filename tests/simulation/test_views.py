@@ -14,7 +14,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.sensors.slam import R_DEVICE_CAM
 from wearcap.simulation.places.site import build_site
 from wearcap.simulation.rendering import texture_kernels as kernels
-from wearcap.simulation.rendering.views import Development, Scenery, render_view, view_depth
+from wearcap.simulation.rendering.views import Development, Scenery, exposed, render_view
 
 PINHOLE = Camera("pinhole", 160, 96, 75.0, 75.0, 79.5, 47.5)
 HEAD = Camera("opencv", 160, 96, 75.0, 76.0, 80.0, 47.0, (-0.08, 0.02, 0.001, -0.0005))
@@ -27,7 +27,7 @@ def scenery() -> Scenery:
 
 
 def pose(scenery: Scenery, yaw: float, pitch: float = 0.1, shift=(0.0, 0.0)) -> Rigid:
-    x, y, z = scenery.world.spots[0].position
+    x, y, z = scenery.world.places.spots[0].position
     turn = rotation.about_axis("z", torch.tensor(yaw)) @ rotation.about_axis("y", torch.tensor(pitch))
     return Rigid(turn @ R_DEVICE_CAM, torch.tensor([x + shift[0], y + shift[1], z + 1.65]))
 
@@ -35,7 +35,7 @@ def pose(scenery: Scenery, yaw: float, pitch: float = 0.1, shift=(0.0, 0.0)) -> 
 @pytest.mark.parametrize("camera", [PINHOLE, HEAD, FISHEYE], ids=lambda camera: camera.model)
 def test_depth_is_the_renderers(scenery, camera):
     T = pose(scenery, 0.7)
-    ours = view_depth(scenery, camera, T)
+    ours = exposed(scenery, camera, T)[1]
     grid = torch.stack(torch.meshgrid(torch.arange(camera.width), torch.arange(camera.height), indexing="xy"), -1)
     rays = camera.unproject(grid.double())
     pinhole = render(PINHOLE, T, [scenery.world.mesh]).depth
@@ -51,7 +51,7 @@ def test_depth_is_the_renderers(scenery, camera):
 
 def test_a_pixel_has_the_colour_of_the_point_that_it_shows(scenery):
     T = pose(scenery, 2.0)
-    picture, depth = render_view(scenery, HEAD, T), view_depth(scenery, HEAD, T)
+    picture, depth = render_view(scenery, HEAD, T), exposed(scenery, HEAD, T)[1]
     row, column = 60, 90
     point = T @ (HEAD.unproject(torch.tensor([float(column), float(row)])) * float(depth[row, column]))
     vertices = scenery.world.mesh.vertices[scenery.world.mesh.faces].astype(np.float64)
@@ -69,7 +69,8 @@ def test_a_pixel_has_the_colour_of_the_point_that_it_shows(scenery):
 def test_a_small_picture_is_the_mean_of_a_large_one(scenery):
     T = pose(scenery, -1.0)
     small = render_view(scenery, PINHOLE, T).astype(float)
-    averaged = render_view(scenery, PINHOLE, T, samples=4).astype(float)
+    large = render_view(scenery, PINHOLE.scaled(4 * PINHOLE.width, 4 * PINHOLE.height), T).astype(float)
+    averaged = large.reshape(PINHOLE.height, 4, PINHOLE.width, 4, 3).mean((1, 3))
     assert np.abs(small - averaged).mean() < 9.0
     assert np.abs((small - averaged).mean((0, 1))).max() < 4.0
 

@@ -15,7 +15,7 @@ def flat(request):
 
 
 def test_the_floor_of_a_flight_rises_step_by_step(stairs_flat):
-    (flight,) = stairs_flat.flights
+    (flight,) = stairs_flat.places.flights
     along = np.array([np.cos(flight.direction), np.sin(flight.direction)])
     step = np.arange(1, flight.steps)
     middles = np.array(flight.start) + ((step - 0.5) * flight.tread)[:, None] * along
@@ -32,7 +32,7 @@ def test_no_floor_outside(flat):
 
 def test_clearance_is_the_distance_to_the_nearest_thing(flat):
     points = flat.sample_floor(np.random.default_rng(0), 200)
-    clearance = flat.clearance(points)
+    clearance = flat.navigation.clearance_at(points)
     nearest = np.full(len(points), np.inf)
     for item in flat.objects:
         distance = distance_to_convex(points[:, :2], item.footprint)
@@ -40,7 +40,7 @@ def test_clearance_is_the_distance_to_the_nearest_thing(flat):
         nearest = np.where(bars, np.minimum(nearest, distance), nearest)
     assert (clearance <= nearest + flat.cell).all()
     inside = flat.objects[0].footprint.mean(0)
-    assert flat.clearance(np.array([[*inside, flat.objects[0].z_range[0]]]))[0] < flat.cell
+    assert flat.navigation.clearance_at(np.array([[*inside, flat.objects[0].z_range[0]]]))[0] < flat.cell
 
 
 def test_paths_keep_off_obstacles_and_on_the_floor(flat):
@@ -57,8 +57,8 @@ def test_paths_keep_off_obstacles_and_on_the_floor(flat):
         assert gaps.max() < 0.15
         assert np.abs(np.diff(path[:, 2])).max() < 0.36
         np.testing.assert_allclose(flat.floor_height(path[:, :2], path[:, 2]), path[:, 2], atol=1e-6)
-        own = np.minimum(flat.clearance(start[None]), flat.clearance(goal[None]))[0]
-        assert flat.clearance(path).min() > min(0.28, own) - 0.06
+        own = np.minimum(flat.navigation.clearance_at(start[None]), flat.navigation.clearance_at(goal[None]))[0]
+        assert flat.navigation.clearance_at(path).min() > min(0.28, own) - 0.06
     assert found >= 5, "rooms hang together"
 
 
@@ -68,19 +68,21 @@ def test_no_way_into_the_void(flat):
 
 
 def test_doors_are_wide_enough_and_open(flat):
-    assert flat.doors
-    for door in flat.doors:
+    assert flat.places.doors
+    for door in flat.places.doors:
         assert 0.79 < door.width < 0.96
         middle = np.array([door.position[:3]], dtype=np.float64)
-        assert flat.clearance(middle)[0] > 0.28
+        assert flat.navigation.clearance_at(middle)[0] > 0.28
 
 
 def test_every_seat_and_target_can_be_reached(flat):
-    assert flat.seats
-    assert flat.reach_targets
+    assert flat.places.seats
+    assert flat.places.reach_targets
     rng = np.random.default_rng(0)
     start = flat.sample_floor(rng, 1)[0]
-    for point in [seat.standing_point() for seat in flat.seats] + [np.array(t.stand) for t in flat.reach_targets]:
+    for point in [seat.standing_point() for seat in flat.places.seats] + [
+        np.array(t.stand) for t in flat.places.reach_targets
+    ]:
         assert flat.plan_path(start, point, rng) is not None
 
 

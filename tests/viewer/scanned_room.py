@@ -22,7 +22,7 @@ def scanned_room(spacing_m: float = 0.04) -> Scan:
     builder, rng = WorldBuilder("room"), np.random.default_rng(4)
     x0, y0, x1, y1 = ROOM
     outline = rectangle(((x0 + x1) / 2, (y0 + y1) / 2), (x1 - x0, y1 - y0), 0.0)
-    builder.rooms.append(Room("room", outline, 0.0))
+    builder.places.rooms.append(Room("room", outline, 0.0))
     builder.add_surface("floor", outline, (0.62, 0.5, 0.38), texture=4.0, thickness=0.1)
     for center, size in (
         (((x0 + x1) / 2, y0 - 0.05, 1.25), (x1 - x0, 0.1, 2.5)),

@@ -112,12 +112,7 @@ def bend_over(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.G
 
 def squat_by(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.Generator) -> None:
     """Squat in front of a low object as if to lift it, hands on the thighs or before the knees, and get up again."""
-    start = plan.time + 0.1
-    depth = rng.uniform(0.24, 0.42) * plan.hip_height
-    down = (0.7 + 1.1 * depth) * rng.uniform(0.9, 1.3) / plan.style.briskness
-    leave = start + down + rng.uniform(0.4, 2.5)
-    up = down * rng.uniform(1.0, 1.25)
-    squat(plan, rng, depth, rng.uniform(0.3, 0.55) + 0.5 * depth, (start, down), (leave, up))
+    start, _, leave, up = squat(plan, rng, (0.24, 0.42), (0.3, 0.55), 0.7, 2.5)
     before = (0.42, rng.uniform(-0.05, 0.25), rng.uniform(-0.75, -0.55), 0.3, 0.2, 0.1)
     hold(plan, SIDES, ON_THIGHS if rng.random() < 0.5 else before, start, leave + 0.8 * up, rng)
     _look(plan, T_world_object, (0.0, 0.0, 0.6 * height), start, leave)

@@ -50,28 +50,21 @@ SWING_M, SWING_RAD = 0.05, 0.10
 
 
 @dataclass(frozen=True)
-class _Manner:
-    """How objects are lifted and put down."""
-
-    wait_s: float
-    """Longest time between taking hold and lifting."""
-    rise: float
-    """Time to lift per bend of the knees (s/m)."""
-    upright: float
-    """Mean lean of the trunk while carrying (rad)."""
-    out: float
-    """Share of the way down in which free hands get out of the way."""
-    lower: float
-    """Time to put down per bend of the knees (s/m)."""
-    release_s: float
-    """Longest time between setting down and letting go."""
-
-
-@dataclass(frozen=True)
 class Errand:
     """A plan to take an object from one place to another, not yet written to the motion's plan."""
 
-    manner: ClassVar[_Manner]
+    wait_s: ClassVar[float]
+    """Longest time between taking hold and lifting."""
+    rise: ClassVar[float]
+    """Time to lift per bend of the knees (s/m)."""
+    upright: ClassVar[float]
+    """Mean lean of the trunk while carrying (rad)."""
+    out: ClassVar[float]
+    """Share of the way down in which free hands get out of the way."""
+    lower: ClassVar[float]
+    """Time to put down per bend of the knees (s/m)."""
+    release_s: ClassVar[float]
+    """Longest time between setting down and letting go."""
     movable: Movable
     start: Float[np.ndarray, "4"]
     """Pose of the object before: x, y (m), heading (rad), height of its underside (m)."""
@@ -159,7 +152,7 @@ class Errand:
 class Carry(Errand):
     """A plan to carry a box between both palms."""
 
-    manner = _Manner(wait_s=0.5, rise=1.2, upright=-0.04, out=0.45, lower=1.2, release_s=0.4)
+    wait_s, rise, upright, out, lower, release_s = 0.5, 1.2, -0.04, 0.45, 1.2, 0.4
     chest: Float[np.ndarray, "2"]
     """Origin of the box ahead of and below the chest while it is carried (m)."""
 
@@ -168,7 +161,7 @@ class Carry(Errand):
 class Take(Errand):
     """A plan to take an object with one hand or both."""
 
-    manner = _Manner(wait_s=0.4, rise=1.1, upright=-0.03, out=0.5, lower=1.1, release_s=0.35)
+    wait_s, rise, upright, out, lower, release_s = 0.4, 1.1, -0.03, 0.5, 1.1, 0.35
 
     def neutral(self) -> Float[np.ndarray, "3 3"]:
         """Rotation relative to the holder's heading while the keys' angles are zero: upright, or, for objects
@@ -383,17 +376,17 @@ def lift(plan: Plan, choice: Errand, rng: np.random.Generator) -> Held:
     A `Take` becomes a `HeldObject`.
     """
     arrive(plan, rng, choice.stand)
-    manner, start, briskness = choice.manner, plan.time, plan.style.briskness
+    start, briskness = plan.time, plan.style.briskness
     bend, lean, aside = choice.bend(plan, choice.start, rng)
     down = (0.75 + 1.1 * bend) * rng.uniform(0.9, 1.25) / briskness
     touch = start + down
-    begin = touch + rng.uniform(0.1, manner.wait_s)
-    rise = (0.9 + manner.rise * bend) * rng.uniform(0.9, 1.3) / briskness
+    begin = touch + rng.uniform(0.1, choice.wait_s)
+    rise = (0.9 + choice.rise * bend) * rng.uniform(0.9, 1.3) / briskness
     up = begin, begin + rise
     bow(plan, start, touch, bend, lean, aside)
     # one bends to the other side when something heavy is carried at one side
-    bow(plan, *up, 0.0, rng.normal(manner.upright, 0.03), 0.05 * choice.sign if choice.beside else 0.0)
-    choice.move_free_hand(plan, bend, (start, start + manner.out * down), (touch, up[1]), rng)
+    bow(plan, *up, 0.0, rng.normal(choice.upright, 0.03), 0.05 * choice.sign if choice.beside else 0.0)
+    choice.move_free_hand(plan, bend, (start, start + choice.out * down), (touch, up[1]), rng)
     point = np.append(choice.start[:2], choice.start[3] + 0.8 * choice.movable.height)
     look_at(plan, point, (start, start + 0.5), (begin + 0.3 * rise, up[1]))
     plan.time = up[1] + rng.uniform(0.0, 0.3)
@@ -409,10 +402,10 @@ def put_down(plan: Plan, held: Held, rng: np.random.Generator) -> Handling:
     """Lower the object to its place, let go and stand up; the wearer stands at or near `choice.goal`."""
     choice = held.choice
     arrive(plan, rng, choice.goal)
-    manner, start, briskness = choice.manner, plan.time + 0.1, plan.style.briskness
+    start, briskness = plan.time + 0.1, plan.style.briskness
     bend, lean, aside = choice.bend(plan, choice.stop, rng)
-    lower = (1.0 + manner.lower * bend) * rng.uniform(0.9, 1.3) / briskness
-    release = start + lower + rng.uniform(0.05, manner.release_s)
+    lower = (1.0 + choice.lower * bend) * rng.uniform(0.9, 1.3) / briskness
+    release = start + lower + rng.uniform(0.05, choice.release_s)
     rise = (0.8 + 1.0 * bend) * rng.uniform(0.9, 1.2) / briskness
     down = start, start + lower
     bow(plan, *down, bend, lean, aside)

@@ -121,6 +121,57 @@ class _Turn:
     def values(self, share: Float[np.ndarray, "time"]) -> Float[np.ndarray, "time"]:
         return self.start + ease(share) * (self.stop - self.start)
 
+    def perform(self, plan: Plan, house: House, rng: np.random.Generator) -> None:
+        """Write the grip, the steps, the object's motion and the interactions."""
+        item, start, briskness = self.item, plan.time, plan.style.briskness
+        touch = start + 0.75 / briskness
+        begin = touch + rng.uniform(0.05, 0.25)
+        stop = begin + self.seconds
+        release = stop + rng.uniform(0.02, 0.25)
+        count = max(round(self.seconds * 30), 8)
+        here = np.array([*plan.position[:2], self.places[0, 2] + wrap(plan.heading - self.places[0, 2])])
+        fade = np.linspace(1.0, 0.0, len(self.places))[:, None] ** 2
+        # the body's path at even times, smooth, its ends kept
+        keys = self.places + fade * (here - self.places[0])
+        at = np.linspace(0.0, len(keys) - 1.0, count)
+        fine = np.stack([np.interp(at, np.arange(len(keys)), column) for column in keys.T], 1)
+        sigma = 0.9 * count / len(keys)
+        reach = max(int(3 * sigma), 1)
+        padded = np.concatenate([np.repeat(fine[:1], reach, 0), fine, np.repeat(fine[-1:], reach, 0)])
+        path = scipy.ndimage.gaussian_filter1d(padded, sigma, axis=0)[reach : reach + count]
+        times = np.linspace(begin, stop, count)
+        place = item.handles[self.handle]
+        # the hand turns on the handle so that the fingers point along the arm
+        values = self.values(np.linspace(0.0, 1.0, count))
+        held, pose = item.handle(self.handle, values), item.pose(values)
+        fingers = (pose.R.numpy() @ np.array(place.fingers))[:, :2]
+        across = np.stack([-np.sin(path[:, 2]), np.cos(path[:, 2])], 1)
+        arm = held[:, :2] - path[:, :2] - 0.18 * LEFT_SIGN[self.side] * across
+        angle = np.arctan2(fingers[:, 0] * arm[:, 1] - fingers[:, 1] * arm[:, 0], (fingers * arm).sum(1))
+        yaw = YAW_MOST * np.tanh(np.unwrap(angle) / YAW_MOST)
+
+        def poses(at: Float[np.ndarray, "time"], chest: Rigid) -> Rigid:
+            return item.pose(self.values((at - begin) / self.seconds))
+
+        def hand_poses(at: Float[np.ndarray, "time"], chest: Rigid) -> Rigid:
+            pose = poses(at, chest)
+            about = rotation.about_axis("z", torch.from_numpy(np.interp(at, times, yaw)))
+            point = torch.tensor(place.point, dtype=torch.float64)
+            R, palm = about @ pose.R, (pose.R @ point[:, None])[..., 0] + pose.t
+            return Rigid(R, palm - (R @ point[:, None])[..., 0])
+
+        grip = replace(Grip.drawn(place, hand_poses, touch, release, rng, briskness), reach_s=touch - start)
+        plan.grip(self.side, grip)
+        middle = begin + 0.5 * self.seconds
+        handle = item.handle(self.handle, np.array(self.start))
+        look_at(plan, handle, (start, start + 0.45), (middle, middle + 0.6), 0.8)
+        body = lambda at: np.stack([np.interp(at, times, column) for column in path.T], 1)  # noqa: E731
+        shuffle(plan, rng, body, begin - 0.1, stop)
+        contact_class = item.object.freedom.contact_class
+        house.handlings.append(Handling.of(item.name, contact_class, poses, [(self.side, grip)]))
+        house.values[item.name] = self.stop
+        plan.time = max(plan.time, release)
+
 
 def operate(
     plan: Plan,
@@ -148,60 +199,8 @@ def operate(
         place = item.handles[handle]
         pretend_to_handle(plan, {turn.side: place}, item.pose(turn.start), place.point[2], rng)
     else:
-        _perform(plan, house, turn, rng)
+        turn.perform(plan, house, rng)
     return True
-
-
-def _perform(plan: Plan, house: House, turn: _Turn, rng: np.random.Generator) -> None:
-    """Write the grip, the steps, the object's motion and the interactions."""
-    item, start, briskness = turn.item, plan.time, plan.style.briskness
-    touch = start + 0.75 / briskness
-    begin = touch + rng.uniform(0.05, 0.25)
-    stop = begin + turn.seconds
-    release = stop + rng.uniform(0.02, 0.25)
-    count = max(round(turn.seconds * 30), 8)
-    here = np.array([*plan.position[:2], turn.places[0, 2] + wrap(plan.heading - turn.places[0, 2])])
-    fade = np.linspace(1.0, 0.0, len(turn.places))[:, None] ** 2
-    # the body's path at even times, smooth, its ends kept
-    keys = turn.places + fade * (here - turn.places[0])
-    at = np.linspace(0.0, len(keys) - 1.0, count)
-    fine = np.stack([np.interp(at, np.arange(len(keys)), column) for column in keys.T], 1)
-    sigma = 0.9 * count / len(keys)
-    reach = max(int(3 * sigma), 1)
-    padded = np.concatenate([np.repeat(fine[:1], reach, 0), fine, np.repeat(fine[-1:], reach, 0)])
-    path = scipy.ndimage.gaussian_filter1d(padded, sigma, axis=0)[reach : reach + count]
-    times = np.linspace(begin, stop, count)
-    place = item.handles[turn.handle]
-    # the hand turns on the handle so that the fingers point along the arm
-    values = turn.values(np.linspace(0.0, 1.0, count))
-    held, pose = item.handle(turn.handle, values), item.pose(values)
-    fingers = (pose.R.numpy() @ np.array(place.fingers))[:, :2]
-    across = np.stack([-np.sin(path[:, 2]), np.cos(path[:, 2])], 1)
-    arm = held[:, :2] - path[:, :2] - 0.18 * LEFT_SIGN[turn.side] * across
-    angle = np.arctan2(fingers[:, 0] * arm[:, 1] - fingers[:, 1] * arm[:, 0], (fingers * arm).sum(1))
-    yaw = YAW_MOST * np.tanh(np.unwrap(angle) / YAW_MOST)
-
-    def poses(at: Float[np.ndarray, "time"], chest: Rigid) -> Rigid:
-        return item.pose(turn.values((at - begin) / turn.seconds))
-
-    def hand_poses(at: Float[np.ndarray, "time"], chest: Rigid) -> Rigid:
-        pose = poses(at, chest)
-        about = rotation.about_axis("z", torch.from_numpy(np.interp(at, times, yaw)))
-        point = torch.tensor(place.point, dtype=torch.float64)
-        R, palm = about @ pose.R, (pose.R @ point[:, None])[..., 0] + pose.t
-        return Rigid(R, palm - (R @ point[:, None])[..., 0])
-
-    grip = replace(Grip.drawn(place, hand_poses, touch, release, rng, briskness), reach_s=touch - start)
-    plan.grip(turn.side, grip)
-    middle = begin + 0.5 * turn.seconds
-    handle = item.handle(turn.handle, np.array(turn.start))
-    look_at(plan, handle, (start, start + 0.45), (middle, middle + 0.6), 0.8)
-    body = lambda at: np.stack([np.interp(at, times, column) for column in path.T], 1)  # noqa: E731
-    shuffle(plan, rng, body, begin - 0.1, stop)
-    contact_class = item.object.freedom.contact_class
-    house.handlings.append(Handling.of(item.name, contact_class, poses, [(turn.side, grip)]))
-    house.values[item.name] = turn.stop
-    plan.time = max(plan.time, release)
 
 
 @dataclass(frozen=True)
@@ -248,11 +247,27 @@ class _Task:
         cost += 0.15 * rng.standard_normal(len(points))
         away = np.linalg.norm(points[:, None] - walkable[None], axis=-1).min(1)
         cost[0, away > 0.45] = np.inf
-        chosen, total = _cheapest(points, cost)
-        if chosen is None:
+        # the points by key with the least sum of their costs and of squared distances between them
+        usable = np.isfinite(cost).any(0)
+        points, cost, heading = points[usable], cost[:, usable], heading[:, usable]
+        if not len(points):
             return None
-        keys = np.arange(len(chosen))
-        return total, np.column_stack([points[chosen], np.unwrap(heading[keys, chosen])])
+        step = np.linalg.norm(points[:, None] - points[None], axis=-1)
+        change = np.where(step > STEP_M, np.inf, (step / 0.11) ** 2)
+        total, came = cost[0], []
+        for key in range(1, len(cost)):
+            through = total[:, None] + change
+            best = through.argmin(0)
+            came.append(best)
+            total = through[best, np.arange(len(points))] + cost[key]
+        if not np.isfinite(total).any():
+            return None
+        path = [int(total.argmin())]
+        for best in reversed(came):
+            path.append(int(best[path[-1]]))
+        path.reverse()
+        facing = np.unwrap(heading[np.arange(len(path)), path])
+        return float(total.min()), np.column_stack([points[path], facing])
 
     def rated(
         self, points: Float[np.ndarray, "point 2"], room: Float[np.ndarray, "point"]
@@ -297,27 +312,3 @@ def _within(
         edge = end - start
         inside &= edge[0] * (y - start[1]) - edge[1] * (x - start[0]) > -margin * np.hypot(*edge)
     return inside
-
-
-def _cheapest(
-    points: Float[np.ndarray, "point 2"], cost: Float[np.ndarray, "key point"]
-) -> tuple[np.ndarray | None, float]:
-    """Points by key with the least sum of their costs and of squared distances between them."""
-    usable = np.isfinite(cost).any(0)
-    points, cost, number = points[usable], cost[:, usable], np.flatnonzero(usable)
-    if not len(points):
-        return None, np.inf
-    step = np.linalg.norm(points[:, None] - points[None], axis=-1)
-    change = np.where(step > STEP_M, np.inf, (step / 0.11) ** 2)
-    total, came = cost[0], []
-    for key in range(1, len(cost)):
-        through = total[:, None] + change
-        best = through.argmin(0)
-        came.append(best)
-        total = through[best, np.arange(len(points))] + cost[key]
-    if not np.isfinite(total).any():
-        return None, np.inf
-    path = [int(total.argmin())]
-    for best in reversed(came):
-        path.append(int(best[path[-1]]))
-    return number[path[::-1]], float(total.min())

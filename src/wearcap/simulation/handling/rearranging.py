@@ -33,7 +33,7 @@ REACHABLE_SHARE = 0.85
 KEYS = np.linspace(0.0, 1.0, 9)
 
 
-def rearrange(plan: Plan, house: House, rng: np.random.Generator, movable: Movable, pretend: bool = False) -> bool:
+def rearrange(plan: Plan, house: House, rng: np.random.Generator, movable: Movable, pretend: bool) -> bool:
     """Slide an object to another place nearby; False, with nothing done, where none is found or reachable.
 
     With `pretend`, the wearer only goes there and does something that resembles it, and nothing is touched.
@@ -53,7 +53,7 @@ def rearrange(plan: Plan, house: House, rng: np.random.Generator, movable: Movab
     return True
 
 
-def relocate(plan: Plan, house: House, rng: np.random.Generator, movable: Movable, pretend: bool = False) -> bool:
+def relocate(plan: Plan, house: House, rng: np.random.Generator, movable: Movable, pretend: bool) -> bool:
     """Carry an object to another place on the floor; False, with nothing done, where none is found or reachable.
 
     All but boxes are used before or after. With `pretend`, the wearer only goes there and does something that

@@ -183,7 +183,17 @@ def slide(plan: Plan, choice: Slide, rng: np.random.Generator, floor_z: float = 
     for side, grip in grips:
         plan.grip(side, grip)
     _lean(plan, choice, plan.time, begin, end, release, rng)
-    _look(plan, choice, touch, begin, end, floor_z, rng)
+    # one looks at the place of the grip, then about where the path leads
+    local = torch.tensor(next(iter(choice.places.values())).point, dtype=torch.float64)
+    pose = floor_pose(choice.start, floor_z)
+    point = (pose.R @ local + pose.t).numpy()
+    look_at(plan, point, (touch - 0.6, touch - 0.2), (begin + 0.1, begin + 0.8), 0.85)
+    time, back = begin + 0.6, abs(choice.travel_angle) > PULL
+    while time < end - 0.8:
+        over_shoulder = back and rng.random() < 0.4
+        yaw = rng.choice([-1.0, 1.0]) * rng.uniform(0.7, 1.1) if over_shoulder else rng.normal(0, 0.2)
+        time = turn_head(plan, time, yaw, rng.normal(0.35, 0.12)) + rng.exponential(1.2) + 0.3
+    turn_head(plan, max(time, end))
     base = float(choice.stand[2])
     unwrap = np.array([0.0, 0.0, plan.heading + wrap(base - plan.heading) - base])
     shuffle(plan, rng, lambda times: choice.body_at(choice.share(times - begin)) + unwrap, begin, end)
@@ -220,19 +230,3 @@ def _lean(
     plan.shift.move(end - 0.6, end + 0.1, (0.0, 0.0))
     plan.crouch.move(end - 0.3, release + 0.4, 0.0)
     plan.lean.move(end - 0.3, release + 0.7, (0.0, 0.0, 0.0))
-
-
-def _look(
-    plan: Plan, choice: Slide, touch: float, begin: float, end: float, floor_z: float, rng: np.random.Generator
-) -> None:
-    """Look at the place of the grip, then about where the path leads."""
-    local = torch.tensor(next(iter(choice.places.values())).point, dtype=torch.float64)
-    pose = floor_pose(choice.start, floor_z)
-    point = (pose.R @ local + pose.t).numpy()
-    look_at(plan, point, (touch - 0.6, touch - 0.2), (begin + 0.1, begin + 0.8), 0.85)
-    time, back = begin + 0.6, abs(choice.travel_angle) > PULL
-    while time < end - 0.8:
-        over_shoulder = back and rng.random() < 0.4
-        yaw = rng.choice([-1.0, 1.0]) * rng.uniform(0.7, 1.1) if over_shoulder else rng.normal(0, 0.2)
-        time = turn_head(plan, time, yaw, rng.normal(0.35, 0.12)) + rng.exponential(1.2) + 0.3
-    turn_head(plan, max(time, end))

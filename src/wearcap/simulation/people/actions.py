@@ -14,7 +14,7 @@ from wearcap.simulation.people.plan import LEFT_SIGN, SIDES, Plan, wrap
 from wearcap.simulation.people.posture import look_about, look_at, turn_head
 from wearcap.simulation.people.walking import turn_to, walk_along
 from wearcap.simulation.places.outline import turn
-from wearcap.simulation.places.world import ReachTarget, World
+from wearcap.simulation.places.world import World
 
 Act = Callable[[Plan, World, np.random.Generator], bool]
 Pose = tuple[float, ...]
@@ -74,7 +74,7 @@ def start_place(world: World, rng: np.random.Generator) -> tuple[Float[np.ndarra
 def _free_point(world: World, rng: np.random.Generator, beside_z: float | None = None) -> Float[np.ndarray, "3"]:
     """A random free place to stand; outdoors, often one that is higher or lower than `beside_z` (m)."""
     points = world.sample_floor(rng, 24)
-    free = (world.clearance(points) > FREE_M) & ~world.on_stairs(points)
+    free = (world.navigation.clearance_at(points) > FREE_M) & ~world.on_stairs(points)
     if world.outdoors and beside_z is not None and rng.random() < ELSEWHERE:
         other = free & (np.abs(points[:, 2] - beside_z) > 0.3)
         free = other if other.any() else free
@@ -103,7 +103,7 @@ def follow(plan: Plan, world: World, rng: np.random.Generator, path: np.ndarray,
     start = plan.time
     if path_length(path) > 0.25:
         speed = plan.style.gait.speed * float(np.exp(rng.normal(0.0, 0.13)))
-        walk_along(plan, path, rng, speed, world.flights)
+        walk_along(plan, path, rng, speed, world.places.flights)
         look_about(plan, start + 1.0, plan.time, rng, spread=0.22, pause_s=3.0)
     if heading is not None and abs(wrap(heading - plan.heading)) > 0.2:
         turn_to(plan, heading, rng)
@@ -125,16 +125,31 @@ def hold(
 
 
 def squat(
-    plan: Plan, rng: np.random.Generator, depth: float, lean: float, down: tuple[float, float], up: tuple[float, float]
-) -> None:
-    """Bend knees (m) and trunk (rad, forwards), and straighten them; `down` and `up` are starts and durations (s)."""
-    start, leave = down[0], up[0]
-    out, back = (start, start + down[1]), (leave, leave + up[1])
+    plan: Plan,
+    rng: np.random.Generator,
+    depths: tuple[float, float],
+    leans: tuple[float, float],
+    quickest_s: float,
+    longest_s: float,
+) -> tuple[float, float, float, float]:
+    """Bend knees and trunk, stay for up to `longest_s`, and straighten them.
+
+    `depths` is a range of shares of the hip height, `leans` one of forward leans (rad) of a flat squat, which would
+    take about `quickest_s`. Returns the starts and durations of both ways (s).
+    """
+    start = plan.time + 0.1
+    depth = rng.uniform(*depths) * plan.hip_height
+    down = (quickest_s + 1.1 * depth) * rng.uniform(0.9, 1.3) / plan.style.briskness
+    leave = start + down + rng.uniform(0.4, longest_s)
+    up = down * rng.uniform(1.0, 1.25)
+    lean = rng.uniform(*leans) + 0.5 * depth
+    out, back = (start, start + down), (leave, leave + up)
     plan.crouch.visit(depth, out, back)
     plan.lean.visit((lean, 0.0, rng.normal(0.0, 0.08)), out, back)
     if depth > DEEP * plan.hip_height:
         for side in SIDES:
-            plan.heel_lift[side].visit(HEELS_RAD, (start + 0.3 * down[1], out[1]), (leave, leave + 0.6 * up[1]))
+            plan.heel_lift[side].visit(HEELS_RAD, (start + 0.3 * down, out[1]), (leave, leave + 0.6 * up))
+    return start, down, leave, up
 
 
 @_activity("stand", weight=2.0)
@@ -243,43 +258,41 @@ def _carry_along(plan: Plan, world: World, rng: np.random.Generator) -> bool:
 @_activity("reach", weight=2.5)
 def _reach(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     """Go to a shelf, table or handle and take hold of a point there, crouching or leaning as it needs."""
-    if not world.reach_targets:
+    targets = world.places.reach_targets
+    if not targets:
         return False
-    target = world.reach_targets[rng.integers(len(world.reach_targets))]
+    target = targets[rng.integers(len(targets))]
     if not approach(plan, world, rng, np.array(target.stand), target.heading):
         return False
     for _ in range(rng.integers(1, 4)):
-        _grasp(plan, target, rng)
+        # one reach with the nearer hand: minimum-jerk out, a pause, and back (0.4–1.2 s each way)
+        ahead, across = turn(plan.heading).T
+        off = np.append(0.08 * rng.standard_normal() * across, 0.04 * rng.standard_normal())
+        touched = np.array(target.position) + off
+        aside = float((touched[:2] - plan.position[:2]) @ across) + 0.1 * rng.standard_normal()
+        side = "left" if aside > 0 else "right"
+        arm, shoulder = plan.arm_length, 1.52 * plan.hip_height
+        # the wrist's goal is where the fingers of a straight hand touch the point
+        fingers = float(np.linalg.norm(plan.skeleton.sites["left_fingertip"].t_joint_site))
+        arm_vector = touched - plan.position - np.append(LEFT_SIGN[side] * 0.17 * across, shoulder)
+        point = touched - FINGERS_USED * fingers * arm_vector / np.linalg.norm(arm_vector)
+        low = shoulder - (point[2] - plan.position[2])
+        far = float((point[:2] - plan.position[:2]) @ ahead)
+        crouch = float(np.clip(low - 1.05 * arm, 0.0, 0.42 * plan.hip_height))
+        left_over = np.hypot(max(far, 0.0), max(low - crouch, -0.6)) - 0.90 * arm
+        lean = float(np.clip(left_over / 0.45, 0.0, 0.9)) + 0.6 * crouch
+        start = plan.time
+        out = float(np.clip(0.45 + 0.55 * np.hypot(far, low) + 0.8 * crouch, 0.5, 1.6)) / plan.style.briskness
+        hold_s, back = rng.uniform(0.3, 1.4), out * rng.uniform(1.0, 1.3)
+        leave = start + out + hold_s
+        there, home = (start, start + out), (leave, leave + back)
+        inner = LEFT_SIGN[side] * np.clip(0.25 * lean, 0.0, 0.2)
+        plan.lean.visit((lean, 0.0, -inner), there, home)
+        plan.crouch.visit(crouch, there, home)
+        plan.hands[side].go_for(point, there, home)
+        look_at(plan, touched, (start, start + 0.45), (leave, leave + 0.5), 1.0)
+        plan.time = leave + back + rng.uniform(0.05, 0.6)
     return True
-
-
-def _grasp(plan: Plan, target: ReachTarget, rng: np.random.Generator) -> None:
-    """One reach with the nearer hand: minimum-jerk out, a pause, and back (0.4–1.2 s each way)."""
-    ahead, across = turn(plan.heading).T
-    touched = np.array(target.position) + np.append(0.08 * rng.standard_normal() * across, 0.04 * rng.standard_normal())
-    aside = float((touched[:2] - plan.position[:2]) @ across) + 0.1 * rng.standard_normal()
-    side = "left" if aside > 0 else "right"
-    arm, shoulder = plan.arm_length, 1.52 * plan.hip_height
-    # the wrist's goal is where the fingers of a straight hand touch the point
-    fingers = float(np.linalg.norm(plan.skeleton.sites["left_fingertip"].t_joint_site))
-    arm_vector = touched - plan.position - np.append(LEFT_SIGN[side] * 0.17 * across, shoulder)
-    point = touched - FINGERS_USED * fingers * arm_vector / np.linalg.norm(arm_vector)
-    low = shoulder - (point[2] - plan.position[2])
-    far = float((point[:2] - plan.position[:2]) @ ahead)
-    crouch = float(np.clip(low - 1.05 * arm, 0.0, 0.42 * plan.hip_height))
-    left_over = np.hypot(max(far, 0.0), max(low - crouch, -0.6)) - 0.90 * arm
-    lean = float(np.clip(left_over / 0.45, 0.0, 0.9)) + 0.6 * crouch
-    start = plan.time
-    out = float(np.clip(0.45 + 0.55 * np.hypot(far, low) + 0.8 * crouch, 0.5, 1.6)) / plan.style.briskness
-    hold_s, back = rng.uniform(0.3, 1.4), out * rng.uniform(1.0, 1.3)
-    leave = start + out + hold_s
-    there, home = (start, start + out), (leave, leave + back)
-    inner = LEFT_SIGN[side] * np.clip(0.25 * lean, 0.0, 0.2)
-    plan.lean.visit((lean, 0.0, -inner), there, home)
-    plan.crouch.visit(crouch, there, home)
-    plan.hands[side].go_for(point, there, home)
-    look_at(plan, touched, (start, start + 0.45), (leave, leave + 0.5), 1.0)
-    plan.time = leave + back + rng.uniform(0.05, 0.6)
 
 
 @_activity("sit", weight=2.0)
@@ -289,9 +302,10 @@ def _sit(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     The trunk leans forward 40–45°, the hips go back and down, it leans back; in reverse order to get up (Schenkman et
     al. 1990).
     """
-    if not world.seats:
+    seats = world.places.seats
+    if not seats:
         return False
-    seat = world.seats[rng.integers(len(world.seats))]
+    seat = seats[rng.integers(len(seats))]
     if not approach(plan, world, rng, seat.standing_point(), seat.heading):
         return False
     down, up = rng.uniform(1.5, 2.2, 2) / plan.style.briskness
@@ -323,12 +337,7 @@ def _sit(plan: Plan, world: World, rng: np.random.Generator) -> bool:
 @_activity("crouch", weight=1.2)
 def _crouch(plan: Plan, world: World, rng: np.random.Generator) -> bool:
     """Bend knees and trunk, often to touch an object before the feet with one hand, and come up again."""
-    start = plan.time + 0.1
-    depth = rng.uniform(0.18, 0.44) * plan.hip_height
-    down = (0.6 + 1.1 * depth) * rng.uniform(0.9, 1.3) / plan.style.briskness
-    leave = start + down + rng.uniform(0.4, 3.5)
-    up = down * rng.uniform(1.0, 1.25)
-    squat(plan, rng, depth, rng.uniform(0.35, 0.6) + 0.5 * depth, (start, down), (leave, up))
+    start, down, leave, up = squat(plan, rng, (0.18, 0.44), (0.35, 0.6), 0.6, 3.5)
     if rng.random() < 0.7:
         side = str(rng.choice(SIDES))
         angle = plan.heading + rng.normal(0.0, 0.3) + (0.25 if side == "left" else -0.25)

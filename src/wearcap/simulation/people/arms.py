@@ -226,26 +226,15 @@ def arm_motion(
     turn = pose_weight[:, 0] * torch.from_numpy(pose[:, 4].copy()) + torch.from_numpy(relaxed[:, 0])
     fold = pose_weight[:, 0] * torch.from_numpy(pose[:, 5].copy()) + torch.from_numpy(relaxed[:, 1] + 0.06)
     R_forearm = R_shoulder @ rotation.exp(flexion[:, None] * hinge)
-    R_elbow, R_hand = _turned(bones, R_forearm, turn, fold, grips)
-    return {"collar": R_collar, "shoulder": R_shoulder, "elbow": R_elbow, "wrist": R_elbow @ R_hand}
-
-
-def _turned(
-    bones: _ArmBones,
-    R_forearm: Float[Tensor, "time 3 3"],
-    turn: Float[Tensor, "time"],
-    fold: Float[Tensor, "time"],
-    grips: list[tuple[slice, Tensor, _ArmPosture]],
-) -> tuple[Float[Tensor, "time 3 3"], Float[Tensor, "time 3 3"]]:
-    """The elbow's rotation in the world and the wrist's in the forearm: at ease, or as the grips have it."""
-    axis, sign = bones.axis, bones.sign
-    R_hand = rotation.exp(0.3 * sign * turn[:, None] * axis) @ rotation.about_axis("x", -sign * fold)
+    # the forearm's turn and the wrist's bend: at ease, or as the grips have them
+    R_hand = rotation.exp(0.3 * sign * turn[:, None] * bones.axis) @ rotation.about_axis("x", -sign * fold)
     turn = 0.7 * sign * turn
     for part, share, taken in grips:
-        wanted_turn, wanted_bend = forearm_and_wrist(R_forearm[part], taken.hand, axis)
+        wanted_turn, wanted_bend = forearm_and_wrist(R_forearm[part], taken.hand, bones.axis)
         turn[part] += share * (wanted_turn - turn[part])
         R_hand[part] = rotation.exp(torch.lerp(rotation.log(R_hand[part]), wanted_bend, share[:, None]))
-    return R_forearm @ rotation.exp(turn[:, None] * axis), R_hand
+    R_elbow = R_forearm @ rotation.exp(turn[:, None] * bones.axis)
+    return {"collar": R_collar, "shoulder": R_shoulder, "elbow": R_elbow, "wrist": R_elbow @ R_hand}
 
 
 def _swing(trunk: Trunk, sign: float, running: np.ndarray, rng: np.random.Generator) -> tuple[Tensor, Tensor]:

@@ -1,6 +1,7 @@
 """The space that a moving body occupies: limbs as capsules, its centre of mass, and the floor it sweeps by height."""
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 import scipy.ndimage
@@ -70,7 +71,13 @@ class BodySpace:
             points = (start + share * (end - start)).reshape(-1, 3)
             points[:, 2] += SOLE_M if part == "foot" else 0.0
             groups.setdefault((radius, PARTS.index(part)), []).append(points)
-        thinned = {kind: _thinned(np.concatenate(points)) for kind, points in groups.items()}
+        thinned = {}
+        for kind, parts in groups.items():  # one point for each cube of side `VOXEL_M` that contains any
+            points = np.concatenate(parts)
+            cube = np.floor(points / VOXEL_M).astype(np.int64)
+            cube -= cube.min(0)
+            key = (cube[:, 0] * (cube[:, 1].max() + 1) + cube[:, 1]) * (cube[:, 2].max() + 1) + cube[:, 2]
+            thinned[kind] = points[np.unique(key, return_index=True)[1]]
         counts = [len(points) for points in thinned.values()]
         radius, part = (np.repeat(column, counts) for column in zip(*thinned))
         return cls(np.concatenate(list(thinned.values())), radius, part)
@@ -127,12 +134,22 @@ def foot_points(motion: Motion) -> Float[np.ndarray, "time patch 3"]:
     return site_positions(motion.skeleton, motion.T_world_joint, FOOT_PATCHES).double().numpy()
 
 
-def _thinned(points: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "kept 3"]:
-    """One point for each cube of side `VOXEL_M` that contains any."""
-    cube = np.floor(points / VOXEL_M).astype(np.int64)
-    cube -= cube.min(0)
-    key = (cube[:, 0] * (cube[:, 1].max() + 1) + cube[:, 1]) * (cube[:, 2].max() + 1) + cube[:, 2]
-    return points[np.unique(key, return_index=True)[1]]
+def off_balance(motion: Motion) -> Float[np.ndarray, "time"]:
+    """Horizontal distance (m) of the centre of mass from the convex hull of `foot_points`."""
+    points, corners = mass_center(motion)[:, :2], foot_points(motion)[..., :2]
+    count = corners.shape[1]
+    best = np.full(len(points), np.inf)
+    for i, j in combinations(range(count), 2):
+        edge, offset = corners[:, j] - corners[:, i], points - corners[:, i]
+        share = np.clip((offset * edge).sum(1) / np.maximum((edge * edge).sum(1), 1e-12), 0.0, 1.0)
+        best = np.minimum(best, np.linalg.norm(offset - share[:, None] * edge, axis=1))
+    for three in combinations(range(count), 3):
+        sides = []
+        for a, b in zip(three, (*three[1:], three[0])):
+            edge, offset = corners[:, b] - corners[:, a], points - corners[:, a]
+            sides.append(edge[:, 0] * offset[:, 1] - edge[:, 1] * offset[:, 0])
+        best[(np.min(sides, 0) >= 0) | (np.max(sides, 0) <= 0)] = 0.0
+    return best
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 Small steps carry the body along any path: forwards, backwards, sideways, turning.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from wearcap.simulation.people.gait import advance, bump, climb
 from wearcap.simulation.people.plan import LEFT_SIGN, OTHER, SIDES, STEP_M, Footprint, Plan, wrap
 from wearcap.simulation.people.track import blur, ease
 from wearcap.simulation.places.outline import turn
+from wearcap.simulation.places.world import Flight
 
 SPACING_M = 0.02
 RUN_SPEED = 2.1
@@ -63,7 +64,7 @@ class _Course:
     """Speed (m/s) from which on the gait is running."""
 
     @classmethod
-    def of(cls, plan: Plan, path: Float[np.ndarray, "waypoint 3"], speed: float, flights: tuple) -> "_Course":
+    def of(cls, plan: Plan, path: Float[np.ndarray, "waypoint 3"], speed: float, flights: Sequence) -> "_Course":
         """Speed, time and step phase along a path. Steps fall on the treads of the flights that it takes."""
         # evenly spaced points of the path with rounded corners, and its unwrapped heading
         run = np.concatenate([[0.0], np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).cumsum()])
@@ -129,7 +130,7 @@ class _Course:
 
 
 def walk_along(
-    plan: Plan, path: Float[np.ndarray, "waypoint 3"], rng: np.random.Generator, speed: float, flights: tuple = ()
+    plan: Plan, path: Float[np.ndarray, "waypoint 3"], rng: np.random.Generator, speed: float, flights: Sequence = ()
 ) -> None:
     """Turn towards a path's start, walk (or run, above 2.1 m/s) along it and stop at its end, feet together."""
     course = _Course.of(plan, path, speed, flights)
@@ -137,7 +138,16 @@ def walk_along(
     if abs(wrap(ahead - plan.heading)) > np.deg2rad(50):
         turn_to(plan, ahead - np.sign(wrap(ahead - plan.heading)) * np.deg2rad(15), rng)
     steps = round(course.phase[-1])
-    side = _first_foot(plan, wrap(course.at_phase("heading", 1.0) - plan.heading), rng)
+    # first the foot behind, else the inner one of a turn, else either
+    turned = wrap(course.at_phase("heading", 1.0) - plan.heading)
+    apart = (plan.prints["left"][-1].ground - plan.prints["right"][-1].ground)[:2]
+    leads = apart @ turn(plan.heading)[:, 0]
+    if abs(leads) > 0.1:
+        side = "right" if leads > 0 else "left"
+    elif abs(turned) > 0.2:
+        side = "left" if turned > 0 else "right"
+    else:
+        side = SIDES[int(rng.random() < 0.5)]
     lands = np.array([course.at_phase("time", k - 0.5) for k in range(1, steps + 1)])
     tempo = np.diff(lands, append=lands[-1] + 0.55) if steps > 1 else np.array([0.6])
     lands = lands + plan.style.gait.variability * rng.standard_normal(steps) * np.clip(tempo, 0, 0.6) * 0.6
@@ -187,7 +197,7 @@ def _walk_step(plan: Plan, side: str, lift: float, land: float, print_: Footprin
     plan.step(side, lift, land, lift_pitch, replace(print_, **swing))
 
 
-def _tread_anchors(points: np.ndarray, flight, foot: float) -> list[tuple[float, int, float]]:
+def _tread_anchors(points: np.ndarray, flight: Flight, foot: float) -> list[tuple[float, int, float]]:
     """(arc length, 1 up or -1 down, tread) of the places on a path where a foot must stand on a flight.
 
     `foot` is how far the toes are ahead of the ankle (m).
@@ -213,17 +223,6 @@ def _tread_anchors(points: np.ndarray, flight, foot: float) -> list[tuple[float,
     wanted = wanted[(wanted > crossing[0]) & (wanted < crossing[-1])]
     places = np.interp(wanted, crossing, np.arange(first, last + 1) * SPACING_M)
     return [(float(place), up, flight.tread) for place in places]
-
-
-def _first_foot(plan: Plan, turned: float, rng: np.random.Generator) -> str:
-    """The foot behind, else the inner one of a turn by an angle (rad), else either."""
-    apart = (plan.prints["left"][-1].ground - plan.prints["right"][-1].ground)[:2]
-    ahead = apart @ turn(plan.heading)[:, 0]
-    if abs(ahead) > 0.1:
-        return "right" if ahead > 0 else "left"
-    if abs(turned) > 0.2:
-        return "left" if turned > 0 else "right"
-    return SIDES[int(rng.random() < 0.5)]
 
 
 def turn_to(plan: Plan, heading: float, rng: np.random.Generator) -> None:
@@ -268,9 +267,6 @@ class _BodyPath:
     def at(self, name: str, time: float) -> float:
         return float(np.interp(time, self.times, getattr(self, name)))
 
-    def place_at(self, time: float) -> Float[np.ndarray, "3"]:
-        return np.array([np.interp(time, self.times, column) for column in self.place.T])
-
     def landings(
         self, plan: Plan, rng: np.random.Generator
     ) -> tuple[Float[np.ndarray, "step"], Float[np.ndarray, "step"]]:
@@ -314,7 +310,7 @@ class _BodyPath:
     ) -> None:
         """One step whose stance has its middle at a time; `timing` is its landing, swing and the steps' interval (s)."""
         land, swing, beat = timing
-        gait, (x, y, heading) = plan.style.gait, self.place_at(middle)
+        gait, (x, y, heading) = plan.style.gait, (np.interp(middle, self.times, column) for column in self.place.T)
         across, ahead = abs(self.at("aside", middle)) * beat, self.at("ahead", middle)
         half = max(gait.stance_width, across + CLOSE_M) / 2 * (1.0 + gait.variability * rng.standard_normal())
         center = np.array([x, y, plan.position[2]])

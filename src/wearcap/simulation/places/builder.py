@@ -3,6 +3,7 @@
 import colorsys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -79,11 +80,11 @@ def hue(rng: np.random.Generator, saturation: tuple[float, float] = (0.15, 0.7))
     return colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(*saturation), rng.uniform(0.45, 0.9))
 
 
-def entered(table: dict[str, Callable], name: str) -> Callable:
-    """Decorator that enters a maker in a table under a name."""
+def entered(table: dict[str, Callable], *kinds: str) -> Callable:
+    """Decorator that enters a maker in a table under a kind; a maker of several kinds is given its `kind`."""
 
     def enter(maker: Callable) -> Callable:
-        table[name] = maker
+        table.update({kind: partial(maker, kind=kind) if len(kinds) > 1 else maker for kind in kinds})
         return maker
 
     return enter
@@ -98,14 +99,9 @@ class WorldBuilder:
         self.name, self.heading, self.shift, self.outdoors = name, heading, shift, outdoors
         self.objects: list[w.WorldObject] = []
         self.surfaces: list[w.Surface] = []
-        self.seats: list[w.Seat] = []
-        self.reach_targets: list[w.ReachTarget] = []
-        self.flights: list[w.Flight] = []
-        self.rooms: list[w.Room] = []
-        self.doors: list[w.Door] = []
+        self.places = w.Places()
         self.windows: list[w.Door] = []
         """Gaps above a sill, given by the floor point below them."""
-        self.spots: list[w.CaptureSpot] = []
         self._triangles: list[tuple] = []
 
     @classmethod
@@ -174,7 +170,7 @@ class WorldBuilder:
         if isinstance(corners, tuple):
             x_low, y_low, x_high, y_high = corners
             corners = np.array([[x_low, y_low], [x_high, y_low], [x_high, y_high], [x_low, y_high]])
-        self.rooms.append(w.Room(name, self.to_world(corners), z, open_air))
+        self.places.rooms.append(w.Room(name, self.to_world(corners), z, open_air))
 
     def add_object(self, kind: str, outline, z_range: tuple[float, float], position, heading: float = 0.0) -> int:
         """Add an obstacle without triangles; returns its index for `add_box(item=…)`."""
@@ -203,7 +199,7 @@ class WorldBuilder:
             self.add_box(center, part.size, part.color, part.texture, heading, item, part.sides)
         for seat_x, seat_y, height, seat_heading, depth in piece.seats:
             spot = self.point(*(about @ np.array([seat_x, seat_y]) + (x, y)), z + height)
-            self.seats.append(w.Seat(spot, self.heading + heading + seat_heading, height, depth))
+            self.places.seats.append(w.Seat(spot, self.heading + heading + seat_heading, height, depth))
         for reach in piece.reaches:
             front = piece.size[0] / 2 + 0.33
             self.add_reach(
@@ -214,18 +210,37 @@ class WorldBuilder:
         return item
 
     def add_reach(self, position, stand, heading: float) -> None:
-        self.reach_targets.append(w.ReachTarget(self.point(*position), self.point(*stand), self.heading + heading))
+        self.places.reach_targets.append(
+            w.ReachTarget(self.point(*position), self.point(*stand), self.heading + heading)
+        )
 
     def finish(self, cell: float = 0.1) -> w.World:
         """The world, without the seats and reach targets that no walker can stand in front of.
 
         `cell` is the side of a cell of its planning grid (m).
         """
-        draft = self._world((), (), cell)
-        seats = tuple(s for s in self.seats if _reachable(draft, s.standing_point(), 0.45))
-        reaches = tuple(r for r in self.reach_targets if _reachable(draft, np.array(r.stand), 0.15))
-        world = self._world(seats, reaches, cell)
-        world.__dict__["navigation"] = draft.navigation
+        face_counts = [len(t[1]) for t in self._triangles]
+        draft = w.World(
+            name=self.name,
+            mesh=self.mesh(),
+            face_object=np.repeat([t[4] for t in self._triangles], face_counts),
+            face_texture=np.repeat(np.array([t[3] for t in self._triangles], np.float64), face_counts),
+            objects=tuple(self.objects),
+            surfaces=tuple(self.surfaces),
+            places=self.places,
+            cell=cell,
+            outdoors=self.outdoors,
+        )
+        grid = draft.navigation
+
+        def reachable(point: np.ndarray, within_m: float) -> bool:
+            node = grid.nearest_node(point)
+            return node is not None and bool(np.linalg.norm(grid.node_points[node][:2] - point[:2]) < within_m)
+
+        seats = [seat for seat in self.places.seats if reachable(seat.standing_point(), 0.45)]
+        targets = [each for each in self.places.reach_targets if reachable(np.array(each.stand), 0.15)]
+        world = replace(draft, places=replace(self.places, seats=seats, reach_targets=targets))
+        world.__dict__["navigation"] = grid
         return world
 
     def mesh(self) -> Mesh:
@@ -238,30 +253,6 @@ class WorldBuilder:
             np.concatenate([each + start for each, start in zip(faces, starts)]).astype(np.int32),
             np.repeat(np.array(colors, np.float32), counts, axis=0),
         )
-
-    def _world(self, seats: tuple, reaches: tuple, cell: float) -> w.World:
-        face_counts = [len(t[1]) for t in self._triangles]
-        return w.World(
-            name=self.name,
-            mesh=self.mesh(),
-            face_object=np.repeat([t[4] for t in self._triangles], face_counts),
-            face_texture=np.repeat(np.array([t[3] for t in self._triangles], np.float64), face_counts),
-            objects=tuple(self.objects),
-            surfaces=tuple(self.surfaces),
-            seats=seats,
-            reach_targets=reaches,
-            flights=tuple(self.flights),
-            rooms=tuple(self.rooms),
-            doors=tuple(self.doors),
-            cell=cell,
-            outdoors=self.outdoors,
-            spots=tuple(self.spots),
-        )
-
-
-def _reachable(world: w.World, point: np.ndarray, within_m: float) -> bool:
-    node = world.navigation.nearest_node(point)
-    return node is not None and bool(np.linalg.norm(world.navigation.node_points[node][:2] - point[:2]) < within_m)
 
 
 def _prism_faces(sides: int) -> np.ndarray:

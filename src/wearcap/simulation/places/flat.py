@@ -107,7 +107,7 @@ def lay_out(builder: WorldBuilder, rng: np.random.Generator, stairs: bool, furni
             builder.add_slab("floor", outline, z, slab, wood(rng), 1.5, level=level)
         for wall in layout.walls(z, rng):
             wall.build(builder, wall_color, rng)
-        kept_free = [before_gap(builder, door) for door in builder.doors if abs(door.position[2] - z) < 0.1]
+        kept_free = [before_gap(builder, door) for door in builder.places.doors if abs(door.position[2] - z) < 0.1]
         kinds = rng.permutation([*ROOM_KINDS, *ROOM_KINDS])[: len(rooms)]
         for number, (outline, kind) in enumerate(zip(rooms, kinds)):
             builder.add_slab("floor", outline, z, slab, wood(rng), 1.5, level=level)

@@ -31,6 +31,12 @@ ROOM_KINDS: dict[str, tuple[str, ...]] = {
 }
 """Furniture along the walls of each kind of room, in order of preference."""
 
+TABLES = {
+    "table": ((0.75, 0.95), (1.1, 1.9), (0.72, 0.76)),
+    "desk": ((0.6, 0.75), (1.2, 1.6), (0.72, 0.76)),
+    "coffee_table": ((0.5, 0.7), (0.8, 1.2), (0.38, 0.46)),
+}
+"""Ranges of depth, width and height of each kind of table (m)."""
 HAS_TABLE = ("living room", "kitchen")
 
 MAKERS: dict[str, Callable[[np.random.Generator], Piece]] = {}
@@ -67,17 +73,9 @@ def _chair(rng: np.random.Generator) -> Piece:
     return Piece("chair", (depth, width), (0.0, back), parts_of(rows), seats=((0.0, 0.0, seat, 0.0, depth / 2),))
 
 
-@entered(MAKERS, "armchair")
-def _armchair(rng: np.random.Generator) -> Piece:
-    return _upholstered(rng, "armchair", places=1)
-
-
-@entered(MAKERS, "sofa")
-def _sofa(rng: np.random.Generator) -> Piece:
-    return _upholstered(rng, "sofa", places=int(rng.integers(2, 4)))
-
-
-def _upholstered(rng: np.random.Generator, kind: str, places: int) -> Piece:
+@entered(MAKERS, "armchair", "sofa")
+def _upholstered(rng: np.random.Generator, kind: str) -> Piece:
+    places = 1 if kind == "armchair" else int(rng.integers(2, 4))
     depth, arm, seat = rng.uniform(0.80, 0.90), 0.16, rng.uniform(0.42, 0.46)
     inner, color = 0.62 * places, hue(rng)
     width = inner + 2 * arm
@@ -110,29 +108,10 @@ def _bed(rng: np.random.Generator) -> Piece:
     return Piece("bed", (width, length), (0.0, 1.0), parts_of(rows), seats=seats)
 
 
-@entered(MAKERS, "table")
-def _table(rng: np.random.Generator) -> Piece:
-    size = (rng.uniform(0.75, 0.95), rng.uniform(1.1, 1.9))
-    return _laid_table(rng, "table", size, rng.uniform(0.72, 0.76))
-
-
-@entered(MAKERS, "desk")
-def _desk(rng: np.random.Generator) -> Piece:
-    depth, width, top = rng.uniform(0.6, 0.75), rng.uniform(1.2, 1.6), rng.uniform(0.72, 0.76)
-    plain = _laid_table(rng, "desk", (depth, width), top)
-    screen = Part((-depth / 4, 0, top + 0.28), (0.03, 0.55, 0.34), DARK, 30.0)
-    return Piece("desk", plain.size, (0.0, top + 0.45), (*plain.parts, screen), reaches=plain.reaches)
-
-
-@entered(MAKERS, "coffee_table")
-def _coffee_table(rng: np.random.Generator) -> Piece:
-    size = (rng.uniform(0.5, 0.7), rng.uniform(0.8, 1.2))
-    return _laid_table(rng, "coffee_table", size, rng.uniform(0.38, 0.46))
-
-
-def _laid_table(rng: np.random.Generator, kind: str, size: tuple[float, float], top: float) -> Piece:
-    """A table with props on it; its first five parts are the legs and the top."""
-    depth, width = size
+@entered(MAKERS, *TABLES)
+def _laid_table(rng: np.random.Generator, kind: str) -> Piece:
+    """A table with props on it, a desk also with a screen; its first five parts are the legs and the top."""
+    depth, width, top = (rng.uniform(*span) for span in TABLES[kind])
     color = wood(rng)
     rows = [
         *_legs(depth - 0.06, width - 0.06, top - 0.04, 0.06, color),
@@ -140,7 +119,11 @@ def _laid_table(rng: np.random.Generator, kind: str, size: tuple[float, float], 
     ]
     props = [_prop(rng, (rng.uniform(0.0, depth / 2 - 0.12), y, top)) for y in _spread(rng, width - 0.3, 3)]
     reaches = tuple((p.center[0], p.center[1], top + p.size[2] * 0.7) for p in props)
-    return Piece(kind, size, (0.0, top), (*parts_of(rows), *props), reaches=reaches)
+    high = top
+    if kind == "desk":
+        props.append(Part((-depth / 4, 0, top + 0.28), (0.03, 0.55, 0.34), DARK, 30.0))
+        high += 0.45
+    return Piece(kind, (depth, width), (0.0, high), (*parts_of(rows), *props), reaches=reaches)
 
 
 @entered(MAKERS, "shelf")

@@ -130,7 +130,7 @@ class _Builder(WorldBuilder):
     def door_leaves(self, static: World) -> list[Openable]:
         """Door leaves in the gaps, mostly opening into rooms, on whichever side they have the space to."""
         leaves, rng = [], self.rng
-        for door in self.doors:
+        for door in self.places.doors:
             variants = list(product((-1.0, 1.0), repeat=2))
             into_hall = np.array([_room_at(static, door, side).startswith("hallway") for side, _ in variants])
             order = np.argsort(rng.random(4) + np.where(into_hall, rng.choice([0.0, 1.0], p=[0.2, 0.8]), 0.0))
@@ -226,7 +226,10 @@ def _numbered(items: list) -> tuple:
 
 
 def _furnish(plan: Plan, kind: str, rng: np.random.Generator) -> None:
-    """Movable furniture first, then static furniture along the walls, with room in front of windows."""
+    """Movable furniture first, boxes and some sofas at a wall; then static furniture along the walls.
+
+    Windows have room in front of them.
+    """
     builder = plan.builder
     assert isinstance(builder, _Builder)
     for number, window in enumerate(builder.windows):
@@ -234,9 +237,28 @@ def _furnish(plan: Plan, kind: str, rng: np.random.Generator) -> None:
             builder.shut.add(number)
         elif number not in builder.shut:
             plan.kept_free.append(before_gap(builder, window, 1.0, 0.1))
+    x_low, y_low, x_high, y_high = plan.room
     for category in LOOSE[kind]:
-        if rng.random() < 0.85:
-            _place_loose(plan, category, rng)
+        if rng.random() >= 0.85:
+            continue
+        piece = _loose(category, rng)
+        if category == "box" or (category == "sofa" and rng.random() < 0.5):
+            plan.against_wall(piece, rng, front=0.0 if category == "box" else FRONT_M)
+            continue
+        for _ in range(16):
+            heading = int(rng.integers(4)) * np.pi / 2 + rng.normal(0.0, 0.05)
+            x, y = rng.uniform(x_low + 0.6, x_high - 0.6), rng.uniform(y_low + 0.6, y_high - 0.6)
+            if plan.try_place(piece, x, y, heading):
+                break
+        else:
+            continue
+        # chairs on the long sides of a table
+        for side, across in product((-1, 1), (-0.25, 0.25)) if category == "table" else ():
+            off = side * (piece.size[0] / 2 + rng.uniform(0.30, 0.45))
+            chair_x, chair_y = (np.array([x, y]) + turn(heading) @ np.array([off, across * piece.size[1]])).tolist()
+            facing = heading + (0.0 if side < 0 else np.pi) + rng.uniform(-0.3, 0.3)
+            if rng.random() < 0.45:
+                plan.try_place(_loose("chair", rng), chair_x, chair_y, facing)
     for category in FIXED[kind]:
         if rng.random() < 0.8:
             plan.against_wall(MAKERS[category](rng), rng)
@@ -248,32 +270,10 @@ def _loose(category: str, rng: np.random.Generator) -> _Loose:
     return _Loose(category, size, (0.0, movable.height), (), movable=movable)
 
 
-def _place_loose(plan: Plan, category: str, rng: np.random.Generator) -> None:
-    """A box or sofa at a wall, else anything somewhere in the room; a table with chairs on its long sides."""
-    piece = _loose(category, rng)
-    x_low, y_low, x_high, y_high = plan.room
-    if category == "box" or (category == "sofa" and rng.random() < 0.5):
-        plan.against_wall(piece, rng, front=0.0 if category == "box" else FRONT_M)
-        return
-    for _ in range(16):
-        heading = int(rng.integers(4)) * np.pi / 2 + rng.normal(0.0, 0.05)
-        x, y = rng.uniform(x_low + 0.6, x_high - 0.6), rng.uniform(y_low + 0.6, y_high - 0.6)
-        if plan.try_place(piece, x, y, heading):
-            break
-    else:
-        return
-    for side, across in product((-1, 1), (-0.25, 0.25)) if category == "table" else ():
-        off = side * (piece.size[0] / 2 + rng.uniform(0.30, 0.45))
-        chair_x, chair_y = (np.array([x, y]) + turn(heading) @ np.array([off, across * piece.size[1]])).tolist()
-        facing = heading + (0.0 if side < 0 else np.pi) + rng.uniform(-0.3, 0.3)
-        if rng.random() < 0.45:
-            plan.try_place(_loose("chair", rng), chair_x, chair_y, facing)
-
-
 def _room_at(static: World, gap: Door, side: float) -> str:
     """Name of the room half a metre away from a gap, "" outside."""
     point = np.array(gap.position[:2]) + side * 0.5 * turn(gap.heading)[:, 0]
-    names = [room.name for room in static.rooms if points_in_convex(point[None], room.polygon)[0]]
+    names = [room.name for room in static.places.rooms if points_in_convex(point[None], room.polygon)[0]]
     return names[0] if names else ""
 
 
@@ -308,12 +308,12 @@ class House:
             away = np.linalg.norm(grid.node_points[:, :2] - np.array(point)[:2], axis=1)
             return bool((away < NEAR_WALKABLE_M).any())
 
-        now = replace(
-            static,
-            objects=(*static.objects, *extra),
-            seats=tuple(seat for seat in static.seats if near(seat.standing_point())),
-            reach_targets=tuple(target for target in static.reach_targets if near(target.stand)),
+        places = replace(
+            static.places,
+            seats=[seat for seat in static.places.seats if near(seat.standing_point())],
+            reach_targets=[target for target in static.places.reach_targets if near(target.stand)],
         )
+        now = replace(static, objects=(*static.objects, *extra), places=places)
         now.__dict__["navigation"] = grid
         return now
 

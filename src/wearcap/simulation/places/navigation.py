@@ -93,10 +93,6 @@ class NavigationGrid:
         return NavigationGrid(self.origin, self.cell, self.height, clearance, walkable)
 
     @cached_property
-    def _cells(self) -> Int[np.ndarray, "node 3"]:
-        return np.argwhere(self.walkable)
-
-    @cached_property
     def _graph(self) -> tuple[scipy.sparse.csr_array, np.ndarray, np.ndarray]:
         """Links with their lengths (m, climbs included), and the two nodes of each link in the matrix's order."""
         first, second = _links(self.height, self.walkable)
@@ -112,13 +108,13 @@ class NavigationGrid:
 
     @cached_property
     def node_points(self) -> Float[np.ndarray, "node 3"]:
-        layer, i, j = self._cells.T
-        xy = self.origin + (self._cells[:, 1:] + 0.5) * self.cell
-        return np.concatenate([xy, self.height[layer, i, j][:, None]], 1)
+        xy = self.origin + (np.argwhere(self.walkable)[:, 1:] + 0.5) * self.cell
+        return np.concatenate([xy, self.height[self.walkable][:, None]], 1)
 
     def layer_of(self, points: Float[np.ndarray, "*batch 3"]) -> Int[np.ndarray, "*batch"]:
         """Index of the layer whose floor is nearest in height to each point."""
-        i, j = np.moveaxis(self._index_of(points[..., :2]), -1, 0)
+        index = np.floor((points[..., :2] - self.origin) / self.cell).astype(int)
+        i, j = np.moveaxis(np.clip(index, 0, np.array(self.height.shape[1:]) - 1), -1, 0)
         gap = np.abs(self.height[:, i, j] - points[..., 2])
         return np.where(np.isnan(gap), np.inf, gap).argmin(0)
 
@@ -136,22 +132,12 @@ class NavigationGrid:
         far = (1 - v) * self.clearance[layer, i + 1, j] + v * self.clearance[layer, i + 1, j + 1]
         return (1 - u) * near + u * far
 
-    def _index_of(self, points_xy: np.ndarray) -> np.ndarray:
-        index = np.floor((points_xy - self.origin) / self.cell).astype(int)
-        return np.clip(index, 0, np.array(self.height.shape[1:]) - 1)
-
     def nearest_node(self, point: Float[np.ndarray, "3"]) -> int | None:
         """The walkable cell nearest to a floor point, within 1.5 m and on its storey; None when there is none."""
         offset = self.node_points - point
         distance = np.linalg.norm(offset[:, :2], axis=1) + np.where(np.abs(offset[:, 2]) < 0.6, 0.0, np.inf)
         nearest = int(distance.argmin())
         return nearest if distance[nearest] < SNAP_M else None
-
-    def sample(self, rng: np.random.Generator, count: int) -> Float[np.ndarray, "count 3"]:
-        """Random positions within walkable cells (m)."""
-        points = self.node_points[rng.integers(len(self.node_points), size=count)]
-        points[:, :2] += rng.uniform(-0.5, 0.5, (count, 2)) * self.cell
-        return points
 
     def lengths_from(self, start: Float[np.ndarray, "3"]) -> Float[np.ndarray, "node"]:
         """Length (m) of the shortest path from a floor point to every walkable cell (`node_points`)."""
@@ -176,6 +162,33 @@ class NavigationGrid:
         while path[-1] != last:
             path.append(int(came_from[path[-1]]))
         return self.node_points[path]
+
+    def path(
+        self, start: Float[np.ndarray, "3"], goal: Float[np.ndarray, "3"], flights: list, rng: np.random.Generator
+    ) -> Float[np.ndarray, "waypoint 3"] | None:
+        """A smooth path off obstacles, straight on `flights`, waypoints about 0.1 m apart; heights only to a cell."""
+        cells = self.shortest(start, goal, shyness=rng.uniform(1.0, 4.0))
+        if cells is None:
+            return None
+        points = _evenly(np.concatenate([start[None], cells, goal[None]]))
+        if len(points) < 4:
+            return points
+        layer = self.layer_of(points)
+        sides = [rng.uniform(-1, 1) * max(flight.width / 2 - 0.35, 0.0) for flight in flights]
+        for _ in range(SMOOTHING_PASSES):
+            moved = points.copy()
+            moved[1:-1, :2] += 0.5 * ((points[:-2, :2] + points[2:, :2]) / 2 - points[1:-1, :2])
+            for flight, side in zip(flights, sides):  # drawn to a line beside the flight's middle
+                run, off = flight.up_and_left(moved[:, :2])
+                on = (run > -STAIR_APPROACH_M) & (run < flight.length + STAIR_APPROACH_M)
+                on &= (np.abs(off) < flight.width / 2) & (moved[:, 2] > flight.base_z - 0.3)
+                on &= moved[:, 2] < flight.top_z + 0.3
+                on[[0, -1]] = False
+                moved[on, :2] += ((side - off[on]) * 0.5)[:, None] * flight.left
+            clear = self.clearance_in(layer, moved[:, :2])
+            tight = (clear < CLEARANCE_M) & (clear < self.clearance_in(layer, points[:, :2]))
+            points = np.where(tight[:, None], points, moved)
+        return _evenly(points)
 
 
 def _window(outline: np.ndarray, origin: np.ndarray, cell: float, shape: tuple, margin: float) -> tuple:
@@ -219,40 +232,6 @@ def _keep_off(objects: tuple, origin: np.ndarray, cell: float, height: np.ndarra
         for floor, clear in zip(height, clearance):
             bars = (item.z_range[0] < floor[window] + HEADROOM_M) & (item.z_range[1] > floor[window] + LOW_M)
             clear[window] = np.where(bars, np.minimum(clear[window], distance), clear[window])
-
-
-def plan_path(
-    grid: NavigationGrid,
-    flights: tuple,
-    start: Float[np.ndarray, "3"],
-    goal: Float[np.ndarray, "3"],
-    rng: np.random.Generator,
-) -> Float[np.ndarray, "waypoint 3"] | None:
-    """A smooth path from start to goal, waypoints about 0.1 m apart; heights only to a cell. None without a path.
-
-    It keeps off obstacles and is straight on stairs.
-    """
-    cells = grid.shortest(start, goal, shyness=rng.uniform(1.0, 4.0))
-    if cells is None:
-        return None
-    points = _evenly(np.concatenate([start[None], cells, goal[None]]))
-    if len(points) < 4:
-        return points
-    layer = grid.layer_of(points)
-    sides = [rng.uniform(-1, 1) * max(flight.width / 2 - 0.35, 0.0) for flight in flights]
-    for _ in range(SMOOTHING_PASSES):
-        moved = points.copy()
-        moved[1:-1, :2] += 0.5 * ((points[:-2, :2] + points[2:, :2]) / 2 - points[1:-1, :2])
-        for flight, side in zip(flights, sides):  # drawn to a line beside the flight's middle
-            run, off = flight.up_and_left(moved[:, :2])
-            on = (run > -STAIR_APPROACH_M) & (run < flight.length + STAIR_APPROACH_M) & (np.abs(off) < flight.width / 2)
-            on &= (moved[:, 2] > flight.base_z - 0.3) & (moved[:, 2] < flight.top_z + 0.3)
-            on[[0, -1]] = False
-            moved[on, :2] += ((side - off[on]) * 0.5)[:, None] * flight.left
-        clear = grid.clearance_in(layer, moved[:, :2])
-        tight = (clear < CLEARANCE_M) & (clear < grid.clearance_in(layer, points[:, :2]))
-        points = np.where(tight[:, None], points, moved)
-    return _evenly(points)
 
 
 def _evenly(points: np.ndarray) -> np.ndarray:

@@ -75,12 +75,12 @@ class _Layout:
     """From left to right."""
 
     @classmethod
-    def drawn(cls, rng: np.random.Generator, ramp_slope: float | None) -> "_Layout":
+    def drawn(cls, rng: np.random.Generator) -> "_Layout":
         kerb, street = rng.uniform(0.10, 0.15), rng.uniform(3.6, 5.5)
         pavement = street + rng.uniform(2.2, 3.2)
         steps, rise, tread = int(rng.integers(3, 7)), rng.uniform(0.15, 0.17), rng.uniform(0.30, 0.32)
         height = steps * rise
-        slope = float(np.clip(ramp_slope or rng.uniform(0.07, 0.10), height / LONGEST_RAMP_M, 0.10))
+        slope = float(np.clip(rng.uniform(0.07, 0.10), height / LONGEST_RAMP_M, 0.10))
         run, ramp_width = height / slope, rng.uniform(1.6, 2.1)
         long, deep = rng.uniform(4.5, 6.5), rng.uniform(2.8, 3.6)
         depth = pavement + deep + (steps - 1) * tread + rng.uniform(2.2, 3.5)
@@ -111,109 +111,108 @@ class _Layout:
             tuple(_Crossing(*place, drop, number == dropped) for number, place in enumerate(crossings)),
         )
 
+    def build_ground(self, builder: WorldBuilder, rng: np.random.Generator) -> None:
+        """Street, kerb stones, pavement (lowered at one crossing) and square, in a meadow that is only visible."""
+        width, street, kerb = self.width, self.street, self.kerb
+        shade = rng.uniform(0.30, 0.42)
+        builder.add_slab("floor", (0.0, 0.0, width, street), 0.0, 0.05, (shade, shade, shade * 1.04), 3.0)
+        inner = street + KERB_STONE_M
+        pieces = [(0.0, width)]
+        for crossing in self.crossings:
+            if not crossing.lowered:
+                continue
+            low, high = crossing.x - crossing.width / 2, crossing.x + crossing.width / 2
+            pieces, end = [(0.0, low), (high, width)], street + crossing.drop
+            slope = kerb / crossing.drop
+            builder.add_slab("ramp", (low, street, high, end), kerb, kerb, PAVING, 6.0, (0.0, slope, -slope * street))
+            for a, b in pieces:
+                builder.add_slab("floor", (a, inner, b, end), kerb, kerb, PAVING, 6.0)
+            inner = end
+        for a, b in pieces:
+            builder.add_slab("kerb", (a, street, b, street + KERB_STONE_M), kerb, kerb, STONE, 12.0)
+        builder.add_slab("floor", (0.0, inner, width, self.pavement), kerb, kerb, PAVING, 6.0)
+        warm, light = rng.uniform(0.0, 0.16), rng.uniform(0.45, 0.75)  # gravel, clinker or flagstones
+        earthy = light * (1.0 + warm), light, light * (1.0 - warm)
+        builder.add_slab("floor", (0.0, self.pavement, width, self.depth), kerb, kerb, earthy, 5.0)
+        center = (width / 2, self.depth / 2, -0.11)
+        builder.add_box(center, (width + 24.0, self.depth + 24.0, 0.1), MEADOW, 1.0)
+        for name, low, high, z in (
+            ("street", 0.0, street, 0.0),
+            ("pavement", street, self.pavement, kerb),
+            ("square", self.pavement, self.stairs.start[1], kerb),
+        ):
+            builder.add_room(name, (0.0, low, width, high), z)
 
-def build_outdoor(rng: np.random.Generator, name: str, ramp_slope: float | None = None) -> World:
-    """An open place with kerbs of 10–15 cm, stairs and a ramp of 7–10 % (`ramp_slope` None leaves it to chance)."""
+    def build_terrace(self, builder: WorldBuilder) -> None:
+        """A raised floor with railings, open to the stairs before it and to the ramp beside it."""
+        top, base, (x_low, y_low, x_high, y_high), ramp = self.top, self.kerb, self.terrace, self.ramp
+        box, up = ramp.box, ramp.up
+        foot, head = (box[0], box[2]) if up > 0 else (box[2], box[0])
+        plane = up * ramp.slope, 0.0, top - up * ramp.slope * head
+        builder.add_slab("floor", self.terrace, top, top - base, STONE, 6.0)
+        builder.add_slab("ramp", box, top, top - base, (0.62, 0.60, 0.57), 6.0, plane)
+        build_flight(builder, self.stairs, color=STONE)
+        x, wide = self.stairs.start[0], self.stairs.width
+        side, far = (x_low, x_high) if up > 0 else (x_high, x_low)
+        edge = 0.05
+        for a, b in (
+            ((x_low + edge, y_low + edge), (x - wide / 2 - 0.03, y_low + edge)),
+            ((x + wide / 2 + 0.03, y_low + edge), (x_high - edge, y_low + edge)),
+            ((side + up * edge, y_low + edge), (side + up * edge, box[1])),
+            ((far - up * edge, y_low + edge), (far - up * edge, y_high)),
+        ):
+            sloped_rail(builder, a, b, base, (top, top))
+        sloped_rail(builder, (foot, box[1] + edge), (head, box[1] + edge), base, (base, top))
+        builder.add_room("terrace", self.terrace, top)
+
+    def build_borders(self, builder: WorldBuilder, rng: np.random.Generator) -> None:
+        """The kerb, a house behind the square, one across the street or at an end, garden walls and hedges.
+
+        Cars, hedges and railings line the kerb, which is stepped over, or walked down, where they leave gaps.
+        """
+        street, kerb, width, depth = self.street, self.kerb, self.width, self.depth
+        at = 0.0
+        for crossing in self.crossings:
+            x, half = crossing.x, crossing.width / 2
+            barrier(builder, (at, x - half), street, (0.0, kerb), rng, street > 4.6)
+            at = x + half
+            if not crossing.lowered:
+                start, direction = builder.point(x, street), builder.heading + np.pi / 2
+                builder.places.flights.append(Flight(start, direction, 1, kerb, KERB_TREAD_M, crossing.width, 0.0))
+            for side in (-1, 1) if crossing.lowered else ():
+                beside = x + side * (half + 0.06)
+                sloped_rail(builder, (beside, street), (beside, street + crossing.drop), kerb, (kerb, kerb), 0.6)
+        barrier(builder, (at, width), street, (0.0, kerb), rng, street > 4.6)
+        doors = [(self.terrace[0] + rng.uniform(0.3, 0.7) * (self.terrace[2] - self.terrace[0]), self.top)]
+        doors.append((width - 1.0 if self.ramp.up < 0 else 1.0, kerb))
+        build_facade(builder, (0.0, depth, width, depth + 0.4), rng.uniform(5.0, 7.5), doors, self.top, rng)
+        for x in np.arange(0.0, width - 2.0, 3.0):
+            if rng.uniform() < 0.75:
+                tall, hedge = rng.uniform(0.8, 2.2), rng.uniform() < 0.5
+                color, texture = ((0.22, 0.42, 0.2), 35.0) if hedge else (hue(rng, (0.1, 0.35)), 9.0)
+                center = (x + 1.5, -0.25, tall / 2)
+                builder.add_block(
+                    "hedge" if hedge else "wall", center, (rng.uniform(2.0, 3.0), 0.4, tall), color, texture
+                )
+        for x in (-0.2, width + 0.2):
+            if rng.uniform() < 0.6:
+                tall, low = rng.uniform(0.9, 2.4), rng.uniform(street, self.pavement)
+                center = (x, (low + depth) / 2, tall / 2 + kerb)
+                builder.add_block("wall", center, (0.3, depth - low, tall), hue(rng, (0.1, 0.35)), 9.0)
+        for x in rng.uniform(0.0, width, 4):
+            tree = MAKERS["tree"](rng)
+            builder.place(tree, (float(x), float(rng.uniform(-4.0, -1.5)), -0.06), 0.0)
+
+
+def build_outdoor(rng: np.random.Generator, name: str) -> World:
+    """An open place with kerbs of 10–15 cm, stairs and a ramp of 7–10 %."""
     builder = WorldBuilder.drawn(name, rng, outdoors=True)
-    layout = _Layout.drawn(rng, ramp_slope)
-    _build_ground(builder, layout, rng)
-    _build_terrace(builder, layout)
-    _build_borders(builder, layout, rng)
+    layout = _Layout.drawn(rng)
+    layout.build_ground(builder, rng)
+    layout.build_terrace(builder)
+    layout.build_borders(builder, rng)
     _furnish(builder, layout, rng)
     return builder.finish()
-
-
-def _build_ground(builder: WorldBuilder, layout: _Layout, rng: np.random.Generator) -> None:
-    """Street, kerb stones, pavement (lowered at one crossing) and square, in a meadow that is only visible."""
-    width, street, kerb = layout.width, layout.street, layout.kerb
-    shade = rng.uniform(0.30, 0.42)
-    builder.add_slab("floor", (0.0, 0.0, width, street), 0.0, 0.05, (shade, shade, shade * 1.04), 3.0)
-    inner = street + KERB_STONE_M
-    pieces = [(0.0, width)]
-    for crossing in layout.crossings:
-        if not crossing.lowered:
-            continue
-        low, high = crossing.x - crossing.width / 2, crossing.x + crossing.width / 2
-        pieces, end = [(0.0, low), (high, width)], street + crossing.drop
-        slope = kerb / crossing.drop
-        builder.add_slab("ramp", (low, street, high, end), kerb, kerb, PAVING, 6.0, (0.0, slope, -slope * street))
-        for a, b in pieces:
-            builder.add_slab("floor", (a, inner, b, end), kerb, kerb, PAVING, 6.0)
-        inner = end
-    for a, b in pieces:
-        builder.add_slab("kerb", (a, street, b, street + KERB_STONE_M), kerb, kerb, STONE, 12.0)
-    builder.add_slab("floor", (0.0, inner, width, layout.pavement), kerb, kerb, PAVING, 6.0)
-    warm, light = rng.uniform(0.0, 0.16), rng.uniform(0.45, 0.75)  # gravel, clinker or flagstones
-    earthy = light * (1.0 + warm), light, light * (1.0 - warm)
-    builder.add_slab("floor", (0.0, layout.pavement, width, layout.depth), kerb, kerb, earthy, 5.0)
-    center = (width / 2, layout.depth / 2, -0.11)
-    builder.add_box(center, (width + 24.0, layout.depth + 24.0, 0.1), MEADOW, 1.0)
-    for name, low, high, z in (
-        ("street", 0.0, street, 0.0),
-        ("pavement", street, layout.pavement, kerb),
-        ("square", layout.pavement, layout.stairs.start[1], kerb),
-    ):
-        builder.add_room(name, (0.0, low, width, high), z)
-
-
-def _build_terrace(builder: WorldBuilder, layout: _Layout) -> None:
-    """A raised floor with railings, open to the stairs before it and to the ramp beside it."""
-    top, base, (x_low, y_low, x_high, y_high), ramp = layout.top, layout.kerb, layout.terrace, layout.ramp
-    box, up = ramp.box, ramp.up
-    foot, head = (box[0], box[2]) if up > 0 else (box[2], box[0])
-    plane = up * ramp.slope, 0.0, top - up * ramp.slope * head
-    builder.add_slab("floor", layout.terrace, top, top - base, STONE, 6.0)
-    builder.add_slab("ramp", box, top, top - base, (0.62, 0.60, 0.57), 6.0, plane)
-    build_flight(builder, layout.stairs, color=STONE)
-    x, wide = layout.stairs.start[0], layout.stairs.width
-    side, far = (x_low, x_high) if up > 0 else (x_high, x_low)
-    edge = 0.05
-    for a, b in (
-        ((x_low + edge, y_low + edge), (x - wide / 2 - 0.03, y_low + edge)),
-        ((x + wide / 2 + 0.03, y_low + edge), (x_high - edge, y_low + edge)),
-        ((side + up * edge, y_low + edge), (side + up * edge, box[1])),
-        ((far - up * edge, y_low + edge), (far - up * edge, y_high)),
-    ):
-        sloped_rail(builder, a, b, base, (top, top))
-    sloped_rail(builder, (foot, box[1] + edge), (head, box[1] + edge), base, (base, top))
-    builder.add_room("terrace", layout.terrace, top)
-
-
-def _build_borders(builder: WorldBuilder, layout: _Layout, rng: np.random.Generator) -> None:
-    """The kerb, a house behind the square, one across the street or at an end, garden walls and hedges.
-
-    Cars, hedges and railings line the kerb, which is stepped over, or walked down, where they leave gaps.
-    """
-    street, kerb, width, depth = layout.street, layout.kerb, layout.width, layout.depth
-    at = 0.0
-    for crossing in layout.crossings:
-        x, half = crossing.x, crossing.width / 2
-        barrier(builder, (at, x - half), street, (0.0, kerb), rng, street > 4.6)
-        at = x + half
-        if not crossing.lowered:
-            start, direction = builder.point(x, street), builder.heading + np.pi / 2
-            builder.flights.append(Flight(start, direction, 1, kerb, KERB_TREAD_M, crossing.width, 0.0))
-        for side in (-1, 1) if crossing.lowered else ():
-            beside = x + side * (half + 0.06)
-            sloped_rail(builder, (beside, street), (beside, street + crossing.drop), kerb, (kerb, kerb), 0.6)
-    barrier(builder, (at, width), street, (0.0, kerb), rng, street > 4.6)
-    doors = [(layout.terrace[0] + rng.uniform(0.3, 0.7) * (layout.terrace[2] - layout.terrace[0]), layout.top)]
-    doors.append((width - 1.0 if layout.ramp.up < 0 else 1.0, kerb))
-    build_facade(builder, (0.0, depth, width, depth + 0.4), rng.uniform(5.0, 7.5), doors, layout.top, rng)
-    for x in np.arange(0.0, width - 2.0, 3.0):
-        if rng.uniform() < 0.75:
-            tall, hedge = rng.uniform(0.8, 2.2), rng.uniform() < 0.5
-            color, texture = ((0.22, 0.42, 0.2), 35.0) if hedge else (hue(rng, (0.1, 0.35)), 9.0)
-            center = (x + 1.5, -0.25, tall / 2)
-            builder.add_block("hedge" if hedge else "wall", center, (rng.uniform(2.0, 3.0), 0.4, tall), color, texture)
-    for x in (-0.2, width + 0.2):
-        if rng.uniform() < 0.6:
-            tall, low = rng.uniform(0.9, 2.4), rng.uniform(street, layout.pavement)
-            center = (x, (low + depth) / 2, tall / 2 + kerb)
-            builder.add_block("wall", center, (0.3, depth - low, tall), hue(rng, (0.1, 0.35)), 9.0)
-    for x in rng.uniform(0.0, width, 4):
-        tree = MAKERS["tree"](rng)
-        builder.place(tree, (float(x), float(rng.uniform(-4.0, -1.5)), -0.06), 0.0)
 
 
 def _furnish(builder: WorldBuilder, layout: _Layout, rng: np.random.Generator) -> None:

@@ -41,6 +41,8 @@ MOVABLE = (
     *("desk", "cabinet", "sofa", "planter"),
 )
 """Kinds of objects that may stand elsewhere, or be gone, some days later."""
+MOST_M = 0.5
+"""Largest displacement of such an object (m)."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,42 @@ class _Layout:
             walls.append(between)
         return walls
 
+    def build_open_air(self, builder: WorldBuilder, rng: np.random.Generator) -> None:
+        """Terrace, stairs and ramp with their railings, the yard's paving and lawn, walls and a house around it."""
+        x_low, y_low, x_high, edge = self.terrace
+        paving, gray = (0.62, 0.60, 0.56), float(rng.uniform(0.34, 0.46))
+        builder.add_slab("floor", self.terrace, 0.0, -BASE + 0.05, STONE, 6.0)
+        builder.add_slab("ramp", self.ramp, 0.0, -BASE, paving, 6.0, (0.0, -RAMP_SLOPE, RAMP_SLOPE * edge))
+        start = (self.stair_x, edge + (RISERS - 1) * TREAD_M)
+        build_flight(builder, Flight(start, -np.pi / 2, RISERS, RISE_M, TREAD_M, self.stair_width, BASE), color=STONE)
+        half = self.stair_width / 2
+        gaps = sorted([(self.ramp[0], self.ramp[2]), (self.stair_x - half - 0.03, self.stair_x + half + 0.03)])
+        ends = [x_low + 0.05, *(x for gap in gaps for x in gap), x_high - 0.05]
+        for a, b in zip(ends[::2], ends[1::2]):
+            if b - a > 0.1:
+                sloped_rail(builder, (a, edge - 0.05), (b, edge - 0.05), BASE, (0.0, 0.0))
+        for x in (self.ramp[0] + 0.05, self.ramp[2] - 0.05):
+            sloped_rail(builder, (x, edge), (x, self.ramp[3]), BASE, (0.0, BASE))
+        far = self.yard[3]
+        lawn = edge + (far - edge) * 0.62
+        builder.add_slab("floor", (x_low, edge, x_high, lawn), BASE, 0.05, (gray, gray, 1.04 * gray), 3.0)
+        builder.add_slab("floor", (x_low, lawn, x_high, far), BASE, 0.05, (0.30, 0.46, 0.22), 12.0)
+        builder.add_room("terrace", self.terrace, 0.0, open_air=True)
+        builder.add_room("yard", self.yard, BASE, open_air=True)
+        doors = [(float(x_high * share), BASE) for share in (0.3, 0.75)]
+        build_facade(builder, (x_low - 2, far, x_high + 2, far + 0.4), rng.uniform(5.5, 8.0), doors, BASE, rng)
+        for x in (x_low - 0.2, x_high + 0.2):
+            for y, next_y in pairwise(np.linspace(y_low + 0.1, far, 5)):
+                tall, hedge = rng.uniform(1.3, 2.4), rng.uniform() < 0.4
+                center, size = (x, (y + next_y) / 2, BASE + tall / 2), (0.3, next_y - y, tall)
+                if hedge:
+                    builder.add_block("hedge", center, size, (0.24, 0.42, 0.2), 35.0)
+                else:
+                    color = tuple(rng.uniform(0.4, 0.75) * np.array((1.0, 0.82, 0.72)))
+                    builder.add_block("garden_wall", center, size, color, 9.0)
+        ground = ((x_low + x_high) / 2, far / 2, BASE - 0.11)
+        builder.add_box(ground, (self.width + 30.0, far + 30.0, 0.1), (0.40, 0.50, 0.30), 1.0)
+
 
 def build_site(rng: np.random.Generator, name: str, scale: float = 1.0) -> World:
     """A site with its capture spot in the first hall; `scale` below 1 makes it smaller (0.6: about a third)."""
@@ -120,7 +158,7 @@ def build_site(rng: np.random.Generator, name: str, scale: float = 1.0) -> World
         for x in np.arange(box[0] + 1.3, box[2] - 1.0, 2.8):
             for y in np.arange(box[1] + 1.2, box[3] - 0.8, 2.6):
                 builder.add_box((float(x), float(y), HEIGHT - 0.03), (1.25, 0.28, 0.06), (1.0, 1.0, 0.97), 8.0)
-    _build_open_air(builder, layout, rng)
+    layout.build_open_air(builder, rng)
     _furnish(builder, layout, rng)
     return builder.finish()
 
@@ -137,45 +175,8 @@ def _row(box: Box, spacing: float, width: float) -> list[tuple[float, float]]:
     return [(box[0] + (k + 0.5) * (box[2] - box[0]) / count, float(width)) for k in range(count)]
 
 
-def _build_open_air(builder: WorldBuilder, layout: _Layout, rng: np.random.Generator) -> None:
-    """Terrace, stairs and ramp with their railings, the yard's paving and lawn, walls and a house around it."""
-    x_low, y_low, x_high, edge = layout.terrace
-    paving, gray = (0.62, 0.60, 0.56), float(rng.uniform(0.34, 0.46))
-    builder.add_slab("floor", layout.terrace, 0.0, -BASE + 0.05, STONE, 6.0)
-    builder.add_slab("ramp", layout.ramp, 0.0, -BASE, paving, 6.0, (0.0, -RAMP_SLOPE, RAMP_SLOPE * edge))
-    start = (layout.stair_x, edge + (RISERS - 1) * TREAD_M)
-    build_flight(builder, Flight(start, -np.pi / 2, RISERS, RISE_M, TREAD_M, layout.stair_width, BASE), color=STONE)
-    half = layout.stair_width / 2
-    gaps = sorted([(layout.ramp[0], layout.ramp[2]), (layout.stair_x - half - 0.03, layout.stair_x + half + 0.03)])
-    ends = [x_low + 0.05, *(x for gap in gaps for x in gap), x_high - 0.05]
-    for a, b in zip(ends[::2], ends[1::2]):
-        if b - a > 0.1:
-            sloped_rail(builder, (a, edge - 0.05), (b, edge - 0.05), BASE, (0.0, 0.0))
-    for x in (layout.ramp[0] + 0.05, layout.ramp[2] - 0.05):
-        sloped_rail(builder, (x, edge), (x, layout.ramp[3]), BASE, (0.0, BASE))
-    far = layout.yard[3]
-    lawn = edge + (far - edge) * 0.62
-    builder.add_slab("floor", (x_low, edge, x_high, lawn), BASE, 0.05, (gray, gray, 1.04 * gray), 3.0)
-    builder.add_slab("floor", (x_low, lawn, x_high, far), BASE, 0.05, (0.30, 0.46, 0.22), 12.0)
-    builder.add_room("terrace", layout.terrace, 0.0, open_air=True)
-    builder.add_room("yard", layout.yard, BASE, open_air=True)
-    doors = [(float(x_high * share), BASE) for share in (0.3, 0.75)]
-    build_facade(builder, (x_low - 2, far, x_high + 2, far + 0.4), rng.uniform(5.5, 8.0), doors, BASE, rng)
-    for x in (x_low - 0.2, x_high + 0.2):
-        for y, next_y in pairwise(np.linspace(y_low + 0.1, far, 5)):
-            tall, hedge = rng.uniform(1.3, 2.4), rng.uniform() < 0.4
-            center, size = (x, (y + next_y) / 2, BASE + tall / 2), (0.3, next_y - y, tall)
-            if hedge:
-                builder.add_block("hedge", center, size, (0.24, 0.42, 0.2), 35.0)
-            else:
-                color = tuple(rng.uniform(0.4, 0.75) * np.array((1.0, 0.82, 0.72)))
-                builder.add_block("garden_wall", center, size, color, 9.0)
-    ground = ((x_low + x_high) / 2, far / 2, BASE - 0.11)
-    builder.add_box(ground, (layout.width + 30.0, far + 30.0, 0.1), (0.40, 0.50, 0.30), 1.0)
-
-
 def _furnish(builder: WorldBuilder, layout: _Layout, rng: np.random.Generator) -> None:
-    free, margin = [before_gap(builder, door) for door in builder.doors], THICKNESS / 2 + 0.01
+    free, margin = [before_gap(builder, door) for door in builder.places.doors], THICKNESS / 2 + 0.01
     kinds = rng.permutation([*ROOM_KINDS, *ROOM_KINDS])
     for box, kind in zip(layout.rooms, kinds):
         plan = Plan(builder, inset(box, margin), 0.0, list(free))
@@ -186,7 +187,20 @@ def _furnish(builder: WorldBuilder, layout: _Layout, rng: np.random.Generator) -
     for number, box in enumerate(layout.halls):
         plan = Plan(builder, inset(box, margin), 0.0, list(free))
         if number == 0:
-            _add_capture_spot(plan, rng)
+            # the capture spot: a free square in the middle of the hall, a table at one side of it
+            x_low, y_low, x_high, y_high = plan.room
+            table, half = MAKERS["table"](rng), SPOT_M / 2
+            x, y = float(rng.uniform(x_low + half + 0.8, x_high - half - 0.8)), (y_low + y_high) / 2
+            for heading in rng.permutation(4) * np.pi / 2:
+                ahead = np.array([np.cos(heading), np.sin(heading)])
+                place = np.array([x, y]) + (half + table.size[0] / 2) * ahead
+                if plan.try_place(table, float(place[0]), float(place[1]), float(heading + np.pi)):
+                    break
+            else:
+                raise AssertionError("a hall always has room for the capture spot's table")
+            plan.kept_free.append((x - half, y - half, x + half, y + half))
+            at, facing = builder.point(x, y, plan.z), builder.heading + float(heading)
+            builder.places.spots.append(CaptureSpot(at, facing, SPOT_M, half, table.z_range[1]))
         # columns down the middle, out of the walkers' path, with notices on them
         y, color = (plan.room[1] + plan.room[3]) / 2, hue(rng, (0.0, 0.1))
         for x in np.arange(plan.room[0] + 2.5, plan.room[2] - 1.5, 4.2):
@@ -216,40 +230,18 @@ def _furnish(builder: WorldBuilder, layout: _Layout, rng: np.random.Generator) -
             plan.somewhere(kind, rng)
 
 
-def _add_capture_spot(plan: Plan, rng: np.random.Generator) -> None:
-    """A free square in the middle of a hall, a table at one side of it."""
-    x_low, y_low, x_high, y_high = plan.room
-    table, half = MAKERS["table"](rng), SPOT_M / 2
-    depth = table.size[0] / 2
-    x = float(rng.uniform(x_low + half + 0.8, x_high - half - 0.8))
-    y = (y_low + y_high) / 2
-    for heading in rng.permutation(4) * np.pi / 2:
-        ahead = np.array([np.cos(heading), np.sin(heading)])
-        place = np.array([x, y]) + (half + depth) * ahead
-        if plan.try_place(table, float(place[0]), float(place[1]), float(heading + np.pi)):
-            break
-    else:
-        raise AssertionError("a hall always has room for the capture spot's table")
-    plan.kept_free.append((x - half, y - half, x + half, y + half))
-    builder = plan.builder
-    spot = CaptureSpot(builder.point(x, y, plan.z), builder.heading + float(heading), SPOT_M, half, table.z_range[1])
-    builder.spots.append(spot)
-
-
-def changed_world(
-    world: World, rng: np.random.Generator, moved: float = 0.4, removed: float = 0.15, most_m: float = 0.5
-) -> World:
+def changed_world(world: World, rng: np.random.Generator, moved: float = 0.4, removed: float = 0.15) -> World:
     """The world with these shares of its movable objects shifted (and turned), or removed.
 
-    Walkers keep to the world as it was: objects are moved by at most `most_m`. The capture spots' tables stay.
+    Walkers keep to the world as it was: objects are moved by at most `MOST_M`. The capture spots' tables stay.
     """
     vertices, kept = world.mesh.vertices.copy(), np.ones(len(world.mesh.faces), bool)
     objects = list(world.objects)
     for number, item in enumerate(world.objects):
         luck = rng.random()
-        shift, angle = rng.uniform(-most_m, most_m, 2) / np.sqrt(2), rng.normal(0.0, 0.4)
+        shift, angle = rng.uniform(-MOST_M, MOST_M, 2) / np.sqrt(2), rng.normal(0.0, 0.4)
         here = np.array(item.position[:2])
-        at_spot = any(np.linalg.norm(here - spot.position[:2]) < spot.size for spot in world.spots)
+        at_spot = any(np.linalg.norm(here - spot.position[:2]) < spot.size for spot in world.places.spots)
         if item.kind not in MOVABLE or luck > moved + removed or at_spot:
             continue
         own = world.face_object == number

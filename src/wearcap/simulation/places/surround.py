@@ -10,14 +10,14 @@ both feet are off the floor, sits; a lower foot at rest above the floor while th
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations, product
+from itertools import product
 
 import numpy as np
 import scipy.ndimage
 from jaxtyping import Bool, Float
 
 from wearcap.recording.motion import Motion
-from wearcap.simulation.people.body_space import BodySpace, SweptFloor, foot_points, mass_center
+from wearcap.simulation.people.body_space import BodySpace, SweptFloor, foot_points, mass_center, off_balance
 from wearcap.simulation.places.builder import Piece, WorldBuilder, entered, hue
 from wearcap.simulation.places.furniture import BOTH, IRON, MAKERS, ROOM_KINDS, Plan, parts_of, wood
 from wearcap.simulation.places.outdoor import MEADOW, PAVEMENT_KINDS, SQUARE_KINDS
@@ -220,7 +220,7 @@ class _FreePlan(Plan):
                 wall.windows += [(wall.length * (k + 0.5) / count, float(rng.uniform(0.9, 1.4))) for k in range(count)]
             wall.build(builder, color, rng)
         self.room = inset(box, 0.07)
-        self.kept_free += [before_gap(builder, door) for door in builder.doors]
+        self.kept_free += [before_gap(builder, door) for door in builder.places.doors]
         self.place_beside(NEAR_INDOORS, path, rng)
         self.furnish(str(rng.choice(list(ROOM_KINDS))), rng)
 
@@ -260,7 +260,13 @@ def surround(motion: Motion, rng: np.random.Generator, name: str) -> World:
     fast = float(np.linalg.norm(path[-1] - path[0])) / max(duration_s, 0.1) > FAST
     tall = bool((body.points[:, 2] + body.radius).max() > TALL_M)
     outdoors = bool(rng.uniform() < (0.75 if fast else 0.12)) | tall
-    builder = WorldBuilder(name, _heading(path, rng), tuple(path.mean(0).tolist()), outdoors)
+    offset = path - path.mean(0)
+    if np.ptp(offset, axis=0).max() < 2.0:  # the body stays in one place
+        heading = float(rng.uniform(-np.pi, np.pi))
+    else:  # roughly along the path
+        along = np.linalg.svd(offset, full_matrices=False)[2][0]
+        heading = float(np.arctan2(along[1], along[0]) + rng.normal(0.0, 0.12))
+    builder = WorldBuilder(name, heading, tuple(path.mean(0).tolist()), outdoors)
     turned = body.points.copy()
     turned[:, :2] = builder.from_world(turned[:, :2])
     here = BodySpace(turned, body.radius, body.part)
@@ -276,28 +282,18 @@ def surround(motion: Motion, rng: np.random.Generator, name: str) -> World:
     return builder.finish()
 
 
-def _heading(path: Float[np.ndarray, "time 2"], rng: np.random.Generator) -> float:
-    """Heading of a room: roughly along the path; random for a body that stays in one place."""
-    offset = path - path.mean(0)
-    if np.ptp(offset, axis=0).max() < 2.0:
-        return float(rng.uniform(-np.pi, np.pi))
-    along = np.linalg.svd(offset, full_matrices=False)[2][0]
-    return float(np.arctan2(along[1], along[0]) + rng.normal(0.0, 0.12))
-
-
 def find_sits(motion: Motion) -> list[_Sit]:
     """Every seat that the motion needs, the longest used first; sits in one place share one."""
     feet = foot_points(motion)
     pelvis = motion.joint("pelvis")
     place = pelvis.t.double().numpy()
-    off_balance = _outside(mass_center(motion)[:, :2], feet[..., :2]) > OFF_BALANCE_M
-    hanging = feet[..., 2].min(1) > LOWEST_STEP_M
+    unsupported = (off_balance(motion) > OFF_BALANCE_M) | (feet[..., 2].min(1) > LOWEST_STEP_M)
     still = _speed(motion, place) < STILL
     angles = []  # of the thighs from vertical
     for side in ("left", "right"):
         thigh = (motion.joint(f"{side}_knee").t - motion.joint(f"{side}_hip").t).double().numpy()
         angles.append(np.arccos(np.clip(-thigh[:, 2] / np.linalg.norm(thigh, axis=1), -1.0, 1.0)))
-    sitting = still & (np.minimum(*angles) > np.deg2rad(BENT_DEG)) & (off_balance | hanging)
+    sitting = still & (np.minimum(*angles) > np.deg2rad(BENT_DEG)) & unsupported
     forward = pelvis.R[..., 0].double().numpy()
     sits: list[_Sit] = []
     for start, stop in sorted(_stretches(sitting, motion, SIT_S), key=lambda span: span[0] - span[1]):
@@ -431,22 +427,3 @@ def _stretches(holds: Bool[np.ndarray, "time"], motion: Motion, least_s: float) 
     """First frame and end of every run of true frames that lasts long enough."""
     edges = np.flatnonzero(np.diff(np.pad(holds, 1).astype(np.int8)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2]) if (b - a) / motion.fps >= least_s]
-
-
-def _outside(
-    points: Float[np.ndarray, "time 2"], corners: Float[np.ndarray, "time corner 2"]
-) -> Float[np.ndarray, "time"]:
-    """Distance (m) of each point from the convex hull of its corners."""
-    count = corners.shape[1]
-    best = np.full(len(points), np.inf)
-    for i, j in combinations(range(count), 2):
-        edge, offset = corners[:, j] - corners[:, i], points - corners[:, i]
-        share = np.clip((offset * edge).sum(1) / np.maximum((edge * edge).sum(1), 1e-12), 0.0, 1.0)
-        best = np.minimum(best, np.linalg.norm(offset - share[:, None] * edge, axis=1))
-    for three in combinations(range(count), 3):
-        sides = []
-        for a, b in zip(three, (*three[1:], three[0])):
-            edge, offset = corners[:, b] - corners[:, a], points - corners[:, a]
-            sides.append(edge[:, 0] * offset[:, 1] - edge[:, 1] * offset[:, 0])
-        best[(np.min(sides, 0) >= 0) | (np.max(sides, 0) <= 0)] = 0.0
-    return best

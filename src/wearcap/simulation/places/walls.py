@@ -57,7 +57,7 @@ class Wall:
             if not is_door:
                 self.add_panel(builder, (start, stop), (0.0, low), color)
             gap = w.Door(builder.point(*self.at(middle), self.z), builder.heading + self.heading + np.pi / 2, width)
-            (builder.doors if is_door else builder.windows).append(gap)
+            (builder.places.doors if is_door else builder.windows).append(gap)
             edges = [(middle + side * (width / 2 + 0.03), (low + high) / 2, 0.06, high - low) for side in (-1, 1)]
             edges += [(middle, edge, width + 0.12, 0.06) for edge in ((high,) if is_door else (low, high))]
             for along, z, long, tall in edges:  # posts and bars of the frame, slightly in front of the wall
@@ -120,7 +120,9 @@ def build_flight(
                 bars.append((top + 0.45, 0.05, 0.9))
             for z, long, tall in bars:
                 builder.add_box((*middle, z), (long, 0.05, tall), WOODEN, 3.0, heading, item)
-    builder.flights.append(replace(flight, start=builder.point(*flight.start), direction=builder.heading + heading))
+    builder.places.flights.append(
+        replace(flight, start=builder.point(*flight.start), direction=builder.heading + heading)
+    )
 
 
 def build_railing(builder: WorldBuilder, start: tuple, end: tuple, z: float) -> None:

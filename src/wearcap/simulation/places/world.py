@@ -6,18 +6,19 @@ A builder (`flat.build_flat`, `outdoor.build_outdoor`, `site.build_site`) fills 
 needs no change there.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from wearcap.geometry.mesh import Mesh
-from wearcap.simulation.places.navigation import NavigationGrid, plan_path
+from wearcap.simulation.places.navigation import NavigationGrid
 from wearcap.simulation.places.outline import points_in_convex
 
 STEP_UP_M = 0.35
 """Largest height above the last floor at which a foot finds a floor."""
+CALF_TO_EDGE_M = 0.12
 
 
 @dataclass(frozen=True)
@@ -61,15 +62,10 @@ class Seat:
     depth: float
     """Distance from `position` forward to the seat's front edge (m)."""
 
-    @property
-    def floor_z(self) -> float:
-        return self.position[2] - self.height
-
-    def standing_point(self, calf_to_edge: float = 0.12) -> Float[np.ndarray, "3"]:
+    def standing_point(self) -> Float[np.ndarray, "3"]:
         """Floor point below the pelvis of someone who stands in front of the seat, ready to sit down (m)."""
-        x, y, _ = self.position
-        reach = self.depth + calf_to_edge
-        return np.array([x + reach * np.cos(self.heading), y + reach * np.sin(self.heading), self.floor_z])
+        (x, y, z), reach = self.position, self.depth + CALF_TO_EDGE_M
+        return np.array([x + reach * np.cos(self.heading), y + reach * np.sin(self.heading), z - self.height])
 
 
 @dataclass(frozen=True)
@@ -154,6 +150,18 @@ class Door:
     width: float
 
 
+@dataclass(frozen=True)
+class Places:
+    """Where one sits, reaches, climbs, passes, and returns to in a recording."""
+
+    seats: list[Seat] = field(default_factory=list)
+    reach_targets: list[ReachTarget] = field(default_factory=list)
+    flights: list[Flight] = field(default_factory=list)
+    rooms: list[Room] = field(default_factory=list)
+    doors: list[Door] = field(default_factory=list)
+    spots: list[CaptureSpot] = field(default_factory=list)
+
+
 @dataclass(frozen=True, kw_only=True)
 class World:
     """Seeded surroundings. `face_object` gives each face of `mesh` its object (index), or -1 for the shell."""
@@ -165,12 +173,7 @@ class World:
     """Visual features per m² of each face: near 0 on blank walls, hundreds on book spines."""
     objects: tuple[WorldObject, ...]
     surfaces: tuple[Surface, ...]
-    seats: tuple[Seat, ...] = ()
-    reach_targets: tuple[ReachTarget, ...] = ()
-    flights: tuple[Flight, ...] = ()
-    rooms: tuple[Room, ...] = ()
-    doors: tuple[Door, ...] = ()
-    spots: tuple[CaptureSpot, ...] = ()
+    places: Places
     cell: float = 0.1
     """Side of a cell of the planning grid (m)."""
     outdoors: bool = False
@@ -195,14 +198,10 @@ class World:
         """The planning grid, built at first use."""
         return NavigationGrid.build(self.surfaces, self.objects, self.cell)
 
-    def clearance(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
-        """Distance (m, to about a cell) from floor points to the nearest obstacle; 0 inside one."""
-        return self.navigation.clearance_at(points)
-
     def on_stairs(self, points: Float[np.ndarray, "point 3"]) -> Bool[np.ndarray, "point"]:
         """Whether floor points lie on a flight or within a step of its ends."""
         near = np.zeros(len(points), bool)
-        for flight in self.flights:
+        for flight in self.places.flights:
             run, side = flight.up_and_left(points[:, :2])
             near |= (run > -0.8) & (run < flight.length + 0.8) & (np.abs(side) < flight.width / 2 + 0.1)
         return near
@@ -216,7 +215,7 @@ class World:
         off obstacles, except on the last steps to a start or goal that is nearer to one itself (a seat).
         `rng` varies how far from walls this walk likes to be. None when no path leads there.
         """
-        path = plan_path(self.navigation, self.flights, start, goal, rng)
+        path = self.navigation.path(start, goal, self.places.flights, rng)
         if path is not None:
             floor = self.floor_height(path[:, :2], path[:, 2])
             path[:, 2] = np.where(np.isnan(floor), path[:, 2], floor)
@@ -224,6 +223,8 @@ class World:
 
     def sample_floor(self, rng: np.random.Generator, count: int) -> Float[np.ndarray, "count 3"]:
         """Random floor points (m) in the largest connected walkable part."""
-        points = self.navigation.sample(rng, count)
+        nodes = self.navigation.node_points
+        points = nodes[rng.integers(len(nodes), size=count)]
+        points[:, :2] += rng.uniform(-0.5, 0.5, (count, 2)) * self.cell
         points[:, 2] = self.floor_height(points[:, :2], points[:, 2])
         return points

@@ -167,7 +167,7 @@ class _Session:
 
     def __init__(self, world: World, person: Person, rng: np.random.Generator, protocol: Protocol):
         self.world, self.rng, self.protocol = world, rng, protocol
-        self.spot: CaptureSpot = world.spots[0]
+        self.spot: CaptureSpot = world.places.spots[0]
         self.home = np.array(self.spot.position)
         self.plan = Plan(person, self.home.copy(), self.spot.heading, world.floor_height)
         self.plan.time = 0.8
@@ -216,7 +216,7 @@ class _Session:
     def wander(self, until_m: float) -> None:
         """Walk from place to place as long as the path home leaves room for it."""
         points = self.world.navigation.node_points
-        free = (self.world.clearance(points) > FREE_M) & ~self.world.on_stairs(points)
+        free = (self.world.navigation.clearance_at(points) > FREE_M) & ~self.world.on_stairs(points)
         while True:
             there = self.world.navigation.lengths_from(self.plan.position)
             left = until_m - self.travelled

@@ -166,7 +166,16 @@ def ego_frames(
     world: World, motion: Motion, shape: dict[str, float], stream: CameraStream, rng: np.random.Generator
 ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """The image at each timestamp of the stream, which must be timestamps of the motion."""
-    scenery, body, lens = Scenery.of(world), _Body.dressed(motion.skeleton, shape, rng), _lens()
+    scenery, body = Scenery.of(world), _Body.dressed(motion.skeleton, shape, rng)
+    camera = EGO_CAMERA
+    x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    plane = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy], -1)
+    rays = np.concatenate([plane, np.ones((*x.shape, 1))], -1).reshape(-1, 3).astype(np.float32)
+    length = np.linalg.norm(rays, axis=-1)
+    view = View(np.eye(3), camera.fx, camera.cx, camera.cy, camera.width, camera.height)
+    # one sample per pixel
+    lens = Lens(rays / length[:, None], np.arange(len(rays), dtype=np.int32), length, 1.0 / camera.fx, (view,))
+    to_depth = (lens.rays * lens.reach[:, None]).reshape(camera.height, camera.width, 3)
     rows = torch.searchsorted(motion.timestamps, stream.timestamps.contiguous())
     T_head_cam = Rigid(stream.R_head_cam, stream.t_head_cam)
     shot = _Shot.drawn(len(rows), rng)
@@ -175,45 +184,24 @@ def ego_frames(
         vertices = body.model.vertices(T_world_joint).numpy()
         T_world_cam = T_world_joint[:, motion.skeleton.index("head")] @ T_head_cam[None]
         for number in range(len(vertices)):
-            light = _drawn(scenery, lens, T_world_cam[number], body, vertices[number], shot.light)
-            light *= shot.gain * shot.exposure[first + number]
-            light += shot.noise * rng.standard_normal(light.shape, np.float32) + 0.5
-            yield np.clip(light, 0, 255).astype(np.uint8)
-
-
-def _lens() -> Lens:
-    """The lens of `EGO_CAMERA`, one sample per pixel."""
-    x, y = np.meshgrid(np.arange(EGO_CAMERA.width), np.arange(EGO_CAMERA.height))
-    plane = np.stack([(x - EGO_CAMERA.cx) / EGO_CAMERA.fx, (y - EGO_CAMERA.cy) / EGO_CAMERA.fy], -1)
-    rays = np.concatenate([plane, np.ones((*x.shape, 1))], -1).reshape(-1, 3).astype(np.float32)
-    length = np.linalg.norm(rays, axis=-1)
-    view = View(np.eye(3), EGO_CAMERA.fx, EGO_CAMERA.cx, EGO_CAMERA.cy, EGO_CAMERA.width, EGO_CAMERA.height)
-    slots = np.arange(len(rays), dtype=np.int32)
-    return Lens(rays / length[:, None], slots, length, 1.0 / EGO_CAMERA.fx, (view,))
-
-
-def _drawn(
-    scenery: Scenery,
-    lens: Lens,
-    T_world_cam: Rigid,
-    body: _Body,
-    vertices: Float32[np.ndarray, "vertex 3"],
-    light: Float[np.ndarray, "6"],
-) -> Float32[np.ndarray, "height width 3"]:
-    """Light (grey levels, unbounded) in the image of `EGO_CAMERA`; `vertices` are the body's in the world."""
-    R, t = T_world_cam.R.double().numpy(), T_world_cam.t.double().numpy()
-    pose, (view,) = np.concatenate([R, t[:, None]], 1), lens.views
-    nearness, index = visible(scenery, R, t, view)
-    own, in_cam = np.full_like(index, -1), (vertices - t) @ R
-    raster.draw_pinhole(in_cam, body.faces, view.focal, view.focal, view.cx, view.cy, NEAR_M, nearness, own)
-    index[own >= 0] = -1
-    picture = colored(scenery, lens, pose, nearness.ravel(), index.ravel(), light)[0].reshape(*own.shape, 3)
-    # The renderer shades the body alone, each face with its own normal.
-    none = np.zeros(len(body.faces), bool)
-    shaded, rays = np.empty(picture.shape, np.uint8), (lens.rays * lens.reach[:, None]).reshape(picture.shape)
-    triangles = raster.Triangles(in_cam, body.faces, body.color, none, none, 255 * body.color, body.faces)
-    background = np.zeros((view.height, 3), np.float32)
-    images = background, shaded, np.empty(own.shape, np.float32), np.empty_like(own)
-    raster.resolve(nearness, own, rays, 1, pose, triangles, body.color, light, raster.Shadows(), *images)
-    picture[own >= 0] = shaded[own >= 0]
-    return picture
+            R, t = T_world_cam.R[number].double().numpy(), T_world_cam.t[number].double().numpy()
+            pose = np.concatenate([R, t[:, None]], 1)
+            nearness, index = visible(scenery, R, t, view)
+            own, in_cam = np.full_like(index, -1), (vertices[number] - t) @ R
+            raster.draw_pinhole(in_cam, body.faces, view.focal, view.focal, view.cx, view.cy, NEAR_M, nearness, own)
+            index[own >= 0] = -1
+            picture, _ = colored(scenery, lens, pose, nearness.ravel(), index.ravel(), shot.light)
+            picture = picture.reshape(to_depth.shape)
+            # The renderer shades the body alone, each face with its own normal.
+            none = np.zeros(len(body.faces), bool)
+            triangles = raster.Triangles(in_cam, body.faces, body.color, none, none, 255 * body.color, body.faces)
+            background = np.zeros((view.height, 3), np.float32)
+            shaded = np.empty(picture.shape, np.uint8)
+            images = background, shaded, np.empty(own.shape, np.float32), np.empty_like(own)
+            raster.resolve(
+                nearness, own, to_depth, 1, pose, triangles, body.color, shot.light, raster.Shadows(), *images
+            )
+            picture[own >= 0] = shaded[own >= 0]
+            picture *= shot.gain * shot.exposure[first + number]
+            picture += shot.noise * rng.standard_normal(picture.shape, np.float32) + 0.5
+            yield np.clip(picture, 0, 255).astype(np.uint8)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from PIL import Image
 
 from wearcap.errors import WearcapError
@@ -98,10 +98,14 @@ def scan_world(
     survey = (stations, order[within], first, CELL_M, origin, shape, nearness)
     # Most faces of a world are inside or below others: a face is sampled if some of a few random points are seen.
     probed = np.repeat(np.arange(len(scenery.faces)), PROBES)
-    corners = scenery.vertices.astype(np.float64)[scenery.faces[probed]]
-    _, kept = _measured(scenery, survey, scanner, probed, random_points(corners, rng), rng)
+    corners = scenery.vertices.astype(np.float64)[scenery.faces]
+    _, kept = _measured(scenery, survey, scanner, probed, random_points(corners[probed], rng), rng)
+    area = 0.5 * np.linalg.norm(face_normals(corners), axis=1)
+    ends = rng.poisson(kept.reshape(-1, PROBES).any(1) * area / spacing_m**2).cumsum()
     points, colors = [], []
-    for face, place in _samples(scenery, spacing_m, kept.reshape(-1, PROBES).any(1), rng):
+    for start in range(0, int(ends[-1]), CHUNK):
+        face = np.searchsorted(ends, np.arange(start, min(start + CHUNK, int(ends[-1]))), side="right")
+        place = random_points(corners[face], rng)
         measured, kept = _measured(scenery, survey, scanner, face, place, rng)
         points.append(measured[kept].astype(np.float32))
         footprint = np.full(int(kept.sum()), max(spacing_m, 0.01))
@@ -121,7 +125,7 @@ def _measured(scenery: Scenery, survey: tuple, scanner: Scanner, face, place, rn
 def place_stations(world: World, spacing_m: float, clearance_m: float = 0.45) -> Float[np.ndarray, "station 3"]:
     """Floor points (m) that cover the walkable area, none nearer to another than the spacing; always the same."""
     points = world.navigation.node_points
-    free = points[world.clearance(points) > clearance_m]
+    free = points[world.navigation.clearance_at(points) > clearance_m]
     points = free if len(free) else points
     left = np.ones(len(points), bool)
     chosen = []
@@ -129,36 +133,6 @@ def place_stations(world: World, spacing_m: float, clearance_m: float = 0.45) ->
         chosen.append(int(left.argmax()))
         left &= np.linalg.norm(points - points[chosen[-1]], axis=1) >= spacing_m
     return points[chosen]
-
-
-def _samples(scenery: Scenery, spacing_m: float, wanted: Bool[np.ndarray, "face"], rng: np.random.Generator):
-    """(faces, points) of samples of the wanted faces as dense as the spacing asks, `CHUNK` or so at a time."""
-    corners = scenery.vertices.astype(np.float64)[scenery.faces]
-    area = 0.5 * np.linalg.norm(face_normals(corners), axis=1)
-    ends = rng.poisson(wanted * area / spacing_m**2).cumsum()
-    for start in range(0, int(ends[-1]), CHUNK):
-        number = np.arange(start, min(start + CHUNK, int(ends[-1])))
-        face = np.searchsorted(ends, number, side="right")
-        yield face, random_points(corners[face], rng)
-
-
-@compiled
-def _cube_pixel(x, y, z, size):
-    """Side of the cube around a station, row and column, and depth before that side, of an offset from it."""
-    ax, ay, az = abs(x), abs(y), abs(z)
-    if az >= ax and az >= ay:
-        side, depth = (0 if z > 0 else 5), az
-        u, v = (x if z > 0 else -x), y
-    elif ax >= ay:
-        side, depth = (1 if x > 0 else 2), ax
-        u, v = (-z if x > 0 else z), y
-    else:
-        side, depth = (3 if y > 0 else 4), ay
-        u, v = x, (-z if y > 0 else z)
-    depth = max(depth, 1e-6)
-    column = int(min(size - 1.0, max(0.0, math.floor(0.5 * size * (1.0 + u / depth)))))
-    row = int(min(size - 1.0, max(0.0, math.floor(0.5 * size * (1.0 + v / depth)))))
-    return side, row, column, depth
 
 
 @compiled
@@ -188,7 +162,17 @@ def _measure(points, normals, survey, draws, errors, out, kept):
             facing = -(dx * normals[k, 0] + dy * normals[k, 1] + dz * normals[k, 2]) / distance
             if distance > max_m or distance < 0.3 or facing < 0.03:
                 continue
-            side, row, column, depth = _cube_pixel(dx, dy, dz, size)
+            # side of the cube around the station, depth before that side, row and column
+            ax, ay, az = abs(dx), abs(dy), abs(dz)
+            if az >= ax and az >= ay:
+                side, depth, u, v = (0 if dz > 0 else 5), az, (dx if dz > 0 else -dx), dy
+            elif ax >= ay:
+                side, depth, u, v = (1 if dx > 0 else 2), ax, (-dz if dx > 0 else dz), dy
+            else:
+                side, depth, u, v = (3 if dy > 0 else 4), ay, dx, (-dz if dy > 0 else dz)
+            depth = max(depth, 1e-6)
+            column = int(min(size - 1.0, max(0.0, math.floor(0.5 * size * (1.0 + u / depth)))))
+            row = int(min(size - 1.0, max(0.0, math.floor(0.5 * size * (1.0 + v / depth)))))
             drawn = nearness[station, side, row, column]
             if drawn * depth > 1.02 + 0.08 * (1.0 - min(1.0, 4.0 * facing)):
                 continue

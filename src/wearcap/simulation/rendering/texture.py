@@ -22,6 +22,8 @@ LIGHT: Float[np.ndarray, "6"] = np.array([*_TO_LIGHT / np.linalg.norm(_TO_LIGHT)
 _TEXTILE = ("sofa", "armchair", "bed")
 _WOODEN = ("table", "desk", "coffee_table", "shelf", "wardrobe", "cabinet", "chair", "bench", "door_frame", "railing")
 _STONY = ("low_wall", "planter", "garden_wall")
+_LEVEL = (kernels.PARQUET, kernels.TILES, kernels.ASPHALT, kernels.STONE, kernels.CEILING, kernels.CARPET)
+_OWN_PICTURE = (kernels.POSTER, kernels.BOOKS, kernels.PAINT)
 _PRINTED = 95.0
 """Visual features per m² from which on a face has a print."""
 
@@ -44,7 +46,17 @@ class Paint:
         corners = world.mesh.vertices[world.mesh.faces].astype(np.float64)
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
-        origin, u, v = _axes(world, normal)
+        # origin, heading (rad) and in-plane axes of each face's pattern: its object's own, or the shell's
+        edge = world.surfaces[0].polygon[1] - world.surfaces[0].polygon[0]
+        places = [(item.position, item.heading) for item in world.objects]
+        places.append(((0.0, 0.0, 0.0), float(np.arctan2(edge[1], edge[0]))))
+        origin, heading = (np.array(column)[world.face_object] for column in zip(*places))
+        u = np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], 1)
+        along = np.stack([np.cos(heading), np.sin(heading), np.zeros(len(normal))], 1)
+        along -= (along * normal).sum(1, keepdims=True) * normal
+        u = np.where(np.abs(normal[:, 2:]) > 0.7, along, u)
+        u /= np.maximum(np.linalg.norm(u, axis=1, keepdims=True), 1e-20)
+        v = np.cross(normal, u)
         offset = corners - origin[:, None]
         a, b = np.einsum("fcx,fx->fc", offset, u), np.einsum("fcx,fx->fc", offset, v)
         extents = np.stack([a.min(1), a.max(1), b.min(1), b.max(1)], 1)
@@ -55,13 +67,20 @@ class Paint:
         height = np.einsum("fx,fx->f", offset[:, 0], normal)
         color = world.mesh.color[world.mesh.faces[:, 0]].astype(np.float64)
         materials = _materials(world, corners.mean(1), normal, color, extents)
-        return cls(
-            np.concatenate([origin, u, v, normal, height[:, None]], 1),
-            extents,
-            color,
-            materials,
-            _seeds(world, extents, materials, normal, color),
+        # one seed per box side with a picture of its own, per object and side, or per colour of the shell
+        names = [zlib.crc32(f"{world.name} {entry.name}".encode()) for entry in world.objects]
+        base = np.array([*names, zlib.crc32(world.name.encode())], np.int64)[world.face_object]
+        cos, sin = np.cos(heading), np.sin(heading)
+        local = np.stack(
+            [cos * normal[:, 0] + sin * normal[:, 1], cos * normal[:, 1] - sin * normal[:, 0], normal[:, 2]], 1
         )
+        side = np.round(3 * local).astype(np.int64) @ np.array([1009, 9176, 31337])
+        tint = np.round(255 * color).astype(np.int64) @ np.array([7, 131, 65537])
+        place = np.round(64 * extents).astype(np.int64) @ np.array([73856093, 19349663, 83492791, 5915587])
+        level = (world.face_object < 0) & np.isin(materials, _LEVEL)
+        seed = base + tint + np.where(level, 0, side) + np.where(np.isin(materials, _OWN_PICTURE), place, 0)
+        frames = np.concatenate([origin, u, v, normal, height[:, None]], 1)
+        return cls(frames, extents, color, materials, seed & 0x3FFFFFFF)
 
     @property
     def tables(self) -> tuple[np.ndarray, ...]:
@@ -79,26 +98,6 @@ class Paint:
         footprint = footprint.astype(np.float32)
         kernels.color_points(points, face.astype(np.int32), front, footprint, self.tables, LIGHT, light)
         return np.minimum(light, 255).astype(np.uint8)
-
-
-def _headings(world: World) -> Float[np.ndarray, "face"]:
-    """Heading of each face's object, or of the shell (rad)."""
-    edge = world.surfaces[0].polygon[1] - world.surfaces[0].polygon[0]
-    headings = [item.heading for item in world.objects] + [float(np.arctan2(edge[1], edge[0]))]
-    return np.array(headings)[world.face_object]
-
-
-def _axes(world: World, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Origin and in-plane axes of each face's pattern: its object's own, or the shell's."""
-    origin = np.array([item.position for item in world.objects] + [(0.0, 0.0, 0.0)])[world.face_object]
-    heading = _headings(world)
-    level = np.abs(normal[:, 2]) > 0.7
-    u = np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], 1)
-    along = np.stack([np.cos(heading), np.sin(heading), np.zeros(len(normal))], 1)
-    along -= (along * normal).sum(1, keepdims=True) * normal
-    u = np.where(level[:, None], along, u)
-    u /= np.maximum(np.linalg.norm(u, axis=1, keepdims=True), 1e-20)
-    return origin, u, np.cross(normal, u)
 
 
 def _materials(
@@ -126,7 +125,7 @@ def _materials(
     kinds = np.array([entry.kind for entry in world.objects] + [""])[item]
     out[np.isin(kinds, ("wall", "pillar")) & ~shell] = kernels.PLASTER
     before = (middle + 0.3 * normal)[:, :2]
-    rooms = [] if world.outdoors else [room.polygon for room in world.rooms if not room.open_air]
+    rooms = [] if world.outdoors else [room.polygon for room in world.places.rooms if not room.open_air]
     indoors = np.any([np.zeros(len(before), bool), *(points_in_convex(before, room) for room in rooms)], axis=0)
     out[(kinds == "wall") & upright & ~indoors] = kernels.BRICK
     out[np.isin(kinds, _STONY)] = kernels.BRICK
@@ -139,23 +138,3 @@ def _materials(
     printed = np.isin(out, (kernels.POSTER, kernels.BOOKS))
     out[green_ish & ~printed & (texture > 0.9) & ((texture >= 12.0) | shell)] = kernels.FOLIAGE
     return out.astype(np.uint8)
-
-
-def _seeds(world: World, extents, materials, normal, color) -> Int[np.ndarray, "face"]:
-    """One seed per box side with a picture of its own, per object and side, or per colour of the shell."""
-    names = [zlib.crc32(f"{world.name} {entry.name}".encode()) for entry in world.objects]
-    base = np.array([*names, zlib.crc32(world.name.encode())], np.int64)[world.face_object]
-    cos, sin = np.cos(_headings(world)), np.sin(_headings(world))
-    local = np.stack(
-        [cos * normal[:, 0] + sin * normal[:, 1], cos * normal[:, 1] - sin * normal[:, 0], normal[:, 2]], 1
-    )
-    side = np.round(3 * local).astype(np.int64) @ np.array([1009, 9176, 31337])
-    tint = np.round(255 * color).astype(np.int64) @ np.array([7, 131, 65537])
-    place = np.round(64 * extents).astype(np.int64) @ np.array([73856093, 19349663, 83492791, 5915587])
-    shell = world.face_object < 0
-    level = np.isin(
-        materials, (kernels.PARQUET, kernels.TILES, kernels.ASPHALT, kernels.STONE, kernels.CEILING, kernels.CARPET)
-    )
-    own = np.isin(materials, (kernels.POSTER, kernels.BOOKS, kernels.PAINT))
-    seed = base + tint + np.where(shell & level, 0, side) + np.where(own, place, 0)
-    return seed & 0x3FFFFFFF

@@ -118,38 +118,6 @@ def _brick(a, b, red, green, blue, seed, footprint):
 
 
 @compiled
-def _sheet(x, y, wide, tall, red, green, blue, seed, footprint):
-    """A print of wide x tall metres at (x, y) from its corner: shapes on a ground, lines of text below."""
-    least = min(wide, tall)
-    for shape in range(9):
-        cx, cy = wide * _chance(shape, 0, seed), tall * (0.25 + 0.75 * _chance(shape, 1, seed))
-        half_x = least * (0.06 + 0.30 * _chance(shape, 2, seed))
-        half_y = least * (0.06 + 0.30 * _chance(shape, 3, seed))
-        turn = 6.283 * _chance(shape, 4, seed)
-        u = math.cos(turn) * (x - cx) + math.sin(turn) * (y - cy)
-        v = -math.sin(turn) * (x - cx) + math.cos(turn) * (y - cy)
-        if _chance(shape, 5, seed) < 0.4:
-            cover = _inside(half_x - math.hypot(u, v), footprint)
-        else:
-            cover = _inside(min(half_x - abs(u), half_y - abs(v)), footprint)
-        if cover > 0.0:
-            r, g, b = _hue(_chance(shape, 6, seed))
-            lift = _chance(shape, 7, seed)
-            gray = 0.15 + 0.8 * _chance(shape, 8, seed)
-            r, g, b = _covered(gray, gray, gray, r, g, b, 0.8 * lift)
-            red, green, blue = _covered(red, green, blue, r, g, b, cover)
-    line, letter = 0.05 * least + 0.012, 0.03 * least + 0.008
-    row = math.floor(y / line)
-    if y < 0.3 * tall:
-        column = math.floor(x / letter)
-        ink = 1.0 if _chance(column, row, seed + 9) < 0.66 else 0.0
-        ink *= _inside(0.32 * line - abs(y - (row + 0.5) * line), footprint) * _fade(2.0 * letter, footprint)
-        ink = max(ink, 0.3 * (1.0 - _fade(2.0 * letter, footprint)))
-        red, green, blue = _covered(red, green, blue, 0.08, 0.08, 0.1, ink)
-    return red, green, blue
-
-
-@compiled
 def _poster(a, b, extent, red, green, blue, seed, footprint):
     """A framed print; a large board has several sheets; a small object (a switch, a mug) gets a mark."""
     wide, tall = extent[1] - extent[0], extent[3] - extent[2]
@@ -168,7 +136,33 @@ def _poster(a, b, extent, red, green, blue, seed, footprint):
     x, y, own = x - i * own_wide, y - j * own_tall, seed + 17 * i + 131 * j
     if columns * rows > 1:
         red, green, blue = 0.9 - 0.6 * _chance(i, j, seed + 1), 0.9 - 0.6 * _chance(i, j, seed + 2), 0.8
-    red, green, blue = _sheet(x, y, own_wide, own_tall, red, green, blue, own, footprint)
+    # a sheet: shapes on a ground, lines of text below
+    least = min(own_wide, own_tall)
+    for shape in range(9):
+        cx, cy = own_wide * _chance(shape, 0, own), own_tall * (0.25 + 0.75 * _chance(shape, 1, own))
+        half_x = least * (0.06 + 0.30 * _chance(shape, 2, own))
+        half_y = least * (0.06 + 0.30 * _chance(shape, 3, own))
+        turn = 6.283 * _chance(shape, 4, own)
+        u = math.cos(turn) * (x - cx) + math.sin(turn) * (y - cy)
+        v = -math.sin(turn) * (x - cx) + math.cos(turn) * (y - cy)
+        if _chance(shape, 5, own) < 0.4:
+            cover = _inside(half_x - math.hypot(u, v), footprint)
+        else:
+            cover = _inside(min(half_x - abs(u), half_y - abs(v)), footprint)
+        if cover > 0.0:
+            r, g, b = _hue(_chance(shape, 6, own))
+            lift = _chance(shape, 7, own)
+            gray = 0.15 + 0.8 * _chance(shape, 8, own)
+            r, g, b = _covered(gray, gray, gray, r, g, b, 0.8 * lift)
+            red, green, blue = _covered(red, green, blue, r, g, b, cover)
+    line, letter = 0.05 * least + 0.012, 0.03 * least + 0.008
+    row = math.floor(y / line)
+    if y < 0.3 * own_tall:
+        column = math.floor(x / letter)
+        ink = 1.0 if _chance(column, row, own + 9) < 0.66 else 0.0
+        ink *= _inside(0.32 * line - abs(y - (row + 0.5) * line), footprint) * _fade(2.0 * letter, footprint)
+        ink = max(ink, 0.3 * (1.0 - _fade(2.0 * letter, footprint)))
+        red, green, blue = _covered(red, green, blue, 0.08, 0.08, 0.1, ink)
     rim = _inside(0.018 - min(min(x, own_wide - x), min(y, own_tall - y)), footprint)
     tone = 0.95 if _chance(0, 7, own) < 0.5 else 0.15
     return _covered(red, green, blue, tone, tone, tone, rim)
@@ -219,18 +213,6 @@ def _grain(along, across, red, green, blue, seed, footprint):
 
 
 @compiled
-def _parquet(a, b, red, green, blue, seed, footprint):
-    """Planks of 14 cm, each of its own shade, with open joints."""
-    row = math.floor(b / 0.14)
-    shifted = a + 1.3 * _chance(row, 0, seed)
-    plank = math.floor(shifted / 1.3)
-    own = 1.0 + 0.42 * (_chance(plank, row, seed + 1) - 0.5) * _fade(0.25, footprint)
-    red, green, blue = _grain(a, b, red * own, green * own, blue * own, seed + 31 * row, footprint)
-    gap = 0.75 * max(_joint(b, 0.14, 0.005, footprint), _joint(shifted, 1.3, 0.005, footprint))
-    return _covered(red, green, blue, 0.12, 0.09, 0.07, gap)
-
-
-@compiled
 def _slabs(a, b, red, green, blue, seed, size, contrast, footprint):
     """Square tiles, flagstones or a rug's motifs with joints; a few are of another make, some are stained."""
     i, j = math.floor(a / size), math.floor(b / size)
@@ -253,27 +235,6 @@ def _slabs(a, b, red, green, blue, seed, size, contrast, footprint):
 
 
 @compiled
-def _fabric(a, b, red, green, blue, seed, footprint):
-    """Cloth with stripes or checks of its own width, and a worn surface."""
-    width = 0.05 + 0.07 * _chance(0, 1, seed)
-    visible = _fade(2.0 * width, footprint)
-    tone = 1.0 + 0.28 * visible * (_chance(math.floor(a / width), 0, seed) - 0.5)
-    if _chance(0, 2, seed) < 0.5:
-        tone += 0.28 * visible * (_chance(math.floor(b / width), 7, seed) - 0.5)
-    tone += 0.08 * _noise(a, b, 0.05, seed + 1, footprint) + 0.10 * _noise(a, b, 0.4, seed + 2, footprint)
-    return red * tone, green * tone, blue * tone
-
-
-@compiled
-def _foliage(a, b, red, green, blue, seed, footprint):
-    """Leaves or blades of grass: light and dark on every scale, yellower here, bluer there."""
-    tone = 0.34 * _noise(a, b, 0.05, seed, footprint) + 0.28 * _noise(a, b, 0.11, seed + 1, footprint)
-    tone += 0.22 * _noise(a, b, 0.3, seed + 2, footprint) + 0.16 * _noise(a, b, 1.2, seed + 3, footprint)
-    warm = 0.22 * _noise(a, b, 0.5, seed + 4, footprint)
-    return red * (1.0 + tone + warm), green * (1.0 + tone), blue * (1.0 + tone - warm)
-
-
-@compiled
 def _asphalt(a, b, red, green, blue, seed, footprint):
     """Asphalt: gravelly, mended in patches, cracked."""
     tone = 0.14 * _noise(a, b, 0.045, seed, footprint) + 0.10 * _noise(a, b, 0.13, seed + 1, footprint)
@@ -286,21 +247,6 @@ def _asphalt(a, b, red, green, blue, seed, footprint):
     crack = abs(_noise(a, b, 1.1, seed + 6, 0.001) + 0.3 * _noise(a, b, 0.2, seed + 7, 0.001))
     tone -= 0.35 * _inside(0.012 - crack * 0.35, 0.5 * footprint) * min(1.0, 0.03 / footprint)
     tone += 1.0
-    return red * tone, green * tone, blue * tone
-
-
-@compiled
-def _paint(a, b, red, green, blue, seed, footprint):
-    """Lacquered wood, plastic or metal: even, with a few marks, labels and scratches."""
-    tone = 1.0 + 0.03 * _noise(a, b, 0.5, seed, footprint) + 0.03 * _noise(a, b, 0.06, seed + 1, footprint)
-    i, j = math.floor(a / 0.3), math.floor(b / 0.3)
-    if _chance(i, j, seed + 2) < 0.3:
-        x = a - (i + 0.2 + 0.6 * _chance(i, j, seed + 3)) * 0.3
-        y = b - (j + 0.2 + 0.6 * _chance(i, j, seed + 4)) * 0.3
-        half_x, half_y = 0.01 + 0.04 * _chance(i, j, seed + 5), 0.004 + 0.025 * _chance(i, j, seed + 6)
-        mark = 0.6 * _inside(min(half_x - abs(x), half_y - abs(y)), footprint) * _fade(4.0 * half_y, footprint)
-        to = 0.05 + 0.9 * _chance(i, j, seed + 7)
-        return _covered(red * tone, green * tone, blue * tone, to, to, to, mark)
     return red * tone, green * tone, blue * tone
 
 
@@ -338,7 +284,13 @@ def _pattern(material, a, b, extent, red, green, blue, seed, footprint):
             a, b = b, a
         return _grain(a, b, red, green, blue, seed, footprint)
     if material == PARQUET:
-        return _parquet(a, b, red, green, blue, seed, footprint)
+        # planks of 14 cm, each of its own shade, with open joints
+        row = math.floor(b / 0.14)
+        shifted = a + 1.3 * _chance(row, 0, seed)
+        own = 1.0 + 0.42 * (_chance(math.floor(shifted / 1.3), row, seed + 1) - 0.5) * _fade(0.25, footprint)
+        red, green, blue = _grain(a, b, red * own, green * own, blue * own, seed + 31 * row, footprint)
+        gap = 0.75 * max(_joint(b, 0.14, 0.005, footprint), _joint(shifted, 1.3, 0.005, footprint))
+        return _covered(red, green, blue, 0.12, 0.09, 0.07, gap)
     if material == TILES:
         return _slabs(a, b, red, green, blue, seed, 0.3, 0.16, footprint)
     if material == STONE:
@@ -346,14 +298,36 @@ def _pattern(material, a, b, extent, red, green, blue, seed, footprint):
     if material == CARPET:
         return _slabs(a, b, red, green, blue, seed, 0.22, 0.7, footprint)
     if material == FABRIC:
-        return _fabric(a, b, red, green, blue, seed, footprint)
+        # cloth with stripes or checks of its own width, and a worn surface
+        width = 0.05 + 0.07 * _chance(0, 1, seed)
+        visible = _fade(2.0 * width, footprint)
+        tone = 1.0 + 0.28 * visible * (_chance(math.floor(a / width), 0, seed) - 0.5)
+        if _chance(0, 2, seed) < 0.5:
+            tone += 0.28 * visible * (_chance(math.floor(b / width), 7, seed) - 0.5)
+        tone += 0.08 * _noise(a, b, 0.05, seed + 1, footprint) + 0.10 * _noise(a, b, 0.4, seed + 2, footprint)
+        return red * tone, green * tone, blue * tone
     if material == FOLIAGE:
-        return _foliage(a, b, red, green, blue, seed, footprint)
+        # leaves or blades of grass: light and dark on every scale, yellower here, bluer there
+        tone = 0.34 * _noise(a, b, 0.05, seed, footprint) + 0.28 * _noise(a, b, 0.11, seed + 1, footprint)
+        tone += 0.22 * _noise(a, b, 0.3, seed + 2, footprint) + 0.16 * _noise(a, b, 1.2, seed + 3, footprint)
+        warm = 0.22 * _noise(a, b, 0.5, seed + 4, footprint)
+        return red * (1.0 + tone + warm), green * (1.0 + tone), blue * (1.0 + tone - warm)
     if material == ASPHALT:
         return _asphalt(a, b, red, green, blue, seed, footprint)
     if material == CEILING:
         return _ceiling(a, b, red, green, blue, seed, footprint)
-    return _paint(a, b, red, green, blue, seed, footprint)
+    # lacquered wood, plastic or metal: even, with a few marks, labels and scratches
+    tone = 1.0 + 0.03 * _noise(a, b, 0.5, seed, footprint) + 0.03 * _noise(a, b, 0.06, seed + 1, footprint)
+    red, green, blue = red * tone, green * tone, blue * tone
+    i, j = math.floor(a / 0.3), math.floor(b / 0.3)
+    if _chance(i, j, seed + 2) >= 0.3:
+        return red, green, blue
+    x = a - (i + 0.2 + 0.6 * _chance(i, j, seed + 3)) * 0.3
+    y = b - (j + 0.2 + 0.6 * _chance(i, j, seed + 4)) * 0.3
+    half_x, half_y = 0.01 + 0.04 * _chance(i, j, seed + 5), 0.004 + 0.025 * _chance(i, j, seed + 6)
+    mark = 0.6 * _inside(min(half_x - abs(x), half_y - abs(y)), footprint) * _fade(4.0 * half_y, footprint)
+    to = 0.05 + 0.9 * _chance(i, j, seed + 7)
+    return _covered(red, green, blue, to, to, to, mark)
 
 
 @compiled

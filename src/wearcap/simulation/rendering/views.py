@@ -13,7 +13,7 @@ import scipy.interpolate
 import scipy.sparse
 import scipy.sparse.csgraph
 import torch
-from jaxtyping import Float, Float32, Int32, UInt8
+from jaxtyping import Float32, Int32, UInt8
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import raster
@@ -27,6 +27,7 @@ from wearcap.simulation.rendering.texture_kernels import color_points
 NEAR_M = 0.03
 SKY = np.array([[0.80, 0.84, 0.88], [0.48, 0.63, 0.85]]) * 255.0
 """Sky colour at the horizon and overhead."""
+_EVERY_PX = 8
 _APART_M, _APART_STEPS = 0.00015, 16
 """Smallest margin by which solids are grown, and the number of margins, its multiples."""
 _GROUND_M2 = 0.25
@@ -86,20 +87,16 @@ def render_view(
     T_world_cam: Rigid,
     development: Development = Development(),
     rng: np.random.Generator | None = None,
-    samples: int = 1,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """The image of a camera; several poses ("frame 3 3", "frame 3") are averaged: motion blur.
 
-    `samples` n averages n x n rays per pixel (smooth outlines). `rng` is needed for noise alone.
+    `rng` is needed for noise alone.
     """
     poses = T_world_cam if T_world_cam.R.ndim == 3 else T_world_cam[None]
-    fine = camera.scaled(samples * camera.width, samples * camera.height) if samples > 1 else camera
-    light = np.zeros((fine.height, fine.width, 3), np.float32)
+    light = np.zeros((camera.height, camera.width, 3), np.float32)
     for number in range(len(poses.t)):
-        light += _exposed(scenery, fine, poses[number])[0]
+        light += exposed(scenery, camera, poses[number])[0]
     light /= len(poses.t)
-    if samples > 1:
-        light = light.reshape(camera.height, samples, camera.width, samples, 3).mean((1, 3))
     if development.contrast != 1.0:
         light = light.mean() + development.contrast * (light - light.mean())
     if development.exposure != 1.0:
@@ -113,13 +110,10 @@ def render_view(
     return np.clip(light + 0.5, 0, 255).astype(np.uint8)
 
 
-def view_depth(scenery: Scenery, camera: Camera, T_world_cam: Rigid) -> Float32[np.ndarray, "height width"]:
-    """Distance along each pixel's ray (m); infinite without a surface."""
-    return _exposed(scenery, camera, T_world_cam)[1]
-
-
-def _exposed(scenery: Scenery, camera: Camera, T_world_cam: Rigid) -> tuple[np.ndarray, np.ndarray]:
-    """Light in the image, and distance along the rays (m)."""
+def exposed(
+    scenery: Scenery, camera: Camera, T_world_cam: Rigid
+) -> tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]:
+    """Light in the image, and distance along each pixel's ray (m; infinite without a surface)."""
     lens, shape = _lens(camera), (camera.height, camera.width)
     R, t = (part.detach().double().cpu().numpy() for part in (T_world_cam.R, T_world_cam.t))
     buffers = [visible(scenery, R @ view.R_cam_view, t, view) for view in lens.views]
@@ -199,7 +193,18 @@ CUBE = (
 
 @lru_cache(maxsize=8)
 def _lens(camera: Camera) -> Lens:
-    rays = _rays(camera)
+    # Unit ray of every pixel, NaN where the lens maps none. Where it maps all, they are quintic splines through every
+    # eighth pixel's: off by less than 1e-6.
+    x, y = (np.arange(-2 * _EVERY_PX, n + 2 * _EVERY_PX, _EVERY_PX) for n in (camera.width, camera.height))
+    all_x, all_y = np.arange(camera.width), np.arange(camera.height)
+    some, every = (torch.from_numpy(np.stack(np.meshgrid(*axes), -1)).double() for axes in ((x, y), (all_x, all_y)))
+    rays = camera.unproject(some).numpy()
+    if np.isnan(rays).any():
+        rays = camera.unproject(every).numpy()
+    else:
+        splines = [scipy.interpolate.RectBivariateSpline(y, x, rays[..., k], kx=5, ky=5) for k in range(3)]
+        rays = np.stack([spline(all_y, all_x) for spline in splines], -1)
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     seen = np.isfinite(rays).all(-1)
     rays = np.nan_to_num(rays)
     if camera.is_fisheye:
@@ -231,25 +236,6 @@ def _lens(camera: Camera) -> Lens:
         kept.append(view)
     flat_rays = rays.astype(np.float32).reshape(-1, 3)
     return Lens(flat_rays, slots.ravel(), reach.ravel(), 2.0 / (camera.fx + camera.fy), tuple(kept))
-
-
-_EVERY_PX = 8
-
-
-def _rays(camera: Camera) -> Float[np.ndarray, "height width 3"]:
-    """Unit ray of every pixel, NaN where the lens maps none.
-
-    Where it maps all, they are quintic splines through every eighth pixel's: off by less than 1e-6.
-    """
-    x, y = (np.arange(-2 * _EVERY_PX, n + 2 * _EVERY_PX, _EVERY_PX) for n in (camera.width, camera.height))
-    grid = torch.from_numpy(np.stack(np.meshgrid(x, y), -1)).double()
-    rays = camera.unproject(grid).numpy()
-    all_x, all_y = np.arange(camera.width), np.arange(camera.height)
-    if np.isnan(rays).any():
-        return camera.unproject(torch.from_numpy(np.stack(np.meshgrid(all_x, all_y), -1)).double()).numpy()
-    splines = [scipy.interpolate.RectBivariateSpline(y, x, rays[..., k], kx=5, ky=5) for k in range(3)]
-    rays = np.stack([spline(all_y, all_x) for spline in splines], -1)
-    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
 @compiled
