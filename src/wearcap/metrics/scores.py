@@ -52,8 +52,10 @@ def comparable(
 
 
 def truth_at(motion: Motion, recording: Recording, name: str) -> tuple[Motion, Bool[Tensor, "time patch"] | None]:
-    """The true motion at the capture's frames, and true foot contact. Raises WearcapError without a true motion."""
-    truth, contact = recording.motion, _foot_contact(recording)
+    """The true motion at the capture's frames, and true contact of the foot patches (None unless all are tracked). Raises WearcapError without a true motion."""
+    truth, contact, track = recording.motion, None, recording.contacts
+    if track is not None and set(FOOT_PATCHES) <= set(track.parts):
+        contact = track.contact[:, [track.parts.index(patch) for patch in FOOT_PATCHES]]
     if truth is None:
         raise WearcapError("no true motion to compare with", where=name, expected="a recording with `motion`")
     same = len(motion) == len(truth) and torch.allclose(motion.timestamps, truth.timestamps, rtol=0, atol=1e-6)
@@ -62,14 +64,6 @@ def truth_at(motion: Motion, recording: Recording, name: str) -> tuple[Motion, B
         frame = nearest_frames(truth.timestamps, motion.timestamps)
         truth, contact = at_times(truth, motion.timestamps), None if contact is None else contact[frame]
     return truth, contact
-
-
-def _foot_contact(recording: Recording) -> Bool[Tensor, "time patch"] | None:
-    """True contact of the foot patches, None if the recording does not track all of them."""
-    track = recording.contacts
-    if track is None or not set(FOOT_PATCHES) <= set(track.parts):
-        return None
-    return track.contact[:, [track.parts.index(patch) for patch in FOOT_PATCHES]]
 
 
 def cue_errors_cm(motion: Motion, cues: Mapping[str, Cue]) -> dict[str, Float[Tensor, "_"]]:
