@@ -263,10 +263,8 @@ def check_imu(stream: str, imu: ImuStream, joint: Trajectory | None) -> list[Fin
         else:
             up = (imu.R_world_imu.double() @ imu.acc_imu.double()[..., None])[..., 0].mean(0) / GRAVITY
             evidence += f", points along ({', '.join(f'{v:+.2f}' for v in up.tolist())}) of the world"
-            what, fix = (
-                "gravity does not point along z",
-                "The sensor's orientation is in another world, or its axes are exchanged.",
-            )
+            what = "gravity does not point along z"
+            fix = "The sensor's orientation is in another world, or its axes are exchanged."
             if up[2] < -0.85:
                 what, fix = "its sign is reversed", "Negate it: at rest specific force points up."
             upwards = check.ok("measures gravity, upwards", evidence)
