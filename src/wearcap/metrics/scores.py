@@ -52,7 +52,10 @@ def comparable(
 
 
 def truth_at(motion: Motion, recording: Recording, name: str) -> tuple[Motion, Bool[Tensor, "time patch"] | None]:
-    """The true motion at the capture's frames, and true contact of the foot patches (None unless all are tracked). Raises WearcapError without a true motion."""
+    """The true motion at the capture's frames, and true contact of the foot patches (None unless all are tracked).
+
+    Raises WearcapError without a true motion.
+    """
     truth, contact, track = recording.motion, None, recording.contacts
     if track is not None and set(FOOT_PATCHES) <= set(track.parts):
         contact = track.contact[:, [track.parts.index(patch) for patch in FOOT_PATCHES]]

@@ -159,8 +159,8 @@ class HPS(StagedSystem):
         """Data of the energy: initial state, localised cameras, contacts, the suit's motion from frame to frame, and
         `R_head_cam`, estimated from the localised frames (HPS paper eq. 4) unless it is given.
 
-        Contacts are the suit's flags, without patches that move faster than `max_contact_speed`. Raises WearcapError when
-        there are no flags, or not one per frame.
+        Contacts are the suit's flags, without patches that move faster than `max_contact_speed`. Raises WearcapError
+        when there are no flags, or not one per frame.
         """
         motion, (_, localization, _) = start.motion, required(recording)
         R_cam, sure = at_frames(localization, motion)
