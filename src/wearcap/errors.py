@@ -1,7 +1,7 @@
 """The one exception that users are meant to read, and a typo's nearest valid neighbours."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 
@@ -23,6 +23,12 @@ class WearcapError(Exception):
     def __reduce__(self):
         """Survive the trip back from a worker process."""
         return type(self), (self.what, self.where, self.expected, self.fix)
+
+
+def require_choice(value: object, allowed: Collection[str], what: str) -> None:
+    """Raise WearcapError with what is wrong and the allowed words, unless the value is one of them."""
+    if value not in allowed:
+        raise WearcapError(what, expected=f"one of {', '.join(allowed)}")
 
 
 def nearest(wrong: str, valid: Iterable[str]) -> str:

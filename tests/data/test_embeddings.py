@@ -16,7 +16,6 @@ from wearcap.data.embeddings import embed_camera, embedding_name
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.models.image_encoder import EgoViewEncoder
-from wearcap.prepare import embeddings
 from wearcap.prepare.embeddings import embed_dataset
 from wearcap.recording import RecordingStore, serialize
 from wearcap.recording.recording import CameraStream
@@ -182,7 +181,7 @@ def test_a_second_run_does_nothing_and_a_killed_one_goes_on(filmed, monkeypatch)
         raise Killed
 
     # Files are written, the manifest never learns of them.
-    monkeypatch.setattr(embeddings, "REGISTER_EVERY_S", 1000)
+    monkeypatch.setattr("wearcap.prepare.engine.REGISTER_EVERY_S", 1000)
     monkeypatch.setattr(RecordingStore, "register", dies)
     with pytest.raises(Killed):
         embed_dataset(filmed.root, Corners())

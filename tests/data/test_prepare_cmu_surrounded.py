@@ -9,9 +9,8 @@ import captured_motion as captured
 from wearcap.cli.conf import compose
 from wearcap.cli.prepare import run
 from wearcap.prepare import simulated
-from wearcap.prepare.mocap import _nominal_head
 from wearcap.recording import Recording, RecordingStore
-from wearcap.recording.recording import CameraStream
+from wearcap.recording.recording import CameraStream, HeadStream
 from wearcap.recording.serialize import flatten
 from wearcap.recording.store import Entry, recording_path, save_recording
 from wearcap.simulation.rendering.ego_view import EGO_CAMERA
@@ -23,11 +22,11 @@ def source(root, **changed) -> RecordingStore:
     """A data set of a walk (train) and a sitter (test)."""
     store = RecordingStore(root)
     for name, motion in MOTIONS.items():
-        subject = name.split("_")[0]
+        subject, head, t = name.split("_")[0], motion.joint("head"), torch.tensor([0.09, 0.0, 0.09])
         recording = replace(
             Recording(
                 name,
-                head=_nominal_head(motion, [0.09, 0.0, 0.09]),
+                head=HeadStream(motion.timestamps, head.R.contiguous(), head @ t, torch.eye(3), t),
                 motion=motion,
                 skeleton=motion.skeleton,
                 subject=subject,

@@ -5,7 +5,7 @@ import pytest
 
 from wearcap.errors import WearcapError
 from wearcap.io.formats.ply import Ply, write_ply
-from wearcap.io.formats.scene_folder import _unit_fault, read_scan
+from wearcap.io.formats.scene_folder import read_scan
 
 
 def room(spacing_m: float = 0.03, side_m: float = 6.0) -> np.ndarray:
@@ -26,19 +26,25 @@ def test_a_scan_comes_back(tmp_path):
 
 
 @pytest.mark.parametrize("spacing_m", [0.005, 0.03, 0.2])
-def test_density_alone_tells_millimetres(spacing_m):
+def test_density_alone_tells_millimetres(spacing_m, tmp_path):
     points = room(spacing_m, 2.0 if spacing_m < 0.01 else 10.0)
-    assert _unit_fault(points) is None
-    assert "millimetres" in (_unit_fault(points * 1000) or "")
+    write_ply(Ply(points), tmp_path / "a.ply")
+    assert len(read_scan(tmp_path / "a.ply").points) == len(points)
+    write_ply(Ply(points * 1000), tmp_path / "a.ply")
+    with pytest.raises(WearcapError, match="millimetres"):
+        read_scan(tmp_path / "a.ply")
 
 
-def test_extent_alone_tells_millimetres():
+def test_extent_alone_tells_millimetres(tmp_path):
     points = np.random.default_rng(0).uniform(0, [9000, 9000, 2500], (500, 3)).astype(np.float32)
-    assert "millimetres" in (_unit_fault(points) or "")
+    write_ply(Ply(points), tmp_path / "a.ply")
+    with pytest.raises(WearcapError, match="millimetres"):
+        read_scan(tmp_path / "a.ply")
 
 
-def test_a_sparse_or_tiny_cloud_is_no_fault():
-    assert _unit_fault(np.eye(3, dtype=np.float32) * 30) is None
+def test_a_sparse_or_tiny_cloud_is_no_fault(tmp_path):
+    write_ply(Ply(np.eye(3, dtype=np.float32) * 30), tmp_path / "a.ply")
+    assert len(read_scan(tmp_path / "a.ply").points) == 3
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import argparse
 import webbrowser
 from pathlib import Path
 
-from wearcap.cli.main import port_number
+from wearcap.cli.main import add_page
 from wearcap.errors import WearcapError
 
 HELP = "mark hand contacts in the browser: wearcap annotate DATASET/NAME [--video FILE]"
@@ -36,9 +36,7 @@ def main(arguments: list[str]) -> None:
         help="labels to start from, where there are none yet: contacts of a captured motion (.npz), a label file "
         "(.json), or `recording` for the recording's own",
     )
-    parser.add_argument(
-        "--port", type=port_number, default=8090, help="port of the page (default 8090, else the next free)"
-    )
+    add_page(parser, 8090)
     parser.add_argument("--no-browser", action="store_true", help="print the address, open nothing")
     options = parser.parse_args(arguments)
     if options.video_start is not None and options.video is None:

@@ -119,7 +119,16 @@ def _explanation(error: Exception, config_name: str, arguments: list[str]) -> We
         if argument in ("--config-name", "-cn"):
             config_name = arguments[place + 1]
     if isinstance(error, MissingConfigException):
-        return _missing_choice(error)
+        wrong = str(error.missing_cfg_file or "").removesuffix(".yaml")
+        group, _, choice = wrong.rpartition("/")
+        if not group:
+            roots = [path.stem for path in conf_dir().glob("*.yaml")]
+            return WearcapError(f"no config {choice!r}", where=conf_dir(), fix=nearest(choice, roots))
+        folder = conf_dir() / group
+        options = sorted(path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.yaml"))
+        if not options:
+            return WearcapError(f"no config group {group!r}", fix=nearest(group, _groups()))
+        return WearcapError(f"no choice {choice!r} in config group {group!r}", fix=nearest(choice, options))
     if isinstance(error, OverrideParseException):
         what, fix = f"cannot read the override {error.override!r}", f"({str(error).splitlines()[0]})"
         return WearcapError(what, expected="key=value", fix=fix)
@@ -146,19 +155,6 @@ def _explanation(error: Exception, config_name: str, arguments: list[str]) -> We
     with suppress(HydraException, OmegaConfBaseException):
         valid |= set(_dotted(_compose(config_name, rest)))
     return WearcapError(f"config {config_name!r} has no key {wrong!r}", fix=nearest(wrong, valid))
-
-
-def _missing_choice(error: MissingConfigException) -> WearcapError:
-    wrong = str(error.missing_cfg_file or "").removesuffix(".yaml")
-    group, _, choice = wrong.rpartition("/")
-    if not group:
-        roots = [path.stem for path in conf_dir().glob("*.yaml")]
-        return WearcapError(f"no config {choice!r}", where=conf_dir(), fix=nearest(choice, roots))
-    folder = conf_dir() / group
-    options = sorted(path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.yaml"))
-    if not options:
-        return WearcapError(f"no config group {group!r}", fix=nearest(group, _groups()))
-    return WearcapError(f"no choice {choice!r} in config group {group!r}", fix=nearest(choice, options))
 
 
 def _groups() -> list[str]:

@@ -3,6 +3,7 @@
 import argparse
 import json
 import sys
+from dataclasses import asdict
 
 from rich.console import Console
 from rich.progress import Progress
@@ -27,7 +28,9 @@ def main(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     if options.json:
         report = examine(options.path)
-        print(json.dumps(report.as_json(), indent=1, ensure_ascii=False))
+        findings = {name: [asdict(finding) for finding in found] for name, found in report.findings.items()}
+        content = {"source": report.source, "sound": report.sound, "findings": findings}
+        print(json.dumps(content, indent=1, ensure_ascii=False))
     else:
         console = Console()
         with Progress(console=Console(stderr=True), transient=True) as progress:

@@ -1,5 +1,6 @@
 """`wearcap VERB …`: finds the verb's module, runs it, and turns errors that users can fix into one message."""
 
+import argparse
 import errno
 import importlib
 import os
@@ -70,24 +71,27 @@ def port_number(text: str) -> int:
     return number
 
 
-def _lift_limit(arguments: list[str]) -> list[str]:
-    """Apply `--max-file-gib` as the limit of file sizes, for worker processes too; returns the other arguments."""
-    option = "--max-file-gib"
-    place = next((i for i, word in enumerate(arguments) if word.split("=")[0] == option), None)
-    if place is None:
-        return arguments
-    word, *rest = arguments[place:]
-    value = word.partition("=")[2] if "=" in word else rest.pop(0) if rest else ""
-    gib_bytes(value, option)
-    os.environ[VARIABLE] = value
-    return arguments[:place] + rest
+def add_page(parser: argparse.ArgumentParser, port: int, host: bool = False) -> None:
+    """Add the options `--port`, and `--host` if the page can be served to other machines."""
+    text = f"port of the page (default {port}, else the next free)"
+    parser.add_argument("--port", type=port_number, default=port, help=text)
+    if host:
+        text = "address to serve on (default: this machine only)"
+        parser.add_argument("--host", default="127.0.0.1", help=text)
 
 
 def main(arguments: list[str] | None = None) -> None:
     """The console command. Exits with 0, 2 (an error that a user can fix) or 130 (interrupted)."""
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
-        arguments = _lift_limit(arguments)
+        option = "--max-file-gib"
+        place = next((i for i, word in enumerate(arguments) if word.split("=")[0] == option), None)
+        if place is not None:  # the limit of file sizes, for worker processes too
+            word, *rest = arguments[place:]
+            value = word.partition("=")[2] if "=" in word else rest.pop(0) if rest else ""
+            gib_bytes(value, option)
+            os.environ[VARIABLE] = value
+            arguments = arguments[:place] + rest
     except WearcapError as error:
         print(f"wearcap: {error}", file=sys.stderr)
         sys.exit(USER_ERROR)

@@ -6,7 +6,7 @@ from pathlib import Path
 from rich import print as show
 
 from wearcap.body.anny_body import anny_body
-from wearcap.cli.view import add_motions, read_motions
+from wearcap.cli.view import add_recording, read_motions
 from wearcap.errors import WearcapError
 from wearcap.recording.store import dataset_folder, load_recording
 from wearcap.runtime.system import CaptureInput
@@ -18,8 +18,7 @@ HELP = "pictures without a screen: wearcap render DATASET/NAME --out sheet.png|m
 
 def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="wearcap render", description="Draw a recording to a PNG or an MP4.")
-    parser.add_argument("recording", help="DATASET/NAME or a recording's .safetensors file")
-    add_motions(parser, "draw with it")
+    add_recording(parser, "draw with it")
     parser.add_argument("--out", type=Path, help=".png for a contact sheet, .mp4 for a video (default: NAME.png)")
     parser.add_argument("--start", type=float, default=0.0, help="from this second of the recording on")
     parser.add_argument("--stop", type=float, help="up to this second")

@@ -16,7 +16,7 @@ from rich.progress import track
 from rich.table import Table
 
 from wearcap.cli.conf import hydra_main
-from wearcap.cli.main import port_number
+from wearcap.cli.main import add_page
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.formats.colmap import Tracks
@@ -111,10 +111,7 @@ def edit(arguments: list[str]) -> None:
         "--environment", help="the file to make or to go on with (default: environment.json beside the scan)"
     )
     parser.add_argument("--metres-per-unit", type=float, help="of a scan in another unit (0.001 for millimetres)")
-    parser.add_argument(
-        "--port", type=port_number, default=8080, help="port of the page (default 8080, else the next free)"
-    )
-    parser.add_argument("--host", default="127.0.0.1", help="address to serve on (default: this machine only)")
+    add_page(parser, 8080, host=True)
     options = parser.parse_args(arguments)
 
     from wearcap.io.formats.environment import FILE_NAME

@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from wearcap.cli.main import port_number
+from wearcap.cli.main import add_page
 from wearcap.errors import WearcapError
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.recording.motion import Motion
@@ -32,20 +32,17 @@ def read_motions(paths: Sequence[str]) -> dict[str, Motion]:
     return {label: read_motion(file) for label, file in zip(labels, files, strict=True)}
 
 
-def add_motions(parser: argparse.ArgumentParser, purpose: str) -> None:
-    """Add the option `--motion FILE …`, whose files `read_motions` reads."""
+def add_recording(parser: argparse.ArgumentParser, purpose: str) -> None:
+    """Add the recording and the option `--motion FILE …`, whose files `read_motions` reads."""
+    parser.add_argument("recording", help="DATASET/NAME or a recording's .safetensors file")
     text = f"captured motions (.npz that `wearcap capture` wrote) to {purpose}"
     parser.add_argument("--motion", nargs="+", action="extend", default=[], metavar="FILE", help=text)
 
 
 def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="wearcap view", description="Show a recording in the browser.")
-    parser.add_argument("recording", help="DATASET/NAME or a recording's .safetensors file")
-    add_motions(parser, "show with it; several stand side by side")
-    parser.add_argument(
-        "--port", type=port_number, default=8080, help="port of the page (default 8080, else the next free)"
-    )
-    parser.add_argument("--host", default="127.0.0.1", help="address to serve on (default: this machine only)")
+    add_recording(parser, "show with it; several stand side by side")
+    add_page(parser, 8080, host=True)
     parser.add_argument("--environment", help="objects to show (default: what the recording names)")
     options = parser.parse_args(arguments)
 

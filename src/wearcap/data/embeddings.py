@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import groupby, islice
 from pathlib import Path
 
 import numpy as np
@@ -88,20 +89,10 @@ def _read(path: Path, size: int) -> dict[str, Tensor] | None:
 def _embed(
     frames: Iterator[UInt8[np.ndarray, "height width 3"]], encoder: ImageEncoder
 ) -> dict[str, Float[Tensor, "time feature"]]:
-    parts = [
-        torch.stack([encoder.embed(batch), encoder.embed(batch.flip(2))]).half().cpu() for batch in _batches(frames)
-    ]
+    parts = []
+    for _, alike in groupby(frames, key=lambda frame: frame.shape):
+        while images := list(islice(alike, BATCH)):
+            batch = torch.from_numpy(np.stack(images))
+            parts.append(torch.stack([encoder.embed(batch), encoder.embed(batch.flip(2))]).half().cpu())
     both = torch.cat(parts, 1) if parts else torch.zeros(2, 0, encoder.size).half()
     return dict(zip(_KEYS, both.contiguous().unbind()))
-
-
-def _batches(frames: Iterator[UInt8[np.ndarray, "height width 3"]]) -> Iterator[UInt8[Tensor, "batch height width 3"]]:
-    """Batches of successive frames of equal size."""
-    batch: list[np.ndarray] = []
-    for frame in frames:
-        if batch and (len(batch) == BATCH or frame.shape != batch[0].shape):
-            yield torch.from_numpy(np.stack(batch))
-            batch = []
-        batch.append(frame)
-    if batch:
-        yield torch.from_numpy(np.stack(batch))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import safetensors
 import torch
-from jaxtyping import Bool, Float16, Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from rich.progress import track
 from safetensors.torch import save
 from torch import Tensor
@@ -19,7 +19,6 @@ from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 from wearcap.models.checkpoint import load_network
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
-from wearcap.recording import HeadStream, PointCloud
 from wearcap.recording.store import Entry, RecordingStore
 from wearcap.scene.voxels import VoxelMap, mirrored
 
@@ -62,7 +61,18 @@ class PlaceCodes:
         path = root / "cache" / f"places-{self.fingerprint}" / f"{entry.sha256}.safetensors"
         if not path.is_file():
             file = RecordingStore.open(root).open_file(Path(entry.file).stem)
-            code, code_mirrored = self._encoded(file.part("points"), file.part("head"))
+            cloud, head = file.part("points"), file.part("head")
+            seen = 0 if cloud is None or not len(cloud.points_world) else len(head.timestamps)
+            code = torch.zeros(seen, self.size, dtype=torch.float16)
+            code_mirrored = code.clone()
+            if seen:
+                surroundings = VoxelMap(self.encoder.grid)
+                surroundings.add(cloud.points_world, cloud.first_seen)
+            for start in range(0, seen, _AT_ONCE):
+                part = slice(start, start + _AT_ONCE)
+                grids = surroundings.voxelize(head.T_world_device[part], head.timestamps[part])
+                with torch.inference_mode():
+                    code[part], code_mirrored[part] = self.encoder.encode(grids), self.encoder.encode(mirrored(grids))
             with atomic_path(path) as temporary:
                 temporary.write_bytes(save({"code": code, "code_mirrored": code_mirrored}))
         return path
@@ -73,26 +83,6 @@ class PlaceCodes:
         todo = [name for name in names if not (folder / f"{store.entries[name].sha256}.safetensors").is_file()]
         for name in track(todo, f"points of {store.root.name}", disable=not todo):
             self.file_of(store.root, store.entries[name])
-
-    @torch.inference_mode()
-    def _encoded(
-        self, cloud: PointCloud | None, head: HeadStream
-    ) -> tuple[Float16[Tensor, "time feature"], Float16[Tensor, "time feature"]]:
-        """Codes of the points that had been seen by each head frame, and of the same points mirrored left to right.
-
-        No rows without points.
-        """
-        if cloud is None or not len(cloud.points_world):
-            return torch.zeros(0, self.size, dtype=torch.float16), torch.zeros(0, self.size, dtype=torch.float16)
-        code = torch.zeros(len(head.timestamps), self.size, dtype=torch.float16)
-        code_mirrored = code.clone()
-        surroundings = VoxelMap(self.encoder.grid)
-        surroundings.add(cloud.points_world, cloud.first_seen)
-        for start in range(0, len(code), _AT_ONCE):
-            part = slice(start, start + _AT_ONCE)
-            grids = surroundings.voxelize(head.T_world_device[part], head.timestamps[part])
-            code[part], code_mirrored[part] = self.encoder.encode(grids), self.encoder.encode(mirrored(grids))
-        return code, code_mirrored
 
 
 @dataclass(frozen=True)

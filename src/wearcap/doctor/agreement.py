@@ -14,17 +14,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, angular_velocity, interpolate, outlier_mask, resample, smooth
 from wearcap.io.formats.video import video_info
-from wearcap.recording import (
-    CameraStream,
-    Cue,
-    FloorTrack,
-    HeadStream,
-    ImuStream,
-    Localization,
-    Motion,
-    PointCloud,
-    Recording,
-)
+from wearcap.recording import CameraStream, Cue, HeadStream, ImuStream, Localization, Motion, PointCloud, Recording
 from wearcap.scene.floor import estimate_floor
 from wearcap.sensors.claps import detect_claps
 from wearcap.sensors.imu import GRAVITY, mean_filter
@@ -130,15 +120,6 @@ def _check_floor(check: Check, points: PointCloud, head: HeadStream) -> Finding:
         fix = "Check unit and up axis of both."
         return check.warning("the floor is at no standing or sitting distance", evidence, fix)
     return check.ok("a floor below the head", evidence)
-
-
-def floor_below(points: PointCloud, head: HeadStream) -> FloorTrack | None:
-    """Height of the floor in the points along the head's path; None if there is none."""
-    try:
-        floor = estimate_floor(points.points_world, head.t_world_device)
-    except WearcapError:
-        return None
-    return FloorTrack(head.timestamps, floor.height) if floor.confidence.median() > 0.3 else None
 
 
 def check_camera(stream: CameraStream) -> list[Finding]:
@@ -267,7 +248,27 @@ def check_imu(stream: str, imu: ImuStream, joint: Trajectory | None) -> list[Fin
     if has_error(findings):
         return findings
     if imu.acc_imu is not None:
-        findings.append(_specific_force(Check(f"{stream}: accelerometer"), imu.acc_imu, imu.R_world_imu))
+        # Specific force is 9.81 m/s² upwards on average.
+        check, usual = Check(f"{stream}: accelerometer"), quantile(imu.acc_imu.norm(dim=-1), 0.5)
+        evidence = f"median length {usual:.4g} m/s²"
+        if not 0.8 * GRAVITY < usual < 1.25 * GRAVITY:
+            off = {name: abs(math.log(max(usual, 1e-9) * unit / GRAVITY)) for name, unit in _ACC_UNITS.items()}
+            unit = min(off, key=lambda name: off[name])
+            what, fix = "does not measure gravity", "If gravity was removed, it belongs into acc_world."
+            if off[unit] < 0.25:
+                what, fix = f"is in {unit}, not m/s²", f"Multiply by {_ACC_UNITS[unit]:.5g}."
+            findings.append(check.error(what, evidence, fix))
+        elif imu.R_world_imu is None:
+            findings.append(check.ok("measures gravity", evidence))
+        else:
+            up = (imu.R_world_imu.double() @ imu.acc_imu.double()[..., None])[..., 0].mean(0) / GRAVITY
+            evidence += f", points along ({', '.join(f'{v:+.2f}' for v in up.tolist())}) of the world"
+            what = "gravity does not point along z"
+            fix = "The sensor's orientation is in another world, or its axes are exchanged."
+            if up[2] < -0.85:
+                what, fix = "its sign is reversed", "Negate it: at rest specific force points up."
+            upwards = check.ok("measures gravity, upwards", evidence)
+            findings.append(upwards if up[2] > 0.85 else check.error(what, evidence, fix))
     if imu.acc_world is not None:
         check, mean = Check(f"{stream}: free acceleration"), imu.acc_world.double().mean(0)
         evidence = f"mean ({', '.join(f'{v:+.2f}' for v in mean.tolist())}) m/s²"
@@ -281,28 +282,6 @@ def check_imu(stream: str, imu: ImuStream, joint: Trajectory | None) -> list[Fin
     if imu.gyro_imu is not None:
         findings.append(_gyroscope(Check(f"{stream}: gyroscope"), imu, imu.gyro_imu.double()))
     return findings if joint is None else findings + _against_motion(stream, imu, joint)
-
-
-def _specific_force(check: Check, acc_imu: Tensor, R_world_imu: Tensor | None) -> Finding:
-    """Specific force is 9.81 m/s² upwards on average."""
-    usual = quantile(acc_imu.norm(dim=-1), 0.5)
-    evidence = f"median length {usual:.4g} m/s²"
-    if not 0.8 * GRAVITY < usual < 1.25 * GRAVITY:
-        off = {name: abs(math.log(max(usual, 1e-9) * unit / GRAVITY)) for name, unit in _ACC_UNITS.items()}
-        unit = min(off, key=lambda name: off[name])
-        if off[unit] < 0.25:
-            return check.error(f"is in {unit}, not m/s²", evidence, f"Multiply by {_ACC_UNITS[unit]:.5g}.")
-        return check.error("does not measure gravity", evidence, "If gravity was removed, it belongs into acc_world.")
-    if R_world_imu is None:
-        return check.ok("measures gravity", evidence)
-    up = (R_world_imu.double() @ acc_imu.double()[..., None])[..., 0].mean(0) / GRAVITY
-    evidence += f", points along ({', '.join(f'{v:+.2f}' for v in up.tolist())}) of the world"
-    if up[2] > 0.85:
-        return check.ok("measures gravity, upwards", evidence)
-    if up[2] < -0.85:
-        return check.error("its sign is reversed", evidence, "Negate it: at rest specific force points up.")
-    fix = "The sensor's orientation is in another world, or its axes are exchanged."
-    return check.error("gravity does not point along z", evidence, fix)
 
 
 def _gyroscope(check: Check, imu: ImuStream, gyro: Tensor) -> Finding:

@@ -1,6 +1,7 @@
 """Examine one recording, or everything in a path: data sets, files, MPS folders, scenes, environments, motion capture."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +18,6 @@ from wearcap.doctor.agreement import (
     check_imu,
     check_localization,
     check_points,
-    floor_below,
 )
 from wearcap.doctor.body import check_contact_prob, check_motion
 from wearcap.doctor.places import is_map, is_place, read_environment_file, read_map, read_place
@@ -39,8 +39,9 @@ from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import read_euroc, read_tum
 from wearcap.io.formats.text import read_json_object
-from wearcap.recording import HeadStream, Motion, PointCloud, Recording, RecordingStore
+from wearcap.recording import FloorTrack, HeadStream, Motion, PointCloud, Recording, RecordingStore
 from wearcap.recording.store import RecordingFile
+from wearcap.scene.floor import estimate_floor
 
 
 def examine(source: Recording | str | Path, progress: Callable[[int, int], None] | None = None) -> Report:
@@ -85,7 +86,9 @@ def examine_recording(recording: Recording) -> list[Finding]:
         head = None if has_error(found) else head
     floor = recording.floor
     if floor is None and recording.points is not None and head is not None:
-        floor = floor_below(recording.points, head)
+        with suppress(WearcapError):
+            below = estimate_floor(recording.points.points_world, head.t_world_device)
+            floor = FloorTrack(head.timestamps, below.height) if below.confidence.median() > 0.3 else None
     bodies = {}
     for name, motion in (("motion", recording.motion), ("suit", recording.suit)):
         if motion is not None and name in usable:

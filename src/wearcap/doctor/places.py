@@ -64,7 +64,20 @@ def read_place(folder: Path) -> tuple[Recording, list[Finding]]:
         navvis = is_hps_scene(folder) and not (folder / PHOTOS).is_file()
         try:
             photos = read_hps_scene(folder)[1] if navvis else read_photos(folder)
-            findings += _check_photos(photos, scan)
+            check = Check("photos")
+            missing = [photo.file.name for photo in photos if not photo.file.is_file()]
+            if not photos:
+                fix = "List them in photos.json."
+                findings.append(check.error("no photos", "a map of this scene would be empty", fix))
+            elif missing:
+                evidence = f"{len(missing)} of {len(photos)}, as {missing[:3]}"
+                fix = "Put them at the paths in photos.json."
+                findings.append(check.error("image files are missing", evidence, fix))
+            else:
+                calibrations = f"{len({photo.camera for photo in photos})} calibrations"
+                some = photos[:: -(-len(photos) // _LOOKED_AT)]
+                findings += [check.ok(f"{len(photos)} photos", calibrations), _check_sizes(some)]
+                findings += [] if scan is None else [_check_sight(some, scan)]
         except WearcapError as error:
             fix = "List pictures with their cameras and poses in photos.json."
             none = Check("photos").error("no photos", "a map of this scene would be empty", fix)
@@ -131,20 +144,6 @@ def _check_scan(scan: Scan) -> list[Finding]:
         fix = "z should point up: turn the scan and its photos' poses together."
         findings.append(Check("scan: up axis").warning("the scan is taller than wide", f"{size} m", fix))
     return findings
-
-
-def _check_photos(photos: list[Photo], scan: Scan | None) -> list[Finding]:
-    """Photos exist, have their calibration's size, and see the scan."""
-    check = Check("photos")
-    if not photos:
-        return [check.error("no photos", "a map of this scene would be empty", "List them in photos.json.")]
-    missing = [photo.file.name for photo in photos if not photo.file.is_file()]
-    if missing:
-        evidence = f"{len(missing)} of {len(photos)}, as {missing[:3]}"
-        return [check.error("image files are missing", evidence, "Put them at the paths in photos.json.")]
-    found = check.ok(f"{len(photos)} photos", f"{len({photo.camera for photo in photos})} calibrations")
-    some = photos[:: -(-len(photos) // _LOOKED_AT)]
-    return [found, _check_sizes(some)] if scan is None else [found, _check_sizes(some), _check_sight(some, scan)]
 
 
 def _check_sizes(photos: list[Photo]) -> Finding:
@@ -226,28 +225,22 @@ def _check_environment(environment: Environment) -> list[Finding]:
         elif longest > HUGE_M:
             fix = "Is it in millimetres, or the whole scan?"
             findings.append(check.warning("the mesh is larger than an object", f"{longest:.3g} m", fix))
-        findings += _check_freedom(item)
+        # The hinge should be at an edge of the mesh, and limits set.
+        check = Check(f"object {item.name}: freedom")
+        if item.freedom.pivot is not None:
+            low, high = item.box_world[:, :2]
+            side = int((high - low).argmax())
+            along = (item.freedom.pivot[side] - low[side]) / max(high[side] - low[side], 1e-9)
+            if item.hinge_gap_m > HINGE_GAP_M:
+                evidence = f"{100 * item.hinge_gap_m:.0f} cm from its box, from above"
+                findings.append(check.warning("the hinge is beside the mesh", evidence, "Put the pivot at the hinge."))
+            elif 0.3 < along < 0.7:
+                evidence = f"at {100 * along:.0f} % of its longest side"
+                findings.append(check.note("the hinge is in the middle", evidence, "Doors turn about an edge."))
+        if item.freedom.kind in ("hinge", "axis") and item.freedom.limits is None:
+            fix = "Set limits where they are known."
+            findings.append(check.note("no limits", "it may turn or slide without end", fix))
     return findings + _check_floor(objects) + _check_overlaps(objects)
-
-
-def _check_freedom(item: SceneObject) -> list[Finding]:
-    """The hinge is at an edge of the mesh, and limits are set."""
-    check, found = Check(f"object {item.name}: freedom"), []
-    if item.freedom.pivot is not None:
-        gap = item.hinge_gap_m
-        low, high = item.box_world[:, :2]
-        side = int((high - low).argmax())
-        along = (item.freedom.pivot[side] - low[side]) / max(high[side] - low[side], 1e-9)
-        if gap > HINGE_GAP_M:
-            evidence = f"{100 * gap:.0f} cm from its box, from above"
-            found.append(check.warning("the hinge is beside the mesh", evidence, "Put the pivot at the hinge."))
-        elif 0.3 < along < 0.7:
-            evidence = f"at {100 * along:.0f} % of its longest side"
-            found.append(check.note("the hinge is in the middle", evidence, "Doors turn about an edge."))
-    if item.freedom.kind in ("hinge", "axis") and item.freedom.limits is None:
-        fix = "Set limits where they are known."
-        found.append(check.note("no limits", "it may turn or slide without end", fix))
-    return found
 
 
 def _check_floor(objects: tuple[SceneObject, ...]) -> list[Finding]:

@@ -1,7 +1,7 @@
 """The doctor's findings by recording, the worst first."""
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partialmethod
 
 from wearcap.errors import WearcapError
@@ -80,8 +80,3 @@ class Report:
                 key = (finding.severity, finding.check, finding.what)
                 groups.setdefault(key, (finding, []))[1].append(name)
         return sorted(groups.values(), key=lambda group: -SEVERITIES.index(group[0].severity))
-
-    def as_json(self) -> dict:
-        """Plain dicts and lists."""
-        findings = {name: [asdict(f) for f in found] for name, found in self.findings.items()}
-        return {"source": self.source, "sound": self.sound, "findings": findings}

@@ -79,8 +79,8 @@ class Handling:
 
     object: str
     category: str
-    start_s: float
-    stop_s: float
+    span_s: tuple[float, float]
+    """First and last time of its interactions."""
     end_cm: float
     """Position error of the object's centre after its release (Table 5.1)."""
     end_deg: float

@@ -6,7 +6,6 @@ tridiagonal. Norms are minimised by iteratively reweighted least squares with a 
 over the iterations. `systems/hps/README.md` derives the system.
 """
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
@@ -22,17 +21,7 @@ from wearcap.geometry import rotation
 from wearcap.optimize import banded_kernels as kernels
 from wearcap.optimize.banded_kernels import HEAD, LEGS, Body, Forms, Kinematics, Rows
 from wearcap.optimize.costs import LOSSES
-from wearcap.optimize.hps import (
-    TERMS,
-    FootPatches,
-    HpsData,
-    HpsEnergy,
-    HpsState,
-    Solution,
-    Term,
-    data_values,
-    find_ground,
-)
+from wearcap.optimize.hps import TERMS, FootPatches, HpsData, HpsEnergy, HpsState, Solution, data_values, find_ground
 
 _VALUES = {
     "t_root": kernels.TRANSLATION,
@@ -79,7 +68,19 @@ def solve_in_stretches(
     together with `overlap` localised frames beyond each of its ends, whose solution is discarded. Borders are never
     within a localisation outage. The history is the mean over stretches, weighted by their numbers of frames.
     """
-    spans = list(_spans(data, stretch, overlap))
+    localized = (data.hold_confidence > 0).long()
+    localized_before = torch.cat([localized.new_zeros(1), localized.cumsum(0)])
+    borders = [0]
+    while len(data) - borders[-1] > 1.5 * stretch:
+        border = borders[-1] + stretch
+        while border < len(data) and not localized[border]:
+            border += 1
+        borders.append(border)
+    spans = []  # frames (first, keep from, keep to, last) of each stretch
+    for keep, stop in pairwise([b for b in borders if b < len(data)] + [len(data)]):
+        first = int(torch.searchsorted(localized_before, localized_before[keep] - overlap, right=True)) - 1
+        last = int(torch.searchsorted(localized_before, localized_before[stop] + overlap))
+        spans.append((max(min(first, keep), 0), keep, stop, min(max(last, stop), len(data))))
     with ThreadPoolExecutor(max_workers=max(jobs, 1)) as pool:
         solved = list(pool.map(lambda span: solve_banded(energy, data[span[0] : span[3]], settings), spans))
     kept = [s.state[keep - first : stop - first] for s, (first, keep, stop, _) in zip(solved, spans)]
@@ -92,23 +93,6 @@ def solve_in_stretches(
     return Solution(
         HpsState(*(torch.cat(part) for part in parts)), history, "; ".join(sorted({s.reason for s in solved}))
     )
-
-
-def _spans(data: HpsData, stretch: int, overlap: int) -> Iterator[tuple[int, int, int, int]]:
-    """Frames (first, keep from, keep to, last) of each stretch."""
-    localized = (data.hold_confidence > 0).long()
-    localized_before = torch.cat([localized.new_zeros(1), localized.cumsum(0)])
-    borders = [0]
-    while len(data) - borders[-1] > 1.5 * stretch:
-        border = borders[-1] + stretch
-        while border < len(data) and not localized[border]:
-            border += 1
-        borders.append(border)
-    borders = [b for b in borders if b < len(data)] + [len(data)]
-    for keep, stop in pairwise(borders):
-        first = int(torch.searchsorted(localized_before, localized_before[keep] - overlap, right=True)) - 1
-        last = int(torch.searchsorted(localized_before, localized_before[stop] + overlap))
-        yield max(min(first, keep), 0), keep, stop, min(max(last, stop), len(data))
 
 
 def solve_banded(
@@ -256,8 +240,20 @@ class Stretch:
         term, (length, n) = TERMS[self.terms[row]], self.system[2].shape
 
         def residuals(unknowns: Tensor) -> Tensor:
-            values = self.values | self._perturbed(term, unknowns)
-            found = term.cost(*(values[name] for name in term.inputs))
+            """Residuals as a function of the frames' unknowns, exact to first order at zero."""
+            move, turn, head, legs = unknowns.split([3, 3, LEGS - HEAD, unknowns.shape[1] - LEGS], 1)
+            R_root, R_head = (torch.from_numpy(self.kin.R[:, joint]) for joint in (0, self.body.head_chain[-1]))
+            theta = torch.from_numpy(self.theta[:, self.body.leg_chains.ravel() - 1])
+            points = torch.from_numpy(self.kin.points)
+            perturbed = {
+                "t_root": lambda: torch.from_numpy(self.t) + move,
+                "R_root": lambda: R_root @ rotation.exp(turn),
+                "R_head": lambda: rotation.exp(head + (R_root @ turn[..., None])[..., 0]) @ R_head,
+                "theta_legs": lambda: theta + legs.unflatten(1, (-1, 3)),
+                "soles": lambda: points + torch.einsum("tvin,tn->tvi", self._sole_jacobian(), unknowns),
+            }
+            inputs = (perturbed[name]() if name in perturbed else self.values[name] for name in term.inputs)
+            found = term.cost(*inputs)
             return found.reshape(len(found), -1, found.shape[-1])
 
         still = torch.zeros(length, n, dtype=torch.float64)
@@ -282,22 +278,6 @@ class Stretch:
             weight.numpy().reshape(-1),
         )
         return residual, weight, jacobian
-
-    def _perturbed(self, term: Term, unknowns: Float64[Tensor, "time unknown"]) -> dict[str, Tensor]:
-        """The state values that a term reads, as functions of the frames' unknowns, exact to first order at zero."""
-        move, turn, head, legs = unknowns.split([3, 3, LEGS - HEAD, unknowns.shape[1] - LEGS], 1)
-        R_root, R_head = (torch.from_numpy(self.kin.R[:, joint]) for joint in (0, self.body.head_chain[-1]))
-        theta = torch.from_numpy(self.theta[:, self.body.leg_chains.ravel() - 1])
-        values = {
-            "t_root": lambda: torch.from_numpy(self.t) + move,
-            "R_root": lambda: R_root @ rotation.exp(turn),
-            "R_head": lambda: rotation.exp(head + (R_root @ turn[..., None])[..., 0]) @ R_head,
-            "theta_legs": lambda: theta + legs.unflatten(1, (-1, 3)),
-            "soles": lambda: (
-                torch.from_numpy(self.kin.points) + torch.einsum("tvin,tn->tvi", self._sole_jacobian(), unknowns)
-            ),
-        }
-        return {name: values[name]() for name in term.inputs if name in values}
 
     def _sole_jacobian(self) -> Float64[Tensor, "time vertex 3 unknown"]:
         """Derivative of the patch vertices in their frame's unknowns."""

@@ -3,7 +3,6 @@
 This does not use the task engine: a failure must leave the recording in its data set, and a large encoder is loaded once.
 """
 
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from wearcap.errors import WearcapError
 from wearcap.files import remove_leftovers
 from wearcap.locks import folder_lock
 from wearcap.models.image_encoder import ImageEncoder
-from wearcap.prepare.engine import REGISTER_EVERY_S, Report, check_recording, progress_bar
+from wearcap.prepare.engine import Report, check_recording, registering
 from wearcap.recording.recording import CameraStream
 from wearcap.recording.store import Entry, RecordingFile, RecordingStore, save_recording
 
@@ -29,48 +28,38 @@ def embed_dataset(
     """
     root = RecordingStore.open(dataset).root
     name_of_all = embedding_name(encoder)
-    report, pending, written_at = Report(), dict[str, Entry](), time.monotonic()
+    report = Report()
     with folder_lock(root, "prepare embeddings"):
         remove_leftovers(root, below=True)
         store = RecordingStore.open(root)
-        try:
-            with progress_bar(len(store.entries), 0) as advance:
-                for name in store.names():
-                    try:
-                        registered = _is_registered(store, name)
-                        file = RecordingFile(store.path_of(name), verify=registered)
-                        camera = file.part("camera")
-                        if not isinstance(camera, CameraStream) or not (camera.video or camera.image_files):
-                            report.notes[name] = "no head camera's pictures"
-                        elif (
-                            registered  # a file of a killed run that is not in the manifest yet is written again
-                            and not overwrite
-                            and camera.embedding is not None
-                            and camera.embedding_mirrored is not None
-                            and camera.embedding_name == name_of_all
-                        ):
-                            report.current.append(name)
-                        else:
-                            pending[name] = _embed(store, name, file, encoder, cache)
-                            report.written.append(name)
-                    except WearcapError as error:
-                        report.failed[name] = str(error)
-                    if time.monotonic() - written_at > REGISTER_EVERY_S:
-                        store.register(pending)
-                        pending, written_at = {}, time.monotonic()
-                    advance()
-        finally:
-            store.register(pending)
+        with registering(store, len(store.entries)) as finish:
+            for name in store.names():
+                path, made = store.path_of(name), dict[str, Entry]()
+                try:
+                    # A killed run leaves files that are younger than the manifest; they are written again.
+                    registered = not path.is_file() or path.stat().st_mtime_ns <= store.manifest_path.stat().st_mtime_ns
+                    file = RecordingFile(path, verify=registered)
+                    camera = file.part("camera")
+                    if not isinstance(camera, CameraStream) or not (camera.video or camera.image_files):
+                        report.notes[name] = "no head camera's pictures"
+                    elif (
+                        registered
+                        and not overwrite
+                        and camera.embedding is not None
+                        and camera.embedding_mirrored is not None
+                        and camera.embedding_name == name_of_all
+                    ):
+                        report.current.append(name)
+                    else:
+                        made[name] = _embed(store, name, file, encoder, cache)
+                        report.written.append(name)
+                except WearcapError as error:
+                    report.failed[name] = str(error)
+                finish(made)
     if len(report.notes) == len(store.entries):
         fix = "Prepare it with them, as `wearcap prepare simulated camera=true` does."
         raise WearcapError("no recording has a head camera's pictures", where=store.root, fix=fix)
     return report
-
-
-def _is_registered(store: RecordingStore, name: str) -> bool:
-    """Whether a recording's file is not younger than the manifest, which is written after it."""
-    path = store.path_of(name)
-    return not path.is_file() or path.stat().st_mtime_ns <= store.manifest_path.stat().st_mtime_ns
 
 
 def _embed(

@@ -24,7 +24,7 @@ from joblib.externals.loky import get_reusable_executor
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, require_choice
 from wearcap.files import remove_leftovers, sha256_of
 from wearcap.io.formats.poses import are_rotations
 from wearcap.locks import folder_lock
@@ -152,43 +152,29 @@ def prepare(
         raise WearcapError(f"two sources give a recording the name {twice!r}", expected="unique names")
     if jobs == 0:
         raise WearcapError("0 jobs", expected="a number of jobs, or -1 for one per core")
-    if backend not in BACKENDS:
-        raise WearcapError(f"no backend {backend!r}", expected=f"one of {', '.join(BACKENDS)}")
+    require_choice(backend, BACKENDS, f"no backend {backend!r}")
     with folder_lock(output, "prepare") as lock:
         store = RecordingStore(output)
         store.register({})  # missing permission or space should show now and not after the first hour
         remove_leftovers(store.root, below=True)
         todo = tasks if overwrite else [task for task in tasks if not _is_current(store, task)]
-        current = sorted(names - {task.name for task in todo})
-        with closing(_outcomes(todo, store.root, jobs, backend, scheduler, lock)) as outcomes:
-            return _collect(outcomes, store, current, len(tasks))
-
-
-def _collect(
-    outcomes: Iterator[tuple[str, Entry | str, str]], store: RecordingStore, current: list[str], total: int
-) -> Report:
-    """Register the workers' results in the manifest, and report."""
-    report, pending, written_at = Report(current=current), dict[str, Entry](), time.monotonic()
-    try:
-        with progress_bar(total, len(current)) as advance:
-            for name, outcome, note in outcomes:
-                if isinstance(outcome, Entry):
-                    pending[name] = outcome
-                    report.written.append(name)
-                else:
-                    report.failed[name] = outcome
-                    store.entries.pop(name, None)  # made with other settings
-                if note:
-                    report.notes[name] = note
-                if time.monotonic() - written_at > REGISTER_EVERY_S:
-                    store.register(pending)
-                    pending, written_at = {}, time.monotonic()
-                advance()
-    except BrokenExecutor as error:
-        fix = "What is finished is kept: run again with fewer jobs."
-        raise WearcapError("a worker process was killed (out of memory?)", where=store.root, fix=fix) from error
-    finally:
-        store.register(pending)
+        report = Report(current=sorted(names - {task.name for task in todo}))
+        outcomes = _outcomes(todo, store.root, jobs, backend, scheduler, lock)
+        try:
+            with closing(outcomes), registering(store, len(tasks), len(report.current)) as finish:
+                for name, outcome, note in outcomes:
+                    made = {name: outcome} if isinstance(outcome, Entry) else {}
+                    if isinstance(outcome, Entry):
+                        report.written.append(name)
+                    else:
+                        report.failed[name] = outcome
+                        store.entries.pop(name, None)  # made with other settings
+                    if note:
+                        report.notes[name] = note
+                    finish(made)
+        except BrokenExecutor as error:
+            fix = "What is finished is kept: run again with fewer jobs."
+            raise WearcapError("a worker process was killed (out of memory?)", where=store.root, fix=fix) from error
     report.written.sort()
     return report
 
@@ -270,6 +256,30 @@ def _backend(backend: str, jobs: int, scheduler: str | None, lock: int | None) -
     except ModuleNotFoundError as error:
         fix = f"pip install {'wearcap[cluster]' if backend == 'dask' else 'ray'}"
         raise WearcapError(f"the backend {backend!r} needs the package {error.name!r}", fix=fix) from error
+
+
+@contextmanager
+def registering(store: RecordingStore, total: int, done: int = 0) -> Iterator[Callable[[dict[str, Entry]], None]]:
+    """Show progress, and enter recordings in the manifest at most every `REGISTER_EVERY_S`, and at the end.
+
+    The yielded function is called for each finished recording, with its entry if it has been written.
+    """
+    pending, written_at = dict[str, Entry](), time.monotonic()
+
+    def finish(made: dict[str, Entry]) -> None:
+        nonlocal written_at
+        pending.update(made)
+        if time.monotonic() - written_at > REGISTER_EVERY_S:
+            store.register(pending)
+            pending.clear()
+            written_at = time.monotonic()
+        advance()
+
+    try:
+        with progress_bar(total, done) as advance:
+            yield finish
+    finally:
+        store.register(pending)
 
 
 @contextmanager

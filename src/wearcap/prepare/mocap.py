@@ -86,10 +86,11 @@ def mocap_recording(motion: Motion, about: About, settings: MocapSettings) -> Re
         t_world_root=motion.t_world_root - torch.tensor([0.0, 0.0, floor]),
         provenance=provenance | ({NOTE: note} if note else {}),
     )
-    times = motion.timestamps
+    times, head, t = motion.timestamps, motion.joint("head"), torch.tensor(list(settings.t_head_device))
     return Recording(
         **vars(about),
-        head=_nominal_head(motion, settings.t_head_device),
+        # The path of a device fixed to the head joint, its axes parallel to the head's
+        head=HeadStream(times, head.R.contiguous(), head @ t, torch.eye(3), t),
         motion=motion,
         contacts=ContactTrack(times, FOOT_PATCHES, contact),
         floor=FloorTrack(times, torch.zeros(len(times))) if level else None,
@@ -104,13 +105,6 @@ def on_xsens23(motion: Motion) -> Motion:
     skeleton = fit_offsets(motion.skeleton, xsens23())
     R, t = retarget(motion.skeleton, skeleton, motion.R_parent_joint, motion.t_world_root)
     return replace(motion, skeleton=skeleton, R_parent_joint=R, t_world_root=t)
-
-
-def _nominal_head(motion: Motion, t_head_device: Sequence[float]) -> HeadStream:
-    """The path of a device fixed to the head joint, its axes parallel to the head's."""
-    head = motion.joint("head")
-    t = torch.tensor(list(t_head_device))
-    return HeadStream(motion.timestamps, head.R.contiguous(), head @ t, torch.eye(3), t)
 
 
 def without_glitches(motion: Motion, limits: CleaningLimits) -> tuple[Motion, str]:

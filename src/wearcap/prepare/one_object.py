@@ -1,6 +1,7 @@
 """People who handle one object, BEHAVE and OMOMO: a recording with the object's path, and its environment."""
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
 from itertools import pairwise
@@ -49,14 +50,17 @@ _MIN_STEPS = 10
 _UPSIDE_DOWN_M = 0.2
 
 
-def _one_object(take: OneObject, about: About, settings: MocapSettings, output: str | Path) -> Recording:
+def _one_object(
+    read: Callable[[], OneObject], source: str, license: str, settings: MocapSettings, output: str | Path
+) -> Recording:
     """Like `mocap_recording`, with the object's path on the motion's clock and an environment of that one object.
 
     The environment is written to `output`/scenes/NAME; the object is free to move and handled throughout, so there
     are no `interactions`. Of the segments between gaps and glitches the longest is kept, as noted in the motion's
     provenance. Raises WearcapError for an object of unknown class and for a body that is upside down.
     """
-    kind = object_class(take.object_name)
+    take = read()
+    about, kind = About(take.name, take.subject, source, license, take.activity), object_class(take.object_name)
     kept, cut, frames = take, "", len(take.motion)
     gaps = (take.motion.timestamps.diff() > MAX_GAP_S).nonzero()[:, 0].tolist()
     if gaps:
@@ -119,11 +123,10 @@ def _ground_rotation(points_world: Float[Tensor, "point 3"]) -> Float[Tensor, "3
     return rotation.exp(axis / axis.norm().clamp(min=1e-12) * angle).to(points_world.dtype)
 
 
-def _behave(root: Path, name: str, settings: MocapSettings, license: str, output: Path) -> Recording:
-    """Body and object on level ground at z = 0; the environment is written beside the recording.
+def _level_behave(root: Path, name: str, settings: MocapSettings) -> OneObject:
+    """A take, rotated so that the ground below the planted feet is level; provenance notes the tilt.
 
-    The take is rotated so that the ground below the planted feet is level; provenance notes the tilt. Raises WearcapError
-    for a ground tilted by more than `MAX_TILT_DEG`.
+    Raises WearcapError for a ground tilted by more than `MAX_TILT_DEG`.
     """
     take = read_behave(root, name)
     motion = on_xsens23(take.motion)
@@ -135,9 +138,7 @@ def _behave(root: Path, name: str, settings: MocapSettings, license: str, output
         fix = "Check which of the source's axes is up."
         raise WearcapError(what, where=take.name, expected=f"at most {MAX_TILT_DEG:g}°", fix=fix)
     motion = replace(motion, provenance=motion.provenance | {"tilt_deg": f"{tilt:.2f}"})
-    take = replace(take, motion=motion).turned(R)
-    about = About(name, take.subject, "BEHAVE", license, take.activity)
-    return _one_object(take, about, settings, output)
+    return replace(take, motion=motion).turned(R)
 
 
 def behave_tasks(
@@ -154,17 +155,10 @@ def behave_tasks(
     for name in behave_names(source):
         files = [sequences / name / file for file in (BODY_FILE, OBJECT_FILE, INFO_FILE)]
         key = content_hash(name, shared, *(file for file in files if file.is_file()))
-        tasks.append(Task(name, partial(_behave, source, name, settings, license, Path(output)), splits.of(name), key))
+        read = partial(_level_behave, source, name, settings)
+        make = partial(_one_object, read, "BEHAVE", license, settings, Path(output))
+        tasks.append(Task(name, make, splits.of(name), key))
     return tasks
-
-
-def _omomo(
-    sequence: OmomoSequence, root: Path, source_fps: float | int, settings: MocapSettings, license: str, output: Path
-) -> Recording:
-    """Body and object with the floor at z = 0; the environment is written beside the recording."""
-    take = omomo_take(sequence, root, source_fps)
-    about = About(take.name, take.subject, "OMOMO", license, take.activity)
-    return _one_object(take, about, settings, output)
 
 
 def omomo_tasks(
@@ -195,7 +189,8 @@ def omomo_tasks(
             arrays.update(f"{name} {array.dtype} {array.shape}".encode())
             arrays.update(np.ascontiguousarray(array).tobytes())
         key = content_hash(sequence.name, shared, of_mesh[sequence.object_name], arrays.hexdigest())
-        make = partial(_omomo, sequence, source, source_fps, settings, license, Path(output))
+        read = partial(omomo_take, sequence, source, source_fps)
+        make = partial(_one_object, read, "OMOMO", license, settings, Path(output))
         tasks.append(Task(sequence.name, make, splits.of(sequence.subject), key))
     return tasks
 

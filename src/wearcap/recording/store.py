@@ -8,13 +8,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
 
 import safetensors
 from safetensors.torch import save
 from torch import Tensor
 
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, require_choice
 from wearcap.files import atomic_path, parse_json, remembered_sha256, sha256_of, write_text
 from wearcap.recording.recording import Recording
 from wearcap.recording.serialize import dumps, flatten, require_part, unflatten
@@ -47,8 +46,7 @@ class Entry:
     @classmethod
     def of(cls, recording: Recording, root: Path, split: str, config_hash: str) -> "Entry":
         """The manifest entry of a recording whose file has been written."""
-        if split not in SPLITS:
-            raise WearcapError(f"no split {split!r}", expected=f"one of {', '.join(SPLITS)}")
+        require_choice(split, SPLITS, f"no split {split!r}")
         path = recording_path(root, recording.name)
         stream = recording.motion or recording.head
         frames = len(stream.timestamps) if stream else 0
@@ -78,11 +76,21 @@ class RecordingFile:
     """
 
     def __init__(self, path: str | Path, *, verify: bool = True):
-        """Open a file. Raises WearcapError when it is missing, damaged, no recording, or differs from the
-        manifest's."""
-        self.path = Path(path)
-        if verify:
-            _verify(self.path)
+        """Open a file. Raises WearcapError when it is missing, damaged, no recording, or differs from its data set's
+        manifest; files outside a data set are not compared."""
+        self.path, manifest = Path(path), Path(path).parent.parent / MANIFEST
+        try:
+            if verify and self.path.parent.name == FOLDER and manifest.is_file() and self.path.is_file():
+                found = manifest.stat()
+                entry = _entries(manifest, found.st_size, found.st_mtime_ns, found.st_ino).get(self.path.name)
+                if entry is not None and (size := self.path.stat().st_size) != entry.bytes:
+                    expected = f"{entry.bytes} bytes, as the manifest says"
+                    fix = "It was cut short or replaced: prepare it again."
+                    raise WearcapError(f"{size} bytes long", self.path, expected, fix)
+                if entry is not None and remembered_sha256(self.path) != entry.sha256:
+                    raise _differs(self.path)
+        except OSError as error:
+            raise WearcapError(f"cannot be read ({error.strerror or error})", self.path) from error
         try:
             self._file = safetensors.safe_open(str(self.path), framework="pt")
         except FileNotFoundError as error:
@@ -147,23 +155,6 @@ class RecordingFile:
             raise WearcapError(f"this recording has no {key!r}", self.path, f"one of {', '.join(sorted(self.keys))}")
 
 
-def _verify(path: Path) -> None:
-    """Raise WearcapError when a file differs from its data set's manifest; files outside a data set are not checked."""
-    manifest = path.parent.parent / MANIFEST
-    try:
-        if path.parent.name != FOLDER or not manifest.is_file() or not path.is_file():
-            return
-        found = manifest.stat()
-        entry = _entries(manifest, found.st_size, found.st_mtime_ns, found.st_ino).get(path.name)
-        if entry is not None and (size := path.stat().st_size) != entry.bytes:
-            expected = f"{entry.bytes} bytes, as the manifest says"
-            raise WearcapError(f"{size} bytes long", path, expected, "It was cut short or replaced: prepare it again.")
-        if entry is not None and remembered_sha256(path) != entry.sha256:
-            raise _differs(path)
-    except OSError as error:
-        raise WearcapError(f"cannot be read ({error.strerror or error})", path) from error
-
-
 def _differs(path: Path) -> WearcapError:
     what = "its checksum differs from the manifest's"
     return WearcapError(what, path, fix="It was damaged or replaced: prepare it again.")
@@ -203,7 +194,21 @@ class RecordingStore:
             what = f"schema version {str(version)[:40]}"
             raise WearcapError(what, path, f"version {SCHEMA_VERSION}", "Prepare the data set again.")
         try:
-            self.entries |= {name: self._entry(name, entry) for name, entry in manifest["recordings"].items()}
+            for name, row in manifest["recordings"].items():
+                for field in dataclasses.fields(Entry):
+                    value = row[field.name]
+                    if type(value) is not field.type and not (field.type is float and type(value) is int):
+                        raise ValueError(f"{field.name} of {name!r} is {str(value)[:40]!r}")
+                    if field.type in (int, float) and not 0 <= value <= _MOST.get(field.name, math.inf):
+                        raise ValueError(f"{field.name} of {name!r} is {value}")
+                entry = Entry(**row)
+                if self.root / entry.file != recording_path(self.root, name):
+                    raise ValueError(f"{name!r} is at {entry.file!r}, outside this data set")
+                if entry.split not in SPLITS:
+                    raise ValueError(f"{name!r} is in split {entry.split[:40]!r}")
+                if entry.frames * entry.fps and entry.bytes < entry.frames:
+                    raise ValueError(f"{name!r} has {entry.frames} frames in {entry.bytes} bytes")
+                self.entries[name] = entry
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             what = f"not a readable manifest ({str(error)[:200]})"
             raise WearcapError(what, path, fix="Delete it and prepare the data set again.") from error
@@ -219,23 +224,6 @@ class RecordingStore:
     @property
     def manifest_path(self) -> Path:
         return self.root / MANIFEST
-
-    def _entry(self, name: str, row: dict[str, Any]) -> Entry:
-        """Parse one row of the manifest. Raises ValueError or TypeError for invalid values."""
-        for field in dataclasses.fields(Entry):
-            value = row[field.name]
-            if type(value) is not field.type and not (field.type is float and type(value) is int):
-                raise ValueError(f"{field.name} of {name!r} is {str(value)[:40]!r}")
-            if field.type in (int, float) and not 0 <= value <= _MOST.get(field.name, math.inf):
-                raise ValueError(f"{field.name} of {name!r} is {value}")
-        entry = Entry(**row)
-        if self.root / entry.file != recording_path(self.root, name):
-            raise ValueError(f"{name!r} is at {entry.file!r}, outside this data set")
-        if entry.split not in SPLITS:
-            raise ValueError(f"{name!r} is in split {entry.split[:40]!r}")
-        if entry.frames * entry.fps and entry.bytes < entry.frames:
-            raise ValueError(f"{name!r} has {entry.frames} frames in {entry.bytes} bytes")
-        return entry
 
     def names(self, split: str | None = None) -> list[str]:
         """Sorted names of the recordings of one split ("train", "val", "test"), or of all."""

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from wearcap.body.skeleton import Site, Skeleton
 from wearcap.diffusion.schedule import CosineSchedule, Schedule
-from wearcap.errors import WearcapError, nearest
+from wearcap.errors import WearcapError, nearest, require_choice
 
 RUNTIMES = ("auto", "eager", "compile", "onnx")
 """Backends; auto: compiled (CUDA graphs) on a GPU, else ONNX Runtime where it is installed, else eager. All but eager
@@ -258,8 +258,7 @@ ROT6D = tuple(f"{column}{axis}" for column in "xy" for axis in "xyz")
 def schedule_to_json(schedule: Schedule) -> dict[str, Any]:
     """A schedule by name and settings. Raises WearcapError for one of another class than `SCHEDULES`."""
     name = type(schedule).__name__
-    if name not in SCHEDULES:
-        raise WearcapError(f"schedule {name} cannot be exported", expected=f"one of {', '.join(SCHEDULES)}")
+    require_choice(name, SCHEDULES, f"schedule {name} cannot be exported")
     return {"name": name, **vars(schedule)}
 
 

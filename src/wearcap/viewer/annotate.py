@@ -151,16 +151,6 @@ class Video:
     times: Float64[np.ndarray, "point 2"]
     """Rising pairs of recording time and video time (s), interpolated linearly."""
 
-    @classmethod
-    def starting(cls, path: Path, start_s: float) -> "Video":
-        """A video whose first picture was taken at `start_s` of the recording, on the same clock from there on.
-
-        Raises WearcapError when it is missing or damaged.
-        """
-        info = video_info(path)
-        length = max(info.frames, 1) / info.fps
-        return cls(path, np.array([[start_s, 0.0], [start_s + length, length]]))
-
 
 @dataclass(frozen=True)
 class Take:
@@ -301,7 +291,12 @@ class Desk:
             recording = self.recording(index)
             shown = motion or recording.motion or recording.suit
             start = video_start_s if video_start_s is not None else float(shown.timestamps[0]) if shown else 0.0
-            return Take.of(recording, folder, motion, Video.starting(video, start) if video else None)
+            film = None
+            if video is not None:  # its first picture was taken at `start`; from there on it is on the same clock
+                info = video_info(video)
+                length = max(info.frames, 1) / info.fps
+                film = Video(video, np.array([[start, 0.0], [start + length, length]]))
+            return Take.of(recording, folder, motion, film)
 
         self.recording = lru_cache(maxsize=2)(lambda index: load_recording(places[index]))
         self.take = lru_cache(maxsize=2)(open_take)

@@ -15,7 +15,7 @@ import viser
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, require_choice
 from wearcap.geometry.trajectory import Trajectory, nearest_frames
 from wearcap.recording import Motion, Recording
 from wearcap.scene.objects import Environment, SceneObject
@@ -244,8 +244,7 @@ class Page(ServedPage):
 
     def arrange(self, layout: str) -> None:
         """Show ground truth and captures "over" one another, "beside" (the first capture in its place), or one alone."""
-        if layout not in self._layouts():
-            raise WearcapError(f"no layout {layout!r}", expected=f"one of {', '.join(self._layouts())}")
+        require_choice(layout, self._layouts(), f"no layout {layout!r}")
         self.layout = layout
         for column, (name, placed) in enumerate(self.bodies.items()):
             aside = self.aside_m * ((TRUTH in self.bodies) - column) if layout == BESIDE else 0.0

@@ -9,7 +9,6 @@ the mesh that was registered: other resolutions of an object have another mean.
 
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -96,7 +95,12 @@ def read_behave(root: str | Path, name: str) -> OneObject:
             what = f"the body's frame {apart[0]} is of {other[apart[0]]:.3f} s, the object's of {times[apart[0]]:.3f} s"
             raise WearcapError(what, folder, "the same frame_times in both files", "Fetch both files again.")
     times = torch.from_numpy(times)
-    object_name, gender = _about(read_json(folder / INFO_FILE), folder / INFO_FILE)
+    info = read_json(folder / INFO_FILE)
+    object_name = info.get("cat") if isinstance(info, dict) else None
+    if not isinstance(object_name, str) or not object_name.isidentifier():
+        expected = '{"cat": "boxlarge", "gender": "male", …}'
+        raise WearcapError("does not name the object", folder / INFO_FILE, expected)
+    gender = info["gender"] if isinstance(info.get("gender"), str) else ""
     pelvis, about = body["trans"].astype(np.float64) + PELVIS_SMPLH, {"source": name, "format": "behave"}
     motion = smpl_motion(times, smplh52(), body["poses"], pelvis, **about, gender=gender)
     R = rotation.exp(torch.from_numpy(fitted["angles"].astype(np.float64)))
@@ -152,14 +156,6 @@ def _times(arrays: dict[str, np.ndarray], path: Path, frames: int) -> Float64[np
         raise WearcapError(f"frames come at {rate:.4g} per second", path, f"{FPS} per second", fix)
     check_rising(grid / FPS, path)
     return grid / FPS
-
-
-def _about(info: Any, path: Path) -> tuple[str, str]:
-    """Name of the object and gender of the person."""
-    if not isinstance(info, dict) or not isinstance(info.get("cat"), str) or not info["cat"].isidentifier():
-        raise WearcapError("does not name the object", path, '{"cat": "boxlarge", "gender": "male", …}')
-    gender = info.get("gender")
-    return info["cat"], gender if isinstance(gender, str) else ""
 
 
 def _shape(body: dict[str, np.ndarray], path: Path, frames: int) -> dict[str, float]:

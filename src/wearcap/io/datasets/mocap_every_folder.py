@@ -110,10 +110,21 @@ def read_mocap_every_folder(folder: str | Path) -> MocapEveryFolder:
     video = folder / VIDEO if (folder / VIDEO).is_file() else None
     size = None if video is None else (video_info(video).width, video_info(video).height)
     points = read_ply(folder / POINTS).points if (folder / POINTS).is_file() else None
+    undistorted = None  # SLAM's pictures, whose size follows from the video's, else from the principal point
+    if (path := folder / UNDISTORTED).is_file():
+        fx, fy, cx, cy = _intrinsics(path, (4,))
+        width, height = round(cx / 4) * 8, round(cy / 4) * 8
+        if size is not None:
+            shrink = np.sqrt(_SLAM_PIXELS / (size[0] * size[1]))
+            width, height = (int(side * shrink) // 8 * 8 for side in size)
+        if not (0.25 * width < cx < 0.75 * width and 0.25 * height < cy < 0.75 * height):
+            what = f"principal point {cx:.1f}, {cy:.1f}"
+            raise WearcapError(what, path, f"one near the middle of {width}x{height} pixels")
+        undistorted = Camera("pinhole", width, height, fx, fy, cx, cy)
     return MocapEveryFolder(
         folder.resolve().name,
         track,
-        _undistorted(folder / UNDISTORTED, size),
+        undistorted,
         _lens(folder / LENS, size),
         None if points is None else torch.from_numpy(points),
         video,
@@ -213,21 +224,6 @@ def _intrinsics(path: Path, counts: tuple[int, ...]) -> list[float]:
         what = f"{len(values)} numbers"
         raise WearcapError(what, path, f"{' or '.join(map(str, counts))}: fx fy cx cy and distortion")
     return values
-
-
-def _undistorted(path: Path, video: tuple[int, int] | None) -> Camera | None:
-    """The pinhole camera of SLAM's pictures, whose size follows from the video's, else from the principal point."""
-    if not path.is_file():
-        return None
-    fx, fy, cx, cy = _intrinsics(path, (4,))
-    width, height = round(cx / 4) * 8, round(cy / 4) * 8
-    if video is not None:
-        shrink = np.sqrt(_SLAM_PIXELS / (video[0] * video[1]))
-        width, height = (int(side * shrink) // 8 * 8 for side in video)
-    if not (0.25 * width < cx < 0.75 * width and 0.25 * height < cy < 0.75 * height):
-        what = f"principal point {cx:.1f}, {cy:.1f}"
-        raise WearcapError(what, path, f"one near the middle of {width}x{height} pixels")
-    return Camera("pinhole", width, height, fx, fy, cx, cy)
 
 
 def _lens(path: Path, video: tuple[int, int] | None) -> Camera | None:

@@ -124,7 +124,15 @@ class _Hierarchy:
             elif self.joints[self.open[-2]].end is None:
                 self.joints[self.open[-2]].end = offset
         elif key == "CHANNELS":
-            self.add_channels(int(next(self.words)))
+            count = int(next(self.words))
+            if not 0 <= count <= len(_CHANNELS):
+                raise ValueError(f"CHANNELS {count}")
+            names = [name.lower() for name in islice(self.words, count)]
+            if not self.open or self.open[-1] == _END_SITE or self.joints[self.open[-1]].channels:
+                raise ValueError("CHANNELS belongs once into a joint")
+            if len(names) != count or not set(names) <= set(_CHANNELS) or len(set(names)) != count:
+                raise ValueError(f"CHANNELS {count} with {' '.join(names)[:80]}")
+            self.joints[self.open[-1]].channels = [_CHANNELS[name] for name in names]
         elif key == "}":
             self.open.pop()
         elif key != "HIERARCHY":
@@ -152,16 +160,6 @@ class _Hierarchy:
             raise ValueError("a joint without a name" if not name else f"more than {MAX_JOINTS} joints")
         self.joints.append(_Joint(name, self.open[-1] if self.open else -1))
         self.open.append(len(self.joints) - 1)
-
-    def add_channels(self, count: int) -> None:
-        if not 0 <= count <= len(_CHANNELS):
-            raise ValueError(f"CHANNELS {count}")
-        names = [name.lower() for name in islice(self.words, count)]
-        if not self.open or self.open[-1] == _END_SITE or self.joints[self.open[-1]].channels:
-            raise ValueError("CHANNELS belongs once into a joint")
-        if len(names) != count or not set(names) <= set(_CHANNELS) or len(set(names)) != count:
-            raise ValueError(f"CHANNELS {count} with {' '.join(names)[:80]}")
-        self.joints[self.open[-1]].channels = [_CHANNELS[name] for name in names]
 
 
 def _parse_motion(

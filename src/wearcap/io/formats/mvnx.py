@@ -6,7 +6,6 @@ segment's position is its joint's, so orientations are taken as they are.
 
 import io
 import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -161,9 +160,22 @@ def read_mvnx(path: str | Path, max_bytes: int | None = None) -> Recording:
         plain_xml(path, "MVNX file as MVN exports it"),
         open_bytes(path, max_bytes, MAX_BYTES) as source,
     ):
-        chunks = _Chunks(source)
-        for element in _elements(iterparse(chunks, events=("start", "end"), forbid_dtd=True), chunks):
-            file.take(element)
+        chunks, frames, kept = _Chunks(source), None, 0
+        for event, element in iterparse(chunks, events=("start", "end"), forbid_dtd=True):
+            chunks.restart()
+            name = tag_of(element)
+            kept += event == "start"
+            if kept > _MAX_ELEMENTS:
+                raise ValueError(f"more than {_MAX_ELEMENTS} elements beside its frames")
+            if event == "start" and name == "frames":
+                frames = element
+            elif (event == "start" and name == "subject") or (
+                event == "end" and name in ("segment", "sensor", "contactDefinition", "frame")
+            ):
+                file.take(element)
+                if name == "frame" and frames is not None:  # forgotten once it is used, so that memory stays flat
+                    frames.clear()
+                    kept = 0
     return _recording(file)
 
 
@@ -184,27 +196,6 @@ class _Chunks:
         self._size = _CHUNK
 
 
-def _elements(events: Iterator[tuple[str, Element]], chunks: _Chunks) -> Iterator[Element]:
-    """Complete elements of interest; frames are forgotten once they are used, so that memory stays flat."""
-    frames: Element | None = None
-    kept = 0
-    for event, element in events:
-        chunks.restart()
-        name = tag_of(element)
-        kept += event == "start"
-        if kept > _MAX_ELEMENTS:
-            raise ValueError(f"more than {_MAX_ELEMENTS} elements beside its frames")
-        if event == "start" and name == "frames":
-            frames = element
-        elif (event == "start" and name == "subject") or (
-            event == "end" and name in ("segment", "sensor", "contactDefinition", "frame")
-        ):
-            yield element
-            if name == "frame" and frames is not None:
-                frames.clear()
-                kept = 0
-
-
 def _plain(label: str) -> str:
     return label.replace(" ", "").replace("_", "").lower()
 
@@ -220,12 +211,22 @@ def _recording(file: _File) -> Recording:
     R_world = matrix_from_quat_wxyz(_quaternions(file, "orientation"))[:, rows].double()
     t_world = file.column("position", 3)[:, rows]
     skeleton = _fitted(file, skeleton, rows, R_world, t_world)
+    contacts = file.column("footContacts", 1)[..., 0] if file.frames["footContacts"] else None
+    if contacts is not None and file.contacts:  # without definitions they are in the order of FOOT_PATCHES already
+        columns = []
+        for patch in FOOT_PATCHES:
+            side, part = patch.split("_")[:2]
+            found = [k for k, label in enumerate(file.contacts) if side in label and part in label]
+            if len(found) != 1:
+                raise WearcapError(f"foot contacts {file.contacts}", file.path, "heel and toe of both feet")
+            columns += found
+        contacts = contacts[:, columns]
     motion = Motion(
         timestamps,
         skeleton,
         local_rotations(skeleton, R_world).float(),
         t_world[:, 0].float(),
-        contact_prob=_contacts(file),
+        contact_prob=contacts,
         provenance={"source": file.path.name, "format": "mvnx"},
     )
     # One stream per sensor on a known segment, with free acceleration (m/s², world) and orientation
@@ -301,20 +302,3 @@ def _fitted(
         if label in _SITE_OF and segment in _JOINT_OF and len(at) == 3
     }
     return replace(fitted, sites=fitted.sites | points)
-
-
-def _contacts(file: _File) -> Float[Tensor, "time patch"] | None:
-    """Foot contacts in FOOT_PATCHES order; files without definitions list them in that order already."""
-    if not file.frames["footContacts"]:
-        return None
-    contacts = file.column("footContacts", 1)[..., 0]
-    if not file.contacts:
-        return contacts
-    columns = []
-    for patch in FOOT_PATCHES:
-        side, part = patch.split("_")[:2]
-        found = [k for k, label in enumerate(file.contacts) if side in label and part in label]
-        if len(found) != 1:
-            raise WearcapError(f"foot contacts {file.contacts}", file.path, "heel and toe of both feet")
-        columns += found
-    return contacts[:, columns]

@@ -67,20 +67,7 @@ class OCamModel:
         if focal <= 0:
             what = f"its direct polynomial begins with {self.pol[0]:g}"
             raise WearcapError(what, where, "a negative number (the axis points backwards)")
-        rho, theta = self._curve(determinant, where)
-        share = theta / theta[-1]  # powers of numbers up to 1 keep the system solvable
-        exponents = np.arange(2, _POWERS + 2)
-        basis = np.stack([share**power for power in exponents.tolist()], 1)
-        solution = np.linalg.lstsq(basis, rho / focal - theta, rcond=None)[0]
-        misfit_px = float(np.abs(basis @ solution + theta - rho / focal).max()) * focal
-        if misfit_px > _MAX_MISFIT_PX:
-            raise WearcapError(f"its polynomial is met only within {misfit_px:.2f} px", where, "a fisheye lens")
-        powers = (solution / theta[-1] ** exponents).tolist()
-        return Camera("ocam", self.width, self.height, focal, focal, self.column, self.row, (c, d, e, *powers))
-
-    def _curve(self, determinant: float, where: str | Path) -> tuple[np.ndarray, np.ndarray]:
-        """Radii ρ (pixels) up to the image's furthest corner, and their angles θ from the axis (rad)."""
-        c, d, e = self.affine
+        # Radii ρ (pixels) up to the image's furthest corner, and their angles θ from the axis (rad)
         corners = np.array([*product((0, self.height - 1), (0, self.width - 1))], np.float64)
         offset = corners - (self.row, self.column)
         u = (offset[:, 0] - d * offset[:, 1]) / determinant
@@ -100,7 +87,15 @@ class OCamModel:
             if central.max() > _MAX_DISAGREEMENT_PX:
                 what = f"its two polynomials differ by up to {central.max():.3g} px"
                 raise WearcapError(what, where, "two fits of one lens")
-        return rho, theta
+        share = theta / theta[-1]  # powers of numbers up to 1 keep the system solvable
+        exponents = np.arange(2, _POWERS + 2)
+        basis = np.stack([share**power for power in exponents.tolist()], 1)
+        solution = np.linalg.lstsq(basis, rho / focal - theta, rcond=None)[0]
+        misfit_px = float(np.abs(basis @ solution + theta - rho / focal).max()) * focal
+        if misfit_px > _MAX_MISFIT_PX:
+            raise WearcapError(f"its polynomial is met only within {misfit_px:.2f} px", where, "a fisheye lens")
+        powers = (solution / theta[-1] ** exponents).tolist()
+        return Camera("ocam", self.width, self.height, focal, focal, self.column, self.row, (c, d, e, *powers))
 
 
 def read_sensor_frame(path: str | Path) -> dict[str, OCamModel]:

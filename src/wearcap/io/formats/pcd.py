@@ -52,7 +52,16 @@ def read_pcd(path: str | Path) -> Ply:
         _require(len(data) - body >= count * dtype.itemsize, path)
         rows = np.frombuffer(data, dtype, count, body)
     elif encoding == "binary_compressed":
-        rows = _compressed_rows(memoryview(data)[body:], dtype, count, path)
+        packed = memoryview(data)[body:]
+        _require(len(packed) >= 8, path)
+        compressed, size = (int(v) for v in np.frombuffer(packed, "<u4", 2))
+        _require(len(packed) >= 8 + compressed and size == count * dtype.itemsize, path)
+        with understood("its compressed data is damaged", path, fix="Copy the file again.", errors=ValueError):
+            plain = _lzf_decompressed(packed[8 : 8 + compressed], size)
+        rows, start = np.empty(count, dtype), 0  # decompressed, each field's values are contiguous
+        for name in dtype.names or ():
+            rows[name] = np.frombuffer(plain, dtype[name], count, start)
+            start += count * dtype[name].itemsize
     else:
         raise WearcapError(f"DATA {encoding}", path, "ascii, binary or binary_compressed")
     with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite and is dropped
@@ -88,21 +97,6 @@ def _require(complete: bool, path: str | Path) -> None:
     if not complete:
         what = "it holds fewer points than its header states"
         raise WearcapError(what, path, fix="The file was cut short: copy it again.")
-
-
-def _compressed_rows(body: memoryview, dtype: np.dtype, count: int, path: str | Path) -> np.ndarray:
-    """Decompressed LZF data, in which each field's values are contiguous."""
-    _require(len(body) >= 8, path)
-    compressed, size = (int(v) for v in np.frombuffer(body, "<u4", 2))
-    _require(len(body) >= 8 + compressed and size == count * dtype.itemsize, path)
-    with understood("its compressed data is damaged", path, fix="Copy the file again.", errors=ValueError):
-        plain = _lzf_decompressed(body[8 : 8 + compressed], size)
-    rows, start = np.empty(count, dtype), 0
-    for name in dtype.names or ():
-        width = dtype[name].itemsize
-        rows[name] = np.frombuffer(plain, dtype[name], count, start)
-        start += count * width
-    return rows
 
 
 def _lzf_decompressed(data: bytes | memoryview, size: int) -> bytes:

@@ -88,9 +88,15 @@ def read_ply(path: str | Path) -> Ply:
             if element.count == 0:
                 tables[element.name] = {}
                 continue
-            read = _ascii_lists if any(p.count_dtype for p in element.properties) else _ascii_table
             with understood(f"a {element.name} row does not match the header", path):
-                table, rows = read(element, lines)
+                if any(p.count_dtype for p in element.properties):
+                    table, rows = _ascii_lists(element, lines)
+                else:
+                    with warnings.catch_warnings(), np.errstate(invalid="ignore", over="ignore"):
+                        warnings.simplefilter("ignore", UserWarning)  # numpy warns about a file that ends here
+                        values = np.loadtxt(islice(lines, element.count), ndmin=2, comments=None)
+                        rows, kept = len(values), element.properties if len(values) else []
+                        table = {p.name: values[:, i].astype(p.dtype) for i, p in enumerate(kept)}
             if rows < element.count:
                 raise _cut_short(path, element)
             tables[element.name] = table
@@ -240,14 +246,6 @@ def _read_even_rows(element: _Element, data: bytes, start: int, order: str) -> t
                 return None, start
             table[p.name] = _Lists(values.reshape(-1), np.full(len(rows), values.shape[1]))
     return table, stop
-
-
-def _ascii_table(element: _Element, lines: Iterator[str]) -> tuple[dict, int]:
-    with warnings.catch_warnings(), np.errstate(invalid="ignore", over="ignore"):
-        warnings.simplefilter("ignore", UserWarning)  # numpy warns about a file that ends here
-        values = np.loadtxt(islice(lines, element.count), ndmin=2, comments=None)
-        table = {p.name: values[:, i].astype(p.dtype) for i, p in enumerate(element.properties) if len(values)}
-        return table, len(values)
 
 
 def _ascii_lists(element: _Element, lines: Iterator[str]) -> tuple[dict, int]:

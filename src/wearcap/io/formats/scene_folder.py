@@ -6,7 +6,6 @@ Scans are PLY and PCD files, whose unit, extent and density are checked.
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
 
 from wearcap.errors import WearcapError
 from wearcap.io.datasets.hps import is_hps_scene, read_hps_scene
@@ -41,32 +40,24 @@ def read_scan(path: str | Path, *, metres_per_unit: float | None = None) -> Scan
     points = content.points if metres_per_unit is None else content.points * np.float32(metres_per_unit)
     if not len(points):
         raise WearcapError("the scan has no points", path, "a cloud of the scene's surfaces")
-    if metres_per_unit is None and (fault := _unit_fault(points)):
-        fix = "Give metres_per_unit=0.001 for a scan in millimetres, 1 for one that is sparse."
-        raise WearcapError(fault, path, "metres", fix)
+    if metres_per_unit is None:
+        # Millimetres show in the extent of whole scenes, and in the density of small ones: every point alone in its
+        # half-metre cell.
+        low, high = points.min(0).astype(np.float64), points.max(0).astype(np.float64)
+        extent, fault = high - low, None
+        size = " x ".join(f"{side:.4g}" for side in extent)
+        if extent.max() > MAX_EXTENT_M or extent[2] > MAX_HEIGHT_M:
+            fault = f"the scan measures {size} of its units"
+        elif len(points) >= DENSE_FROM:
+            cells = np.floor((points - low) / _CELL_M).astype(np.int64)
+            sides = cells.max(0) + 1
+            per_cell = len(points) / len(np.unique((cells[:, 0] * sides[1] + cells[:, 1]) * sides[2] + cells[:, 2]))
+            if per_cell < _MIN_PER_CELL:
+                fault = f"the scan's {len(points)} points lie over {_CELL_M} of its units apart ({size} in all)"
+        if fault is not None:
+            fix = "Give metres_per_unit=0.001 for a scan in millimetres, 1 for one that is sparse."
+            raise WearcapError(f"{fault}: it looks like millimetres", path, "metres", fix)
     return Scan(points, content.colors)
-
-
-def _unit_fault(points: Float32[np.ndarray, "point 3"]) -> str | None:
-    """Reason why these points cannot be a scene in metres; None if they can.
-
-    Millimetres show in the extent of whole scenes, and in the density of small ones: every point alone in its
-    half-metre cell.
-    """
-    low, high = points.min(0).astype(np.float64), points.max(0).astype(np.float64)
-    extent = high - low
-    size = " x ".join(f"{side:.4g}" for side in extent)
-    if extent.max() > MAX_EXTENT_M or extent[2] > MAX_HEIGHT_M:
-        return f"the scan measures {size} of its units: it looks like millimetres"
-    if len(points) < DENSE_FROM:
-        return None
-    cells = np.floor((points - low) / _CELL_M).astype(np.int64)
-    sides = cells.max(0) + 1
-    per_cell = len(points) / len(np.unique((cells[:, 0] * sides[1] + cells[:, 1]) * sides[2] + cells[:, 2]))
-    if per_cell < _MIN_PER_CELL:
-        apart = f"{len(points)} points lie over {_CELL_M} of its units apart ({size} in all)"
-        return f"the scan's {apart}: it looks like millimetres"
-    return None
 
 
 CLOUD = "pointcloud.ply"

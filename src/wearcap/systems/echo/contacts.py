@@ -100,32 +100,25 @@ class GuidedScene:
         for item, surface in enumerate(self.surfaces):
             pose = forward_kinematics(surface.skeleton, body.R_parent_joint[item], body.t_world_root[item])
             touches = in_contact[item, :, :BODY_POINTS] & has_object[item, :, None]
-            if touches.any():
-                touch = touch + self._to_object(item, surface, pose, T_object[item], touches)
+            if touches.any():  # the nearest surface points stay fixed in the gradient
+                frame, point = touches.nonzero(as_tuple=True)
+                T = T_object[item][frame]
+                local = (T.R.mT @ (surface.vertices(pose)[frame, point] - T.t)[..., None])[..., 0]
+                number = self.conditioning.object_number[item, frame].long()
+                share = 1 / touches.sum(1)[frame]
+                total = local.new_zeros(())
+                for index in number.unique().tolist():
+                    tree = self.objects[item][int(index)]
+                    mine = local[number == index]
+                    _, nearest = tree.query(mine.detach().double().numpy())
+                    target = torch.from_numpy(np.asarray(tree.data, np.float32)[nearest])
+                    total = total + ((mine - target).square().sum(1) * share[number == index]).sum()
+                touch = touch + total
             stands = in_contact[item, :, BODY_POINTS:] & self.conditioning.valid[item, :, None]
             soles = site_positions(surface.skeleton, pose, FOOT_PATCHES)
             height = soles[..., 2] - self.conditioning.floor_height[item, :, None]
             stand = stand + (height.square() * stands / stands.sum(1, keepdim=True).clamp_min(1)).sum()
         return touch, stand
-
-    def _to_object(
-        self, item: int, surface: BodyModel, pose: Rigid, T_object: Rigid, touches: Tensor
-    ) -> Float[Tensor, ""]:
-        """Squared distances of one batch item's touching points to the nearest surface points, which stay fixed in the
-        gradient."""
-        frame, point = touches.nonzero(as_tuple=True)
-        arm = surface.vertices(pose)[frame, point] - T_object.t[frame]
-        local = (T_object.R[frame].mT @ arm[..., None])[..., 0]
-        number = self.conditioning.object_number[item, frame].long()
-        share = 1 / touches.sum(1)[frame]
-        total = local.new_zeros(())
-        for index in number.unique().tolist():
-            tree = self.objects[item][int(index)]
-            mine = local[number == index]
-            _, nearest = tree.query(mine.detach().double().numpy())
-            target = torch.from_numpy(np.asarray(tree.data, np.float32)[nearest])
-            total = total + ((mine - target).square().sum(1) * share[number == index]).sum()
-        return total
 
 
 def _is_touched(conditioning: Conditioning, outputs: Outputs, threshold: float) -> Bool[Tensor, "batch frame"]:

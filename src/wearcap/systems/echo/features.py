@@ -10,7 +10,7 @@ from torch import Tensor
 from wearcap.body.contact_points import BODY_POINTS
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.data.features import LIMBS
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, require_choice
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 
@@ -62,8 +62,7 @@ class EchoFeatures:
     """Frame rate of the model (Hz)."""
 
     def __post_init__(self):
-        if self.frame not in FRAMES:
-            raise WearcapError(f"ECHO has no frame {self.frame!r}", expected=f"one of {', '.join(FRAMES)}")
+        require_choice(self.frame, FRAMES, f"ECHO has no frame {self.frame!r}")
 
     @property
     def condition_size(self) -> int:

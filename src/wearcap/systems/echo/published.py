@@ -98,27 +98,27 @@ class NearestEcho:
         """One motion per scenario; deterministic, seeds are ignored."""
         reader, fps = ObjectReader(self.features, self.encoder), self.features.fps
         paths = [head_path(scenario.recording, scenario.recording.skeleton, fps) for scenario in scenarios]
-        return [self._capture(batch_item_of(scenario, path, reader)) for scenario, path in zip(scenarios, paths)]
-
-    def _capture(self, item: BatchItem) -> Motion:
-        conditioning, count = item.conditioning, len(item.path.timestamps)
-        points = ThreePoints(*(part[0] for part in conditioning.points))
-        size = body_size(item.path.skeleton)
-        channels = (_channels(self.features, points, conditioning.floor_height[0], size) - self.mean) / self.scale
-        total, weight = torch.zeros(count, self.outputs.shape[1]), torch.zeros(count, 1)
-        offsets = torch.arange(self.window)
+        offsets, motions = torch.arange(self.window), []
         triangle = torch.minimum(offsets + 1, self.window - offsets).float()[:, None] / self.window
-        for start in [*range(0, max(count - self.window, 0), self.window // 2), max(count - self.window, 0)]:
-            take = (start + offsets).clamp_max(count - 1)
-            active = int(conditioning.object_number[0, take[self.window // 2]])
-            name = item.objects[active].category if active >= 0 else NO_CLASS
-            name = name if name in self.descriptor else NO_CLASS
-            query = rearrange(channels[take[:: self.sample]], "frame channel -> (frame channel)")
-            best = (self.descriptor[name] - query).square().sum(1).argmin()
-            retrieved = self.outputs[self.frames[name][best] + offsets]
-            total.index_add_(0, take, retrieved * triangle)
-            weight.index_add_(0, take, triangle)
-        return motion_of(item, _decoded(self.features, total / weight, item), True, {"pipeline": "nearest_echo"})
+        for item in (batch_item_of(scenario, path, reader) for scenario, path in zip(scenarios, paths)):
+            conditioning, count = item.conditioning, len(item.path.timestamps)
+            points = ThreePoints(*(part[0] for part in conditioning.points))
+            size = body_size(item.path.skeleton)
+            channels = (_channels(self.features, points, conditioning.floor_height[0], size) - self.mean) / self.scale
+            total, weight = torch.zeros(count, self.outputs.shape[1]), torch.zeros(count, 1)
+            for start in [*range(0, max(count - self.window, 0), self.window // 2), max(count - self.window, 0)]:
+                take = (start + offsets).clamp_max(count - 1)
+                active = int(conditioning.object_number[0, take[self.window // 2]])
+                name = item.objects[active].category if active >= 0 else NO_CLASS
+                name = name if name in self.descriptor else NO_CLASS
+                query = rearrange(channels[take[:: self.sample]], "frame channel -> (frame channel)")
+                best = (self.descriptor[name] - query).square().sum(1).argmin()
+                retrieved = self.outputs[self.frames[name][best] + offsets]
+                total.index_add_(0, take, retrieved * triangle)
+                weight.index_add_(0, take, triangle)
+            outputs = _decoded(self.features, total / weight, item)
+            motions.append(motion_of(item, outputs, True, {"pipeline": "nearest_echo"}))
+        return motions
 
 
 def _decoded(features: EchoFeatures, outputs: Float[Tensor, "time feature"], item: BatchItem) -> Outputs:

@@ -10,7 +10,7 @@ from torch import Tensor
 from wearcap.body.anny_body import anny_body
 from wearcap.body.contact_points import BODY_POINTS, TOUCH_M, contact_points
 from wearcap.body.skeleton import FOOT_PATCHES
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, require_choice
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate_clamped, nearest_frames, resample
 from wearcap.metrics import objects as object_metrics
@@ -123,7 +123,21 @@ def score_echo(motion: Motion, truth: Truth, name: str, seed: int) -> Row:
     busy = truth.active >= 0
     if busy.any():
         scores["busy_mpjpe_mm"] = 10 * mpjpe_cm(joints[busy], true[busy]).item()
-        scores |= _object_scores(motion, truth)
+        parts: dict[str, list[Tensor]] = {}
+        for number, (shape, T_true) in enumerate(zip(truth.objects, truth.T_world_object)):
+            rows = (truth.active == number).nonzero()[:, 0]
+            track = (motion.object_motion or {}).get(shape.name)
+            if track is None or not len(rows):
+                continue
+            T_found, T_true = shape.centred(_poses_at(track, motion.timestamps[rows])), T_true[rows]
+            for key, value in {
+                "v2v_cm": object_metrics.vertex_error_cm(T_found, T_true, shape.cloud),
+                "center_cm": object_metrics.center_error_cm(T_found, T_true, shape.cloud),
+                "rotation_deg": object_metrics.rotation_difference_deg(T_found, T_true),
+                "quaternion": object_metrics.quaternion_difference(T_found, T_true),
+            }.items():
+                parts.setdefault(key, []).append(value)
+        scores |= {key: torch.cat(values).mean().item() for key, values in parts.items()}
     if motion.body_contact_prob is not None and busy.any():
         found = detection_scores(motion.body_contact_prob[busy].flatten(), truth.touch[busy].flatten())
         precision, recall = found.precision, found.recall
@@ -131,33 +145,12 @@ def score_echo(motion: Motion, truth: Truth, name: str, seed: int) -> Row:
     return Row(name, seed, len(motion), scores)
 
 
-def _object_scores(motion: Motion, truth: Truth) -> dict[str, float]:
-    """Means over the frames in which an object is active; empty if the capture has no objects."""
-    parts: dict[str, list[Tensor]] = {}
-    for number, (shape, T_true) in enumerate(zip(truth.objects, truth.T_world_object)):
-        rows = (truth.active == number).nonzero()[:, 0]
-        track = (motion.object_motion or {}).get(shape.name)
-        if track is None or not len(rows):
-            continue
-        T_found = shape.centred(_poses_at(track, motion.timestamps[rows]))
-        true = T_true[rows]
-        for key, value in {
-            "v2v_cm": object_metrics.vertex_error_cm(T_found, true, shape.cloud),
-            "center_cm": object_metrics.center_error_cm(T_found, true, shape.cloud),
-            "rotation_deg": object_metrics.rotation_difference_deg(T_found, true),
-            "quaternion": object_metrics.quaternion_difference(T_found, true),
-        }.items():
-            parts.setdefault(key, []).append(value)
-    return {key: torch.cat(values).mean().item() for key, values in parts.items()}
-
-
 def observed_share(truth: Truth, modality: str, share: float, seed: int) -> Observed:
     """Ground truth of one modality in a random share of the frames, drawn uniformly (ECHO Tables 3, S2).
 
     Raises WearcapError for an unknown modality.
     """
-    if modality not in MODALITIES:
-        raise WearcapError(f"no modality {modality!r}", expected=f"one of {', '.join(MODALITIES)}")
+    require_choice(modality, MODALITIES, f"no modality {modality!r}")
     rng = np.random.default_rng([17, seed])
     count = len(truth.motion)
     chosen = np.sort(rng.choice(count, max(1, round(share * count)), replace=False))

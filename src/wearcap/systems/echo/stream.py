@@ -239,7 +239,24 @@ class EchoStream(HeadAndWristsStream):
         return motions
 
     def _frame(self, time: float, T_world_head: Rigid) -> Conditioning:
-        poses = [T_world_head, *(self._wrist_at(joint, time, T_world_head) for joint in WRISTS)]
+        poses = [T_world_head]
+        for joint in WRISTS:
+            seen = self._wrists.samples[joint]
+            if not seen or seen[-1][0] < time - MAX_GAP_S:
+                self.silent += 1
+            if seen:
+                times, R, t = zip(*seen)
+                track = Trajectory(torch.tensor(times, dtype=torch.float64), torch.stack(R), torch.stack(t))
+                pose = wrist_poses(track, torch.tensor([time], dtype=torch.float64))
+                poses.append(Rigid(pose.R.float(), pose.t.float()))
+                # Only the last second is needed, and one pose before it.
+                old = bisect_left(seen, time - 1.0, key=lambda pose: pose[0]) - 1
+                self._wrists.samples[joint] = seen[max(old, 0) :]
+            else:  # a wrist that was not tracked yet is beside the body, with the arm down
+                heading = rotation.about_axis("z", rotation.yaw_of(T_world_head.R))
+                aside = ASIDE_M if joint == WRISTS[0] else -ASIDE_M
+                below = torch.tensor([0.0, aside, -BELOW * self.wearer.skeleton.height_of("head")])
+                poses.append(Rigid(heading, T_world_head.t + (heading @ below[:, None])[..., 0]))
         R, t = torch.stack([T.R for T in poses], 1), torch.stack([T.t for T in poses], 1)
         floor = torch.full((1,), self.wearer.floor_m or 0.0)
         if self.wearer.floor_m is None:
@@ -287,24 +304,6 @@ class EchoStream(HeadAndWristsStream):
             self._pending[k] = (time, changed, head)
             frames.append(changed)
         self._queue.conditioning = Conditioning(*(torch.cat(fields, 1) for fields in zip(*frames)))
-
-    def _wrist_at(self, joint: str, time: float, T_world_head: Rigid) -> Rigid:
-        poses = self._wrists.samples[joint]
-        if not poses or poses[-1][0] < time - MAX_GAP_S:
-            self.silent += 1
-        if not poses:
-            # A wrist that was not tracked yet is beside the body, with the arm down.
-            heading = rotation.about_axis("z", rotation.yaw_of(T_world_head.R))
-            aside = ASIDE_M if joint == WRISTS[0] else -ASIDE_M
-            below = torch.tensor([0.0, aside, -BELOW * self.wearer.skeleton.height_of("head")])
-            return Rigid(heading, T_world_head.t + (heading @ below[:, None])[..., 0])
-        times, R, t = zip(*poses)
-        track = Trajectory(torch.tensor(times, dtype=torch.float64), torch.stack(R), torch.stack(t))
-        pose = wrist_poses(track, torch.tensor([time], dtype=torch.float64))
-        # Only the last second is needed, and one pose before it.
-        old = bisect_left(poses, time - 1.0, key=lambda pose: pose[0]) - 1
-        self._wrists.samples[joint] = poses[max(old, 0) :]
-        return Rigid(pose.R.float(), pose.t.float())
 
     def _emit(self, outputs: Outputs | None) -> list[Motion]:
         if outputs is None or not self._pending:

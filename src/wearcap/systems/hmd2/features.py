@@ -8,7 +8,7 @@ from torch import Tensor
 
 from wearcap.body.skeleton import FEET
 from wearcap.data.features import LIMBS, first_repeated
-from wearcap.errors import WearcapError
+from wearcap.errors import require_choice
 from wearcap.geometry import rotation
 
 
@@ -33,9 +33,7 @@ class HeadFeatures:
 
     def __post_init__(self):
         for name, allowed in (("frame", ("heading", "window")), ("height", ("stature", "floor", "relative"))):
-            if getattr(self, name) not in allowed:
-                what = f"head features have no {name} {getattr(self, name)!r}"
-                raise WearcapError(what, expected=f"one of {', '.join(allowed)}")
+            require_choice(getattr(self, name), allowed, f"head features have no {name} {getattr(self, name)!r}")
 
     @property
     def condition_size(self) -> int:

@@ -66,8 +66,18 @@ class HMD2Session(Session):
         if len(samples) != len(self.streams):
             expected = f"of {len(self.streams)}, as the session has"
             raise WearcapError(f"samples of {len(samples)} wearers", expected=expected)
-        if not self.embedded:
-            self._require_embeddings(samples)
+        wearers = zip(self.streams, samples) if not self.embedded else ()
+        for sample in (sample for state, part in wearers if state.shows_pictures for sample in part):
+            embedding, size = getattr(sample, "embedding", None), self.system.model.net.image_size
+            if isinstance(embedding, Tensor) and embedding.shape == (size,):
+                self.embedded = True
+                break
+            if isinstance(embedding, Tensor) and embedding.ndim == 1:
+                when = "an unknown time" if time_fault(sample.timestamp) else f"{sample.timestamp:.3f} s"
+                raise WearcapError(
+                    f"an embedding of {len(embedding)} features at {when}",
+                    expected=f"{size} of {self.system.model.image_encoder!r}, which the network was trained on",
+                )
         for number, part in enumerate(samples):
             for sample in part:
                 self._take(number, self.streams[number].admit(sample))
@@ -93,22 +103,6 @@ class HMD2Session(Session):
             state.begin()
         for _, sample in admitted.packets:
             state.take(sample)
-
-    def _require_embeddings(self, samples: Sequence[Sequence[HeadSample]]) -> None:
-        size = self.system.model.net.image_size
-        for state, part in zip(self.streams, samples):
-            for sample in part:
-                embedding = getattr(sample, "embedding", None)
-                if not state.shows_pictures or not isinstance(embedding, Tensor) or embedding.ndim != 1:
-                    continue
-                if embedding.shape == (size,):
-                    self.embedded = True
-                    return
-                when = "an unknown time" if time_fault(sample.timestamp) else f"{sample.timestamp:.3f} s"
-                raise WearcapError(
-                    f"an embedding of {len(embedding)} features at {when}",
-                    expected=f"{size} of {self.system.model.image_encoder!r}, which the network was trained on",
-                )
 
     def _run(self, wearers: Sequence[int], ended: bool) -> list[Motion | None]:
         """The next poses of some wearers; None for the others."""

@@ -83,25 +83,21 @@ class WearerState:
         time, points = float(sensed.timestamp), None
         if self.pipeline.model.net.points_size and "points" in self.pipeline.use:
             points = door.points(sensed.points_world)
-        parts = points, self._embedding(sensed.embedding), self._floor_height(sensed.floor_height)
+        embedding = sensed.embedding if self.shows_pictures else None
+        if embedding is not None:
+            size = self.pipeline.model.net.image_size
+            if fault := packets.values_fault(embedding, (size,), packets.MAX_FEATURE):
+                door.refuse("embedding", fault)
+                embedding = torch.full((size,), torch.nan)  # no image is used until the next valid one
+            else:
+                embedding = packets.owned(embedding)
+        parts = points, embedding, self._floor_height(sensed.floor_height)
         return door.admit(time, HeadSample(time, door.pose(sensed.T_world_device), *parts))
 
     @property
     def shows_pictures(self) -> bool:
         """Whether image embeddings condition the model."""
         return bool(self.pipeline.model.net.image_size) and "images" in self.pipeline.use
-
-    def _embedding(self, embedding: object) -> Float[Tensor, "feature"] | None:
-        """A copy of the embedding; NaN if it is faulty, so that no image is used until the next valid one."""
-        size = self.pipeline.model.net.image_size
-        if embedding is None or not self.shows_pictures:
-            return None
-        fault = packets.values_fault(embedding, (size,), packets.MAX_FEATURE)
-        if fault is None:
-            assert isinstance(embedding, Tensor)
-            return packets.owned(embedding)
-        self.door.refuse("embedding", fault)
-        return torch.full((size,), torch.nan)
 
     def _floor_height(self, height: object) -> float | None:
         if height is None:

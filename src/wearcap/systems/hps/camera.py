@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from wearcap.body.skeleton import WRISTS
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, require_choice
 from wearcap.io.formats.video import read_frames, read_image
 from wearcap.localization.features import Extractor, GlobalDescriptor, Matcher, RootSift
 from wearcap.localization.localizer import Localizer, LocalizerSettings, localize_video
@@ -52,8 +52,7 @@ class Synchronization:
     """Largest offset (s) between the clocks that is searched."""
 
     def __post_init__(self):
-        if self.clock not in CLOCKS:
-            raise WearcapError(f"clock={self.clock!r}", expected=f"one of {', '.join(CLOCKS)}")
+        require_choice(self.clock, CLOCKS, f"clock={self.clock!r}")
 
     def by_claps(self, recording: Recording) -> bool:
         """Whether this recording is synchronised by claps."""

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.body.anny_body import anny_body
@@ -157,7 +157,11 @@ class HPS(StagedSystem):
         R_head_cam: Float[Tensor, "3 3"] | None = None,
     ) -> HpsData:
         """Data of the energy: initial state, localised cameras, contacts, the suit's motion from frame to frame, and
-        `R_head_cam`, estimated from the localised frames (HPS paper eq. 4) unless it is given."""
+        `R_head_cam`, estimated from the localised frames (HPS paper eq. 4) unless it is given.
+
+        Contacts are the suit's flags, without patches that move faster than `max_contact_speed`. Raises WearcapError
+        when there are no flags, or not one per frame.
+        """
         motion, (_, localization, _) = start.motion, required(recording)
         R_cam, sure = at_frames(localization, motion)
         root, head = motion.R_parent_joint[:, 0].double(), motion.joint("head").R.double()
@@ -168,6 +172,18 @@ class HPS(StagedSystem):
         body = anny_body(motion.skeleton, recording.shape or None)
         yaw = start.yaw_correction.double()
         heading = rotation.about_axis("z", yaw[:-1] + rotation.wrap_angle(yaw.diff()) / 2)
+        if aligned.contact_prob is None or len(aligned.contact_prob) != len(aligned):
+            count = "no" if aligned.contact_prob is None else f"{len(aligned.contact_prob)} frames of"
+            raise WearcapError(
+                f"{count} foot contacts for {len(aligned)} frames of the suit's pose",
+                expected="one per frame and patch",
+                fix="wearcap.sensors.contacts derives them.",
+            )
+        contact = aligned.contact_prob >= 0.5
+        if self.evidence.max_contact_speed is not None:
+            patches = site_positions(aligned.skeleton, aligned.T_world_joint, FOOT_PATCHES)
+            speed = finite_difference(patches, aligned.timestamps).norm(dim=-1)
+            contact &= speed <= self.evidence.max_contact_speed
         return HpsData(
             FootPatches.of(body),
             HpsState(rotation.log(motion.R_parent_joint[:, 1:].double()), root, motion.t_world_root.double()),
@@ -175,7 +191,7 @@ class HPS(StagedSystem):
             R_cam,
             sure,
             sure * start.valid if self.evidence.confident else torch.ones_like(sure),
-            _believed_contact(aligned, self.evidence.max_contact_speed).double(),
+            contact.double(),
             SuitSteps(
                 (heading @ aligned.t_world_root.double().diff(dim=0)[..., None])[..., 0], turns(root), turns(head)
             ),
@@ -245,20 +261,3 @@ def at_frames(
 def turns(R_world_body: Float[Tensor, "time 3 3"]) -> Float[Tensor, "pair 3 3"]:
     """Rotation in world axes from each frame to the next."""
     return R_world_body[1:] @ R_world_body[:-1].mT
-
-
-def _believed_contact(suit: Motion, max_speed: float | None) -> Bool[Tensor, "time patch"]:
-    """The suit's contact flags, without patches that are faster than `max_speed` (m/s) in the suit's motion. Raises
-    WearcapError when there are no flags, or not one per frame."""
-    if suit.contact_prob is None or len(suit.contact_prob) != len(suit):
-        count = "no" if suit.contact_prob is None else f"{len(suit.contact_prob)} frames of"
-        raise WearcapError(
-            f"{count} foot contacts for {len(suit)} frames of the suit's pose",
-            expected="one per frame and patch",
-            fix="wearcap.sensors.contacts derives them.",
-        )
-    contact = suit.contact_prob >= 0.5
-    if max_speed is None:
-        return contact
-    patches = site_positions(suit.skeleton, suit.T_world_joint, FOOT_PATCHES)
-    return contact & (finite_difference(patches, suit.timestamps).norm(dim=-1) <= max_speed)

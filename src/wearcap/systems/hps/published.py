@@ -4,7 +4,7 @@ from abc import abstractmethod
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from wearcap.errors import WearcapError
+from wearcap.errors import require_choice
 from wearcap.geometry.trajectory import Trajectory, filled, interpolate
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import resampled
@@ -69,8 +69,7 @@ class HpsBaseline(PlacedSuit):
     localization: Localize = field(default_factory=MapLocalization)
 
     def __post_init__(self):
-        if self.kind not in KINDS:
-            raise WearcapError(f"no baseline {self.kind!r}", expected=f"one of {', '.join(KINDS)}")
+        require_choice(self.kind, KINDS, f"no baseline {self.kind!r}")
 
     @property
     def name(self) -> str:

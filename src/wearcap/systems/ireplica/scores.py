@@ -115,8 +115,7 @@ def _handling(row, rows, environment, held, timestamps, palms, found, real) -> H
     return Handling(
         name,
         scene_object.category,
-        start,
-        stop,
+        (start, stop),
         float(left_cm),
         float(left_deg),
         float(moved_cm[0]),

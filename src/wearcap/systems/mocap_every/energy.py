@@ -12,7 +12,7 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.errors import WearcapError
+from wearcap.errors import require_choice
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 
@@ -116,8 +116,7 @@ class LatentSolver:
     """Learning rate of Adam."""
 
     def __post_init__(self):
-        if self.kind not in SOLVERS:
-            raise WearcapError(f"no solver {self.kind!r}", expected=f"one of {', '.join(SOLVERS)}")
+        require_choice(self.kind, SOLVERS, f"no solver {self.kind!r}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from torch import Tensor
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import FOOT_JOINTS, MIRROR, WRISTS, Skeleton
 from wearcap.data.features import LIMBS, first_repeated
-from wearcap.errors import WearcapError
+from wearcap.errors import require_choice
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.sensors.imu import acceleration
@@ -94,9 +94,7 @@ class WatchFeatures:
 
     def __post_init__(self):
         for name, allowed in (("frame", FRAMES), ("wrists", TRACKED), ("root", ROOTS)):
-            if getattr(self, name) not in allowed:
-                what = f"watch features have no {name} {getattr(self, name)!r}"
-                raise WearcapError(what, expected=f"one of {', '.join(allowed)}")
+            require_choice(getattr(self, name), allowed, f"watch features have no {name} {getattr(self, name)!r}")
 
     @property
     def size(self) -> int:

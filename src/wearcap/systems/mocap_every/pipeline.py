@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.skeleton import FEET, Skeleton
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, require_choice
 from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.metrics.scores import score_in_world
 from wearcap.metrics.table import Row
@@ -87,8 +87,7 @@ class MocapEvery(LearnedSystem):
     def __post_init__(self):
         self._run: Run | None = None
         self._backend = chosen(self.runtime, self.precision, self.device)
-        if self.floor not in FLOORS:
-            raise WearcapError(f"no floor {self.floor!r}", expected=f"one of {', '.join(FLOORS)}")
+        require_choice(self.floor, FLOORS, f"no floor {self.floor!r}")
         window = self.model.net.window
         if not 0 < self.stride <= window or not 0 <= self.lookahead <= window - self.stride:
             what = f"windows of {window} frames with stride {self.stride} and lookahead {self.lookahead}"

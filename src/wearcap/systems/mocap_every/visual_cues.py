@@ -13,7 +13,7 @@ from einops import reduce
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
-from wearcap.body.skeleton import FEET, FOOT_JOINTS, Skeleton
+from wearcap.body.skeleton import FEET, FOOT_JOINTS
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 from wearcap.geometry import rotation
@@ -133,7 +133,15 @@ class VisualCues:
             contact = reduce(motion.contact_prob, "time (foot patch) -> time foot", "max", foot=FEET)
         window = Posed(motion.R_parent_joint[frames], motion.t_world_root[frames], contact[frames])
         head = Rigid(T_world_head.R[frames], T_world_head.t[frames])
-        seen = _observations(recording, skeleton, head, frames, exists, cues, poses)
+        # Frames outside the capture have confidence 0.
+        rows = [(skeleton.index(cue.joint), cue.points[frames], cue.confidence[frames] * exists) for cue in cues]
+        places = tuple(energy.PlaceCue(*row) for row in rows if row[1].shape[-1] == 3)
+        viewed = tuple(energy.PoseCue(R[frames], confidence[frames] * exists[..., None]) for R, confidence in poses)
+        seen = energy.Seen(head, None, None, (), places, viewed)
+        if (camera := recording.camera) is not None:
+            pixels = tuple(energy.PixelCue(*row) for row in rows if row[1].shape[-1] == 2)
+            T_head_cam = Rigid(camera.R_head_cam, camera.t_head_cam)
+            seen = energy.Seen(head, camera.camera, T_head_cam, pixels, places, viewed)
         origin = window.origin()
         X0 = window.encode(origin)
         feet = skeleton.indices(*FOOT_JOINTS)
@@ -203,26 +211,6 @@ def at_frames(cue: Cue, timestamps: Float64[Tensor, "time"]) -> Cue:
     points = cue.points[nearest]
     near &= points.isfinite().all(-1)
     return replace(cue, timestamps=timestamps, points=points.nan_to_num(), confidence=cue.confidence[nearest] * near)
-
-
-def _observations(
-    recording: Recording,
-    skeleton: Skeleton,
-    head: Rigid,
-    frames: Tensor,
-    exists: Tensor,
-    cues: list[Cue],
-    poses: list[energy.PoseCue],
-) -> energy.Seen:
-    """Observations of a batch of windows; frames outside the capture have confidence 0."""
-    camera = recording.camera
-    rows = [(skeleton.index(cue.joint), cue.points[frames], cue.confidence[frames] * exists) for cue in cues]
-    pixels = tuple(energy.PixelCue(*row) for row in rows if row[1].shape[-1] == 2)
-    places = tuple(energy.PlaceCue(*row) for row in rows if row[1].shape[-1] == 3)
-    viewed = tuple(energy.PoseCue(R[frames], confidence[frames] * exists[..., None]) for R, confidence in poses)
-    if camera is None:
-        return energy.Seen(head, None, None, (), places, viewed)
-    return energy.Seen(head, camera.camera, Rigid(camera.R_head_cam, camera.t_head_cam), pixels, places, viewed)
 
 
 def load_visual_cues(

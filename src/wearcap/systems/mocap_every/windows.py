@@ -67,7 +67,21 @@ class EstimatorWindows:
         self._floors = torch.cat([self._floors[count:], self.floor.ahead(new.t_world_head)])
         self._sum = torch.cat([self._sum[count:], self._sum.new_zeros(count, self._sum.shape[1])])
         self._consumed += count
-        output = self._estimate()
+        pipeline, features = self._pipeline, self._pipeline.model.features
+        sensed, floor, size = Sensed(*(part[None] for part in self._sensed)), self._floors[None], self._size
+        if pipeline.mirror_average:  # the mirrored window's prediction is mirrored back: no left-right bias
+            sensed = Sensed(*(torch.cat(both) for both in zip(sensed, sensed.mirrored())))
+            floor, size = floor.expand(2, -1), size.expand(2, -1)
+        canonical = features.canonical(sensed, floor)
+        estimated = pipeline.estimate(features.encode(sensed, floor, size, canonical))
+        R, t = features.decode_motion(estimated.motion.float(), sensed, canonical)
+        contact = estimated.contact_logit.float().sigmoid()
+        if pipeline.mirror_average:
+            R = torch.stack([R[0], mirrored_rotations(R[1], self._skeleton)])
+            t = torch.stack([t[0], t[1] * t.new_tensor(MIRROR)])
+            contact = torch.stack([contact[0], contact[1].flip(-1)])
+        # Root, 6D rotations and contact of the window's last frames, in the world
+        output = torch.cat([t, rotation.rot6d_from_matrix(R).flatten(-2), contact], -1).mean(0)
         last = len(output)
         self._sum[-last:] += self._weight[-last:] * torch.cat([output, torch.ones(last, 1)], -1)
         R, t, contact = _parts(output[-count:])
@@ -95,28 +109,6 @@ class EstimatorWindows:
         rows = self._sum[stop - max(count, 0) : stop]
         self._returned += max(count, 0)
         return FinalPoses(*_parts(rows[:, :-1] / rows[:, -1:]), self._floors[stop - len(rows) : stop])
-
-    def _estimate(self) -> Float[Tensor, "predicted value"]:
-        """Root, 6D rotations and contact of the window's last frames, in the world.
-
-        With `mirror_average` the prediction for the mirrored window is mirrored back and averaged in, which removes
-        the network's left-right bias.
-        """
-        pipeline, skeleton = self._pipeline, self._skeleton
-        assert self._sensed is not None
-        sensed, floor, size = Sensed(*(part[None] for part in self._sensed)), self._floors[None], self._size
-        if pipeline.mirror_average:
-            sensed = Sensed(*(torch.cat(both) for both in zip(sensed, sensed.mirrored())))
-            floor, size = floor.expand(2, -1), size.expand(2, -1)
-        canonical = pipeline.model.features.canonical(sensed, floor)
-        estimated = pipeline.estimate(pipeline.model.features.encode(sensed, floor, size, canonical))
-        R, t = pipeline.model.features.decode_motion(estimated.motion.float(), sensed, canonical)
-        contact = estimated.contact_logit.float().sigmoid()
-        if pipeline.mirror_average:
-            R = torch.stack([R[0], mirrored_rotations(R[1], skeleton)])
-            t = torch.stack([t[0], t[1] * t.new_tensor(MIRROR)])
-            contact = torch.stack([contact[0], contact[1].flip(-1)])
-        return torch.cat([t, rotation.rot6d_from_matrix(R).flatten(-2), contact], -1).mean(0)
 
 
 def _parts(
