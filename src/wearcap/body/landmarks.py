@@ -67,11 +67,9 @@ def _limb(by_name: dict[str, int], side: str, limb: str, skeleton: Skeleton) -> 
             first, second, third = (by_name.get(prefix + name, -1) for name in names)
             if min(first, second, third) >= 0:
                 return first, second, third
-    raise WearcapError(
-        f"the {side} {limb} of skeleton {skeleton.name!r} is not recognised",
-        expected="joints named like " + " or ".join("/".join(n) for n in alternatives[:3]),
-        fix=f"It has {', '.join(skeleton.joint_names)}; rename them.",
-    )
+    what = f"the {side} {limb} of skeleton {skeleton.name!r} is not recognised"
+    expected = "joints named like " + " or ".join("/".join(n) for n in alternatives[:3])
+    raise WearcapError(what, expected=expected, fix=f"It has {', '.join(skeleton.joint_names)}; rename them.")
 
 
 def landmarks(skeleton: Skeleton) -> Landmarks:
@@ -80,10 +78,8 @@ def landmarks(skeleton: Skeleton) -> Landmarks:
     for joint, name in enumerate(skeleton.joint_names):
         by_name.setdefault(_plain(name), joint)
     if "head" not in by_name:
-        raise WearcapError(
-            f"skeleton {skeleton.name!r} has no joint named head",
-            fix=f"It has {', '.join(skeleton.joint_names)}; rename one.",
-        )
+        fix = f"It has {', '.join(skeleton.joint_names)}; rename one."
+        raise WearcapError(f"skeleton {skeleton.name!r} has no joint named head", fix=fix)
     head = by_name["head"]
     limb, collar, toe, forearm = {}, {}, {}, {}
     for side in ("left", "right"):

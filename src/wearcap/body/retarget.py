@@ -194,9 +194,10 @@ def _places(source: TPose, target: TPose, scale: float) -> dict[int, Tensor]:
         weight = ((wanted - arc[after - 1]) / steps[after - 1].clamp_min(1e-9))[:, None]
         places.update(zip(joints, (points[after - 1] * (1 - weight) + points[after] * weight).unbind(0)))
 
-    if len(to.spine) > 1:
-        chain(column, to.spine[:-1], to.spine[-1])
-    places[to.spine[-1]] = column[-1] if len(to.spine) > 1 else column[0]
+    *lower, top = to.spine
+    if lower:
+        chain(column, tuple(lower), top)
+    places[top] = column[-1] if lower else column[0]
     if to.neck:
         chain(at_s[[neck_s, *from_s.neck[1:], from_s.head]], to.neck, to.head)
     for side in _SIDES:

@@ -66,10 +66,8 @@ class Skeleton:
             )
         for joint, parent in enumerate(self.parents):
             if not (parent == -1 if joint == 0 else 0 <= parent < joint):
-                raise WearcapError(
-                    f"joint {self.joint_names[joint]!r} of skeleton {self.name!r} has parent {parent}",
-                    expected="the root first (parent -1) and every parent before its children",
-                )
+                what = f"joint {self.joint_names[joint]!r} of skeleton {self.name!r} has parent {parent}"
+                raise WearcapError(what, expected="the root first (parent -1) and every parent before its children")
         if len(set(self.joint_names)) != len(self.joint_names):
             raise WearcapError(f"skeleton {self.name!r} names a joint twice", expected="unique joint names")
 
@@ -96,9 +94,8 @@ class Skeleton:
             if candidate in self._index_of:
                 return self._index_of[candidate]
         near = ", ".join(difflib.get_close_matches(name, self.joint_names, n=3, cutoff=0.3))
-        raise WearcapError(
-            f"skeleton {self.name!r} has no joint {name!r}", expected=f"one like {near or self.joint_names}"
-        )
+        what = f"skeleton {self.name!r} has no joint {name!r}"
+        raise WearcapError(what, expected=f"one like {near or self.joint_names}")
 
     def indices(self, *names: str) -> list[int]:
         return [self.index(name) for name in names]

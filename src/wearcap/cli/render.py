@@ -31,9 +31,8 @@ def main(arguments: list[str]) -> None:
     recording = load_recording(options.recording)
     out = options.out or Path(f"{recording.name}.png")
     if out.suffix not in (".png", ".mp4"):
-        raise WearcapError(
-            f"cannot draw a {out.suffix or 'file without an ending'}", where=out, expected=".png or .mp4"
-        )
+        what = f"cannot draw a {out.suffix or 'file without an ending'}"
+        raise WearcapError(what, where=out, expected=".png or .mp4")
     environment = CaptureInput(recording, dataset_folder(options.recording)).objects(options.environment)
     truth = with_objects(recording, environment)
     motions = ({} if truth is None else {"truth": truth}) | read_motions(options.motion)

@@ -33,9 +33,8 @@ HELP = "the visual map of a scene: wearcap scene scene=FOLDER output=map.safeten
 def run(config: DictConfig) -> VisualMap:
     """Build or extend the config's map, report on it, and save it."""
     if config.every < 1 or config.check < 0:
-        raise WearcapError(
-            f"every={config.every} check={config.check}", expected="every=1 (all photos) or more, check=0 or more"
-        )
+        expected = "every=1 (all photos) or more, check=0 or more"
+        raise WearcapError(f"every={config.every} check={config.check}", expected=expected)
     photos, source = read_scene(config.scene, config.images, config.metres_per_unit)
     extractor, matcher, descriptor = (
         instantiate(config.localization[part]) for part in ("extractor", "matcher", "descriptor")

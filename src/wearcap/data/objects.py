@@ -66,10 +66,8 @@ def object_cloud(mesh: Mesh, count: int = POINTS, seed: int = 0) -> Float[Tensor
     Deterministic for a seed. Raises WearcapError for a mesh without vertices, or with some that are not finite.
     """
     if not len(mesh.vertices) or not np.isfinite(mesh.vertices).all():
-        raise WearcapError(
-            f"a mesh of {len(mesh.vertices)} vertices, some perhaps NaN or infinite, has no cloud",
-            expected="at least one vertex, all of them finite (m)",
-        )
+        what = f"a mesh of {len(mesh.vertices)} vertices, some perhaps NaN or infinite, has no cloud"
+        raise WearcapError(what, expected="at least one vertex, all of them finite (m)")
     rng = np.random.default_rng(seed)
     corners = mesh.vertices.astype(np.float64)[mesh.faces]
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]

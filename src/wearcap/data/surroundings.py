@@ -62,12 +62,12 @@ class PlaceCodes:
         if not path.is_file():
             file = RecordingStore.open(root).open_file(Path(entry.file).stem)
             cloud, head = file.part("points"), file.part("head")
-            seen = 0 if cloud is None or not len(cloud.points_world) else len(head.timestamps)
+            surroundings = VoxelMap(self.encoder.grid)
+            if cloud is not None and len(cloud.points_world):
+                surroundings.add(cloud.points_world, cloud.first_seen)
+            seen = len(head.timestamps) if cloud is not None and len(cloud.points_world) else 0
             code = torch.zeros(seen, self.size, dtype=torch.float16)
             code_mirrored = code.clone()
-            if seen:
-                surroundings = VoxelMap(self.encoder.grid)
-                surroundings.add(cloud.points_world, cloud.first_seen)
             for start in range(0, seen, _AT_ONCE):
                 part = slice(start, start + _AT_ONCE)
                 grids = surroundings.voxelize(head.T_world_device[part], head.timestamps[part])

@@ -162,19 +162,14 @@ def _training_motions(stores: Sequence[RecordingStore]) -> Iterator[tuple[HeadPa
             kind = (recording.motion.skeleton.joint_names, fps)
             first = first or kind
             if kind != first or len(path.timestamps) != len(recording.motion):
-                raise WearcapError(
-                    f"recording {name!r} does not fit the others",
-                    where=store.root,
-                    expected=f"the joints of the first at {first[1]} Hz, head and motion on one clock",
-                    fix="Prepare the data sets alike.",
-                )
+                what = f"recording {name!r} does not fit the others"
+                expected = f"the joints of the first at {first[1]} Hz, head and motion on one clock"
+                raise WearcapError(what, where=store.root, expected=expected, fix="Prepare the data sets alike.")
             yield path, recording.motion.R_parent_joint
     if first is None:
-        raise WearcapError(
-            "no training recordings with head and motion",
-            where=", ".join(str(store.root) for store in stores),
-            expected="a training split of recordings with both",
-        )
+        what = "no training recordings with head and motion"
+        where = ", ".join(str(store.root) for store in stores)
+        raise WearcapError(what, where=where, expected="a training split of recordings with both")
 
 
 def _fps_of(path: HeadPath) -> float:
@@ -184,11 +179,8 @@ def _fps_of(path: HeadPath) -> float:
 def _query_path(recording: Recording, joint_names: tuple[str, ...], fps: float) -> HeadPath:
     skeleton: Skeleton | None = recording.skeleton or (recording.motion.skeleton if recording.motion else None)
     if skeleton is None or skeleton.joint_names != joint_names:
-        raise WearcapError(
-            "its skeleton is not the one of the training data",
-            where=recording.name,
-            expected=f"joints {', '.join(joint_names)}",
-        )
+        what = "its skeleton is not the one of the training data"
+        raise WearcapError(what, where=recording.name, expected=f"joints {', '.join(joint_names)}")
     return head_path(recording, skeleton, fps)
 
 

@@ -79,11 +79,8 @@ class Realism:
         WearcapError for others."""
         module: Any = load_trained(checkpoint)[0]
         if not isinstance(module.net, MotionAutoencoder):
-            raise WearcapError(
-                "realism needs a motion autoencoder",
-                where=checkpoint,
-                expected="a checkpoint of experiment=motion_autoencoder",
-            )
+            expected = "a checkpoint of experiment=motion_autoencoder"
+            raise WearcapError("realism needs a motion autoencoder", where=checkpoint, expected=expected)
         return cls(module.net, module.features, stride_s)
 
     def beside(self, measure: Measure, method: str) -> Measure:

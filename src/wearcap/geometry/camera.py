@@ -55,10 +55,8 @@ class Camera:
             counts = " or ".join(map(str, _COEFFICIENTS[self.model]))
             raise WearcapError(f"camera model {self.model!r} with {len(self.distortion)} coefficients", expected=counts)
         if not (self.width > 0 and self.height > 0 and self.fx > 0 and self.fy > 0):
-            raise WearcapError(
-                f"camera of {self.width}x{self.height} pixels with focal lengths {self.fx}, {self.fy}",
-                expected="positive numbers",
-            )
+            what = f"camera of {self.width}x{self.height} pixels with focal lengths {self.fx}, {self.fy}"
+            raise WearcapError(what, expected="positive numbers")
 
     @classmethod
     def pinhole(cls, width: int, height: int, vertical_fov_deg: float) -> "Camera":

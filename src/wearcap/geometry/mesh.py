@@ -24,10 +24,8 @@ class Mesh:
 
     def __post_init__(self):
         if self.color.ndim == 2 and len(self.color) not in (len(self.vertices), len(self.faces)):
-            raise WearcapError(
-                f"a mesh of {len(self.vertices)} vertices and {len(self.faces)} faces with {len(self.color)} colours",
-                expected="one colour, or one per vertex or per face",
-            )
+            what = f"a mesh of {len(self.vertices)} vertices and {len(self.faces)} faces with {len(self.color)} colours"
+            raise WearcapError(what, expected="one colour, or one per vertex or per face")
 
     @cached_property
     def color_rows(self) -> Int32[np.ndarray, "face 3"]:

@@ -233,10 +233,8 @@ class SplatCloud:
     def build(cls, points: Float32[np.ndarray, "point 3"], block: int = 512) -> "SplatCloud":
         """Sort a cloud along a space-filling curve and cut it. Raises WearcapError when it is empty or not finite."""
         if not len(points) or not np.isfinite(points).all():
-            raise WearcapError(
-                "a cloud without points" if not len(points) else "points that are NaN or infinite",
-                expected="at least one point, all finite (m)",
-            )
+            what = "a cloud without points" if not len(points) else "points that are NaN or infinite"
+            raise WearcapError(what, expected="at least one point, all finite (m)")
         low = points.min(0)
         cell = max(float((points.max(0) - low).max()) / (1 << 20), 1e-9)
         order = np.argsort(_z_order(points, low, cell)).astype(np.int32)

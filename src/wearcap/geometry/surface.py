@@ -92,11 +92,8 @@ def _pack(points: np.ndarray, origin: np.ndarray, cell_m: float) -> Int64[np.nda
     """One integer for the three coordinates of each point's cell."""
     cell = np.floor((points - origin) / cell_m).astype(np.int64)
     if cell.max(initial=0) >= 1 << 20:
-        raise WearcapError(
-            f"the cloud extends over {np.ptp(points, axis=0).max():.0f} m",
-            expected="a scene in metres",
-            fix="Divide by 1000 if it is in millimetres.",
-        )
+        what = f"the cloud extends over {np.ptp(points, axis=0).max():.0f} m"
+        raise WearcapError(what, expected="a scene in metres", fix="Divide by 1000 if it is in millimetres.")
     return (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
 
 

@@ -54,11 +54,9 @@ def require_rising(timestamps: Float64[Tensor, "time"]) -> None:
     ):
         if bad.any():
             frame = int(bad.nonzero()[0])
-            raise WearcapError(
-                f"the timestamp of frame {frame} ({timestamps[frame].item():.6f} s) {word}",
-                expected="strictly rising timestamps in seconds",
-                fix="Sort the frames and drop duplicates.",
-            )
+            what = f"the timestamp of frame {frame} ({timestamps[frame].item():.6f} s) {word}"
+            expected = "strictly rising timestamps in seconds"
+            raise WearcapError(what, expected=expected, fix="Sort the frames and drop duplicates.")
 
 
 def interpolate(
@@ -71,10 +69,8 @@ def interpolate(
     slack = timestamps.diff().median().item() if len(timestamps) > 1 else 0.0
     outside = ~((at >= timestamps[0] - slack) & (at <= timestamps[-1] + slack))
     if outside.any():
-        raise WearcapError(
-            f"{int(outside.sum())} of {len(at)} times, first {at[outside][0].item():.3f} s, lie outside the stream",
-            expected=f"times from {timestamps[0].item():.3f} s to {timestamps[-1].item():.3f} s",
-        )
+        what = f"{int(outside.sum())} of {len(at)} times, first {at[outside][0].item():.3f} s, lie outside the stream"
+        raise WearcapError(what, expected=f"times from {timestamps[0].item():.3f} s to {timestamps[-1].item():.3f} s")
     return _lerp(value, *_brackets(timestamps, at))
 
 

@@ -91,11 +91,9 @@ class Track:
         number = {name: index for index, name in enumerate(pictures.names)}
         photos = {number[photo.file.name]: photo for photo in model.photos if photo.file.name in number}
         if not photos:
-            raise WearcapError(
-                f"the model places none of {len(pictures.names)} pictures",
-                where=where,
-                expected=f"names such as {pictures.names[0]}" if pictures.names else "photos",
-            )
+            what = f"the model places none of {len(pictures.names)} pictures"
+            expected = f"names such as {pictures.names[0]}" if pictures.names else "photos"
+            raise WearcapError(what, where=where, expected=expected)
         cameras = {photo.camera for photo in photos.values()}
         if len(cameras) > 1:
             fix = "Map the video as taken with a single camera."

@@ -80,7 +80,6 @@ def cue_errors_cm(motion: Motion, cues: Mapping[str, Cue]) -> dict[str, Float[Te
             at = interpolate(motion.timestamps, joints[:, motion.skeleton.index(name)], cue.timestamps[usable])
             errors[name] = joint_error_cm(at, cue.points[usable])
     if not errors:
-        raise WearcapError(
-            "no keypoint to compare this motion with", expected="3D cues named like its joints, on its clock"
-        )
+        expected = "3D cues named like its joints, on its clock"
+        raise WearcapError("no keypoint to compare this motion with", expected=expected)
     return errors

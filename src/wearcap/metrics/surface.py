@@ -71,9 +71,8 @@ def foot_vertices(
     """Vertices of the foot patches (m) and their contacts; patches in the order of `FOOT_PATCHES`. Raises WearcapError
     when contacts and poses differ in length."""
     if len(contact) != len(T_world_joint.t):
-        raise WearcapError(
-            f"contacts of {len(contact)} frames for poses of {len(T_world_joint.t)}", expected="as many of either"
-        )
+        what = f"contacts of {len(contact)} frames for poses of {len(T_world_joint.t)}"
+        raise WearcapError(what, expected="as many of either")
     vertices = [body.vertices(T_world_joint, FOOT_REGIONS[patch]) for patch in FOOT_PATCHES]
     touching = [contact[:, i, None].expand(-1, part.shape[1]) for i, part in enumerate(vertices)]
     return torch.cat(vertices, 1), torch.cat(touching, 1)
@@ -107,10 +106,8 @@ def chamfer(
     body, points = vertices.detach().cpu().double().numpy(), cloud.detach().cpu().double().numpy()
     for name, rows in (("the body", body), ("the cloud", points)):
         if not len(rows) or not np.isfinite(rows).all():
-            raise WearcapError(
-                f"{name} has {len(rows)} points" + (", some of them NaN or infinite" if len(rows) else ""),
-                expected="at least one point, all finite",
-            )
+            what = f"{name} has {len(rows)} points" + (", some of them NaN or infinite" if len(rows) else "")
+            raise WearcapError(what, expected="at least one point, all finite")
     if faces is None:
         to_body, _ = KDTree(body).query(points)
     else:

@@ -55,10 +55,8 @@ def evaluate_motion(
     """
     _require_comparable(prediction, truth)
     if contact is not None and len(contact) != len(truth):
-        raise WearcapError(
-            f"{len(contact)} frames of contact for {len(truth)} frames of motion",
-            expected="true contact at the truth's frames",
-        )
+        what = f"{len(contact)} frames of contact for {len(truth)} frames of motion"
+        raise WearcapError(what, expected="true contact at the truth's frames")
     fps = truth.fps
     pose, pose_true = _double_pose(prediction), _double_pose(truth)
     joints, joints_true = pose.t, pose_true.t
@@ -100,11 +98,8 @@ def _double_pose(motion: Motion) -> Rigid:
 
 def _require_comparable(prediction: Motion, truth: Motion) -> None:
     if prediction.skeleton.joint_names != truth.skeleton.joint_names:
-        raise WearcapError(
-            f"captured on skeleton {prediction.skeleton.name!r}, true on {truth.skeleton.name!r}",
-            expected="the same joints",
-            fix="Retarget one of them first.",
-        )
+        what = f"captured on skeleton {prediction.skeleton.name!r}, true on {truth.skeleton.name!r}"
+        raise WearcapError(what, expected="the same joints", fix="Retarget one of them first.")
     if len(truth) < 2:
         raise WearcapError(f"a motion of {len(truth)} frames cannot be scored", expected="at least two frames")
     same_clock = len(prediction) == len(truth) and torch.allclose(

@@ -25,10 +25,8 @@ class AdamSettings:
 
     def __post_init__(self):
         if not 0 < self.advance < self.window:
-            raise WearcapError(
-                f"windows of {self.window} frames that advance by {self.advance}",
-                expected="less than a window: neighbours share a frame",
-            )
+            what = f"windows of {self.window} frames that advance by {self.advance}"
+            raise WearcapError(what, expected="less than a window: neighbours share a frame")
 
 
 def solve_adam_windows(energy: HpsEnergy, data: HpsData, settings: AdamSettings = AdamSettings()) -> Solution:

@@ -165,9 +165,8 @@ class Stretch:
         self.fill_system()
         diagonal, below, gradient = self.system
         if not (np.einsum("tii->ti", diagonal) > 0).all():
-            raise WearcapError(
-                "the energy does not determine the motion", expected="weights of pose, hold and steps above zero"
-            )
+            expected = "weights of pose, hold and steps above zero"
+            raise WearcapError("the energy does not determine the motion", expected=expected)
         kernels.factor_and_solve(diagonal, below, gradient, damping)
         kernels.apply_step(gradient, relaxation, self.theta, self.R_root, self.t, self.theta_imu, self.body, self.kin)
 
@@ -305,11 +304,9 @@ def _value_of(name: str) -> int:
     if compared == ("theta_legs", "theta_legs_imu", 2):
         return kernels.LEG_POSE
     if term.reach not in (1, 2) or "theta" in term.inputs:
-        raise WearcapError(
-            f"the banded solver cannot minimise the term {name!r}",
-            expected="a term of one or two frames, of root, head, legs or soles: the spine is eliminated, the arms stay",
-            fix="Use theta_legs for theta, or the solver adam_windows.",
-        )
+        expected = "a term of one or two frames, of root, head, legs or soles: the spine is eliminated, the arms stay"
+        fix = "Use theta_legs for theta, or the solver adam_windows."
+        raise WearcapError(f"the banded solver cannot minimise the term {name!r}", expected=expected, fix=fix)
     along_normal = len(term.expected) == 2 and (term.inputs[0], term.reach) != ("soles", 1)
     known = term.expected and not along_normal
     return _VALUES.get(term.inputs[0], kernels.DIFFERENTIATED) if known else kernels.DIFFERENTIATED
@@ -332,10 +329,8 @@ def _active_body(patches: FootPatches) -> tuple[tuple[int, ...], Body]:
     last_two = torch.tensor([legs[int(patch) // 2][-2:] for patch in patches.patch])
     shares = weights.gather(1, last_two)
     if (shares.sum(1) < 0.99).any():
-        raise WearcapError(
-            "vertices of the foot patches are skinned to joints other than ankle and toe",
-            expected="a body whose soles follow the feet",
-        )
+        what = "vertices of the foot patches are skinned to joints other than ankle and toe"
+        raise WearcapError(what, expected="a body whose soles follow the feet")
     arms = body.rest_vertices[patches.vertex].double()[:, None] - skeleton.rest_joints.double()[last_two]
     return joints, Body(
         parents=np.array([number[skeleton.parents[joint]] for joint in joints]),

@@ -40,9 +40,8 @@ class OffsetSettings:
 
     def __post_init__(self):
         if not (self.transition_s > 0 and self.hold > 0):
-            raise WearcapError(
-                f"a transition of {self.transition_s} s, a hold of {self.hold}", expected="positive numbers"
-            )
+            what = f"a transition of {self.transition_s} s, a hold of {self.hold}"
+            raise WearcapError(what, expected="positive numbers")
 
     @property
     def stiffness(self) -> float:
@@ -67,10 +66,8 @@ def offset_for(
         raise WearcapError("a target of negative weight", expected="zero or more")
     bad = (weights > 0) & ~targets.isfinite().all(1)
     if bad.any():
-        raise WearcapError(
-            f"the target of frame {int(bad.nonzero()[0])} is not a number",
-            expected="finite metres where the weight is above zero",
-        )
+        what = f"the target of frame {int(bad.nonzero()[0])} is not a number"
+        raise WearcapError(what, expected="finite metres where the weight is above zero")
     pull = settings.hold * weights.double().numpy()
     wanted = torch.where(weights[:, None] > 0, targets, 0.0).double().numpy()
     if len(targets) < 3:

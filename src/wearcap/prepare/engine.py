@@ -97,17 +97,15 @@ class Splits:
         try:
             lines = path.read_text(encoding="utf-8").splitlines()
         except FileNotFoundError as error:
-            raise WearcapError(
-                "no such split list", where=path, expected="a .csv with columns subject,split"
-            ) from error
+            expected = "a .csv with columns subject,split"
+            raise WearcapError("no such split list", where=path, expected=expected) from error
         table = list(csv.DictReader(line for line in lines if line.strip() and not line.startswith("#")))
         if not table or set(table[0]) != {"subject", "split"}:
             raise WearcapError("not a split list", where=path, expected="columns subject,split")
         for row in table:
             if row["split"] not in (*SPLITS, BY_HASH):
-                raise WearcapError(
-                    f"no split {row['split']!r}", where=path, expected=f"one of {', '.join((*SPLITS, BY_HASH))}"
-                )
+                expected = f"one of {', '.join((*SPLITS, BY_HASH))}"
+                raise WearcapError(f"no split {row['split']!r}", where=path, expected=expected)
         return cls(path, tuple((row["subject"], row["split"]) for row in table))
 
 

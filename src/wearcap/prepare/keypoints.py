@@ -125,9 +125,8 @@ def keypoints_dataset(
 
 def _camera(recording: Recording) -> CameraStream:
     if recording.camera is None:
-        raise WearcapError(
-            "no head camera", where=recording.name, expected="a recording with one, whose pixels keypoints are"
-        )
+        expected = "a recording with one, whose pixels keypoints are"
+        raise WearcapError("no head camera", where=recording.name, expected=expected)
     return recording.camera
 
 

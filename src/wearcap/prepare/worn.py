@@ -146,9 +146,8 @@ def hcontact_tasks(
     for name in names:
         kind = next((kind for pattern, kind in classes.items() if fnmatchcase(name, pattern)), None)
         if kind is None:
-            raise WearcapError(
-                f"no contact class for sequence {name!r}", expected="a pattern of `classes` that matches it"
-            )
+            what = f"no contact class for sequence {name!r}"
+            raise WearcapError(what, expected="a pattern of `classes` that matches it")
         subject = subject_of(name)
         files = [source / "body" / f"{name}{ENDING}", source / "contacts" / f"{name}.json"]
         there = [path for path in files if path.is_file()]

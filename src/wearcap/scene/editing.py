@@ -127,11 +127,9 @@ class ObjectEditing:
         """
         self._check_name(name)
         if len(self.selected) < FEWEST_POINTS:
-            raise WearcapError(
-                f"{len(self.selected)} points are selected",
-                expected=f"{FEWEST_POINTS} or more",
-                fix="Select the object's points with the box or the brush first.",
-            )
+            what = f"{len(self.selected)} points are selected"
+            fix = "Select the object's points with the box or the brush first."
+            raise WearcapError(what, expected=f"{FEWEST_POINTS} or more", fix=fix)
         points = self.scan.points[self.selected]
         remaining = self.left()
         remaining[self.selected] = False
@@ -196,9 +194,8 @@ class ObjectEditing:
 
     def _check_name(self, name: str) -> None:
         if not _NAME.fullmatch(name):
-            raise WearcapError(
-                f"an object cannot be named {name!r}", expected="letters, digits, _ and -: it becomes a file's name"
-            )
+            expected = "letters, digits, _ and -: it becomes a file's name"
+            raise WearcapError(f"an object cannot be named {name!r}", expected=expected)
         if name.lower() in {cut.item.name.lower() for cut in self._state.cuts}:
             raise WearcapError(f"there is an object {name!r} already", expected="another name")
 
@@ -214,11 +211,9 @@ class ObjectEditing:
         middle = (low + high) / 2
         beyond = float(np.maximum(scan.min(0) - middle, middle - scan.max(0)).max())
         if beyond > _OUTSIDE_M:
-            raise WearcapError(
-                f"the object {item.name!r} stands {beyond:.1f} m outside the scan",
-                expected="an environment of this scene",
-                fix="Give the scan that it was made from, or another environment file.",
-            )
+            what = f"the object {item.name!r} stands {beyond:.1f} m outside the scan"
+            fix = "Give the scan that it was made from, or another environment file."
+            raise WearcapError(what, expected="an environment of this scene", fix=fix)
         low, high = low - _SURFACE_M, high + _SURFACE_M
         around = self._cloud.in_box(Box(tuple((low + high) / 2), tuple(high - low)))
         if not len(around):

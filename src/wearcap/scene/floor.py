@@ -74,11 +74,8 @@ def estimate_floor(
     near, wide = (_votes(points, keys, bottom, bins, reach) for reach in (_NEAR, _WIDE))
     votes = near + wide * (1 - near.sum(1, keepdims=True) / _ENOUGH).clip(0.02, 1)
     if not votes.any():
-        raise WearcapError(
-            "no points below the head's path",
-            expected="a cloud in the head's world, z up",
-            fix="Check that the cloud and the head path share one world, and that the cloud shows the floor.",
-        )
+        fix = "Check that the cloud and the head path share one world, and that the cloud shows the floor."
+        raise WearcapError("no points below the head's path", expected="a cloud in the head's world, z up", fix=fix)
     heights = bottom + (np.arange(bins) + 0.5) * _BIN_M
     clearance = keys[:, 2:] - heights
     # Cost of each height: how weak its layer is beside the strongest there, and the share of points below it.

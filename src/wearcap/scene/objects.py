@@ -52,15 +52,11 @@ class Freedom:
         if self.kind not in FREEDOMS:
             raise WearcapError(f"no degree of freedom {self.kind!r}", expected=f"one of {', '.join(FREEDOMS)}")
         if (self.kind == "hinge") != (self.pivot is not None):
-            raise WearcapError(
-                f"a {self.kind} {'with' if self.pivot else 'without'} a pivot",
-                expected="a hinge and a point of its axis together",
-            )
+            what = f"a {self.kind} {'with' if self.pivot else 'without'} a pivot"
+            raise WearcapError(what, expected="a hinge and a point of its axis together")
         if (self.kind == "axis") != (self.axis is not None):
-            raise WearcapError(
-                f"{self.kind!r} {'with' if self.axis else 'without'} an axis",
-                expected="a slide along an axis and its direction together",
-            )
+            what = f"{self.kind!r} {'with' if self.axis else 'without'} an axis"
+            raise WearcapError(what, expected="a slide along an axis and its direction together")
         if self.axis is not None and abs(float(np.linalg.norm(self.axis)) - 1.0) > 1e-3:
             raise WearcapError(f"axis {self.axis}", expected="a unit vector")
         if self.limits is not None and not self.limits[0] <= 0.0 <= self.limits[1]:
@@ -155,43 +151,28 @@ def check_object_mesh(mesh: Mesh, where: str | Path, own_axes: bool = True) -> N
         raise WearcapError("the object's mesh has no vertices", where=where, expected="at least one triangle")
     bad = ~np.isfinite(vertices).all(1)
     if bad.any():
-        raise WearcapError(
-            f"{int(bad.sum())} vertices of the object's mesh are NaN or infinite, the first is {int(bad.argmax())}",
-            where=where,
-            expected="finite coordinates (m)",
-            fix="Export the mesh again.",
-        )
+        what = f"{int(bad.sum())} vertices of the object's mesh are NaN or infinite, the first is {int(bad.argmax())}"
+        raise WearcapError(what, where=where, expected="finite coordinates (m)", fix="Export the mesh again.")
     if not len(faces):
-        raise WearcapError(
-            "the object's mesh has no faces",
-            where=where,
-            expected="triangles, not a point cloud",
-            fix="Export it as a triangle mesh.",
-        )
+        what = "the object's mesh has no faces"
+        fix = "Export it as a triangle mesh."
+        raise WearcapError(what, where=where, expected="triangles, not a point cloud", fix=fix)
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise WearcapError(
-            f"a face of the object's mesh names vertex {faces.max()}, there are {len(vertices)}",
-            where=where,
-            expected="faces of its own vertices",
-        )
+        what = f"a face of the object's mesh names vertex {faces.max()}, there are {len(vertices)}"
+        raise WearcapError(what, where=where, expected="faces of its own vertices")
     low, high = vertices.min(0), vertices.max(0)
     extent, (least, greatest) = float((high - low).max()), EXTENTS_M
     if not least <= extent <= greatest:
         millimetres = extent > greatest and least <= extent / 1000 <= greatest
-        raise WearcapError(
-            f"the object's mesh is {extent:.4g} m long",
-            where=where,
-            expected=f"{least:g} to {greatest:g} m",
-            fix="It looks like millimetres: divide by 1000." if millimetres else "Bring it to metres.",
-        )
+        what = f"the object's mesh is {extent:.4g} m long"
+        fix = "It looks like millimetres: divide by 1000." if millimetres else "Bring it to metres."
+        raise WearcapError(what, where=where, expected=f"{least:g} to {greatest:g} m", fix=fix)
     off = float(np.linalg.norm(np.maximum(np.maximum(low, -high), 0.0)))
     if own_axes and off > MAX_OFF_CENTER * (high - low).max():
-        raise WearcapError(
-            f"the object's mesh is not centred: its origin lies {off:.2f} m outside of the box around it",
-            where=where,
-            expected="axes of its own, with the origin in or near the object",
-            fix="Subtract the mean of its vertices, and place its poses accordingly.",
-        )
+        what = f"the object's mesh is not centred: its origin lies {off:.2f} m outside of the box around it"
+        expected = "axes of its own, with the origin in or near the object"
+        fix = "Subtract the mean of its vertices, and place its poses accordingly."
+        raise WearcapError(what, where=where, expected=expected, fix=fix)
 
 
 @dataclass(frozen=True)

@@ -42,10 +42,8 @@ class VoxelGrid:
 
     def __post_init__(self):
         if self.cells < 1 or not 0 < self.clip_m <= 0.5 * self.cell_m * (1 + 1e-9):
-            raise WearcapError(
-                f"a voxel grid of {self.cells} cells in {self.size_m} m, distances up to {self.clip_m} m",
-                expected=f"distances up to half a cell ({0.5 * self.cell_m:g} m)",
-            )
+            what = f"a voxel grid of {self.cells} cells in {self.size_m} m, distances up to {self.clip_m} m"
+            raise WearcapError(what, expected=f"distances up to half a cell ({0.5 * self.cell_m:g} m)")
 
     @property
     def cell_m(self) -> float:

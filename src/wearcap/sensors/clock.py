@@ -251,12 +251,10 @@ def fit_swing_clock(
     try:
         clock = fit_clock(camera_s, watch_s)
     except WearcapError as error:
-        raise WearcapError(
-            error.what.replace("clap", "swing").replace("suit", "watch"),
-            where="arm swings",
-            expected=error.expected.replace("clap", "swing"),
-            fix="Give the times of the frames in which the hands are highest, at uneven intervals.",
-        ) from error
+        what = error.what.replace("clap", "swing").replace("suit", "watch")
+        expected = error.expected.replace("clap", "swing")
+        fix = "Give the times of the frames in which the hands are highest, at uneven intervals."
+        raise WearcapError(what, where="arm swings", expected=expected, fix=fix) from error
     ours = clock.to_camera(watch_s)
     gap = (camera_s[:, None] - ours).abs()
     nearest = gap.argmin(1)

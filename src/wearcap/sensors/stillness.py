@@ -44,12 +44,8 @@ def require(checks: Sequence[StepCheck]) -> None:
     """Raise WearcapError for the first check that is not ok: the step, what was measured, what is expected."""
     for check in checks:
         if not check.ok:
-            raise WearcapError(
-                f"{check.what}: {check.measured:.3g} {check.unit}".rstrip(),
-                where=check.step,
-                expected=check.expected,
-                fix=check.fix,
-            )
+            what = f"{check.what}: {check.measured:.3g} {check.unit}".rstrip()
+            raise WearcapError(what, where=check.step, expected=check.expected, fix=check.fix)
 
 
 def during(

@@ -287,9 +287,8 @@ class ObjectEditor(ServedPage):
         gap = replace(item, freedom=freedom).hinge_gap_m
         if gap > MAX_HINGE_GAP_M:
             self._show_objects()
-            raise WearcapError(
-                f"the hinge would be {gap:.2f} m from {item.name}", expected=f"at most {MAX_HINGE_GAP_M} m"
-            )
+            what = f"the hinge would be {gap:.2f} m from {item.name}"
+            raise WearcapError(what, expected=f"at most {MAX_HINGE_GAP_M} m")
         self.editing.set_freedom(item.name, freedom)
 
     def move_box(self) -> None:

@@ -70,9 +70,8 @@ class _Timeline:
         if head is not None and len(head.timestamps):
             streams.append(head.timestamps)
         if not streams and recording.points is None and not recording.scene:
-            raise WearcapError(
-                f"recording {recording.name!r} has nothing to show", expected="a motion, a head path, points or a scene"
-            )
+            what = f"recording {recording.name!r} has nothing to show"
+            raise WearcapError(what, expected="a motion, a head path, points or a scene")
         start = min((times[0].item() for times in streams), default=0.0)
         return cls(start, max((times[-1].item() for times in streams), default=0.0), start)
 

@@ -30,11 +30,8 @@ def generate_clouds(
     available = (*MOVABLES, *OPENABLES)
     for name in classes:
         if name not in available:
-            raise WearcapError(
-                f"no objects of class {name!r} are generated",
-                expected=f"some of {', '.join(available)}",
-                fix=nearest(name, available),
-            )
+            what = f"no objects of class {name!r} are generated"
+            raise WearcapError(what, expected=f"some of {', '.join(available)}", fix=nearest(name, available))
     clouds, labels = [], []
     for label, name in enumerate(track(classes, f"objects to {split} on")):
         if name in MOVABLES:

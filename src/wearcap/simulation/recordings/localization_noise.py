@@ -98,9 +98,8 @@ def with_outage(localization: Localization, start_s: float, length_s: float) -> 
     times = localization.timestamps
     lost = (times >= start_s) & (times < start_s + length_s)
     if not lost.any():
-        raise WearcapError(
-            f"an outage of {length_s} s at {start_s} s", expected=f"within {times[0]:.1f} to {times[-1]:.1f} s"
-        )
+        expected = f"within {times[0]:.1f} to {times[-1]:.1f} s"
+        raise WearcapError(f"an outage of {length_s} s at {start_s} s", expected=expected)
     return _without(localization, lost)
 
 

@@ -149,9 +149,8 @@ def write_ego_video(
     every = max(1, round(motion.fps / EGO_FPS)) if len(motion) > 1 else 1
     times = motion.timestamps[::every]
     if len(times) < 2:
-        raise WearcapError(
-            f"a video of {len(times)} frames", where=motion.provenance.get("source"), expected="two or more"
-        )
+        what = f"a video of {len(times)} frames"
+        raise WearcapError(what, where=motion.provenance.get("source"), expected="two or more")
     tilt = torch.tensor([0.0, np.deg2rad(rng.uniform(*PITCH_DEG)), 0.0])
     turn = tilt + np.deg2rad(MOUNT_DEG) * torch.from_numpy(rng.standard_normal(3))
     moved = t_head_device + MOUNT_M * torch.from_numpy(rng.standard_normal(3)).float()

@@ -147,10 +147,8 @@ def write_head_video(
     Raises WearcapError for odd picture sizes and fewer than two times.
     """
     if camera.width % 2 or camera.height % 2 or len(times) < 2:
-        raise WearcapError(
-            f"a video of {len(times)} frames of {camera.width}x{camera.height}",
-            expected="even sizes, two frames or more",
-        )
+        what = f"a video of {len(times)} frames of {camera.width}x{camera.height}"
+        raise WearcapError(what, expected="even sizes, two frames or more")
     fps = 1.0 / times.diff().median().item()
     with atomic_path(file) as temporary, av.open(str(temporary), "w", format="mp4") as container:
         codec, options = video_encoder(filming.crf)

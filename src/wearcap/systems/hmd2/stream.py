@@ -74,10 +74,8 @@ class HMD2Session(Session):
                 break
             if isinstance(embedding, Tensor) and embedding.ndim == 1:
                 when = "an unknown time" if time_fault(sample.timestamp) else f"{sample.timestamp:.3f} s"
-                raise WearcapError(
-                    f"an embedding of {len(embedding)} features at {when}",
-                    expected=f"{size} of {self.system.model.image_encoder!r}, which the network was trained on",
-                )
+                expected = f"{size} of {self.system.model.image_encoder!r}, which the network was trained on"
+                raise WearcapError(f"an embedding of {len(embedding)} features at {when}", expected=expected)
         for number, part in enumerate(samples):
             for sample in part:
                 self._take(number, self.streams[number].admit(sample))

@@ -88,9 +88,8 @@ class Synchronization:
                 "Give pipeline.synchronization.max_offset_s=SECONDS if both started within so much, or "
                 "….camera_claps_s=[…], or ….clock=shared where camera and suit are on one clock already."
             )
-            raise WearcapError(
-                error.what, where=error.where or recording.name, expected=error.expected, fix=fix
-            ) from error
+            where = error.where or recording.name
+            raise WearcapError(error.what, where=where, expected=error.expected, fix=fix) from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,12 +124,10 @@ class MapLocalization:
             return None
         own = (folder / recording.scene).parent / MAP_NAME if recording.scene else None
         if own is None or not own.is_file():
-            raise WearcapError(
-                "no localisation in this recording, and no map",
-                where=recording.name,
-                expected="camera poses, or a visual map of the scene",
-                fix="Build one (wearcap scene) and give pipeline.localization.map=FILE.",
-            )
+            what = "no localisation in this recording, and no map"
+            expected = "camera poses, or a visual map of the scene"
+            fix = "Build one (wearcap scene) and give pipeline.localization.map=FILE."
+            raise WearcapError(what, where=recording.name, expected=expected, fix=fix)
         return own
 
     def reads(self, recording: Recording, folder: Path) -> list[Any]:
@@ -215,11 +212,8 @@ def _usual_step(stream: CameraStream) -> int:
 def _pictures(recording: Recording, folder: Path) -> list[Path]:
     stream = recording.camera
     if stream is None or (stream.video is None and stream.image_files is None):
-        raise WearcapError(
-            "no pictures of the head camera",
-            where=recording.name,
-            expected="a video or picture files, to be localised in the map",
-        )
+        expected = "a video or picture files, to be localised in the map"
+        raise WearcapError("no pictures of the head camera", where=recording.name, expected=expected)
     return [folder / name for name in ([stream.video] if stream.video is not None else stream.image_files or ())]
 
 

@@ -109,12 +109,10 @@ class HPS(StagedSystem):
         """Raise WearcapError when a term of the energy needs a scan and there is none."""
         terms = self.energy.reading("on_ground")
         if scan is None and terms:
-            raise WearcapError(
-                f"no scan of the scene, which the energy's term {' and '.join(terms)} needs",
-                where=where,
-                expected="a recording that names its scan, or scene=FOLDER",
-                fix="Without one: pipeline=paper/hps_without_scene.",
-            )
+            what = f"no scan of the scene, which the energy's term {' and '.join(terms)} needs"
+            expected = "a recording that names its scan, or scene=FOLDER"
+            fix = "Without one: pipeline=paper/hps_without_scene."
+            raise WearcapError(what, where=where, expected=expected, fix=fix)
 
     def motion_of(self, results: dict[str, Any]) -> Motion | None:
         """Motion after the last stage that was run: aligned, initial or optimised."""
@@ -174,11 +172,8 @@ class HPS(StagedSystem):
         heading = rotation.about_axis("z", yaw[:-1] + rotation.wrap_angle(yaw.diff()) / 2)
         if aligned.contact_prob is None or len(aligned.contact_prob) != len(aligned):
             count = "no" if aligned.contact_prob is None else f"{len(aligned.contact_prob)} frames of"
-            raise WearcapError(
-                f"{count} foot contacts for {len(aligned)} frames of the suit's pose",
-                expected="one per frame and patch",
-                fix="wearcap.sensors.contacts derives them.",
-            )
+            what = f"{count} foot contacts for {len(aligned)} frames of the suit's pose"
+            raise WearcapError(what, expected="one per frame and patch", fix="wearcap.sensors.contacts derives them.")
         contact = aligned.contact_prob >= 0.5
         if self.evidence.max_contact_speed is not None:
             patches = site_positions(aligned.skeleton, aligned.T_world_joint, FOOT_PATCHES)
@@ -225,11 +220,8 @@ def require(recording: Recording, *names: str) -> None:
     """Raise WearcapError unless the recording has all of these parts."""
     missing = [name for name in names if getattr(recording, name) is None]
     if missing:
-        raise WearcapError(
-            f"no {' and no '.join(missing)} in this recording",
-            where=recording.name,
-            expected="a suit's motion, a head camera, and where it was localised",
-        )
+        expected = "a suit's motion, a head camera, and where it was localised"
+        raise WearcapError(f"no {' and no '.join(missing)} in this recording", where=recording.name, expected=expected)
 
 
 def mount(recording: Recording) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:

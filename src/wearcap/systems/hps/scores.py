@@ -62,11 +62,8 @@ class HpsTruth:
         motion, suit = recording.motion, recording.suit
         feet = None if recording.contacts is None else recording.contacts.feet
         if motion is None or suit is None or suit.contact_prob is None or feet is None:
-            raise WearcapError(
-                "nothing to measure a capture against",
-                where=recording.name,
-                expected="a true motion, true contacts, and a suit with contacts",
-            )
+            expected = "a true motion, true contacts, and a suit with contacts"
+            raise WearcapError("nothing to measure a capture against", where=recording.name, expected=expected)
         touching = replace(motion, contact_prob=feet.float())
         true = resampled(touching, fps)
         detected = resampled(suit, fps).contact_prob
@@ -147,9 +144,8 @@ def nearest_frames(timestamps: Float64[Tensor, "time"], at: Float64[Tensor, "ins
     frames = (timestamps[:, None] - at).abs().argmin(0)
     off = (timestamps[frames] - at).abs()
     if off.max() > 0.51 * timestamps.diff().median():
-        raise WearcapError(
-            f"no captured frame at {at[off.argmax()]:.2f} s", expected="a capture of the whole recording"
-        )
+        what = f"no captured frame at {at[off.argmax()]:.2f} s"
+        raise WearcapError(what, expected="a capture of the whole recording")
     return frames
 
 

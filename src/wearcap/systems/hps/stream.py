@@ -230,16 +230,12 @@ class HpsStream:
         and when no piece was ever localised."""
         self._refuse_alone()
         if self.suit is None and self.refused:
-            raise WearcapError(
-                f"no piece can be used ({', '.join(self.refused)})",
-                where=self.about.name,
-                expected="finite poses of the suit at rising times",
-            )
+            what = f"no piece can be used ({', '.join(self.refused)})"
+            raise WearcapError(what, where=self.about.name, expected="finite poses of the suit at rising times")
         motion = self._end()
         if self.suit is not None and not self._any_returned:
-            raise WearcapError(
-                "the camera was never localised", expected="some localised frames", where=self.about.name
-            )
+            what = "the camera was never localised"
+            raise WearcapError(what, expected="some localised frames", where=self.about.name)
         return motion
 
     def _end(self) -> Motion | None:
@@ -398,11 +394,8 @@ def follow(
         if piece.suit is None and stream is None:
             raise WearcapError("no suit in this piece", where=piece.name, expected="a suit's motion in each piece")
         if hps.synchronization.by_claps(piece):
-            raise WearcapError(
-                "a live recording cannot be synchronised by claps",
-                where=piece.name,
-                fix="Set the clocks before, and give pipeline.synchronization.clock=shared.",
-            )
+            fix = "Set the clocks before, and give pipeline.synchronization.clock=shared."
+            raise WearcapError("a live recording cannot be synchronised by claps", where=piece.name, fix=fix)
         if piece.suit is None:
             refused[f"suit: {WRONG_TYPE}"] += 1
             continue

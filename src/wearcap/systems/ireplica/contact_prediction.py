@@ -78,11 +78,8 @@ class ContactDetector:
             or kinds[1] not in FEATURES
             or not (isinstance(classes, list) and isinstance(fps, int | float))
         ):
-            raise WearcapError(
-                f"a checkpoint of {kinds[0] or 'another model'}",
-                where=path,
-                expected=f"a contact network: {' or '.join(NETWORKS)}",
-            )
+            what = f"a checkpoint of {kinds[0] or 'another model'}"
+            raise WearcapError(what, where=path, expected=f"a contact network: {' or '.join(NETWORKS)}")
         encoder = FEATURES[kinds[1]](**{key: value for key, value in features.items() if key != "_target_"})
         net = {key: value for key, value in net.items() if key != "_partial_"}
         network = build(net | {"inputs": encoder.size, "classes": len(classes)}, state, path, prefix="net.")
@@ -106,10 +103,8 @@ class ContactPredictor:
     def __init__(self, *detectors: ContactDetector):
         names = [name for detector in detectors for name in detector.classes]
         if not names or len(set(names)) < len(names):
-            raise WearcapError(
-                f"contact networks for {', '.join(names) or 'nothing'}",
-                expected="one network for each class of interaction",
-            )
+            what = f"contact networks for {', '.join(names) or 'nothing'}"
+            raise WearcapError(what, expected="one network for each class of interaction")
         self.detectors, self.classes = detectors, tuple(names)
         for detector in detectors:
             detector.net.eval()

@@ -64,11 +64,9 @@ class ContactTransformer(ContactNetwork):
     def __init__(self, inputs: int = 69, classes: int = 1, dropout: float = 0.5, batch_axis: bool = False):
         super().__init__(classes)
         if classes != 1:
-            raise WearcapError(
-                f"the published contact network for {classes} classes of interaction",
-                expected="one class",
-                fix="Train one network per class, as the thesis does, or model=contact_sequence.",
-            )
+            what = f"the published contact network for {classes} classes of interaction"
+            fix = "Train one network per class, as the thesis does, or model=contact_sequence."
+            raise WearcapError(what, expected="one class", fix=fix)
         self.inputs, self.batch_axis = inputs, batch_axis
         self.encoder = nn.Linear(inputs, _WIDTH)
         self.layers = nn.ModuleList(EncoderLayer(dropout) for _ in range(_LAYERS))

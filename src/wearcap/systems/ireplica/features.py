@@ -127,11 +127,8 @@ def pose_frames(
     Raises WearcapError for frames that are not finite."""
     bad = ~motion.R_parent_joint.isfinite().flatten(1).all(1) | ~motion.timestamps.isfinite()
     if bad.any():
-        raise WearcapError(
-            f"{int(bad.sum())} of {len(bad)} poses are not numbers, first frame {int(bad.nonzero()[0])}",
-            expected="a pose in every frame",
-            fix="Fill the gaps, or cut them out.",
-        )
+        what = f"{int(bad.sum())} of {len(bad)} poses are not numbers, first frame {int(bad.nonzero()[0])}"
+        raise WearcapError(what, expected="a pose in every frame", fix="Fill the gaps, or cut them out.")
     if not is_even(motion.timestamps, fps):
         motion = resampled(motion, fps)
     R = in_skeleton(motion.skeleton, worn(motion.skeleton, skeleton), motion.R_parent_joint)

@@ -37,10 +37,8 @@ class ContactSettings:
 
     def __post_init__(self):
         if not 0.0 < self.threshold < 1.0 or self.gap_s < 0:
-            raise WearcapError(
-                f"threshold {self.threshold}, gap {self.gap_s} s",
-                expected="a probability between 0 and 1, and no negative time",
-            )
+            expected = "a probability between 0 and 1, and no negative time"
+            raise WearcapError(f"threshold {self.threshold}, gap {self.gap_s} s", expected=expected)
 
 
 @dataclass(frozen=True)
@@ -172,10 +170,8 @@ class AttachmentSettings:
 
     def __post_init__(self):
         if self.anchor not in ANCHORS or not self.reach_m > 0:
-            raise WearcapError(
-                f"anchor {self.anchor!r}, reach {self.reach_m} m",
-                expected=f"one of {', '.join(ANCHORS)}, and a positive distance",
-            )
+            expected = f"one of {', '.join(ANCHORS)}, and a positive distance"
+            raise WearcapError(f"anchor {self.anchor!r}, reach {self.reach_m} m", expected=expected)
 
 
 PALMS = ("left_palm", "right_palm")
@@ -237,10 +233,8 @@ class ObjectTracker:
         times, first, last = contacts["timestamps"], registered.timestamps[0], registered.timestamps[-1]
         inside = (times >= first) & (times <= last)
         if not inside.any():
-            raise WearcapError(
-                f"a motion in the scene from {first.item():.3f} to {last.item():.3f} s and contacts at other times",
-                expected="both on one clock",
-            )
+            what = f"a motion in the scene from {first.item():.3f} to {last.item():.3f} s and contacts at other times"
+            raise WearcapError(what, expected="both on one clock")
         motion = at_times(registered, times[inside].contiguous())
         prob = {
             name: interpolate(times, value, motion.timestamps)

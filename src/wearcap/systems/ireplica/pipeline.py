@@ -69,12 +69,9 @@ class IReplica(StagedSystem):
         """Path of the environment file. Raises WearcapError if neither the pipeline nor the recording names one."""
         path = source.environment_file(self.environment)
         if path is None:
-            raise WearcapError(
-                "no objects that can be moved",
-                where=source.recording.name,
-                expected="a recording that names its environment, or pipeline.environment=FILE",
-                fix="Make one with `wearcap scene`.",
-            )
+            expected = "a recording that names its environment, or pipeline.environment=FILE"
+            fix = "Make one with `wearcap scene`."
+            raise WearcapError("no objects that can be moved", where=source.recording.name, expected=expected, fix=fix)
         return path
 
     def motion_of(self, results: dict[str, Any]) -> Motion | None:

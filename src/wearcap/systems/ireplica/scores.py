@@ -51,11 +51,8 @@ def score_interactions(motion: Motion, recording: Recording, environment: Enviro
     lacks a true motion, interactions or object motion, or the capture objects."""
     truth, held = recording.motion, recording.interactions
     if truth is None or held is None or not recording.object_motion:
-        raise WearcapError(
-            "nothing to measure interactions against",
-            where=recording.name,
-            expected="a true motion, interactions and object motion",
-        )
+        expected = "a true motion, interactions and object motion"
+        raise WearcapError("nothing to measure interactions against", where=recording.name, expected=expected)
     if motion.object_motion is None:
         raise WearcapError("this capture has no objects", where=recording.name, expected="object_motion")
     true = at_times(truth, motion.timestamps)

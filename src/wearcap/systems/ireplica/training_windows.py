@@ -89,11 +89,9 @@ class ContactContent(Content):
         interactions = file.part("interactions")
         if f"{self.stream}.timestamps" not in file.keys or interactions is None:
             missing = "interactions" if interactions is None else self.stream
-            raise WearcapError(
-                f"this recording has no {missing}, which contact detection learns from",
-                where=file.path,
-                fix="Prepare a data set with interactions, such as `wearcap prepare simulated_interactions`.",
-            )
+            what = f"this recording has no {missing}, which contact detection learns from"
+            fix = "Prepare a data set with interactions, such as `wearcap prepare simulated_interactions`."
+            raise WearcapError(what, where=file.path, fix=fix)
         timestamps = file.tensor(f"{self.stream}.timestamps")
         motion: Motion = file.part(self.stream)
         if is_even(timestamps, self.fps) and motion.skeleton.joint_names == self.skeleton.joint_names:

@@ -29,13 +29,11 @@ class TrackedPoints:
 
     def __post_init__(self):
         if not self.points or self.points[0] != "head":
-            raise WearcapError(
-                f"tracked points {', '.join(self.points) or '(none)'}", expected="the head, then what else is tracked"
-            )
+            what = f"tracked points {', '.join(self.points) or '(none)'}"
+            raise WearcapError(what, expected="the head, then what else is tracked")
         if self.height not in ("stature", "floor", "world"):
-            raise WearcapError(
-                f"tracked points have no height {self.height!r}", expected="one of stature, floor, world"
-            )
+            what = f"tracked points have no height {self.height!r}"
+            raise WearcapError(what, expected="one of stature, floor, world")
 
     @property
     def size(self) -> int:
