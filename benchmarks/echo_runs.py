@@ -82,7 +82,7 @@ class Streamed:
 
     def fill(self) -> "Streamed":
         """Until the window is full, and what is compiled is."""
-        for _ in range(2 * self.session.system.model.net.window):
+        for _ in range(2 * self.session.pipeline.model.net.window):
             self.step()
         return self
 
