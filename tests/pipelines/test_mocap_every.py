@@ -21,12 +21,12 @@ def recording():
 
 
 @pytest.mark.parametrize("floor", ["follow", "update", "points", "fixed"])
-def test_the_body_hangs_from_the_measured_head(recording, floor):
+def test_the_body_is_anchored_to_the_measured_head(recording, floor):
     captured = drawn_pipeline(floor=floor).run(recording)
     motion = captured.motion
     assert len(motion) == len(recording.head.timestamps)
     torch.testing.assert_close(motion.joint("head").t, recording.head.T_world_head.t, atol=1e-4, rtol=0)
-    torch.testing.assert_close(motion.joint("head").R, recording.head.T_world_head.R, atol=1e-4, rtol=0)
+    torch.testing.assert_close(motion.joint("head").R, recording.head.T_world_head.R, atol=3e-4, rtol=0)  # float32
     assert captured.floor.height.isfinite().all()
     assert motion.provenance["floor"] == floor
 
