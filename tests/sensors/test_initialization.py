@@ -21,7 +21,7 @@ from wearcap.sensors.initialization import (
     inliers,
     yaw_between,
 )
-from wearcap.sensors.simulated import SuitNoise, suit_motion
+from wearcap.sensors.suit import SuitNoise, suit_motion
 
 PAPER = InitializationSettings("tangent", "line", path_smoothing_s=0.0)
 SEEN = InitializationSettings(path_smoothing_s=0.0)

@@ -9,9 +9,14 @@ import torch
 from wearcap.body.skeleton import Skeleton
 from wearcap.geometry import rotation
 from wearcap.recording import Motion
-from wearcap.sensors.simulated import SuitNoise, suit_motion
+from wearcap.sensors.suit import SuitNoise, suit_motion
 
-NONE = SuitNoise(0.0, 0.0, 6.0, 0.0, 0.0, 0.0, 2.0, 0.0, (0.0, 0.0), (0.0, 0.0))
+NONE = SuitNoise(
+    SegmentErrors(0.0, 0.0, 6.0, 0.0),
+    PathErrors(0.0, 0.0, 0.0, scale=0.0, step_scale=0.0, height_m=0.0, height_drift_m=0.0),
+    BodyErrors(0.0, 0.0),
+    ContactErrors((0.0, 0.0), (0.0, 0.0)),
+)
 FPS = 10.0
 STICK = Skeleton("stick", ("pelvis", "head"), (-1, 0), torch.tensor([[0.0, 0.0, 0.9], [0.0, 0.0, 0.6]]))
 

@@ -52,6 +52,7 @@ TERMS = {
     "root_smooth": Term(costs.rotation_step, ("R_root", "no_turn"), 2, expected=("no_turn",)),
     "head_smooth": Term(costs.rotation_step, ("R_head", "no_turn"), 2, expected=("no_turn",)),
     "pose": Term(costs.pose_offset, ("theta", "theta_imu"), 1, expected=("theta_imu",)),
+    "root": Term(costs.rotation_offset, ("R_root", "R_root_start"), 1, expected=("R_root_start",)),
     "hold": Term(costs.position_offset, ("t_root", "t_start"), 1, "hold_confidence", ("t_start",)),
     "translation_step": Term(costs.position_step, ("t_root", "t_step"), 2, expected=("t_step",)),
     "root_step": Term(costs.rotation_step, ("R_root", "R_root_step"), 2, expected=("R_root_step",)),
@@ -260,6 +261,7 @@ def data_values(data: HpsData, ground: dict[str, Tensor]) -> dict[str, Tensor]:
     derived = {
         "ones": torch.ones_like(t[:, 0]),
         "t_start": t,
+        "R_root_start": data.start.R_world_root,
         "theta_imu": theta_imu,
         "theta_legs_imu": theta_imu[:, _leg_columns(patches)],
         "R_localized_head": data.R_world_cam @ data.R_head_cam.T,

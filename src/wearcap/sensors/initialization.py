@@ -23,14 +23,19 @@ MAX_SPEED = 3.0
 YAWS, BRIDGES = ("tangent", "orientation"), ("line", "suit")
 ANGLE_SCALE, DISTANCE_SCALE = 0.1, 0.15
 """Robust scales (rad, m) of the smoothing residuals."""
+TILT_SCALE = 0.05
+"""Robust scale (rad) of the direction of gravity."""
 PATH_SPAN_S = 1.0
 """Duration (s) of the displacements, a metre or more: 5 cm of noise turn one by 4°, a hundred by 0.4°."""
 
 
 def align_suit(
-    suit: Motion, localization: Localization, mount: Rigid, first_s: float = 10.0
+    suit: Motion, localization: Localization, mount: Rigid, first_s: float = 10.0, tilt: bool = False
 ) -> tuple[Motion, Float[Tensor, ""]]:
     """Move a suit's motion into the scene by a rotation about gravity and a translation: (motion, angle in rad).
+
+    With `tilt` (ours) the motion is first tilted to gravity's direction in the map (`gravity_in_map`); the thesis
+    takes the map as level.
 
     The angle is that of eq. 4.14, estimated robustly over the first `first_s` seconds of localised frames instead of
     frame 0, which may be an outlier; it turns root orientation and path of all frames (eq. 4.15). The translation moves
@@ -38,6 +43,10 @@ def align_suit(
     must agree already. Raises WearcapError when no localised frame lies within the suit's time.
     """
     seen = inliers(localization)
+    if tilt:
+        up = gravity_in_map(suit, localization, mount.R).float()
+        R_map_suit = rotation.exp(torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0]), up))
+        suit = suit.moved(Rigid(R_map_suit, suit.t_world_root[0] - R_map_suit @ suit.t_world_root[0]))
     inside = localization.timestamps >= suit.timestamps[0]
     inside &= seen & (localization.timestamps <= suit.timestamps[-1])
     step = localization.timestamps.diff().median().item() if len(seen) > 1 else first_s
@@ -60,6 +69,36 @@ def align_suit(
     worn: Tensor = head @ mount.t  # pyright: ignore[reportAssignmentType]
     move = _weighted_median(T_world_cam.t - worn @ R_scene_suit.mT, weight)
     return suit.moved(Rigid(R_scene_suit, move)), turn
+
+
+def gravity_in_map(
+    suit: Motion, localization: Localization, R_head_cam: Float[Tensor, "3 3"], most_deg: float = 5.0
+) -> Float64[Tensor, "3"]:
+    """Direction (unit vector, map axes) that the suit's sensors measure as up, where a map is not level.
+
+    Independent of the heading, which may drift: seen from the camera, up is R_world_cam^T n by the map and
+    R_head_cam^T R_world_head^T e_z by the suit. n and the mount R_head_cam, of which the nominal value is the first
+    guess, are found in turn by weighted means (Wahba's problem) whose weights fall with the angle between both. A
+    wearer who looks into different directions separates the two; beyond `most_deg` the map is taken as level.
+    """
+    seen = inliers(localization)
+    seen &= (localization.timestamps >= suit.timestamps[0]) & (localization.timestamps <= suit.timestamps[-1])
+    head = suit.joint("head")
+    R_world_head = resample(Trajectory(suit.timestamps, head.R, head.t), localization.timestamps[seen]).R_world_body
+    R_cam, up_head = localization.R_world_cam[seen].double(), R_world_head.double()[:, 2]
+    level = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    if not seen.any():
+        return level
+    up, mount, weight = level, R_head_cam.double(), localization.confidence[seen].double()
+    w = weight
+    for _ in range(30):
+        up_cam = (R_cam.mT @ up[:, None])[..., 0]
+        mount = roma.special_procrustes(torch.einsum("t,ti,tj->ij", w, up_head, up_cam))
+        by_suit = (R_cam @ (mount.mT @ up_head[..., None]))[..., 0]
+        up = torch.nn.functional.normalize((w[:, None] * by_suit).sum(0), dim=0)
+        off = torch.linalg.cross(by_suit, up.expand_as(by_suit)).norm(dim=-1)
+        w = weight / (1 + (off / TILT_SCALE) ** 2) ** 2
+    return up if up[2] > np.cos(np.deg2rad(most_deg)) else level
 
 
 def inliers(localization: Localization) -> Bool[Tensor, "time"]:
@@ -146,6 +185,8 @@ class InitializationSettings:
     min_speed: float = 0.3
     """m/s over a tangent; slower frames are stationary."""
     yaw_smoothing_s: float = 30.0
+    tilt: bool = True
+    """Whether the suit's motion is tilted to gravity's direction in the map (ours)."""
     path_smoothing_s: float = 1.0
     """Standard deviation (as for yaw) of the smoothing of the difference between camera and suit path, for
     bridge="suit" only; 0: none (thesis)."""

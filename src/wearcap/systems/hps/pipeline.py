@@ -86,7 +86,7 @@ class HPS(StagedSystem):
             Stage(
                 "align",
                 lambda done: self.align(on_one_clock(recording, done)),
-                lambda: (self.fps, *body),
+                lambda: (self.fps, self.initialization.tilt, *body),
                 ("synchronize", "localize"),
             ),
             Stage(
@@ -139,7 +139,7 @@ class HPS(StagedSystem):
     def align(self, recording: Recording) -> Motion:
         """The suit's motion at `fps`, rotated about gravity and moved into the scene (thesis eq. 4.14, 4.15)."""
         suit, localization, T_head_cam = required(recording)
-        return align_suit(resampled(suit, self.fps), localization, T_head_cam)[0]
+        return align_suit(resampled(suit, self.fps), localization, T_head_cam, tilt=self.initialization.tilt)[0]
 
     def initialize(self, recording: Recording, aligned: Motion) -> Initialization:
         """Initial state of the optimisation: the suit's pose on the camera's path (thesis §4.2.5, eq. 4.13)."""
