@@ -154,6 +154,10 @@ class FootPatches:
         one = torch.nn.functional.one_hot(self.patch, len(FOOT_REGIONS)).to(points)
         return torch.einsum("tvi,vp->tpi", points, one / one.sum(0))
 
+    def scaled(self, scale: float) -> "FootPatches":
+        """The patches of a body of which all is longer by one factor."""
+        return replace(self, body=self.body.scaled(scale))
+
     @cached_property
     def soles(self) -> BodyModel:
         """Body model that consists of the patches only."""
@@ -296,7 +300,11 @@ def energy_terms(
 ) -> dict[str, Float[Tensor, ""]]:
     """Weighted terms of eq. 4.1, differentiable in the state; the scene below the feet is queried for this state."""
     of_state = state_values(data, state, full_mesh)
-    values = of_state | data_values(data, find_ground(data, of_state["soles"], energy))
+    return energy_of(energy, of_state | data_values(data, find_ground(data, of_state["soles"], energy)))
+
+
+def energy_of(energy: HpsEnergy, values: dict[str, Tensor]) -> dict[str, Float[Tensor, ""]]:
+    """Weighted terms of eq. 4.1 of the values of a state and its data, by name."""
     terms = {}
     for name, weight in energy.weights.items():
         if weight == 0:

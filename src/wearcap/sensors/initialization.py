@@ -25,6 +25,13 @@ ANGLE_SCALE, DISTANCE_SCALE = 0.1, 0.15
 """Robust scales (rad, m) of the smoothing residuals."""
 TILT_SCALE = 0.05
 """Robust scale (rad) of the direction of gravity."""
+HEADING_WALK = np.deg2rad(3.0) / np.sqrt(60)
+"""Deviation (rad/√s) of the random walk of a suit's heading, by which its path bends where the camera is lost."""
+GAP_YAW, GAP_SCALE, GAP_END_M = np.deg2rad(0.5), 0.004, 0.03
+"""Deviations, at a gap's ends, of the heading (rad) and of the displacement (m); of the suit's distances within it."""
+GAP_S, NODE_S, MOST_SPREADS = 2.0, 0.5, 4.0
+"""Shortest gap (s) over which the path is bent, spacing (s) of the angles within it, and largest plausible miss of its
+end, in deviations."""
 PATH_SPAN_S = 1.0
 """Duration (s) of the displacements, a metre or more: 5 cm of noise turn one by 4°, a hundred by 0.4°."""
 
@@ -256,6 +263,7 @@ def initialize(
         if len(product):
             yaw = yaw + _robust_angle(product.angle(), product.abs(), scale_rad=ANGLE_SCALE).double()
     if settings.bridge == "suit":
+        yaw = yaw + _bend(paths, yaw, settings.path_smoothing_s)
         camera = _bridged(paths, yaw, settings)
     turn = rotation.about_axis("z", yaw).to(body.dtype)
     R = suit.R_parent_joint.clone()
@@ -296,16 +304,65 @@ def _tangent_yaw(paths: _Paths, settings: InitializationSettings) -> Float64[Ten
     return (camera * body.conj()).angle()[frame]
 
 
+def _bend(paths: _Paths, yaw: Float64[Tensor, "time"], smoothing_s: float) -> Float64[Tensor, "time"]:
+    """Angle (rad) by which the suit's heading most likely drifted further within each gap, so that its path, which is
+    bent by it, arrives where the camera is found again; 0 outside gaps.
+
+    The drift y is a random walk that is known at both ends to `GAP_YAW`. Of all drifts that lead to the displacement d
+    by which the suit misses the gap's end, the expected one is linear in it: cov(y, d) cov(d)⁻¹ d. A displacement
+    beyond `MOST_SPREADS` deviations has another cause.
+    """
+    times, apart = _apart(paths, _turned(paths, yaw), smoothing_s)
+    bend = torch.zeros_like(yaw)
+    edge = torch.cat([paths.valid.new_ones(1), paths.valid, paths.valid.new_ones(1)]).int().diff()
+    for first, stop in zip((edge == -1).nonzero()[:, 0].tolist(), (edge == 1).nonzero()[:, 0].tolist()):
+        if first == 0 or stop == len(yaw):
+            continue
+        span = (paths.timestamps[stop] - paths.timestamps[first]).item()
+        if span < GAP_S:
+            continue
+        after = torch.searchsorted(times, paths.timestamps[stop])
+        missed = (apart[after] - apart[after - 1])[:2]
+        nodes = torch.linspace(0.0, span, round(span / NODE_S) + 1, dtype=yaw.dtype)
+        at = torch.searchsorted(paths.timestamps, paths.timestamps[first] + nodes).clamp(max=len(yaw) - 1)
+        step = _turned(paths, yaw)[at, :2].diff(dim=0)
+        middle = (nodes[1:] + nodes[:-1]) / 2
+        bridge = torch.minimum(middle[:, None], middle) - middle[:, None] * middle / span
+        covariance = HEADING_WALK**2 * bridge + GAP_YAW**2
+        side = torch.stack([-step[:, 1], step[:, 0]], 1)
+        along = covariance @ side
+        whole = step.sum(0)
+        spread = side.T @ along + GAP_SCALE**2 * whole[:, None] * whole + GAP_END_M**2 * torch.eye(2, dtype=yaw.dtype)
+        pull = torch.linalg.solve(spread, missed)
+        if missed @ pull > MOST_SPREADS**2:
+            continue
+        drift = along @ pull
+        inside = slice(first, stop)
+        bend[inside] = _interpolated(paths.timestamps[inside] - paths.timestamps[first], middle, drift[:, None])[:, 0]
+    return bend
+
+
+def _turned(paths: _Paths, yaw: Float64[Tensor, "time"]) -> Float64[Tensor, "time 3"]:
+    """The suit's path from the origin, turned step by step."""
+    turn = rotation.about_axis("z", (yaw[1:] + yaw[:-1]) / 2)
+    steps = (turn @ paths.body.diff(dim=0)[..., None])[..., 0]
+    return torch.cat([torch.zeros(1, 3, dtype=steps.dtype), steps.cumsum(0)])
+
+
 def _bridged(paths: _Paths, yaw: Tensor, settings: InitializationSettings) -> Float64[Tensor, "time 3"]:
     """The suit's path, turned step by step, plus the camera's difference from it, interpolated over gaps."""
-    turn = rotation.about_axis("z", (yaw[1:] + yaw[:-1]) / 2)
-    suit_path = (turn @ paths.body.diff(dim=0)[..., None])[..., 0].cumsum(0)
-    suit_path = torch.cat([torch.zeros(1, 3, dtype=suit_path.dtype), suit_path])
-    times, apart = paths.timestamps[paths.valid], (paths.camera - suit_path)[paths.valid]
-    if settings.path_smoothing_s:
-        ones = torch.ones(len(times), dtype=torch.float64)
-        apart = _robust_smooth(times, apart, ones, settings.path_smoothing_s, DISTANCE_SCALE)
+    suit_path = _turned(paths, yaw)
+    times, apart = _apart(paths, suit_path, settings.path_smoothing_s)
     return suit_path + _interpolated(paths.timestamps, times, apart)
+
+
+def _apart(paths: _Paths, suit_path: Float64[Tensor, "time 3"], smoothing_s: float) -> tuple[Tensor, Tensor]:
+    """Times of the valid frames and the camera's difference (m) from the suit's path there, smoothed."""
+    times, apart = paths.timestamps[paths.valid], (paths.camera - suit_path)[paths.valid]
+    if smoothing_s:
+        ones = torch.ones(len(times), dtype=torch.float64)
+        apart = _robust_smooth(times, apart, ones, smoothing_s, DISTANCE_SCALE)
+    return times, apart
 
 
 def _interpolated(
