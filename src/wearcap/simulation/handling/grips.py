@@ -43,6 +43,20 @@ class GripPlace:
     fingers: Vector
     """Preferred direction of the fingers; the arm may turn them some 40° about the normal."""
 
+    @property
+    def flat(self) -> bool:
+        """Whether the palm lies on an upright face."""
+        return abs(self.normal[2]) < 0.3
+
+    def varied(self, rng: np.random.Generator, roll: float, yaw: float) -> "GripPlace":
+        """The same point in a hand that is rolled about its fingers and turned about the normal by these deviations
+        (rad)."""
+        axes = torch.tensor([self.fingers, self.normal], dtype=torch.float64)
+        angles = torch.from_numpy(np.clip(rng.normal(0.0, (roll, yaw)), -2 * roll, 2 * roll))
+        rolled = exp(angles[0] * axes[0])
+        turned = rolled @ exp(angles[1] * axes[1])
+        return GripPlace(self.point, vector((turned @ axes[1]).numpy()), vector((turned @ axes[0]).numpy()))
+
 
 @dataclass(frozen=True)
 class Hold:
