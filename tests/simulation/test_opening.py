@@ -1,16 +1,19 @@
 """Whoever opens something has a hand on its handle and is not in its way."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from wearcap.body.kinematics import site_positions
+from wearcap.simulation.handling import opening
 from wearcap.simulation.handling.opening import operate
 from wearcap.simulation.people.plan import Plan
 from wearcap.simulation.people.wearer import TAIL_S, perform
 from wearcap.simulation.places.interactive_flat import House, build_interactive_flat
 from wearcap.simulation.places.outline import distance_to_convex
 
-FPS = 30.0
+FPS, SWINGS_ON_S = 30.0, 0.7
 CASES = [("door", 0), ("door", 1), ("window", 0), ("drawer", 0), ("cabinet_door", 0)]
 
 
@@ -62,7 +65,9 @@ def test_the_palm_stays_on_the_handle_or_where_it_pushes(case):
 def test_the_thing_moves_only_in_a_hand_and_within_its_limits(case):
     _, _, house, item, motion = case
     track = house.object_motion(motion)[item.name]
-    held = house.interactions(1e3).hand_contact(motion.timestamps).any(1)
+    rows, swings_on = house.interactions(1e3), SWINGS_ON_S if item.hinged else 0.0
+    longer = replace(rows, stop_s=rows.stop_s + swings_on)
+    held = longer.hand_contact(motion.timestamps).any(1)
     moved = (track.t_world_body.diff(dim=0).norm(dim=-1) > 1e-5) | (
         track.R_world_body.diff(dim=0).norm(dim=(-1, -2)) > 1e-5
     )
@@ -96,3 +101,14 @@ def test_the_body_keeps_off_the_thing_and_the_walls(case):
         for other in flat.static.objects:
             if other.z_range[0] < 1.0 and other.z_range[1] > 0.9:
                 assert distance_to_convex(place[held, :2], other.footprint).min() > 0.12, other.name
+
+
+def test_a_leaf_swings_on_when_it_is_let_go_early(person, monkeypatch):
+    monkeypatch.setattr(opening, "EARLY", 1.0)
+    _, house, item, motion = opened_and_closed("door", 1, person)
+    rows, track = house.interactions(1e3), house.object_motion(motion)[item.name]
+    for first, stop in zip(rows.start_s, rows.stop_s):
+        after = (motion.timestamps > stop) & (motion.timestamps < stop + SWINGS_ON_S)
+        assert (track.R_world_body[after].diff(dim=0).norm(dim=(-1, -2)) > 1e-4).any(), "moves without a hand"
+        assert first < stop
+    assert (track.t_world_body[-1] - item.object.t_world_object).norm() < 1e-4, "closed again"

@@ -13,7 +13,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.scene.objects import SceneObject
 from wearcap.simulation.handling.grips import Grip, GripPlace, Handling, Vector, still, vector
 from wearcap.simulation.handling.holding import bend_for, bow, spread
-from wearcap.simulation.people.actions import ON_THIGHS, hold, squat
+from wearcap.simulation.people.actions import ON_THIGHS, POSTURES, hold, squat
 from wearcap.simulation.people.plan import SIDES, Plan
 from wearcap.simulation.people.posture import look_about, look_at
 
@@ -21,8 +21,17 @@ Manner = Literal["move", "rest", "pretend"]
 """What is done with an object: it is moved; held without being moved; or neither moved nor touched."""
 SHORT_M = (0.05, 0.10)
 """Range of the palm's distance from the surface of an object that is not touched."""
-STAY_S, APART_S = (0.6, 2.6), 0.3
+STAY_S, APART_S = (0.6, 3.0), 0.3
 """Range of the root of the time for which hands stay; mean delay of each hand in coming and in leaving."""
+STANCES: dict[str, tuple[bool, tuple[float, ...]]] = {
+    "in pockets": (True, (0.10, 0.04, -0.80, 0.8, 0.5, 0.1)),
+    "hand in a pocket": (False, (0.10, 0.04, -0.80, 0.8, 0.5, 0.1)),
+    "on hips": (True, POSTURES["on_hips"][1]),
+    "on a railing": (True, (0.52, 0.02, -0.56, 0.45, 0.4, 0.3)),
+    "leaning": (False, (0.74, 0.08, -0.14, 0.5, 0.0, 0.5)),
+    "pointing": (False, (0.86, 0.00, -0.22, 0.3, 0.2, 0.0)),
+}
+"""Whether both hands take part, and the hands' pose (`HandScore.pose`), of who stands by and touches nothing."""
 LOW_M, HOVER_LOW_M = 0.60, 0.18
 """Height of places below which one bends down, and the hands' distance then, beside the object."""
 
@@ -33,16 +42,14 @@ def pretend_to_handle(
     """One of the acts that resemble handling, in front of an object of a height."""
     low = float(T_world_object.t[2]) + height_m < 0.95
     chance = rng.random()
-    if low and chance < 0.18:
+    if low and chance < 0.10:
         bend_over(plan, T_world_object, height_m, rng)
-    elif low and chance < 0.32:
+    elif low and chance < 0.18:
         squat_by(plan, T_world_object, height_m, rng)
-    elif chance < 0.45:
+    elif chance < 0.26:
         gesture_at(plan, T_world_object, height_m, rng)
-    elif chance < 0.55:  # linger
-        stop = plan.time + rng.uniform(1.0, 3.5)
-        look_about(plan, plan.time, stop, rng, spread=0.4)
-        plan.time = stop
+    elif chance < 0.42:
+        stand_by(plan, T_world_object, height_m, rng)
     else:
         hover(plan, places, T_world_object, rng)
 
@@ -117,6 +124,17 @@ def gesture_at(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.
     if rng.random() < 0.7:
         _look(plan, T_world_object, (0.0, 0.0, height), start + 0.2, stop - 0.8)
     plan.time = stop + 0.1
+
+
+def stand_by(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.Generator) -> None:
+    """Stand at an object of a height (m) for a while in one of `STANCES`, looking at it first and then about."""
+    start, stop = plan.time + 0.1, plan.time + rng.uniform(2.0, 6.0)
+    both, pose = list(STANCES.values())[rng.integers(len(STANCES))]
+    hold(plan, SIDES if both else (str(rng.choice(SIDES)),), pose, start, stop, rng)
+    middle = start + rng.uniform(0.8, 1.6)
+    _look(plan, T_world_object, (0.0, 0.0, height), start, middle)
+    look_about(plan, middle + 0.6, stop, rng, spread=0.4)
+    plan.time = stop
 
 
 def bend_over(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.Generator) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from wearcap.simulation.handling.distractors import Manner
-from wearcap.simulation.handling.imitating import imitate
+from wearcap.simulation.handling.imitating import free_hands_s, imitate
 from wearcap.simulation.handling.opening import operate
 from wearcap.simulation.handling.rearranging import rearrange, relocate
 from wearcap.simulation.people.actions import ACTIVITIES, follow, start_place
@@ -53,11 +53,11 @@ class Habits:
     """Probability of using the last object again, unless it was in the hands for long."""
     near_m: float = 2.5
     """Distance per factor 1/e in the probability of an object's choice."""
-    alike: float = 1.2
+    alike: float = 1.3
     """Time of hands in the poses of touching that touch nothing, as a share of the hands' time in contact."""
     resting_share: float = 0.3
     """Probability of holding an object without moving it."""
-    imitated_share: float = 0.6
+    imitated_share: float = 0.55
     """Share of what resembles handling that is done in the air or with something else, away from the object."""
 
 
@@ -102,12 +102,12 @@ class Household:
             start = self.plan.time
             held = sum(stop - begin for h in self.house.handlings for begin, stop, _ in h.rows)
             eager = 0.5 + 3.0 * (self.habits.held_share - held / max(start, 10.0))
-            if self.rng.random() < np.clip(sum(self.lacks().values()) / KEEP_UP_S, 0.0, 0.8):
-                lacks = {kind: max(lack, 0.0) for kind, lack in self.lacks().items()}
+            lacks = self._lacks()
+            if self.rng.random() < np.clip(sum(lacks.values()) / KEEP_UP_S, 0.0, 0.95):
                 kind = str(self.rng.choice(list(lacks), p=np.array(list(lacks.values())) / sum(lacks.values())))
-                touching = self._hands_s()
-                name = self.imitate(kind)
-                self.alike_s[kind] += self._hands_s() - touching
+                free = free_hands_s(self.plan, self.house)
+                name = self.imitate(kind, lacks[kind])
+                self.alike_s[kind] += free_hands_s(self.plan, self.house) - free
             else:
                 name = self.interact() if self.rng.random() < np.clip(eager, 0.1, 0.92) else self.do_ordinary()
             if self.plan.time < start + 0.05:
@@ -149,29 +149,24 @@ class Household:
         self.last = name
         return f"{'move' if name in self.movables else 'turn'} {self.items[name].category}"
 
-    def imitate(self, kind: str) -> str:
+    def imitate(self, kind: str, busy_s: float) -> str:
         """Do what resembles handling a kind of object but touches none: in the air, with something else, or short of it."""
         items = {name: item for name, item in self.items.items() if item.category == kind}
         if self.rng.random() < self.habits.imitated_share:
             item = items[str(self.rng.choice(list(items)))]
-            if imitate(self.plan, self.house, self.rng, item):
+            if imitate(self.plan, self.house, self.rng, item, busy_s):
                 return "imitate"
-        name = self._drawn(items)
+        name = self.last if self.last in items else self._drawn(items)
         done = self._act(name, "pretend") or (self.go(self.place_of(name), 1.0) and self._act(name, "pretend"))
         return "pretend" if done else "stand"
 
-    def lacks(self) -> dict[str, float]:
+    def _lacks(self) -> dict[str, float]:
         """Time (s) that look-alikes of each kind of object are behind their share of the hands' time in contact."""
         found = {item.category: -self.alike_s[item.category] for item in self.items.values()}
         for handling in self.house.handlings:
             touching = sum((stop - start) * sum(hands) for start, stop, hands in handling.rows)
             found[self.items[handling.name].category] += self.habits.alike * touching
-        return found
-
-    def _hands_s(self) -> float:
-        """Time (s) of both hands in grips so far, whether they touch or only resemble it, beside that of contact."""
-        grips = sum(grip.release_s - grip.touch_s for side in self.plan.grips.values() for grip in side)
-        return grips - sum((stop - start) * sum(hands) for h in self.house.handlings for start, stop, hands in h.rows)
+        return {kind: max(lack, 0.0) for kind, lack in found.items()}
 
     def _act(self, name: str, manner: Manner | None = None) -> bool:
         """Use one object in a manner; None: move it, or now and then only hold it."""

@@ -20,14 +20,15 @@ from wearcap.simulation.places.movables import Movable
 from wearcap.simulation.places.openables import Openable
 from wearcap.simulation.places.outline import stays_apart
 
-NEAR_M, APART_M, TRIES = 2.5, 0.05, 12
+NEAR_M, APART_M, TRIES = 1.6, 0.05, 8
 """Largest distance of the copy from the wearer, its distance from other objects, and the places that are tried."""
-COPY, AGAIN = "something", 0.7
-"""Name of the copy; probability of handling it once more."""
+COPY = "something"
 
 
-def imitate(plan: Plan, house: House, rng: np.random.Generator, item: Movable | Openable) -> bool:
-    """Handle a copy of an object at a free place; False, with nothing done, where none is found."""
+def imitate(plan: Plan, house: House, rng: np.random.Generator, item: Movable | Openable, busy_s: float) -> bool:
+    """Handle a copy of an object at a free place until hands were busy for some time (s); False, with nothing done, where
+    none is found."""
+    until = free_hands_s(plan, house) + busy_s
     flat, points = house.flat, house.world(plan.position).navigation.node_points
     points = points[np.linalg.norm(points[:, :2] - plan.position[:2], axis=1) < NEAR_M]
     solid = [each.footprint for each in (*flat.static.objects, *house.obstacles()) if each.z_range[0] < 1.5]
@@ -42,7 +43,7 @@ def imitate(plan: Plan, house: House, rng: np.random.Generator, item: Movable | 
             other = _with(house, InteractiveFlat(flat.static, (*flat.movables, copy), flat.openables))
             act = rearrange if item.rails else relocate
             if act(plan, other, rng, copy, "move"):
-                while rng.random() < AGAIN and act(plan, other, rng, copy, "move"):
+                while free_hands_s(plan, house) < until and act(plan, other, rng, copy, "move"):
                     pass
                 return True
         else:
@@ -52,10 +53,16 @@ def imitate(plan: Plan, house: House, rng: np.random.Generator, item: Movable | 
             start, stop = ends if rng.random() < 0.5 else ends[::-1]
             other.values[COPY], handle = start, int(rng.integers(len(copy.handles)))
             if operate(plan, other, rng, copy, stop, handle, "move"):
-                while rng.random() < AGAIN and operate(plan, other, rng, copy, start, handle, "move"):
+                while free_hands_s(plan, house) < until and operate(plan, other, rng, copy, start, handle, "move"):
                     start, stop = stop, start
                 return True
     return False
+
+
+def free_hands_s(plan: Plan, house: House) -> float:
+    """Time (s) of both hands so far at places where they touch no object of a house."""
+    grips = sum(grip.release_s - grip.touch_s for side in plan.grips.values() for grip in side)
+    return grips - sum((stop - start) * sum(hands) for h in house.handlings for start, stop, hands in h.rows)
 
 
 def _with(house: House, flat: InteractiveFlat) -> House:

@@ -33,6 +33,8 @@ OTHER_HAND, FLAT, FLAT_M = 0.4, 0.5, 0.8
 higher above the floor than the last (m)."""
 YAW_MOST = 1.1
 """Largest rotation of a hand on its handle (rad)."""
+EARLY = 0.25
+"""Probability of letting go of a leaf that still moves."""
 BEYOND_M = 0.4
 """Preferred distance beyond a leaf's edge."""
 OUT_RAD, OUT_M = 0.25, 0.08
@@ -135,6 +137,8 @@ class _Turn:
         begin = touch + 0.05 + min(rng.exponential(0.4), 2.0)
         stop = begin + self.seconds
         release = stop + 0.02 + min(rng.exponential(0.5), 3.0)
+        if item.hinged and rng.random() < EARLY:
+            release = begin + rng.uniform(0.8, 0.95) * self.seconds
         count = max(round(self.seconds * 30), 8)
         here = np.array([*plan.position[:2], self.places[0, 2] + wrap(plan.heading - self.places[0, 2])])
         fade = np.linspace(1.0, 0.0, len(self.places))[:, None] ** 2
@@ -175,9 +179,9 @@ class _Turn:
         body = lambda at: np.stack([np.interp(at, times, column) for column in path.T], 1)  # noqa: E731
         shuffle(plan, rng, body, begin - 0.1, stop)
         contact_class = item.object.freedom.contact_class
-        house.handlings.append(Handling.of(item.name, contact_class, poses, [(self.side, grip)]))
+        house.handlings.append(Handling.of(item.name, contact_class, poses, [(self.side, grip)], stop))
         house.values[item.name] = self.stop
-        plan.time = max(plan.time, release)
+        plan.time = max(plan.time, release, stop)
 
 
 def operate(
