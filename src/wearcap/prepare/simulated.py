@@ -28,6 +28,7 @@ from wearcap.prepare.engine import Splits, Task, content_hash
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import SPLITS, RecordingFile, RecordingStore
 from wearcap.sensors.slam import semidense_points
+from wearcap.sensors.suit import SuitNoise
 from wearcap.simulation.places.site import changed_world
 from wearcap.simulation.places.surround import surround
 from wearcap.simulation.recordings.hps import HpsConfig, Protocol, simulate_hps
@@ -37,6 +38,7 @@ from wearcap.simulation.recordings.interaction_session import (
     simulate_interactions,
     simulate_objects,
 )
+from wearcap.simulation.recordings.localization_noise import LocalizationNoise
 from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_recording
 from wearcap.simulation.rendering.ego_view import write_ego_video
 from wearcap.simulation.rendering.head_camera import HEAD_CAMERA_TRUTH, Filming, write_head_video
@@ -147,6 +149,8 @@ def simulated_hps_tasks(
     recordings: dict[str, int],
     fps: float | int,
     camera_fps: float | int,
+    suit: str,
+    localization: str,
     returns_m: list[float],
     end_m: float | int,
     spacing_m: float | None,
@@ -159,14 +163,21 @@ def simulated_hps_tasks(
     """`recordings[split]` sessions each; people and sites of the splits never meet, and a split's sites are few.
 
     Scenes go to `output`/scenes: points `spacing_m` apart (None: no scene at all), photo stations `photo_m` apart
-    (0: no photos). The first `video_s` (None: all) of each head camera are filmed at `video_fps`. Raises WearcapError
-    as `simulated_tasks` does, and for distances that do not rise.
+    (0: no photos). The first `video_s` (None: all) of each head camera are filmed at `video_fps`. `suit` and
+    `localization` name presets of errors. Raises WearcapError as `simulated_tasks` does, for a preset that does not
+    exist, and for distances that do not rise.
     """
     distances = [0.0, *map(float, returns_m), float(end_m)]
     if any(b <= a for a, b in pairwise(distances)):
         raise WearcapError(f"returns at {returns_m} m, end at {end_m} m", expected="distances that rise")
     protocol = Protocol(returns_m=tuple(distances[1:-1]), end_m=distances[-1])
-    config = HpsConfig(fps=float(fps), camera_fps=float(camera_fps), protocol=protocol)
+    config = HpsConfig(
+        fps=float(fps),
+        camera_fps=float(camera_fps),
+        protocol=protocol,
+        suit=SuitNoise.preset(suit),
+        localization=LocalizationNoise.preset(localization),
+    )
     scene = None if spacing_m is None else SceneSettings(spacing_m=float(spacing_m), photo_m=float(photo_m))
     seconds = None if video_s is None else float(video_s)
     video = {"seconds": seconds, "fps": float(video_fps), "changed": float(changed)}
@@ -212,16 +223,25 @@ def simulated_interactions_tasks(
     minutes: float | int,
     fps: float | int,
     camera_fps: float | int,
+    suit: str,
+    localization: str,
     spacing_m: float | int,
     seed: int,
 ) -> list[Task]:
     """`recordings[split]` recordings of some minutes each; people and flats of the splits never meet.
 
-    Scenes go to `output`/scenes, with points `spacing_m` apart. Raises WearcapError as `simulated_tasks` does.
+    Scenes go to `output`/scenes, with points `spacing_m` apart. `suit` and `localization` name presets of errors. Raises
+    WearcapError as `simulated_tasks` does, and for a preset that does not exist.
     """
     if not spacing_m > 0:
         raise WearcapError(f"points {spacing_m} m apart", expected="a positive spacing")
-    config = InteractionConfig(fps=float(fps), camera_fps=float(camera_fps), minutes=float(minutes))
+    config = InteractionConfig(
+        fps=float(fps),
+        camera_fps=float(camera_fps),
+        minutes=float(minutes),
+        suit=SuitNoise.preset(suit),
+        localization=LocalizationNoise.preset(localization),
+    )
     make = partial(_in_flat, simulate_interactions, config, float(spacing_m), source_files())
     return _tasks("interactions", recordings, seed, splits, output, make, asdict(config), float(spacing_m))
 
