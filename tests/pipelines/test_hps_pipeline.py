@@ -19,6 +19,7 @@ from wearcap.localization.point_map import PointMapper
 from wearcap.optimize.banded import BandedSettings, solve_banded
 from wearcap.optimize.costs import Loss
 from wearcap.optimize.hps import HpsEnergy
+from wearcap.optimize.hps_constants import ConstantsPrior
 from wearcap.optimize.trajectory import Bending, bend
 from wearcap.optimize.trajectory_banded import bend_banded
 from wearcap.recording import Motion, Recording
@@ -93,6 +94,28 @@ def test_planted_errors_of_suit_and_clock_go():
         CaptureInput(recording, scan=Scan(floor_points()))
     )
     assert root_error_m(wrong_clock, recording).mean() > 0.5
+
+
+@pytest.mark.parametrize(("scale", "moved_m"), [(1.0, 0.0), (0.97, 0.0), (1.0, 0.03)])
+def test_a_body_of_the_wrong_size_and_a_mount_that_was_not_measured_are_found(walk, scale, moved_m):
+    suit, camera = walk.suit, walk.camera
+    wrong = replace(
+        walk,
+        suit=replace(suit, skeleton=suit.skeleton.scaled(scale)),
+        camera=replace(camera, t_head_cam=camera.t_head_cam - torch.tensor([0.0, 0.0, moved_m])),
+    )
+    prior = ConstantsPrior(scale=0.03 if not moved_m else 0.0, mount_m=0.03 if moved_m else 0.0)
+    pipeline = replace(PIPELINE, constants=prior)
+    source = CaptureInput(wrong, scan=Scan(floor_points()))
+    results = pipeline.results(source)
+    constants = results["constants"]
+    assert constants.scale == pytest.approx(1 / scale, abs=0.01)
+    assert constants.t_mount[2] == pytest.approx(moved_m, abs=0.01)
+    found, given = pipeline.motion_of(results), replace(PIPELINE, constants=None)(source)
+    assert found.skeleton.stature == pytest.approx(walk.motion.skeleton.stature, rel=0.01)
+    if (scale, moved_m) != (1.0, 0.0):
+        assert root_error_m(found, walk).mean() < 0.7 * root_error_m(given, walk).mean()
+    assert pipeline.report(source, results)["bone_scale"] == constants.scale
 
 
 def test_the_report_tells_what_was_found(walk, tmp_path):
