@@ -23,15 +23,15 @@ from wearcap.prepare.simulated import source_files
 from wearcap.recording import Recording
 from wearcap.recording.store import RecordingFile, save_recording
 from wearcap.scene.scan import Scan
+from wearcap.sensors.claps import detect_claps_audio
 from wearcap.sensors.clock import Clock
 from wearcap.simulation.places.world import World
 from wearcap.simulation.recordings.hps import HpsConfig, simulate_hps
+from wearcap.simulation.rendering.head_camera import SOUND_HZ, sound_track
 from wearcap.simulation.rendering.scan import scan_world
 from wearcap.simulation.rendering.views import Scenery
 from wearcap.systems.hps.scores import RigCloud, nearest_frames, visit_times
 
-MICROPHONE_S = 0.002
-"""Deviation of a clap's time as a camera's microphone gives it."""
 RIG_SCENE_M = 8.0
 """Of the scan around the spot, the rig is registered to."""
 CLOUD_VOXEL_M = 0.01
@@ -144,10 +144,17 @@ class TrueClock:
         return suit_s * self.rate + self.offset_s
 
     def heard_s(self, recording: Recording, seed: int) -> list[float]:
-        """The claps as the camera's microphone hears them, s from the first picture, as pipelines take them."""
-        assert recording.camera is not None
-        off = MICROPHONE_S * torch.from_numpy(np.random.default_rng([33, seed]).standard_normal(len(self.claps_s)))
-        return (self.to_camera(self.claps_s) + off - recording.camera.timestamps[0]).tolist()
+        """The claps that are detected in the camera's sound track, s from the first picture, as pipelines take them."""
+        camera, track = recording.camera, recording.contacts
+        assert camera is not None
+        assert track is not None
+        assert recording.motion is not None
+        touching = track.contact.any(1)
+        strikes = recording.motion.timestamps[1:][touching[1:] & ~touching[:-1]]
+        first, last = camera.timestamps[0], camera.timestamps[-1]
+        claps, steps = ((self.to_camera(times) - first).tolist() for times in (self.claps_s, strikes))
+        sound = sound_track(float(last - first), claps, np.random.default_rng([33, seed]), steps)
+        return detect_claps_audio(torch.from_numpy(sound), SOUND_HZ).tolist()
 
     def error_s(self, clock: Clock) -> float:
         """How far a found clock is off, at most, over the claps' span."""

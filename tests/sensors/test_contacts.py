@@ -11,7 +11,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import Motion
 from wearcap.sensors.contacts import contacts_from_motion
-from wearcap.sensors.simulated import SuitNoise, suit_motion
+from wearcap.sensors.suit import SuitNoise, suit_motion
 from wearcap.simulation.people.wearer import simulate_motion
 from wearcap.simulation.recordings.simulate import person_of, world_of
 

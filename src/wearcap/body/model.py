@@ -1,7 +1,7 @@
 """A skinned body surface on a skeleton, the common form of all parametric bodies of a given shape, and its named parts
 that touch the world: toes, heels, soles, palms."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import torch
@@ -60,6 +60,12 @@ class BodyModel:
             entries = (local - torch.eye(3, dtype=local.dtype, device=local.device)).flatten(-3)
             rest = rest + torch.einsum("...f,fvc->...vc", entries, self.pose_blend[:, rows].to(local))
         return (blended[..., :3] @ rest[..., None])[..., 0] + blended[..., 3]
+
+    def scaled(self, scale: float) -> "BodyModel":
+        """The body with all lengths scaled by one factor."""
+        blend = None if self.pose_blend is None else self.pose_blend * scale
+        rest = self.rest_vertices * scale
+        return replace(self, skeleton=self.skeleton.scaled(scale), rest_vertices=rest, pose_blend=blend)
 
     @cached_property
     def _weights(self) -> Float[Tensor, "vertex joint"]:

@@ -52,6 +52,13 @@ def head_orientation(
     return _turn(R_world_head @ R_head_cam, R_world_cam)
 
 
+def rotation_offset(
+    R_world_body: Float[Tensor, "time 3 3"], expected: Float[Tensor, "time 3 3"]
+) -> Float[Tensor, "time 3"]:
+    """Rotation (rad, world axes) from a body's orientation to the expected one, such as the suit's (ours)."""
+    return _turn(R_world_body, expected)
+
+
 def position_offset(
     position: Float[Tensor, "time *vertex 3"], expected: Float[Tensor, "time *vertex 3"]
 ) -> Float[Tensor, "time *vertex 3"]:

@@ -52,6 +52,7 @@ TERMS = {
     "root_smooth": Term(costs.rotation_step, ("R_root", "no_turn"), 2, expected=("no_turn",)),
     "head_smooth": Term(costs.rotation_step, ("R_head", "no_turn"), 2, expected=("no_turn",)),
     "pose": Term(costs.pose_offset, ("theta", "theta_imu"), 1, expected=("theta_imu",)),
+    "root": Term(costs.rotation_offset, ("R_root", "R_root_start"), 1, expected=("R_root_start",)),
     "hold": Term(costs.position_offset, ("t_root", "t_start"), 1, "hold_confidence", ("t_start",)),
     "translation_step": Term(costs.position_step, ("t_root", "t_step"), 2, expected=("t_step",)),
     "root_step": Term(costs.rotation_step, ("R_root", "R_root_step"), 2, expected=("R_root_step",)),
@@ -152,6 +153,10 @@ class FootPatches:
         """Mean position of each patch's vertices."""
         one = torch.nn.functional.one_hot(self.patch, len(FOOT_REGIONS)).to(points)
         return torch.einsum("tvi,vp->tpi", points, one / one.sum(0))
+
+    def scaled(self, scale: float) -> "FootPatches":
+        """The patches of a body of which all is longer by one factor."""
+        return replace(self, body=self.body.scaled(scale))
 
     @cached_property
     def soles(self) -> BodyModel:
@@ -260,6 +265,7 @@ def data_values(data: HpsData, ground: dict[str, Tensor]) -> dict[str, Tensor]:
     derived = {
         "ones": torch.ones_like(t[:, 0]),
         "t_start": t,
+        "R_root_start": data.start.R_world_root,
         "theta_imu": theta_imu,
         "theta_legs_imu": theta_imu[:, _leg_columns(patches)],
         "R_localized_head": data.R_world_cam @ data.R_head_cam.T,
@@ -294,7 +300,11 @@ def energy_terms(
 ) -> dict[str, Float[Tensor, ""]]:
     """Weighted terms of eq. 4.1, differentiable in the state; the scene below the feet is queried for this state."""
     of_state = state_values(data, state, full_mesh)
-    values = of_state | data_values(data, find_ground(data, of_state["soles"], energy))
+    return energy_of(energy, of_state | data_values(data, find_ground(data, of_state["soles"], energy)))
+
+
+def energy_of(energy: HpsEnergy, values: dict[str, Tensor]) -> dict[str, Float[Tensor, ""]]:
+    """Weighted terms of eq. 4.1 of the values of a state and its data, by name."""
     terms = {}
     for name, weight in energy.weights.items():
         if weight == 0:

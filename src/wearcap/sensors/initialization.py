@@ -23,14 +23,26 @@ MAX_SPEED = 3.0
 YAWS, BRIDGES = ("tangent", "orientation"), ("line", "suit")
 ANGLE_SCALE, DISTANCE_SCALE = 0.1, 0.15
 """Robust scales (rad, m) of the smoothing residuals."""
+TILT_SCALE = 0.05
+"""Robust scale (rad) of the direction of gravity."""
+HEADING_WALK = np.deg2rad(3.0) / np.sqrt(60)
+"""Deviation (rad/√s) of the random walk of a suit's heading, by which its path bends where the camera is lost."""
+GAP_YAW, GAP_SCALE, GAP_END_M = np.deg2rad(1.0), 0.004, 0.03
+"""Deviations, at a gap's ends, of the heading (rad) and of the displacement (m); of the suit's distances within it."""
+GAP_S, NODE_S, MOST_SPREADS = 2.0, 0.5, 4.0
+"""Shortest gap (s) over which the path is bent, spacing (s) of the angles within it, and largest plausible miss of its
+end, in deviations."""
 PATH_SPAN_S = 1.0
 """Duration (s) of the displacements, a metre or more: 5 cm of noise turn one by 4°, a hundred by 0.4°."""
 
 
 def align_suit(
-    suit: Motion, localization: Localization, mount: Rigid, first_s: float = 10.0
+    suit: Motion, localization: Localization, mount: Rigid, first_s: float = 10.0, tilt: bool = False
 ) -> tuple[Motion, Float[Tensor, ""]]:
     """Move a suit's motion into the scene by a rotation about gravity and a translation: (motion, angle in rad).
+
+    With `tilt` (ours) the motion is first tilted to gravity's direction in the map (`gravity_in_map`); the thesis
+    takes the map as level.
 
     The angle is that of eq. 4.14, estimated robustly over the first `first_s` seconds of localised frames instead of
     frame 0, which may be an outlier; it turns root orientation and path of all frames (eq. 4.15). The translation moves
@@ -38,6 +50,10 @@ def align_suit(
     must agree already. Raises WearcapError when no localised frame lies within the suit's time.
     """
     seen = inliers(localization)
+    if tilt:
+        up = gravity_in_map(suit, localization, mount.R).float()
+        R_map_suit = rotation.exp(torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0]), up))
+        suit = suit.moved(Rigid(R_map_suit, suit.t_world_root[0] - R_map_suit @ suit.t_world_root[0]))
     inside = localization.timestamps >= suit.timestamps[0]
     inside &= seen & (localization.timestamps <= suit.timestamps[-1])
     step = localization.timestamps.diff().median().item() if len(seen) > 1 else first_s
@@ -60,6 +76,37 @@ def align_suit(
     worn: Tensor = head @ mount.t  # pyright: ignore[reportAssignmentType]
     move = _weighted_median(T_world_cam.t - worn @ R_scene_suit.mT, weight)
     return suit.moved(Rigid(R_scene_suit, move)), turn
+
+
+def gravity_in_map(
+    suit: Motion, localization: Localization, R_head_cam: Float[Tensor, "3 3"], most_deg: float = 5.0
+) -> Float64[Tensor, "3"]:
+    """Direction (unit vector, map axes) that the suit's sensors measure as up, where a map is not level.
+
+    Independent of the heading, which may drift: seen from the camera, up is R_world_cam^T n by the map and
+    R_head_cam^T R_world_head^T e_z by the suit. n and the mount R_head_cam, of which the nominal value is the first
+    guess, are found in turn by weighted means (Wahba's problem) whose weights fall with the angle between both. A
+    wearer who looks into different directions separates the two; beyond `most_deg` the map is taken as level.
+    """
+    seen = inliers(localization)
+    seen &= (localization.timestamps >= suit.timestamps[0]) & (localization.timestamps <= suit.timestamps[-1])
+    head = suit.joint("head")
+    R_world_head = resample(Trajectory(suit.timestamps, head.R, head.t), localization.timestamps[seen]).R_world_body
+    R_cam, up_head = localization.R_world_cam[seen].double(), R_world_head.double()[:, 2]
+    level = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    if not seen.any():
+        return level
+    up, weight = level, localization.confidence[seen].double()
+    w = weight
+    for _ in range(30):
+        up_cam = (R_cam.mT @ up[:, None])[..., 0]
+        both = torch.einsum("t,ti,tj->ij", w, up_head, up_cam)
+        mount: Tensor = roma.special_procrustes(both)  # pyright: ignore[reportAssignmentType]
+        by_suit = (R_cam @ (mount.mT @ up_head[..., None]))[..., 0]
+        up = torch.nn.functional.normalize((w[:, None] * by_suit).sum(0), dim=0)
+        off = torch.linalg.cross(by_suit, up.expand_as(by_suit)).norm(dim=-1)
+        w = weight / (1 + (off / TILT_SCALE) ** 2) ** 2
+    return up if up[2] > np.cos(np.deg2rad(most_deg)) else level
 
 
 def inliers(localization: Localization) -> Bool[Tensor, "time"]:
@@ -146,6 +193,8 @@ class InitializationSettings:
     min_speed: float = 0.3
     """m/s over a tangent; slower frames are stationary."""
     yaw_smoothing_s: float = 30.0
+    tilt: bool = True
+    """Whether the suit's motion is tilted to gravity's direction in the map (ours)."""
     path_smoothing_s: float = 1.0
     """Standard deviation (as for yaw) of the smoothing of the difference between camera and suit path, for
     bridge="suit" only; 0: none (thesis)."""
@@ -215,6 +264,7 @@ def initialize(
         if len(product):
             yaw = yaw + _robust_angle(product.angle(), product.abs(), scale_rad=ANGLE_SCALE).double()
     if settings.bridge == "suit":
+        yaw = yaw + _bend(paths, yaw, settings.path_smoothing_s)
         camera = _bridged(paths, yaw, settings)
     turn = rotation.about_axis("z", yaw).to(body.dtype)
     R = suit.R_parent_joint.clone()
@@ -255,16 +305,65 @@ def _tangent_yaw(paths: _Paths, settings: InitializationSettings) -> Float64[Ten
     return (camera * body.conj()).angle()[frame]
 
 
+def _bend(paths: _Paths, yaw: Float64[Tensor, "time"], smoothing_s: float) -> Float64[Tensor, "time"]:
+    """Angle (rad) by which the suit's heading most likely drifted further within each gap, so that its path, which is
+    bent by it, arrives where the camera is found again; 0 outside gaps.
+
+    The drift y is a random walk that is known at both ends to `GAP_YAW`. Of all drifts that lead to the displacement d
+    by which the suit misses the gap's end, the expected one is linear in it: cov(y, d) cov(d)⁻¹ d. A displacement
+    beyond `MOST_SPREADS` deviations has another cause.
+    """
+    times, apart = _apart(paths, _turned(paths, yaw), smoothing_s)
+    bend = torch.zeros_like(yaw)
+    edge = torch.cat([paths.valid.new_ones(1), paths.valid, paths.valid.new_ones(1)]).int().diff()
+    for first, stop in zip((edge == -1).nonzero()[:, 0].tolist(), (edge == 1).nonzero()[:, 0].tolist()):
+        if first == 0 or stop == len(yaw):
+            continue
+        span = (paths.timestamps[stop] - paths.timestamps[first]).item()
+        if span < GAP_S:
+            continue
+        after = torch.searchsorted(times, paths.timestamps[stop])
+        missed = (apart[after] - apart[after - 1])[:2]
+        nodes = torch.linspace(0.0, span, round(span / NODE_S) + 1, dtype=yaw.dtype)
+        at = torch.searchsorted(paths.timestamps, paths.timestamps[first] + nodes).clamp(max=len(yaw) - 1)
+        step = _turned(paths, yaw)[at, :2].diff(dim=0)
+        middle = (nodes[1:] + nodes[:-1]) / 2
+        bridge = torch.minimum(middle[:, None], middle) - middle[:, None] * middle / span
+        covariance = HEADING_WALK**2 * bridge + GAP_YAW**2
+        side = torch.stack([-step[:, 1], step[:, 0]], 1)
+        along = covariance @ side
+        whole = step.sum(0)
+        spread = side.T @ along + GAP_SCALE**2 * whole[:, None] * whole + GAP_END_M**2 * torch.eye(2, dtype=yaw.dtype)
+        pull = torch.linalg.solve(spread, missed)
+        if missed @ pull > MOST_SPREADS**2:
+            continue
+        drift = along @ pull
+        inside = slice(first, stop)
+        bend[inside] = _interpolated(paths.timestamps[inside] - paths.timestamps[first], middle, drift[:, None])[:, 0]
+    return bend
+
+
+def _turned(paths: _Paths, yaw: Float64[Tensor, "time"]) -> Float64[Tensor, "time 3"]:
+    """The suit's path from the origin, turned step by step."""
+    turn = rotation.about_axis("z", (yaw[1:] + yaw[:-1]) / 2)
+    steps = (turn @ paths.body.diff(dim=0)[..., None])[..., 0]
+    return torch.cat([torch.zeros(1, 3, dtype=steps.dtype), steps.cumsum(0)])
+
+
 def _bridged(paths: _Paths, yaw: Tensor, settings: InitializationSettings) -> Float64[Tensor, "time 3"]:
     """The suit's path, turned step by step, plus the camera's difference from it, interpolated over gaps."""
-    turn = rotation.about_axis("z", (yaw[1:] + yaw[:-1]) / 2)
-    suit_path = (turn @ paths.body.diff(dim=0)[..., None])[..., 0].cumsum(0)
-    suit_path = torch.cat([torch.zeros(1, 3, dtype=suit_path.dtype), suit_path])
-    times, apart = paths.timestamps[paths.valid], (paths.camera - suit_path)[paths.valid]
-    if settings.path_smoothing_s:
-        ones = torch.ones(len(times), dtype=torch.float64)
-        apart = _robust_smooth(times, apart, ones, settings.path_smoothing_s, DISTANCE_SCALE)
+    suit_path = _turned(paths, yaw)
+    times, apart = _apart(paths, suit_path, settings.path_smoothing_s)
     return suit_path + _interpolated(paths.timestamps, times, apart)
+
+
+def _apart(paths: _Paths, suit_path: Float64[Tensor, "time 3"], smoothing_s: float) -> tuple[Tensor, Tensor]:
+    """Times of the valid frames and the camera's difference (m) from the suit's path there, smoothed."""
+    times, apart = paths.timestamps[paths.valid], (paths.camera - suit_path)[paths.valid]
+    if smoothing_s:
+        ones = torch.ones(len(times), dtype=torch.float64)
+        apart = _robust_smooth(times, apart, ones, smoothing_s, DISTANCE_SCALE)
+    return times, apart
 
 
 def _interpolated(

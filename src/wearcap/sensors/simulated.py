@@ -1,15 +1,13 @@
-"""Simulated output of a head-mounted device's SLAM and of an inertial suit (Xsens-like), and the noise of all sensors."""
+"""Simulated output of a head-mounted device's SLAM, and the noise that all simulated sensors share."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.ndimage
-import scipy.stats
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body.kinematics import local_rotations
 from wearcap.geometry import rotation
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import HeadStream
@@ -75,59 +73,3 @@ def head_stream(
             turn = heading_walk(rng, len(t), noise.yaw_drift_deg_per_sqrt_min, motion.fps)
             R, t = turn @ R, t[:1] + (turn @ (t - t[:1])[..., None])[..., 0]
     return HeadStream(motion.timestamps, R, t, torch.eye(3), t_head_device)
-
-
-@dataclass(frozen=True)
-class SuitNoise:
-    """Errors of a suit; zeros make it perfect. The path drifts by about 0.5 m over 70 m, 1 m over 380 m."""
-
-    fixed_deg: float = 1.0
-    """Calibration error of each segment's orientation, constant in a recording."""
-    slow_deg: float = 1.3
-    """Orientation error that varies over `slow_period_s`."""
-    slow_period_s: float = 6.0
-    heading_walk_deg_per_sqrt_min: float = 0.06
-    scale: float = 0.0008
-    """Standard deviation of the scale error of walked distances, constant in a recording."""
-    step_scale: float = 0.036
-    """Standard deviation of the scale error of walked distances from step to step."""
-    step_period_s: float = 2.0
-    height_m: float = 0.01
-    contact_delay_s: tuple[float, float] = (0.010, 0.040)
-    contact_wrong: tuple[float, float] = (0.02, 0.05)
-    """Share of flags that are wrong besides being late, in bursts of a tenth of a second."""
-
-
-def suit_motion(
-    motion: Motion, contact: Bool[Tensor, "time patch"], noise: SuitNoise, rng: np.random.Generator
-) -> Motion:
-    """The suit's estimate of `motion`, in a world that starts at the true one and drifts.
-
-    `contact` is the ground truth of `FOOT_PATCHES`; the reported flags become a `contact_prob` of 0 or 1.
-    """
-    length, joints, fps = len(motion), len(motion.skeleton), motion.fps
-    fixed = torch.from_numpy(rng.standard_normal((1, joints * 3))).float()
-    slow = smooth_noise(rng, length, joints * 3, noise.slow_period_s, fps)
-    error = (noise.fixed_deg * fixed + noise.slow_deg * slow).unflatten(-1, (joints, 3))
-    heading = heading_walk(rng, length, noise.heading_walk_deg_per_sqrt_min, fps)
-    R_world_joint = heading[:, None] @ motion.T_world_joint.R @ rotation.exp(np.deg2rad(1.0) / np.sqrt(3) * error)
-    # The path's steps are integrated with errors of heading and scale; the height is the true one plus noise.
-    stretch = 1 + noise.scale * float(rng.standard_normal())
-    stretch = stretch + noise.step_scale * smooth_noise(rng, length, 1, noise.step_period_s, fps)
-    wander = noise.height_m * smooth_noise(rng, length, 1, 20.0, fps)[:, 0]
-    root = motion.t_world_root
-    step = root.diff(dim=0, prepend=root[:1]).double()
-    path = root[0] + ((heading.double() @ step[..., None])[..., 0] * stretch).cumsum(0)
-    # Contact flags are late by a delay of the recording (to a frame), and some of them wrong.
-    late = round(float(rng.uniform(*noise.contact_delay_s)) * fps)
-    wrong = scipy.stats.norm.isf(float(rng.uniform(*noise.contact_wrong)))
-    delayed = torch.cat([contact[:1].expand(min(late, length), -1), contact[: length - late]])
-    reported = delayed ^ (smooth_noise(rng, *contact.shape, 0.2, fps) > wrong)
-    return replace(
-        motion,
-        R_parent_joint=local_rotations(motion.skeleton, R_world_joint),
-        t_world_root=torch.stack([path[:, 0], path[:, 1], root[:, 2] + wander], -1).float(),
-        contact_prob=reported.float(),
-        object_motion=None,
-        provenance={"source": "simulated suit"},
-    )

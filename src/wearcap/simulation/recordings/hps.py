@@ -14,14 +14,14 @@ from wearcap.errors import WearcapError
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import ImuStream, Intervals, Recording
 from wearcap.sensors.imu import ImuNoise, synthesize_imu
-from wearcap.sensors.simulated import SuitNoise, suit_motion
+from wearcap.sensors.suit import SuitNoise, suit_motion
 from wearcap.simulation.people.actions import ACTIVITIES, FREE_M, follow, path_length
 from wearcap.simulation.people.person import Person
 from wearcap.simulation.people.plan import LEFT_SIGN, SIDES, Plan
 from wearcap.simulation.people.walking import turn_to
 from wearcap.simulation.people.wearer import TAIL_S, SimulatedMotion, perform
 from wearcap.simulation.places.world import CaptureSpot, World
-from wearcap.simulation.recordings.localization_noise import LocalizationNoise, localize_statistically
+from wearcap.simulation.recordings.localization_noise import LocalizationNoise, by_gravity, localize_statistically
 from wearcap.simulation.recordings.simulate import POOLS, drawn_person, seeded, with_truth, world_of
 from wearcap.simulation.rendering.head_camera import HEAD_CAMERA_TRUTH, HeadCameraConfig, head_camera, view_texture
 
@@ -122,6 +122,7 @@ def simulate_hps(config: HpsConfig, name: str, split: str, seed: int, world: Wor
     if config.localization is not None:
         texture = view_texture(world, path, max(1, round(config.camera_fps / 2)))
         localization = localize_statistically(path, config.localization, rng, texture)
+        suit = by_gravity(suit, config.localization.map, rng)
     about = {
         "claps_s": " ".join(f"{time:.4f}" for time in session.claps_s),
         "camera_clock_offset_s": f"{clock[0]:.6f}",

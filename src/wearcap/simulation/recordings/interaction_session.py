@@ -11,7 +11,8 @@ import numpy as np
 
 from wearcap.errors import WearcapError
 from wearcap.recording.recording import Recording
-from wearcap.sensors.simulated import SlamNoise, SuitNoise, head_stream, suit_motion
+from wearcap.sensors.simulated import SlamNoise, head_stream
+from wearcap.sensors.suit import SuitNoise, suit_motion
 from wearcap.simulation.handling.household import USUAL, VARIED, Habits, Household
 from wearcap.simulation.handling.rearranging import APART_M
 from wearcap.simulation.people.person import Person
@@ -19,7 +20,7 @@ from wearcap.simulation.people.wearer import SimulatedMotion, perform
 from wearcap.simulation.places.interactive_flat import House, InteractiveFlat, build_interactive_flat, obstacle
 from wearcap.simulation.places.movables import HANDHELDS, Movable, make_movable
 from wearcap.simulation.places.outline import stays_apart
-from wearcap.simulation.recordings.localization_noise import LocalizationNoise, localize_statistically
+from wearcap.simulation.recordings.localization_noise import LocalizationNoise, by_gravity, localize_statistically
 from wearcap.simulation.recordings.simulate import POOLS, drawn_person, seeded, with_truth
 from wearcap.simulation.rendering.head_camera import HeadCameraConfig, head_camera, view_texture
 
@@ -113,7 +114,7 @@ def simulate_interactions(
     suit = suit_motion(simulated.motion, simulated.contact, config.suit, rng)
     camera, path, _ = head_camera(simulated.motion, person.t_head_device, config, rng)
     texture = view_texture(flat.world, path, max(1, round(config.camera_fps / 2)))
-    parts = {"suit": suit, "camera": camera}
+    parts = {"suit": by_gravity(suit, config.localization.map, rng), "camera": camera}
     parts["localization"] = localize_statistically(path, config.localization, rng, texture)
     return _handled(house, simulated, person, name, config.minutes, parts), flat
 

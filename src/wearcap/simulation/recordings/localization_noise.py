@@ -2,11 +2,14 @@
 
 Good frames are off by some centimetres, mostly depending on the view, so that the error persists while the view
 does; bursts of frames are plainly wrong; and for seconds nothing is found at all, mostly in front of blank walls.
+Confidence and covariance follow from the number of matches, as a localiser counts them: they tell how large errors are
+to be expected, not how large one is. The map itself is tilted and bent.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+import scipy.stats
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -14,6 +17,7 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
+from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Localization
 from wearcap.sensors.simulated import smooth_noise
 
@@ -21,6 +25,19 @@ VIEW_M, VIEW_DEG, VIEW_S = 0.8, 35.0, 12.0
 """Translation, rotation and time that change a view, and with it the lasting part of the error."""
 BLANK_PULL = 3.0
 """Ratio of the outage rates at the blankest views and at rich ones."""
+
+
+@dataclass(frozen=True)
+class MapErrors:
+    """What a map and its scan do to everybody; values are drawn uniformly from the ranges once per recording."""
+
+    tilt_deg: tuple[float, float] = (0.3, 1.5)
+    """Angle between the map's vertical axis and gravity."""
+    scale: tuple[float, float] = (0.002, 0.005)
+    """Share by which the map's metre is too long or too short."""
+    bend_m: tuple[float, float] = (0.005, 0.015)
+    """Deviation, along each axis, of localised positions from the scan's, which varies over `bend_over_m`."""
+    bend_over_m: float = 50.0
 
 
 @dataclass(frozen=True)
@@ -43,6 +60,50 @@ class LocalizationNoise:
     outage_s: tuple[float, float] = (1.0, 60.0)
     misjudged: float = 0.2
     """Share of the outliers whose confidence is that of good frames."""
+    map: MapErrors = field(default_factory=MapErrors)
+
+    @classmethod
+    def preset(cls, name: str) -> "LocalizationNoise":
+        """Localisation "ideal", "typical" or "poor". Raises WearcapError for another name."""
+        if name not in LOCALIZATIONS:
+            raise WearcapError(f"localization={name!r}", expected=f"one of {', '.join(LOCALIZATIONS)}")
+        return LOCALIZATIONS[name]
+
+
+LOCALIZATIONS = {
+    "ideal": LocalizationNoise(
+        (0.01, 0.03), (0.3, 0.8), outliers=(0.0, 0.02), lost=(0.0, 0.02), outage_s=(1.0, 10.0), misjudged=0.05,
+        map=MapErrors((0.0, 0.1), (0.0, 0.0005), (0.0, 0.002)),
+    ),
+    "typical": LocalizationNoise(),
+    "poor": LocalizationNoise(
+        (0.06, 0.12), (1.5, 3.0), outliers=(0.12, 0.25), lost=(0.06, 0.15), misjudged=0.3,
+        map=MapErrors((1.0, 2.0), (0.004, 0.008), (0.01, 0.03)),
+    ),
+}  # fmt: skip
+"""Localisations by name."""
+EXPECTED_ERROR = 0.35
+"""Change of the logarithm of the expected error by one deviation of the quality of a view."""
+
+
+def by_gravity(suit: Motion, errors: MapErrors, rng: np.random.Generator) -> Motion:
+    """A suit's motion as it is measured, upright by gravity and in metres, where it was given in a map's axes.
+
+    Seen from a map that is tilted and whose metre is too long, gravity leans and the body is small.
+    """
+    direction = rng.uniform(0.0, 2 * np.pi)
+    lean = np.deg2rad(rng.uniform(*errors.tilt_deg)) * torch.tensor([np.cos(direction), np.sin(direction), 0.0])
+    R_world_map = rotation.exp(lean.float())
+    scale = 1 + float(rng.uniform(*errors.scale)) * float(rng.choice([-1, 1]))
+    start = suit.t_world_root[0]
+    R_parent_joint = suit.R_parent_joint.clone()
+    R_parent_joint[:, 0] = R_world_map @ R_parent_joint[:, 0]
+    return replace(
+        suit,
+        skeleton=suit.skeleton.scaled(scale),
+        R_parent_joint=R_parent_joint,
+        t_world_root=start + scale * (suit.t_world_root - start) @ R_world_map.mT,
+    )
 
 
 def localize_statistically(
@@ -64,17 +125,22 @@ def localize_statistically(
     passed = path.timestamps.diff().float() / VIEW_S
     view = torch.cat([torch.zeros(1), (moved + turned + passed).cumsum(0)]).double().numpy()
     steps = int(8 * view[-1]) + 3
-    coarse = smooth_noise(rng, steps, 6, 8.0, 1.0).numpy()
+    coarse = smooth_noise(rng, steps, 7, 8.0, 1.0).numpy()
     slow = np.stack([np.interp(8 * view, np.arange(steps), column) for column in coarse.T], 1)
     quick = smooth_noise(rng, count, 6, 0.15, fps)
-    lasting = np.sqrt(noise.lasting) * torch.from_numpy(slow).float()
-    error = scale * (lasting + np.sqrt(1 - noise.lasting) * quick)
+    # A view has more matches or fewer; with fewer, larger errors are to be expected.
+    quality = slow[:, 6]
+    if texture is not None:
+        quality = (quality + _normal_rank(texture)) / np.sqrt(2)
+    expected = scale * torch.from_numpy(np.exp(-EXPECTED_ERROR * quality))[:, None]
+    lasting = np.sqrt(noise.lasting) * torch.from_numpy(slow[:, :6]).float()
+    error = expected * (lasting + np.sqrt(1 - noise.lasting) * quick)
     wrong, off = _outliers(count, noise, rng, fps)
     error = torch.where(wrong[:, None], off, error).float()
+    error[:, 3:] += _bend(path, noise.map, rng)
     lost = _outages(count, fps, noise, rng, texture)
-    # Confidence is like a share of inliers: high for small errors, low for most wrong frames, with much scatter.
-    good = 0.92 - 0.09 * (error / scale.float()).norm(dim=-1).clamp(max=6.0).double().numpy() / np.sqrt(6 / 3)
-    good += 0.10 * rng.standard_normal(count)
+    # Confidence is like a share of inliers: that of the view, low for most wrong frames, with much scatter.
+    good = 0.75 + 0.10 * quality + 0.08 * rng.standard_normal(count)
     bad = rng.beta(2.0, 7.0, count)
     fooled = rng.random(count) < noise.misjudged
     value = np.where(
@@ -114,6 +180,21 @@ def _without(found: Localization, lost: Tensor) -> Localization:
         confidence=torch.where(lost, torch.zeros(()), found.confidence),
         covariance=covariance,
     )
+
+
+def _normal_rank(value: Float[Tensor, "time"]) -> np.ndarray:
+    """Standard normal deviates of the same order."""
+    rank = value.argsort().argsort().double().numpy()
+    return scipy.stats.norm.ppf((rank + 0.5) / len(rank))
+
+
+def _bend(path: Trajectory, errors: MapErrors, rng: np.random.Generator) -> Float[Tensor, "time 3"]:
+    """Displacement of localised positions (m) by a map that is bent against the scan: smooth over the floor."""
+    wave = rng.standard_normal((32, 2)) * 2 * np.pi / errors.bend_over_m
+    phase = rng.uniform(0.0, 2 * np.pi, (3, 32))
+    along = path.t_world_body[:, :2].double().numpy() @ wave.T
+    bend = np.sqrt(2 / 32) * np.cos(along[:, None] + phase).sum(-1)
+    return torch.from_numpy(rng.uniform(*errors.bend_m) * bend).float()
 
 
 def _outliers(count: int, noise: LocalizationNoise, rng: np.random.Generator, fps: float) -> tuple[Tensor, Tensor]:

@@ -18,8 +18,9 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.recording.recording import ContactTrack, FloorTrack, Recording
 from wearcap.sensors.imu import ImuNoise, synthesize_imu
 from wearcap.sensors.keypoints import action_camera
-from wearcap.sensors.simulated import SlamNoise, SuitNoise, head_stream, suit_motion
+from wearcap.sensors.simulated import SlamNoise, head_stream
 from wearcap.sensors.slam import semidense_points
+from wearcap.sensors.suit import SuitNoise, suit_motion
 from wearcap.simulation.people.person import Person, draw_person
 from wearcap.simulation.people.wearer import SimulatedMotion, simulate_motion
 from wearcap.simulation.places.flat import build_flat

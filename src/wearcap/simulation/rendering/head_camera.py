@@ -1,6 +1,6 @@
 """The camera on a simulated wearer's head: its mount, its clock, the texture it sees, and its video with sound."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -34,6 +34,8 @@ HEAD_CAMERA_TRUTH = "head_camera"
 GLANCE_PX, GLANCE = (27, 48), (22.0, 22.0, 23.5, 13.0)
 """Height and width of the small image in which texture is measured; its focal lengths and middle (px)."""
 SOUND_HZ = 48_000
+WORD_EVERY_S, KNOCK_EVERY_S = 8.0, 120.0
+"""Mean time between words and between knocks in the sound track."""
 BLUR_STEP_PX, MOST_STEPS = 3.0, 5
 """Largest motion between the sub-frames that are averaged into a frame, and most sub-frames."""
 GLARE = 0.03
@@ -156,7 +158,8 @@ def write_head_video(
         assert isinstance(stream, av.VideoStream)
         stream.width, stream.height, stream.pix_fmt = camera.width, camera.height, "yuv420p"
         sound = container.add_stream("aac", rate=SOUND_HZ, layout="mono")
-        for piece in _sound(times, claps_s, rng):
+        first, last = times[0].item(), times[-1].item()
+        for piece in _audio_frames(sound_track(last - first + 0.1, [clap - first for clap in claps_s], rng)):
             container.mux(sound.encode(piece))
         container.mux(sound.encode(None))
         for picture in film(scenery, camera, path, times, filming, rng):
@@ -164,20 +167,50 @@ def write_head_video(
         container.mux(stream.encode(None))
 
 
-def _sound(times: torch.Tensor, claps_s: Sequence[float], rng: np.random.Generator):
-    """Audio frames from the first to the last image: a quiet room, and claps of some 10 ms."""
-    first, last = times[0].item(), times[-1].item()
-    count = int((last - first + 0.1) * SOUND_HZ)
-    wave = 0.001 * rng.standard_normal(count, np.float32)
-    length = int(0.05 * SOUND_HZ)
-    fading = np.exp(-np.arange(length) / (0.006 * SOUND_HZ)).astype(np.float32)
+def sound_track(
+    seconds: float, claps_s: Sequence[float], rng: np.random.Generator, steps_s: Sequence[float] = ()
+) -> Float[np.ndarray, "sample"]:
+    """What the head camera's microphone hears (48 kHz, -1…1), `claps_s` and footfalls `steps_s` from its first sample.
+
+    A room with hum and noise, footfalls with a dull and a sharp part, rustling clothes, a voice now and then, knocks of
+    other people's doing, and claps of some 10 ms with the room's reverberation.
+    """
+    count = int(seconds * SOUND_HZ)
+    time = np.arange(count, dtype=np.float32) / SOUND_HZ
+    wave = 0.002 * rng.standard_normal(count, np.float32) + 0.004 * np.sin(2 * np.pi * 100 * time)
+    since = np.arange(int(0.4 * SOUND_HZ), dtype=np.float32) / SOUND_HZ
+
+    def noise() -> np.ndarray:
+        return rng.standard_normal(len(since), np.float32)
+
+    for step in steps_s:
+        heel = 0.05 * np.sin(2 * np.pi * 70 * since) * np.exp(-since / 0.04)
+        _add(wave, step, float(rng.uniform(0.5, 1.5)) * (heel + 0.006 * np.exp(-since / 0.005) * noise()))
+        _add(wave, step + 0.2, 0.004 * np.sin(np.pi * since / since[-1]) ** 2 * noise())
+    for word in rng.uniform(0.0, seconds, rng.poisson(seconds / WORD_EVERY_S)):
+        pitch = rng.uniform(100, 240)
+        voiced = sum(np.sin(2 * np.pi * pitch * n * since) / n for n in (1, 2, 5, 8, 13))
+        _add(wave, word, 0.06 * np.clip(since / 0.04, 0, 1) * np.clip((0.35 - since) / 0.1, 0, 1) * voiced)
+        _add(wave, word + 0.3, 0.02 * np.sin(np.pi * np.clip(since / 0.2, 0, 1)) * noise())
+    for knock in rng.uniform(0.0, seconds, rng.poisson(seconds / KNOCK_EVERY_S)):
+        ringing = np.sin(2 * np.pi * 350 * since) + 0.4 * np.exp(-since / 0.003) * noise()
+        _add(wave, knock, 0.1 * ringing * np.exp(-since / 0.02))
     for clap in claps_s:
-        start = round((clap - first) * SOUND_HZ)
-        if 0 <= start < count:
-            stop = min(start + length, count)
-            burst = 0.35 * fading * rng.standard_normal(length, np.float32)
-            wave[start:stop] += burst[: stop - start]
-    for start in range(0, count, 1024):
-        piece = av.AudioFrame.from_ndarray(wave[None, start : start + 1024].clip(-1, 1).copy(), "fltp", "mono")
+        burst = np.exp(-since / 0.006) + 0.03 * np.exp(-since / 0.12) * (since > 0.01)
+        _add(wave, clap, float(rng.uniform(0.2, 0.5)) * burst * noise())
+    return wave.clip(-1, 1).astype(np.float32)
+
+
+def _add(wave: np.ndarray, at_s: float, piece: np.ndarray) -> None:
+    """Add a piece of sound to a track, from a time on and as far as the track reaches."""
+    start = round(at_s * SOUND_HZ)
+    if 0 <= start < len(wave):
+        wave[start : start + len(piece)] += piece[: len(wave) - start]
+
+
+def _audio_frames(wave: np.ndarray) -> Iterator[av.AudioFrame]:
+    """Pieces of 1,024 samples for an encoder."""
+    for start in range(0, len(wave), 1024):
+        piece = av.AudioFrame.from_ndarray(wave[None, start : start + 1024].copy(), "fltp", "mono")
         piece.rate, piece.pts = SOUND_HZ, start
         yield piece
