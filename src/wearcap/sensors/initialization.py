@@ -27,7 +27,7 @@ TILT_SCALE = 0.05
 """Robust scale (rad) of the direction of gravity."""
 HEADING_WALK = np.deg2rad(3.0) / np.sqrt(60)
 """Deviation (rad/√s) of the random walk of a suit's heading, by which its path bends where the camera is lost."""
-GAP_YAW, GAP_SCALE, GAP_END_M = np.deg2rad(1.0), 0.004, 0.03
+GAP_YAW, GAP_SCALE, GAP_END_M = np.deg2rad(0.5), 0.004, 0.03
 """Deviations, at a gap's ends, of the heading (rad) and of the displacement (m); of the suit's distances within it."""
 GAP_S, NODE_S, MOST_SPREADS = 2.0, 0.5, 4.0
 """Shortest gap (s) over which the path is bent, spacing (s) of the angles within it, and largest plausible miss of its
