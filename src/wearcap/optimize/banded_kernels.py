@@ -559,18 +559,24 @@ def factor_and_solve(diagonal, below, right, damping):
                 right[j, i] -= D[i, k] * right[j, k]
             right[j, i] /= D[i, i]
         if j + 1 < count:
-            X = np.ascontiguousarray(below[j].T)  # becomes L⁻¹ times the coupling, row by row
+            # Only unknowns of the next frame that are coupled to this one count: a foot in the air has none.
+            coupled = np.flatnonzero(np.array([below[j, m].any() for m in range(n)]))
+            X = np.ascontiguousarray(below[j][coupled].T)  # becomes L⁻¹ times the coupling, row by row
             for i in range(n):
                 for k in range(i):
                     factor = D[i, k]
-                    for m in range(n):
-                        X[i, m] -= factor * X[k, m]
+                    if factor != 0.0:
+                        for m in range(len(coupled)):
+                            X[i, m] -= factor * X[k, m]
                 inverse = 1.0 / D[i, i]
-                for m in range(n):
+                for m in range(len(coupled)):
                     X[i, m] *= inverse
-            below[j] = X.T
-            diagonal[j + 1] -= np.dot(X.T, X)
-            right[j + 1] -= np.dot(X.T, right[j])
+            square, pull = np.dot(X.T, X), np.dot(X.T, right[j])
+            for a in range(len(coupled)):
+                below[j, coupled[a]] = X[:, a]
+                right[j + 1, coupled[a]] -= pull[a]
+                for b in range(len(coupled)):
+                    diagonal[j + 1, coupled[a], coupled[b]] -= square[a, b]
     for j in range(count - 1, -1, -1):
         if j + 1 < count:
             right[j] -= np.dot(below[j].T, right[j + 1])
