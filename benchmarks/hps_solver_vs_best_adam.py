@@ -11,6 +11,9 @@ Ours solves a stretch per core.
 all of Adam's runs, and ours runs until it is there too. value and baseline: seconds, medians of runs in turns.
 ratio = baseline / value, to be at least `goal`. Where one side never reaches the target, the unit says so, and its time
 is that of its whole budget: a lower bound of the time for it.
+
+The goal is not reached yet on one core: processor seconds for 30 s of recording, in the least of runs beside other
+work, were 0.59 to an energy of 7.73 against 4.76 of Adam (3e-2, to zero over 250 steps), 8 times.
 """
 
 import math
