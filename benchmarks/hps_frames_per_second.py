@@ -7,7 +7,7 @@ to be at least `goal` / 30.
 
 import time
 
-from hps_solver_vs_adam_full_mesh import walk
+from hps_solver_vs_best_adam import walk
 from hydra.utils import instantiate
 
 from wearcap.cli.conf import compose

@@ -11,6 +11,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from simulated_depth_rig import look_at
 
+from wearcap.body.anny_body import anny_body
 from wearcap.body.model import FOOT_REGIONS
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.geometry.camera import Camera
@@ -151,7 +152,8 @@ def _beside(middle: Float[np.ndarray, "3"], along: Float[np.ndarray, "3"]) -> tu
 def _foot(
     session: Session, truth: HpsTruth, motion: Motion, frame: int, T_world_cam: Rigid, middle: np.ndarray
 ) -> UInt8[np.ndarray, "height width 3"]:
-    vertices = truth.body.vertices(motion.T_world_joint[frame]).numpy().astype(np.float32)
+    captured = anny_body(motion.skeleton, truth.shape)
+    vertices = captured.vertices(motion.T_world_joint[frame]).numpy().astype(np.float32)
     body = Mesh(
         vertices, truth.body.faces.numpy().astype(np.int32), np.array([0.55, 0.65, 0.8], np.float32), smooth=True
     )

@@ -29,6 +29,7 @@ from wearcap.systems.ireplica.scores import score_interactions
 ON_BENT_PATH = (
     "as published",
     "as published, w/o contact corr.",
+    "as published, our contacts",
     "ours, on the bent path",
     "ours, on the bent path, w/o contact corr.",
 )
@@ -88,6 +89,7 @@ def run_recording(run: RecordingRun) -> dict[str, Any]:
     ours = pipeline_of("ireplica", run.networks.ours)
     published = pipeline_of("paper/ireplica", run.networks.published)
     motion, bent = ours.registered(case.source), published.registered(case.source)
+    placed = ours.placed(case.environment, case.source)
     contacts = {"ours": _contacts(ours, case), "published": _contacts(published, case)}
     rows = {
         name: capture(bent if name in ON_BENT_PATH else motion)
@@ -99,8 +101,7 @@ def run_recording(run: RecordingRun) -> dict[str, Any]:
         "location": case.recording.location,
         "rows": {name: scored(captured, case) for name, captured in rows.items()},
         "gaps": {
-            str(gap): scored(_with_gap(ours.tracker, gap)(motion, contacts["ours"], case.environment), case)
-            for gap in GAPS_S
+            str(gap): scored(_with_gap(ours.tracker, gap)(motion, contacts["ours"], placed), case) for gap in GAPS_S
         },
         "detection": {
             **{name: detection(value, case.recording) for name, value in contacts.items()},
@@ -120,17 +121,23 @@ def _rows(
     """Name of a row → what captures it from HPS' motion."""
     environment, held, true = case.environment, case.recording.interactions, case.recording.object_motion
     assert held is not None
-    track = lambda tracker, which: lambda motion: tracker(motion, contacts[which], environment)  # noqa: E731
+    placed = ours.placed(environment, case.source)
+
+    def track(tracker: ObjectTracker, which: str, objects: Environment = placed) -> Callable[[Motion], Motion]:
+        return lambda motion: tracker(motion, contacts[which], objects)
+
     changed = lambda **how: replace(ours.tracker, attachment=replace(ours.tracker.attachment, **how))  # noqa: E731
     oracle = true_contacts(held, contacts["ours"]["timestamps"])
     correction = ours.tracker.correction
     return {
         "HPS": lambda motion: static_objects(motion, environment),
         "HPS w/ GT": lambda motion: interpolated_objects(motion, environment, held, true),
-        "nearest object by distance": lambda motion: held_when_near(ours.tracker, motion, environment),
-        "as published": track(published.tracker, "published"),
-        "as published, w/o contact corr.": track(replace(published.tracker, correction=None), "published"),
+        "nearest object by distance": lambda motion: held_when_near(ours.tracker, motion, placed),
+        "as published": track(published.tracker, "published", environment),
+        "as published, w/o contact corr.": track(replace(published.tracker, correction=None), "published", environment),
+        "as published, our contacts": track(published.tracker, "ours", environment),
         "ours": track(ours.tracker, "ours"),
+        "ours, objects as measured": track(ours.tracker, "ours", environment),
         "ours, w/o contact corr.": track(replace(ours.tracker, correction=None, hands=None), "ours"),
         "ours, wearer moved, arms not": track(replace(ours.tracker, hands=None), "ours"),
         "ours, arms moved, wearer not": track(replace(ours.tracker, correction=None), "ours"),
@@ -142,7 +149,7 @@ def _rows(
         "ours, right hand carries": track(changed(anchor="right"), "ours"),
         "ours, no gaps filled": track(_with_gap(ours.tracker, 0.0), "ours"),
         "ours, classes in parallel": track(changed(one_class=False), "ours"),
-        "ours, true contacts": lambda motion: ours.tracker(motion, oracle, environment),
+        "ours, true contacts": lambda motion: ours.tracker(motion, oracle, placed),
     }
 
 
@@ -185,7 +192,8 @@ def _worse(ours: IReplica, case: Case, change: Callable[[Recording], Recording])
     worse = replace(case, source=replace(case.source, recording=recording))
     assert recording.suit is not None
     contacts = ours.contacts(recording.suit)
-    captured = ours.interact(ours.registered(worse.source), contacts, case.environment)
+    placed = ours.placed(case.environment, case.source)
+    captured = ours.interact(ours.registered(worse.source), contacts, placed)
     return scored(captured, case) | {"detection": detection(contacts, case.recording)}
 
 

@@ -116,7 +116,7 @@ def frames_per_second(pipeline: HMD2, pushes: int = 40) -> float:
     return stream.frames_per_second
 
 
-def figure(name: str, value: float, baseline: float, goal: float) -> dict:
+def figure(name: str, value: float, baseline: float, goal: float | None) -> dict:
     return {
         "name": name,
         "value": value,

@@ -19,7 +19,9 @@ from rich.table import Table
 from tabling import cell, finite, new_table, summarize
 
 from wearcap.files import write_text
+from wearcap.sensors.suit import SUITS, SuitNoise
 from wearcap.simulation.recordings.hps import HpsConfig, Protocol
+from wearcap.simulation.recordings.localization_noise import LocalizationNoise
 
 PAPER = {
     "stand": {
@@ -62,15 +64,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="distances (m) after which the wearer is back at the capture spot",
     )
     parser.add_argument("--end", type=float, default=Protocol.end_m, help="length of the session (m)")
+    parser.add_argument("--sensors", choices=list(SUITS), default="typical", help="errors of suit and localisation")
     parser.add_argument("--jobs", type=int, default=2, help="seeds at a time; a single one uses as many cores")
 
 
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     """Print and write all tables; returns the path of the JSON file."""
     count = 1 if options.quick else options.seeds
-    folder = options.output / "hps"
+    folder = options.output / ("hps" if options.sensors == "typical" else f"hps_{options.sensors}")
     protocol = Protocol(returns_m=tuple(options.returns), end_m=options.end)
-    settings = SessionSettings(options.split, HpsConfig(protocol=protocol), options.spacing)
+    suit, localization = SuitNoise.preset(options.sensors), LocalizationNoise.preset(options.sensors)
+    config = HpsConfig(protocol=protocol, suit=suit, localization=localization)
+    settings = SessionSettings(options.split, config, options.spacing)
     jobs = min(options.jobs, count)
     first = options.first_seed
     seeds = [
@@ -79,7 +84,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     ]
     runs = [run for run in Parallel(n_jobs=jobs)(delayed(run_seed)(seed) for seed in seeds) if run]
     places = ["at start", *(f"{distance:.0f} m" for distance in options.returns)]
-    tree: dict[str, Any] = {"about": about, "places": places, **summarized(runs)}
+    tree: dict[str, Any] = {"about": about, "sensors": options.sensors, "places": places, **summarized(runs)}
     show = Console(width=max(Console().width, WIDTH), highlight=False).print
     for name in ("stand", "move"):
         show(_chamfer_table(name, places, tree["chamfer_cm"][name]))
@@ -88,7 +93,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     show(_order_line(tree["order_beyond_start"]))
     draw_drift(folder / "drift.png", {row: [run["scores"][row]["drift"] for run in runs] for row in ROWS})
     tree["seeds"] = runs
-    path = options.output / "hps.json"
+    path = options.output / ("hps.json" if options.sensors == "typical" else f"hps_{options.sensors}.json")
     write_text(path, json.dumps(finite(tree), indent=1, allow_nan=False) + "\n")
     return path
 

@@ -55,6 +55,24 @@ def test_windows_from_the_store_are_faster_than_npz():
     assert figure["ratio"] > 2  # half a minute instead of fifteen
 
 
+def test_adams_clock_stops_at_equal_energy_and_says_where_it_never_gets_there():
+    import latent_optimisation_vs_best_adam as clocks
+
+    goal = torch.linspace(-1, 1, 48).reshape(2, 4, 6)
+    problem = clocks.Problem(torch.zeros(2, 4, 6), lambda z: {"bowl": (z - goal).square().sum((1, 2))})
+    schedule, solver = clocks.Schedule(0.1, 60), clocks.LatentSolver(steps=30)
+    whole = clocks.adam(problem, schedule, 300)
+    assert len(whole) == 61
+    stopped = clocks.adam(problem, schedule, 300, target=1.0)
+    assert stopped[-1].energy <= 1.001 < stopped[-2].energy
+    assert clocks.ours(problem, solver, 1.0).energy <= 1.001
+    reached = clocks.figure("bowl", problem, 1.0, solver, schedule, 300, 1, None)
+    assert "lower bound" not in reached["unit"]
+    assert reached["ratio"] == pytest.approx(reached["baseline"] / reached["value"])
+    slow = clocks.figure("bowl", problem, 1.0, solver, clocks.Schedule(1e-5, None), 10, 1, None)
+    assert "Adam does not reach 1.0000: its time is a lower bound" in slow["unit"]
+
+
 MEASURED = """
 import json, sys
 

@@ -46,7 +46,7 @@ def test_a_recording_becomes_files_and_a_report(data, tmp_path, capfd):
     assert "optimize: reused" not in printed
     assert {path.name for path in out.glob("motion.*")} == {"motion.npz", "motion.bvh", "motion.glb", "motion.mp4"}
     report = json.loads((out / "report.json").read_text())
-    assert [stage["reused"] for stage in report["stages"]] == [True] * 4 + [False]
+    assert [stage["reused"] for stage in report["stages"]] == [True] * 4 + [False] * 2
     assert report["localized"]["share"] == 1.0
     motion = read_motion(out / "motion.npz")
     assert motion.provenance["pipeline"] == "hps"

@@ -18,6 +18,8 @@ def tasks_of(root: Path, **changes):
         "recordings": {"test": 1},
         "fps": 60,
         "camera_fps": 30,
+        "suit": "typical",
+        "localization": "typical",
         "returns_m": [],
         "end_m": 15,
         "spacing_m": 0.4,

@@ -15,7 +15,7 @@ from wearcap.geometry.surface import SurfaceIndex
 from wearcap.optimize import costs
 from wearcap.optimize.adam_windows import AdamSettings, solve_adam_windows
 from wearcap.optimize.banded import BandedSettings, Stretch, solve_banded, solve_in_stretches
-from wearcap.optimize.banded_kernels import LEGS
+from wearcap.optimize.banded_kernels import LEGS, factor_and_solve
 from wearcap.optimize.costs import Loss
 from wearcap.optimize.hps import TERMS, FootPatches, HpsData, HpsEnergy, HpsState, SuitSteps, Term, energy_terms
 
@@ -346,3 +346,20 @@ def test_an_energy_that_leaves_something_open_is_refused():
         solve_banded(HpsEnergy({"slide": 1.0}), data)
     with pytest.raises(WearcapError, match="no term 'slid'"):
         HpsEnergy({"slid": 1.0})
+
+
+def test_elimination_solves_blocks_of_which_some_unknowns_are_not_coupled():
+    """A foot in the air is not coupled to the next frame; another one is when it lands."""
+    rng, (count, n) = np.random.default_rng(0), (6, 9)
+    root = rng.normal(size=(count, n, n))
+    diagonal, below = root @ root.transpose(0, 2, 1) + 20 * np.eye(n), rng.normal(size=(count - 1, n, n))
+    below[0, 3:6], below[1, 6:], below[2] = 0.0, 0.0, 0.0
+    whole = np.zeros((count, n, count, n))
+    for j in range(count):
+        whole[j, :, j] = diagonal[j]
+        if j + 1 < count:
+            whole[j + 1, :, j], whole[j, :, j + 1] = below[j], below[j].T
+    right = rng.normal(size=(count, n))
+    expected = np.linalg.solve(whole.reshape(count * n, -1), right.ravel()).reshape(count, n)
+    factor_and_solve(diagonal, below, right, 0.0)
+    np.testing.assert_allclose(right, expected, atol=1e-10)

@@ -82,9 +82,26 @@ def test_terms_are_what_they_are_named_after():
 def test_solvers_find_the_bottom(kind):
     goal = torch.linspace(-1, 1, 24).reshape(1, 4, 6)
     solver = LatentSolver(kind, 60 if kind == "lbfgs" else 800, 0.02)
-    found = solve_latent(torch.zeros(1, 4, 6), lambda z: {"bowl": (z - goal).square().sum()}, solver)
+    found = solve_latent(torch.zeros(1, 4, 6), lambda z: {"bowl": (z - goal).square().sum((1, 2))}, solver)
     torch.testing.assert_close(found.latent, goal, atol=1e-2, rtol=0)
     assert found.history[-1]["total"] < 1e-3 < found.history[0]["total"]
+
+
+def test_windows_of_a_batch_are_solved_as_if_alone():
+    """Each window has its own curvature and step length: a steep neighbour neither slows nor moves it."""
+    goal = torch.linspace(-1, 1, 48).reshape(2, 4, 6)
+    steep = torch.tensor([1.0, 1e4])
+
+    def bowls(rows: slice):
+        stretch = torch.linspace(1, 30, 24).reshape(4, 6)
+        return lambda z: {"bowl": steep[rows] * (stretch * (z - goal[rows]).square()).sum((1, 2))}
+
+    both = solve_latent(torch.zeros(2, 4, 6), bowls(slice(0, 2)), LatentSolver(steps=30))
+    alone = [solve_latent(torch.zeros(1, 4, 6), bowls(slice(k, k + 1)), LatentSolver(steps=30)) for k in range(2)]
+    torch.testing.assert_close(both.latent, torch.cat([one.latent for one in alone]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(both.latent, goal, atol=1e-2, rtol=0)
+    totals = [entry["total"] for entry in both.history]
+    assert totals == sorted(totals, reverse=True)
 
 
 def test_feet_at_rest_hold_nothing_up():

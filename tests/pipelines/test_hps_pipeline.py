@@ -19,9 +19,11 @@ from wearcap.localization.point_map import PointMapper
 from wearcap.optimize.banded import BandedSettings, solve_banded
 from wearcap.optimize.costs import Loss
 from wearcap.optimize.hps import HpsEnergy
+from wearcap.optimize.hps_constants import ConstantsPrior
 from wearcap.optimize.trajectory import Bending, bend
 from wearcap.optimize.trajectory_banded import bend_banded
 from wearcap.recording import Motion, Recording
+from wearcap.recording.timing import resampled
 from wearcap.runtime.system import Captured, CaptureInput, StageOptions, System
 from wearcap.scene.scan import Scan
 from wearcap.systems.hps import pipeline as hps_module
@@ -93,6 +95,29 @@ def test_planted_errors_of_suit_and_clock_go():
         CaptureInput(recording, scan=Scan(floor_points()))
     )
     assert root_error_m(wrong_clock, recording).mean() > 0.5
+
+
+@pytest.mark.parametrize(("scale", "moved_m"), [(1.0, 0.0), (0.97, 0.0), (1.0, 0.03)])
+def test_a_body_of_the_wrong_size_and_a_mount_that_was_not_measured_are_found(walk, scale, moved_m):
+    suit, camera = walk.suit, walk.camera
+    wrong = replace(
+        walk,
+        suit=replace(suit, skeleton=suit.skeleton.scaled(scale)),
+        camera=replace(camera, t_head_cam=camera.t_head_cam - torch.tensor([0.0, 0.0, moved_m])),
+    )
+    pipeline = replace(PIPELINE, constants=ConstantsPrior(*((0.0, 0.03) if moved_m else (0.03, 0.0))))
+    source = CaptureInput(wrong, scan=Scan(floor_points()))
+    results = pipeline.results(source)
+    constants = results["constants"]
+    assert constants.scale == pytest.approx(1 / scale, abs=0.015)
+    assert constants.t_mount[2] == pytest.approx(moved_m, abs=0.01)
+    assert pipeline.report(source, results)["bone_scale"] == constants.scale
+    found, given = pipeline.motion_of(results), replace(PIPELINE, constants=None)(source)
+    assert found.skeleton.stature == pytest.approx(constants.scale * wrong.suit.skeleton.stature)
+    if scale != 1.0:
+        true = resampled(walk.motion, 30.0).joint("head").t[:, 2]
+        off = [(motion.joint("head").t[:, 2] - true[: len(motion)]).abs().mean() for motion in (found, given)]
+        assert off[0] < 0.6 * off[1]
 
 
 def test_the_report_tells_what_was_found(walk, tmp_path):

@@ -13,10 +13,12 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording.recording import Localization
+from wearcap.sensors import initialization
 from wearcap.sensors.initialization import (
     InitializationSettings,
     align_suit,
     body_camera,
+    gravity_in_map,
     initialize,
     inliers,
     yaw_between,
@@ -115,6 +117,47 @@ def test_an_outage_is_bridged_by_the_suit():
         assert start.valid.float().mean() > 0.6
     assert error["line"] > 1.0
     assert error["suit"] < 0.2
+
+
+def test_a_heading_that_drifts_in_an_outage_bends_the_path_where_the_camera_is_lost(monkeypatch):
+    """Twenty seconds without a camera in which the heading drifts by 2.5 degrees and back."""
+    motion = strolling_motion(60.0, pauses=False)
+    time = motion.timestamps
+    yaw = np.deg2rad(2.5) * torch.sin(np.pi * ((time - 20.0) / 20.0).clamp(0.0, 1.0))
+    lost = (time > 20.0) & (time < 40.0)
+    suit, found = drifting(motion, yaw), localized(motion, replace(PERFECT, outages_s=((20.0, 40.0),)))
+
+    def started():
+        start = initialize(suit, found, MOUNT.R, MOUNT.t)
+        error = (start.motion.t_world_root - motion.t_world_root).norm(dim=-1)
+        return error[lost].mean(), error[~lost].max(), (start.yaw_correction + yaw)[lost].abs().mean()
+
+    within, outside, off = started()
+    monkeypatch.setattr(initialization, "GAP_S", np.inf)
+    stretched, _, off_before = started()
+    assert within < 0.75 * stretched
+    assert off < 0.75 * off_before
+    assert outside < 0.1
+
+
+def test_a_jump_that_no_drift_explains_does_not_bend_the_path():
+    motion = strolling_motion(60.0, pauses=False)
+    found = localized(motion, replace(PERFECT, outages_s=((20.0, 40.0),)))
+    later = (found.timestamps > 30.0)[:, None] * torch.tensor([8.0, -6.0, 0.0])
+    start = initialize(motion, replace(found, t_world_cam=found.t_world_cam + later), MOUNT.R, MOUNT.t)
+    assert start.yaw_correction.abs().max() < np.deg2rad(1.0)
+
+
+@pytest.mark.parametrize("lean_deg", [0.0, 1.2, 20.0])
+def test_gravity_is_found_in_a_map_that_is_not_level(lean_deg):
+    """Up to a few degrees; a map that leans as much as a wall is not believed."""
+    motion = strolling_motion(60.0)
+    lean = rotation.exp(torch.tensor([0.0, np.deg2rad(lean_deg), 0.0]).float())
+    found = localized(motion, LocalizationNoise())
+    found = replace(found, R_world_cam=lean @ found.R_world_cam, t_world_cam=found.t_world_cam @ lean.mT)
+    up = gravity_in_map(motion, found, MOUNT.R)
+    expected = lean[:, 2].double() if lean_deg < 5.0 else torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    assert torch.linalg.cross(up, expected).norm() < np.deg2rad(0.3)
 
 
 def test_bursts_of_outliers_do_not_pull_the_path():

@@ -12,12 +12,18 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
 from wearcap.prepare.engine import check_recording
 from wearcap.recording.serialize import flatten, unflatten
-from wearcap.sensors.claps import detect_claps
+from wearcap.sensors.claps import detect_claps, detect_claps_audio
 from wearcap.sensors.slam import R_DEVICE_CAM
 from wearcap.simulation.places.site import build_site
 from wearcap.simulation.recordings.hps import HpsConfig, Protocol, simulate_hps
-from wearcap.simulation.recordings.localization_noise import LocalizationNoise, localize_statistically, with_outage
-from wearcap.simulation.rendering.head_camera import HEAD_CAMERA_TRUTH, view_texture
+from wearcap.simulation.recordings.localization_noise import (
+    LocalizationNoise,
+    MapErrors,
+    by_gravity,
+    localize_statistically,
+    with_outage,
+)
+from wearcap.simulation.rendering.head_camera import HEAD_CAMERA_TRUTH, SOUND_HZ, sound_track, view_texture
 
 SHORT = Protocol(returns_m=(45.0,), end_m=80.0, clap_every_s=60.0)
 
@@ -164,7 +170,7 @@ def test_outages_come_where_there_is_little_to_see(long_path):
     texture[:9000] = 1.0 + torch.rand(9000, generator=torch.Generator().manual_seed(0))
     noise = LocalizationNoise(lost=(0.05, 0.05), outage_s=(1.0, 8.0))
     lost = torch.stack(
-        [localize_statistically(long_path, noise, np.random.default_rng(s), texture).confidence == 0 for s in range(12)]
+        [localize_statistically(long_path, noise, np.random.default_rng(s), texture).confidence == 0 for s in range(40)]
     )
     assert lost[:, 9000:].double().mean() > 1.3 * lost[:, :9000].double().mean()
 
@@ -193,3 +199,49 @@ def test_a_seed_determines_everything_and_localisation_can_be_left_out(site):
     assert not any(key.startswith("localization") for key in one)
     with pytest.raises(WearcapError, match="Hz"):
         HpsConfig(camera_fps=0.0)
+
+
+def test_confidence_tells_how_good_the_view_is_and_not_how_large_an_error_is(long_path):
+    noise = LocalizationNoise(outliers=(0.0, 0.0), lost=(0.0, 0.0), map=MapErrors(bend_m=(0.0, 0.0)))
+    related = []
+    for seed in range(12):
+        found = localize_statistically(long_path, noise, np.random.default_rng(seed))
+        off = (found.t_world_cam - long_path.t_world_body).norm(dim=-1)
+        related.append(np.corrcoef(found.confidence[::30], off[::30])[0, 1])
+    assert -0.5 < np.mean(related) < -0.05
+
+
+def test_a_map_leans_and_has_its_own_metre(simulated):
+    motion = simulated.recording.motion
+    errors = MapErrors(tilt_deg=(1.0, 1.0), scale=(0.005, 0.005))
+    seen = by_gravity(motion, errors, np.random.default_rng(0))
+    lean = rotation.geodesic(seen.R_parent_joint[:, 0], motion.R_parent_joint[:, 0]).rad2deg()
+    torch.testing.assert_close(lean, torch.ones_like(lean), atol=0.05, rtol=0)
+    share = seen.skeleton.stature / motion.skeleton.stature
+    assert abs(share - 1) == pytest.approx(0.005, abs=1e-4)
+    reach = [(m.t_world_root - m.t_world_root[0]).norm(dim=-1).max() for m in (seen, motion)]
+    assert float(reach[0] / reach[1]) == pytest.approx(share, rel=1e-3)
+
+
+def test_presets_of_localisation_by_name(long_path):
+    off = [
+        (
+            localize_statistically(long_path, LocalizationNoise.preset(name), np.random.default_rng(0)).t_world_cam
+            - long_path.t_world_body
+        )
+        .norm(dim=-1)
+        .median()
+        for name in ("ideal", "typical", "poor")
+    ]
+    assert off == sorted(off)
+    with pytest.raises(WearcapError, match="ideal, typical, poor"):
+        LocalizationNoise.preset("perfect")
+
+
+def test_claps_are_heard_among_steps_and_voices():
+    claps = [3.2, 3.9, 5.1, 40.0]
+    sound = sound_track(60.0, claps, np.random.default_rng(0), np.arange(6.0, 38.0, 0.55).tolist())
+    heard = detect_claps_audio(torch.from_numpy(sound), SOUND_HZ)
+    nearest = (torch.tensor(claps, dtype=torch.float64)[:, None] - heard).abs().amin(1)
+    assert (nearest < 0.01).sum() >= 3
+    assert len(heard) <= 8

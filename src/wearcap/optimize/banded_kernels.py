@@ -293,19 +293,32 @@ def weigh(k, square, share, rows, smooth, energy, weight):
 @compiled
 def _gather_motion(j, k, t, body, rows, smooth, kin, forms, energy):
     """Add a term of one frame's translation or rotation, or of its step to the next: ½ w |r + next - step here|²."""
-    value, slot, pair, r, step = rows.value[k], rows.slot[k, 0], rows.reach[k] == 2, np.empty(3), np.eye(3)
-    if value == TRANSLATION:
-        r = (t[j + 1] - t[j] if pair else t[j]) - rows.positions[slot, j]
+    value, slot, pair, r = rows.value[k], rows.slot[k, 0], rows.reach[k] == 2, np.empty(3)
+    turns = value != TRANSLATION
+    if turns:
+        joint, here = 0 if value == ROOT else body.head_chain[-1], np.empty((3, 3))
+        for i in range(3):
+            for m in range(3):
+                here[i, m] = rows.rotations[slot, j, i, m]
+                if pair:
+                    here[i, m] = 0.0
+                    for l in range(3):
+                        here[i, m] += rows.rotations[slot, j, i, l] * kin.R[j, joint, l, m]
+        _turn_between(here, kin.R[j + pair, joint], r)
     else:
-        joint, step = 0 if value == ROOT else body.head_chain[-1], rows.rotations[slot, j]
-        _turn_between(step @ kin.R[j, joint] if pair else step, kin.R[j + pair, joint], r)
-    w = _rho(k, r @ r, rows.share[rows.slot[k, 2], j], rows, smooth, energy)
+        for i in range(3):
+            r[i] = t[j + pair, i] - (t[j, i] if pair else 0.0) - rows.positions[slot, j, i]
+    w = _rho(k, _square(r), rows.share[rows.slot[k, 2], j], rows, smooth, energy)
     forms.small[j + pair, value] += w
-    forms.small_gradient[j + pair, value] += w * r
+    for i in range(3):
+        forms.small_gradient[j + pair, value, i] += w * r[i]
     if pair:
         forms.small[j, value] += w
-        forms.small_step[j, value] -= w * step
-        forms.small_gradient[j, value] -= w * (step.T @ r)
+        for i in range(3):
+            for m in range(3):
+                step = rows.rotations[slot, j, i, m] if turns else (1.0 if i == m else 0.0)
+                forms.small_step[j, value, i, m] -= w * step
+                forms.small_gradient[j, value, m] -= w * step * r[i]
 
 
 @compiled
@@ -559,18 +572,24 @@ def factor_and_solve(diagonal, below, right, damping):
                 right[j, i] -= D[i, k] * right[j, k]
             right[j, i] /= D[i, i]
         if j + 1 < count:
-            X = np.ascontiguousarray(below[j].T)  # becomes L⁻¹ times the coupling, row by row
+            # Only unknowns of the next frame that are coupled to this one count: a foot in the air has none.
+            coupled = np.flatnonzero(np.array([below[j, m].any() for m in range(n)]))
+            X = np.ascontiguousarray(below[j][coupled].T)  # becomes L⁻¹ times the coupling, row by row
             for i in range(n):
                 for k in range(i):
                     factor = D[i, k]
-                    for m in range(n):
-                        X[i, m] -= factor * X[k, m]
+                    if factor != 0.0:
+                        for m in range(len(coupled)):
+                            X[i, m] -= factor * X[k, m]
                 inverse = 1.0 / D[i, i]
-                for m in range(n):
+                for m in range(len(coupled)):
                     X[i, m] *= inverse
-            below[j] = X.T
-            diagonal[j + 1] -= np.dot(X.T, X)
-            right[j + 1] -= np.dot(X.T, right[j])
+            square, pull = np.dot(X.T, X), np.dot(X.T, right[j])
+            for a in range(len(coupled)):
+                below[j, coupled[a]] = X[:, a]
+                right[j + 1, coupled[a]] -= pull[a]
+                for b in range(len(coupled)):
+                    diagonal[j + 1, coupled[a], coupled[b]] -= square[a, b]
     for j in range(count - 1, -1, -1):
         if j + 1 < count:
             right[j] -= np.dot(below[j].T, right[j + 1])

@@ -28,6 +28,7 @@ from wearcap.prepare.engine import Splits, Task, content_hash
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import SPLITS, RecordingFile, RecordingStore
 from wearcap.sensors.slam import semidense_points
+from wearcap.sensors.suit import SuitNoise
 from wearcap.simulation.places.site import changed_world
 from wearcap.simulation.places.surround import surround
 from wearcap.simulation.recordings.hps import HpsConfig, Protocol, simulate_hps
@@ -37,6 +38,8 @@ from wearcap.simulation.recordings.interaction_session import (
     simulate_interactions,
     simulate_objects,
 )
+from wearcap.simulation.recordings.localization_noise import LocalizationNoise
+from wearcap.simulation.recordings.measured import EnvironmentErrors, as_measured
 from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_recording
 from wearcap.simulation.rendering.ego_view import write_ego_video
 from wearcap.simulation.rendering.head_camera import HEAD_CAMERA_TRUTH, Filming, write_head_video
@@ -147,6 +150,8 @@ def simulated_hps_tasks(
     recordings: dict[str, int],
     fps: float | int,
     camera_fps: float | int,
+    suit: str,
+    localization: str,
     returns_m: list[float],
     end_m: float | int,
     spacing_m: float | None,
@@ -159,14 +164,21 @@ def simulated_hps_tasks(
     """`recordings[split]` sessions each; people and sites of the splits never meet, and a split's sites are few.
 
     Scenes go to `output`/scenes: points `spacing_m` apart (None: no scene at all), photo stations `photo_m` apart
-    (0: no photos). The first `video_s` (None: all) of each head camera are filmed at `video_fps`. Raises WearcapError
-    as `simulated_tasks` does, and for distances that do not rise.
+    (0: no photos). The first `video_s` (None: all) of each head camera are filmed at `video_fps`. `suit` and
+    `localization` name presets of errors. Raises WearcapError as `simulated_tasks` does, for a preset that does not
+    exist, and for distances that do not rise.
     """
     distances = [0.0, *map(float, returns_m), float(end_m)]
     if any(b <= a for a, b in pairwise(distances)):
         raise WearcapError(f"returns at {returns_m} m, end at {end_m} m", expected="distances that rise")
     protocol = Protocol(returns_m=tuple(distances[1:-1]), end_m=distances[-1])
-    config = HpsConfig(fps=float(fps), camera_fps=float(camera_fps), protocol=protocol)
+    config = HpsConfig(
+        fps=float(fps),
+        camera_fps=float(camera_fps),
+        protocol=protocol,
+        suit=SuitNoise.preset(suit),
+        localization=LocalizationNoise.preset(localization),
+    )
     scene = None if spacing_m is None else SceneSettings(spacing_m=float(spacing_m), photo_m=float(photo_m))
     seconds = None if video_s is None else float(video_s)
     video = {"seconds": seconds, "fps": float(video_fps), "changed": float(changed)}
@@ -178,6 +190,7 @@ def _in_flat(
     simulate: Callable[..., Any],
     config: InteractionConfig | ObjectConfig,
     spacing_m: float | None,
+    measured: bool,
     simulator: str,
     name: str,
     split: str,
@@ -186,12 +199,14 @@ def _in_flat(
 ) -> Recording:
     """One session in a flat; its environment and, with `spacing_m`, its scan with everything at its initial pose are written.
 
+    With `measured`, the environment has the errors of somebody who measured where things are.
     Files that were made with the same settings by the same simulator are left as they are.
     """
     recording, flat = simulate(config, name, split, seed)
     place = Path("scenes") / recording.location
     folder, note = root / place, root / place / MADE
-    wanted = json.dumps(({} if spacing_m is None else {"spacing_m": spacing_m}) | {"simulator": simulator})
+    made = {"measured": measured, "simulator": simulator} | ({} if spacing_m is None else {"spacing_m": spacing_m})
+    wanted = json.dumps(made)
     files = [FILE_NAME] if spacing_m is None else [CLOUD, FILE_NAME]
     current = note.is_file() and note.read_text(encoding="utf-8") == wanted
     if not current or not all((folder / file).is_file() for file in files):
@@ -199,7 +214,9 @@ def _in_flat(
             scenery, rng = Scenery.of(flat.world), np.random.default_rng(12)
             scan = scan_world(scenery, spacing_m, rng, walked=flat.static)
             write_ply(Ply(scan.points, scan.colors), folder / CLOUD)
-        write_environment(flat.environment, folder / FILE_NAME)
+        rng = np.random.default_rng([13, zlib.crc32(recording.location.encode())])
+        environment = as_measured(flat.environment, EnvironmentErrors(), rng) if measured else flat.environment
+        write_environment(environment, folder / FILE_NAME)
         write_text(note, wanted)
     scene = {} if spacing_m is None else {"scene": (place / CLOUD).as_posix()}
     return replace(recording, environment=(place / FILE_NAME).as_posix(), **scene)
@@ -212,18 +229,28 @@ def simulated_interactions_tasks(
     minutes: float | int,
     fps: float | int,
     camera_fps: float | int,
+    suit: str,
+    localization: str,
+    measured: bool,
     spacing_m: float | int,
     seed: int,
 ) -> list[Task]:
     """`recordings[split]` recordings of some minutes each; people and flats of the splits never meet.
 
-    Scenes go to `output`/scenes, with points `spacing_m` apart. Raises WearcapError as `simulated_tasks` does.
+    Scenes go to `output`/scenes, with points `spacing_m` apart; `measured` environments have the errors of measuring.
+    `suit` and `localization` name presets of errors. Raises WearcapError as `simulated_tasks` does, and for a preset that does not exist.
     """
     if not spacing_m > 0:
         raise WearcapError(f"points {spacing_m} m apart", expected="a positive spacing")
-    config = InteractionConfig(fps=float(fps), camera_fps=float(camera_fps), minutes=float(minutes))
-    make = partial(_in_flat, simulate_interactions, config, float(spacing_m), source_files())
-    return _tasks("interactions", recordings, seed, splits, output, make, asdict(config), float(spacing_m))
+    config = InteractionConfig(
+        fps=float(fps),
+        camera_fps=float(camera_fps),
+        minutes=float(minutes),
+        suit=SuitNoise.preset(suit),
+        localization=LocalizationNoise.preset(localization),
+    )
+    make = partial(_in_flat, simulate_interactions, config, float(spacing_m), measured, source_files())
+    return _tasks("interactions", recordings, seed, splits, output, make, asdict(config), float(spacing_m), measured)
 
 
 def simulated_objects_tasks(
@@ -234,7 +261,7 @@ def simulated_objects_tasks(
     Environments go to `output`/scenes. Raises WearcapError as `simulated_tasks` does.
     """
     config = ObjectConfig(fps=float(fps), minutes=float(minutes))
-    make = partial(_in_flat, simulate_objects, config, None, source_files())
+    make = partial(_in_flat, simulate_objects, config, None, False, source_files())
     return _tasks("objects", recordings, seed, splits, output, make, asdict(config))
 
 

@@ -27,13 +27,14 @@ from torch import Tensor, nn
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, sha256_of, write_text
 from wearcap.optimize.hps import HpsState, Solution
+from wearcap.optimize.hps_constants import Constants
 from wearcap.recording import Motion, Recording
 from wearcap.recording.serialize import KNOWN, dumps, flatten, unflatten
 from wearcap.runtime.system import Captured, CaptureInput, StageOptions, System
 from wearcap.sensors.clock import Clock
 from wearcap.sensors.initialization import Initialization
 
-RESULTS = KNOWN | {cls.__name__: cls for cls in (Clock, Initialization, Solution, HpsState)}
+RESULTS = KNOWN | {cls.__name__: cls for cls in (Clock, Initialization, Constants, Solution, HpsState)}
 """Classes that a cached result may contain."""
 PACKAGE = Path(__file__).parents[1]
 _DAMAGE = (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, WearcapError, SafetensorError)

@@ -96,11 +96,12 @@ def gravity_in_map(
     level = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     if not seen.any():
         return level
-    up, mount, weight = level, R_head_cam.double(), localization.confidence[seen].double()
+    up, weight = level, localization.confidence[seen].double()
     w = weight
     for _ in range(30):
         up_cam = (R_cam.mT @ up[:, None])[..., 0]
-        mount = roma.special_procrustes(torch.einsum("t,ti,tj->ij", w, up_head, up_cam))
+        both = torch.einsum("t,ti,tj->ij", w, up_head, up_cam)
+        mount: Tensor = roma.special_procrustes(both)  # pyright: ignore[reportAssignmentType]
         by_suit = (R_cam @ (mount.mT @ up_head[..., None]))[..., 0]
         up = torch.nn.functional.normalize((w[:, None] * by_suit).sum(0), dim=0)
         off = torch.linalg.cross(by_suit, up.expand_as(by_suit)).norm(dim=-1)

@@ -207,7 +207,7 @@ def _heading_error(motion: Motion, errors: PathErrors, rng: np.random.Generator)
     place = motion.t_world_root[:, :2].double().numpy()
     steel = np.sqrt(2 / MAGNETIC_WAVES) * np.cos(place @ wave.T + phase).sum(1)
     keep = np.exp(-1 / (errors.steel_s * fps))
-    followed = scipy.signal.lfilter([1 - keep], [1, -keep], steel - steel[0])
+    followed = np.asarray(scipy.signal.lfilter([1 - keep], [1, -keep], steel - steel[0]))
     angle = errors.steel_deg * followed + rate * np.arange(length) / fps / 60
     return rotation.about_axis("z", torch.from_numpy(np.deg2rad(angle)).float()) @ walked
 

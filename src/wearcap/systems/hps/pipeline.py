@@ -1,7 +1,7 @@
 """HPS (thesis ch. 4): registers a suit's motion in a scanned scene by a head camera, without drift.
 
-The steps of the thesis in order: synchronize → localize → align → initialize → optimize. Each can be called alone, and
-is a stage whose result can be cached.
+The steps of the thesis in order: synchronize → localize → align → initialize → optimize, and ours before the last one:
+constants. Each can be called alone, and is a stage whose result can be cached.
 """
 
 from collections import Counter
@@ -22,6 +22,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, finite_difference, resample
 from wearcap.optimize.hps import FootPatches, HpsData, HpsEnergy, HpsState, Solution, SuitSteps
+from wearcap.optimize.hps_constants import Constants, ConstantsPrior, estimate_constants, with_constants
 from wearcap.recording import Motion, Recording
 from wearcap.recording.growing import follow_pieces
 from wearcap.recording.recording import Localization
@@ -68,6 +69,8 @@ class HPS(StagedSystem):
     solver: Solver
     initialization: InitializationSettings = field(default_factory=InitializationSettings)
     evidence: Evidence = field(default_factory=Evidence)
+    constants: ConstantsPrior | None = None
+    """Constants that are estimated with the motion; None: the suit's body and the nominal mount (thesis)."""
     fps: float = 30.0
     name: str = "hps"
     synchronization: Synchronization = field(default_factory=Synchronization)
@@ -80,6 +83,15 @@ class HPS(StagedSystem):
         require(recording, "suit", "camera")
         first = camera_stages(source, self.synchronization, self.localization)
         self.require_scan(source.scan, recording.name)
+        before = ("synchronize", "localize", "align", "initialize")
+
+        def problem(done: dict[str, Any]) -> HpsData:
+            return self.problem(on_one_clock(recording, done), done["align"], done["initialize"], source.read_scan())
+
+        def inputs() -> tuple[Any, ...]:
+            weights = (self.energy, self.solver, self.evidence, self.constants)
+            return *weights, source.scan, source.metres_per_unit, recording.shape
+
         body = (recording.suit, *mount(recording))
         return [
             *first,
@@ -95,13 +107,16 @@ class HPS(StagedSystem):
                 lambda: (self.initialization, *mount(recording)),
                 ("synchronize", "localize", "align"),
             ),
+            *(
+                [Stage("constants", lambda done: self.estimate(problem(done)), inputs, before)]
+                if self.constants
+                else []
+            ),
             Stage(
                 "optimize",
-                lambda done: self.optimize(
-                    self.problem(on_one_clock(recording, done), done["align"], done["initialize"], source.read_scan())
-                ),
-                lambda: (self.energy, self.solver, self.evidence, source.scan, source.metres_per_unit, recording.shape),
-                ("synchronize", "localize", "align", "initialize"),
+                lambda done: self.optimize(problem(done), done.get("constants")),
+                inputs,
+                (*before, "constants") if self.constants else before,
             ),
         ]
 
@@ -117,16 +132,20 @@ class HPS(StagedSystem):
     def motion_of(self, results: dict[str, Any]) -> Motion | None:
         """Motion after the last stage that was run: aligned, initial or optimised."""
         if "optimize" in results:
-            return self.motion(results["initialize"], results["optimize"])
+            return self.motion(results["initialize"], results["optimize"], results.get("constants"))
         return results["initialize"].motion if "initialize" in results else results.get("align")
 
     def report(self, source: CaptureInput, results: dict[str, Any]) -> dict[str, Any]:
-        """Clock, share of localised frames, alignment angle, energy by term and iteration, and the stopping reason."""
+        """Clock, share of localised frames, alignment angle, estimated constants, energy by term and iteration, and the
+        stopping reason."""
         about = camera_report(results)
         if "align" in results:
             assert source.recording.suit is not None
             angle, _ = yaw_between(source.recording.suit.R_parent_joint[0, 0], results["align"].R_parent_joint[0, 0])
             about["alignment_deg"] = angle.rad2deg().item()
+        if "constants" in results:
+            constants = results["constants"]
+            about |= {"bone_scale": constants.scale, "mount_moved_cm": (100 * constants.t_mount).tolist()}
         if "optimize" in results:
             about |= {"stopped": results["optimize"].reason, "energy": results["optimize"].history}
         return about
@@ -193,15 +212,21 @@ class HPS(StagedSystem):
             scan.surface if scan else None,
         )
 
-    def optimize(self, data: HpsData) -> Solution:
-        """Minimise the energy (thesis eq. 4.1)."""
-        return self.solver(self.energy, data)
+    def estimate(self, data: HpsData) -> Constants:
+        """Constants of the recording (ours)."""
+        assert self.constants is not None
+        return estimate_constants(self.energy, data, self.solver, self.fps, self.constants)
 
-    def motion(self, start: Initialization, solution: Solution) -> Motion:
+    def optimize(self, data: HpsData, constants: Constants | None = None) -> Solution:
+        """Minimise the energy (thesis eq. 4.1)."""
+        return self.solver(self.energy, with_constants(data, constants) if constants else data)
+
+    def motion(self, start: Initialization, solution: Solution, constants: Constants | None = None) -> Motion:
         """Captured motion of a solution; foot contacts are those of the suit."""
-        state = solution.state
+        state, skeleton = solution.state, start.motion.skeleton
         return replace(
             start.motion,
+            skeleton=skeleton.scaled(constants.scale) if constants else skeleton,
             R_parent_joint=state.R_parent_joint.float(),
             t_world_root=state.t_world_root.float(),
             provenance={"pipeline": self.name, "solver": solution.reason},

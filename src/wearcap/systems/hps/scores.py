@@ -46,6 +46,8 @@ class HpsTruth:
     motion: Motion
     """True motion at the captures' frames."""
     body: BodyModel
+    """The wearer's body; a capture is scored with one of its own skeleton and the wearer's `shape`."""
+    shape: dict[str, float] | None
     surface: SurfaceIndex
     contact: Bool[Tensor, "time patch"]
     """Foot contact as the suit reports it: the thesis's "frames when foot contact is detected"."""
@@ -72,6 +74,7 @@ class HpsTruth:
         return cls(
             true,
             anny_body(motion.skeleton, recording.shape or None),
+            recording.shape or None,
             scan.surface,
             detected >= 0.5,
             true.contact_prob >= 0.5,
@@ -110,13 +113,14 @@ class HpsScores:
 def score_hps(motion: Motion, truth: HpsTruth) -> HpsScores:
     """Score one capture. Raises WearcapError unless it has the truth's joints and timestamps, and finite poses."""
     joints = evaluate_motion(motion, truth.motion, truth.true_contact)
-    literal, surface = zip(*(interval_chamfer(motion, truth.body, clouds) for clouds in truth.visits))
+    body = anny_body(motion.skeleton, truth.shape)
+    literal, surface = zip(*(interval_chamfer(motion, body, clouds) for clouds in truth.visits))
     error = joint_error_cm(motion.T_world_joint.t, truth.motion.T_world_joint.t)[:, 0]
     return HpsScores(
         literal,
         surface,
-        _foot_scores(motion, truth, truth.contact),
-        _foot_scores(motion, truth, truth.true_contact),
+        _foot_scores(motion, body, truth, truth.contact),
+        _foot_scores(motion, body, truth, truth.true_contact),
         drift(travelled_m(truth.motion), error),
         joints,
     )
@@ -149,12 +153,12 @@ def nearest_frames(timestamps: Float64[Tensor, "time"], at: Float64[Tensor, "ins
     return frames
 
 
-def _foot_scores(motion: Motion, truth: HpsTruth, contact: Bool[Tensor, "time patch"]) -> FootSurface:
+def _foot_scores(motion: Motion, body: BodyModel, truth: HpsTruth, contact: Bool[Tensor, "time patch"]) -> FootSurface:
     """Foot-to-scan distance and foot sliding of a capture during `contact` (Table 4.3)."""
     times = truth.motion.timestamps
     examined = (times - times[0]) % FEET_EVERY_S < FEET_S
     touching = contact & examined[:, None]
-    return foot_surface(*foot_vertices(truth.body, motion.T_world_joint, touching), truth.surface)
+    return foot_surface(*foot_vertices(body, motion.T_world_joint, touching), truth.surface)
 
 
 def travelled_m(motion: Motion) -> Float[Tensor, "time"]:

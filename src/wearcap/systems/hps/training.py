@@ -58,7 +58,8 @@ def validated(pipeline: HPS, where: str) -> dict[str, float]:
     recording, folder = load_recording(where), dataset_folder(where)
     source = CaptureInput.in_dataset(recording, folder)
     results = pipeline.results(source)
-    motion, nan = pipeline.motion(results["initialize"], results["optimize"]), float("nan")
+    motion, nan = pipeline.motion_of(results), float("nan")
+    assert motion is not None
     scan, feet = source.read_scan(), {"surface_cm": nan, "sliding_cm": nan}
     if scan is not None and motion.contact_prob is not None:
         # Distance to the scan and sliding of the feet that the suit reports in contact (thesis Table 4.3).

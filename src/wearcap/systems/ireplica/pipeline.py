@@ -20,6 +20,7 @@ from wearcap.recording.timing import resampled
 from wearcap.runtime.stages import Stage, StagedSystem, run_stages
 from wearcap.runtime.system import CaptureInput
 from wearcap.scene.objects import Environment
+from wearcap.scene.placement import placed_on_scan
 from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 from wearcap.systems.ireplica.object_tracker import ObjectTracker
 from wearcap.systems.ireplica.scores import score_interactions
@@ -36,6 +37,8 @@ class IReplica(StagedSystem):
     tracker: ObjectTracker
     environment: str | Path | None = None
     """File of the objects; None: the recording's environment."""
+    place_on_scan: bool = False
+    """Whether objects' initial poses and hinges are corrected by the scan (ours), where there is one."""
     fps: float = 60.0
     """Frame rate of contacts, objects and output motion, independent of the registration's."""
     name: str = "ireplica"
@@ -59,8 +62,10 @@ class IReplica(StagedSystem):
             Stage("contacts", lambda done: self.contacts(suit), lambda: (self.predictor, suit, self.fps)),
             Stage(
                 "interact",
-                lambda done: self.interact(self.registration.motion_of(done), done["contacts"], environment),
-                lambda: (environment, self.tracker, self.fps),
+                lambda done: self.interact(
+                    self.registration.motion_of(done), done["contacts"], self.placed(environment, source)
+                ),
+                lambda: (environment, source.scan if self.place_on_scan else None, self.tracker, self.fps),
                 (*(stage.name for stage in before), "contacts"),
             ),
         ]
@@ -109,6 +114,11 @@ class IReplica(StagedSystem):
         """Contact probabilities of both hands by class, from the suit's pose alone (thesis §5.3.2)."""
         motion = resampled(suit, self.fps)
         return {"timestamps": motion.timestamps, **self.predictor(motion)}
+
+    def placed(self, environment: Environment, source: CaptureInput) -> Environment:
+        """The environment as the scan shows it, if that is wanted and there is a scan."""
+        scan = source.read_scan() if self.place_on_scan else None
+        return environment if scan is None else placed_on_scan(environment, scan)
 
     def interact(self, registered: Motion, contacts: dict[str, Tensor], environment: Environment) -> Motion:
         """Attach, correct, move and release objects, one contact interval after the other (thesis §5.3.1–5.3.3)."""

@@ -140,7 +140,8 @@ class IReplicaValidation(Callback):
             for recording, source, motion in self._registered:
                 environment = read_environment(pipeline.environment_file(source))
                 assert recording.suit is not None
-                captured = pipeline.interact(motion, pipeline.contacts(recording.suit), environment)
+                placed = pipeline.placed(environment, source)
+                captured = pipeline.interact(motion, pipeline.contacts(recording.suit), placed)
                 rows += score_interactions(captured, recording, environment).handlings
         pl_module.train(training)
         for name, value in summary(rows).items() if rows else ():

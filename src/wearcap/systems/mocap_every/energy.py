@@ -3,7 +3,8 @@
 Each term is a pure function of the edited body. The unknown is the latent z of a batch of motion windows.
 """
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -23,6 +24,8 @@ SPEED_SMOOTHING_M2_S2 = 1e-4
 """Smoothing constant of foot speeds (m²/s²): without it the energy has a kink at zero speed, where second-order solvers
 get stuck."""
 SOLVERS = ("lbfgs", "adam")
+FIRST_STEP, CURVATURES = 3.0, 10
+"""Norm of the first change of a window's latent that L-BFGS tries, and number of steps whose curvature it keeps."""
 
 
 class Body(NamedTuple):
@@ -121,7 +124,7 @@ class LatentSolver:
 
 @dataclass(frozen=True, eq=False)
 class LatentSolution:
-    """Optimised latents, and the energy by term at every evaluation."""
+    """Optimised latents, and the energy by term (summed over windows) after every evaluation."""
 
     latent: Float[Tensor, "batch channel short"]
     history: list[dict[str, float]] = field(default_factory=list)
@@ -141,14 +144,14 @@ def energy_terms(
     feet: list[int],
     fps: float,
     weights: LatentWeights,
-) -> dict[str, Float[Tensor, ""]]:
-    """Weighted terms of L = L_vis + L_reg + L_contact: means per window, summed over windows.
+) -> dict[str, Float[Tensor, "batch"]]:
+    """Weighted terms of L = L_vis + L_reg + L_contact of each window.
 
     `moved` is the latents' change from their start.
     """
     terms = {
-        "stay": weights.stay * moved.square().mean((1, 2)).sum(),
-        "contact": weights.contact * contact_slip(body, feet, fps).mean(1).sum(),
+        "stay": weights.stay * moved.square().mean((1, 2)),
+        "contact": weights.contact * contact_slip(body, feet, fps).mean(1),
     }
     for name, weight, errors in (
         ("pixel", weights.pixel, [(cue.error(body, seen), cue.confidence) for cue in seen.pixels]),
@@ -157,45 +160,107 @@ def energy_terms(
     ):
         if errors:
             observed = torch.stack([(confidence > 0).sum(1).clamp_min(1) for _, confidence in errors])
-            terms[name] = weight * sum(((e.sum(1) / n).sum() for (e, _), n in zip(errors, observed)), torch.zeros(()))
+            terms[name] = weight * torch.stack([e.sum(1) / n for (e, _), n in zip(errors, observed)]).sum(0)
     return terms
 
 
 def solve_latent(
     start: Float[Tensor, "batch channel short"],
-    energy: Callable[[Float[Tensor, "batch channel short"]], dict[str, Float[Tensor, ""]]],
+    energy: Callable[[Float[Tensor, "batch channel short"]], dict[str, Float[Tensor, "batch"]]],
     solver: LatentSolver = LatentSolver(),
 ) -> LatentSolution:
-    """Minimise the sum of the energy's terms over the latents, starting at `start`."""
-    latent = start.detach().clone(memory_format=torch.contiguous_format).requires_grad_()
-    history: list[dict[str, float]] = []
-    if solver.kind == "adam":
-        optimizer: torch.optim.Optimizer = torch.optim.Adam([latent], lr=solver.learning_rate)
-        iterations = solver.steps
-    else:
-        optimizer = torch.optim.LBFGS(
-            [latent],
-            lr=1.0,
-            max_iter=solver.steps,
-            history_size=20,
-            line_search_fn="strong_wolfe",
-            tolerance_grad=1e-7,
-            tolerance_change=1e-7,
+    """Minimise the sum of the energy's terms of each window over its latent, starting at `start`."""
+
+    def evaluate(latent: Tensor) -> _Evaluation:
+        with torch.enable_grad():
+            terms = energy(latent.requires_grad_())
+            total = torch.stack(list(terms.values())).sum(0)
+            (gradient,) = torch.autograd.grad(total.sum(), latent)
+        return _Evaluation(latent.detach(), {k: v.detach() for k, v in terms.items()}, total.detach(), gradient)
+
+    latent = start.detach().clone(memory_format=torch.contiguous_format)
+    evaluations = _adam(latent, evaluate, solver) if solver.kind == "adam" else _lbfgs(latent, evaluate, solver.steps)
+    history = []
+    for last in evaluations:
+        latent = last.latent
+        sums = {name: value.sum().item() for name, value in last.terms.items()}
+        history.append(sums | {"total": last.total.sum().item()})
+    return LatentSolution(latent, history)
+
+
+class _Evaluation(NamedTuple):
+    """Energy of each window at its latent."""
+
+    latent: Float[Tensor, "batch channel short"]
+    terms: dict[str, Float[Tensor, "batch"]]
+    total: Float[Tensor, "batch"]
+    gradient: Float[Tensor, "batch channel short"]
+
+
+def _adam(
+    latent: Float[Tensor, "batch channel short"], evaluate: Callable[[Tensor], _Evaluation], solver: LatentSolver
+) -> Iterator[_Evaluation]:
+    """Each step's evaluation, and the last latent's."""
+    optimizer = torch.optim.Adam([latent], lr=solver.learning_rate)
+    for _ in range(solver.steps):
+        before = evaluate(latent.detach().clone())
+        yield before
+        latent.grad = before.gradient
+        optimizer.step()
+    yield evaluate(latent)
+
+
+def _lbfgs(
+    start: Float[Tensor, "batch channel short"], evaluate: Callable[[Tensor], _Evaluation], steps: int
+) -> Iterator[_Evaluation]:
+    """The state after each evaluation of an L-BFGS of each window, in one batch (ours).
+
+    Windows do not depend on each other, so each has its own curvature and step length. Where a step does not decrease
+    a window's energy, that window tries a shorter one in the same evaluation in which the others take their next.
+    """
+    now = evaluate(start)
+    yield now
+    scale = FIRST_STEP / _dot(now.gradient, now.gradient).sqrt().clamp_min(1e-12)
+    length, direction, pairs = torch.ones_like(scale), -scale * now.gradient, deque(maxlen=CURVATURES)
+    for _ in range(steps - 1):
+        tried = evaluate(now.latent + length * direction)
+        enough = now.total + 1e-4 * (length * _dot(now.gradient, direction)).flatten()
+        less = tried.total <= enough  # False where an energy is not finite
+        there = less[:, None, None]
+        step = torch.where(there, tried.latent - now.latent, 0.0)
+        change = torch.where(there, tried.gradient - now.gradient, 0.0)
+        now = _Evaluation(
+            now.latent + step,
+            {name: torch.where(less, tried.terms[name], value) for name, value in now.terms.items()},
+            torch.where(less, tried.total, now.total),
+            now.gradient + change,
         )
-        iterations = 1
+        yield now
+        along, square = _dot(step, change), _dot(change, change)
+        curved = along > 1e-10 * square
+        pairs.append((step, change, torch.where(curved, 1 / along, 0.0)))
+        scale = torch.where(curved, along / square, scale)
+        direction = _newton(now.gradient, scale, pairs)
+        direction = torch.where(_dot(now.gradient, direction) < 0, direction, -scale * now.gradient)
+        length = torch.where(there, 1.0, 0.3 * length)
 
-    def closure() -> Tensor:
-        optimizer.zero_grad()
-        terms = energy(latent)
-        total = torch.stack(list(terms.values())).sum()
-        total.backward()
-        history.append({name: value.item() for name, value in terms.items()} | {"total": total.item()})
-        return total
 
-    with torch.enable_grad():
-        for _ in range(iterations):
-            optimizer.step(closure)
-    return LatentSolution(latent.detach(), history)
+def _newton(gradient: Tensor, scale: Tensor, pairs: Iterable[tuple[Tensor, Tensor, Tensor]]) -> Tensor:
+    """The two-loop recursion (Nocedal 1980) per window: -H g, where `scale` times the identity is the first H."""
+    direction, shares = -gradient, []
+    for step, change, inverse in reversed(list(pairs)):
+        shares.append(inverse * _dot(step, direction))
+        direction = direction - shares[-1] * change
+    direction = scale * direction
+    for (step, change, inverse), share in zip(pairs, reversed(shares)):
+        direction = direction + (share - inverse * _dot(change, direction)) * step
+    return direction
+
+
+def _dot(
+    a: Float[Tensor, "batch channel short"], b: Float[Tensor, "batch channel short"]
+) -> Float[Tensor, "batch 1 1"]:
+    return (a * b).sum((1, 2), keepdim=True)
 
 
 def _norm(value: Float[Tensor, "*batch axis"], epsilon: float = CUE_SMOOTHING) -> Float[Tensor, "*batch"]:

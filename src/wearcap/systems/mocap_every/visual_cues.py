@@ -157,7 +157,7 @@ class VisualCues:
             decoded = self.manifold.decode(latent)
             return X0 + smoothing @ (decoded - reconstructed) if self.residual else decoded
 
-        def terms(latent: Tensor) -> dict[str, Float[Tensor, ""]]:
+        def terms(latent: Tensor) -> dict[str, Float[Tensor, "window"]]:
             posed = Posed.decode(edited(latent), origin)
             body = energy.Body(*anchor(skeleton, posed.R_parent_joint, head), window.foot_contact)
             return energy.energy_terms(body, seen, latent - start, feet, motion.fps, self.weights)
