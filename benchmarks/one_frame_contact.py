@@ -5,8 +5,6 @@ person and no flat. value: average precision, the mean over trainings, to be at 
 baseline: the share of frames in contact, which is the average precision of a guess. ratio = value / baseline.
 """
 
-import argparse
-import json
 from collections.abc import Sequence
 
 import torch
@@ -22,7 +20,6 @@ from wearcap.simulation.people.wearer import perform
 from wearcap.simulation.places.interactive_flat import House
 from wearcap.simulation.recordings.interaction_session import FLATS, InteractionConfig, flat_of
 from wearcap.simulation.recordings.simulate import drawn_person, seeded
-from wearcap.systems.ireplica.contact_sequence import ContactSequence
 from wearcap.systems.ireplica.features import HandViews
 
 ANY = "any"
@@ -31,7 +28,6 @@ EVERY = 6
 """Step between the frames that are used: a tenth of a second."""
 UNITS, EPOCHS, BATCH, RATE = 32, 12, 512, 3e-3
 GOAL = 0.6
-WINDOW, WINDOW_STEPS, WINDOW_BATCH = 180, 500, 24
 
 
 def session(split: str, seed: int) -> tuple[Float[Tensor, "time feature"], Bool[Tensor, "time hand class"]]:
@@ -77,57 +73,12 @@ def one_frame(train: Sessions, test: Sessions, seed: int) -> list[float]:
     return [average_precision(prob[:, k], y_test[:, k] > 0.5) for k in range(y.shape[1])]
 
 
-def whole_window(train: Sessions, test: Sessions, seed: int) -> list[float]:
-    """The same of the contact network, which sees 61 frames; trained for minutes, not until it is best."""
-    torch.manual_seed(seed)
-    network = ContactSequence(train[0][0].shape[1], train[0][1].shape[2])
-    network.normalize_on(torch.stack([x[: 60 * 60] for x, _ in train]))
-    optimizer = torch.optim.AdamW(network.parameters(), RATE)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, total_steps=WINDOW_STEPS)
-    margin = (WINDOW - network(torch.zeros(1, WINDOW, network.inputs)).shape[1]) // 2
-    for _ in range(WINDOW_STEPS):
-        chosen = [train[k] for k in torch.randint(len(train), (WINDOW_BATCH,)).tolist()]
-        starts = [int(torch.randint(len(x) - WINDOW, ())) for x, _ in chosen]
-        x = torch.stack([x[start : start + WINDOW] for (x, _), start in zip(chosen, starts)])
-        y = torch.stack([y[start + margin : start + WINDOW - margin] for (_, y), start in zip(chosen, starts)])
-        loss = F.binary_cross_entropy_with_logits(network(x), y.float())
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        schedule.step()
-    network.eval()
-    with torch.no_grad():
-        prob = torch.cat([network(x[None])[0].sigmoid() for x, _ in test]).flatten(0, 1)
-    truth = torch.cat([y[margin : len(y) - margin] for _, y in test]).flatten(0, 1)
-    return [average_precision(prob[:, k], truth[:, k]) for k in range(truth.shape[1])]
-
-
-def figures(name: str, scores: Float[Tensor, "seed class"], test: Sessions) -> list[dict]:
-    """One figure for any contact, and one for each class."""
-    share = torch.cat([y.flatten(0, 1) for _, y in test]).float().mean(0).tolist()
-    found = []
-    for k, kind in enumerate((ANY, *CONTACT_CLASSES)):
-        value = scores[:, k].mean().item()
-        figure = {"name": f"{name} {kind}", "value": value, "unit": "AP", "baseline": share[k]}
-        found.append({**figure, "ratio": value / share[k], "goal": GOAL})
-    return found
-
-
-def measure(train: int = 36, test: int = 16, seeds: int = 3, window: bool = False) -> list[dict]:
-    sessions = [[session(split, k) for k in range(count)] for split, count in (("train", train), ("test", test))]
-    found = figures(
-        "one_frame_contact", torch.tensor([one_frame(*sessions, seed) for seed in range(seeds)]), sessions[1]
-    )
-    if window:
-        found += figures("whole_window_contact", torch.tensor([whole_window(*sessions, 0)]), sessions[1])
-    return found
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--window", action="store_true", help="the contact network's average precision as well (minutes)"
-    )
-    torch.set_num_threads(1)
-    for each in measure(window=parser.parse_args().window):
-        print(json.dumps(each))
+def measure(train: int = 36, test: int = 16, seeds: int = 3) -> list[dict]:
+    seen, unseen = ([session(split, k) for k in range(count)] for split, count in (("train", train), ("test", test)))
+    scores = torch.tensor([one_frame(seen, unseen, seed) for seed in range(seeds)]).mean(0).tolist()
+    shares = torch.cat([y.flatten(0, 1) for _, y in unseen]).float().mean(0).tolist()
+    return [
+        {"name": f"one_frame_contact {kind}", "value": score, "unit": "AP", "baseline": share}
+        | {"ratio": score / share, "goal": GOAL}
+        for kind, score, share in zip((ANY, *CONTACT_CLASSES), scores, shares)
+    ]
