@@ -16,7 +16,7 @@ CONFIG = InteractionConfig(minutes=1.0)
 
 @pytest.fixture(scope="module")
 def simulated():
-    return simulate_interactions(CONFIG, "session", "val", 3)
+    return simulate_interactions(CONFIG, "session", "val", 4)
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def test_a_recording_has_all_its_parts(simulated, recording):
         assert torch.equal(track.timestamps, recording.motion.timestamps)
     found = recording.localization.confidence > 0
     assert 0.8 < found.double().mean() <= 1.0
-    assert recording.location == "sim-val-interactive_flat-003"
+    assert recording.location == "sim-val-interactive_flat-004"
 
 
 def test_rows_of_one_hand_do_not_overlap(recording):
