@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 import torch
-from handled import assert_natural, level_world, palm_errors, performed, plan_at
+from handled import FPS, assert_natural, level_world, palm_errors, performed, plan_at
 
+from wearcap.body.kinematics import site_positions
 from wearcap.geometry import rotation
-from wearcap.simulation.handling.distractors import bend_over, gesture_at, hover, squat_by
+from wearcap.scene.objects import Environment
+from wearcap.simulation.handling.distractors import bend_over, gesture_at, hover, rest_on, squat_by, stand_by
 from wearcap.simulation.handling.grips import Grip, GripPlace, Handling, object_motion, still
 from wearcap.simulation.handling.holding import carry_options, lift, put_down
 from wearcap.simulation.handling.sliding import slide, slide_options
@@ -123,7 +125,7 @@ def test_distractors_stay_off_the_thing(floor, category):
     plan = plan_at(person, floor, *choice.stand)
     pose = movable.object.T_world_object
     hover(plan, choice.places, pose, rng)
-    for act in (gesture_at, bend_over, squat_by):
+    for act in (gesture_at, bend_over, squat_by, stand_by):
         act(plan, pose, movable.height, rng)
     simulated = performed(plan, floor, rng)
     assert_natural(simulated)
@@ -132,6 +134,31 @@ def test_distractors_stay_off_the_thing(floor, category):
         wrist = simulated.motion.joint(f"{side}_wrist").t.numpy()
         outside = np.maximum(np.maximum(low - wrist, wrist - high), 0.0)
         assert np.linalg.norm(outside, axis=1).min() > 0.01
+
+
+def test_hands_rest_on_a_thing_that_stays_and_hover_short_of_it(floor):
+    rng = np.random.default_rng(4)
+    person, movable = draw_person("p", rng), make_movable("table", "table_1", rng)
+    plan = plan_at(person, floor, 0.0, 0.0, 0.0)
+    options = slide_options(plan, movable, np.zeros(3), np.array([1.0, 0.0, 0.0]), rng)
+    choice = next(option for option in options if len(option.places) == 2)
+    plan = plan_at(person, floor, *choice.stand)
+    pose = movable.object.T_world_object
+    handling = rest_on(plan, movable.object, choice.places, pose, rng)
+    hover(plan, choice.places, pose, rng)
+    simulated = performed(plan, floor, rng)
+    assert_natural(simulated)
+    assert palm_errors(plan, simulated.motion).max() < 0.003
+    edges = sorted({edge for start, stop, _ in handling.rows for edge in (start, stop)})
+    assert len(edges) == 4, "each hand comes and goes in its own time"
+    track = object_motion(pose, [handling], simulated.motion)
+    assert track.t_world_body.abs().max() == 0.0
+    table = Environment((movable.object,))
+    palms = site_positions(simulated.motion.skeleton, simulated.motion.T_world_joint, ("left_palm", "right_palm"))
+    for side, palm in zip(SIDES, palms.unbind(1)):
+        for grip, least, most in zip(plan.grips[side], (0.0, 0.03), (0.02, 0.14)):
+            frame = int((grip.touch_s + grip.release_s) / 2 * FPS)
+            assert least <= table.nearest(palm[frame : frame + 1]).distance[0] < most
 
 
 @pytest.mark.parametrize("category", sorted(MOVABLES))

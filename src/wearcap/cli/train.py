@@ -44,7 +44,8 @@ def train(config: DictConfig) -> float:
         callbacks = [instantiate(callback, _convert_="all") for callback in chosen]
         callbacks.insert(0, ConfigInCheckpoint(OmegaConf.to_container(config, resolve=True)))
         if config.early_stop:
-            callbacks.append(EarlyStopping("val/loss", patience=config.early_stop))
+            best = config.callbacks.checkpoint
+            callbacks.append(EarlyStopping(best.monitor, mode=best.get("mode", "min"), patience=config.early_stop))
         loggers = [instantiate(logger, _convert_="all") for logger in (config.logger or {}).values() if logger]
         trainer: lightning.Trainer = instantiate(
             config.trainer, callbacks=callbacks, logger=loggers or False, plugins=[RunCheckpointIO(run)]

@@ -1,22 +1,37 @@
-"""Motions that resemble handling an object but are not: reaching short of it, gestures, bending over and squatting.
+"""Acts in front of an object that stays where it is: hands that rest on it, and what resembles handling but is not.
 
-Each is done where the wearer stands, in front of an object; nothing is touched or recorded as contact.
+Each is done where the wearer stands. Only `rest_on` touches the object; hands that hover stop short of it.
 """
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import torch
 
 from wearcap.geometry.rigid import Rigid
-from wearcap.simulation.handling.grips import Grip, GripPlace, Vector, still, vector
+from wearcap.scene.objects import SceneObject
+from wearcap.simulation.handling.grips import Grip, GripPlace, Handling, Vector, still, vector
 from wearcap.simulation.handling.holding import bend_for, bow, spread
-from wearcap.simulation.people.actions import ON_THIGHS, hold, squat
+from wearcap.simulation.people.actions import ON_THIGHS, POSTURES, hold, squat
 from wearcap.simulation.people.plan import SIDES, Plan
 from wearcap.simulation.people.posture import look_about, look_at
 
-SHORT_M = (0.05, 0.20)
-"""Range of the palm's distance from the surface."""
+Manner = Literal["move", "rest", "pretend"]
+"""What is done with an object: it is moved; held without being moved; or neither moved nor touched."""
+SHORT_M = (0.05, 0.10)
+"""Range of the palm's distance from the surface of an object that is not touched."""
+STAY_S, APART_S = (0.6, 3.0), 0.3
+"""Range of the root of the time for which hands stay; mean delay of each hand in coming and in leaving."""
+STANCES: dict[str, tuple[bool, tuple[float, ...]]] = {
+    "in pockets": (True, (0.10, 0.04, -0.80, 0.8, 0.5, 0.1)),
+    "hand in a pocket": (False, (0.10, 0.04, -0.80, 0.8, 0.5, 0.1)),
+    "on hips": (True, POSTURES["on_hips"][1]),
+    "on a railing": (True, (0.52, 0.02, -0.56, 0.45, 0.4, 0.3)),
+    "leaning": (False, (0.74, 0.08, -0.14, 0.5, 0.0, 0.5)),
+    "pointing": (False, (0.86, 0.00, -0.22, 0.3, 0.2, 0.0)),
+}
+"""Whether both hands take part, and the hands' pose (`HandScore.pose`), of who stands by and touches nothing."""
 LOW_M, HOVER_LOW_M = 0.60, 0.18
 """Height of places below which one bends down, and the hands' distance then, beside the object."""
 
@@ -27,22 +42,39 @@ def pretend_to_handle(
     """One of the acts that resemble handling, in front of an object of a height."""
     low = float(T_world_object.t[2]) + height_m < 0.95
     chance = rng.random()
-    if low and chance < 0.18:
+    if low and chance < 0.10:
         bend_over(plan, T_world_object, height_m, rng)
-    elif low and chance < 0.32:
+    elif low and chance < 0.18:
         squat_by(plan, T_world_object, height_m, rng)
-    elif chance < 0.45:
+    elif chance < 0.26:
         gesture_at(plan, T_world_object, height_m, rng)
-    elif chance < 0.55:  # linger
-        stop = plan.time + rng.uniform(1.0, 3.5)
-        look_about(plan, plan.time, stop, rng, spread=0.4)
-        plan.time = stop
+    elif chance < 0.42:
+        stand_by(plan, T_world_object, height_m, rng)
     else:
         hover(plan, places, T_world_object, rng)
 
 
 def hover(plan: Plan, places: dict[str, GripPlace], T_world_object: Rigid, rng: np.random.Generator) -> None:
-    """Reach for places on an object as if to take hold, stop short of them, stay a while, and draw back.
+    """Reach for places on an object as if to take hold, stop short of them, stay a while, and draw back."""
+    short = {}
+    for side, place in places.items():
+        gap = rng.uniform(*SHORT_M) * np.array(place.normal) - rng.uniform(0.0, 0.03) * np.array(place.fingers)
+        short[side] = replace(place, point=vector(np.array(place.point) + gap + 0.01 * rng.standard_normal(3)))
+    _reach_out(plan, short, T_world_object, rng)
+
+
+def rest_on(
+    plan: Plan, touched: SceneObject, places: dict[str, GripPlace], T_world_object: Rigid, rng: np.random.Generator
+) -> Handling:
+    """Put hands on places of an object and leave them there for a while; it does not move."""
+    grips = _reach_out(plan, places, T_world_object, rng)
+    return Handling.of(touched.name, touched.freedom.contact_class, still(T_world_object), grips)
+
+
+def _reach_out(
+    plan: Plan, places: dict[str, GripPlace], T_world_object: Rigid, rng: np.random.Generator
+) -> list[tuple[str, Grip]]:
+    """Reach for places, stay, and draw back; each hand comes and goes in its own time.
 
     `places` is by hand, in the object's axes; they must be within reach of the standing wearer.
     """
@@ -52,27 +84,26 @@ def hover(plan: Plan, places: dict[str, GripPlace], T_world_object: Rigid, rng: 
     crouch, lean = bend_for(plan, low - float(plan.position[2]), rng) if low < LOW_M else (0.0, 0.0)
     out = float(np.clip(rng.normal(0.8, 0.18) + crouch, 0.45, 1.6)) / briskness
     touch = start + out
-    leave = touch + rng.uniform(0.2, 2.2)
-    gap = rng.uniform(*SHORT_M) * (0.5 if crouch > 0 else 1.0)
+    leave = touch + rng.uniform(*STAY_S) ** 2
     lean = lean or float(np.clip(rng.normal(0.2, 0.1), 0.0, 0.5))
-    stop = leave
+    stop, grips = leave, []
     for side, place in places.items():
-        point = np.array(place.point) + gap * np.array(place.normal) - rng.uniform(0.0, 0.05) * np.array(place.fingers)
-        short = replace(place, point=vector(point + 0.02 * rng.standard_normal(3)))
-        late = rng.uniform(0.0, 0.3)
-        grip = Grip.drawn(short, still(T_world_object), touch + late, leave + late, rng, briskness)
+        late, later = rng.exponential(APART_S, 2)
+        grip = Grip.drawn(place, still(T_world_object), touch + late, max(leave, touch + late) + later, rng, briskness)
         if crouch > 0 or grip.start_s < plan.time:
             grip = replace(grip, reach_s=grip.touch_s - start)
         if crouch > 0:
             grip = replace(grip, return_s=1.1 * out, hover_m=HOVER_LOW_M)
         plan.grip(side, grip)
+        grips.append((side, grip))
         stop = max(stop, grip.stop_s)
     if crouch > 0:
         spread(plan, (start, start + 0.45 * out), (leave, stop))
     bow(plan, start, touch, crouch, lean)
     bow(plan, leave, stop, 0.0, 0.0)
-    _look(plan, T_world_object, first.point, start, leave)
+    _look(plan, T_world_object, first.point, start, min(leave, touch + rng.uniform(0.5, 2.0)))
     plan.time = stop
+    return grips
 
 
 def gesture_at(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.Generator) -> None:
@@ -93,6 +124,17 @@ def gesture_at(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.
     if rng.random() < 0.7:
         _look(plan, T_world_object, (0.0, 0.0, height), start + 0.2, stop - 0.8)
     plan.time = stop + 0.1
+
+
+def stand_by(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.Generator) -> None:
+    """Stand at an object of a height (m) for a while in one of `STANCES`, looking at it first and then about."""
+    start, stop = plan.time + 0.1, plan.time + rng.uniform(2.0, 6.0)
+    both, pose = list(STANCES.values())[rng.integers(len(STANCES))]
+    hold(plan, SIDES if both else (str(rng.choice(SIDES)),), pose, start, stop, rng)
+    middle = start + rng.uniform(0.8, 1.6)
+    _look(plan, T_world_object, (0.0, 0.0, height), start, middle)
+    look_about(plan, middle + 0.6, stop, rng, spread=0.4)
+    plan.time = stop
 
 
 def bend_over(plan: Plan, T_world_object: Rigid, height: float, rng: np.random.Generator) -> None:

@@ -43,6 +43,20 @@ class GripPlace:
     fingers: Vector
     """Preferred direction of the fingers; the arm may turn them some 40° about the normal."""
 
+    @property
+    def flat(self) -> bool:
+        """Whether the palm lies on an upright face."""
+        return abs(self.normal[2]) < 0.3
+
+    def varied(self, rng: np.random.Generator, roll: float, yaw: float) -> "GripPlace":
+        """The same point in a hand that is rolled about its fingers and turned about the normal by these deviations
+        (rad)."""
+        axes = torch.tensor([self.fingers, self.normal], dtype=torch.float64)
+        angles = torch.from_numpy(np.clip(rng.normal(0.0, (roll, yaw)), -2 * roll, 2 * roll))
+        rolled = exp(angles[0] * axes[0])
+        turned = rolled @ exp(angles[1] * axes[1])
+        return GripPlace(self.point, vector((turned @ axes[1]).numpy()), vector((turned @ axes[0]).numpy()))
+
 
 @dataclass(frozen=True)
 class Hold:
@@ -134,9 +148,13 @@ class Handling:
     moves: Moves
     rows: tuple[tuple[float, float, tuple[bool, bool]], ...]
     """Intervals (s) with a fixed set of holding hands, one flag for each of `HANDS`."""
+    rests_s: float = 0.0
+    """Time at which the object has come to rest (s), if that is after the last release: a door swings on."""
 
     @classmethod
-    def of(cls, name: str, contact_class: str, moves: Moves, grips: Sequence[tuple[str, Grip]]) -> "Handling":
+    def of(
+        cls, name: str, contact_class: str, moves: Moves, grips: Sequence[tuple[str, Grip]], rests_s: float = 0.0
+    ) -> "Handling":
         """A handling from its grips (side, grip): rows are split where the set of holding hands changes."""
         rows = []
         for start, stop in pairwise(sorted({time for _, grip in grips for time in (grip.touch_s, grip.release_s)})):
@@ -144,7 +162,7 @@ class Handling:
             hands = {side for side, grip in grips if grip.touch_s <= middle < grip.release_s}
             if hands:
                 rows.append((start, stop, ("left" in hands, "right" in hands)))
-        return cls(name, contact_class, moves, tuple(rows))
+        return cls(name, contact_class, moves, tuple(rows), rests_s)
 
     @property
     def start_s(self) -> float:
@@ -165,7 +183,7 @@ def object_motion(T_world_object: Rigid, handlings: Sequence[Handling], motion: 
     R = T_world_object.R.double().repeat(len(times), 1, 1)
     t = T_world_object.t.double().repeat(len(times), 1)
     for handling in sorted(handlings, key=lambda handling: handling.start_s):
-        first, last = np.searchsorted(times, (handling.start_s, handling.stop_s)).tolist()
+        first, last = np.searchsorted(times, (handling.start_s, max(handling.stop_s, handling.rests_s))).tolist()
         if first >= len(times):
             continue
         last = max(last, first + 1)

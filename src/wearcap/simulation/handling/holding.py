@@ -419,7 +419,7 @@ def put_down(plan: Plan, held: Held, rng: np.random.Generator) -> Handling:
     hover = (0.15, 0.22) if box else (0.05, 0.09) if choice.side else (0.12, 0.18)
     grips = []
     for side, place in choice.places.items():
-        late = rng.uniform(0.0, 0.12) if box and rng.random() < 0.5 else 0.0
+        late = min(rng.exponential(0.12), 0.4) if box else 0.0
         reach_s, return_s = held.touch_s - held.start_s, float(np.clip(0.7 * rise, 0.4, 1.1))
         grip = Grip(place, moves, held.touch_s, release + late, reach_s, return_s, rng.uniform(*hover))
         plan.grip(side, grip)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from wearcap.simulation.handling.distractors import Manner
+from wearcap.simulation.handling.imitating import free_hands_s, imitate
 from wearcap.simulation.handling.opening import operate
 from wearcap.simulation.handling.rearranging import rearrange, relocate
 from wearcap.simulation.people.actions import ACTIVITIES, follow, start_place
@@ -20,9 +22,11 @@ from wearcap.simulation.places.outline import distance_to_convex
 
 EVEN_S = 4.0
 """Kinds are drawn by their weight divided by the sum of this and the time for which they were held already (s)."""
-AGAIN, ROOM = 0.25, 0.10
+AGAIN, ROOM = 0.40, 0.04
 """Probability of using the last object again, and of moving several objects of one room."""
 TRIES = 5
+KEEP_UP_S = 6.0
+"""Lack of look-alikes (s) over which they certainly come next."""
 ORDINARY = ("stand", "look_around", "turn", "walk", "hold", "gesture", "carry", "reach", "sit", "crouch")
 CLOSE_BEHIND = 0.35
 """Probability of closing a door after walking through."""
@@ -49,8 +53,12 @@ class Habits:
     """Probability of using the last object again, unless it was in the hands for long."""
     near_m: float = 2.5
     """Distance per factor 1/e in the probability of an object's choice."""
-    distractor_share: float = 0.14
-    """Probability of an act in front of an object without touching it."""
+    alike: float = 1.2
+    """Time of hands in the poses of touching that touch nothing, as a share of the hands' time in contact."""
+    resting_share: float = 0.3
+    """Probability of holding an object without moving it."""
+    imitated_share: float = 0.8
+    """Share of what resembles handling that is done in the air or with something else, away from the object."""
 
 
 USUAL = Habits(
@@ -58,14 +66,14 @@ USUAL = Habits(
         "door": 1.5, "window": 2.2, "drawer": 2.2, "cabinet_door": 1.8, "sofa": 2.5, "table": 1.2, "chair": 1.2,
         "box": 0.8,
     },
-    0.42,
+    0.36,
 )  # fmt: skip
 VARIED = Habits(
     {
         "door": 3.0, "window": 4.4, "drawer": 4.4, "cabinet_door": 4.6, "sofa": 4.5, "table": 2.6, "chair": 2.4,
         "box": 0.5, "suitcase": 1.2, "backpack": 1.2, "bottle": 1.0, "tool": 1.0, "ball": 0.9,
     },
-    0.75, even=True, again=0.7, near_m=1.5, distractor_share=0.04,
+    0.75, even=True, again=0.7, near_m=1.5, alike=0.1, resting_share=0.1,
 )  # fmt: skip
 """Every kind is held for a fair share of the time, hand-held objects for about half of it."""
 
@@ -85,6 +93,8 @@ class Household:
         self.movables = {item.name: item for item in house.flat.movables}
         self.items: dict[str, Movable | Openable] = self.openables | self.movables
         self.last: str | None = None
+        self.alike_s: Counter[str] = Counter()
+        """Time of hands in look-alikes of each kind of object."""
 
     def live(self, duration_s: float) -> None:
         """Plan until a time (s) is reached, and a little beyond."""
@@ -92,7 +102,14 @@ class Household:
             start = self.plan.time
             held = sum(stop - begin for h in self.house.handlings for begin, stop, _ in h.rows)
             eager = 0.5 + 3.0 * (self.habits.held_share - held / max(start, 10.0))
-            name = self.interact() if self.rng.random() < np.clip(eager, 0.1, 0.92) else self.do_ordinary()
+            lacks = self._lacks()
+            if self.rng.random() < np.clip(sum(lacks.values()) / KEEP_UP_S, 0.0, 0.95):
+                kind = str(self.rng.choice(list(lacks), p=np.array(list(lacks.values())) / sum(lacks.values())))
+                free = free_hands_s(self.plan, self.house)
+                name = self.imitate(kind, lacks[kind])
+                self.alike_s[kind] += free_hands_s(self.plan, self.house) - free
+            else:
+                name = self.interact() if self.rng.random() < np.clip(eager, 0.1, 0.92) else self.do_ordinary()
             if self.plan.time < start + 0.05:
                 ACTIVITIES["stand"].act(self.plan, self.house.flat.static, self.rng)
                 name = "stand"
@@ -132,12 +149,32 @@ class Household:
         self.last = name
         return f"{'move' if name in self.movables else 'turn'} {self.items[name].category}"
 
-    def _act(self, name: str) -> bool:
-        pretend = self.rng.random() < self.habits.distractor_share
+    def imitate(self, kind: str, busy_s: float) -> str:
+        """Do what resembles handling a kind of object but touches none: in the air, with something else, or short of it."""
+        items = {name: item for name, item in self.items.items() if item.category == kind}
+        if self.rng.random() < self.habits.imitated_share:
+            item = items[str(self.rng.choice(list(items)))]
+            if imitate(self.plan, self.house, self.rng, item, busy_s):
+                return "imitate"
+        name = self.last if self.last in items else self._drawn(items)
+        done = self._act(name, "pretend") or (self.go(self.place_of(name), 1.0) and self._act(name, "pretend"))
+        return "pretend" if done else "stand"
+
+    def _lacks(self) -> dict[str, float]:
+        """Time (s) that look-alikes of each kind of object are behind their share of the hands' time in contact."""
+        found = {item.category: -self.alike_s[item.category] for item in self.items.values()}
+        for handling in self.house.handlings:
+            touching = sum((stop - start) * sum(hands) for start, stop, hands in handling.rows)
+            found[self.items[handling.name].category] += self.habits.alike * touching
+        return {kind: max(lack, 0.0) for kind, lack in found.items()}
+
+    def _act(self, name: str, manner: Manner | None = None) -> bool:
+        """Use one object in a manner; None: move it, or now and then only hold it."""
+        manner = manner or ("rest" if self.rng.random() < self.habits.resting_share else "move")
         if name in self.openables:
-            return self.turn(self.openables[name], pretend)
+            return self.turn(self.openables[name], manner)
         act = relocate if self.movables[name].category in ("box", *HANDHELDS) else rearrange
-        return act(self.plan, self.house, self.rng, self.movables[name], pretend)
+        return act(self.plan, self.house, self.rng, self.movables[name], manner)
 
     def rearrange_room(self) -> str:
         """Move several objects near each other, one after another."""
@@ -149,7 +186,7 @@ class Household:
             self.use(name)
         return "rearrange" if self.plan.time > start else "stand"
 
-    def turn(self, item: Openable, pretend: bool) -> bool:
+    def turn(self, item: Openable, manner: Manner) -> bool:
         """Open a closed openable, close an open one; sometimes to a value in between."""
         at, full = self.house.values[item.name], item.openness(item.opened)
         if item.openness(at) > 0.3 * full:
@@ -159,7 +196,7 @@ class Household:
         value = item.closed + share * (item.opened - item.closed)
         if abs(value - at) < 0.12 * full:
             return False
-        return operate(self.plan, self.house, self.rng, item, value, self._side(item), pretend)
+        return operate(self.plan, self.house, self.rng, item, value, self._side(item), manner)
 
     def go(self, goal: Float[np.ndarray, "3"], stop_m: float = 0.0) -> bool:
         """Walk to a floor point (m), or within `stop_m` of it, opening closed doors on the path; False on failure."""

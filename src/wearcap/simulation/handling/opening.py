@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.simulation.handling.distractors import pretend_to_handle
+from wearcap.simulation.handling.distractors import Manner, pretend_to_handle, rest_on
 from wearcap.simulation.handling.grips import Grip, Handling
 from wearcap.simulation.people.actions import approach
 from wearcap.simulation.people.plan import LEFT_SIGN, SIDES, Plan, wrap
@@ -28,10 +28,13 @@ from wearcap.simulation.places.world import World
 KEY_S = 0.2
 NEAR_M = 2.2
 """Distance from the handle's path up to which objects are checked for collisions."""
-OTHER_HAND = 0.25
-"""Probability of using the hand with the higher cost."""
+OTHER_HAND, FLAT, FLAT_M = 0.4, 0.5, 0.8
+"""Probability of using the hand with the higher cost, and of pushing with the palm where the handle is
+higher above the floor than the last (m)."""
 YAW_MOST = 1.1
 """Largest rotation of a hand on its handle (rad)."""
+EARLY = 0.25
+"""Probability of letting go of a leaf that still moves."""
 BEYOND_M = 0.4
 """Preferred distance beyond a leaf's edge."""
 OUT_RAD, OUT_M = 0.25, 0.08
@@ -78,6 +81,12 @@ class _Turn:
         amount = abs(value - start) / (np.deg2rad(80.0) if item.hinged else 0.4)
         seconds = float(np.clip((0.9 + 1.3 * amount) * rng.normal(1.0, 0.12) / plan.style.briskness, 1.0, 3.2))
         values = start + ease(np.linspace(0.0, 1.0, max(round(seconds / KEY_S), 6))) * (value - start)
+        palm_m = float(item.handle(handle, start)[2]) - floor
+        pushed = (value - start) * item.opening_sign * (1 if handle == 0 else -1) < 0
+        place = item.handles[handle].varied(rng, 0.3, 0.25)
+        if pushed and palm_m > FLAT_M and rng.random() < FLAT:
+            place = item.pushed_at(handle, rng)
+        item = replace(item, handles=(*item.handles[:handle], place, *item.handles[handle + 1 :]))
         palms = item.handle(handle, values)
         near = [
             other
@@ -125,9 +134,11 @@ class _Turn:
         """Write the grip, the steps, the object's motion and the interactions."""
         item, start, briskness = self.item, plan.time, plan.style.briskness
         touch = start + 0.75 / briskness
-        begin = touch + rng.uniform(0.05, 0.25)
+        begin = touch + 0.05 + min(rng.exponential(0.4), 2.0)
         stop = begin + self.seconds
-        release = stop + rng.uniform(0.02, 0.25)
+        release = stop + 0.02 + min(rng.exponential(0.5), 3.0)
+        if item.hinged and rng.random() < EARLY:
+            release = begin + rng.uniform(0.8, 0.95) * self.seconds
         count = max(round(self.seconds * 30), 8)
         here = np.array([*plan.position[:2], self.places[0, 2] + wrap(plan.heading - self.places[0, 2])])
         fade = np.linspace(1.0, 0.0, len(self.places))[:, None] ** 2
@@ -148,7 +159,7 @@ class _Turn:
         across = np.stack([-np.sin(path[:, 2]), np.cos(path[:, 2])], 1)
         arm = held[:, :2] - path[:, :2] - 0.18 * LEFT_SIGN[self.side] * across
         angle = np.arctan2(fingers[:, 0] * arm[:, 1] - fingers[:, 1] * arm[:, 0], (fingers * arm).sum(1))
-        yaw = YAW_MOST * np.tanh(np.unwrap(angle) / YAW_MOST)
+        yaw = (0.0 if place.flat else YAW_MOST) * np.tanh(np.unwrap(angle) / YAW_MOST)
 
         def poses(at: Float[np.ndarray, "time"], chest: Rigid) -> Rigid:
             return item.pose(self.values((at - begin) / self.seconds))
@@ -168,9 +179,9 @@ class _Turn:
         body = lambda at: np.stack([np.interp(at, times, column) for column in path.T], 1)  # noqa: E731
         shuffle(plan, rng, body, begin - 0.1, stop)
         contact_class = item.object.freedom.contact_class
-        house.handlings.append(Handling.of(item.name, contact_class, poses, [(self.side, grip)]))
+        house.handlings.append(Handling.of(item.name, contact_class, poses, [(self.side, grip)], stop))
         house.values[item.name] = self.stop
-        plan.time = max(plan.time, release)
+        plan.time = max(plan.time, release, stop)
 
 
 def operate(
@@ -180,11 +191,11 @@ def operate(
     item: Openable,
     value: float,
     handle: int = 0,
-    pretend: bool = False,
+    manner: Manner = "move",
 ) -> bool:
     """Go to an openable and bring it to a value by one of its handles; False, with nothing done, if impossible.
 
-    With `pretend`, the wearer only goes there and does something that resembles it, and nothing is touched.
+    In the manner "rest" it is held without being moved; in "pretend" nothing is touched (`Manner`).
     """
     world = house.world(plan.position)
     turn = _Turn.planned(plan, house, world, rng, item, value, handle)
@@ -195,11 +206,13 @@ def operate(
     far = np.linalg.norm(goal[:2] - plan.position[:2]) > 0.1 or abs(wrap(heading - plan.heading)) > 0.3
     if far and not approach(plan, world, rng, goal, heading):
         return False
-    if pretend:
-        place = item.handles[handle]
-        pretend_to_handle(plan, {turn.side: place}, item.pose(turn.start), place.point[2], rng)
-    else:
+    places, pose = {turn.side: turn.item.handles[handle]}, item.pose(turn.start)
+    if manner == "move":
         turn.perform(plan, house, rng)
+    elif manner == "rest":
+        house.handlings.append(rest_on(plan, item.object, places, pose, rng))
+    else:
+        pretend_to_handle(plan, places, pose, places[turn.side].point[2], rng)
     return True
 
 

@@ -5,7 +5,7 @@ from itertools import islice
 import numpy as np
 from jaxtyping import Float
 
-from wearcap.simulation.handling.distractors import pretend_to_handle
+from wearcap.simulation.handling.distractors import Manner, pretend_to_handle, rest_on
 from wearcap.simulation.handling.grips import GripPlace
 from wearcap.simulation.handling.holding import Errand, HeldObject, carry_options, lift, put_down, take_options
 from wearcap.simulation.handling.sliding import Slide, slide, slide_options
@@ -33,10 +33,10 @@ REACHABLE_SHARE = 0.85
 KEYS = np.linspace(0.0, 1.0, 9)
 
 
-def rearrange(plan: Plan, house: House, rng: np.random.Generator, movable: Movable, pretend: bool) -> bool:
+def rearrange(plan: Plan, house: House, rng: np.random.Generator, movable: Movable, manner: Manner) -> bool:
     """Slide an object to another place nearby; False, with nothing done, where none is found or reachable.
 
-    With `pretend`, the wearer only goes there and does something that resembles it, and nothing is touched.
+    In the manner "rest" it is held without being moved; in "pretend" nothing is touched (`Manner`).
     """
     world = house.world(plan.position)
     choice = _drawn_slide(plan, house, world, rng, movable)
@@ -45,19 +45,19 @@ def rearrange(plan: Plan, house: House, rng: np.random.Generator, movable: Movab
     far = np.linalg.norm(choice.stand[:2] - plan.position[:2]) > 0.25
     if far and not _go_to(plan, world, rng, choice.stand):
         return False
-    if pretend:
-        _pretend(plan, house, rng, choice, {side: choice.places[side] for side in choice.hands[0]})
+    if manner != "move":
+        _stay(plan, house, rng, choice, {side: choice.places[side] for side in choice.hands[0]}, manner)
         return True
     house.handlings.append(slide(plan, choice, rng, float(plan.position[2])))
     house.poses[movable.name] = floor_pose(choice.stop, float(house.poses[movable.name].t[2]))
     return True
 
 
-def relocate(plan: Plan, house: House, rng: np.random.Generator, movable: Movable, pretend: bool) -> bool:
+def relocate(plan: Plan, house: House, rng: np.random.Generator, movable: Movable, manner: Manner) -> bool:
     """Carry an object to another place on the floor; False, with nothing done, where none is found or reachable.
 
-    All but boxes are used before or after. With `pretend`, the wearer only goes there and does something that
-    resembles it, and nothing is touched.
+    All but boxes are used before or after. In the manner "rest" it is held without being moved; in "pretend" nothing is
+    touched (`Manner`).
     """
     world, box = house.world(plan.position), movable.category == "box"
     for _ in range(PLACES):
@@ -70,8 +70,8 @@ def relocate(plan: Plan, house: House, rng: np.random.Generator, movable: Movabl
         return False
     if not _go_to(plan, world, rng, choice.stand):
         return False
-    if pretend:
-        _pretend(plan, house, rng, choice, choice.places)
+    if manner != "move":
+        _stay(plan, house, rng, choice, choice.places, manner)
         return True
     held = lift(plan, choice, rng)
     early = isinstance(held, HeldObject) and rng.random() < USED_BEFORE
@@ -90,12 +90,21 @@ def _go_to(plan: Plan, world: World, rng: np.random.Generator, place: Float[np.n
     return approach(plan, world, rng, np.append(place[:2], plan.position[2]), place[2])
 
 
-def _pretend(
-    plan: Plan, house: House, rng: np.random.Generator, choice: Slide | Errand, places: dict[str, GripPlace]
+def _stay(
+    plan: Plan,
+    house: House,
+    rng: np.random.Generator,
+    choice: Slide | Errand,
+    places: dict[str, GripPlace],
+    manner: Manner,
 ) -> None:
-    """Do something that resembles handling an object, standing where it would be handled."""
+    """Hold an object, or do what resembles it, standing where it would be handled; the object stays where it is."""
     step_to(plan, rng, choice.stand[:2], choice.stand[2])
-    pretend_to_handle(plan, places, house.poses[choice.movable.name], choice.movable.height, rng)
+    pose = house.poses[choice.movable.name]
+    if manner == "rest":
+        house.handlings.append(rest_on(plan, choice.movable.object, places, pose, rng))
+    else:
+        pretend_to_handle(plan, places, pose, choice.movable.height, rng)
 
 
 def _drawn_slide(plan: Plan, house: House, world: World, rng: np.random.Generator, movable: Movable) -> Slide | None:

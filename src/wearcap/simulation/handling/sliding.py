@@ -137,12 +137,13 @@ def _drawn(
     middle = rail.length / 2 + float(np.clip(rng.normal(0.0, 0.4), -1, 1)) * min(reach, 0.5)
     if turned > 0.5:  # the lever is longer near an end
         middle = rail.length / 2 + float(rng.choice([-1.0, 1.0])) * reach * rng.uniform(0.0, 0.8)
-    tilt = rng.uniform(0.0, 0.18)
+    tilt, across = rng.uniform(0.0, 0.18), 0.85 * rng.beta(0.6, 1.2)
     places = {}
     for side in used:
         offset = -LEFT_SIGN[side] * apart / 2 + 0.03 * rng.standard_normal() * (rail.length > 0.1)
         along = float(np.clip(middle + offset, 0.0, rail.length))
-        places[side] = rail.at(along, tilt + rng.normal(0.0, 0.05))
+        place = rail.at(along, tilt + rng.normal(0.0, 0.05), across + 0.15 * rng.uniform())
+        places[side] = place.varied(rng, 0.12, 0.25)
     bow = float(np.clip(rng.normal(0.0, 0.05), -0.1, 0.1)) * length if turned == 0 else 0.0
     # the middle of the feet: toes clear of the object, hands in front of their shoulders
     ahead, left = turn(rail.facing).T
@@ -165,10 +166,10 @@ def slide(plan: Plan, choice: Slide, rng: np.random.Generator, floor_z: float = 
     """
     arrive(plan, rng, choice.stand)
     touch = plan.time + float(np.clip(rng.normal(0.8, 0.15) / plan.style.briskness, 0.5, 1.3))
-    begin = touch + rng.uniform(0.25, 0.8)
+    begin = touch + 0.2 + min(rng.exponential(0.5), 2.5)
     end = begin + (choice.seconds + choice.pause_s)
     moves = lambda times, chest: floor_pose(choice.object_at(choice.share(times - begin)), floor_z)  # noqa: E731
-    release = end + rng.uniform(0.1, 0.7)
+    release = end + 0.05 + min(rng.exponential(0.7), 3.0)
     # one grip per hand, from its first to its last set; sets change while the object moves
     count = len(choice.hands)
     cuts = begin + (end - begin) * (np.arange(1, count) + 0.25 * rng.uniform(-1, 1, count - 1)) / count
@@ -203,7 +204,7 @@ def slide(plan: Plan, choice: Slide, rng: np.random.Generator, floor_z: float = 
 
 def _stagger(rng: np.random.Generator) -> float:
     """Delay between hands (s): they come and go together, or one after the other."""
-    return rng.uniform(0.05, 0.25) if rng.random() < 0.5 else 0.0
+    return min(rng.exponential(0.25), 0.9) if rng.random() < 0.7 else 0.0
 
 
 def _lean(

@@ -49,15 +49,20 @@ class Rail:
     stand_off: float
     """Distance from the middle of the rail back to the footprint's edge, against `facing` (m)."""
     both_hands: bool = True
+    spare: Vector = (0.0, 0.0, 0.0)
+    """Displacement to the far edge of the band along the rail in which hands can rest (m)."""
 
     @property
     def length(self) -> float:
         return float(np.linalg.norm(np.subtract(self.stop, self.start)))
 
-    def at(self, along: float, tilt: float = 0.0) -> GripPlace:
-        """A place `along` the rail from its start (m), the hand tipped towards the holder by `tilt` (rad)."""
+    def at(self, along: float, tilt: float = 0.0, across: float = 0.0) -> GripPlace:
+        """A place `along` the rail from its start (m), the hand tipped towards the holder by `tilt` (rad).
+
+        `across` is its share of the way to the far edge of the rail's band.
+        """
         share = along / self.length if self.length > 0 else 0.0
-        point = np.array(self.start) + share * np.subtract(self.stop, self.start)
+        point = np.array(self.start) + share * np.subtract(self.stop, self.start) + across * np.array(self.spare)
         normal, fingers = np.array(self.normal), np.array(self.fingers)
         cos, sin = np.cos(tilt), np.sin(tilt)
         normal, fingers = cos * normal - sin * fingers, cos * fingers + sin * normal
@@ -144,12 +149,13 @@ def _sofa(rng: np.random.Generator) -> Movable:
     piece = MAKERS["armchair" if rng.random() < 0.3 else "sofa"](rng)
     half_depth, half_width = piece.size[0] / 2, piece.size[1] / 2
     x, y = -half_depth + 0.012, half_width - 0.1
-    rails = [Rail((x, y, 0.85), (x, -y, 0.85), UP, (1.0, 0.0, 0.0), 0.0, 0.012)]
+    rails = [Rail((x, y, 0.85), (x, -y, 0.85), UP, (1.0, 0.0, 0.0), 0.0, 0.012, spare=(0.18, 0.0, 0.0))]
     for sign in (1.0, -1.0):
         y = sign * (half_width - 0.015)
         ends = (half_depth - 0.06, y, 0.62), (-half_depth + 0.3, y, 0.62)
         # who looks at the right arm (sign < 0) has the sofa's back on the left
-        rails.append(Rail(*ends[:: int(sign)], UP, (0.0, -sign, 0.0), -sign * np.pi / 2, 0.015))
+        spare = (0.0, -0.12 * sign, 0.0)
+        rails.append(Rail(*ends[:: int(sign)], UP, (0.0, -sign, 0.0), -sign * np.pi / 2, 0.015, spare=spare))
     return _sliding(piece, rails)
 
 
@@ -165,7 +171,8 @@ def _table(rng: np.random.Generator) -> Movable:
         deep, wide = abs(ahead @ half), abs(left @ half) - 0.08
         edge = -(deep - 0.012) * ahead
         start, stop = (vector(np.append(edge + sign * wide * left, top)) for sign in (1.0, -1.0))
-        rails.append(Rail(start, stop, UP, (float(ahead[0]), float(ahead[1]), 0.0), facing, 0.012))
+        fingers, spare = (float(ahead[0]), float(ahead[1]), 0.0), vector(np.append(0.22 * ahead, 0.0))
+        rails.append(Rail(start, stop, UP, fingers, facing, 0.012, spare=spare))
     return _sliding(bare, rails)
 
 

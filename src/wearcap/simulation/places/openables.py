@@ -15,7 +15,7 @@ from jaxtyping import Float
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.scene.objects import Freedom, SceneObject
-from wearcap.simulation.handling.grips import GripPlace, vector
+from wearcap.simulation.handling.grips import SKIN_M, GripPlace, vector
 from wearcap.simulation.places.builder import Part, Piece, hue
 from wearcap.simulation.places.furniture import PATTERNED, PLAIN, parts_of, wood
 
@@ -92,6 +92,20 @@ class Openable:
         """Position of the palm on a handle, in the world (m)."""
         pose = self.pose(values)
         return pose.t.numpy() + pose.R.numpy() @ np.array(self.handles[number].point)
+
+    def pushed_at(self, number: int, rng: np.random.Generator) -> GripPlace:
+        """A place for a flat palm on the face beside a handle, in its own axes: its front is pushed there."""
+        x_low, y_low, x_high, y_high = *self.outline.min(0), *self.outline.max(0)
+        low, high = (z - float(self.object.t_world_object[2]) for z in self.z_range)
+        z = float(np.clip(rng.uniform(0.95, 1.45), low + 0.05, high - 0.05))
+        aside = rng.normal(0.0, 0.35)
+        if not self.hinged:  # its handle stands out by 3 cm beyond the front
+            y = rng.uniform(0.2, 0.45) * (y_high - y_low) * rng.choice([-1.0, 1.0])
+            return GripPlace((SKIN_M, y, z), (1.0, 0.0, 0.0), vector(np.array([0.0, np.sin(aside), np.cos(aside)])))
+        sign = self.opening_sign * (1 if number == 0 else -1)
+        edge = 0.03 if self.category == "window" else rng.uniform(0.10, 0.45) * (x_high - x_low)
+        point = (x_high - edge, (y_high if sign > 0 else y_low) + sign * SKIN_M, z)
+        return GripPlace(point, (0.0, sign, 0.0), vector(np.array([np.sin(aside), 0.0, np.cos(aside)])))
 
     def blocks(self, value: float) -> bool:
         """Whether it is a door that is not open enough to walk through."""

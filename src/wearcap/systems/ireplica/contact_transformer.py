@@ -18,12 +18,30 @@ from wearcap.systems.ireplica.contact_prediction import FRAMES, ContactNetwork
 _WIDTH, _HEADS, _LAYERS, _HANDS = 32, 8, 3, 2
 
 
+class Dropout(nn.Module):
+    """nn.Dropout with a mask of random bytes: six times as fast on a CPU, where masks took half of a training step.
+
+    The share that is dropped is a multiple of 1/256.
+    """
+
+    def __init__(self, share: float):
+        super().__init__()
+        self.least = round(256 * share)
+
+    def forward(self, x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+        if not self.training or self.least == 0:
+            return x
+        words = torch.empty(-(-x.numel() // 8), dtype=torch.int64, device=x.device).random_(-(2**63), None)
+        kept = words.view(torch.uint8)[: x.numel()].view(x.shape) >= self.least
+        return x * (kept * (256 / (256 - self.least)))
+
+
 class Attention(nn.Module):
     """Multi-head self-attention, its parameters named and shaped as in nn.MultiheadAttention."""
 
     def __init__(self, dropout: float):
         super().__init__()
-        self.dropout = dropout
+        self.dropout = Dropout(dropout)
         self.in_proj_weight = nn.Parameter(nn.init.xavier_uniform_(torch.empty(3 * _WIDTH, _WIDTH)))
         self.in_proj_bias = nn.Parameter(torch.zeros(3 * _WIDTH))
         self.out_proj = nn.Linear(_WIDTH, _WIDTH)
@@ -32,7 +50,11 @@ class Attention(nn.Module):
     def forward(self, x: Float[Tensor, "sequence token width"]) -> Float[Tensor, "sequence token width"]:
         projected = F.linear(x, self.in_proj_weight, self.in_proj_bias)
         q, k, v = projected.unflatten(-1, (3, _HEADS, -1)).permute(2, 0, 3, 1, 4)
-        attended = F.scaled_dot_product_attention(q, k, v, dropout_p=self.dropout if self.training else 0.0)
+        if self.training:
+            weights = (q / math.sqrt(q.shape[-1]) @ k.transpose(-1, -2)).softmax(-1)
+            attended = self.dropout(weights) @ v
+        else:
+            attended = F.scaled_dot_product_attention(q, k, v)
         return self.out_proj(attended.transpose(1, 2).flatten(2))
 
 
@@ -44,7 +66,7 @@ class EncoderLayer(nn.Module):
         self.self_attn = Attention(dropout)
         self.linear1, self.linear2 = nn.Linear(_WIDTH, _WIDTH), nn.Linear(_WIDTH, _WIDTH)
         self.norm1, self.norm2 = nn.LayerNorm(_WIDTH), nn.LayerNorm(_WIDTH)
-        self.dropout = nn.Dropout(dropout)
+        self.dropout = Dropout(dropout)
 
     def forward(self, x: Float[Tensor, "sequence token width"]) -> Float[Tensor, "sequence token width"]:
         x = self.norm1(x + self.dropout(self.self_attn(x)))
@@ -72,7 +94,7 @@ class ContactTransformer(ContactNetwork):
         self.layers = nn.ModuleList(EncoderLayer(dropout) for _ in range(_LAYERS))
         self.decoder = nn.Linear(_WIDTH, _HANDS)
         self.aggregator = nn.Linear(FRAMES * _HANDS, _HANDS)
-        self.dropout = nn.Dropout(dropout)
+        self.dropout = Dropout(dropout)
 
     def forward(self, pose: Float[Tensor, "batch time feature"]) -> Float[Tensor, "batch out hand class"]:
         windows = pose.unfold(1, FRAMES, 1).transpose(-1, -2).flatten(0, 1)
