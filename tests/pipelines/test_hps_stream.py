@@ -94,6 +94,18 @@ def test_lost_localisation_is_bridged_by_the_suit():
     assert error[-60:].mean() < 6.0
 
 
+def test_a_path_that_has_drifted_is_left_within_three_seconds():
+    recording = hps_recording(seconds=18.0)
+    assert recording.suit is not None
+    share = ((recording.suit.timestamps - 8.0) / 4.0).clamp(0.0, 1.0).float()
+    drift = share[:, None] * torch.tensor([0.5, -0.6, 0.0])
+    drifting = replace(recording, suit=replace(recording.suit, t_world_root=recording.suit.t_world_root + drift))
+    motions = list(follow(hps(), pieces(drifting, lost=(8.0, 12.0)), Scan(floor_points()), settings=SETTINGS))
+    error = root_error_cm(motions, recording)
+    assert error[int(11.0 * 30)] > 30.0
+    assert error[15 * 30 :].max() < 10.0
+
+
 def test_a_camera_that_falls_silent_for_longer_than_a_window_is_bridged_too():
     recording = hps_recording(seconds=20.0)
     stream = HpsStream(hps(), recording, Scan(floor_points()), SETTINGS)

@@ -20,7 +20,7 @@ from wearcap.body import skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry import rigid, rotation, trajectory
 from wearcap.geometry.rigid import Rigid
-from wearcap.optimize.hps import HpsState
+from wearcap.optimize.hps import HpsData, HpsState
 from wearcap.recording import Motion, Recording
 from wearcap.recording import motion as motion_types
 from wearcap.recording import recording as recording_types
@@ -39,6 +39,9 @@ MAX_UNALIGNED_S = 600.0
 MAX_PAUSE_S = 10.0
 """Longest gap (s) within a stretch. A piece after a longer one is kept aside until the next piece continues it; then a
 new stretch begins."""
+MISSED_M, SEEN_S = 0.05, 0.3
+"""Distance (m) of the last final frame from the localised path that is made up for, and time (s) for which the camera
+must be localised after it."""
 _LOCALIZED = ("timestamps", "R_world_cam", "t_world_cam", "confidence")
 
 
@@ -58,6 +61,8 @@ class StreamSettings:
     """Length of final motion that a window is constrained to."""
     tie: float = 30.0
     """Weight of a final frame's position, relative to a localised frame's (1)."""
+    recovery_s: float = 1.0
+    """Time in which the path returns to the camera's when that is found again."""
 
 
 def _suit_fault(suit: object, like: Motion | None) -> str | None:
@@ -275,13 +280,8 @@ class HpsStream:
         recording = replace(self.about, suit=self.suit, localization=self.seen)
         data = self.hps.problem(recording, aligned, start, self.scan, self.R_head_cam)[first:]
         if self.done is not None:
-            # Final frames constrain the window: their positions replace the camera's in the `hold` term.
             count = int((times[first:] <= self.done.timestamps[-1] + 0.5 / fps).sum())
-            final = self.done.sliced(len(self.done) - count, len(self.done))
-            t, hold = data.start.t_world_root.clone(), data.hold_confidence.clone()
-            t[:count], hold[:count] = final.t_world_root.double(), settings.tie
-            tied = HpsState(data.start.theta, data.start.R_world_root, t)
-            data = replace(data, start=tied, hold_confidence=hold)
+            data = self._tied(data, self.done.sliced(len(self.done) - count, len(self.done)))
         solution = self.hps.optimize(data)
         part = replace(start, motion=start.motion.sliced(first, len(times)))
         motion = self.hps.motion(part, solution)
@@ -294,6 +294,23 @@ class HpsStream:
         self.done = motion.sliced(max(0, stop - keep), stop)
         self._forget(motion.timestamps[stop - 1].item() - settings.window_s)
         return motion.sliced(begin, stop)
+
+    def _tied(self, data: HpsData, final: Motion) -> HpsData:
+        """The window's data after frames that are final: their positions replace the camera's in the `hold` term.
+
+        Where they had drifted, and the camera is localised again, the way from the last of them to the localised path
+        is covered within `recovery_s`, in addition to the suit's displacements.
+        """
+        fps, count = self.hps.fps, len(final)
+        t, hold, t_step = data.start.t_world_root.clone(), data.hold_confidence.clone(), data.steps.t_step.clone()
+        missed = t[count - 1] - final.t_world_root[-1].double()
+        if missed.norm() > MISSED_M and hold[count:].count_nonzero() >= SEEN_S * fps:
+            share = (torch.arange(len(t) - count + 1) / (fps * self.settings.recovery_s)).clamp(max=1.0).to(t)
+            t[count:] -= (1 - share[1:, None]) * missed
+            t_step[count - 1 :] += share.diff()[:, None] * missed
+        t[:count], hold[:count] = final.t_world_root.double(), self.settings.tie
+        tied = HpsState(data.start.theta, data.start.R_world_root, t)
+        return replace(data, start=tied, hold_confidence=hold, steps=replace(data.steps, t_step=t_step))
 
     def _window(self) -> Motion:
         """Aligned suit motion of the window at the pipeline's rate."""
