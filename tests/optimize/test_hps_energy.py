@@ -159,7 +159,7 @@ def test_compiled_energy_and_gradient_agree_with_autograd(name):
     energy = HpsEnergy({term: 1.0 + place for place, term in enumerate(TERMS) if name in (term, "all")}, MIXED)
     state = disturbed(data, 0.05)
     stretch = Stretch(energy, data, state)
-    compiled = stretch.evaluate(1e-9, look_up=True)
+    compiled = stretch.evaluate(1e-9)
     theta, t = state.theta.clone().requires_grad_(), state.t_world_root.clone().requires_grad_()
     turn = torch.zeros_like(t).requires_grad_()
     terms = energy_terms(energy, data, HpsState(theta, state.R_world_root @ rotation.exp(turn), t))
@@ -191,7 +191,7 @@ def test_automatic_derivatives_agree_with_the_compiled_ones(name, monkeypatch):
     for term in (TERMS[name], replace(TERMS[name], expected=())):
         monkeypatch.setitem(TERMS, name, term)
         stretch = Stretch(energy, data, state)
-        systems.append([np.array(stretch.evaluate(1e-3, look_up=True)["total"])])
+        systems.append([np.array(stretch.evaluate(1e-3)["total"])])
         stretch.fill_system()
         systems[-1] += [part.copy() for part in stretch.system]
     block = 0.05 if TERMS[name].inputs[0].startswith("R_") else 1e-9  # the kernels leave out half the turn's own slope

@@ -109,7 +109,7 @@ def solve_banded(
     for iteration in range(settings.iterations + 1):
         share = min(1.0, iteration / max(settings.iterations - 3, 1))
         smooth = settings.smooth_start ** (1 - share) * settings.smooth_end**share
-        history.append(problem.evaluate(smooth, look_up=iteration < 3 or iteration % 3 == 0))
+        history.append(problem.evaluate(smooth))
         totals = [entry["total"] for entry in history]
         if totals[-1] <= min(totals):
             best = problem.state()
@@ -144,13 +144,12 @@ class Stretch:
         """The weighted terms in the order of `rows`."""
         self.linearized: list[tuple[Tensor, Tensor, Tensor]] = []
 
-    def evaluate(self, smooth: float, look_up: bool) -> dict[str, float]:
-        """Energy by term at the current state; with `look_up` the scene below the feet is queried again."""
+    def evaluate(self, smooth: float) -> dict[str, float]:
+        """Energy by term at the current state, on the scene that is below the feet there."""
         kernels.update_kinematics(self.theta, self.R_root, self.t, self.body, self.kin)
-        if look_up:
-            ground = find_ground(self.data, torch.from_numpy(self.kin.points), self.energy)
-            self.values = data_values(self.data, ground)
-            self.rows = self._rows()
+        ground = find_ground(self.data, torch.from_numpy(self.kin.points), self.energy)
+        self.values = data_values(self.data, ground)
+        self.rows = self._rows()
         for form in self.forms:
             form.fill(0.0)
         by_term = np.zeros(len(TERMS))
