@@ -11,7 +11,7 @@ import torch
 
 from wearcap.geometry.rigid import Rigid
 from wearcap.scene.objects import SceneObject
-from wearcap.simulation.handling.grips import Grip, GripPlace, Handling, Vector, still, vector
+from wearcap.simulation.handling.grips import Grip, GripPlace, Handling, Vector, still, vector, wandering
 from wearcap.simulation.handling.holding import bend_for, bow, spread
 from wearcap.simulation.people.actions import ON_THIGHS, POSTURES, hold, squat
 from wearcap.simulation.people.plan import SIDES, Plan
@@ -60,21 +60,21 @@ def hover(plan: Plan, places: dict[str, GripPlace], T_world_object: Rigid, rng: 
     for side, place in places.items():
         gap = rng.uniform(*SHORT_M) * np.array(place.normal) - rng.uniform(0.0, 0.03) * np.array(place.fingers)
         short[side] = replace(place, point=vector(np.array(place.point) + gap + 0.01 * rng.standard_normal(3)))
-    _reach_out(plan, short, T_world_object, rng)
+    _reach_out(plan, short, T_world_object, rng, free=True)
 
 
 def rest_on(
     plan: Plan, touched: SceneObject, places: dict[str, GripPlace], T_world_object: Rigid, rng: np.random.Generator
 ) -> Handling:
     """Put hands on places of an object and leave them there for a while; it does not move."""
-    grips = _reach_out(plan, places, T_world_object, rng)
+    grips = _reach_out(plan, places, T_world_object, rng, free=False)
     return Handling.of(touched.name, touched.freedom.contact_class, still(T_world_object), grips)
 
 
 def _reach_out(
-    plan: Plan, places: dict[str, GripPlace], T_world_object: Rigid, rng: np.random.Generator
+    plan: Plan, places: dict[str, GripPlace], T_world_object: Rigid, rng: np.random.Generator, free: bool
 ) -> list[tuple[str, Grip]]:
-    """Reach for places, stay, and draw back; each hand comes and goes in its own time.
+    """Reach for places, stay, and draw back; each hand comes and goes in its own time, and wanders where it is free.
 
     `places` is by hand, in the object's axes; they must be within reach of the standing wearer.
     """
@@ -89,7 +89,8 @@ def _reach_out(
     stop, grips = leave, []
     for side, place in places.items():
         late, later = rng.exponential(APART_S, 2)
-        grip = Grip.drawn(place, still(T_world_object), touch + late, max(leave, touch + late) + later, rng, briskness)
+        moves = wandering(still(T_world_object), rng) if free else still(T_world_object)
+        grip = Grip.drawn(place, moves, touch + late, max(leave, touch + late) + later, rng, briskness)
         if crouch > 0 or grip.start_s < plan.time:
             grip = replace(grip, reach_s=grip.touch_s - start)
         if crouch > 0:

@@ -32,6 +32,10 @@ def vector(values: Float[np.ndarray, "3"]) -> Vector:
     return x, y, z
 
 
+WANDER_M, WANDER_HZ = 0.012, (0.15, 0.8)
+"""Deviation (m) of each of three waves per axis, and range of their frequencies, of hands that are not held."""
+
+
 @dataclass(frozen=True)
 class GripPlace:
     """Place of a palm on an object, in the object's axes."""
@@ -137,6 +141,19 @@ def still(T_world_object: Rigid) -> Moves:
     return lambda times, chest: Rigid(
         T_world_object.R.double().expand(len(times), 3, 3), T_world_object.t.double().expand(len(times), 3)
     )
+
+
+def wandering(moves: Moves, rng: np.random.Generator) -> Moves:
+    """The same motion with a drift of centimetres within seconds: hands that nothing holds do not keep their place."""
+    hertz, phase = rng.uniform(*WANDER_HZ, (3, 3)), rng.uniform(0.0, 2 * np.pi, (3, 3))
+    amount = rng.normal(0.0, WANDER_M, (3, 3))
+
+    def wandered(times: Float[np.ndarray, "time"], T_world_chest: Rigid) -> Rigid:
+        T = moves(times, T_world_chest)
+        waves = amount * np.sin(2 * np.pi * hertz * times[:, None, None] + phase)
+        return Rigid(T.R, T.t + torch.from_numpy(waves.sum(2)))
+
+    return wandered
 
 
 @dataclass(frozen=True)

@@ -53,11 +53,11 @@ class Habits:
     """Probability of using the last object again, unless it was in the hands for long."""
     near_m: float = 2.5
     """Distance per factor 1/e in the probability of an object's choice."""
-    alike: float = 1.2
+    alike: float = 0.9
     """Time of hands in the poses of touching that touch nothing, as a share of the hands' time in contact."""
-    resting_share: float = 0.3
+    resting_share: float = 0.2
     """Probability of holding an object without moving it."""
-    imitated_share: float = 0.8
+    imitated_share: float = 0.5
     """Share of what resembles handling that is done in the air or with something else, away from the object."""
 
 

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 
 from wearcap.geometry import rotation
+from wearcap.simulation.handling.grips import wandering
 from wearcap.simulation.handling.opening import operate
 from wearcap.simulation.handling.rearranging import rearrange, relocate
 from wearcap.simulation.people.plan import Plan
@@ -27,7 +28,17 @@ COPY = "something"
 
 def imitate(plan: Plan, house: House, rng: np.random.Generator, item: Movable | Openable, busy_s: float) -> bool:
     """Handle a copy of an object at a free place until hands were busy for some time (s); False, with nothing done, where
-    none is found."""
+    none is found. Nothing guides the hands: they stray from the paths of hands that hold something."""
+    before = {side: len(grips) for side, grips in plan.grips.items()}
+    done = _handle_copy(plan, house, rng, item, busy_s)
+    for side, count in before.items():
+        free = [replace(grip, moves=wandering(grip.moves, rng)) for grip in plan.grips[side][count:]]
+        plan.grips[side][count:] = free
+    return done
+
+
+def _handle_copy(plan: Plan, house: House, rng: np.random.Generator, item: Movable | Openable, busy_s: float) -> bool:
+    """The same with hands that keep to the copy."""
     until = free_hands_s(plan, house) + busy_s
     flat, points = house.flat, house.world(plan.position).navigation.node_points
     points = points[np.linalg.norm(points[:, :2] - plan.position[:2], axis=1) < NEAR_M]
