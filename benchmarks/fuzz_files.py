@@ -27,6 +27,7 @@ import test_aria_mps  # noqa: E402
 import test_asf_amc  # noqa: E402
 import test_colmap  # noqa: E402
 import test_egohoi  # noqa: E402
+import test_hand_detections  # noqa: E402
 import test_hcontact  # noqa: E402
 import test_mvnx  # noqa: E402
 import test_watch_log  # noqa: E402
@@ -46,6 +47,7 @@ from wearcap.io.formats import (  # noqa: E402
     contact_labels,
     csv_table,
     environment,
+    hand_detections,
     motion_npz,
     mvnx,
     npz,
@@ -173,6 +175,16 @@ def _xdata(path: Path) -> None:
     )
 
 
+def _hand_detections(folder: Path) -> None:
+    for name in ("HOD", "VISOR", "COCO"):
+        (folder / f"{name}.json").write_text(json.dumps(getattr(test_hand_detections, name)))
+
+
+def _vertex_contacts(folder: Path) -> None:
+    np.savez(folder / "p.npz", contact=np.full((3, 8), 0.5, np.float32), frames=[1, 2, 4])
+    (folder / "s.json").write_text('{"leftHand": [0, 1], "rightHand": [2], "rightHandIndex1": [3]}')
+
+
 def _environment(folder: Path) -> None:
     mesh = np.array([[0, 0, 0], [1, 0, 0], [1, 0, 2], [0, 0, 2]], np.float32)
     ply.write_ply(ply.Ply(mesh, None, np.array([[0, 1, 2], [0, 2, 3]], np.int32)), folder / "objects/door.ply")
@@ -261,6 +273,13 @@ READERS: dict[str, Reader] = {
     "egohoi_locations": _one("l.json", json.dumps(test_egohoi.SLID), egohoi.read_object_locations),
     "environment": Reader(_environment, environment.read_environment),
     "euroc": _one("e.csv", EUROC, poses.read_euroc),
+    "hand_detections": Reader(
+        _hand_detections,
+        lambda folder: [hand_detections.read_hand_detections(path, 0.5) for path in sorted(folder.iterdir())],
+    ),
+    "vertex_contacts": Reader(
+        _vertex_contacts, lambda folder: hand_detections.read_vertex_contacts(folder / "p.npz", folder / "s.json")
+    ),
     "hcontact": Reader(
         lambda folder: test_hcontact.write_set(folder, frames=FRAMES),
         lambda folder: hcontact.read_hcontact(folder, test_hcontact.DOOR),
