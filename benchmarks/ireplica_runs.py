@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import torch
 from hydra.utils import instantiate
+from interaction_rig import rig_distances, rig_looks
+from rgb_objects import found_objects, with_found_objects
 from seen_flat import SeenFlat
 from simulated_detections import FPS, HOD, detections, seen_hands
 from torch import Tensor
@@ -42,6 +44,8 @@ ON_BENT_PATH = (
     "ours, on the bent path, w/o contact corr.",
 )
 """Rows whose wearer is registered as documented; HPS registers the others'."""
+RIG_ROWS = ("HPS", "as published", "ours")
+"""Rows that are measured by depth cameras, too."""
 GAPS_S = (0.0, 0.25, 0.5, 1.0, 2.0)
 """Of the paper's Table 5.4."""
 
@@ -100,6 +104,7 @@ def run_recording(run: RecordingRun) -> dict[str, Any]:
     placed = ours.placed(case.environment, case.source)
     contacts = {"ours": _contacts(ours, case), "published": _contacts(published, case)}
     seen = SeenFlat.of(case.recording)
+    objects = None if seen is None else found_objects(seen)
     if seen is not None:
         contacts["detections"] = detected_contacts(seen, contacts["ours"]["timestamps"])
     rows = {
@@ -121,6 +126,11 @@ def run_recording(run: RecordingRun) -> dict[str, Any]:
             ),
         },
     }
+    if seen is not None and objects is not None:
+        captured = with_found_objects(motion, seen, objects, case.environment)
+        found["rows"]["HPS w/ RGB object localisation"] = scored(captured, case)
+        found["rgb"] = {"pictures": objects.looked, "found": objects.found}
+        found["rig"] = _rig(seen, case, rows)
     if run.robustness:
         found["robustness"] = {name: _worse(ours, case, change) for name, change in DISTURBANCES.items()}
     return found
@@ -168,6 +178,17 @@ def _rows(
         "ours, classes in parallel": track(changed(one_class=False), "ours"),
         "ours, true contacts": lambda motion: ours.tracker(motion, oracle, placed),
     } | seen_rows
+
+
+def _rig(seen: SeenFlat, case: Case, rows: dict[str, Motion]) -> dict[str, Any]:
+    """Distances to what depth cameras around one handling measure, of `RIG_ROWS` and the truth (thesis Table 5.5)."""
+    scan = case.source.read_scan()
+    looks = None if scan is None else rig_looks(seen, scan.points)
+    if looks is None:
+        return {}
+    truth = replace(seen.motion, object_motion=case.recording.object_motion)
+    motions = {"truth": truth} | {name: rows[name] for name in RIG_ROWS}
+    return {name: rig_distances(looks, motion, seen) for name, motion in motions.items()}
 
 
 def _with_gap(tracker: ObjectTracker, gap_s: float) -> ObjectTracker:
