@@ -31,13 +31,25 @@ import test_hand_detections  # noqa: E402
 import test_hcontact  # noqa: E402
 import test_mvnx  # noqa: E402
 import test_watch_log  # noqa: E402
+import totalcapture_files  # noqa: E402
 from PIL import Image  # noqa: E402
 
 import keypoint_files  # noqa: E402
 from wearcap.body.skeletons import smplh52  # noqa: E402
 from wearcap.geometry.camera import Camera  # noqa: E402
 from wearcap.geometry.rigid import Rigid  # noqa: E402
-from wearcap.io.datasets import adt, amass, behave, egohoi, hcontact, hps, mocap_every_folder, nymeria, omomo  # noqa: E402
+from wearcap.io.datasets import (  # noqa: E402
+    adt,
+    amass,
+    behave,
+    egohoi,
+    hcontact,
+    hps,
+    mocap_every_folder,
+    nymeria,
+    omomo,
+    totalcapture,
+)
 from wearcap.io.devices import aria_mps, watch_log  # noqa: E402
 from wearcap.io.formats import (  # noqa: E402
     asf_amc,
@@ -362,6 +374,10 @@ READERS: dict[str, Reader] = {
         "a.txt.gz",
         gzip.compress(b"some words\nof text\n"),
         lambda path: (text.read_text(path), list(text.numbered_lines(path))),
+    ),
+    "totalcapture": Reader(
+        lambda folder: totalcapture_files.write_totalcapture(folder, frames=6),
+        lambda folder: totalcapture.read_totalcapture(totalcapture.totalcapture_files(folder)[0]),
     ),
     "tum": _one("t.txt", TUM, poses.read_tum),
     "tum_gz": _one("t.txt.gz", gzip.compress(TUM.encode()), poses.read_tum),
