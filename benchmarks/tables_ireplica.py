@@ -123,16 +123,18 @@ def _run_printed(run: RecordingRun) -> dict[str, Any]:
 
 def _tree(groups: list[list[dict[str, Any]]]) -> dict[str, Any]:
     """All figures, over groups."""
-    first = groups[0][0]
+    runs = [run for group in groups for run in group]
+    rows, detectors = (
+        [name for name in runs[0][part] if all(name in run[part] for run in runs)] for part in ("rows", "detection")
+    )
     gaps = {str(gap): [[run["gaps"][str(gap)] for run in group] for group in groups] for gap in GAPS_S}
     disturbed = [[run["robustness"] for run in group if "robustness" in run] for group in groups]
     return {
         "handlings": sum(len(run["rows"]["ours"]["handlings"]) for group in groups for run in group),
-        "rows": {row: _row([[run["rows"][row] for run in group] for group in groups]) for row in first["rows"]},
+        "rows": {row: _row([[run["rows"][row] for run in group] for group in groups]) for row in rows},
         "gaps": {gap: _measure(parts, "end_cm", None) for gap, parts in gaps.items()},
         "detection": {
-            name: _detection([[run["detection"][name] for run in group] for group in groups])
-            for name in first["detection"]
+            name: _detection([[run["detection"][name] for run in group] for group in groups]) for name in detectors
         },
         **_by_depth_cameras(groups),
         "robustness": {
@@ -221,7 +223,11 @@ def _show(tree: dict[str, Any]) -> None:
     parts = (_ends(tree), _hands(tree), _detections(tree), _gaps(tree), _chamfer(tree))
     for part in (*parts, *([_robustness(tree)] if tree["robustness"] else [])):
         console.print(part)
-    if tree["rgb"]:
+    if not tree["rgb"]:
+        console.print(
+            "left out: what the head camera and depth cameras see (no simulated recording of flats as they are built now)"
+        )
+    else:
         console.print(
             "RGB object localisation: found in {found} of {pictures} pictures of handlings".format(**tree["rgb"])
         )
