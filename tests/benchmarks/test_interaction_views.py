@@ -21,6 +21,7 @@ EVERY = 15
 def recording() -> Recording:
     """Half a minute, filmed by a camera that looks down at the hands."""
     found = simulate_interactions(InteractionConfig(minutes=0.5), "session", "val", 3)[0]
+    assert found.camera is not None
     down = about_axis("y", torch.tensor(np.deg2rad(40.0)).float())
     return replace(found, camera=replace(found.camera, R_head_cam=down @ found.camera.R_head_cam))
 
