@@ -1,4 +1,4 @@
-"""Three depth cameras around an interaction (thesis Table 5.5): how far captured body and object are from what they measure.
+"""Three depth cameras around an interaction (thesis Table 5.5): distances of captured body and object to what they measure.
 
 The rig is that of HPS's tables: simulated time-of-flight cameras on tripods, registered to the scan by their own depth
 images. As documented, distances go from the captured surfaces to the measured cloud; what the cameras cannot see of a

@@ -1,8 +1,9 @@
 """Objects localised in the head camera's pictures alone (thesis §5.4.3, "HPS w/ RGB Obj. Loc.").
 
-As documented: pictures show each object at a known pose; keypoints of a picture of the head camera that lie within the
-object's mask, which is perfect, are matched with theirs, and P3P in RANSAC gives the object's six degrees of freedom in the
-camera. HPS's camera carries it into the world. Pictures are rendered, features are SIFT's, nothing is filtered over time.
+As documented: pictures show each object at a known pose; keypoints of a picture of the head camera that lie within
+the object's mask, which is perfect, are matched with theirs, and P3P in RANSAC gives the object's six degrees of
+freedom in the camera. HPS's camera carries it into the world. Pictures are rendered, features are SIFT's, nothing is
+filtered over time.
 """
 
 from dataclasses import dataclass, replace
@@ -162,7 +163,10 @@ def _pose(features: Features, landmarks: _Landmarks, camera: Camera) -> Rigid | 
 
 
 def with_found_objects(motion: Motion, seen: SeenFlat, found: FoundObjects, environment: Environment) -> Motion:
-    """Row "HPS w/ RGB object localisation": objects are where they were last found, from HPS's camera."""
+    """Row "HPS w/ RGB object localisation": objects are where they were last found, from HPS's camera.
+
+    Until it is found, an object stays at its initial pose; the paper's row also takes poses of few matches.
+    """
     tracks = dict(static_objects(motion, environment).object_motion or {})
     for name, rows in found.T_cam_object.items():
         times = torch.tensor([time for time, _ in rows], dtype=torch.float64)

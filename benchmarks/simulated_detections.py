@@ -1,8 +1,8 @@
-"""Detections of hands and contacts in a head camera's pictures, as a detector that judges each picture alone makes them.
+"""Detections of hands and contacts in a head camera's pictures, as a detector makes them that judges each one alone.
 
 What is in the picture is exact: the hands' vertices through the lens, without those that objects or walls hide. How
 well a hand in sight is found and judged is Hand Object Detector's own record on egocentric pictures (Shan et al. 2020,
-model 100K+ego on its ego test set): average precision of hands 90.5, with the right side 90.0, with the right state 75.0.
+model 100K+ego on its ego test set): average precision of hands 90.5, with the right side 90.0, the right state 75.0.
 These are pictures with hands at work in them; a hand before an object that it does not touch is what it mistakes most.
 """
 
@@ -88,7 +88,7 @@ def seen_hands(seen: SeenFlat, every: int) -> SeenHands:
 def _around(
     seen: SeenFlat, poses: dict[str, Rigid], frame: int, camera: Camera, T_world_cam: Rigid
 ) -> tuple[Float32[np.ndarray, "height width"], list[tuple[Bool[np.ndarray, "height width"], list[float]]]]:
-    """Depth (m) of walls and objects as `GLANCE` sees them; for each object in sight where it is, and its box (px of `camera`)."""
+    """Depth (m) of walls and objects as `GLANCE` sees them; where each object in sight is, and its box (px of `camera`)."""
     depth, found = depth_of(GLANCE, T_world_cam, seen.world(poses, frame).mesh), []
     for item in seen.flat.environment.objects:
         if (poses[item.name].t[frame] - T_world_cam.t).norm() > NEAR_M:

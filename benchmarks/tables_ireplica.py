@@ -148,7 +148,7 @@ def _tree(groups: list[list[dict[str, Any]]]) -> dict[str, Any]:
 
 
 def _by_depth_cameras(groups: list[list[dict[str, Any]]]) -> dict[str, Any]:
-    """Distances to depth cameras' clouds, and the pictures in which an object was found, where recordings are simulated."""
+    """Distances to depth cameras' clouds, and pictures in which an object was found, where recordings are simulated."""
     looks = [run["rig"] for group in groups for run in group if run.get("rig")]
     names = looks[0] if looks else {}
     rgb = [run["rgb"] for group in groups for run in group if "rgb" in run]
@@ -225,7 +225,7 @@ def _show(tree: dict[str, Any]) -> None:
         console.print(part)
     if not tree["rgb"]:
         console.print(
-            "left out: what the head camera and depth cameras see (no simulated recording of flats as they are built now)"
+            "left out: what head and depth cameras see (no simulated recording of flats as they are built now)"
         )
     else:
         console.print(
@@ -292,7 +292,7 @@ def _gaps(tree: dict[str, Any]) -> Table:
 
 def _chamfer(tree: dict[str, Any]) -> Table:
     shown = new_table(
-        "Table 5.5: Chamfer to the true surfaces during interactions (cm), and to what three depth cameras around one of "
+        "Table 5.5: Chamfer to the true surfaces during interactions (cm), and to what depth cameras around one of "
         "them measure (as documented; in brackets the paper's)",
         ["", "body", "object", "body, cameras", "object, cameras"],
     )

@@ -1,4 +1,4 @@
-"""What head camera and depth cameras see of simulated interactions: hands, objects, and the distances measured to them."""
+"""What head camera and depth cameras see of simulated interactions: hands, objects, and distances to them."""
 
 from dataclasses import replace
 

@@ -339,7 +339,7 @@ def test_hands_are_put_onto_what_they_hold_by_the_arms_alone(scene):
 
 
 def detected(motion: Motion, tmp_path, **settings) -> IReplica:
-    """A pipeline whose contacts are of a detector's file: a left hand in contact in every third picture while it holds."""
+    """A pipeline with a detector's file: a left hand in contact in every third picture while it holds."""
     row = [10, 10, 60, 60, 0.9, 3, 0.0, 1.0, 0.1, 0]
     pictures = [{"frame": k + 1, "hand_dets": [row] if TAKE <= k < LEAVE else None} for k in range(0, FRAMES, 3)]
     (tmp_path / "r.json").write_text(json.dumps(pictures))

@@ -1,9 +1,9 @@
 """The TotalCapture data set: thirteen Xsens sensors on a body that Vicon measures, five subjects, 60 Hz.
 
 Files of a sequence, all in one folder or each kind below a folder of its own, the subject (s1 … s5) in the path:
-`ACTION/gt_skel_gbl_pos.txt` and `gt_skel_gbl_ori.txt` (a line of 21 joint names, then "x y z" in inches and quaternions per
-frame, tab-separated, y up), `ACTION_Xsens_AuxFields.sensors` ("sensors frames", then per frame its number and a line per
-sensor: name, orientation w x y z, specific force, angular velocity and magnetic field in its axes), and
+`ACTION/gt_skel_gbl_pos.txt` and `gt_skel_gbl_ori.txt` (a line of 21 joint names, then "x y z" in inches and
+quaternions per frame, tab-separated, y up), `ACTION_Xsens_AuxFields.sensors` ("sensors frames", then per frame its
+number and a line per sensor: name, orientation w x y z, specific force, angular velocity, magnetic field), and
 `SUBJECT_ACTION_calib_imu_ref.txt` (name, x y z w: the sensors' common world in Vicon's). Both end together.
 """
 
@@ -163,7 +163,7 @@ def _counts(fields: list[str], where: str) -> tuple[int, int]:
 
 
 def read_reference(path: str | Path) -> dict[str, Float[Tensor, "3 3"]]:
-    """Orientation of each sensor's world in Vicon's. Raises WearcapError for lines without a name and a unit quaternion."""
+    """Orientation of each sensor's world in Vicon's. Raises WearcapError for lines without name and unit quaternion."""
     found: dict[str, Tensor] = {}
     wanted = 0
     for number, line in numbered_lines(path):
@@ -222,7 +222,9 @@ def _vicon_motion(times: Tensor, positions: np.ndarray, quaternions: np.ndarray,
         spreads.append(((carried - offset).square().sum(-1).mean().sqrt().item(), R, offset))
     (spread, R, offset), (other, _, _) = sorted(spreads, key=lambda row: row[0])
     if not spread < _RIGID_M or not 2 * spread < other:
-        what = f"joints move by {100 * spread:.1f} cm in the axes of their parents ({100 * other:.1f} cm in the other order)"
+        what = (
+            f"joints move by {100 * spread:.1f} cm in the axes of their parents ({100 * other:.1f} in the other order)"
+        )
         fix = "Give the sequence's own two files; a sequence in which nobody moves says nothing."
         raise WearcapError(what, where, f"rigid bones, within {100 * _RIGID_M:.0f} cm", fix)
     rest = dict(zip(list(PARENTS)[1:], offset))

@@ -3,8 +3,8 @@
 - Hand Object Detector (100DOH): JSON `[{"frame": 12, "hand_dets": [[…]], "obj_dets": [[…]]}, …]` or
   `{"frame_000012.jpg": {"hand_dets": …}, …}` with the detector's own rows x1 y1 x2 y2 (px), score, state, offset to the
   object (x, y, magnitude), side; or CSV with a row per hand and the columns `HOD_COLUMNS`.
-- EPIC-KITCHENS VISOR: `{"video_annotations": [{"image", "annotations": [{"name", "in_contact_object"}]}]}`, and the COCO
-  files of its hand-object benchmark, whose annotations have `handside` and `isincontact` (and `score`, if predicted).
+- EPIC-KITCHENS VISOR: `{"video_annotations": [{"image", "annotations": [{"name", "in_contact_object"}]}]}`, and the
+  COCO files of its hand-object benchmark, whose annotations have `handside`, `isincontact` (and `score`, if predicted).
 - POSA and its like: .npz with the probability `contact` ("picture vertex") that each vertex of a body is in contact.
 """
 
@@ -30,7 +30,7 @@ _BOX = ("x1", "y1", "x2", "y2")
 HOD_COLUMNS = ("frame", *_BOX, "score", "state", "offset_x", "offset_y", "offset_magnitude", "side")
 """Columns of the detector's rows, preceded by the picture's number."""
 OBJECT_STATES = (3, 4)
-"""The detector's states for contact with a portable and with a stationary object; 0 is none, 1 self, 2 another person."""
+"""The detector's states for contact with a portable or stationary object; 0 is none, 1 self, 2 another person."""
 _UNKNOWN = ("inconclusive", "none-of-the-above")
 """VISOR's words for hands whose contact nobody could judge."""
 _MAX_NUMBER = 1 << 40
@@ -57,7 +57,7 @@ def read_hand_detections(path: str | Path, min_score: float) -> HandDetections:
     """Read a detector's or annotators' file, recognised by its suffix and content.
 
     Of several boxes of one hand the most confident counts; boxes below `min_score` do not. Raises WearcapError for any
-    other content, numbers that are not finite, boxes, scores, states and sides that are none, and files without pictures.
+    other content, numbers that are not finite, boxes, scores, states and sides that are none, and without pictures.
     """
     if ".csv" in Path(path).suffixes:
         columns = read_columns(path, HOD_COLUMNS[1:], whole=HOD_COLUMNS[:1])

@@ -235,8 +235,8 @@ class ObjectTracker:
         """Return the corrected motion with `object_motion`, `interactions` and `hand_contact_prob`, at the contacts'
         frames within the registered motion's time span.
 
-        `contacts` has probabilities "time hand" by class, and their "timestamps"; a contact of `UNKNOWN_CLASS` takes the
-        nearest object of any. Raises WearcapError if no frame is
+        `contacts` has probabilities "time hand" by class, and their "timestamps"; a contact of `UNKNOWN_CLASS` takes
+        the nearest object of any. Raises WearcapError if no frame is
         within the motion's time span.
         """
         times, first, last = contacts["timestamps"], registered.timestamps[0], registered.timestamps[-1]
