@@ -27,16 +27,29 @@ import test_aria_mps  # noqa: E402
 import test_asf_amc  # noqa: E402
 import test_colmap  # noqa: E402
 import test_egohoi  # noqa: E402
+import test_hand_detections  # noqa: E402
 import test_hcontact  # noqa: E402
 import test_mvnx  # noqa: E402
 import test_watch_log  # noqa: E402
+import totalcapture_files  # noqa: E402
 from PIL import Image  # noqa: E402
 
 import keypoint_files  # noqa: E402
 from wearcap.body.skeletons import smplh52  # noqa: E402
 from wearcap.geometry.camera import Camera  # noqa: E402
 from wearcap.geometry.rigid import Rigid  # noqa: E402
-from wearcap.io.datasets import adt, amass, behave, egohoi, hcontact, hps, mocap_every_folder, nymeria, omomo  # noqa: E402
+from wearcap.io.datasets import (  # noqa: E402
+    adt,
+    amass,
+    behave,
+    egohoi,
+    hcontact,
+    hps,
+    mocap_every_folder,
+    nymeria,
+    omomo,
+    totalcapture,
+)
 from wearcap.io.devices import aria_mps, watch_log  # noqa: E402
 from wearcap.io.formats import (  # noqa: E402
     asf_amc,
@@ -46,6 +59,7 @@ from wearcap.io.formats import (  # noqa: E402
     contact_labels,
     csv_table,
     environment,
+    hand_detections,
     motion_npz,
     mvnx,
     npz,
@@ -173,6 +187,16 @@ def _xdata(path: Path) -> None:
     )
 
 
+def _hand_detections(folder: Path) -> None:
+    for name in ("HOD", "VISOR", "COCO"):
+        (folder / f"{name}.json").write_text(json.dumps(getattr(test_hand_detections, name)))
+
+
+def _vertex_contacts(folder: Path) -> None:
+    np.savez(folder / "p.npz", contact=np.full((3, 8), 0.5, np.float32), frames=[1, 2, 4])
+    (folder / "s.json").write_text('{"leftHand": [0, 1], "rightHand": [2], "rightHandIndex1": [3]}')
+
+
 def _environment(folder: Path) -> None:
     mesh = np.array([[0, 0, 0], [1, 0, 0], [1, 0, 2], [0, 0, 2]], np.float32)
     ply.write_ply(ply.Ply(mesh, None, np.array([[0, 1, 2], [0, 2, 3]], np.int32)), folder / "objects/door.ply")
@@ -261,6 +285,13 @@ READERS: dict[str, Reader] = {
     "egohoi_locations": _one("l.json", json.dumps(test_egohoi.SLID), egohoi.read_object_locations),
     "environment": Reader(_environment, environment.read_environment),
     "euroc": _one("e.csv", EUROC, poses.read_euroc),
+    "hand_detections": Reader(
+        _hand_detections,
+        lambda folder: [hand_detections.read_hand_detections(path, 0.5) for path in sorted(folder.iterdir())],
+    ),
+    "vertex_contacts": Reader(
+        _vertex_contacts, lambda folder: hand_detections.read_vertex_contacts(folder / "p.npz", folder / "s.json")
+    ),
     "hcontact": Reader(
         lambda folder: test_hcontact.write_set(folder, frames=FRAMES),
         lambda folder: hcontact.read_hcontact(folder, test_hcontact.DOOR),
@@ -343,6 +374,10 @@ READERS: dict[str, Reader] = {
         "a.txt.gz",
         gzip.compress(b"some words\nof text\n"),
         lambda path: (text.read_text(path), list(text.numbered_lines(path))),
+    ),
+    "totalcapture": Reader(
+        lambda folder: totalcapture_files.write_totalcapture(folder, frames=6),
+        lambda folder: totalcapture.read_totalcapture(totalcapture.totalcapture_files(folder)[0]),
     ),
     "tum": _one("t.txt", TUM, poses.read_tum),
     "tum_gz": _one("t.txt.gz", gzip.compress(TUM.encode()), poses.read_tum),

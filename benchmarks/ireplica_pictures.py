@@ -41,9 +41,8 @@ def draw(dataset: Path, split: str, checkpoint: str, folder: Path) -> None:
                 best[kind] = (worth, name, object_name, start, stop)
     for kind, (_, name, object_name, start, stop) in best.items():
         case = Case.load(dataset, name)
-        assert case.recording.suit is not None
         motion = pipeline.interact(
-            pipeline.registered(case.source), pipeline.contacts(case.recording.suit), case.environment
+            pipeline.registered(case.source), pipeline.contacts(case.recording), case.environment
         )
         truth = with_objects(case.recording)
         assert truth is not None

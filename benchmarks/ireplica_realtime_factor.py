@@ -26,14 +26,12 @@ def measure() -> list[dict]:
         )
     case = Case.load(DATASET, RecordingStore.open(DATASET).names("test")[0])
     pipeline = pipeline_of("ireplica", (CHECKPOINT,), jobs=torch.get_num_threads())
-    suit = case.recording.suit
-    assert suit is not None
     registered = tracked = 0.0
     for _ in range(2):  # the first round compiles
         begin = time.perf_counter()
         motion = pipeline.registered(case.source)
         middle = time.perf_counter()
-        pipeline.interact(motion, pipeline.contacts(suit), case.environment)
+        pipeline.interact(motion, pipeline.contacts(case.recording), case.environment)
         registered, tracked = middle - begin, time.perf_counter() - middle
     length = case.recording.duration_s
     return [

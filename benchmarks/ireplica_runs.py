@@ -1,26 +1,35 @@
 """One recording of interactions, captured by every row of iReplica's tables and scored; and with worse sensors."""
 
+import json
+import zlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import torch
 from hydra.utils import instantiate
+from interaction_rig import rig_distances, rig_looks
+from rgb_objects import found_objects, with_found_objects
+from seen_flat import SeenFlat
+from simulated_detections import FPS, HOD, detections, seen_hands
 from torch import Tensor
 
 from wearcap.body.kinematics import local_rotations
 from wearcap.cli.conf import compose
+from wearcap.files import write_text
 from wearcap.geometry import rotation
 from wearcap.io.formats.environment import read_environment
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.recording.motion import Interactions
 from wearcap.recording.timing import resampled
 from wearcap.runtime.system import CaptureInput
-from wearcap.scene.objects import CONTACT_CLASSES, Environment
+from wearcap.scene.objects import CONTACT_CLASSES, UNKNOWN_CLASS, Environment
 from wearcap.sensors.simulated import smooth_noise
 from wearcap.systems.ireplica.contact_prediction import ContactPredictor
+from wearcap.systems.ireplica.detected_contacts import DetectedContacts
 from wearcap.systems.ireplica.object_tracker import ContactSettings, ObjectTracker
 from wearcap.systems.ireplica.pipeline import IReplica
 from wearcap.systems.ireplica.published import held_when_near, interpolated_objects, nearness, static_objects
@@ -30,10 +39,13 @@ ON_BENT_PATH = (
     "as published",
     "as published, w/o contact corr.",
     "as published, our contacts",
+    "as published, contacts from detections",
     "ours, on the bent path",
     "ours, on the bent path, w/o contact corr.",
 )
 """Rows whose wearer is registered as documented; HPS registers the others'."""
+RIG_ROWS = ("HPS", "as published", "ours")
+"""Rows that are measured by depth cameras, too."""
 GAPS_S = (0.0, 0.25, 0.5, 1.0, 2.0)
 """Of the paper's Table 5.4."""
 
@@ -91,6 +103,10 @@ def run_recording(run: RecordingRun) -> dict[str, Any]:
     motion, bent = ours.registered(case.source), published.registered(case.source)
     placed = ours.placed(case.environment, case.source)
     contacts = {"ours": _contacts(ours, case), "published": _contacts(published, case)}
+    seen = SeenFlat.of(case.recording)
+    objects = None if seen is None else found_objects(seen)
+    if seen is not None:
+        contacts["detections"] = detected_contacts(seen, contacts["ours"]["timestamps"])
     rows = {
         name: capture(bent if name in ON_BENT_PATH else motion)
         for name, capture in _rows(case, ours, published, contacts).items()
@@ -110,6 +126,11 @@ def run_recording(run: RecordingRun) -> dict[str, Any]:
             ),
         },
     }
+    if seen is not None and objects is not None:
+        captured = with_found_objects(motion, seen, objects, case.environment)
+        found["rows"]["HPS w/ RGB object localisation"] = scored(captured, case)
+        found["rgb"] = {"pictures": objects.looked, "found": objects.found}
+        found["rig"] = _rig(seen, case, rows)
     if run.robustness:
         found["robustness"] = {name: _worse(ours, case, change) for name, change in DISTURBANCES.items()}
     return found
@@ -129,6 +150,12 @@ def _rows(
     changed = lambda **how: replace(ours.tracker, attachment=replace(ours.tracker.attachment, **how))  # noqa: E731
     oracle = true_contacts(held, contacts["ours"]["timestamps"])
     correction = ours.tracker.correction
+    seen_rows: dict[str, Callable[[Motion], Motion]] = {}
+    if "detections" in contacts:
+        seen_rows = {
+            "as published, contacts from detections": track(published.tracker, "detections", environment),
+            "ours, contacts from detections": track(ours.tracker, "detections"),
+        }
     return {
         "HPS": lambda motion: static_objects(motion, environment),
         "HPS w/ GT": lambda motion: interpolated_objects(motion, environment, held, true),
@@ -150,7 +177,18 @@ def _rows(
         "ours, no gaps filled": track(_with_gap(ours.tracker, 0.0), "ours"),
         "ours, classes in parallel": track(changed(one_class=False), "ours"),
         "ours, true contacts": lambda motion: ours.tracker(motion, oracle, placed),
-    }
+    } | seen_rows
+
+
+def _rig(seen: SeenFlat, case: Case, rows: dict[str, Motion]) -> dict[str, Any]:
+    """Distances to what depth cameras around one handling measure, of `RIG_ROWS` and the truth (thesis Table 5.5)."""
+    scan = case.source.read_scan()
+    looks = None if scan is None else rig_looks(seen, scan.points)
+    if looks is None:
+        return {}
+    truth = replace(seen.motion, object_motion=case.recording.object_motion)
+    motions = {"truth": truth} | {name: rows[name] for name in RIG_ROWS}
+    return {name: rig_distances(looks, motion, seen) for name, motion in motions.items()}
 
 
 def _with_gap(tracker: ObjectTracker, gap_s: float) -> ObjectTracker:
@@ -158,8 +196,23 @@ def _with_gap(tracker: ObjectTracker, gap_s: float) -> ObjectTracker:
 
 
 def _contacts(pipeline: IReplica, case: Case) -> dict[str, Tensor]:
-    assert case.recording.suit is not None
-    return pipeline.contacts(case.recording.suit)
+    return pipeline.contacts(case.recording)
+
+
+def detected_contacts(seen: SeenFlat, timestamps: Tensor) -> dict[str, Tensor]:
+    """Contacts from simulated detections of the head camera's pictures, written to a file and read from it."""
+    recording, rng = seen.recording, np.random.default_rng([41, zlib.crc32(seen.recording.name.encode())])
+    assert recording.camera is not None
+    assert recording.interactions is not None
+    times, camera = recording.camera.timestamps, recording.camera.camera
+    every = max(1, round(1 / (FPS * times.diff().median().item())))
+    touching = recording.interactions.hand_contact(times[::every].contiguous()).numpy()
+    found = detections(seen_hands(seen, every), touching, HOD, rng, every, (camera.width, camera.height))
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"{recording.name}.json"
+        write_text(path, json.dumps(found))
+        source = DetectedContacts(path, segmentation=None, first_picture=0, hold_s=0.1, min_score=0.5)
+        return {"timestamps": timestamps, **source(recording, timestamps)}
 
 
 def true_contacts(held: Interactions, timestamps: Tensor) -> dict[str, Tensor]:
@@ -168,15 +221,19 @@ def true_contacts(held: Interactions, timestamps: Tensor) -> dict[str, Tensor]:
 
 
 def detection(contacts: dict[str, Tensor], recording: Recording) -> dict[str, dict[str, list[float]]]:
-    """Probabilities and truth per class, thinned to 20 Hz and in short numbers: pooled over recordings later."""
+    """Probabilities and truth per class, thinned to 20 Hz and in short numbers: pooled over recordings later.
+
+    Contacts of no class are measured against those of any, in place of each class.
+    """
     held = recording.interactions
     assert held is not None
+    unknown = contacts.get(UNKNOWN_CLASS)
     every = max(1, round(1 / (20 * contacts["timestamps"].diff().median().item())))
     times = contacts["timestamps"][::every].contiguous()
     return {
         name: {
-            "prob": [round(p, 4) for p in contacts[name][::every].flatten().tolist()],
-            "true": held.hand_contact(times, name).flatten().int().tolist(),
+            "prob": [round(p, 4) for p in (contacts[name] if unknown is None else unknown)[::every].flatten().tolist()],
+            "true": held.hand_contact(times, name if unknown is None else None).flatten().int().tolist(),
         }
         for name in CONTACT_CLASSES
     }
@@ -190,8 +247,7 @@ def _worse(ours: IReplica, case: Case, change: Callable[[Recording], Recording])
     """Scores with sensors that are worse: HPS and contacts are run again."""
     recording = change(case.recording)
     worse = replace(case, source=replace(case.source, recording=recording))
-    assert recording.suit is not None
-    contacts = ours.contacts(recording.suit)
+    contacts = ours.contacts(recording)
     placed = ours.placed(case.environment, case.source)
     captured = ours.interact(ours.registered(worse.source), contacts, placed)
     return scored(captured, case) | {"detection": detection(contacts, case.recording)}

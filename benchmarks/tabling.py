@@ -15,6 +15,7 @@ PREPARE = {
     "simulated": "Run: wearcap prepare simulated",
     "simulated_hillside": "Run: wearcap prepare simulated world=hillside 'activities=[walk,stand]' "
     "'recordings={val: 3, test: 8}' duration_s=90 output=datasets/simulated_hillside",
+    "totalcapture": "Run: wearcap prepare totalcapture source=FOLDER",
     "simulated_objects": "Run: wearcap prepare simulated_objects",
 }
 

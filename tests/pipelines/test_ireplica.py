@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 from functools import partial
 
@@ -8,6 +9,7 @@ import torch
 from wearcap.body.kinematics import site_positions
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
+from wearcap.geometry.camera import Camera
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rotation import about_axis
 from wearcap.geometry.trajectory import Trajectory
@@ -17,11 +19,12 @@ from wearcap.metrics.objects import summary
 from wearcap.optimize.contact_correction import OffsetSettings
 from wearcap.optimize.trajectory import Bending, bend
 from wearcap.optimize.trajectory_banded import bend_banded
-from wearcap.recording import Motion, Recording
+from wearcap.recording import CameraStream, Motion, Recording
 from wearcap.recording.motion import Interactions
 from wearcap.runtime.stages import StagedSystem, digest
 from wearcap.runtime.system import CaptureInput
-from wearcap.scene.objects import Environment, Freedom, SceneObject
+from wearcap.scene.objects import UNKNOWN_CLASS, Environment, Freedom, SceneObject
+from wearcap.systems.ireplica.detected_contacts import DetectedContacts
 from wearcap.systems.ireplica.object_tracker import PALMS, AttachmentSettings, ObjectTracker
 from wearcap.systems.ireplica.pipeline import IReplica
 from wearcap.systems.ireplica.published import held_when_near, interpolated_objects, static_objects
@@ -333,3 +336,49 @@ def test_hands_are_put_onto_what_they_hold_by_the_arms_alone(scene):
     others = [j for j in range(len(motion.skeleton)) if j not in (wrist, elbow)]
     torch.testing.assert_close(joints[0].t[:, others], joints[1].t[:, others])
     assert (joints[1].t - joints[0].t).diff(dim=0).diff(dim=0).abs().max() < 0.004
+
+
+def detected(motion: Motion, tmp_path, **settings) -> IReplica:
+    """A pipeline with a detector's file: a left hand in contact in every third picture while it holds."""
+    row = [10, 10, 60, 60, 0.9, 3, 0.0, 1.0, 0.1, 0]
+    pictures = [{"frame": k + 1, "hand_dets": [row] if TAKE <= k < LEAVE else None} for k in range(0, FRAMES, 3)]
+    (tmp_path / "r.json").write_text(json.dumps(pictures))
+    given = {"segmentation": None, "first_picture": 1, "hold_s": 0.1, "min_score": 0.5} | settings
+    return IReplica(Registered(), None, tracker(), DetectedContacts(tmp_path, **given), fps=FPS)
+
+
+def filmed(motion: Motion) -> Recording:
+    camera = Camera.pinhole(640, 480, 70.0)
+    return Recording("r", suit=motion, camera=CameraStream(motion.timestamps, camera, torch.eye(3), torch.zeros(3)))
+
+
+def test_contacts_detected_in_pictures_move_the_nearest_object_of_any_class(scene, displacement, tmp_path):
+    motion, environment = scene
+    pipeline = detected(motion, tmp_path)
+    contacts = pipeline.contacts(filmed(motion))
+    captured = pipeline.interact(motion, contacts, environment)
+    assert held_of(captured).objects == ("near",)
+    assert held_of(captured).classes == ("sliding",)
+    assert held_of(captured).start_s.item() == pytest.approx(TAKE / FPS, abs=0.11)
+    assert held_of(captured).stop_s.item() == pytest.approx(LEAVE / FPS, abs=0.11)
+    right = {"timestamps": motion.timestamps, UNKNOWN_CLASS: held_left().flip(1)}
+    assert held_of(tracker()(motion, right, environment)).classes == ("hinged",), "the door is at the right hand"
+
+
+def test_pictures_without_a_hand_end_a_contact_only_after_a_while(scene, tmp_path):
+    motion, _ = scene
+    short = detected(motion, tmp_path, hold_s=0.01).contacts(filmed(motion))[UNKNOWN_CLASS]
+    assert 0 < (short[TAKE:LEAVE, 0] > 0).float().mean() < 0.5, "only the pictures themselves"
+    whole = detected(motion, tmp_path).contacts(filmed(motion))[UNKNOWN_CLASS]
+    assert (whole[TAKE:LEAVE, 0] > 0.5).all()
+    assert not whole[:, 1].any()
+
+
+def test_detections_of_another_recording_are_refused(scene, tmp_path):
+    motion, _ = scene
+    with pytest.raises(WearcapError, match="pictures 1 to 358"):
+        detected(motion, tmp_path, first_picture=0).contacts(filmed(motion.sliced(0, 100)))
+    with pytest.raises(WearcapError, match="no camera"):
+        detected(motion, tmp_path).contacts(Recording("r", suit=motion))
+    with pytest.raises(WearcapError, match="no detections for s"):
+        detected(motion, tmp_path).contacts(replace(filmed(motion), name="s"))

@@ -29,6 +29,7 @@ from wearcap.io.datasets.adt import is_adt, read_adt
 from wearcap.io.datasets.amass import read_amass
 from wearcap.io.datasets.hps import hps_names, read_hps_sequence
 from wearcap.io.datasets.nymeria import is_nymeria, read_nymeria, read_xdata
+from wearcap.io.datasets.totalcapture import is_totalcapture, read_totalcapture, totalcapture_files
 from wearcap.io.devices.aria_mps import find_mps_file, head_stream, is_mps_folder, read_closed_loop, read_mps
 from wearcap.io.formats.asf_amc import read_amc, read_asf
 from wearcap.io.formats.bvh import read_bvh
@@ -157,7 +158,7 @@ def _patients(path: Path) -> dict[str, Callable[[], Loaded]]:
         raise WearcapError(
             "nothing to examine here",
             where=path,
-            expected=f"a data set (manifest.json), an MPS, Nymeria, ADT or HPS folder, a scene (pointcloud.ply, photos.json), an environment (environment.json), or files like {', '.join(_MOTIONS)}",
+            expected=f"a data set (manifest.json), an MPS, Nymeria, ADT, TotalCapture or HPS folder, a scene (pointcloud.ply, photos.json), an environment (environment.json), or files like {', '.join(_MOTIONS)}",
         )
     return {file.relative_to(path).as_posix(): partial(_read_file, file) for file in files}
 
@@ -251,10 +252,17 @@ def _read_npz(path: Path) -> Recording | Motion:
     return read_motion(path) if read_npz(path, ("wearcap",)) else read_amass(path)
 
 
+def _totalcapture(folder: Path) -> Recording:
+    """A sequence in Vicon's skeleton; where the sensors are mounted is not known."""
+    read = read_totalcapture(totalcapture_files(folder)[0])
+    return Recording(folder.name, motion=read.motion, imu=read.imu, source="TotalCapture")
+
+
 _FOLDERS: tuple[tuple[Callable[[Path], bool], Callable[[Path], Loaded]], ...] = (
     (is_nymeria, lambda folder: (read_nymeria(folder), [])),
     (is_mps_folder, _read_mps),
     (is_adt, lambda folder: (read_adt(folder), [])),
+    (is_totalcapture, lambda folder: (_totalcapture(folder), [])),
     (is_place, read_place),
 )
 _MOTIONS = {".amc": _read_amc, ".bvh": read_bvh, ".mvnx": read_mvnx, ".npz": _read_npz}

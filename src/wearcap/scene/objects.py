@@ -26,6 +26,8 @@ FREEDOMS = {
 """Kinds of freedom, in words."""
 CONTACT_CLASSES = ("sliding", "hinged")
 """Kinds of interaction that have a contact network each (thesis §5.3.2)."""
+UNKNOWN_CLASS = ""
+"""Kind of an interaction that nobody named: any object may be in contact."""
 EXTENTS_M = (0.01, 5.0)
 """Longest side of the box around an object that a person handles (m)."""
 MAX_OFF_CENTER = 1.0

@@ -22,7 +22,15 @@ from wearcap.recording import Motion
 from wearcap.recording.acts import MARGIN_S, Act, spread_acts
 from wearcap.recording.motion import Interactions
 from wearcap.recording.timing import at_times, resampled
-from wearcap.scene.objects import ANCHORS, CONTACT_CLASSES, Environment, ObjectState, SceneObject, follow_hands
+from wearcap.scene.objects import (
+    ANCHORS,
+    CONTACT_CLASSES,
+    UNKNOWN_CLASS,
+    Environment,
+    ObjectState,
+    SceneObject,
+    follow_hands,
+)
 from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 
 
@@ -94,7 +102,7 @@ def class_intervals(
         contact_prob = {name: torch.where(prob >= best, prob, 0.0) for name, prob in contact_prob.items()}
     found = [
         (interval, name)
-        for name in CONTACT_CLASSES
+        for name in (*CONTACT_CLASSES, UNKNOWN_CLASS)
         if name in contact_prob
         for interval in contact_intervals(active(contact_prob[name], timestamps, contact))
     ]
@@ -227,7 +235,8 @@ class ObjectTracker:
         """Return the corrected motion with `object_motion`, `interactions` and `hand_contact_prob`, at the contacts'
         frames within the registered motion's time span.
 
-        `contacts` has probabilities "time hand" by class, and their "timestamps". Raises WearcapError if no frame is
+        `contacts` has probabilities "time hand" by class, and their "timestamps"; a contact of `UNKNOWN_CLASS` takes
+        the nearest object of any. Raises WearcapError if no frame is
         within the motion's time span.
         """
         times, first, last = contacts["timestamps"], registered.timestamps[0], registered.timestamps[-1]
@@ -272,14 +281,15 @@ class ObjectTracker:
                 continue
             before = None  # the object that the hands already hold, if only the set of hands changes
             for row in reversed(held[-4:]) if self.attachment.keep_object else ():
-                if row.contact_class == contact_class and contact.continues(row.interval):
+                same = contact_class in (row.contact_class, UNKNOWN_CLASS)
+                if same and contact.continues(row.interval):
                     before = row.scene_object
                     break
             scene_object, hands = before, torch.tensor(contact.hands)
             if scene_object is None:
                 poses = {name: state.T_world_object for name, state in states.items()}
                 touching = palms[contact.start][hands]
-                found = environment.nearest(touching, poses, contact_class, self.attachment.reach_m)
+                found = environment.nearest(touching, poses, contact_class or None, self.attachment.reach_m)
                 if not bool((found.object_index >= 0).any()):
                     continue
                 scene_object = environment.objects[int(found.object_index[found.distance.argmin()])]
@@ -292,7 +302,7 @@ class ObjectTracker:
                 frames[..., :2] += offset[:, None]
             T, value = follow_hands(scene_object, state, frames, hands, self.attachment.anchor)
             states[scene_object.name] = ObjectState(T[-1], float(value[-1]))
-            held.append(Held(contact, scene_object, contact_class, state, T))
+            held.append(Held(contact, scene_object, scene_object.freedom.contact_class, state, T))
             busy_until = [contact.stop if on else until for on, until in zip(contact.hands, busy_until)]
         return sorted(held, key=lambda row: row.interval.start)
 

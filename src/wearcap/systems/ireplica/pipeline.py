@@ -15,13 +15,14 @@ from wearcap.errors import WearcapError
 from wearcap.io.formats.environment import read_environment
 from wearcap.metrics.objects import summary
 from wearcap.metrics.table import Row
-from wearcap.recording import Motion
+from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import resampled
 from wearcap.runtime.stages import Stage, StagedSystem, run_stages
 from wearcap.runtime.system import CaptureInput
 from wearcap.scene.objects import Environment
 from wearcap.scene.placement import placed_on_scan
 from wearcap.systems.ireplica.contact_prediction import ContactPredictor
+from wearcap.systems.ireplica.detected_contacts import DetectedContacts
 from wearcap.systems.ireplica.object_tracker import ObjectTracker
 from wearcap.systems.ireplica.scores import score_interactions
 
@@ -32,9 +33,11 @@ class IReplica(StagedSystem):
 
     registration: StagedSystem
     """HPS, or another pipeline that registers the wearer in the scene."""
-    predictor: Callable[[Motion], dict[str, Float[Tensor, "time hand"]]]
-    """Contact probabilities by class, at a motion's frames, from its pose alone."""
+    predictor: Callable[[Motion], dict[str, Float[Tensor, "time hand"]]] | None
+    """Contact probabilities by class, at a motion's frames, from its pose alone; None: `detections` are used."""
     tracker: ObjectTracker
+    detections: DetectedContacts | None = None
+    """Contacts that were found in the camera's pictures, in place of the predictor's."""
     environment: str | Path | None = None
     """File of the objects; None: the recording's environment."""
     place_on_scan: bool = False
@@ -55,11 +58,17 @@ class IReplica(StagedSystem):
     def stages(self, source: CaptureInput) -> list[Stage]:
         """The registration's stages, `contacts`, `interact`. Raises WearcapError as those, or without environment."""
         environment = read_environment(self.environment_file(source))
-        suit = source.recording.suit
-        before = self.registration.stages(source)
+        recording, before = source.recording, self.registration.stages(source)
+        found = (
+            None if self.detections is None else (self.detections, self.detections.file(recording), recording.camera)
+        )
         return [
             *before,
-            Stage("contacts", lambda done: self.contacts(suit), lambda: (self.predictor, suit, self.fps)),
+            Stage(
+                "contacts",
+                lambda done: self.contacts(recording),
+                lambda: (self.predictor, recording.suit, self.fps, found),
+            ),
             Stage(
                 "interact",
                 lambda done: self.interact(
@@ -110,9 +119,13 @@ class IReplica(StagedSystem):
         assert motion is not None
         return motion
 
-    def contacts(self, suit: Motion) -> dict[str, Tensor]:
-        """Contact probabilities of both hands by class, from the suit's pose alone (thesis §5.3.2)."""
-        motion = resampled(suit, self.fps)
+    def contacts(self, recording: Recording) -> dict[str, Tensor]:
+        """Contact probabilities of both hands by class, from the suit's pose alone (thesis §5.3.2), or as detected."""
+        assert recording.suit is not None
+        motion = resampled(recording.suit, self.fps)
+        if self.detections is not None:
+            return {"timestamps": motion.timestamps, **self.detections(recording, motion.timestamps)}
+        assert self.predictor is not None
         return {"timestamps": motion.timestamps, **self.predictor(motion)}
 
     def placed(self, environment: Environment, source: CaptureInput) -> Environment:

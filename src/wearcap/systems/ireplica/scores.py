@@ -13,7 +13,7 @@ from torch import Tensor
 from wearcap.body.anny_body import anny_body
 from wearcap.body.kinematics import site_positions
 from wearcap.errors import WearcapError
-from wearcap.geometry.mesh import face_normals, random_points
+from wearcap.geometry.mesh import Mesh, face_normals, random_points
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
 from wearcap.metrics.objects import Handling, contact_mean, handlings, object_error
@@ -133,18 +133,20 @@ def _chamfer(
     for name, start, stop in rows:
         times = torch.arange(start, stop, CHAMFER_EVERY_S, dtype=torch.float64)
         frames = torch.searchsorted(motion.timestamps, times).clamp(max=len(motion) - 1).tolist()
-        # Points uniform by area on the object's surface (without faces: its vertices), always the same.
-        vertices, faces = environment.by_name(name).mesh.vertices, environment.by_name(name).mesh.faces
-        rng = np.random.default_rng(0)
-        if len(faces):
-            corners = vertices[faces]
-            area = np.linalg.norm(face_normals(corners), axis=1)
-            chosen = rng.choice(len(faces), CHAMFER_POINTS, p=area / area.sum())
-            surface = torch.from_numpy(random_points(corners[chosen], rng))
-        else:
-            surface = torch.from_numpy(vertices[rng.permutation(len(vertices))[:CHAMFER_POINTS]])
+        surface = surface_points(environment.by_name(name).mesh)
         for frame in frames:
             bodies = [body.vertices(m.T_world_joint[frame])[thinned] for m in (motion, true)]
             errors[0].append(chamfer(*bodies).mean_cm)
             errors[1].append(chamfer(*(T[name][frame].to(torch.float32) @ surface for T in (found, real))).mean_cm)
     return tuple(float(np.mean(part)) if part else float("nan") for part in errors)  # pyright: ignore[reportReturnType]
+
+
+def surface_points(mesh: Mesh) -> Float[Tensor, "point 3"]:
+    """Points uniform by area on an object's surface (without faces: its vertices), in its own axes, always the same."""
+    rng = np.random.default_rng(0)
+    if not len(mesh.faces):
+        return torch.from_numpy(mesh.vertices[rng.permutation(len(mesh.vertices))[:CHAMFER_POINTS]])
+    corners = mesh.vertices[mesh.faces]
+    area = np.linalg.norm(face_normals(corners), axis=1)
+    chosen = rng.choice(len(mesh.faces), CHAMFER_POINTS, p=area / area.sum())
+    return torch.from_numpy(random_points(corners[chosen], rng))
