@@ -98,7 +98,10 @@ def score_grids(tree: Tree, labels: Mapping[str, tuple[str, int]], spread: str =
         present = list(dict.fromkeys(metric for row in rows.values() for metric in row))
         metrics = [name for name in labels if name in present] + [name for name in present if name not in labels]
         cells = [[name, *(text(row.get(m), labels.get(m, ("", 2))[1]) for m in metrics)] for name, row in rows.items()]
-        count = max((each["seeds"] for name, row in rows.items() if not name.startswith("paper") for each in row.values()), default=0)
+        count = max(
+            (each["seeds"] for name, row in rows.items() if not name.startswith("paper") for each in row.values()),
+            default=0,
+        )
         about = tree.get("origins", {}).get(title, tree["about"])
         heads = ("", *(labels.get(metric, (metric, 2))[0] for metric in metrics))
         grids.append(Grid(title, heads, cells, origin(about, f"{count} {spread}" if count > 1 else "")))
@@ -112,6 +115,25 @@ def rows_of(trees: Trees, title: str) -> dict[str, dict[str, Any]]:
             if name.startswith(title):
                 return rows
     return {}
+
+
+def picked(
+    trees: Trees, rows: Iterable[tuple[str, str, str]], columns: Iterable[tuple[str, tuple[str, ...], int]]
+) -> list[list[str]]:
+    """Lines of a headline table. rows: a table's title, a row of it, what the page calls it; columns: a heading, the
+    metrics of which a row has one, digits. Rows that are not in the tables are left out."""
+    lines = []
+    for title, name, label in rows:
+        found = rows_of(trees, title).get(name)
+        if found is not None:
+            chosen = ((next((found[m] for m in metrics if m in found), None), digits) for _, metrics, digits in columns)
+            lines.append([label, *(text(summary, digits) for summary, digits in chosen)])
+    return lines
+
+
+def figure_of(speed: Mapping[str, list[Tree]], name: str) -> Tree | None:
+    """The first figure of a benchmark of this name."""
+    return next((figure for figure in speed.get(name, []) if figure["name"] == name), None)
 
 
 def about(command: str) -> dict[str, str]:
@@ -164,7 +186,7 @@ def merged(old: Tree, new: Tree) -> Tree:
     new = {key: value for key, value in new.items() if key != "seeds"}
     if "tables" not in new:
         return new
-    origins = {**old.get("origins", {}), **{title: new["about"] for title in new["tables"]}}
+    origins = {**old.get("origins", {}), **dict.fromkeys(new["tables"], new["about"])}
     return {**new, "tables": {**old.get("tables", {}), **new["tables"]}, "origins": origins}
 
 

@@ -43,7 +43,9 @@ def run(name: str) -> list[dict]:
 def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(description="Run benchmarks; one JSON line per figure.")
     parser.add_argument("names", nargs="*", metavar="NAME", help="benchmarks to run (default: all)")
-    parser.add_argument("--write", type=Path, help="file of JSON lines in which these figures replace their earlier ones")
+    parser.add_argument(
+        "--write", type=Path, help="file of JSON lines in which these figures replace their earlier ones"
+    )
     parser.add_argument("--list", action="store_true", help="name the benchmarks and leave")
     options = parser.parse_args(arguments)
     if options.write is not None:

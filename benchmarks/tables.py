@@ -77,7 +77,9 @@ def write_page(system: str) -> Path:
     """docs/results/SYSTEM.md, and README's row where it has one; returns the page's path."""
     page = page_of(system)
     if page is None:
-        sys.exit(f"error: no page of {system!r}. Expected docs/results/{system}.json, from tables.py {system} --publish.")
+        sys.exit(
+            f"error: no page of {system!r}. Expected docs/results/{system}.json, from tables.py {system} --publish."
+        )
     write_text(RESULTS / f"{system}.md", render(system, page, read_speed()))
     if page.measured:
         readme = ROOT / "README.md"

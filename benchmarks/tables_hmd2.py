@@ -6,17 +6,20 @@ out, which is printed. Checkpoints come by name (checkpoints/) or path.
 
 import argparse
 import json
+import math
 from dataclasses import asdict, replace
 from pathlib import Path
 
 from hmd2_runs import BASELINES, Case, Method, Result, run_method
 from joblib import Parallel, delayed
+from result_pages import NONE, Grid, Page, Tree, Trees, figure_of, grid_of, mean, text
 from rich.console import Console
 from rich.table import Table
 from tabling import cell, finite, new_table
 
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
+from wearcap.metrics.table import Summary
 from wearcap.models.checkpoint import checkpoint_file
 from wearcap.recording import RecordingStore
 
@@ -141,6 +144,135 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     }
     write_text(path, json.dumps(finite({"about": facts, "tables": tree}), indent=1) + "\n")
     return path
+
+
+HEADLINE = {
+    "nearest window": "nearest window of the training",
+    "EgoEgo-style": "EgoEgo-style, head",
+    "AvatarPoser-style (head)": "AvatarPoser-style, head",
+    "AvatarPoser-style (head and hands)": "AvatarPoser-style, which also sees the hands",
+    "full": "**all of it**",
+    "head alone": "the same checkpoint, head alone",
+    "full, the paper's windows": "all of it, the paper's windows and steps",
+    "full, one step to the mean": "all of it, one step to the mean",
+}
+"""Rows of the page's first table, and what the page calls them."""
+CLOCKS = {
+    "hmd2_online_small_fps": "head poses, points and embeddings to poses, h = 10; embeddings and SLAM given; against real time",
+    "hmd2_online_full_fps": "the same with the full model, whose weights are drawn; against real time",
+    "hmd2_runner_vs_eager": "the same: the runner against an eager loop at equal steps and precision; then number format, and steps, alone",
+    "voxelize_frames_per_second": "grids of the points around the body; SLAM given; a whole recording, then a growing map; against real time",
+    "voxelize_vs_brute_force": "the same, against all points for each frame, then against a KD-tree",
+}
+"""Benchmarks of the page's table of speed: what their clocks count, and what is given."""
+FIRST = "Tables 6.1 and 6.3"
+
+
+def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
+    """What docs/results/hmd2.md says."""
+    simulated, real = (
+        {row["method"]: row["scores"] for row in _rows(trees, name)} for name in ("simulated_camera", "cmu_surrounded")
+    )
+    ours, online = simulated["full"], figure_of(speed, "hmd2_online_small_fps")
+    ours_real = f"; real motion (CMU) {mean(real['full']['mpjpe_cm'])}" if "full" in real else ""
+    metrics = (("mpjpe_cm", 2), ("hand_pe_cm", 2), ("lower_pe_cm", 2), ("fid", 2), ("jitter_ratio", 2))
+    shown = [
+        [
+            label,
+            *(
+                text(rows.get(name, {}).get(metric), digits)
+                for rows, chosen in ((simulated, metrics), (real, metrics[:3]))
+                for metric, digits in chosen
+            ),
+        ]
+        for name, label in HEADLINE.items()
+        if name in simulated
+    ]
+    paper = [
+        [f"the paper's {name}, on Nymeria", f"{row[0]:.2f}", f"{row[1]:.2f}", NONE, f"{row[2]:.2f}", *[NONE] * 4]
+        for name, row in PAPER.items()
+    ]
+    grids = [
+        grid_of(
+            _table(f"{title} ({name.removeprefix('hmd2_')})", _results(rows)),
+            tree.get("origins", {}).get(title, tree["about"]),
+            _repetitions(rows),
+        )
+        for name, tree in trees.items()
+        for title, rows in tree["tables"].items()
+    ]
+    first = {name: _results(tree["tables"].get(FIRST, [])) for name, tree in trees.items()}
+    for name, rows in first.items():
+        if any(row.activities for row in rows):
+            table = _activities(
+                f"Tables 6.8–6.10: MPJPE (cm) by what was mostly done ({name.removeprefix('hmd2_')})", rows, "mpjpe_cm"
+            )
+            grids.append(grid_of(table, trees[name]["about"]))
+    return Page(
+        title="[HMD²](../hmd2.md): figures",
+        headline=Grid(
+            "Whole recordings, anchored to the true head; means over repetitions, ± their deviation (cm).",
+            (
+                "",
+                "simulated: MPJPE",
+                "hands",
+                "lower body",
+                "FID",
+                "jitter, of the truth's",
+                "CMU: MPJPE",
+                "hands",
+                "lower body",
+            ),
+            shown + paper,
+        ),
+        held_out="People and places of the test split of simulated wearers, and four CMU subjects in simulated surroundings. "
+        "Everything was chosen on the validation split.",
+        simulated="People, flats, points and pictures of the simulated wearers; on CMU the motion is real, and surroundings, "
+        "points and pictures are simulated. The head's path has the jitter of [simulation](simulation.md). The paper's rows are "
+        "from real recordings (Nymeria): no comparison.",
+        limits=(
+            f"The regressor that also sees both hands has the smaller mean error ({mean(simulated['AvatarPoser-style (head and hands)']['mpjpe_cm'])} "
+            f"against {mean(ours['mpjpe_cm'])} cm) and the larger one in the lower body."
+            if "AvatarPoser-style (head and hands)" in simulated
+            else "The regressor that also sees both hands was not measured.",
+            f"Jitter is {mean(ours['jitter_ratio'])} times the truth's.",
+            "Bad are arms out of the camera's sight, and CMU's dances and jumps.",
+            "Baselines were trained more briefly than ours, EgoEgo-style most so: it shakes.",
+            "FID needs more windows than CMU's held-out subjects have.",
+            "No recording of a real head-mounted device has been scored.",
+        ),
+        full=grids,
+        measured=f"joints {mean(ours['mpjpe_cm'])} cm off{ours_real}",
+        speed=f"{online['ratio']:.0f} × online, head's path and points given" if online else "",
+        clocks=CLOCKS,
+        pictures=(("hmd2_samples.png", "One input, several motions (four samples, above them the truth)"),),
+    )
+
+
+def _rows(trees: Trees, name: str) -> list[Tree]:
+    return trees.get(f"hmd2_{name}", {}).get("tables", {}).get(FIRST, [])
+
+
+def _results(rows: list[Tree]) -> list[Result]:
+    """Results as they were before they became JSON."""
+
+    def summaries(scores: Tree) -> dict[str, Summary]:
+        return {
+            name: Summary(**{**each, "mean": math.nan if each["mean"] is None else each["mean"]})
+            for name, each in scores.items()
+        }
+
+    return [
+        Result(
+            row["method"], summaries(row["scores"]), {name: summaries(each) for name, each in row["activities"].items()}
+        )
+        for row in rows
+    ]
+
+
+def _repetitions(rows: list[Tree]) -> str:
+    count = max((score["seeds"] for row in rows for score in row["scores"].values()), default=1)
+    return f"{count} repetitions" if count > 1 else ""
 
 
 def _case(options: argparse.Namespace) -> Case:

@@ -14,8 +14,8 @@ from hps_pictures import draw_drift
 from hps_runs import DISTURBED, ROWS, TRUTH, SeedRun, run_seed
 from hps_sessions import SessionSettings
 from joblib import Parallel, delayed
-from rich.console import Console
 from result_pages import NONE, Grid, Page, Tree, Trees, grid_of, mean, ranged, text
+from rich.console import Console
 from rich.table import Table
 from tabling import cell, finite, new_table, summarize
 
@@ -99,7 +99,14 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
 
 def _all_tables(tree: dict[str, Any]) -> list[Table]:
     chamfer = [_chamfer_table(name, tree["places"], tree["chamfer_cm"][name]) for name in ("stand", "move")]
-    return [*chamfer, _feet_table(tree), _drift_table(tree), _whole_table(tree), _outage_table(tree), _seconds_table(tree)]
+    return [
+        *chamfer,
+        _feet_table(tree),
+        _drift_table(tree),
+        _whole_table(tree),
+        _outage_table(tree),
+        _seconds_table(tree),
+    ]
 
 
 HEADLINE = (
@@ -126,12 +133,23 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     seconds = sum(summary["mean"] for summary in typical["stage_seconds"]["ours"].values())
     end = typical["places"][-1]
     return Page(
-        title="HPS: figures",
+        title="[HPS](../hps.md): figures",
         headline=Grid(
             f"Whole sessions in the world, and the Chamfer distance to depth cameras' clouds after {end}; means over "
             f"{spread}, ± their deviation (cm).",
-            ("", "joints", "95 % below", f"standing, {end}", f"moving, {end}", "feet to scan", "sliding a frame", "jitter, of the truth's", "growth per 100 m"),
-            [[label, *_headline(trees[name], row)] for name, row, label in HEADLINE if name in trees] + [_paper_headline()],
+            (
+                "",
+                "joints",
+                "95 % below",
+                f"standing, {end}",
+                f"moving, {end}",
+                "feet to scan",
+                "sliding a frame",
+                "jitter, of the truth's",
+                "growth per 100 m",
+            ),
+            [[label, *_headline(trees[name], row)] for name, row, label in HEADLINE if name in trees]
+            + [_paper_headline()],
         ),
         held_out="People and sites are those of the test split; weights of the terms were chosen on sessions of the "
         "validation split. Test sessions are scored once, with the settings of `pipeline=hps`.",
@@ -169,7 +187,13 @@ def _headline(tree: Tree, row: str) -> list[str]:
     places = (tree["chamfer_cm"][name][row][-1] for name in ("stand", "move"))
     cells = [text(whole["mpjpe_cm"], 1), mean(whole["p95_cm"]), *(text(place, 1) for place in places)]
     growth = tree["slope_cm_per_100m"].get(row)
-    return [*cells, mean(feet["absolute_distance_cm"], 2), mean(feet["sliding_cm"], 2), mean(whole["jitter_ratio"]), text(growth)]
+    return [
+        *cells,
+        mean(feet["absolute_distance_cm"], 2),
+        mean(feet["sliding_cm"], 2),
+        mean(whole["jitter_ratio"]),
+        text(growth),
+    ]
 
 
 def _paper_headline() -> list[str]:

@@ -15,8 +15,8 @@ from typing import Any
 import torch
 from ireplica_runs import DISTURBANCES, GAPS_S, Networks, RecordingRun, run_recording
 from joblib import Parallel, delayed
+from result_pages import NONE, Grid, Page, Tree, Trees, figure_of, grid_of, mean, text
 from rich.console import Console
-from result_pages import NONE, Grid, Page, Tree, Trees, grid_of, mean, text
 from rich.table import Table
 from tabling import cell, finite, new_table, summarize
 
@@ -127,14 +127,26 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     shown += [_robustness(tree)] if tree["robustness"] else []
     spread = f"{groups} groups of {len(about['recordings'])} recordings"
     both = f"{mean(rows['as published, our contacts']['all']['end_cm'])}; as published {mean(rows['as published']['all']['end_cm'])}"
-    factor = [figure for figure in speed.get("ireplica_realtime_factor", []) if figure["name"] == "ireplica_realtime_factor"]
-    paper = [f"{PAPER_END['as published'][0]:.1f}", f"{PAPER_END['as published'][1]:.1f}", f"{PAPER_HAND['as published']:.1f}"]
+    factor = figure_of(speed, "ireplica_realtime_factor")
+    paper = [
+        f"{PAPER_END['as published'][0]:.1f}",
+        f"{PAPER_END['as published'][1]:.1f}",
+        f"{PAPER_HAND['as published']:.1f}",
+    ]
     return Page(
-        title="iReplica: figures",
+        title="[iReplica](../ireplica.md): figures",
         headline=Grid(
             f"Where objects were left, and hands and objects against their own true places during contact: "
             f"{tree['handlings']} handlings, means over {spread}, ± the deviation over groups; AP of the contacts that drive the row.",
-            ("", "object's end (cm)", "end (°)", "hand to object (cm)", "hand off (cm)", "object off (cm)", "contacts' AP"),
+            (
+                "",
+                "object's end (cm)",
+                "end (°)",
+                "hand to object (cm)",
+                "hand off (cm)",
+                "object off (cm)",
+                "contacts' AP",
+            ),
             [[label, *_headline(tree, row)] for row, label in HEADLINE.items() if row in rows]
             + [["the paper's, on its own recordings", *paper, NONE, NONE, f"{PAPER_DETECTION[0]:.3f}"]],
         ),
@@ -147,7 +159,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         full=[grid_of(table, about, spread) for table in shown],
         measured=f"objects end {mean(rows['ours']['all']['end_cm'])} cm off, in environments measured by hand (the paper's "
         f"tracker with our contacts {both})",
-        speed=f"{factor[0]['ratio']:.0f} × real time, localised cameras given" if factor else "",
+        speed=f"{factor['ratio']:.0f} × real time, localised cameras given" if factor else "",
         clocks=CLOCKS,
         pictures=tuple(
             (f"ireplica_{name}.png", f"{what}: truth above and captured below, hands in contact green")
