@@ -1,8 +1,8 @@
 """Pages of results: docs/results/SYSTEM.md, made of nothing but the JSON files beside it.
 
 `tables.py SYSTEM --publish` puts a table's JSON there, `tables.py SYSTEM --page` makes the page of it, and the cells of
-README's table. A system's module has `page(trees, speed)`, which says what its page holds; prose stands beside the table
-that it is about, with figures taken from the JSON.
+README's table. A system's module has `page(trees, speed)`, which says what its page holds; prose stands beside the
+table that it is about, with figures taken from the JSON.
 """
 
 import datetime
@@ -181,8 +181,8 @@ def write_speed(path: Path, benchmark: str, figures: list[Tree], about: Mapping[
 
 
 def merged(old: Tree, new: Tree) -> Tree:
-    """A tree as published: of trees with `tables`, tables of other titles stay, each with the `about` of its own command;
-    what was measured of each seed alone is left out."""
+    """A tree as published: of trees with `tables`, tables of other titles stay, each with the `about` of its own
+    command; what was measured of each seed alone is left out."""
     new = {key: value for key, value in new.items() if key != "seeds"}
     if "tables" not in new:
         return new

@@ -167,9 +167,10 @@ HEADLINE = (
 )
 """Rows of the page's first table: table, row, and what the page calls it."""
 CLOCKS = {
-    "echo_online_small_fps": "tracked points to poses, object and contacts: as `pipeline=echo_online`, in eager PyTorch, and with "
-    "the steps of `pipeline=echo` without guidance; tracked points given; against real time",
-    "echo_conveyor_vs_rewindow": "a frame's steps of the rolling schedule; against windows from scratch, then errors of both",
+    "echo_online_small_fps": "tracked points to poses, object and contacts: as `pipeline=echo_online`, in eager "
+    "PyTorch, and with the steps of `pipeline=echo` without guidance; tracked points given; against real time",
+    "echo_conveyor_vs_rewindow": "a frame's steps of the rolling schedule; against windows from scratch, then errors "
+    "of both",
 }
 """Benchmarks of the page's table of speed: what their clocks count, and what is given."""
 
@@ -183,22 +184,24 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     return Page(
         title="[ECHO](../echo.md): figures",
         headline=Grid(
-            "Whole recordings, bodies and objects measured where they stand in the world; means over seeds of the diffusion, "
-            "± their deviation.",
+            "Whole recordings, bodies and objects measured where they stand in the world; means over seeds of the "
+            "diffusion, ± their deviation.",
             ("", *(name for name, _, _ in columns)),
             picked(trees, HEADLINE, columns),
         ),
-        held_out="People and object instances of the test split, and four CMU subjects; kinds of objects are known from "
-        "training. Settings were chosen on the validation split, from which the table of settings is.",
-        simulated="People with objects altogether, tracked points included, which are exact; people alone are CMU's real motion. "
-        "The paper's rows are from real recordings: no comparison. The paper gives its MPJVE without a unit of time; ours is "
-        "the difference of displacements from one frame to the next at 30 Hz.",
+        held_out="People and object instances of the test split, and four CMU subjects; kinds of objects are known "
+        "from training. Settings were chosen on the validation split, from which the table of settings is.",
+        simulated="People with objects altogether, tracked points included, which are exact; people alone are CMU's "
+        "real motion. The paper's rows are from real recordings: no comparison. The paper gives its MPJVE without a "
+        "unit of time; ours is the difference of displacements from one frame to the next at 30 Hz.",
         limits=(
-            f"An object's orientation is off by {mean(ours['rotation_deg'], 0)}°, no better than the average of its class: head "
-            "and wrists tell little of it, and large objects' vertices go with it.",
-            "Observed contacts leave the object unchanged within the spread, unlike in the paper, where they help it most.",
+            f"An object's orientation is off by {mean(ours['rotation_deg'], 0)}°, no better than the average of its "
+            "class: head and wrists tell little of it, and large objects' vertices go with it.",
+            "Observed contacts leave the object unchanged within the spread, unlike in the paper, where they help it "
+            "most.",
             "Body motion jitters between observed and generated frames.",
-            "The trainings of the ablation are short, with one seed each, and scored without guidance but where the row says so.",
+            "The trainings of the ablation are short, with one seed each, and scored without guidance but where the "
+            "row says so.",
             "No recording of real people with objects has been captured.",
         ),
         full=[grid for tree in trees.values() for grid in score_grids(tree, LABELS)],

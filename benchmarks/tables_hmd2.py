@@ -158,10 +158,13 @@ HEADLINE = {
 }
 """Rows of the page's first table, and what the page calls them."""
 CLOCKS = {
-    "hmd2_online_small_fps": "head poses, points and embeddings to poses, h = 10; embeddings and SLAM given; against real time",
+    "hmd2_online_small_fps": "head poses, points and embeddings to poses, h = 10; embeddings and SLAM given; against "
+    "real time",
     "hmd2_online_full_fps": "the same with the full model, whose weights are drawn; against real time",
-    "hmd2_runner_vs_eager": "the same: the runner against an eager loop at equal steps and precision; then number format, and steps, alone",
-    "voxelize_frames_per_second": "grids of the points around the body; SLAM given; a whole recording, then a growing map; against real time",
+    "hmd2_runner_vs_eager": "the same: the runner against an eager loop at equal steps and precision; then number "
+    "format, and steps, alone",
+    "voxelize_frames_per_second": "grids of the points around the body; SLAM given; a whole recording, then a "
+    "growing map; against real time",
     "voxelize_vs_brute_force": "the same, against all points for each frame, then against a KD-tree",
 }
 """Benchmarks of the page's table of speed: what their clocks count, and what is given."""
@@ -225,14 +228,15 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
             ),
             shown + paper,
         ),
-        held_out="People and places of the test split of simulated wearers, and four CMU subjects in simulated surroundings. "
-        "Everything was chosen on the validation split.",
-        simulated="People, flats, points and pictures of the simulated wearers; on CMU the motion is real, and surroundings, "
-        "points and pictures are simulated. The head's path has the jitter of [simulation](simulation.md). The paper's rows are "
-        "from real recordings (Nymeria): no comparison.",
+        held_out="People and places of the test split of simulated wearers, and four CMU subjects in simulated "
+        "surroundings. Everything was chosen on the validation split.",
+        simulated="People, flats, points and pictures of the simulated wearers; on CMU the motion is real, and "
+        "surroundings, points and pictures are simulated. The head's path has the jitter of "
+        "[simulation](simulation.md). The paper's rows are from real recordings (Nymeria): no comparison.",
         limits=(
-            f"The regressor that also sees both hands has the smaller mean error ({mean(simulated['AvatarPoser-style (head and hands)']['mpjpe_cm'])} "
-            f"against {mean(ours['mpjpe_cm'])} cm) and the larger one in the lower body."
+            "The regressor that also sees both hands has the smaller mean error "
+            f"({mean(simulated['AvatarPoser-style (head and hands)']['mpjpe_cm'])} against {mean(ours['mpjpe_cm'])} "
+            "cm) and the larger one in the lower body."
             if "AvatarPoser-style (head and hands)" in simulated
             else "The regressor that also sees both hands was not measured.",
             f"Jitter is {mean(ours['jitter_ratio'])} times the truth's.",

@@ -153,11 +153,11 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         ),
         held_out="People and sites are those of the test split; weights of the terms were chosen on sessions of the "
         "validation split. Test sessions are scored once, with the settings of `pipeline=hps`.",
-        simulated="All of it: sessions, sites, scans, suits, localisation, claps in the sound track, and the rig of three "
-        "depth cameras at the capture spot. The sizes of the sensors' errors (`--sensors ideal`, `typical`, `poor`) are "
-        "measured beside the literature's in [simulation](simulation.md). Localisation is drawn from statistics here; "
-        "finding real photographs in a map is a test of its own (`make test-real`). The paper's row is from its own "
-        "recordings: no comparison, but for the order of its rows.",
+        simulated="All of it: sessions, sites, scans, suits, localisation, claps in the sound track, and the rig of "
+        "three depth cameras at the capture spot. The sizes of the sensors' errors (`--sensors ideal`, `typical`, "
+        "`poor`) are measured beside the literature's in [simulation](simulation.md). Localisation is drawn from "
+        "statistics here; finding real photographs in a map is a test of its own (`make test-real`). The paper's row "
+        "is from its own recordings: no comparison, but for the order of its rows.",
         limits=_limits(typical),
         full=[grid_of(table, tree["about"], spread) for tree in trees.values() for table in _all_tables(tree)],
         measured=f"joints {ranged(whole['ours'])} cm off over {end} and more, {_presets(trees)} (as published "
@@ -168,10 +168,12 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
 
 
 CLOCKS = {
-    "hps_solver_vs_best_adam": "the optimisation, to an equal energy; map, body and start given; against Adam at its best",
+    "hps_solver_vs_best_adam": "the optimisation, to an equal energy; map, body and start given; against Adam at its "
+    "best",
     "hps_frames_per_second": "the optimisation; map, body and start given; against real time",
     "hps_end_to_end_realtime": "all of it, from suit and video to motion, localisation included; map given",
-    "localization_frames_per_second": "features, retrieval, matching, pose; decoding and map given; against pairwise matching",
+    "localization_frames_per_second": "features, retrieval, matching, pose; decoding and map given; against pairwise "
+    "matching",
     "splat_mpoints_per_second": "points of a scan drawn into a point map; against NumPy",
 }
 """Benchmarks of the page's table of speed: what their clocks count, and what is given."""
@@ -205,8 +207,9 @@ def _paper_headline() -> list[str]:
 def _limits(tree: Tree) -> tuple[str, ...]:
     """The weak sides, with their figures."""
     lost = [
-        f"{where.removeprefix('within ')}: the root is {mean(part['root_cm'])} cm off meanwhile, {mean(part['root_ratio'])} times"
-        f" what it is without (as published {mean(tree['outages']['HPS'][where]['root_cm'], 0)} cm)"
+        f"{where.removeprefix('within ')}: the root is {mean(part['root_cm'])} cm off meanwhile, "
+        f"{mean(part['root_ratio'])} times what it is without (as published "
+        f"{mean(tree['outages']['HPS'][where]['root_cm'], 0)} cm)"
         for where, part in tree["outages"]["ours"].items()
         if where.startswith("within")
     ]

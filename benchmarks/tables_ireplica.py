@@ -126,7 +126,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     shown = [_ends(tree), _hands(tree), _detections(tree), _gaps(tree), _chamfer(tree)]
     shown += [_robustness(tree)] if tree["robustness"] else []
     spread = f"{groups} groups of {len(about['recordings'])} recordings"
-    both = f"{mean(rows['as published, our contacts']['all']['end_cm'])}; as published {mean(rows['as published']['all']['end_cm'])}"
+    theirs, both = (mean(rows[name]["all"]["end_cm"]) for name in ("as published", "as published, our contacts"))
     factor = figure_of(speed, "ireplica_realtime_factor")
     paper = [
         f"{PAPER_END['as published'][0]:.1f}",
@@ -136,8 +136,9 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     return Page(
         title="[iReplica](../ireplica.md): figures",
         headline=Grid(
-            f"Where objects were left, and hands and objects against their own true places during contact: "
-            f"{tree['handlings']} handlings, means over {spread}, ± the deviation over groups; AP of the contacts that drive the row.",
+            "Where objects were left, and hands and objects against their own true places during contact: "
+            f"{tree['handlings']} handlings, means over {spread}, ± the deviation over groups; AP of the contacts "
+            "that drive the row.",
             (
                 "",
                 "object's end (cm)",
@@ -150,15 +151,15 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
             [[label, *_headline(tree, row)] for row, label in HEADLINE.items() if row in rows]
             + [["the paper's, on its own recordings", *paper, NONE, NONE, f"{PAPER_DETECTION[0]:.3f}"]],
         ),
-        held_out="People, flats and objects are those of the test split; networks were trained on the training split, and "
-        "all settings were chosen on the validation split.",
-        simulated="All of it: people, flats, objects, suits and localisation (`typical`), and environments as people measure "
-        "them, with objects and hinges away from where they are said to be; sizes beside the literature's in "
+        held_out="People, flats and objects are those of the test split; networks were trained on the training "
+        "split, and all settings were chosen on the validation split.",
+        simulated="All of it: people, flats, objects, suits and localisation (`typical`), and environments as people "
+        "measure them, with objects and hinges away from where they are said to be; sizes beside the literature's in "
         "[simulation](simulation.md). Every row captures the same motion.",
         limits=_limits(tree),
         full=[grid_of(table, about, spread) for table in shown],
-        measured=f"objects end {mean(rows['ours']['all']['end_cm'])} cm off, in environments measured by hand (the paper's "
-        f"tracker with our contacts {both})",
+        measured=f"objects end {mean(rows['ours']['all']['end_cm'])} cm off, in environments measured by hand (the "
+        f"paper's tracker with our contacts {both}; as published {theirs})",
         speed=f"{factor['ratio']:.0f} × real time, localised cameras given" if factor else "",
         clocks=CLOCKS,
         pictures=tuple(
@@ -183,11 +184,12 @@ def _limits(tree: Tree) -> tuple[str, ...]:
     without = {name: rows[f"ours, {name}"]["all"]["end_cm"] for name in ("w/o contact corr.", "no fit about hinges")}
     return (
         f"The worst kind of object is the {worst}: its ends are {mean(ours['kinds'][worst]['end_cm'])} cm off.",
-        f"Ends are {mean(ours['all']['end_cm'])} cm off; without the contact correction {mean(without['w/o contact corr.'])}, "
-        f"without the fit about hinges {mean(without['no fit about hinges'])}: where these are smaller, the step wins nothing here.",
+        f"Ends are {mean(ours['all']['end_cm'])} cm off; without the contact correction "
+        f"{mean(without['w/o contact corr.'])}, without the fit about hinges {mean(without['no fit about hinges'])}: "
+        "where these are smaller, the step wins nothing here.",
         "Simulated hands are tidier than people's; contact networks are to be judged on real recordings.",
-        "The published contact networks had a shorter training than in the paper: the row that compares the trackers is "
-        "the paper's tracker and path with our contacts.",
+        "The published contact networks had a shorter training than in the paper: the row that compares the trackers "
+        "is the paper's tracker and path with our contacts.",
     )
 
 

@@ -147,11 +147,12 @@ COLUMNS = (
 )
 """Columns of the page's first table: heading, metrics of which a row has one, digits."""
 CLOCKS = {
-    "mocap_every_online_fps": "head poses and watch samples to poses, three frames at a time, then a window for every frame; "
-    "sensors' logs given; against real time",
-    "mocap_every_offline_fps": "whole recordings, windows one after the other, mirror test-time augmentation; PyTorch, then "
-    "ONNX Runtime; against real time",
-    "latent_optimisation_vs_best_adam": "editing by wrists in the picture, to an equal energy; 2D wrists given; against Adam at its best",
+    "mocap_every_online_fps": "head poses and watch samples to poses, three frames at a time, then a window for "
+    "every frame; sensors' logs given; against real time",
+    "mocap_every_offline_fps": "whole recordings, windows one after the other, mirror test-time augmentation; "
+    "PyTorch, then ONNX Runtime; against real time",
+    "latent_optimisation_vs_best_adam": "editing by wrists in the picture, to an equal energy; 2D wrists given; "
+    "against Adam at its best",
 }
 """Benchmarks of the page's table of speed: what their clocks count, and what is given."""
 
@@ -164,28 +165,29 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     return Page(
         title="[MocapEvery](../mocap_every.md): figures",
         headline=Grid(
-            "Whole recordings, measured where they stand in the world. CMU's heads and watches are synthetic, as in the paper.",
+            "Whole recordings, measured where they stand in the world. CMU's heads and watches are synthetic, as in "
+            "the paper.",
             ("", *(name for name, _, _ in COLUMNS)),
             picked(trees, HEADLINE, COLUMNS),
         ),
-        held_out="Four CMU subjects (dance, walking, running, obstacles), and simulated wearers and hillsides of the test "
-        "split. Training stops, and settings are chosen, by the validation split. Rows with a deviation have several "
-        "trainings; all others have one.",
-        simulated="Watches on CMU's real motion, as in the paper, and, in the rows that say so, the errors of the head's "
-        "tracking; hillsides altogether; the wrists that a detector would find in the picture; the calibration's sessions. "
-        "Sizes of errors beside the literature's are in [simulation](simulation.md). The paper's rows are from its own "
-        "recordings: no comparison.",
+        held_out="Four CMU subjects (dance, walking, running, obstacles), and simulated wearers and hillsides of the "
+        "test split. Training stops, and settings are chosen, by the validation split. Rows with a deviation have "
+        "several trainings; all others have one.",
+        simulated="Watches on CMU's real motion, as in the paper, and, in the rows that say so, the errors of the "
+        "head's tracking; hillsides altogether; the wrists that a detector would find in the picture; the "
+        "calibration's sessions. Sizes of errors beside the literature's are in [simulation](simulation.md). The "
+        "paper's rows are from its own recordings: no comparison.",
         limits=(
-            "Legs are guessed from how head and hands move: the lower body is "
-            f"{mean(body['ours']['lower_pe_cm'])} cm off on CMU, where the network overfits few minutes of real motion.",
+            f"Legs are guessed from how head and hands move: the lower body is {mean(body['ours']['lower_pe_cm'])} cm "
+            "off on CMU, where the network overfits few minutes of real motion.",
             'The row "as in the paper" is a short training of a network as small as ours, and far from learned.',
             "Three tracked points instead of watches do better: the wrists' places are what watches do not tell.",
             "CMU's frames with a cue are of dances, pantomime and obstacles that are jumped over.",
             "No log of a real watch has been measured.",
         ),
         full=[grid for tree in trees.values() for grid in score_grids(tree, LABELS, "trainings or runs")],
-        measured=f"hillsides {mean(floor['floor follow']['mpjpe_cm'])} cm; real motion (CMU) {ranged(cmu)}, heads exact to as by "
-        "SLAM with the floor followed",
+        measured=f"hillsides {mean(floor['floor follow']['mpjpe_cm'])} cm; real motion (CMU) {ranged(cmu)}, heads "
+        "exact to as by SLAM with the floor followed",
         speed=f"{online['ratio']:.0f} × online, head poses given" if online else "",
         clocks=CLOCKS,
         pictures=(

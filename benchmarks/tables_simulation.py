@@ -80,62 +80,7 @@ def _sensors(options: argparse.Namespace) -> Tree:
 
 
 PARTS = {"sensors": _sensors, "walking": _walking, "discriminator": _discriminator}
-LITERATURE = (
-    ("heading_deg_per_sqrt_min", "suit: heading drift (°/√min)", 2, "such that the root is as far off as published",
-     "HPS, Tables 1 and 2: of inertial suits the heading drifts"),
-    ("off_after_70_m_cm", "suit: root off after 70 m (cm)", 0, "54 and 52", "HPS, Tables 1 and 2, row IMU"),
-    ("off_after_200_m_cm", "suit: root off after 200 m (cm)", 0, "69 and 61", "the same"),
-    ("off_after_380_m_cm", "suit: root off after 380 m (cm)", 0, "108 and 100", "the same"),
-    ("length_percent", "suit: walked length (%)", 2, "well measured; feet alone: below 4 in 95 % of walks",
-     "Guzov 2025 (dissertation), §5.3.1; Gupta, Skog and Händel 2015"),
-    ("bone_percent", "suit: length of bones (%)", 1, "scaled from stature and few lengths, no figure",
-     "Roetenberg, Luinge and Slycke 2009; size is ours"),
-    ("stature_cm", "suit: stature (cm)", 1, "–", "ours"),
-    ("segment_deg", "suit: orientation of segments without heading (°)", 1, "sensor alone: 0.5 static, 2 moving",
-     "Xsens, MTi and MTx manual MT0100P; the rest is mounting and soft tissue"),
-    ("joint_deg", "suit: joint angles, root mean square (°)", 1, "below 5 in flexion; without magnetometers hips 4 to 6, knees 8",
-     "Schepers, Giuberti and Bellusci 2018 (Xsens MVN); McGrath and Stirling 2022"),
-    ("height_cm", "suit: height of the root (cm)", 1, "–", "ours"),
-    ("height_drift_cm", "suit: change of that height (cm)", 1, "–", "ours"),
-    ("contact_late_ms", "suit: flags of foot contact, late by (ms)", 0, "–", "ours"),
-    ("contact_wrong_percent", "suit: flags of foot contact, wrong (%)", 1, "–", "ours"),
-    ("position_cm", "localisation: median error (cm)", 1, "1 to 5 in rooms", "Sarlin et al. 2021, 7-Scenes, row hloc"),
-    ("rotation_deg", "localisation: median error (°)", 1, "0.8 to 1.5", "the same"),
-    ("outlier_percent", "localisation: off by more than 30 cm (%)", 1, "18 to 19 by more than 1 m, the scene changed",
-     "Sarlin et al. 2020, InLoc, SuperPoint and SuperGlue"),
-    ("lost_percent", "localisation: frames without a pose (%)", 1, "“fails for a long period”", "HPS, on Table 2; size is ours"),
-    ("longest_outage_s", "localisation: longest outage (s)", 0, "–", "ours"),
-    ("tilt_deg", "map: lean against gravity (°)", 2, "–", "ours"),
-    ("scale_percent", "map: scale (%)", 2, "–", "ours"),
-    ("bend_cm", "map: bend, each axis (cm)", 1, "–", "ours"),
-    ("noise_ug_per_sqrt_hz", "watch: noise of acceleration (µg/√Hz)", 0, "160, the sensor alone", "Bosch BMI270, data sheet"),
-    ("gyro_deg_s_per_sqrt_hz", "watch: noise of the rate (°/s/√Hz)", 3, "0.007, the sensor alone", "the same"),
-    ("bias_mg", "watch: bias of acceleration (mg)", 1, "20 before calibration", "the same"),
-    ("attitude_deg", "watch: attitude (°)", 1, "1.5 static, 2.5 moving", "Hillcrest BNO080, data sheet, gaming rotation vector"),
-    ("heading_after_10_min_deg", "watch: heading after 10 minutes (°)", 1, "5, without magnetometer", "the same (0.5° a minute)"),
-    ("strap_deg", "watch: lean by its strap (°)", 1, "–", "ours"),
-    ("jitter_mm", "head: jitter, each axis (mm)", 2, "–", "ours"),
-    ("jitter_deg", "head: jitter, each axis (°)", 2, "–", "ours"),
-    ("head_cm", "head: position, root mean square (cm)", 1, "4.7 and 5.1 with one camera", "MocapEvery, Table 5"),
-    ("head_deg", "head: orientation, root mean square (°)", 1, "2.1 and 2.7 with one camera", "the same"),
-    ("drift_percent", "head: drift of the travelled distance (%)", 3, "none where loops are closed; phones: 2 cm a second, not closed",
-     "Project Aria, closed-loop trajectories; Kim et al. 2022"),
-    ("clock_drift_ms_per_h", "camera: clock against the suit's (ms an hour)", 0, "87", "Guzov 2025 (dissertation), §4.3.4"),
-    ("clock_offset_s", "camera: clock's offset at the start (s)", 1, "–", "ours"),
-    ("claps_heard_percent", "claps heard in the sound track (%)", 0, "“detected in both modalities”", "Guzov 2025 (dissertation), §4.3.4"),
-    ("claps_heard_false_per_min", "other sounds taken for claps (a minute)", 1, "–", "ours"),
-    ("claps_heard_off_ms", "claps heard, off by (ms)", 1, "–", "ours"),
-    ("claps_felt_percent", "claps felt by both wrists (%)", 0, "“detected in both modalities”", "Guzov 2025 (dissertation), §4.3.4"),
-    ("placement_cm", "environment: objects, along the floor (cm)", 1, "–", "ours"),
-    ("placement_deg", "environment: objects, about the vertical (°)", 1, "–", "ours"),
-    ("hinge_cm", "environment: hinges (cm)", 1, "–", "ours"),
-    ("holds_per_min", "hands: holds a minute", 1, "12", "Guzov 2025 (dissertation), §5.4.1: over 2300 in 680,000 frames, read as 60 Hz"),
-    ("hold_s", "hands: median length of a hold (s)", 1, "–", "ours"),
-    ("held_percent", "hands: time in which one holds (%)", 0, "–", "ours"),
-    ("both_hands_percent", "hands: holds with both (%)", 0, "–", "ours"),
-    ("reach_s", "hands: length of a reach (s)", 2, "–", "ours"),
-    ("reach_peak_over_mean", "hands: peak over mean speed of a reach", 2, "1.88, minimum jerk", "Flash and Hogan 1985"),
-)  # fmt: skip
+LITERATURE = Path(__file__).with_name("sensor_literature.tsv")
 """Quantity, label with unit, digits, what is published, and where; "ours" is an assumption."""
 KEY = (
     "heading_deg_per_sqrt_min",
@@ -158,7 +103,7 @@ def _sensors_table(found: Tree) -> Table:
     table = Table(title="Simulated sensors against literature")
     for number, column in enumerate(("", *PRESETS, "literature", "source")):
         table.add_column(column, justify="right" if number in (1, 2, 3) else "left")
-    for line in _sensor_lines(found, [name for name, *_ in LITERATURE]):
+    for line in _sensor_lines(found):
         table.add_row(*line)
     return table
 
@@ -166,12 +111,16 @@ def _sensors_table(found: Tree) -> Table:
 PRESETS = ("ideal", "typical", "poor")
 
 
-def _sensor_lines(found: Tree, names: Sequence[str]) -> list[list[str]]:
-    """A line per measured quantity: by preset, what is published, and where."""
+def _literature() -> list[list[str]]:
+    return [line.split("\t") for line in LITERATURE.read_text(encoding="utf-8").splitlines()[1:]]
+
+
+def _sensor_lines(found: Tree, names: Sequence[str] = ()) -> list[list[str]]:
+    """A line per measured quantity (of `names`, or all): by preset, what is published, and where."""
     return [
-        [label, *(text(found.get(preset, {}).get(name), digits) for preset in PRESETS), published, source]
-        for name, label, digits, published, source in LITERATURE
-        if name in names and any(name in of for of in found.values())
+        [label, *(text(found.get(preset, {}).get(name), int(digits)) for preset in PRESETS), published, source]
+        for name, label, digits, published, source in _literature()
+        if (not names or name in names) and any(name in of for of in found.values())
     ]
 
 
@@ -186,14 +135,16 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
             ("", *PRESETS, "literature", "source"),
             _sensor_lines(measured, KEY),
         ),
-        held_out="People and sites are those of the test split. The suit's heading was fitted to the IMU rows of the paper; "
-        "nothing else was fitted to a result.",
-        simulated="All of it. Each sensor is drawn many times on the same walks; ± is the deviation over draws, and figures "
-        'without it are root mean squares over draws, or single. Sensors without presets stand below "typical".',
+        held_out="People and sites are those of the test split. The suit's heading was fitted to the IMU rows of the "
+        "paper; nothing else was fitted to a result.",
+        simulated="All of it. Each sensor is drawn many times on the same walks; ± is the deviation over draws, and "
+        "figures without it are root mean squares over draws, or single. Sensors without presets stand below "
+        '"typical".',
         limits=(
             'Where the source is "ours" the size is an assumption, because we know no published figure.',
             "Published errors of joints and localisation are from laboratories and benchmarks, not from long walks.",
-            "A session's heading is one draw of a random walk: the distances after which the root is off spread widely.",
+            "A session's heading is one draw of a random walk: the distances after which the root is off spread "
+            "widely.",
             "Nothing here says that errors are correlated with each other as in a real device.",
         ),
         full=[
