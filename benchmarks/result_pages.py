@@ -20,6 +20,7 @@ from tabling import cell
 
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
+from wearcap.metrics.table import Summary
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results"
@@ -77,10 +78,18 @@ def mean(summary: Mapping[str, Any] | None, digits: int = 1) -> str:
 
 
 def ranged(summaries: Iterable[Mapping[str, Any]], digits: int = 1) -> str:
-    """The range of means, as over presets of the sensors; a single one stands alone."""
+    """The range of means, as over presets of the sensors; a single one stands alone, and of none there is nothing."""
     means = [summary["mean"] for summary in summaries if summary["mean"] is not None]
-    shown = list(dict.fromkeys(f"{value:.{digits}f}" for value in (min(means), max(means))))
-    return " to ".join(shown)
+    shown = [f"{value:.{digits}f}" for value in sorted(means)]
+    return " to ".join(dict.fromkeys([*shown[:1], *shown[-1:]]))
+
+
+def summaries(scores: Mapping[str, Mapping[str, Any]]) -> dict[str, Summary]:
+    """Summaries as they were before they became JSON."""
+    return {
+        name: Summary(**{**each, "mean": math.nan if each["mean"] is None else each["mean"]})
+        for name, each in scores.items()
+    }
 
 
 def grid_of(table: Table, about: Mapping[str, Any], spread: str = "") -> Grid:
@@ -90,16 +99,29 @@ def grid_of(table: Table, about: Mapping[str, Any], spread: str = "") -> Grid:
     return Grid(str(table.title), heads, [list(row) for row in zip(*columns)], origin(about, spread))
 
 
+TRAINING = {
+    "parameters_m": ("parameters (M)", 2),
+    "frames_seen_m": ("frames seen (M)", 2),
+    "core_minutes": ("core minutes", 0),
+}
+"""Columns of what a row's training took."""
+
+
 def score_grids(tree: Tree, labels: Mapping[str, tuple[str, int]], spread: str = "seeds") -> list[Grid]:
     """The tables of a tree {"tables": {title: {row: {metric: summary}}}}: columns are the metrics that have a label
-    (and digits), then all others."""
-    grids = []
+    (and digits), then all others but those of the truth, which has a row."""
+    grids, labels = [], {**labels, **TRAINING}
     for title, rows in tree["tables"].items():
-        present = list(dict.fromkeys(metric for row in rows.values() for metric in row))
+        present = list(dict.fromkeys(m for row in rows.values() for m in row if not m.startswith("truth_")))
         metrics = [name for name in labels if name in present] + [name for name in present if name not in labels]
         cells = [[name, *(text(row.get(m), labels.get(m, ("", 2))[1]) for m in metrics)] for name, row in rows.items()]
         count = max(
-            (each["seeds"] for name, row in rows.items() if not name.startswith("paper") for each in row.values()),
+            (
+                each["seeds"]
+                for name, row in rows.items()
+                if not name.startswith(("paper", "truth"))
+                for each in row.values()
+            ),
             default=0,
         )
         about = tree.get("origins", {}).get(title, tree["about"])
@@ -181,13 +203,21 @@ def write_speed(path: Path, benchmark: str, figures: list[Tree], about: Mapping[
 
 
 def merged(old: Tree, new: Tree) -> Tree:
-    """A tree as published: of trees with `tables`, tables of other titles stay, each with the `about` of its own
+    """A tree as published: of trees with `tables`, tables of other numbers stay, each with the `about` of its own
     command; what was measured of each seed alone is left out."""
     new = {key: value for key, value in new.items() if key != "seeds"}
     if "tables" not in new:
         return new
+    again = {_number(title) for title in new["tables"]}
     origins = {**old.get("origins", {}), **dict.fromkeys(new["tables"], new["about"])}
-    return {**new, "tables": {**old.get("tables", {}), **new["tables"]}, "origins": origins}
+    kept = {title: rows for title, rows in old.get("tables", {}).items() if _number(title) not in again}
+    tables = {**kept, **new["tables"]}
+    return {**new, "tables": tables, "origins": {title: origins[title] for title in tables}}
+
+
+def _number(title: str) -> str:
+    """What a table keeps when it is made again: "Table 1" of "Table 1: objects, test"."""
+    return title.split(":")[0]
 
 
 def publish(path: Path, folder: Path = RESULTS) -> Path:

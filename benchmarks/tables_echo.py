@@ -140,15 +140,21 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
 LABELS = {
     "mpjpe_mm": ("MPJPE (mm)", 1),
     "mpjve_mm": ("MPJVE (mm a frame)", 1),
+    "mpjve_printed": ("MPJVE as the paper prints it", 1),
     "foot_contact": ("FC", 2),
     "true_foot_contact": ("FC, truth", 2),
     "v2v_cm": ("E_v2v (cm)", 1),
     "center_cm": ("E_c (cm)", 1),
+    "add_s_cm": ("ADD-S (cm)", 1),
     "rotation_deg": ("rotation (°)", 1),
+    "symmetric_rotation_deg": ("rotation modulo symmetry (°)", 1),
     "quaternion": ("quaternion", 2),
     "touch_f1": ("contact F1", 2),
     "jitter_m_s3": ("jitter (m/s³)", 1),
     "true_jitter_m_s3": ("jitter, truth", 1),
+    "foot_skate_cm_s": ("skate (cm/s)", 1),
+    "floor_penetration_cm": ("into the floor (cm)", 2),
+    "physicality": ("physicality", 4),
 }
 """Columns of the page's tables with their digits."""
 HEADLINE = (
@@ -179,7 +185,8 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     """What docs/results/echo.md says."""
     objects, people = rows_of(trees, "Table 1"), rows_of(trees, "Table 2")
     ours, online = objects["ours"], figure_of(speed, "echo_online_small_fps")
-    columns = [(name, (metric,), digits) for metric, (name, digits) in LABELS.items() if metric in OBJECTS]
+    shown = {metric for title, row, _ in HEADLINE for metric in rows_of(trees, title).get(row, {})}
+    columns = [(LABELS[name][0], (name,), LABELS[name][1]) for name in LABELS if name in shown and name in OBJECTS]
     real = f"; real motion (CMU) {people['ours']['mpjpe_mm']['mean'] / 10:.1f}" if "ours" in people else ""
     return Page(
         title="[ECHO](../echo.md): figures",

@@ -6,20 +6,18 @@ out, which is printed. Checkpoints come by name (checkpoints/) or path.
 
 import argparse
 import json
-import math
 from dataclasses import asdict, replace
 from pathlib import Path
 
 from hmd2_runs import BASELINES, Case, Method, Result, run_method
 from joblib import Parallel, delayed
-from result_pages import NONE, Grid, Page, Tree, Trees, figure_of, grid_of, mean, text
+from result_pages import NONE, Grid, Page, Tree, Trees, figure_of, grid_of, mean, ranged, summaries, text
 from rich.console import Console
 from rich.table import Table
 from tabling import cell, finite, new_table
 
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
-from wearcap.metrics.table import Summary
 from wearcap.models.checkpoint import checkpoint_file
 from wearcap.recording import RecordingStore
 
@@ -152,9 +150,10 @@ HEADLINE = {
     "AvatarPoser-style (head)": "AvatarPoser-style, head",
     "AvatarPoser-style (head and hands)": "AvatarPoser-style, which also sees the hands",
     "full": "**all of it**",
+    "full, ideal sensors": "**all of it**, ideal sensors",
+    "full, poor sensors": "**all of it**, poor sensors",
     "head alone": "the same checkpoint, head alone",
     "full, the paper's windows": "all of it, the paper's windows and steps",
-    "full, one step to the mean": "all of it, one step to the mean",
 }
 """Rows of the page's first table, and what the page calls them."""
 CLOCKS = {
@@ -168,7 +167,7 @@ CLOCKS = {
     "voxelize_vs_brute_force": "the same, against all points for each frame, then against a KD-tree",
 }
 """Benchmarks of the page's table of speed: what their clocks count, and what is given."""
-FIRST = "Tables 6.1 and 6.3"
+MAIN = "Tables 6.1 and 6.3"
 
 
 def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
@@ -177,7 +176,9 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         {row["method"]: row["scores"] for row in _rows(trees, name)} for name in ("simulated_camera", "cmu_surrounded")
     )
     ours, online = simulated["full"], figure_of(speed, "hmd2_online_small_fps")
-    ours_real = f"; real motion (CMU) {mean(real['full']['mpjpe_cm'])}" if "full" in real else ""
+    sensing = ("full, ideal sensors", "full", "full, poor sensors")
+    errors = [ranged(rows[name]["mpjpe_cm"] for name in sensing if name in rows) for rows in (simulated, real)]
+    ours_real = f"; real motion (CMU) {errors[1]}" if errors[1] else ""
     metrics = (("mpjpe_cm", 2), ("hand_pe_cm", 2), ("lower_pe_cm", 2), ("fid", 2), ("jitter_ratio", 2))
     shown = [
         [
@@ -194,6 +195,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     paper = [
         [f"the paper's {name}, on Nymeria", f"{row[0]:.2f}", f"{row[1]:.2f}", NONE, f"{row[2]:.2f}", *[NONE] * 4]
         for name, row in PAPER.items()
+        if name != "HMD² (h = 10)"
     ]
     grids = [
         grid_of(
@@ -204,7 +206,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         for name, tree in trees.items()
         for title, rows in tree["tables"].items()
     ]
-    first = {name: _results(tree["tables"].get(FIRST, [])) for name, tree in trees.items()}
+    first = {name: _results(tree["tables"].get(MAIN, [])) for name, tree in trees.items()}
     for name, rows in first.items():
         if any(row.activities for row in rows):
             table = _activities(
@@ -246,7 +248,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
             "No recording of a real head-mounted device has been scored.",
         ),
         full=grids,
-        measured=f"joints {mean(ours['mpjpe_cm'])} cm off{ours_real}",
+        measured=f"joints {errors[0]} cm off{ours_real}",
         speed=f"{online['ratio']:.0f} × online, head's path and points given" if online else "",
         clocks=CLOCKS,
         pictures=(("hmd2_samples.png", "One input, several motions (four samples, above them the truth)"),),
@@ -254,18 +256,11 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
 
 
 def _rows(trees: Trees, name: str) -> list[Tree]:
-    return trees.get(f"hmd2_{name}", {}).get("tables", {}).get(FIRST, [])
+    return trees.get(f"hmd2_{name}", {}).get("tables", {}).get(MAIN, [])
 
 
 def _results(rows: list[Tree]) -> list[Result]:
     """Results as they were before they became JSON."""
-
-    def summaries(scores: Tree) -> dict[str, Summary]:
-        return {
-            name: Summary(**{**each, "mean": math.nan if each["mean"] is None else each["mean"]})
-            for name, each in scores.items()
-        }
-
     return [
         Result(
             row["method"], summaries(row["scores"]), {name: summaries(each) for name, each in row["activities"].items()}

@@ -14,7 +14,7 @@ from hps_pictures import draw_drift
 from hps_runs import DISTURBED, ROWS, TRUTH, SeedRun, run_seed
 from hps_sessions import SessionSettings
 from joblib import Parallel, delayed
-from result_pages import NONE, Grid, Page, Tree, Trees, grid_of, mean, ranged, text
+from result_pages import NONE, Grid, Page, Tree, Trees, figure_of, grid_of, mean, ranged, text
 from rich.console import Console
 from rich.table import Table
 from tabling import cell, finite, new_table, summarize
@@ -131,7 +131,8 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     spread = f"{sessions} sessions" if sessions > 1 else "one session"
     whole = {row: [tree["whole"][row]["mpjpe_cm"] for tree in trees.values()] for row in ("IMU", "HPS", "ours")}
     seconds = sum(summary["mean"] for summary in typical["stage_seconds"]["ours"].values())
-    end = typical["places"][-1]
+    end, all_of_it = typical["places"][-1], figure_of(speed, "hps_end_to_end_realtime")
+    whole_way = f"; {all_of_it['ratio']:.1f} ×, localisation included" if all_of_it else ""
     return Page(
         title="[HPS](../hps.md): figures",
         headline=Grid(
@@ -162,7 +163,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         full=[grid_of(table, tree["about"], spread) for tree in trees.values() for table in _all_tables(tree)],
         measured=f"joints {ranged(whole['ours'])} cm off over {end} and more, {_presets(trees)} (as published "
         f"{ranged(whole['HPS'])}; suit alone: {ranged(whole['IMU'], 0)})",
-        speed=f"{typical['frames']['mean'] / 30 / seconds:.0f} × real time, localised cameras given",
+        speed=f"{typical['frames']['mean'] / 30 / seconds:.0f} × real time, localised cameras given{whole_way}",
         clocks=CLOCKS,
     )
 

@@ -84,22 +84,23 @@ def test_cells_of_what_is_not_known_and_ranges():
     assert text(None) == text(summary(None)) == "–"
     assert ranged([summary(3.21), summary(2.44), summary(None), summary(4.96)]) == "2.4 to 5.0"
     assert ranged([summary(3.21)]) == "3.2"
+    assert ranged([]) == ""
     assert [number(value) for value in (0.59, 4976.4, 0.0, 12.34, None)] == ["0.590", "4976", "0", "12.3", "–"]
 
 
-def test_published_tables_are_merged_by_title(tmp_path):
+def test_published_tables_are_merged_by_number(tmp_path):
     from result_pages import publish
 
     folder, made = tmp_path / "results", tmp_path / "echo.json"
     folder.mkdir()
-    for date, tables in (("d1", {"A": {"x": 1}, "B": {"x": 2}}), ("d2", {"B": {"x": 3}})):
+    for date, tables in (("d1", {"A: old": {"x": 1}, "B: old": {"x": 2}}), ("d2", {"B: new": {"x": 3}})):
         made.write_text(
             json.dumps({"about": {**ABOUT, "date": date}, "tables": tables, "seeds": [{"frames": [0] * 99}]})
         )
         path = publish(made, folder)
     found = json.loads(path.read_text())
-    assert found["tables"] == {"A": {"x": 1}, "B": {"x": 3}}
-    assert {title: about["date"] for title, about in found["origins"].items()} == {"A": "d1", "B": "d2"}
+    assert found["tables"] == {"A: old": {"x": 1}, "B: new": {"x": 3}}
+    assert {title: about["date"] for title, about in found["origins"].items()} == {"A: old": "d1", "B: new": "d2"}
     assert "seeds" not in found
     made.write_text(json.dumps({"about": ABOUT, "rows": {"ours": 1}}))
     assert set(json.loads(publish(made, folder).read_text())) == {"about", "rows"}
