@@ -236,6 +236,8 @@ def render(system: str, page: Page, speed: Mapping[str, list[Tree]]) -> str:
             f"a headline table of {len(page.headline.rows)} rows", where=system, expected=f"at most {MOST_ROWS}"
         )
     made = f"Written by `python benchmarks/tables.py {system} --page` from the JSON files beside this page."
+    if any(TRANSCRIBED in grid.origin for grid in page.full):
+        made += " Tables that say so are transcribed from an earlier page; the same command makes them anew."
     parts = [f"# {page.title}", made, page.headline.title, markdown(page.headline)]
     parts += ["## Held out", page.held_out, "## Simulated", page.simulated]
     parts += ["## Limits", "\n".join(f"- {limit}" for limit in page.limits)]

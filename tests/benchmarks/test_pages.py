@@ -67,7 +67,7 @@ def test_a_headline_of_more_than_twelve_rows_is_refused():
 
 
 def test_what_is_transcribed_says_so():
-    from result_pages import origin, score_grids
+    from result_pages import origin, render, score_grids
 
     table = {"ours": {"a_cm": summary(1.256, 0.04, 4)}, "paper: theirs": {"b_cm": summary(2.0)}}
     tree = {"about": ABOUT, "tables": {"Table 1": table}, "origins": {"Table 1": {**ABOUT, "transcribed": True}}}
@@ -76,6 +76,9 @@ def test_what_is_transcribed_says_so():
     assert grid.rows == [["ours", "–", "1.26 ± 0.04"], ["paper: theirs", "2.0", "–"]]
     assert grid.origin.endswith("a machine, 4 seeds; transcribed from an earlier page.")
     assert "transcribed" not in origin(ABOUT)
+    line = "Tables that say so are transcribed"
+    assert line in render("echo", small_page(full=[grid]), {})
+    assert line not in render("echo", small_page(), {})
 
 
 def test_cells_of_what_is_not_known_and_ranges():
@@ -147,6 +150,7 @@ def test_the_page_is_what_its_json_gives(system):
 
     page = page_of(system)
     assert page is not None
+    assert all((ROOT / "docs" / name).is_file() for name, _ in page.pictures)
     assert render(system, page, read_speed()) == (RESULTS / f"{system}.md").read_text(encoding="utf-8")
     if page.measured:
         readme = (ROOT / "README.md").read_text(encoding="utf-8")
