@@ -10,6 +10,7 @@ import json
 import math
 import os
 import platform
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -225,8 +226,22 @@ def publish(path: Path, folder: Path = RESULTS) -> Path:
     target = folder / path.name
     old = json.loads(target.read_text(encoding="utf-8")) if target.is_file() else {}
     tree = merged(old, json.loads(path.read_text(encoding="utf-8")))
-    write_text(target, json.dumps(tree, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    write_text(target, compact(tree))
     return target
+
+
+def compact(tree: Tree) -> str:
+    """JSON with six significant digits, and a summary on a line of its own."""
+
+    def rounded(part: Any) -> Any:
+        if isinstance(part, dict):
+            return {key: rounded(value) for key, value in part.items()}
+        if isinstance(part, list):
+            return [rounded(value) for value in part]
+        return float(f"{part:.6g}") if isinstance(part, float) else part
+
+    lines = json.dumps(rounded(tree), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    return re.sub(r"\{\s+(\"mean\":[^{}\[\]]*?)\s+\}", lambda found: "{" + " ".join(found[1].split()) + "}", lines)
 
 
 def render(system: str, page: Page, speed: Mapping[str, list[Tree]]) -> str:

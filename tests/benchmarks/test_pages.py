@@ -109,6 +109,14 @@ def test_published_tables_are_merged_by_number(tmp_path):
     assert set(json.loads(publish(made, folder).read_text())) == {"about", "rows"}
 
 
+def test_published_json_is_short():
+    from result_pages import compact
+
+    shown = compact({"about": ABOUT, "rows": {"ours": [summary(1.23456789, None, 4), {"a": summary(2.0)}]}})
+    assert json.loads(shown)["rows"]["ours"] == [summary(1.23457, None, 4), {"a": summary(2.0)}]
+    assert '{"mean": 1.23457, "std": null, "seeds": 4}' in shown
+
+
 def test_figures_of_speed_replace_those_of_their_benchmark_alone(tmp_path):
     from result_pages import read_speed, write_speed
 
