@@ -161,7 +161,10 @@ def figure_of(speed: Mapping[str, list[Tree]], name: str) -> Tree | None:
 
 def about(command: str) -> dict[str, str]:
     """What a figure needs beside it: command, date, machine."""
-    machine = f"{platform.machine()} {platform.system()}, {os.cpu_count()} cores, Python {platform.python_version()}"
+    known = Path("/proc/cpuinfo")
+    models = re.findall(r"model name\s*: (.+)", known.read_text(encoding="utf-8")) if known.is_file() else []
+    processor = models[0] if models else platform.machine()
+    machine = f"{processor}, {os.cpu_count()} cores, {platform.system()}, Python {platform.python_version()}"
     return {"command": command, "date": datetime.date.today().isoformat(), "machine": machine}
 
 
