@@ -144,6 +144,99 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     return path
 
 
+def _case(options: argparse.Namespace) -> Case:
+    if not (options.dataset / "manifest.json").is_file():
+        raise WearcapError(
+            "no such data set",
+            where=options.dataset,
+            fix="Run: wearcap prepare simulated camera=true output=datasets/simulated_camera",
+        )
+    names = RecordingStore.open(options.dataset).names(options.split)
+    names = names[: 3 if options.quick else options.recordings]
+    seeds = tuple(range(2 if options.quick else options.seeds))
+    realism = options.realism if _exists(options.realism) else None
+    return Case(options.dataset, tuple(names), seeds, tuple(options.training), realism, options.device)
+
+
+def _exists(checkpoint: str) -> bool:
+    try:
+        return checkpoint_file(checkpoint).is_file()
+    except WearcapError:
+        return False
+
+
+def _ours(options: argparse.Namespace, name: str, *overrides: str, pipeline: str = "hmd2") -> Method:
+    return Method(name, options.checkpoint, (f"pipeline={pipeline}", "pipeline.runtime=auto", *overrides))
+
+
+def _latencies(options: argparse.Namespace, h: int) -> list[Method]:
+    """A stride of Table 6.5 as in the paper, and as ours, in as many steps."""
+    ahead = min(LOOKAHEAD, 240 - h)
+    both = (f"pipeline.overlap.stride={h}", "pipeline.sampling.steps=5", "pipeline.live=true")
+    return [
+        _ours(options, f"h = {h}, the paper's", *both, pipeline="paper/hmd2"),
+        _ours(options, f"h = {h}", *both, "pipeline.overlap.fade=10", "pipeline.overlap.lookahead=0"),
+        _ours(
+            options, f"h = {h}, {ahead} ahead", *both, "pipeline.overlap.fade=10", f"pipeline.overlap.lookahead={ahead}"
+        ),
+    ]
+
+
+def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
+    """Rows of the first table; those whose checkpoint is not there are named and left out."""
+    regressors = [
+        Method(f"AvatarPoser-style ({sees})", checkpoint, ("pipeline=pose_regressor",))
+        for sees, checkpoint in zip(("head", "head and hands"), options.regressors)
+    ]
+    ablations = [_ours(options, name, f"pipeline.use={use}") for name, use in MODALITIES.items()]
+    separate = [
+        Method(f"{name}, trained by itself", checkpoint)
+        for name, _, checkpoint in (row.partition("=") for row in options.separate)
+    ]
+    wanted = [
+        *(Method(name) for name in BASELINES),
+        Method("EgoEgo-style", options.egoego, ("pipeline=baseline/egoego_style",)),
+        *regressors,
+        *ablations,
+        *separate,
+        _ours(options, "full, the paper's windows", pipeline="paper/hmd2"),
+        _ours(options, "full, one step to the mean", pipeline="ablation/hmd2_mean"),
+    ]
+    there = [method for method in wanted if method.checkpoint is None or _exists(method.checkpoint)]
+    for method in wanted:
+        if method not in there:
+            console.print(f"left out: {method.name} (no checkpoint {method.checkpoint!r})")
+    return there
+
+
+def _table(title: str, results: list[Result]) -> Table:
+    table = new_table(title, ["", *COLUMNS.values()])
+    for result in results:
+        cells = [cell(asdict(result.scores[key])) if key in result.scores else "–" for key in COLUMNS]
+        table.add_row(result.method, *cells)
+    if results:
+        first = results[0].scores
+        truth = {"physicality": "truth_physicality", "diversity": "truth_diversity"}
+        table.add_row("truth", *(f"{first[truth[key]].mean:.2f}" if truth.get(key) in first else "" for key in COLUMNS))
+    return table
+
+
+def _paper() -> Table:
+    table = new_table("the paper, on Nymeria", ["", "MPJPE", "hand", "FID", "divers.", "phys.", "floor"])
+    for name, values in PAPER.items():
+        table.add_row(name, *(f"{value:.2f}" for value in values))
+    return table
+
+
+def _activities(title: str, results: list[Result], metric: str) -> Table:
+    names = sorted({activity for result in results for activity in result.activities})
+    table = new_table(title, ["", *(name[:14] for name in names)])
+    for result in results:
+        row = [result.activities[name][metric].mean if name in result.activities else None for name in names]
+        table.add_row(result.method, *("–" if value is None else f"{value:.1f}" for value in row))
+    return table
+
+
 HEADLINE = {
     "nearest window": "nearest window of the training",
     "EgoEgo-style": "EgoEgo-style, head",
@@ -272,96 +365,3 @@ def _results(rows: list[Tree]) -> list[Result]:
 def _repetitions(rows: list[Tree]) -> str:
     count = max((score["seeds"] for row in rows for score in row["scores"].values()), default=1)
     return f"{count} repetitions" if count > 1 else ""
-
-
-def _case(options: argparse.Namespace) -> Case:
-    if not (options.dataset / "manifest.json").is_file():
-        raise WearcapError(
-            "no such data set",
-            where=options.dataset,
-            fix="Run: wearcap prepare simulated camera=true output=datasets/simulated_camera",
-        )
-    names = RecordingStore.open(options.dataset).names(options.split)
-    names = names[: 3 if options.quick else options.recordings]
-    seeds = tuple(range(2 if options.quick else options.seeds))
-    realism = options.realism if _exists(options.realism) else None
-    return Case(options.dataset, tuple(names), seeds, tuple(options.training), realism, options.device)
-
-
-def _exists(checkpoint: str) -> bool:
-    try:
-        return checkpoint_file(checkpoint).is_file()
-    except WearcapError:
-        return False
-
-
-def _ours(options: argparse.Namespace, name: str, *overrides: str, pipeline: str = "hmd2") -> Method:
-    return Method(name, options.checkpoint, (f"pipeline={pipeline}", "pipeline.runtime=auto", *overrides))
-
-
-def _latencies(options: argparse.Namespace, h: int) -> list[Method]:
-    """A stride of Table 6.5 as in the paper, and as ours, in as many steps."""
-    ahead = min(LOOKAHEAD, 240 - h)
-    both = (f"pipeline.overlap.stride={h}", "pipeline.sampling.steps=5", "pipeline.live=true")
-    return [
-        _ours(options, f"h = {h}, the paper's", *both, pipeline="paper/hmd2"),
-        _ours(options, f"h = {h}", *both, "pipeline.overlap.fade=10", "pipeline.overlap.lookahead=0"),
-        _ours(
-            options, f"h = {h}, {ahead} ahead", *both, "pipeline.overlap.fade=10", f"pipeline.overlap.lookahead={ahead}"
-        ),
-    ]
-
-
-def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
-    """Rows of the first table; those whose checkpoint is not there are named and left out."""
-    regressors = [
-        Method(f"AvatarPoser-style ({sees})", checkpoint, ("pipeline=pose_regressor",))
-        for sees, checkpoint in zip(("head", "head and hands"), options.regressors)
-    ]
-    ablations = [_ours(options, name, f"pipeline.use={use}") for name, use in MODALITIES.items()]
-    separate = [
-        Method(f"{name}, trained by itself", checkpoint)
-        for name, _, checkpoint in (row.partition("=") for row in options.separate)
-    ]
-    wanted = [
-        *(Method(name) for name in BASELINES),
-        Method("EgoEgo-style", options.egoego, ("pipeline=baseline/egoego_style",)),
-        *regressors,
-        *ablations,
-        *separate,
-        _ours(options, "full, the paper's windows", pipeline="paper/hmd2"),
-        _ours(options, "full, one step to the mean", pipeline="ablation/hmd2_mean"),
-    ]
-    there = [method for method in wanted if method.checkpoint is None or _exists(method.checkpoint)]
-    for method in wanted:
-        if method not in there:
-            console.print(f"left out: {method.name} (no checkpoint {method.checkpoint!r})")
-    return there
-
-
-def _table(title: str, results: list[Result]) -> Table:
-    table = new_table(title, ["", *COLUMNS.values()])
-    for result in results:
-        cells = [cell(asdict(result.scores[key])) if key in result.scores else "–" for key in COLUMNS]
-        table.add_row(result.method, *cells)
-    if results:
-        first = results[0].scores
-        truth = {"physicality": "truth_physicality", "diversity": "truth_diversity"}
-        table.add_row("truth", *(f"{first[truth[key]].mean:.2f}" if truth.get(key) in first else "" for key in COLUMNS))
-    return table
-
-
-def _paper() -> Table:
-    table = new_table("the paper, on Nymeria", ["", "MPJPE", "hand", "FID", "divers.", "phys.", "floor"])
-    for name, values in PAPER.items():
-        table.add_row(name, *(f"{value:.2f}" for value in values))
-    return table
-
-
-def _activities(title: str, results: list[Result], metric: str) -> Table:
-    names = sorted({activity for result in results for activity in result.activities})
-    table = new_table(title, ["", *(name[:14] for name in names)])
-    for result in results:
-        row = [result.activities[name][metric].mean if name in result.activities else None for name in names]
-        table.add_row(result.method, *("–" if value is None else f"{value:.1f}" for value in row))
-    return table
