@@ -281,8 +281,8 @@ HEADLINE = (
     ("Ablation", "BoDiffusion-style + object", "objects: BoDiffusion-style + object, trained as long"),
     ("Ablation", "the paper's frame", "objects: ours, short training, the paper's frame"),
     ("Settings", "initial object poses observed", "objects: ours, initial object poses given"),
+    ("Table 1", "truth", "objects: the truth itself"),
     ("Table 1", "paper: BEHAVE", "the paper's, on BEHAVE"),
-    ("Table 1", "paper: OMOMO", "the paper's, on OMOMO"),
     ("Table 1", "paper: BoDiffusion+Obj, BEHAVE", "the paper's BoDiffusion + object, on BEHAVE"),
     ("Table 2", "ours", "people alone (CMU): **ours**"),
     ("Table 2", "BoDiffusion-style + object", "people alone (CMU): BoDiffusion-style + object, short training"),
@@ -323,8 +323,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
             "Observed contacts leave the object unchanged within the spread, unlike in the paper, where they help it "
             "most.",
             "Body motion jitters between observed and generated frames.",
-            "The trainings of the ablation are short, with one seed each, and scored without guidance but where the "
-            "row says so.",
+            "The trainings of the ablation have one seed each, and are scored without guidance but where the row says so.",
             "No recording of real people with objects has been captured.",
         ),
         full=[grid for tree in trees.values() for grid in score_grids(tree, LABELS)],

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from hmd2_runs import BASELINES, Case, Method, Result, run_method
 from joblib import Parallel, delayed
-from result_pages import NONE, Grid, Page, Tree, Trees, figure_of, grid_of, mean, ranged, summaries, text
+from result_pages import NONE, Grid, Page, Tree, Trees, figure_of, grid_of, mean, ranged, score_grids, summaries, text
 from rich.console import Console
 from rich.table import Table
 from tabling import cell, finite, new_table
@@ -272,6 +272,55 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     sensing = ("full, ideal sensors", "full", "full, poor sensors")
     errors = [ranged(rows[name]["mpjpe_cm"] for name in sensing if name in rows) for rows in (simulated, real)]
     ours_real = f"; real motion (CMU) {errors[1]}" if errors[1] else ""
+    return Page(
+        title="[HMD²](../hmd2.md): figures",
+        headline=Grid(
+            "Whole recordings, anchored to the true head; means over repetitions, ± their deviation (cm).",
+            (
+                "",
+                "simulated: MPJPE",
+                "hands",
+                "lower body",
+                "FID",
+                "jitter, of the truth's",
+                "CMU: MPJPE",
+                "hands",
+                "lower body",
+            ),
+            _first_lines(simulated, real),
+        ),
+        held_out="People and places of the test split of simulated wearers, and four CMU subjects in simulated "
+        "surroundings. Everything was chosen on the validation split.",
+        simulated="People, flats, points and pictures of the simulated wearers; on CMU the motion is real, and "
+        "surroundings, points and pictures are simulated. The head's path has the jitter of "
+        "[simulation](simulation.md). The paper's rows are from real recordings (Nymeria): no comparison.",
+        limits=(
+            *_against_hands(simulated),
+            f"Jitter is {mean(ours['jitter_ratio'])} times the truth's.",
+            "Bad are arms out of the camera's sight, and CMU's dances and jumps.",
+            "Trainings of baselines may be shorter than ours: where checkpoints record it, the tables say what they took.",
+            "FID needs more windows than CMU's held-out subjects have.",
+            "No recording of a real head-mounted device has been scored.",
+        ),
+        full=_grids(trees),
+        measured=f"joints {errors[0]} cm off{ours_real}",
+        speed=f"{online['ratio']:.0f} × online, head's path and points given" if online else "",
+        clocks=CLOCKS,
+        pictures=(("hmd2_samples.png", "One input, several motions (four samples, above them the truth)"),),
+    )
+
+
+def _against_hands(scores: dict[str, Tree]) -> tuple[str, ...]:
+    """What seeing both hands is worth to a regressor."""
+    theirs, ours = scores.get("AvatarPoser-style (head and hands)"), scores["full"]
+    if theirs is None:
+        return ()
+    errors = [f"{mean(theirs[name])} cm against {mean(ours[name])}" for name in ("mpjpe_cm", "lower_pe_cm")]
+    return (f"The regressor that also sees both hands is {errors[0]} off, and {errors[1]} in the lower body.",)
+
+
+def _first_lines(simulated: dict[str, Tree], real: dict[str, Tree]) -> list[list[str]]:
+    """Lines of the page's first table, from scores by row of both data sets."""
     metrics = (("mpjpe_cm", 2), ("hand_pe_cm", 2), ("lower_pe_cm", 2), ("fid", 2), ("jitter_ratio", 2))
     shown = [
         [
@@ -290,6 +339,11 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         for name, row in PAPER.items()
         if name != "HMD² (h = 10)"
     ]
+    return shown + paper
+
+
+def _grids(trees: Trees) -> list[Grid]:
+    """All tables."""
     grids = [
         grid_of(
             _table(f"{title} ({name.removeprefix('hmd2_')})", _results(rows)),
@@ -299,6 +353,11 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         for name, tree in trees.items()
         for title, rows in tree["tables"].items()
     ]
+    labels = {name: (title, 2) for name, title in COLUMNS.items()}
+    for tree in trees.values():
+        parts = {"Table 6.6: 95th percentiles": tree.get("percentiles"), **tree.get("scenarios", {})}
+        found = {title: rows for title, rows in parts.items() if rows}
+        grids += score_grids({"about": tree["about"], "tables": found}, labels)
     first = {name: _results(tree["tables"].get(MAIN, [])) for name, tree in trees.items()}
     for name, rows in first.items():
         if any(row.activities for row in rows):
@@ -306,46 +365,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
                 f"Tables 6.8–6.10: MPJPE (cm) by what was mostly done ({name.removeprefix('hmd2_')})", rows, "mpjpe_cm"
             )
             grids.append(grid_of(table, trees[name]["about"]))
-    return Page(
-        title="[HMD²](../hmd2.md): figures",
-        headline=Grid(
-            "Whole recordings, anchored to the true head; means over repetitions, ± their deviation (cm).",
-            (
-                "",
-                "simulated: MPJPE",
-                "hands",
-                "lower body",
-                "FID",
-                "jitter, of the truth's",
-                "CMU: MPJPE",
-                "hands",
-                "lower body",
-            ),
-            shown + paper,
-        ),
-        held_out="People and places of the test split of simulated wearers, and four CMU subjects in simulated "
-        "surroundings. Everything was chosen on the validation split.",
-        simulated="People, flats, points and pictures of the simulated wearers; on CMU the motion is real, and "
-        "surroundings, points and pictures are simulated. The head's path has the jitter of "
-        "[simulation](simulation.md). The paper's rows are from real recordings (Nymeria): no comparison.",
-        limits=(
-            "The regressor that also sees both hands has the smaller mean error "
-            f"({mean(simulated['AvatarPoser-style (head and hands)']['mpjpe_cm'])} against {mean(ours['mpjpe_cm'])} "
-            "cm) and the larger one in the lower body."
-            if "AvatarPoser-style (head and hands)" in simulated
-            else "The regressor that also sees both hands was not measured.",
-            f"Jitter is {mean(ours['jitter_ratio'])} times the truth's.",
-            "Bad are arms out of the camera's sight, and CMU's dances and jumps.",
-            "Baselines were trained more briefly than ours, EgoEgo-style most so: it shakes.",
-            "FID needs more windows than CMU's held-out subjects have.",
-            "No recording of a real head-mounted device has been scored.",
-        ),
-        full=grids,
-        measured=f"joints {errors[0]} cm off{ours_real}",
-        speed=f"{online['ratio']:.0f} × online, head's path and points given" if online else "",
-        clocks=CLOCKS,
-        pictures=(("hmd2_samples.png", "One input, several motions (four samples, above them the truth)"),),
-    )
+    return grids
 
 
 def _rows(trees: Trees, name: str) -> list[Tree]:

@@ -195,8 +195,8 @@ def _limits(tree: Tree) -> tuple[str, ...]:
         f"{mean(without['w/o contact corr.'])}, without the fit about hinges {mean(without['no fit about hinges'])}: "
         "where these are smaller, the step wins nothing here.",
         "Simulated hands are tidier than people's; contact networks are to be judged on real recordings.",
-        "The published contact networks had a shorter training than in the paper: the row that compares the trackers "
-        "is the paper's tracker and path with our contacts.",
+        "Published contact networks are trained on the same simulated recordings as ours; the row that compares the "
+        "trackers alone is the paper's tracker and path with our contacts.",
     )
 
 

@@ -188,7 +188,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         limits=(
             f"Legs are guessed from how head and hands move: the lower body is {mean(body['ours']['lower_pe_cm'])} cm "
             "off on CMU, where the network overfits few minutes of real motion.",
-            'The row "as in the paper" is a short training of a network as small as ours, and far from learned.',
+            'The row "as in the paper" is one training of a network as small as ours.',
             "Three tracked points instead of watches do better: the wrists' places are what watches do not tell.",
             "CMU's frames with a cue are of dances, pantomime and obstacles that are jumped over.",
             "No log of a real watch has been measured.",
