@@ -2,6 +2,7 @@
 
     python benchmarks/run.py [NAME ...]      all benchmarks, or the named ones
     python benchmarks/run.py --list          their names and what they measure
+    python benchmarks/run.py NAME --write docs/results/speed.jsonl     also into the file that the results' pages show
 
 A benchmark is a module in this folder with `measure() -> list[dict]`; each dict is one figure with the keys
 name, value, unit, baseline, ratio, goal. `value` is ours and `baseline` what it is compared with, measured side by
@@ -42,8 +43,13 @@ def run(name: str) -> list[dict]:
 def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(description="Run benchmarks; one JSON line per figure.")
     parser.add_argument("names", nargs="*", metavar="NAME", help="benchmarks to run (default: all)")
+    parser.add_argument(
+        "--write", type=Path, help="file of JSON lines in which these figures replace their earlier ones"
+    )
     parser.add_argument("--list", action="store_true", help="name the benchmarks and leave")
     options = parser.parse_args(arguments)
+    if options.write is not None:
+        from result_pages import about, write_speed
     known = discover()
     if options.list:
         for name, summary in known.items():
@@ -53,8 +59,11 @@ def main(arguments: list[str]) -> None:
     if unknown:
         parser.error(f"no benchmark {', '.join(unknown)}. Expected some of {', '.join(known)}.")
     for name in options.names or known:
-        for figure in run(name):
+        figures = run(name)
+        for figure in figures:
             print(json.dumps(figure), flush=True)
+        if options.write is not None:
+            write_speed(options.write, name, figures, about(f"python benchmarks/run.py {name}"))
 
 
 if __name__ == "__main__":

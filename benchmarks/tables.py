@@ -1,8 +1,10 @@
 """A system's tables as in its paper, with ours, baselines and ablations.
 
-    python benchmarks/tables.py SYSTEM [--quick] [--help]
+    python benchmarks/tables.py SYSTEM [--quick] [--publish] [--help]
+    python benchmarks/tables.py SYSTEM --page
 
-Prints them and writes OUTPUT/SYSTEM.json (OUTPUT is outputs/tables). Systems:
+Prints them and writes OUTPUT/SYSTEM.json (OUTPUT is outputs/tables), which --publish puts into docs/results as well.
+--page computes nothing: it writes docs/results/SYSTEM.md and README's row from the JSON files in docs/results. Systems:
 
     hmd2          HMD2 with points and pictures: its paper's tables on held-out people and places
     hmd2_head     HMD2 on the head path alone: MPJPE and its parts, realism, beside trivial baselines
@@ -15,18 +17,19 @@ Prints them and writes OUTPUT/SYSTEM.json (OUTPUT is outputs/tables). Systems:
     objects       the object encoder's feature: category, extents, instance of objects unknown to it
     simulation    how far simulated people differ from CMU's: gait statistics, and a discriminator
 
-Each system is a module tables_SYSTEM.py in this folder with `add_arguments(parser)` and
-`tables(options, about)`.
+Each system is a module tables_SYSTEM.py in this folder with `add_arguments(parser)`, `tables(options, about)` and, where
+it has a page, `page(trees, speed)`.
 """
 
 import argparse
-import datetime
 import importlib
-import platform
 import sys
 from pathlib import Path
 
+from result_pages import RESULTS, ROOT, SPEED, Page, about, publish, read_speed, render, results, with_readme
+
 from wearcap.errors import WearcapError
+from wearcap.files import write_text
 
 FOLDER = Path(__file__).resolve().parent
 
@@ -36,31 +39,52 @@ def systems() -> list[str]:
     return sorted(path.stem.removeprefix("tables_") for path in FOLDER.glob("tables_*.py"))
 
 
-def about(arguments: list[str]) -> dict[str, str]:
-    """What a figure needs beside it: command, date, machine."""
-    return {
-        "command": " ".join(["python benchmarks/tables.py", *arguments]),
-        "date": datetime.date.today().isoformat(),
-        "machine": f"{platform.machine()} {platform.system()}, Python {platform.python_version()}",
-    }
-
-
 def main(arguments: list[str]) -> None:
     if not arguments or arguments[0] not in systems():
         wanted = "" if not arguments or arguments[0].startswith("-") else f"error: no tables of {arguments[0]!r}\n\n"
         print(f"{wanted}{__doc__}", file=sys.stderr if wanted else sys.stdout)
         sys.exit(2 if wanted else 0)
+    if "--page" in arguments:
+        print(f"written: {write_page(arguments[0])}")
+        return
     system = importlib.import_module(f"tables_{arguments[0]}")
     parser = argparse.ArgumentParser(f"tables.py {arguments[0]}", description=system.__doc__)
     parser.add_argument("--quick", action="store_true", help="minutes instead of hours: a look, not a result")
     parser.add_argument("--output", type=Path, default=Path("outputs/tables"), help="folder of the table")
+    parser.add_argument("--publish", action="store_true", help="put the JSON into docs/results, too, and make its page")
+    parser.add_argument("--page", action="store_true", help="make the page of what is in docs/results, nothing else")
     system.add_arguments(parser)
     options = parser.parse_args(arguments[1:])
+    command = ["python benchmarks/tables.py", *(word for word in arguments if word != "--publish")]
     try:
-        path = system.tables(options, about(arguments))
+        path = system.tables(options, about(" ".join(command)))
     except WearcapError as error:
         sys.exit(f"error: {error}")
     print(f"written: {path}")
+    if options.publish:
+        print(f"written: {publish(path)}")
+        if hasattr(system, "page"):
+            print(f"written: {write_page(arguments[0])}")
+
+
+def page_of(system: str, folder: Path = RESULTS) -> Page | None:
+    """What the page of a system holds; None where it has no page, or nothing is published."""
+    make, trees = getattr(importlib.import_module(f"tables_{system}"), "page", None), results(system, systems(), folder)
+    return make(trees, read_speed(folder / SPEED)) if make and trees else None
+
+
+def write_page(system: str) -> Path:
+    """docs/results/SYSTEM.md, and README's row where it has one; returns the page's path."""
+    page = page_of(system)
+    if page is None:
+        sys.exit(
+            f"error: no page of {system!r}. Expected docs/results/{system}.json, from tables.py {system} --publish."
+        )
+    write_text(RESULTS / f"{system}.md", render(system, page, read_speed()))
+    if page.measured:
+        readme = ROOT / "README.md"
+        write_text(readme, with_readme(readme.read_text(encoding="utf-8"), system, page))
+    return RESULTS / f"{system}.md"
 
 
 if __name__ == "__main__":

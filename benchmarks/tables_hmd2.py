@@ -11,6 +11,7 @@ from pathlib import Path
 
 from hmd2_runs import BASELINES, Case, Method, Result, run_method
 from joblib import Parallel, delayed
+from result_pages import NONE, Grid, Page, Tree, Trees, figure_of, grid_of, mean, ranged, score_grids, summaries, text
 from rich.console import Console
 from rich.table import Table
 from tabling import cell, finite, new_table
@@ -234,3 +235,153 @@ def _activities(title: str, results: list[Result], metric: str) -> Table:
         row = [result.activities[name][metric].mean if name in result.activities else None for name in names]
         table.add_row(result.method, *("–" if value is None else f"{value:.1f}" for value in row))
     return table
+
+
+HEADLINE = {
+    "nearest window": "nearest window of the training",
+    "EgoEgo-style": "EgoEgo-style, head",
+    "AvatarPoser-style (head)": "AvatarPoser-style, head",
+    "AvatarPoser-style (head and hands)": "AvatarPoser-style, which also sees the hands",
+    "full": "**all of it**",
+    "full, ideal sensors": "**all of it**, ideal sensors",
+    "full, poor sensors": "**all of it**, poor sensors",
+    "head alone": "the same checkpoint, head alone",
+    "full, the paper's windows": "all of it, the paper's windows and steps",
+}
+"""Rows of the page's first table, and what the page calls them."""
+CLOCKS = {
+    "hmd2_online_small_fps": "head poses, points and embeddings to poses, h = 10; embeddings and SLAM given; against "
+    "real time",
+    "hmd2_online_full_fps": "the same with the full model, whose weights are drawn; against real time",
+    "hmd2_runner_vs_eager": "the same: the runner against an eager loop at equal steps and precision; then number "
+    "format, and steps, alone",
+    "voxelize_frames_per_second": "grids of the points around the body; SLAM given; a whole recording, then a "
+    "growing map; against real time",
+    "voxelize_vs_brute_force": "the same, against all points for each frame, then against a KD-tree",
+}
+"""Benchmarks of the page's table of speed: what their clocks count, and what is given."""
+MAIN = "Tables 6.1 and 6.3"
+
+
+def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
+    """What docs/results/hmd2.md says."""
+    simulated, real = (
+        {row["method"]: row["scores"] for row in _rows(trees, name)} for name in ("simulated_camera", "cmu_surrounded")
+    )
+    ours, online = simulated["full"], figure_of(speed, "hmd2_online_small_fps")
+    sensing = ("full, ideal sensors", "full", "full, poor sensors")
+    errors = [ranged(rows[name]["mpjpe_cm"] for name in sensing if name in rows) for rows in (simulated, real)]
+    ours_real = f"; real motion (CMU) {errors[1]}" if errors[1] else ""
+    return Page(
+        title="[HMD²](../hmd2.md): figures",
+        headline=Grid(
+            "Whole recordings, anchored to the true head; means over repetitions, ± their deviation (cm).",
+            (
+                "",
+                "simulated: MPJPE",
+                "hands",
+                "lower body",
+                "FID",
+                "jitter, of the truth's",
+                "CMU: MPJPE",
+                "hands",
+                "lower body",
+            ),
+            _first_lines(simulated, real),
+        ),
+        held_out="People and places of the test split of simulated wearers, and four CMU subjects in simulated "
+        "surroundings. Everything was chosen on the validation split.",
+        simulated="People, flats, points and pictures of the simulated wearers; on CMU the motion is real, and "
+        "surroundings, points and pictures are simulated. The head's path has the jitter of "
+        "[simulation](simulation.md). The paper's rows are from real recordings (Nymeria): no comparison.",
+        limits=(
+            *_against_hands(simulated),
+            f"Jitter is {mean(ours['jitter_ratio'])} times the truth's.",
+            "Bad are arms out of the camera's sight, and CMU's dances and jumps.",
+            "Trainings of baselines may be shorter than ours: where checkpoints record it, the tables say what they took.",
+            "FID needs more windows than CMU's held-out subjects have.",
+            "No recording of a real head-mounted device has been scored.",
+        ),
+        full=_grids(trees),
+        measured=f"joints {errors[0]} cm off{ours_real}",
+        speed=f"{online['ratio']:.0f} × online, head's path and points given" if online else "",
+        clocks=CLOCKS,
+        pictures=(("hmd2_samples.png", "One input, several motions (four samples, above them the truth)"),),
+    )
+
+
+def _against_hands(scores: dict[str, Tree]) -> tuple[str, ...]:
+    """What seeing both hands is worth to a regressor."""
+    theirs, ours = scores.get("AvatarPoser-style (head and hands)"), scores["full"]
+    if theirs is None:
+        return ()
+    errors = [f"{mean(theirs[name])} cm against {mean(ours[name])}" for name in ("mpjpe_cm", "lower_pe_cm")]
+    return (f"The regressor that also sees both hands is {errors[0]} off, and {errors[1]} in the lower body.",)
+
+
+def _first_lines(simulated: dict[str, Tree], real: dict[str, Tree]) -> list[list[str]]:
+    """Lines of the page's first table, from scores by row of both data sets."""
+    metrics = (("mpjpe_cm", 2), ("hand_pe_cm", 2), ("lower_pe_cm", 2), ("fid", 2), ("jitter_ratio", 2))
+    shown = [
+        [
+            label,
+            *(
+                text(rows.get(name, {}).get(metric), digits)
+                for rows, chosen in ((simulated, metrics), (real, metrics[:3]))
+                for metric, digits in chosen
+            ),
+        ]
+        for name, label in HEADLINE.items()
+        if name in simulated
+    ]
+    paper = [
+        [f"the paper's {name}, on Nymeria", f"{row[0]:.2f}", f"{row[1]:.2f}", NONE, f"{row[2]:.2f}", *[NONE] * 4]
+        for name, row in PAPER.items()
+        if name != "HMD² (h = 10)"
+    ]
+    return shown + paper
+
+
+def _grids(trees: Trees) -> list[Grid]:
+    """All tables."""
+    grids = [
+        grid_of(
+            _table(f"{title} ({name.removeprefix('hmd2_')})", _results(rows)),
+            tree.get("origins", {}).get(title, tree["about"]),
+            _repetitions(rows),
+        )
+        for name, tree in trees.items()
+        for title, rows in tree["tables"].items()
+    ]
+    labels = {name: (title, 2) for name, title in COLUMNS.items()}
+    for tree in trees.values():
+        parts = {"Table 6.6: 95th percentiles": tree.get("percentiles"), **tree.get("scenarios", {})}
+        found = {title: rows for title, rows in parts.items() if rows}
+        grids += score_grids({"about": tree["about"], "tables": found}, labels)
+    first = {name: _results(tree["tables"].get(MAIN, [])) for name, tree in trees.items()}
+    for name, rows in first.items():
+        if any(row.activities for row in rows):
+            table = _activities(
+                f"Tables 6.8–6.10: MPJPE (cm) by what was mostly done ({name.removeprefix('hmd2_')})", rows, "mpjpe_cm"
+            )
+            grids.append(grid_of(table, trees[name]["about"]))
+    return grids
+
+
+def _rows(trees: Trees, name: str) -> list[Tree]:
+    return trees.get(f"hmd2_{name}", {}).get("tables", {}).get(MAIN, [])
+
+
+def _results(rows: list[Tree]) -> list[Result]:
+    """Results as they were before they became JSON."""
+    return [
+        Result(
+            row["method"], summaries(row["scores"]), {name: summaries(each) for name, each in row["activities"].items()}
+        )
+        for row in rows
+    ]
+
+
+def _repetitions(rows: list[Tree]) -> str:
+    count = max((score["seeds"] for row in rows for score in row["scores"].values()), default=1)
+    return f"{count} repetitions" if count > 1 else ""

@@ -41,7 +41,9 @@ def summarize(values: list[float]) -> dict[str, float | int | None]:
 
 
 def cell(summary: dict[str, Any], digits: int = 2) -> str:
-    """Mean ± deviation."""
+    """Mean ± deviation; a dash where there is no finite mean."""
+    if summary["mean"] is None or not math.isfinite(summary["mean"]):
+        return "–"
     parts = Summary(summary["mean"], summary["std"], summary["seeds"])
     spread = "" if parts.std is None else f" ± {parts.std:.{digits}f}"
     return f"{parts.mean:.{digits}f}{spread}"

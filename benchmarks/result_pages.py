@@ -1,0 +1,305 @@
+"""Pages of results: docs/results/SYSTEM.md, made of nothing but the JSON files beside it.
+
+`tables.py SYSTEM --publish` puts a table's JSON there, `tables.py SYSTEM --page` makes the page of it, and the cells of
+README's table. A system's module has `page(trees, speed)`, which says what its page holds; prose stands beside the
+table that it is about, with figures taken from the JSON.
+"""
+
+import datetime
+import json
+import math
+import os
+import platform
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+from tabling import cell
+
+from wearcap.errors import WearcapError
+from wearcap.files import write_text
+from wearcap.metrics.table import Summary
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "docs" / "results"
+SPEED = "speed.jsonl"
+"""What `run.py --write` measured, one figure a line."""
+MOST_ROWS = 12
+"""Of a headline table."""
+TRANSCRIBED = "transcribed"
+"""Key of a JSON's `about` whose figures were taken from an earlier page and not from the command's own output."""
+NONE = "–"
+
+Tree = dict[str, Any]
+Trees = Mapping[str, Tree]
+"""The JSON trees of a system by file name (without suffix)."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table of text, and where its figures are from."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: list[list[str]]
+    origin: str = ""
+
+
+@dataclass(frozen=True)
+class Page:
+    """What a system's page holds."""
+
+    title: str
+    headline: Grid
+    held_out: str
+    simulated: str
+    limits: tuple[str, ...]
+    full: list[Grid]
+    measured: str
+    """README's cell "measured here"."""
+    speed: str = ""
+    """README's cell "speed"; empty: it stays as it is."""
+    clocks: Mapping[str, str] = field(default_factory=dict)
+    """What the clock of a benchmark (by name) counts, and what is given."""
+    pictures: tuple[tuple[str, str], ...] = ()
+    """Files of docs/, and what they show."""
+
+
+def text(summary: Mapping[str, Any] | None, digits: int = 2) -> str:
+    """A cell: mean ± deviation; a dash where there is none."""
+    return cell(dict(summary), digits) if summary else NONE
+
+
+def mean(summary: Mapping[str, Any] | None, digits: int = 1) -> str:
+    """The mean alone, for prose."""
+    return text({**summary, "std": None}, digits) if summary else NONE
+
+
+def ranged(summaries: Iterable[Mapping[str, Any]], digits: int = 1) -> str:
+    """The range of means, as over presets of the sensors; a single one stands alone, and of none there is nothing."""
+    means = [summary["mean"] for summary in summaries if summary["mean"] is not None]
+    shown = [f"{value:.{digits}f}" for value in sorted(means)]
+    return " to ".join(dict.fromkeys([*shown[:1], *shown[-1:]]))
+
+
+def summaries(scores: Mapping[str, Mapping[str, Any]]) -> dict[str, Summary]:
+    """Summaries as they were before they became JSON."""
+    return {
+        name: Summary(**{**each, "mean": math.nan if each["mean"] is None else each["mean"]})
+        for name, each in scores.items()
+    }
+
+
+def grid_of(table: Table, about: Mapping[str, Any], spread: str = "") -> Grid:
+    """A terminal's table."""
+    columns = [[str(each).replace("nan", NONE) for each in column.cells] for column in table.columns]
+    heads = tuple(str(column.header) for column in table.columns)
+    return Grid(str(table.title), heads, [list(row) for row in zip(*columns)], origin(about, spread))
+
+
+TRAINING = {
+    "parameters_m": ("parameters (M)", 2),
+    "frames_seen_m": ("frames seen (M)", 2),
+    "core_minutes": ("core minutes", 0),
+}
+"""Columns of what a row's training took."""
+
+
+def score_grids(tree: Tree, labels: Mapping[str, tuple[str, int]], spread: str = "seeds") -> list[Grid]:
+    """The tables of a tree {"tables": {title: {row: {metric: summary}}}}: columns are the metrics that have a label
+    (and digits), then all others but those of the truth, which has a row."""
+    grids, labels = [], {**labels, **TRAINING}
+    for title, rows in tree["tables"].items():
+        present = list(dict.fromkeys(m for row in rows.values() for m in row if not m.startswith("truth_")))
+        metrics = [name for name in labels if name in present] + [name for name in present if name not in labels]
+        cells = [[name, *(text(row.get(m), labels.get(m, ("", 2))[1]) for m in metrics)] for name, row in rows.items()]
+        count = max(
+            (
+                each["seeds"]
+                for name, row in rows.items()
+                if not name.startswith(("paper", "truth"))
+                for each in row.values()
+            ),
+            default=0,
+        )
+        about = tree.get("origins", {}).get(title, tree["about"])
+        heads = ("", *(labels.get(metric, (metric, 2))[0] for metric in metrics))
+        grids.append(Grid(title, heads, cells, origin(about, f"{count} {spread}" if count > 1 else "")))
+    return grids
+
+
+def rows_of(trees: Trees, title: str) -> dict[str, dict[str, Any]]:
+    """Rows of the first table whose title begins so; none where no tree has it."""
+    for tree in trees.values():
+        for name, rows in tree.get("tables", {}).items():
+            if name.startswith(title):
+                return rows
+    return {}
+
+
+def picked(
+    trees: Trees, rows: Iterable[tuple[str, str, str]], columns: Iterable[tuple[str, tuple[str, ...], int]]
+) -> list[list[str]]:
+    """Lines of a headline table. rows: a table's title, a row of it, what the page calls it; columns: a heading, the
+    metrics of which a row has one, digits. Rows that are not in the tables are left out."""
+    lines = []
+    for title, name, label in rows:
+        found = rows_of(trees, title).get(name)
+        if found is not None:
+            chosen = ((next((found[m] for m in metrics if m in found), None), digits) for _, metrics, digits in columns)
+            lines.append([label, *(text(summary, digits) for summary, digits in chosen)])
+    return lines
+
+
+def figure_of(speed: Mapping[str, list[Tree]], name: str) -> Tree | None:
+    """The first figure of a benchmark of this name."""
+    return next((figure for figure in speed.get(name, []) if figure["name"] == name), None)
+
+
+def about(command: str) -> dict[str, str]:
+    """What a figure needs beside it: command, date, machine."""
+    known = Path("/proc/cpuinfo")
+    models = re.findall(r"model name\s*: (.+)", known.read_text(encoding="utf-8")) if known.is_file() else []
+    processor = models[0] if models else platform.machine()
+    machine = f"{processor}, {os.cpu_count()} cores, {platform.system()}, Python {platform.python_version()}"
+    return {"command": command, "date": datetime.date.today().isoformat(), "machine": machine}
+
+
+def origin(about: Mapping[str, Any], spread: str = "") -> str:
+    """A table's command, date and machine, and over what it spreads."""
+    parts = [f"`{about['command']}`", about["date"], about["machine"], *([spread] if spread else [])]
+    return ", ".join(map(str, parts)) + ("; transcribed from an earlier page" if about.get(TRANSCRIBED) else "") + "."
+
+
+def markdown(grid: Grid) -> str:
+    rule = ["---", *["---:"] * (len(grid.columns) - 1)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in (list(grid.columns), rule, *grid.rows))
+
+
+def results(system: str, systems: Iterable[str], folder: Path = RESULTS) -> Trees:
+    """The published trees of a system by name: SYSTEM.json and SYSTEM_….json that is no other system's."""
+    found = {}
+    for path in sorted(folder.glob(f"{system}*.json")):
+        owners = [name for name in systems if path.stem == name or path.stem.startswith(f"{name}_")]
+        if max(owners, key=len, default=None) == system:
+            found[path.stem] = json.loads(path.read_text(encoding="utf-8"))
+    return found
+
+
+def read_speed(path: Path = RESULTS / SPEED) -> dict[str, list[Tree]]:
+    """Figures of speed in a file, by benchmark; none where there is no file."""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    found: dict[str, list[Tree]] = {}
+    for figure in map(json.loads, lines):
+        found.setdefault(figure["benchmark"], []).append(figure)
+    return found
+
+
+def write_speed(path: Path, benchmark: str, figures: list[Tree], about: Mapping[str, str]) -> None:
+    """A benchmark's figures take the place of its earlier ones; those of other benchmarks stay."""
+    known = read_speed(path)
+    known[benchmark] = [{"benchmark": benchmark, **figure, **about} for figure in figures]
+    lines = [json.dumps(figure) for name in sorted(known) for figure in known[name]]
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def merged(old: Tree, new: Tree) -> Tree:
+    """A tree as published: of trees with `tables`, tables of other numbers stay, each with the `about` of its own
+    command; what was measured of each seed alone is left out."""
+    new = {key: value for key, value in new.items() if key != "seeds"}
+    if "tables" not in new:
+        return new
+    again = {_number(title) for title in new["tables"]}
+    origins = {**old.get("origins", {}), **dict.fromkeys(new["tables"], new["about"])}
+    kept = {title: rows for title, rows in old.get("tables", {}).items() if _number(title) not in again}
+    tables = {**kept, **new["tables"]}
+    return {**new, "tables": tables, "origins": {title: origins[title] for title in tables}}
+
+
+def _number(title: str) -> str:
+    """What a table keeps when it is made again: "Table 1" of "Table 1: objects, test"."""
+    return title.split(":")[0]
+
+
+def publish(path: Path, folder: Path = RESULTS) -> Path:
+    """Put a table's JSON beside its page."""
+    target = folder / path.name
+    old = json.loads(target.read_text(encoding="utf-8")) if target.is_file() else {}
+    tree = merged(old, json.loads(path.read_text(encoding="utf-8")))
+    write_text(target, compact(tree))
+    return target
+
+
+def compact(tree: Tree) -> str:
+    """JSON with six significant digits, and a summary on a line of its own."""
+
+    def rounded(part: Any) -> Any:
+        if isinstance(part, dict):
+            return {key: rounded(value) for key, value in part.items()}
+        if isinstance(part, list):
+            return [rounded(value) for value in part]
+        return float(f"{part:.6g}") if isinstance(part, float) else part
+
+    lines = json.dumps(rounded(tree), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    return re.sub(r"\{\s+(\"mean\":[^{}\[\]]*?)\s+\}", lambda found: "{" + " ".join(found[1].split()) + "}", lines)
+
+
+def render(system: str, page: Page, speed: Mapping[str, list[Tree]]) -> str:
+    """The page in Markdown. Raises WearcapError when the headline has too many rows."""
+    if len(page.headline.rows) > MOST_ROWS:
+        raise WearcapError(
+            f"a headline table of {len(page.headline.rows)} rows", where=system, expected=f"at most {MOST_ROWS}"
+        )
+    made = f"Written by `python benchmarks/tables.py {system} --page` from the JSON files beside this page."
+    if any(TRANSCRIBED in grid.origin for grid in page.full):
+        made += " Tables that say so are transcribed from an earlier page; the same command makes them anew."
+    parts = [f"# {page.title}", made, page.headline.title, markdown(page.headline)]
+    parts += ["## Held out", page.held_out, "## Simulated", page.simulated]
+    parts += ["## Limits", "\n".join(f"- {limit}" for limit in page.limits)]
+    clocks = speed_grid(page.clocks, speed)
+    if clocks.rows:
+        parts += ["## Speed", clocks.title, markdown(clocks)]
+    parts += ["## All tables"] if page.full else []
+    for grid in page.full:
+        shown = f"<details><summary>{grid.title}</summary>\n\n{grid.origin}\n\n{markdown(grid)}\n\n</details>"
+        parts.append(shown)
+    parts += ["## Pictures"] if page.pictures else []
+    parts += [f"{caption}:\n\n![{caption}](../{name})" for name, caption in page.pictures]
+    return "\n\n".join(parts) + "\n"
+
+
+def speed_grid(clocks: Mapping[str, str], speed: Mapping[str, list[Tree]]) -> Grid:
+    """Figures of the named benchmarks, with what their clocks count."""
+    rows = []
+    for benchmark, inside in clocks.items():
+        for figure in speed.get(benchmark, []):
+            date = figure["date"] + (" (transcribed)" if figure.get(TRANSCRIBED) else "")
+            measured = [f"{number(figure[key])}" for key in ("value", "baseline", "ratio", "goal")]
+            name = f"`{figure['name']}`"
+            rows.append([name, inside if figure is speed[benchmark][0] else "", *measured, figure["unit"], date])
+    machines = {figure["machine"] for name in clocks for figure in speed.get(name, [])}
+    title = f"`python benchmarks/run.py NAME --write docs/results/{SPEED}`; {'; '.join(sorted(machines))}."
+    return Grid(title, ("", "the clock counts", "ours", "against", "ratio", "goal", "unit", "date"), rows)
+
+
+def number(value: float | None) -> str:
+    """Three significant digits, without an exponent."""
+    if value is None or not math.isfinite(value):
+        return NONE
+    digits = max(0, 2 - math.floor(math.log10(abs(value)))) if value else 0
+    return f"{value:,.{min(digits, 6)}f}".replace(",", "") if digits else f"{value:.0f}"
+
+
+def with_readme(readme: str, system: str, page: Page) -> str:
+    """README with the page's cells in the system's row of its table. Raises WearcapError where it has none."""
+    lines = readme.splitlines(keepends=True)
+    for place, line in enumerate(lines):
+        if line.startswith("| [") and f"](docs/{system}.md)" in line.split(" | ")[0]:
+            cells = line.strip().strip("|").strip().split(" | ")
+            cells[3:] = [page.measured, page.speed or cells[4]]
+            lines[place] = "| " + " | ".join(cells) + " |\n"
+            return "".join(lines)
+    raise WearcapError(f"no row of {system!r}", where="README.md", expected=f"a row that links docs/{system}.md")

@@ -1,0 +1,221 @@
+"""Pages of results: rendered from JSON alone, published JSON is merged, README says what the JSON says."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from wearcap.errors import WearcapError
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "docs" / "results"
+PAGES = sorted(path.stem for path in RESULTS.glob("*.md"))
+
+
+@pytest.fixture(autouse=True)
+def importable(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+
+
+def summary(mean: float | None, std: float | None = None, seeds: int = 1) -> dict:
+    return {"mean": mean, "std": std, "seeds": seeds}
+
+
+ABOUT = {"command": "python benchmarks/tables.py echo", "date": "2026-11-01", "machine": "a machine"}
+
+
+def small_page(rows: int = 2, **changes):
+    from result_pages import Grid, Page
+
+    headline = Grid("What was measured.", ("", "error (cm)"), [[f"row {k}", f"{k}.00"] for k in range(rows)])
+    grid = Grid("Table 9: all of it", ("", "error"), [["ours", "1.25 ± 0.10"]], "`command`, today, here.")
+    parts = {
+        "title": "A system",
+        "headline": headline,
+        "held_out": "People.",
+        "simulated": "Sensors.",
+        "limits": ("One.", "Two."),
+    }
+    return Page(**{**parts, "full": [grid], "measured": "joints 1.2 cm off", **changes})
+
+
+def test_a_page_has_its_sections_in_order_and_folds_the_full_tables():
+    from result_pages import render
+
+    page = small_page(clocks={"fast_fps": "everything; poses given", "slow_fps": "nothing"})
+    figure = {"name": "fast_fps", "value": 90.4, "unit": "frames/s", "baseline": 30.0, "ratio": 3.013, "goal": None}
+    shown = render("echo", page, {"fast_fps": [{**figure, "benchmark": "fast_fps", **ABOUT}]})
+    headings = re.findall(r"^#+ .*", shown, re.MULTILINE)
+    assert headings == ["# A system", "## Held out", "## Simulated", "## Limits", "## Speed", "## All tables"]
+    assert "| row 1 | 1.00 |" in shown.split("## Held out")[0]
+    assert "- One.\n- Two." in shown
+    assert "| `fast_fps` | everything; poses given | 90.4 | 30.0 | 3.01 | – | frames/s | 2026-11-01 |" in shown
+    assert "slow_fps" not in shown
+    folded = re.search(r"<details><summary>(.*?)</summary>\n\n(.*?)\n\n(\| .*)</details>", shown, re.DOTALL)
+    assert folded is not None
+    assert folded[1] == "Table 9: all of it"
+    assert folded[2] == "`command`, today, here."
+
+
+def test_a_headline_of_more_than_twelve_rows_is_refused():
+    from result_pages import render
+
+    assert "row 11" in render("echo", small_page(12), {})
+    with pytest.raises(WearcapError, match="13 rows"):
+        render("echo", small_page(13), {})
+
+
+def test_what_is_transcribed_says_so():
+    from result_pages import origin, render, score_grids
+
+    table = {"ours": {"a_cm": summary(1.256, 0.04, 4)}, "paper: theirs": {"b_cm": summary(2.0)}}
+    tree = {"about": ABOUT, "tables": {"Table 1": table}, "origins": {"Table 1": {**ABOUT, "transcribed": True}}}
+    (grid,) = score_grids(tree, {"b_cm": ("B", 1), "a_cm": ("A", 2)})
+    assert grid.columns == ("", "B", "A")
+    assert grid.rows == [["ours", "–", "1.26 ± 0.04"], ["paper: theirs", "2.0", "–"]]
+    assert grid.origin.endswith("a machine, 4 seeds; transcribed from an earlier page.")
+    assert "transcribed" not in origin(ABOUT)
+    line = "Tables that say so are transcribed"
+    assert line in render("echo", small_page(full=[grid]), {})
+    assert line not in render("echo", small_page(), {})
+
+
+def test_cells_of_what_is_not_known_and_ranges():
+    from result_pages import number, ranged, text
+
+    assert text(None) == text(summary(None)) == "–"
+    assert ranged([summary(3.21), summary(2.44), summary(None), summary(4.96)]) == "2.4 to 5.0"
+    assert ranged([summary(3.21)]) == "3.2"
+    assert ranged([]) == ""
+    assert [number(value) for value in (0.59, 4976.4, 0.0, 12.34, None)] == ["0.590", "4976", "0", "12.3", "–"]
+
+
+def test_published_tables_are_merged_by_number(tmp_path):
+    from result_pages import publish
+
+    folder, made = tmp_path / "results", tmp_path / "echo.json"
+    folder.mkdir()
+    for date, tables in (("d1", {"A: old": {"x": 1}, "B: old": {"x": 2}}), ("d2", {"B: new": {"x": 3}})):
+        made.write_text(
+            json.dumps({"about": {**ABOUT, "date": date}, "tables": tables, "seeds": [{"frames": [0] * 99}]})
+        )
+        path = publish(made, folder)
+    found = json.loads(path.read_text())
+    assert found["tables"] == {"A: old": {"x": 1}, "B: new": {"x": 3}}
+    assert {title: about["date"] for title, about in found["origins"].items()} == {"A: old": "d1", "B: new": "d2"}
+    assert "seeds" not in found
+    made.write_text(json.dumps({"about": ABOUT, "rows": {"ours": 1}}))
+    assert set(json.loads(publish(made, folder).read_text())) == {"about", "rows"}
+
+
+def test_published_json_is_short():
+    from result_pages import compact
+
+    shown = compact({"about": ABOUT, "rows": {"ours": [summary(1.23456789, None, 4), {"a": summary(2.0)}]}})
+    assert json.loads(shown)["rows"]["ours"] == [summary(1.23457, None, 4), {"a": summary(2.0)}]
+    assert '{"mean": 1.23457, "std": null, "seeds": 4}' in shown
+
+
+def test_figures_of_speed_replace_those_of_their_benchmark_alone(tmp_path):
+    from result_pages import read_speed, write_speed
+
+    path = tmp_path / "speed.jsonl"
+    write_speed(path, "b", [{"name": "b", "value": 1.0}, {"name": "b_small", "value": 2.0}], ABOUT)
+    write_speed(path, "a", [{"name": "a", "value": 3.0}], ABOUT)
+    write_speed(path, "b", [{"name": "b", "value": 4.0}], ABOUT)
+    assert {name: [f["value"] for f in figures] for name, figures in read_speed(path).items()} == {
+        "a": [3.0],
+        "b": [4.0],
+    }
+    assert read_speed(path)["a"][0]["date"] == ABOUT["date"]
+    assert read_speed(tmp_path / "none.jsonl") == {}
+
+
+def test_a_systems_results_are_not_those_of_one_with_a_longer_name(tmp_path):
+    from result_pages import results
+
+    for name in ("hmd2", "hmd2_cmu", "hmd2_head", "hps"):
+        (tmp_path / f"{name}.json").write_text("{}")
+    assert list(results("hmd2", ["hmd2", "hmd2_head", "hps"], tmp_path)) == ["hmd2", "hmd2_cmu"]
+
+
+def test_readme_takes_a_pages_cells_and_keeps_all_else():
+    from result_pages import with_readme
+
+    readme = "| [ECHO](docs/echo.md) | head | body | 9 cm | 3 × |\n| [HPS](docs/hps.md) | suit | body | 1 cm | 2 × |\n"
+    assert with_readme(readme, "echo", small_page()) == readme.replace("9 cm", "joints 1.2 cm off")
+    assert "| 5 × |" in with_readme(readme, "hps", small_page(speed="5 ×"))
+    with pytest.raises(WearcapError, match="no row"):
+        with_readme(readme, "hmd2", small_page())
+
+
+@pytest.mark.parametrize("system", PAGES)
+def test_the_page_is_what_its_json_gives(system):
+    """Neither a page nor README's row holds a figure that the JSON beside the page does not."""
+    from result_pages import read_speed, render, with_readme
+    from tables import page_of
+
+    page = page_of(system)
+    assert page is not None
+    assert all((ROOT / "docs" / name).is_file() for name, _ in page.pictures)
+    assert render(system, page, read_speed()) == (RESULTS / f"{system}.md").read_text(encoding="utf-8")
+    if page.measured:
+        readme = (ROOT / "README.md").read_text(encoding="utf-8")
+        assert with_readme(readme, system, page) == readme
+
+
+def test_every_system_has_a_page_that_is_small():
+    assert {"hps", "ireplica", "hmd2", "mocap_every", "echo", "simulation"} <= set(PAGES)
+    assert max(path.stat().st_size for path in RESULTS.iterdir()) < 100_000
+
+
+def hps_run(ours_cm: float) -> dict:
+    """What `hps_runs.run_seed` measures of one session, as far as its page shows it."""
+    from hps_runs import DISTURBED, ROWS, TRUTH
+
+    def scores(cm: float) -> dict:
+        chamfer = [{"mean_cm": cm, "cloud_to_body_cm": cm}] * 8
+        feet = {"distance_cm": cm, "absolute_distance_cm": cm, "sliding_cm": cm}
+        joints = ("mpjpe_cm", "root_cm", "p95_cm", "jitter_m_s3", "jitter_ratio", "foot_skate_cm_s")
+        return {
+            "literal": chamfer, "surface": chamfer, "feet": feet, "feet_true_contact": feet,
+            "joints": dict.fromkeys(joints, cm), "drift": {"slope_cm_per_100m": cm},
+        }  # fmt: skip
+
+    lost = dict.fromkeys(("root_cm", "root_ratio", "joint_cm", "joint_ratio"), 9.9)
+    return {
+        "visits": [{"name": name, "distance_m": m} for m in (0.0, 70.0, 200.0, 380.0) for name in ("stand", "move")],
+        "scores": {row: scores(ours_cm if row == "ours" else 50.0) for row in (*ROWS, TRUTH)},
+        "outages": {"rows": {row: {"within 30 s": lost, "whole recording": lost} for row in DISTURBED}},
+        "stage_seconds": {row: {"optimise": 4.0} for row in ROWS},
+        "frames": 12000,
+    }
+
+
+def test_hps_page_shows_the_range_over_presets_of_sensors():
+    import tables_hps
+    from result_pages import render
+
+    def tree(sensors: str, *ours_cm: float) -> dict:
+        found = tables_hps.summarized([hps_run(cm) for cm in ours_cm])
+        return {"about": ABOUT, "sensors": sensors, "places": ["at start", "70 m", "200 m", "380 m"], **found}
+
+    one = tables_hps.page({"hps": tree("typical", 3.0, 4.0)}, {})
+    assert (
+        one.measured
+        == "joints 3.5 cm off over 380 m and more, with typical sensors (as published 50.0; suit alone: 50)"
+    )
+    assert one.speed == "100 × real time, localised cameras given"
+    trees = {"hps": tree("typical", 3.0, 4.0), "hps_ideal": tree("ideal", 2.0), "hps_poor": tree("poor", 7.0)}
+    page = tables_hps.page(trees, {})
+    assert page.measured.startswith("joints 2.0 to 7.0 cm off")
+    shown = render("hps", page, {})
+    assert [line.split(" | ")[1] for line in shown.splitlines() if line.startswith("| **ours**")] == [
+        "2.0",
+        "3.5 ± 0.7",
+        "7.0",
+    ]
+    assert "| the truth itself |" in shown
+    assert shown.count("Table 4.1") == 3
+    assert "Localisation lost in mid-walk for 30 s: the root is 9.9 cm off meanwhile" in shown
