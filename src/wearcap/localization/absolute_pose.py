@@ -99,6 +99,8 @@ class CameraPose:
     """0…1, from the number of inliers and their spread over the image."""
     covariance: Float[Tensor, "6 6"]
     """Covariance of the pose error in the world: rotation vector ω (rad) with R_true = exp(ω) R, then position (m)."""
+    matches: "Matches | None" = None
+    """The matches that agree with the pose, of a picture that was localised in a map."""
 
 
 @dataclass(frozen=True, eq=False)
