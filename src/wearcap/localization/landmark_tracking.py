@@ -28,6 +28,8 @@ from wearcap.recording.recording import Localization
 
 _AHEAD = 24
 """Number of frames that are decoded ahead while a key frame is localised."""
+_ESTABLISHED = 2
+"""Most key frames that agree with a track and count against a rival of it."""
 _LEVELS = 3
 """Pyramid levels of the optical flow, for large displacements."""
 
