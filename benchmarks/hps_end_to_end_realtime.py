@@ -18,7 +18,6 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import torch
 from hydra.utils import instantiate
 
 from wearcap.cli.conf import compose, splits_dir

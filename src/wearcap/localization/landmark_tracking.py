@@ -9,7 +9,7 @@ the loser alone are withdrawn.
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -28,6 +28,8 @@ from wearcap.recording.recording import Localization
 
 _AHEAD = 24
 """Number of frames that are decoded ahead while a key frame is localised."""
+_TRACKED = 0.5
+"""Confidence from which a key frame is tracked."""
 _ESTABLISHED = 2
 """Most key frames that agree with a track and count against a rival of it."""
 _LEVELS = 3
@@ -47,7 +49,7 @@ class TrackingSettings:
     min_share: float
     """Share of a key frame's landmarks below which tracking is weak."""
     min_confidence: float
-    """Confidence below which tracking is weak, and below which a key frame is not tracked."""
+    """Confidence below which tracking is weak."""
     max_error_px: float
     """Median reprojection error beyond which tracking is weak, at a picture 1000 pixels wide."""
     window_px: int
@@ -127,26 +129,35 @@ class LandmarkTracker:
         near = self._tracks[0].fit if alone else None
         prior = near and Rigid(torch.from_numpy(near.R_world_cam), torch.from_numpy(near.t_world_cam))
         pose = self.localizer.locate(picture, prior)
-        if pose is None or pose.confidence < self.settings.min_confidence:
+        if pose is None or pose.confidence < _TRACKED:
             return pose
         new = self._begun(pose, picture.camera)
         agreeing = next((track for track in self._tracks if _agree(track, new.fit, 2 * self._limit_px(track))), None)
-        if agreeing is None:
-            if alone and self._weak(self._tracks[0]):
+        if agreeing is not None:
+            self._confirm(agreeing, new)
+        elif alone and self._weak(self._tracks[0]):
+            if pose.confidence > self._tracks[0].poses[-1].confidence:
                 self._end(self._tracks)
+                self._tracks = [new]
+        else:
             for track in self._tracks[:1]:
                 track.votes = min(track.votes, _ESTABLISHED)
             self._tracks = [*self._tracks[:1], new]
-            return pose
-        new.votes, new.before, new.first = agreeing.votes + 1, agreeing.before, agreeing.first
-        new.poses = [*agreeing.poses[:-1], pose]
-        others = [track for track in self._tracks if track is not agreeing]
-        self._tracks[self._tracks.index(agreeing)] = new
-        if all(track.votes < new.votes for track in others):
-            self._end(others)
-            self._final += new.poses[:-1]
-            new.poses, new.first = new.poses[-1:], self._now
         return pose
+
+    def _confirm(self, track: _Track, new: _Track) -> None:
+        """A key frame agrees with a track, which goes on with the landmarks by which the position is more certain."""
+        others = [other for other in self._tracks if other is not track]
+        spread, own = (float(part.poses[-1].covariance[3:, 3:].trace()) for part in (new, track))
+        if spread <= own:
+            new.before, new.first, new.votes = track.before, track.first, track.votes
+            new.poses = [*track.poses[:-1], *new.poses]
+            self._tracks[self._tracks.index(track)] = track = new
+        track.votes += 1
+        if all(other.votes < track.votes for other in others):
+            self._end(others)
+            self._final += track.poses[:-1]
+            track.poses, track.first = track.poses[-1:], self._now
 
     def _begun(self, pose: CameraPose, camera: Camera) -> _Track:
         """A track of a key frame's landmarks: of each cell of the picture the same number, as far as it has them."""
@@ -159,9 +170,7 @@ class LandmarkTracker:
         rank[order] = np.arange(len(cell)) - np.repeat(count.cumsum() - count, count)
         chosen = np.argsort(rank, kind="stable")[: self.settings.landmarks]
         fit = Fit(pose.R_world_cam.double().numpy(), pose.t_world_cam.double().numpy(), np.ones(len(chosen), bool))
-        return _Track(
-            self._now, camera, pixels[chosen], points[chosen], fit, fit, len(chosen), pose.confidence, [pose]
-        )
+        return _Track(self._now, camera, pixels[chosen], points[chosen], fit, fit, len(chosen), pose.confidence, [pose])
 
     def _limit_px(self, track: _Track) -> float:
         return self.localizer.settings.max_error_px * track.camera.width / 1000

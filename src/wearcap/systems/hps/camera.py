@@ -26,7 +26,7 @@ from wearcap.sensors.imu import synthesize_imu
 
 CLOCKS = ("shared", "claps", "auto")
 MAP_NAME = "map.safetensors"
-USUAL_HZ, TRACKED_HZ = 6.0, 15.0
+USUAL_HZ, TRACKED_HZ = 6.0, 10.0
 """Default number of frames per second if each is localised anew, and if they are tracked; the suit's motion bridges the
 frames between."""
 
