@@ -1,6 +1,6 @@
 """HPS end to end: seconds of recording per second of computing, from suit and video to motion, localisation included.
 
-A simulated wearer of the test split claps, walks 40 m through a scanned and photographed site and is filmed throughout:
+A simulated wearer of the test split claps, walks 30 m through a scanned and photographed site and is filmed throughout:
 960 x 540 at 30 frames per second, H.264, with sound; suit of typical errors. Inside the clock is all that
 `capture.py pipeline=hps` does between a recording and its motion: reading the map and the scan, the claps in the video's
 sound and in the wrist sensors, decoding every frame, localisation, alignment, initialisation, the bones' scale, the
@@ -36,11 +36,11 @@ FOLDER = Path("outputs/benchmarks/hps_end_to_end")
 WORSE = 1.1
 
 
-def dataset(split: str = "test", end_m: float = 40.0, video_s: float | None = None) -> tuple[Recording, Path]:
+def dataset(split: str = "test", end_m: float = 30.0) -> tuple[Recording, Path]:
     """A recording with its video, scan and map, and their folder; made where it is missing."""
     folder = FOLDER / split
-    settings = [f"recordings={{{split}: 1}}", "returns_m=[]", f"end_m={end_m}", "video_fps=30", "localization=ideal"]
-    settings += [f"video_s={'null' if video_s is None else video_s}", f"output={folder}"]
+    settings = [f"recordings={{{split}: 1}}", "returns_m=[]", f"end_m={end_m}", "video_s=null", "video_fps=30"]
+    settings += ["photo_m=3", "localization=ideal", f"output={folder}"]
     config = compose("prepare", ["prepare=simulated_hps", "preset=quick", *settings])
     tasks = instantiate(config.tasks, _convert_="all", _partial_=True)(splits=Splits.read(splits_dir() / config.splits))
     report = prepare(tasks, folder, jobs=1)
@@ -99,8 +99,8 @@ def accuracy(recording: Recording, motion: Motion, localization: Localization) -
     }
 
 
-def measure(split: str = "test", end_m: float = 40.0, video_s: float | None = None) -> list[dict]:
-    recording, folder = dataset(split, end_m, video_s)
+def measure(split: str = "test", end_m: float = 30.0) -> list[dict]:
+    recording, folder = dataset(split, end_m)
     camera = recording.camera
     assert camera is not None
     duration = (camera.timestamps[-1] - camera.timestamps[0]).item()

@@ -71,6 +71,8 @@ class _Track:
 
     first: int
     """Index of the frame that `poses` begin with: where the track began, or was last confirmed."""
+    key: CameraPose
+    """Pose of the last key frame."""
     camera: Camera
     """Camera of the picture, or the perspective one that it is undistorted to."""
     pixels: Float32[np.ndarray, "landmark 2"]
@@ -81,8 +83,6 @@ class _Track:
     """Pose in the frame before that, for the prediction."""
     started: int
     """Number of landmarks in the last key frame."""
-    trust: float
-    """Confidence of the last key frame."""
     poses: list[CameraPose]
     votes: int = 1
     """Number of key frames that agree with the track."""
@@ -146,10 +146,9 @@ class LandmarkTracker:
         return pose
 
     def _confirm(self, track: _Track, new: _Track) -> None:
-        """A key frame agrees with a track, which goes on with the landmarks by which the position is more certain."""
+        """A key frame agrees with a track, which goes on with the new landmarks if they suffice."""
         others = [other for other in self._tracks if other is not track]
-        spread, own = (float(part.poses[-1].covariance[3:, 3:].trace()) for part in (new, track))
-        if spread <= own:
+        if new.key.confidence >= min(track.poses[-1].confidence, self.settings.min_confidence):
             new.before, new.first, new.votes = track.before, track.first, track.votes
             new.poses = [*track.poses[:-1], *new.poses]
             self._tracks[self._tracks.index(track)] = track = new
@@ -160,17 +159,20 @@ class LandmarkTracker:
             track.poses, track.first = track.poses[-1:], self._now
 
     def _begun(self, pose: CameraPose, camera: Camera) -> _Track:
-        """A track of a key frame's landmarks: of each cell of the picture the same number, as far as it has them."""
+        """A track of a key frame's landmarks, of all cells of the picture alike, from where its pose shows them.
+
+        Tracked from the keypoints, some landmarks would have another pose than all.
+        """
         assert pose.matches is not None
-        pixels, points = pose.matches.pixels, pose.matches.points_world
+        fit = Fit(pose.R_world_cam.double().numpy(), pose.t_world_cam.double().numpy(), np.zeros(0, bool))
+        pixels, points = fit.project(pose.matches.points_world, camera)[0], pose.matches.points_world
         cell = (pixels / [camera.width / 8, camera.height / 6]).astype(np.int64).clip(0, [7, 5]) @ [1, 8]
-        order = np.argsort(cell, kind="stable")
-        count = np.bincount(cell, minlength=48)
+        order, count = np.argsort(cell, kind="stable"), np.bincount(cell, minlength=48)
         rank = np.empty(len(cell), np.int64)
         rank[order] = np.arange(len(cell)) - np.repeat(count.cumsum() - count, count)
         chosen = np.argsort(rank, kind="stable")[: self.settings.landmarks]
-        fit = Fit(pose.R_world_cam.double().numpy(), pose.t_world_cam.double().numpy(), np.ones(len(chosen), bool))
-        return _Track(self._now, camera, pixels[chosen], points[chosen], fit, fit, len(chosen), pose.confidence, [pose])
+        pixels = pixels[chosen].astype(np.float32)
+        return _Track(self._now, pose, camera, pixels, points[chosen], fit, fit, len(chosen), [pose])
 
     def _limit_px(self, track: _Track) -> float:
         return self.localizer.settings.max_error_px * track.camera.width / 1000
@@ -215,8 +217,8 @@ class LandmarkTracker:
         track.pixels, track.points_world = pixels[fit.inlier], matches.points_world[fit.inlier]
         track.error_px = float(np.median(matches.errors(fit)[fit.inlier]))
         R, t = (torch.from_numpy(part).float() for part in (fit.R_world_cam, fit.t_world_cam))
-        covariance = torch.from_numpy(matches.covariance(fit)).float()
-        trust = min(track.trust, confidence(track.pixels, camera))
+        covariance = track.key.covariance + torch.from_numpy(matches.covariance(fit)).float()
+        trust = min(track.key.confidence, confidence(track.pixels, camera))
         track.poses.append(CameraPose(R, t, len(track.pixels), trust, covariance))
         return True
 
