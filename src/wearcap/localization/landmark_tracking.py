@@ -9,7 +9,7 @@ the loser alone are withdrawn.
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -31,7 +31,7 @@ _AHEAD = 24
 _TRACKED = 0.5
 """Confidence from which a key frame is tracked."""
 _ESTABLISHED = 2
-"""Most key frames that agree with a track and count against a rival of it."""
+"""Largest number of agreeing key frames that a track can set against a rival's."""
 _LEVELS = 3
 """Pyramid levels of the optical flow, for large displacements."""
 
@@ -171,7 +171,7 @@ class LandmarkTracker:
         rank = np.empty(len(cell), np.int64)
         rank[order] = np.arange(len(cell)) - np.repeat(count.cumsum() - count, count)
         chosen = np.argsort(rank, kind="stable")[: self.settings.landmarks]
-        pixels = pixels[chosen].astype(np.float32)
+        pixels, pose = pixels[chosen].astype(np.float32), replace(pose, matches=None)
         return _Track(self._now, pose, camera, pixels, points[chosen], fit, fit, len(chosen), [pose])
 
     def _limit_px(self, track: _Track) -> float:
