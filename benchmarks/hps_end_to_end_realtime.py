@@ -4,9 +4,10 @@ A simulated wearer of the test split claps, walks 30 m through a scanned and pho
 960 x 540 at 30 frames per second, H.264, with sound; suit of typical errors. Inside the clock is all that
 `capture.py pipeline=hps` does between a recording and its motion: reading the map and the scan, the claps in the video's
 sound and in the wrist sensors, decoding every frame, localisation, alignment, initialisation, the bones' scale, the
-solver. Outside are imports, compilation (a capture of the first seconds runs before), the suit's file, and written files.
+solver. Outside are imports, compilation and the body's mesh (a capture of the first seconds runs before), the suit's file,
+and written files.
 
-value: times real time with key frames and tracked landmarks (conf/head_camera/map.yaml), 15 poses a second. baseline:
+value: times real time with key frames and tracked landmarks (conf/head_camera/map.yaml), 10 poses a second. baseline:
 the same with each frame localised anew, six a second, as without tracking. ratio = value / baseline; the goal is for
 `value`. Both are compared with the truth on stderr: camera poses at the frames that have one, joints of the captured
 motion in the world, without alignment. If tracking makes the joints' or the camera's mean error more than a tenth larger
