@@ -332,3 +332,39 @@ def test_features_are_chosen_by_mask_and_by_number():
     )
     assert features.subset(np.array([3, 0])).keypoints.tolist() == spread[[3, 0]].tolist()
     assert len(features.subset(np.array([True, False, False, True]))) == 2
+
+
+@pytest.mark.parametrize("distortion", [None, (-0.25, 0.08, 1e-3, -2e-3), (-0.25, 0.08, 1e-3, -2e-3, 0.01)])
+def test_a_fit_projects_as_its_camera_does(distortion):
+    camera = Camera.pinhole(640, 480, 70.0) if distortion is None else Camera("opencv", 640, 480, 400.0, 410.0, 310.0, 250.0, distortion)  # fmt: skip
+    random = np.random.default_rng(2)
+    R = rotation.exp(torch.tensor([0.3, -1.0, 0.4]).double()).numpy()
+    fit = Fit(R, np.array([1.0, 2.0, 3.0]), np.ones(500, bool))
+    points = random.normal(0, 4, (500, 3))
+    pixels, valid = fit.project(points, camera)
+    expected, seen = camera.project(torch.from_numpy((points - fit.t_world_cam) @ R))
+    assert 30 < seen.sum() < 470
+    np.testing.assert_array_equal(valid, seen.numpy())
+    np.testing.assert_allclose(pixels[valid], expected[seen].numpy(), atol=1e-6)
+
+
+def test_the_covariance_of_a_pose_is_that_of_least_squares():
+    """Against derivatives by differences."""
+    camera = Camera("opencv", 640, 480, 400.0, 410.0, 310.0, 250.0, (-0.2, 0.05, 1e-3, -2e-3))
+    random = np.random.default_rng(3)
+    R, t = rotation.exp(torch.tensor([0.3, -1.0, 0.4]).double()), torch.tensor([1.0, 2.0, 3.0]).double()
+    rays = np.concatenate([random.uniform(-0.4, 0.4, (60, 2)), np.ones((60, 1))], 1) * random.uniform(2, 6, (60, 1))
+    points = (rays @ R.numpy().T + t.numpy()).astype(np.float32)
+    everything = np.ones(60, bool)
+
+    def pixels(change: np.ndarray) -> np.ndarray:
+        turned = rotation.exp(torch.from_numpy(change[:3])) @ R
+        return Fit(turned.numpy(), t.numpy() + change[3:], everything).project(points, camera)[0].ravel()
+
+    steps = 1e-6 * np.eye(6)
+    jacobian = np.stack([(pixels(step) - pixels(-step)) / 2e-6 for step in steps], 1)
+    seen = (pixels(np.zeros(6)).reshape(-1, 2) + random.normal(0, 1.5, (60, 2))).astype(np.float32)
+    residual = seen.ravel() - pixels(np.zeros(6))
+    expected = (residual**2).sum() / (120 - 6) * np.linalg.inv(jacobian.T @ jacobian)
+    found = Matches(seen, points, camera).covariance(Fit(R.numpy(), t.numpy(), everything))
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-12)

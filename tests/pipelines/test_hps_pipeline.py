@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 import torch
 from hps_walk import CLAPS_S, MOUNT, floor_points, hps_dataset, hps_recording
+from hydra.utils import instantiate
 from PIL import Image
 
+from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
 from wearcap.evaluation.evaluate import evaluate
 from wearcap.localization.features import RootSift
+from wearcap.localization.localizer import Localizer
 from wearcap.localization.map_builder import MapSettings, build_map
 from wearcap.localization.point_map import PointMapper
 from wearcap.optimize.banded import BandedSettings, solve_banded
@@ -24,6 +27,7 @@ from wearcap.optimize.trajectory import Bending, bend
 from wearcap.optimize.trajectory_banded import bend_banded
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import resampled
+from wearcap.runtime.stages import digest
 from wearcap.runtime.system import Captured, CaptureInput, StageOptions, System
 from wearcap.scene.scan import Scan
 from wearcap.systems.hps import pipeline as hps_module
@@ -268,6 +272,31 @@ def test_pictures_are_localised_in_the_scenes_map(filmed):
     assert (found.t_world_cam - truth).norm(dim=-1).max() < 0.02
     # 6 Hz of the stream's 30
     assert len(MapLocalization(RootSift(400))(recording, root).timestamps) == 2
+
+
+def test_landmarks_are_tracked_between_key_frames(filmed, monkeypatch):
+    root, recording, poses = filmed
+    tracking = instantiate(compose("capture", ["pipeline=hps", "recording=x"]).pipeline.localization.tracking)
+    localize = MapLocalization(RootSift(400), every=1, tracking=tracking)
+    key_frames = []
+    monkeypatch.setattr(
+        Localizer, "locate", lambda *args, real=Localizer.locate: key_frames.append(args) or real(*args)
+    )
+    found = localize(recording, root)
+    assert len(key_frames) == 1
+    assert torch.equal(found.timestamps, recording.camera.timestamps)
+    assert (found.confidence > 0.5).all()
+    truth = torch.stack([pose.t for pose in poses])
+    assert (found.t_world_cam - truth).norm(dim=-1).max() < 0.02
+    assert len(replace(localize, every=None)(recording, root).timestamps) == 2  # 10 Hz of the stream's 30
+    anew = replace(localize, tracking=None)
+    assert digest(*localize.reads(recording, root)) != digest(*anew.reads(recording, root))
+    assert len(anew(recording, root).timestamps) == 6
+    assert len(key_frames) == 1 + 1 + 6
+
+
+def test_the_published_pipeline_localises_each_frame():
+    assert compose("capture", ["pipeline=paper/hps", "recording=x"]).pipeline.localization.tracking is None
 
 
 def test_poses_that_are_there_are_taken_unless_a_map_is_given(filmed, walk):

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import poselib
 import torch
@@ -99,6 +100,8 @@ class CameraPose:
     """0…1, from the number of inliers and their spread over the image."""
     covariance: Float[Tensor, "6 6"]
     """Covariance of the pose error in the world: rotation vector ω (rad) with R_true = exp(ω) R, then position (m)."""
+    matches: "Matches | None" = None
+    """The matches that agree with the pose, of a picture that was localised in a map."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,8 +115,22 @@ class Fit:
     def project(self, points_world: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Project world points into the camera at this pose: pixels, and where they are valid."""
         points_cam = (points_world.astype(np.float64) - self.t_world_cam) @ self.R_world_cam
-        pixels, valid = camera.project(torch.from_numpy(points_cam))
-        return pixels.numpy(), valid.numpy()
+        ahead = points_cam[:, 2] > 1e-6
+        plane = points_cam[:, :2] / np.where(ahead, points_cam[:, 2], 1.0)[:, None]
+        pixels, _ = _projected(np.concatenate([plane, np.ones((len(plane), 1))], 1), camera)
+        inside = ((pixels >= -0.5) & (pixels < np.array([camera.width, camera.height]) - 0.5)).all(1)
+        return pixels, ahead & inside & ((plane**2).sum(1) < camera.lens_terms.fold)
+
+
+def _projected(
+    points_cam: Float64[np.ndarray, "point 3"], camera: Camera
+) -> tuple[Float64[np.ndarray, "point 2"], Float64[np.ndarray, "point 2 6"]]:
+    """Pixels of points before a pinhole or OpenCV camera, and their derivatives in a turn (rad) and shift (m) of the points."""
+    if not len(points_cam):
+        return np.zeros((0, 2)), np.zeros((0, 2, 6))
+    matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+    pixels, jacobian = cv2.projectPoints(points_cam, np.zeros(3), np.zeros(3), matrix, np.array(camera.distortion))
+    return pixels[:, 0], jacobian[:, :6].reshape(-1, 2, 6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,16 +186,12 @@ class Matches:
         pixels = self.pixels[fit.inlier]
         offset = self.points_world[fit.inlier].astype(np.float64) - fit.t_world_cam
         points_cam = offset @ fit.R_world_cam
-        step = 1e-5 * np.maximum(np.linalg.norm(points_cam, axis=1), 1e-6)
-        shifts = step[:, None, None] * np.concatenate([np.eye(3), -np.eye(3)])
-        seen, _ = self.camera.project(torch.from_numpy(points_cam[:, None] + shifts))
-        d_pixel_d_cam = ((seen[:, :3] - seen[:, 3:]) / (2 * torch.from_numpy(step)[:, None, None])).mT.numpy()
-        # p_cam = Rᵀ exp(-ω) (X - t - δ): its derivative is Rᵀ [X - t]× in ω and -Rᵀ in δ
-        cross = np.cross(offset[:, None], np.eye(3)).swapaxes(1, 2)
-        d_pixel_d_world = d_pixel_d_cam @ fit.R_world_cam.T
-        jacobian = np.concatenate([d_pixel_d_world @ cross, -d_pixel_d_world], 2).reshape(-1, 6)
-        centre, _ = self.camera.project(torch.from_numpy(points_cam))
-        residual = pixels - centre.numpy()
+        # p_cam = Rᵀ exp(-ω) (X - t - δ): a turn of p_cam by -Rᵀ ω and a shift by -Rᵀ δ
+        seen, d_pixel_d_cam = _projected(points_cam, self.camera)
+        jacobian = -np.concatenate([part @ fit.R_world_cam.T for part in np.split(d_pixel_d_cam, 2, 2)], 2).reshape(
+            -1, 6
+        )
+        residual = pixels - seen
         variance = max((residual**2).sum() / max(2 * len(pixels) - 6, 1), 0.5**2)
         scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
         covariance = variance * np.linalg.pinv((jacobian / scale).T @ (jacobian / scale), hermitian=True)

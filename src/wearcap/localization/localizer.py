@@ -6,7 +6,8 @@ spread matches, so a more accurate pose. It is ours, as are confidence and covar
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -25,6 +26,7 @@ from wearcap.localization.point_map import described
 from wearcap.localization.visual_map import VisualMap, from_bytes
 from wearcap.recording.recording import Localization
 
+_Frame = TypeVar("_Frame")
 _UNKNOWN = 1e4
 """Variance (rad², m²) of a pose that was not found."""
 
@@ -180,6 +182,7 @@ class Localizer:
             int(fit.inlier.sum()),
             confidence(agreeing, camera),
             torch.from_numpy(matches.covariance(fit)).float(),
+            Matches(matches.pixels[fit.inlier], matches.points_world[fit.inlier], camera),
         )
 
 
@@ -212,21 +215,32 @@ def localize_video(
     last: tuple[float, CameraPose] | None = None
     times: Sequence[float] = timestamps.tolist()
     pictures = _one_ahead(lambda image: localizer.describe(image, camera), frames)
-    for picture in track(
-        pictures, "localization", total=len(times), console=Console(stderr=True), disable=not progress
-    ):
-        if len(poses) == len(times):
-            raise WearcapError(f"more frames than the {len(times)} timestamps", expected="one timestamp per frame")
-        now = times[len(poses)]
+    for picture, now in zip(counted(pictures, len(times), progress), times):
         prior = None
         if use_prior and last is not None and now - last[0] <= prior_age_s:
             prior = Rigid(last[1].R_world_cam, last[1].t_world_cam)
         pose = localizer.locate(picture, prior)
         last = last if pose is None else (now, pose)
-        poses.append(pose)
-    if len(poses) != len(times):
-        raise WearcapError(f"{len(poses)} frames with {len(times)} timestamps", expected="one timestamp per frame")
-    count = len(times)
+        poses.append(None if pose is None else replace(pose, matches=None))
+    return localization_of(poses, timestamps)
+
+
+def counted(frames: Iterable[_Frame], count: int, progress: bool) -> Iterator[_Frame]:
+    """The frames of a video, with a progress bar. Raises WearcapError unless there are `count`."""
+    number = 0
+    for number, frame in enumerate(
+        track(frames, "localization", total=count, console=Console(stderr=True), disable=not progress), 1
+    ):
+        if number > count:
+            raise WearcapError(f"more frames than the {count} timestamps", expected="one timestamp per frame")
+        yield frame
+    if number < count:
+        raise WearcapError(f"{number} frames with {count} timestamps", expected="one timestamp per frame")
+
+
+def localization_of(poses: Sequence[CameraPose | None], timestamps: Float64[Tensor, "time"]) -> Localization:
+    """Poses over time; where there is none, confidence is 0 and the last pose is repeated (at first: the first)."""
+    count = len(poses)
     R, t, sure = torch.eye(3).repeat(count, 1, 1), torch.zeros(count, 3), torch.zeros(count)
     covariance = torch.eye(6).repeat(count, 1, 1) * _UNKNOWN
     repeated = next((pose for pose in poses if pose is not None), None)

@@ -13,6 +13,7 @@ from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError, require_choice
 from wearcap.io.formats.video import read_frames, read_image
 from wearcap.localization.features import Extractor, GlobalDescriptor, Matcher, RootSift
+from wearcap.localization.landmark_tracking import TrackingSettings, track_video
 from wearcap.localization.localizer import Localizer, LocalizerSettings, localize_video
 from wearcap.localization.visual_map import VisualMap
 from wearcap.recording import CameraStream, Recording
@@ -25,8 +26,9 @@ from wearcap.sensors.imu import synthesize_imu
 
 CLOCKS = ("shared", "claps", "auto")
 MAP_NAME = "map.safetensors"
-USUAL_HZ = 6.0
-"""Default number of frames localised per second; the suit's motion bridges the frames between."""
+USUAL_HZ, TRACKED_HZ = 6.0, 10.0
+"""Default number of frames per second if each is localised anew, and if they are tracked; the suit's motion bridges the
+frames between."""
 
 
 @runtime_checkable
@@ -104,7 +106,9 @@ class MapLocalization:
     """A map's file, or a scene's folder that contains map.safetensors; None: the recording's own poses are used, or,
     where it has none, the map in the folder of its scan."""
     every: int | None = None
-    """Step between localised frames; None: chosen for `USUAL_HZ`."""
+    """Step between localised frames; None: chosen for `USUAL_HZ`, or `TRACKED_HZ`."""
+    tracking: TrackingSettings | None = None
+    """How frames between key frames are tracked; None: each frame is localised anew (thesis)."""
     use_prior: bool = True
     """Whether the pose of the previous frame guides the search in the next one."""
 
@@ -135,8 +139,8 @@ class MapLocalization:
         file, stream = self.map_file(recording, folder), recording.camera
         if file is None or stream is None:
             return [recording.localization]
-        features = [self.extractor, self.matcher, self.descriptor, self.settings, self.use_prior]
-        frames = [self.every or _usual_step(stream), stream.timestamps, stream.camera]
+        features = [self.extractor, self.matcher, self.descriptor, self.settings, self.use_prior, self.tracking]
+        frames = [self._step(stream), stream.timestamps, stream.camera]
         return [*features, *frames, file, *_pictures(recording, folder)]
 
     def __call__(self, recording: Recording, folder: Path) -> Localization:
@@ -152,15 +156,19 @@ class MapLocalization:
         localizer = Localizer(
             VisualMap.load(file), self.extractor, self.matcher, self.settings, descriptor=self.descriptor
         )
-        every = self.every or _usual_step(stream)
-        return localize_video(
-            _frames(stream, folder, every),
-            stream.timestamps[::every],
-            stream.camera,
-            localizer,
-            use_prior=self.use_prior,
-            progress=sys.stderr.isatty(),
-        )
+        every = self._step(stream)
+        video = (_frames(stream, folder, every), stream.timestamps[::every], stream.camera, localizer)
+        progress = sys.stderr.isatty()
+        if self.tracking is not None:
+            return track_video(*video, self.tracking, progress=progress)
+        return localize_video(*video, use_prior=self.use_prior, progress=progress)
+
+    def _step(self, stream: CameraStream) -> int:
+        """Step between localised frames."""
+        if self.every is not None or len(stream.timestamps) < 2:
+            return self.every or 1
+        rate = USUAL_HZ if self.tracking is None else TRACKED_HZ
+        return max(1, round(1 / (rate * stream.timestamps.diff().median().item())))
 
 
 def camera_stages(source: CaptureInput, synchronization: Synchronization, localize: Localize) -> list[Stage]:
@@ -201,12 +209,6 @@ def camera_report(results: dict[str, Any]) -> dict[str, Any]:
             "share": (confidence > 0).double().mean().item() if len(confidence) else 0.0,
         }
     return about
-
-
-def _usual_step(stream: CameraStream) -> int:
-    if len(stream.timestamps) < 2:
-        return 1
-    return max(1, round(1 / (USUAL_HZ * stream.timestamps.diff().median().item())))
 
 
 def _pictures(recording: Recording, folder: Path) -> list[Path]:

@@ -4,6 +4,7 @@ The steps of the thesis in order: synchronize → localize → align → initial
 constants. Each can be called alone, and is a stage whose result can be cached.
 """
 
+import functools
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -84,9 +85,10 @@ class HPS(StagedSystem):
         first = camera_stages(source, self.synchronization, self.localization)
         self.require_scan(source.scan, recording.name)
         before = ("synchronize", "localize", "align", "initialize")
+        scan = functools.cache(source.read_scan)
 
         def problem(done: dict[str, Any]) -> HpsData:
-            return self.problem(on_one_clock(recording, done), done["align"], done["initialize"], source.read_scan())
+            return self.problem(on_one_clock(recording, done), done["align"], done["initialize"], scan())
 
         def inputs() -> tuple[Any, ...]:
             weights = (self.energy, self.solver, self.evidence, self.constants)

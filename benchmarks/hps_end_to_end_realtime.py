@@ -1,0 +1,128 @@
+"""HPS end to end: seconds of recording per second of computing, from suit and video to motion, localisation included.
+
+A simulated wearer of the test split claps, walks 30 m through a scanned and photographed site and is filmed throughout:
+960 x 540 at 30 frames per second, H.264, with sound; suit of typical errors. Inside the clock is all that
+`capture.py pipeline=hps` does between a recording and its motion: reading the map and the scan, the claps in the video's
+sound and in the wrist sensors, decoding every frame, localisation, alignment, initialisation, the bones' scale, the
+solver. Outside are imports, compilation and the body's mesh (a capture of the first seconds runs before), the suit's file,
+and written files.
+
+value: times real time with key frames and tracked landmarks (conf/head_camera/map.yaml), 10 poses a second. baseline:
+the same with each frame localised anew, six a second, as without tracking. ratio = value / baseline; the goal is for
+`value`. Both are compared with the truth on stderr: camera poses at the frames that have one, joints of the captured
+motion in the world, without alignment. If tracking makes the joints' or the camera's mean error more than a tenth larger
+the benchmark stops. The recording and its map are made at first (a quarter of an hour) and kept in outputs/benchmarks.
+"""
+
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from hydra.utils import instantiate
+
+from wearcap.cli.conf import compose, splits_dir
+from wearcap.cli.scene import run as build_scene_map
+from wearcap.geometry import rotation
+from wearcap.geometry.trajectory import nearest_frames
+from wearcap.prepare.engine import Splits, prepare
+from wearcap.recording import Motion, Recording
+from wearcap.recording.recording import Localization
+from wearcap.recording.store import RecordingStore
+from wearcap.recording.timing import resampled
+from wearcap.runtime.system import CaptureInput
+from wearcap.simulation.rendering.head_camera import HEAD_CAMERA_TRUTH
+
+FOLDER = Path("outputs/benchmarks/hps_end_to_end")
+WORSE = 1.1
+
+
+def dataset(split: str = "test", end_m: float = 30.0) -> tuple[Recording, Path]:
+    """A recording with its video, scan and map, and their folder; made where it is missing."""
+    folder = FOLDER / split
+    settings = [f"recordings={{{split}: 1}}", "returns_m=[]", f"end_m={end_m}", "video_s=null", "video_fps=30"]
+    settings += ["photo_m=3", "localization=ideal", f"output={folder}"]
+    config = compose("prepare", ["prepare=simulated_hps", "preset=quick", *settings])
+    tasks = instantiate(config.tasks, _convert_="all", _partial_=True)(splits=Splits.read(splits_dir() / config.splits))
+    report = prepare(tasks, folder, jobs=1)
+    if report.failed:
+        raise SystemExit(f"error: {report.failed}")
+    recording = RecordingStore.open(folder).load(tasks[0].name)
+    assert recording.scene is not None
+    scene = (folder / recording.scene).parent
+    if not (scene / "map.safetensors").is_file():
+        build_scene_map(compose("scene", [f"scene={scene}", f"output={scene / 'map.safetensors'}", "check=0"]))
+    return recording, folder
+
+
+def captured(recording: Recording, folder: Path, *choices: str) -> tuple[float, Motion, Localization]:
+    """Seconds that a capture takes, its motion, and the camera's poses."""
+    assert recording.scene is not None
+    scene = folder / Path(recording.scene).parent
+    chosen = ["pipeline=hps", "recording=none", f"pipeline.localization.map={scene}", *choices]
+    pipeline = instantiate(compose("capture", chosen).pipeline, _convert_="all")
+    source = CaptureInput.in_dataset(recording, folder)
+    begin = time.perf_counter()
+    results = pipeline.results(source)
+    motion = pipeline.motion_of(results)
+    seconds = time.perf_counter() - begin
+    assert motion is not None
+    return seconds, motion, results["localize"]
+
+
+def started(recording: Recording, seconds: float = 6.0) -> Recording:
+    """The first seconds of the camera's time."""
+    camera = recording.camera
+    assert camera is not None
+    return replace(
+        recording,
+        camera=replace(camera, timestamps=camera.timestamps[camera.timestamps < camera.timestamps[0] + seconds]),
+    )
+
+
+def accuracy(recording: Recording, motion: Motion, localization: Localization) -> dict[str, float]:
+    """Errors (mean, and 95th percentile) of the camera's poses and of the joints in the world, and the share of frames
+    with a pose."""
+    true, truth = recording.object_motion[HEAD_CAMERA_TRUTH], recording.motion
+    assert truth is not None
+    found = localization.confidence > 0.5
+    at = nearest_frames(true.timestamps, localization.timestamps[found])
+    cm = 100 * (localization.t_world_cam[found] - true.t_world_body[at]).norm(dim=-1)
+    turned = rotation.geodesic(localization.R_world_cam[found].double(), true.R_world_body[at].double()).rad2deg()
+    joints = (motion.T_world_joint.t - resampled(truth, 30.0).T_world_joint.t[: len(motion)]).norm(dim=-1)
+    return {
+        "camera_cm": cm.mean().item(),
+        "camera_p95_cm": cm.quantile(0.95).item(),
+        "camera_deg": turned.mean().item(),
+        "camera_p95_deg": turned.quantile(0.95).item(),
+        "share": found.double().mean().item(),
+        "joints_cm": 100 * joints.mean().item(),
+    }
+
+
+def measure(split: str = "test", end_m: float = 30.0) -> list[dict]:
+    recording, folder = dataset(split, end_m)
+    camera = recording.camera
+    assert camera is not None
+    duration = (camera.timestamps[-1] - camera.timestamps[0]).item()
+    captured(started(recording), folder)
+    rows = {}
+    for name, choices in (("tracked", ()), ("each frame anew", ("pipeline.localization.tracking=null",))):
+        seconds, motion, localization = captured(recording, folder, *choices)
+        rows[name] = {"times_real_time": duration / seconds} | accuracy(recording, motion, localization)
+        print(name, {key: round(value, 3) for key, value in rows[name].items()}, file=sys.stderr, flush=True)
+    ours, anew = rows.values()
+    for key in ("camera_cm", "joints_cm"):
+        if ours[key] > WORSE * anew[key]:
+            raise SystemExit(f"error: {key} is {ours[key]:.2f} with tracking, {anew[key]:.2f} without")
+    value, baseline = (row["times_real_time"] for row in (ours, anew))
+    return [
+        {
+            "name": "hps_end_to_end_realtime",
+            "value": value,
+            "unit": "s of recording per s",
+            "baseline": baseline,
+            "ratio": value / baseline,
+            "goal": 5.0,
+        }
+    ]
