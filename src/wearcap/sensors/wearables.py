@@ -7,17 +7,18 @@ measured them with monocular SLAM (Table 5: 2.1 and 2.7°, 4.7 and 5.1 cm off), 
 and watches on loose straps. Bodies are guessed from a stature, as suits do it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import nearest_frames
-from wearcap.recording.recording import HeadStream, PointCloud, Recording
+from wearcap.recording.recording import HeadStream, Recording
 from wearcap.sensors.imu import ImuNoise, synthesize_imu
 from wearcap.sensors.simulated import SlamNoise, slam_poses
 from wearcap.sensors.suit import SUITS, BodyErrors, estimated_skeleton
@@ -104,8 +105,8 @@ def worn(recording: Recording, noise: WornNoise, rng: np.random.Generator) -> Re
     if points is not None:
         seen = motion.timestamps[:1] if points.first_seen is None else points.first_seen
         frame = nearest_frames(motion.timestamps, seen)
-        from_device = T_true[frame].inverse() @ points.points_world
-        points = PointCloud(T_sensed[frame] @ (scale * from_device), points.confidence, points.first_seen)
+        from_device: Tensor = T_true[frame].inverse() @ points.points_world  # pyright: ignore[reportAssignmentType]
+        points = replace(points, points_world=T_sensed[frame] @ (scale * from_device))
     return Recording(
         recording.name,
         head=HeadStream(motion.timestamps, T_sensed.R, T_sensed.t, head.R_head_device, head.t_head_device),
