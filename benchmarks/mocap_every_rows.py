@@ -1,4 +1,4 @@
-"""What MocapEvery's tables capture: rows on recordings, heads as SLAM gives them, hands as a camera sees them."""
+"""What MocapEvery's tables capture: rows on recordings as devices sense them, hands as a camera sees them."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -6,39 +6,35 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from sensed import sensed
 from torch import Tensor
 
 from wearcap.body.kinematics import site_positions
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.cli.conf import compose, load_pipeline
-from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.metrics.position import joint_error_cm
 from wearcap.metrics.scores import score_in_world, truth_at
 from wearcap.metrics.table import Row, evaluate_motion
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.sensors.keypoints import action_camera, camera_path, seen_joints
-from wearcap.sensors.simulated import smooth_noise
 from wearcap.systems.mocap_every.energy import LatentSolver
 from wearcap.systems.mocap_every.pipeline import CapturedWithFloor, MocapEvery
 from wearcap.systems.mocap_every.visual_cues import at_frames, load_visual_cues
 
 NEAR_M = 0.03
-SLAM_DEG, SLAM_M, SLAM_PERIOD_S = 2.4, 0.05, 4.0
-"""Deviation of camera-derived head poses (the paper's Table 5: 2.1 and 2.7 degrees, 4.7 and 5.1 cm), all of it slow:
-what jumps is found by its acceleration."""
 DETECTOR_PX, MISSED = 4.0, 0.1
 
 
 @dataclass(frozen=True)
 class Method:
-    """A row: a checkpoint, and how it captures."""
+    """A row: a checkpoint, how it captures, and what it senses."""
 
     name: str
     checkpoint: str
+    sensors: str
+    """Preset of the errors of head and watches (`WEARABLES`), or `GIVEN`."""
     pipeline: tuple[str, ...] = ("pipeline=mocap_every",)
-    slam: bool = False
-    """Whether heads are as camera tracking gives them."""
 
 
 def pipeline_of(method: Method) -> MocapEvery:
@@ -50,24 +46,12 @@ def pipeline_of(method: Method) -> MocapEvery:
 def captures(
     method: Method, store: RecordingStore, names: Sequence[str], step: Callable[[], None]
 ) -> Iterator[tuple[Recording, CapturedWithFloor]]:
+    """Every recording with its truth, and what is captured of what devices sense of it."""
     pipeline = pipeline_of(method)
     for name in names:
         recording = store.load(name)
-        worn = with_slam(recording) if method.slam else recording
-        yield recording, pipeline.run(worn)
+        yield recording, pipeline.run(sensed(recording, method.sensors))
         step()
-
-
-def with_slam(recording: Recording) -> Recording:
-    """The recording with head poses that are off as in the paper's Table 5."""
-    head = recording.head
-    assert head is not None
-    fps = 1 / head.timestamps.diff().median().item()
-    rng = np.random.default_rng([5, *recording.name.encode()])
-    noise = smooth_noise(rng, len(head.timestamps), 6, SLAM_PERIOD_S, fps) / np.sqrt(3)
-    turn = rotation.exp(np.deg2rad(SLAM_DEG) * noise[:, :3])
-    moved = head.t_world_device + SLAM_M * noise[:, 3:]
-    return replace(recording, head=replace(head, R_world_device=head.R_world_device @ turn, t_world_device=moved))
 
 
 def body_row(recording: Recording, captured: CapturedWithFloor, seed: int = 0) -> Row:
@@ -107,7 +91,9 @@ def _smoothed(height: Tensor, fps: float) -> Tensor:
     return padded.unfold(0, len(reach), 1) @ (kernel / kernel.sum())
 
 
-def cue_row(recording: Recording, pipeline: MocapEvery, manifold: str, solver: LatentSolver) -> tuple[Row, Row] | None:
+def cue_row(
+    recording: Recording, sensors: str, pipeline: MocapEvery, manifold: str, solver: LatentSolver
+) -> tuple[Row, Row] | None:
     """Scores at the frames that show the right wrist, before and after editing by it; None where none does."""
     motion, head = recording.motion, recording.head
     assert motion is not None
@@ -117,7 +103,7 @@ def cue_row(recording: Recording, pipeline: MocapEvery, manifold: str, solver: L
     cues = seen_joints(motion, camera_path(motion, camera), camera.camera, ["right_wrist"], DETECTOR_PX, MISSED, rng)
     if not cues:
         return None
-    shown = replace(recording, camera=camera, cues=cues, imu={})
+    shown = replace(sensed(recording, sensors), camera=camera, cues=cues)
     before = pipeline.run(shown).motion
     seen = at_frames(cues["right_wrist"], before.timestamps).confidence > 0
     if not seen.any():

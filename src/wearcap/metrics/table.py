@@ -3,6 +3,7 @@
 import json
 import math
 from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -179,24 +180,29 @@ def truth_row(scores: dict[str, Summary]) -> dict[str, Summary]:
     return {name.removeprefix(TRUTH): value for name, value in scores.items() if name.startswith(TRUTH)}
 
 
-def _cells(methods: Scores, metrics: tuple[str, ...] | None) -> list[list[str]]:
+Columns = Sequence[str] | Mapping[str, str]
+"""Metrics of a table, or the headings of their columns by metric."""
+
+
+def _cells(methods: Scores, metrics: Columns | None) -> list[list[str]]:
     """One line per method: its name, then its metrics (default: all metrics of the first method)."""
     columns = list(metrics or next(iter(methods.values())))
+    headings = list(metrics.values()) if isinstance(metrics, Mapping) else columns
     lines = [
         [method, *(str(scores[metric]) if metric in scores else "–" for metric in columns)]
         for method, scores in methods.items()
     ]
-    return [["method", *columns], *lines]
+    return [["method", *headings], *lines]
 
 
-def markdown_table(methods: Scores, metrics: tuple[str, ...] | None = None) -> str:
+def markdown_table(methods: Scores, metrics: Columns | None = None) -> str:
     """A table in Markdown: one line per method, one column per metric."""
     header, *lines = _cells(methods, metrics)
     rule = ["---", *["---:"] * (len(header) - 1)]
     return "\n".join("| " + " | ".join(line) + " |" for line in (header, rule, *lines))
 
 
-def rich_table(title: str, methods: Scores, metrics: tuple[str, ...] | None = None) -> Table:
+def rich_table(title: str, methods: Scores, metrics: Columns | None = None) -> Table:
     """A table for a terminal: one line per metric, one column per method."""
     table = Table(title=title)
     header, *lines = _cells(methods, metrics)
