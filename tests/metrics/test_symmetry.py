@@ -25,7 +25,7 @@ def movable(category: str) -> Mesh:
 
 
 def symmetry_of(mesh: Mesh) -> Symmetry:
-    return Symmetry.of(mesh, TriangleIndex.of(mesh))
+    return Symmetry.of(mesh, object_cloud(mesh), TriangleIndex.of(mesh))
 
 
 @pytest.mark.parametrize(

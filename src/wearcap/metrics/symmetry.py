@@ -13,7 +13,6 @@ from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from wearcap.data.objects import object_cloud
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import geodesic
@@ -39,9 +38,12 @@ class Symmetry:
     """Axes about which every turn does so: none of a suitcase, one of a bottle, three of a ball."""
 
     @classmethod
-    def of(cls, mesh: Mesh, surface: TriangleIndex) -> "Symmetry":
-        """Found by trial: turns by quarters and thirds of the object's own and of its principal axes."""
-        cloud = object_cloud(mesh).double().numpy()
+    def of(cls, mesh: Mesh, points: Float[Tensor, "point 3"], surface: TriangleIndex) -> "Symmetry":
+        """Found by trial: turns by quarters and thirds of the object's own and of its principal axes.
+
+        `points` lie on the mesh's surface, evenly by area.
+        """
+        cloud = points.double().numpy()
         center, principal = _center_and_axes(mesh)
         allowed = SAME * float(np.linalg.norm(np.ptp(cloud, axis=0)))
 

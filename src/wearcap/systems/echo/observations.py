@@ -58,7 +58,7 @@ class ObjectShape:
     @cached_property
     def symmetry(self) -> Symmetry:
         """Turns that leave the object as it was."""
-        return Symmetry.of(self.mesh, self.surface)
+        return Symmetry.of(self.mesh, self.cloud + self.middle, self.surface)
 
     def centred(self, T_world_object: Rigid) -> Rigid:
         """Pose of the bounding box's centre, given the mesh's pose."""
