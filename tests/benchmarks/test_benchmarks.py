@@ -1,9 +1,11 @@
 """Benchmarks and tables run, print the figures of DESIGN, and measure what they claim."""
 
+import argparse
 import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -225,3 +227,43 @@ def test_scenarios_are_where_ours_is_best_in_the_middle_and_worst():
     first = next(iter(found.values()))
     assert first["mean pose"]["hand_pe_cm"].mean == 9.0
     assert tables_hmd2._scenarios([other]) == {}
+
+
+def test_hmd2_tables_write_tails_scenarios_and_sweeps_on_validation(tmp_path, monkeypatch, capsys):
+    import tables_hmd2
+    from hmd2_runs import Result
+    from sensed import GIVEN
+
+    from watched_walk import watched_walk
+    from wearcap.metrics.table import Summary
+    from wearcap.recording import RecordingStore
+
+    store, seen = RecordingStore(tmp_path / "walks"), {}
+    for split in ("val", "test"):
+        store.add(replace(watched_walk(1.0), name=f"walk_{split}"), split=split, config_hash="")
+
+    def run_method(method, case):
+        seen[method.name] = method.sensors or case.sensors, case.names
+        names = [*tables_hmd2.COLUMNS, *tables_hmd2.PARTS, *tables_hmd2.TAIL, "truth_physicality"]
+        scores = {name: Summary(0.00123, 0.0001, 2) for name in names}
+        return Result(method.name, scores, {"walk": scores})
+
+    monkeypatch.setattr(tables_hmd2, "run_method", run_method)
+    monkeypatch.setattr(tables_hmd2, "_exists", lambda checkpoint: True)
+    parser = argparse.ArgumentParser()
+    tables_hmd2.add_arguments(parser)
+    arguments = ["--dataset", str(tmp_path / "walks"), "--jobs", "1", "--strides", "60", "--steps", "5"]
+    options = parser.parse_args([*arguments, "--sensors", "poor"], argparse.Namespace(quick=False, output=tmp_path))
+    tree = json.loads(tables_hmd2.tables(options, {}).read_text())
+    assert tree["about"]["sensors"] == "poor"
+    assert set(tree["tables"]) == {tables_hmd2.FIRST, "Table 6.5: latency", "Table 6.7: steps"}
+    assert seen["full"] == ("poor", ("walk_test",))
+    assert seen["full, typical sensors"][0] == "typical"
+    assert seen["AvatarPoser-style (head and hands)"][0] == GIVEN
+    assert seen["5 steps"] == ("poor", ("walk_val",))
+    assert tree["percentiles"]["full"]["p95_hand_pe_cm"]["mean"] == 0.00123
+    assert len(tree["scenarios"]) == 3
+    shown = capsys.readouterr().out
+    assert "0.0012" in shown
+    assert "truth" in shown
+    assert "Table 6.10" in shown
