@@ -17,11 +17,11 @@ from joblib import Parallel, delayed
 from rich.console import Console
 from rich.table import Table
 from sensed import GIVEN, add_sensors
-from tabling import cell, finite, new_table
+from tabling import finite, new_table
 
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
-from wearcap.metrics.table import P95, Scores, Summary, decimals, truth_row
+from wearcap.metrics.table import P95, Scores, Summary, truth_row
 from wearcap.models.checkpoint import checkpoint_file
 from wearcap.recording import RecordingStore
 from wearcap.sensors.wearables import WEARABLES
@@ -284,8 +284,7 @@ def _table(title: str, results: list[Result]) -> Table:
 
 def _cells(scores: Mapping[str, Summary], columns: Iterable[str]) -> list[str]:
     """Means ± deviations with as many digits as they need; a dash for what there is not."""
-    known = (scores.get(name) for name in columns)
-    return ["–" if value is None else cell(asdict(value), decimals(value.mean)) for value in known]
+    return [str(scores[name]) if name in scores else "–" for name in columns]
 
 
 def _parts(title: str, columns: Mapping[str, str], rows: Scores, paper: Mapping[str, tuple[float, ...]]) -> Table:
