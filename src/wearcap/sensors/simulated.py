@@ -37,6 +37,10 @@ def heading_walk(
     return rotation.about_axis("z", torch.from_numpy(np.cumsum(steps, 0)).float()[:, 0])
 
 
+DRIFT_S = 0.5
+"""Deviation (s) of the kernel that smooths a SLAM system's drift."""
+
+
 @dataclass(frozen=True)
 class SlamNoise:
     """Errors of a head-mounted SLAM system; zeros make it perfect."""
@@ -84,9 +88,12 @@ def slam_poses(T_world_device: Rigid, fps: float, noise: SlamNoise, rng: np.rand
     t = t + noise.jitter_m * jitter[:, 3:]
     if noise.drift_share or noise.yaw_drift_deg_per_sqrt_min:
         walk = torch.from_numpy(rng.standard_normal((len(t), 3))).float() * travelled
-        t = t + noise.drift_share * walk.cumsum(0)
         turn = heading_walk(rng, len(t), noise.yaw_drift_deg_per_sqrt_min, fps)
-        R, t = turn @ R, t[:1] + (turn @ (t - t[:1])[..., None])[..., 0]
+        off = noise.drift_share * walk.cumsum(0)
+        off = off + (turn @ (t + off - t[:1])[..., None])[..., 0] - (t + off - t[:1])
+        # SLAM drifts smoothly: the walk's steps from frame to frame are no jitter of the device.
+        off = scipy.ndimage.gaussian_filter1d(off.double().numpy(), DRIFT_S * fps, axis=0, mode="nearest")
+        R, t = turn @ R, t + torch.from_numpy(off - off[:1]).float()
     if noise.wander_m or noise.wander_deg:
         wander = smooth_noise(rng, len(t), 6, noise.wander_period_s, fps) / np.sqrt(3)
         R, t = rotation.exp(np.deg2rad(noise.wander_deg) * wander[:, :3]) @ R, t + noise.wander_m * wander[:, 3:]
