@@ -40,7 +40,15 @@ BODY = (
     "physicality",
     "floor_penetration_cm",
 )
-FLOOR = ("upper_pe_cm", "lower_pe_cm", "mpjpe_cm", "floor_cm", "floor_within_3cm", "floor_within_3cm_smoothed")
+FLOOR = (
+    "upper_pe_cm",
+    "lower_pe_cm",
+    "mpjpe_cm",
+    "floor_cm",
+    "floor_within_3cm",
+    "floor_within_3cm_smoothed",
+    "r_mpjpe_cm",
+)
 CUES = ("right_hand_cm", "right_arm_cm", "upper_cm", "mpjpe_cm", "jitter_m_s3")
 OURS = "experiment=mocap_every"
 TRAININGS: dict[str, tuple[str, ...]] = {
@@ -147,7 +155,7 @@ def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
         scored = [
             body_row(recording, captured, seed)
             for seed, method in enumerate(methods)
-            for recording, captured in captures(method, store, names, lambda b=bar: progress.advance(b))
+            for recording, _, captured in captures(method, store, names, lambda b=bar: progress.advance(b))
         ]
         scores[name] = aggregate(scored)
     scores["truth"] = truth_row(scores["ours"])
@@ -179,7 +187,7 @@ def _floor(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[
     for method in methods:
         bar = progress.add_task(method.name, total=len(names))
         scores[method.name] = aggregate(
-            [floor_row(*pair) for pair in captures(method, store, names, lambda b=bar: progress.advance(b))]
+            [floor_row(*each) for each in captures(method, store, names, lambda b=bar: progress.advance(b))]
         )
     both = (("paper: fixed", (9.19, 16.58, 12.35)), ("paper: update", (6.04, 7.19, 6.53)))
     paper = {name: {key: Summary(v, None, 1) for key, v in zip(FLOOR, values)} for name, values in both}
