@@ -54,13 +54,18 @@ def captured(
     jobs = [(name, seed) for name in ordered for seed in seeds]
     for start in range(0, len(jobs), items):
         batch = jobs[start : start + items]
-        observed_parts = {name: echo.scenario_of(CaptureInput(store.load(name), store.root)) for name, _ in batch}
+        observed_parts = {name: scenario_of(echo, CaptureInput(store.load(name), store.root)) for name, _ in batch}
         scenarios = [_observing(method, echo, observed_parts[name], store.root, seed) for name, seed in batch]
         motions = echo.capture_scenarios(scenarios, [seed for _, seed in batch])
         for (name, seed), motion in zip(batch, motions):
             scenario = observed_parts[name]
             item = batch_item_of(scenario, head_path(scenario.recording, echo.model.skeleton, echo.fps), reader)
             yield Captured(name, seed, motion, echo.truth(motion, CaptureInput(scenario.recording, store.root)), item)
+
+
+def scenario_of(echo: Echo, source: CaptureInput) -> Scenario:
+    """The recording with the objects of its own file."""
+    return echo.scenario(source.recording, echo.objects(source))
 
 
 def _observing(method: Method, echo: Echo, scenario: Scenario, root: Path, seed: int) -> Scenario:

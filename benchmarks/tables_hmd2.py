@@ -1,28 +1,35 @@
 """HMD² with head path, points and images on held-out people and places: Tables 6.1 to 6.10 of the thesis.
 
-Every row captures whole recordings with every seed; ± is the deviation over seeds. Rows without a checkpoint are left
+Head tracking and what is known of the body have the errors of real devices (`--sensors`); rows that have more say so.
+Latency and steps (Tables 6.5 and 6.7), by which settings are chosen, are measured on the validation split. Every row captures whole recordings with every seed; ± is the deviation over seeds. Rows without a checkpoint are left
 out, which is printed. Checkpoints come by name (checkpoints/) or path.
 """
 
 import argparse
 import json
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 from hmd2_runs import BASELINES, Case, Method, Result, run_method
 from joblib import Parallel, delayed
 from result_pages import NONE, Grid, Page, Tree, Trees, figure_of, grid_of, mean, ranged, score_grids, summaries, text
 from rich.console import Console
 from rich.table import Table
-from tabling import cell, finite, new_table
+from sensed import GIVEN, add_sensors
+from tabling import finite, new_table
 
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
+from wearcap.metrics.table import P95, Scores, Summary, truth_row
 from wearcap.models.checkpoint import checkpoint_file
 from wearcap.recording import RecordingStore
+from wearcap.sensors.wearables import WEARABLES
 
 COLUMNS = {
     "mpjpe_cm": "MPJPE",
+    "best_mpjpe_cm": "best of n",
     "hand_pe_cm": "hand",
     "upper_pe_cm": "upper",
     "lower_pe_cm": "lower",
@@ -32,9 +39,28 @@ COLUMNS = {
     "physicality": "phys.",
     "floor_penetration_cm": "floor",
     "foot_skate_cm_s": "skate",
+    "jitter_m_s3": "m/s³",
     "jitter_ratio": "jitter",
     "seam_ratio": "seam",
+    "world_mpjpe_cm": "world",
 }
+"""Columns of the first table; "jitter" is of the truth's, "world" the MPJPE that is not anchored to the true head."""
+PARTS = {
+    "mpjpe_cm": "MPJPE",
+    "hand_pe_cm": "hand",
+    "lower_pe_cm": "lower",
+    "upper_pe_cm": "upper",
+    "floor_penetration_cm": "floor",
+}
+"""Columns of Tables 6.6 and 6.8 to 6.10."""
+TAIL = {f"{P95}{name.removeprefix('mpjpe_')}": title for name, title in PARTS.items()}
+PAPER_TAIL = {
+    "EgoEgo": (30.91, 60.81, 58.63, 19.26, 10.33),
+    "AvatarPoser (head)": (22.09, 43.19, 44.18, 13.01, 18.96),
+    "AvatarPoser (head and hands)": (16.48, 11.23, 37.91, 5.63, 18.15),
+    "HMD² (h = 180)": (15.49, 34.86, 27.35, 10.80, 4.22),
+}
+"""Thesis Table 6.6, on Nymeria."""
 PAPER = {
     "EgoEgo": (16.61, 34.64, 35.69, 20.15, 3.68, 2.43),
     "AvatarPoser (head)": (10.64, 21.51, 27.61, 12.99, 1.69, 4.21),
@@ -42,12 +68,18 @@ PAPER = {
     "HMD² (h = 10)": (9.19, 17.67, 5.00, 15.23, 1.30, 1.19),
 }
 """Thesis Table 6.1, on Nymeria: MPJPE, hand, FID, Diversity (truth 16.13), Physicality (truth 0.56), floor penetration."""
-MODALITIES = {"full": "[points,images]", "w/o images": "[points]", "w/o points": "[images]", "head alone": "[]"}
+FIRST = "Tables 6.1 and 6.3"
+OURS = "full"
+TRUTH_GIVEN = "hands of the AvatarPoser-style row that sees them (with exact sensors and bones), and the bones of rows that say so"
+"""What of the truth is given to rows."""
+MODALITIES = {OURS: "[points,images]", "w/o images": "[points]", "w/o points": "[images]", "head alone": "[]"}
 STRIDES = (230, 180, 120, 60, 30, 10, 1)
 STEPS = (2, 3, 5, 10, 20, 40, 80)
 LOOKAHEAD = 20
 """Frames that our windows of the sweep look ahead; longer strides have no more than a window's room for it."""
-WIDTH = 170
+SWEEP_STRIDE_S = 0.25
+"""Distance of the windows of FID in the sweeps, whose recordings are fewer."""
+WIDTH = 190
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -64,6 +96,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="data sets that mean pose and nearest window learn from",
     )
     parser.add_argument("--split", default="test", help="train, val or test")
+    add_sensors(parser)
     parser.add_argument("--seeds", type=int, default=8, help="repetitions (2 when quick)")
     parser.add_argument("--recordings", type=int, help="no more than so many of the split")
     parser.add_argument("--checkpoint", default="hmd2", help="the full model")
@@ -82,6 +115,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="rows trained by themselves, such as head=…",
     )
     parser.add_argument("--realism", default="motion_autoencoder", help="the motion autoencoder")
+    parser.add_argument("--sweep-split", default="val", help="split of the sweeps over h and steps")
     parser.add_argument("--sweep-recordings", type=int, default=6, help="recordings of the sweeps over h and steps")
     parser.add_argument("--sweep-seeds", type=int, default=2, help="repetitions of the sweeps")
     parser.add_argument(
@@ -100,48 +134,74 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     """Print and write the tables; returns the file."""
     case = _case(options)
     console = Console(width=WIDTH)
-    short = replace(case, names=case.names[: options.sweep_recordings], seeds=case.seeds[: options.sweep_seeds])
-    sweeps = (
-        []
-        if options.quick
-        else [
-            ("Table 6.5: latency", short, [method for h in options.strides for method in _latencies(options, h)]),
-            (
-                "Table 6.7: steps",
-                short,
-                [_ours(options, f"{n} steps", f"pipeline.sampling.steps={n}") for n in options.steps],
-            ),
-        ]
-    )
-    jobs = [("Tables 6.1 and 6.3", case, _methods(options, console)), *sweeps]
+    jobs = [(FIRST, case, _methods(options, console)), *([] if options.quick else _sweeps(options, case))]
     results = Parallel(n_jobs=options.jobs)(
         delayed(run_method)(method, where) for _, where, methods in jobs for method in methods
     )
     found: dict[str, list[Result]] = {}
-    for title, _, methods in jobs:
+    for title, where, methods in jobs:
         found[title] = [result for result in results[: len(methods)] if result is not None]
         results = results[len(methods) :]
-        console.print(_table(f"{title} ({case.dataset.name}, {options.split})", found[title]))
-    console.print(_paper())
-    for metric, title in (
-        ("mpjpe_cm", "MPJPE (cm)"),
-        ("hand_pe_cm", "hand error (cm)"),
-        ("lower_pe_cm", "lower body (cm)"),
-    ):
-        console.print(
-            _activities(f"Tables 6.8–6.10: {title} by what was mostly done", found["Tables 6.1 and 6.3"], metric)
-        )
-    path = options.output / f"hmd2_{case.dataset.name}.json"
-    tree = {title: [asdict(result) for result in rows] for title, rows in found.items()}
+        split = options.split if where is case else options.sweep_split
+        console.print(_table(f"{title} ({case.dataset.name}, {split}, {case.sensors} sensors)", found[title]))
+    console.print(f"The truth's are, beside the sensors', {TRUTH_GIVEN}.", _paper())
+    tail = {row.method: {name: row.scores[name] for name in TAIL} for row in found[FIRST]}
+    console.print(_parts("Table 6.6: 95th percentiles of each recording", TAIL, tail, PAPER_TAIL))
+    scenarios = _scenarios(found[FIRST])
+    for title, rows in scenarios.items():
+        console.print(_parts(title, PARTS, rows, {}))
+    for metric, title in PARTS.items():
+        console.print(_activities(f"{title} (cm) by what was mostly done", found[FIRST], metric))
+    usual = "" if options.sensors == "typical" else f"_{options.sensors}"
+    path = options.output / f"hmd2_{case.dataset.name}{usual}.json"
     facts = {
         **about,
         "dataset": str(case.dataset),
         "split": options.split,
+        "sensors": options.sensors,
+        "truth given": TRUTH_GIVEN,
         "seeds": len(case.seeds),
         "recordings": len(case.names),
     }
-    write_text(path, json.dumps(finite({"about": facts, "tables": tree}), indent=1) + "\n")
+    tree = {
+        "about": facts,
+        "tables": {title: [asdict(result) for result in rows] for title, rows in found.items()},
+        "percentiles": _plain(tail),
+        "scenarios": {title: _plain(rows) for title, rows in scenarios.items()},
+    }
+    write_text(path, json.dumps(finite(tree), indent=1) + "\n")
     return path
+
+
+def _plain(scores: Scores) -> dict[str, dict[str, Any]]:
+    """Summaries as JSON."""
+    return {method: {name: asdict(value) for name, value in row.items()} for method, row in scores.items()}
+
+
+def _sweeps(options: argparse.Namespace, case: Case) -> list[tuple[str, Case, list[Method]]]:
+    """Tables 6.5 and 6.7."""
+    names = RecordingStore.open(case.dataset).names(options.sweep_split)[: options.sweep_recordings]
+    short = replace(case, names=tuple(names), seeds=tuple(range(options.sweep_seeds)), stride_s=SWEEP_STRIDE_S)
+    steps = [_ours(options, f"{n} steps", f"pipeline.sampling.steps={n}") for n in options.steps]
+    return [
+        ("Table 6.5: latency", short, [method for h in options.strides for method in _latencies(options, h)]),
+        ("Table 6.7: steps", short, steps),
+    ]
+
+
+def _scenarios(results: list[Result]) -> dict[str, Scores]:
+    """Tables 6.8 to 6.10: the activities in which ours is best, in the middle, and worst, by title."""
+    ours = next((result.activities for result in results if result.method == OURS), {})
+    ranked = sorted(ours, key=lambda name: ours[name]["mpjpe_cm"].mean)
+    if not ranked:
+        return {}
+    places = {"6.8: best": 0, "6.9: median": (len(ranked) - 1) // 2, "6.10: worst": -1}
+    return {
+        f"Table {number} of {len(ranked)} activities, {ranked[place]}": {
+            row.method: {metric: row.activities[ranked[place]][metric] for metric in PARTS} for row in results
+        }
+        for number, place in places.items()
+    }
 
 
 def _case(options: argparse.Namespace) -> Case:
@@ -155,7 +215,8 @@ def _case(options: argparse.Namespace) -> Case:
     names = names[: 3 if options.quick else options.recordings]
     seeds = tuple(range(2 if options.quick else options.seeds))
     realism = options.realism if _exists(options.realism) else None
-    return Case(options.dataset, tuple(names), seeds, tuple(options.training), realism, options.device)
+    training = tuple(options.training)
+    return Case(options.dataset, tuple(names), seeds, training, realism, options.sensors, options.device)
 
 
 def _exists(checkpoint: str) -> bool:
@@ -185,9 +246,12 @@ def _latencies(options: argparse.Namespace, h: int) -> list[Method]:
 def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
     """Rows of the first table; those whose checkpoint is not there are named and left out."""
     regressors = [
-        Method(f"AvatarPoser-style ({sees})", checkpoint, ("pipeline=pose_regressor",))
-        for sees, checkpoint in zip(("head", "head and hands"), options.regressors)
+        Method(f"AvatarPoser-style ({sees})", checkpoint, ("pipeline=pose_regressor",), sensors)
+        for sees, checkpoint, sensors in zip(("head", "head and hands"), options.regressors, (None, GIVEN))
     ]
+    full = _ours(options, OURS)
+    sensing = [replace(full, name=f"full, {n} sensors", sensors=n) for n in WEARABLES if n != options.sensors]
+    sensing.append(replace(full, name="full, the data's own sensors, bones given", sensors=GIVEN))
     ablations = [_ours(options, name, f"pipeline.use={use}") for name, use in MODALITIES.items()]
     separate = [
         Method(f"{name}, trained by itself", checkpoint)
@@ -198,6 +262,7 @@ def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
         Method("EgoEgo-style", options.egoego, ("pipeline=baseline/egoego_style",)),
         *regressors,
         *ablations,
+        *sensing,
         *separate,
         _ours(options, "full, the paper's windows", pipeline="paper/hmd2"),
         _ours(options, "full, one step to the mean", pipeline="ablation/hmd2_mean"),
@@ -212,12 +277,24 @@ def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
 def _table(title: str, results: list[Result]) -> Table:
     table = new_table(title, ["", *COLUMNS.values()])
     for result in results:
-        cells = [cell(asdict(result.scores[key])) if key in result.scores else "–" for key in COLUMNS]
-        table.add_row(result.method, *cells)
+        table.add_row(result.method, *_cells(result.scores, COLUMNS))
     if results:
-        first = results[0].scores
-        truth = {"physicality": "truth_physicality", "diversity": "truth_diversity"}
-        table.add_row("truth", *(f"{first[truth[key]].mean:.2f}" if truth.get(key) in first else "" for key in COLUMNS))
+        table.add_row("truth", *_cells(truth_row(results[0].scores), COLUMNS))
+    return table
+
+
+def _cells(scores: Mapping[str, Summary], columns: Iterable[str]) -> list[str]:
+    """Means ± deviations with as many digits as they need; a dash for what there is not."""
+    return [str(scores[name]) if name in scores else "–" for name in columns]
+
+
+def _parts(title: str, columns: Mapping[str, str], rows: Scores, paper: Mapping[str, tuple[float, ...]]) -> Table:
+    """A table of parts of the body."""
+    table = new_table(f"{title} (cm)", ["", *columns.values()])
+    for name, scores in rows.items():
+        table.add_row(name, *_cells(scores, columns))
+    for name, values in paper.items():
+        table.add_row(f"the paper's {name}, on Nymeria", *(f"{value:.2f}" for value in values))
     return table
 
 

@@ -12,7 +12,7 @@ from rich import print as show
 
 from wearcap.cli import evaluate, train
 from wearcap.cli.conf import compose
-from wearcap.metrics.table import Scores, Summary, rich_table, write_scores
+from wearcap.metrics.table import Scores, Summary, rich_table, truth_row, write_scores
 
 OURS = ("experiment=motion_diffusion_head",)
 ABLATIONS = {
@@ -33,7 +33,7 @@ COLUMNS = (
     "jitter_ratio",
     "foot_skate_cm_s",
     "physicality",
-    "truth_physicality",
+    "jitter_m_s3",
     "floor_penetration_cm",
 )
 QUICK = (
@@ -63,6 +63,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
             scores[row] = _evaluated(_trained(row, overrides, options), options, "hmd2")["wearcap"]
         if not options.quick:
             scores["wearcap, latency 0.17 s"] = _evaluated(checkpoints, options, "hmd2_online")["wearcap"]
+    scores["truth"] = truth_row(scores["wearcap"])
     path = options.output / "hmd2_head.json"
     show(rich_table(f"HMD2, head path alone ({options.data})", {**scores, **PAPER}, COLUMNS))
     facts = {"data": options.data, "quick": str(options.quick), "checkpoints": " ".join(map(str, checkpoints))}

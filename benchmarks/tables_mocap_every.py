@@ -1,6 +1,7 @@
 """MocapEvery on held-out people and places: the paper's Tables 2 to 7 on the data at hand.
 
-Bodies are measured where they are put in the world. Checkpoints come by name (checkpoints/) or path; those of baselines
+Heads, watches and what is known of the body have the errors of real devices (`--sensors`): the floor and the wearer's
+bones are given in the rows that say so alone. Bodies are measured where they are put in the world. Checkpoints come by name (checkpoints/) or path; those of baselines
 and ablations from RUNS/NAME/checkpoints/last.ckpt, and further seeds of a training from RUNS/NAME_1 and RUNS/NAME_2: the
 table gives their mean and spread. A row without its checkpoint is left out, and the command that trains it is printed
 (`TRAININGS`).
@@ -16,11 +17,13 @@ from mocap_every_rows import Method, body_row, captures, cue_row, floor_row, pip
 from result_pages import Grid, Page, Tree, Trees, figure_of, mean, picked, ranged, rows_of, score_grids
 from rich.console import Console
 from rich.progress import Progress
+from sensed import GIVEN, add_sensors
 from tabling import finite, recordings_of
 
 from wearcap.files import write_text
-from wearcap.metrics.table import Scores, Summary, aggregate, markdown_table
+from wearcap.metrics.table import Scores, Summary, aggregate, markdown_table, truth_row
 from wearcap.models.checkpoint import checkpoint_file
+from wearcap.sensors.wearables import WEARABLES
 from wearcap.systems.mocap_every.energy import LatentSolver
 from wearcap.systems.mocap_every.visual_cues import load_visual_cues
 
@@ -34,8 +37,19 @@ BODY = (
     "lower_pe_cm",
     "hand_pe_cm",
     "foot_skate_cm_s",
+    "jitter_m_s3",
+    "physicality",
+    "floor_penetration_cm",
 )
-FLOOR = ("upper_pe_cm", "lower_pe_cm", "mpjpe_cm", "floor_cm", "floor_within_3cm", "floor_within_3cm_smoothed")
+FLOOR = (
+    "upper_pe_cm",
+    "lower_pe_cm",
+    "mpjpe_cm",
+    "floor_cm",
+    "floor_within_3cm",
+    "floor_within_3cm_smoothed",
+    "r_mpjpe_cm",
+)
 CUES = ("right_hand_cm", "right_arm_cm", "upper_cm", "mpjpe_cm", "jitter_m_s3")
 OURS = "experiment=mocap_every"
 TRAININGS: dict[str, tuple[str, ...]] = {
@@ -67,7 +81,9 @@ TRAINED = {
     "+ multi-stage": ("mocap_every_short", ("pipeline=mocap_every",)),
     "+ multi-stage, hands tracked": ("mocap_every_hands", ("pipeline=mocap_every",)),
 }
-"""Rows: run, and pipeline."""
+"""Rows: run, and pipeline. All are on a floor that stays as at the beginning."""
+HANDS = ("mocap_every_hands",)
+"""Runs whose hands are tracked: those of the truth, with exact sensors, floor and bones given."""
 PAPER: Scores = {
     name: {key: Summary(value, None, 1) for key, value in zip(BODY, values)}
     for name, values in {
@@ -90,6 +106,7 @@ FLOORS = ("fixed", "update", "points", "follow")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--datasets", type=Path, default=Path("datasets"), help="folder of the prepared data sets")
     parser.add_argument("--split", default="test", help="train, val or test")
+    add_sensors(parser)
     parser.add_argument("--checkpoint", default="mocap_every", help="our checkpoint")
     parser.add_argument("--manifold", default="motion_manifold", help="where motion is edited by cues")
     parser.add_argument("--runs", type=Path, default=Path("outputs/train"), help="folder of the other trainings")
@@ -111,8 +128,9 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
             title, columns, scores = PARTS[part](options, progress)
             found[title] = {method: {k: vars(v) for k, v in row.items()} for method, row in scores.items()}
             console.print(f"\n{title}\n\n{markdown_table(scores, columns)}", markup=False, soft_wrap=True)
-    path = options.output / "mocap_every.json"
-    write_text(path, json.dumps(finite({"about": about, "tables": found}), indent=1) + "\n")
+    path = options.output / f"mocap_every{'' if options.sensors == 'typical' else f'_{options.sensors}'}.json"
+    facts = {**about, "sensors": options.sensors}
+    write_text(path, json.dumps(finite({"about": facts, "tables": found}), indent=1) + "\n")
     return path
 
 
@@ -220,34 +238,24 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
 
 
 def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
-    """Tables 2, 5, 6 and 7: held-out CMU subjects with synthetic watches on a floor that is known to be level."""
-    level = "pipeline.floor=fixed"
-    ours = [
-        Method("ours", options.checkpoint, ("pipeline=mocap_every", level)),
-        Method("ours, floor followed", options.checkpoint),
-        Method(
-            "ours, without mirror averaging",
-            options.checkpoint,
-            ("pipeline=mocap_every", level, "pipeline.mirror_average=false"),
-        ),
-        Method(
-            "ours, not anchored to the head",
-            options.checkpoint,
-            ("pipeline=mocap_every", level, "pipeline.anchor=false"),
-        ),
-        Method("ours, three frames at a time", options.checkpoint, ("pipeline=mocap_every_online", level)),
-        Method("ours, heads as by SLAM", options.checkpoint, slam=True),
-        Method(
-            "ours, heads as by SLAM, not anchored",
-            options.checkpoint,
-            ("pipeline=mocap_every", "pipeline.anchor=false"),
-            slam=True,
-        ),
-    ]
+    """Tables 2, 5, 6 and 7: held-out CMU subjects, whose heads and watches are simulated."""
+    level, usual = "pipeline.floor=fixed", options.sensors
+    variants = {
+        "ours": ("pipeline=mocap_every",),
+        "ours, floor fixed at the beginning": ("pipeline=mocap_every", level),
+        "ours, without mirror averaging": ("pipeline=mocap_every", "pipeline.mirror_average=false"),
+        "ours, not anchored to the head": ("pipeline=mocap_every", "pipeline.anchor=false"),
+        "ours, three frames at a time": ("pipeline=mocap_every_online",),
+    }
+    ours = [Method(name, options.checkpoint, usual, pipeline) for name, pipeline in variants.items()]
+    ours += [Method(f"ours, {other} sensors", options.checkpoint, other) for other in WEARABLES if other != usual]
+    given = "ours, exact sensors, floor and bones given"
+    ours.append(Method(given, options.checkpoint, GIVEN, ("pipeline=mocap_every", level)))
     trained = {}
     for name, (run, pipeline) in TRAINED.items():
         paths = [options.runs / seeded / "checkpoints" / "last.ckpt" for seeded in (run, f"{run}_1", f"{run}_2")]
-        trained[name] = [Method(name, str(path), (*pipeline, level)) for path in paths if path.is_file()]
+        sensors = GIVEN if run in HANDS else usual
+        trained[name] = [Method(name, str(path), sensors, (*pipeline, level)) for path in paths if path.is_file()]
         if not trained[name]:
             command = shlex.join(
                 ["wearcap", "train", *TRAININGS[run], *STEPS, f"name={run}", f"paths.run={options.runs / run}"]
@@ -264,10 +272,12 @@ def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
         scored = [
             body_row(recording, captured, seed)
             for seed, method in enumerate(methods)
-            for recording, captured in captures(method, store, names, lambda b=bar: progress.advance(b))
+            for recording, _, captured in captures(method, store, names, lambda b=bar: progress.advance(b))
         ]
         scores[name] = aggregate(scored)
-    return f"Tables 2, 6, 7: CMU, {options.split}", BODY, scores | PAPER
+    scores["truth"] = truth_row(scores["ours"])
+    title = f"Tables 2, 6, 7: CMU, {options.split}, {usual} sensors (hands tracked: exact, floor and bones given)"
+    return title, BODY, scores | PAPER
 
 
 def _totalcapture(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
@@ -293,33 +303,44 @@ def _floor(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[
     """Table 3: stairs and ramps between terraces at -4 to 4 m."""
     store, names = recordings_of(options, "simulated_hillside")
     methods = [
-        Method(f"floor {floor}", options.checkpoint, ("pipeline=mocap_every", f"pipeline.floor={floor}"))
+        Method(
+            f"floor {floor}", options.checkpoint, options.sensors, ("pipeline=mocap_every", f"pipeline.floor={floor}")
+        )
         for floor in FLOORS
     ]
+    others = [name for name in (*WEARABLES, GIVEN) if name != options.sensors]
+    methods += [Method(_sensing(name), options.checkpoint, name) for name in others]
     run, pipeline = TRAINED["as in the paper"]
     path = options.runs / run / "checkpoints" / "last.ckpt"
     if path.is_file():
         methods += [
-            Method(f"as in the paper, floor {floor}", str(path), (*pipeline, f"pipeline.floor={floor}"))
+            Method(
+                f"as in the paper, floor {floor}", str(path), options.sensors, (*pipeline, f"pipeline.floor={floor}")
+            )
             for floor in ("fixed", "update")
         ]
     scores = {}
     for method in methods:
         bar = progress.add_task(method.name, total=len(names))
         scores[method.name] = aggregate(
-            [floor_row(*pair) for pair in captures(method, store, names, lambda b=bar: progress.advance(b))]
+            [floor_row(*each) for each in captures(method, store, names, lambda b=bar: progress.advance(b))]
         )
     both = (("paper: fixed", (9.19, 16.58, 12.35)), ("paper: update", (6.04, 7.19, 6.53)))
     paper = {name: {key: Summary(v, None, 1) for key, v in zip(FLOOR, values)} for name, values in both}
-    return f"Table 3: hillsides, {options.split}", FLOOR, scores | paper
+    return f"Table 3: hillsides, {options.split}, {options.sensors} sensors", FLOOR, scores | paper
+
+
+def _sensing(sensors: str) -> str:
+    """A row of Table 3 on other sensors."""
+    what = "exact sensors, first floor and bones given" if sensors == GIVEN else f"{sensors} sensors"
+    return f"floor follow, {what}"
 
 
 def _cues(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """Table 4: the right wrist in the head camera's picture, at the frames that show it."""
     checkpoint_file(options.manifold)
     load_visual_cues(options.manifold)
-    level = pipeline_of(Method("ours", options.checkpoint, ("pipeline=mocap_every", "pipeline.floor=fixed")))
-    pipelines = {"cmu": level, "simulated": pipeline_of(Method("ours", options.checkpoint))}
+    pipeline = pipeline_of(Method("ours", options.checkpoint, options.sensors))
     # Adam takes ten times as long: on the smaller data set alone.
     rows = (
         ("cmu", "edited", LatentSolver()),
@@ -332,7 +353,7 @@ def _cues(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
         bar = progress.add_task(f"cues: {data}, {label}", total=len(names))
         pairs = []
         for name in names:
-            pairs.append(cue_row(store.load(name), pipelines[data], options.manifold, solver))
+            pairs.append(cue_row(store.load(name), options.sensors, pipeline, options.manifold, solver))
             progress.advance(bar)
         before, after = ([pair[k] for pair in pairs if pair is not None] for k in (0, 1))
         if before:
@@ -341,7 +362,8 @@ def _cues(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
             progress.console.print(f"{data}: {sum(row.frames for row in before)} frames show the wrist")
     both = (("paper: estimated", (11.91, 9.72, 8.04)), ("paper: edited", (5.55, 5.97, 6.65)))
     paper = {name: {key: Summary(v, None, 1) for key, v in zip(CUES, values)} for name, values in both}
-    return f"Table 4: frames that show the right wrist, {options.split}", CUES, scores | paper
+    title = f"Table 4: frames that show the right wrist, {options.split}, {options.sensors} sensors"
+    return title, CUES, scores | paper
 
 
 def _calibration(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:

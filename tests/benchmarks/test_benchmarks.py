@@ -1,9 +1,11 @@
 """Benchmarks and tables run, print the figures of DESIGN, and measure what they claim."""
 
+import argparse
 import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -173,3 +175,95 @@ def test_discriminator_needs_people_to_hold_out():
     one = [walker(1.0, "only")]
     with pytest.raises(WearcapError, match="1 and 1 people"):
         held_out_accuracy(one, one, True, range(1), 1)
+
+
+def test_sensed_stores_hold_no_truth_and_lend_it_to_scores(tmp_path):
+    from sensed import GIVEN, SensedStore
+
+    from watched_walk import watched_walk
+    from wearcap.recording import RecordingStore
+
+    recording = watched_walk(2.0)
+    RecordingStore(tmp_path).add(recording, split="test", config_hash="")
+    stores = {name: SensedStore.open(tmp_path, name) for name in ("typical", "poor", GIVEN)}
+    found = {name: store.load(recording.name) for name, store in stores.items()}
+    assert found[GIVEN].motion is not None
+    for name in ("typical", "poor"):
+        assert found[name].motion is None
+        assert found[name].floor is None
+        assert stores[name].true(recording.name).motion is not None
+    off = {name: each.head.t_world_device - found[GIVEN].head.t_world_device for name, each in found.items()}
+    assert 0 < off["typical"].norm(dim=-1).mean() < off["poor"].norm(dim=-1).mean()
+    again = SensedStore.open(tmp_path, "typical").load(recording.name)
+    assert torch.equal(again.head.t_world_device, found["typical"].head.t_world_device)
+
+
+def test_best_samples_are_chosen_by_recording():
+    from hmd2_runs import best_of
+
+    from wearcap.metrics.table import Row, aggregate
+
+    errors = {("a", 0): (3.0, 9.0), ("a", 1): (2.0, 8.0), ("b", 0): (4.0, 5.0), ("b", 1): (6.0, 1.0)}
+    rows = [Row(name, seed, 10, {"mpjpe_cm": e, "hand_pe_cm": hand}) for (name, seed), (e, hand) in errors.items()]
+    best = aggregate(best_of(rows))
+    assert best["mpjpe_cm"].mean == 3.0
+    assert best["hand_pe_cm"].mean == 6.5  # of the samples with the least MPJPE, not the best hands
+
+
+def test_scenarios_are_where_ours_is_best_in_the_middle_and_worst():
+    import tables_hmd2
+    from hmd2_runs import Result
+
+    from wearcap.metrics.table import Summary
+
+    def scores(value: float) -> dict[str, Summary]:
+        return {name: Summary(value, None, 1) for name in tables_hmd2.PARTS}
+
+    ours = Result(tables_hmd2.OURS, {}, {"walk": scores(3.0), "sit": scores(7.0), "run": scores(5.0)})
+    other = Result("mean pose", {}, {"walk": scores(9.0), "sit": scores(8.0), "run": scores(1.0)})
+    found = tables_hmd2._scenarios([other, ours])
+    titles = [title.rpartition(", ")[2] for title in found]
+    assert titles == ["walk", "run", "sit"]
+    first = next(iter(found.values()))
+    assert first["mean pose"]["hand_pe_cm"].mean == 9.0
+    assert tables_hmd2._scenarios([other]) == {}
+
+
+def test_hmd2_tables_write_tails_scenarios_and_sweeps_on_validation(tmp_path, monkeypatch, capsys):
+    import tables_hmd2
+    from hmd2_runs import Result
+    from sensed import GIVEN
+
+    from watched_walk import watched_walk
+    from wearcap.metrics.table import Summary
+    from wearcap.recording import RecordingStore
+
+    store, seen = RecordingStore(tmp_path / "walks"), {}
+    for split in ("val", "test"):
+        store.add(replace(watched_walk(1.0), name=f"walk_{split}"), split=split, config_hash="")
+
+    def run_method(method, case):
+        seen[method.name] = method.sensors or case.sensors, case.names
+        names = [*tables_hmd2.COLUMNS, *tables_hmd2.PARTS, *tables_hmd2.TAIL, "truth_physicality"]
+        scores = {name: Summary(0.00123, 0.0001, 2) for name in names}
+        return Result(method.name, scores, {"walk": scores})
+
+    monkeypatch.setattr(tables_hmd2, "run_method", run_method)
+    monkeypatch.setattr(tables_hmd2, "_exists", lambda checkpoint: True)
+    parser = argparse.ArgumentParser()
+    tables_hmd2.add_arguments(parser)
+    arguments = ["--dataset", str(tmp_path / "walks"), "--jobs", "1", "--strides", "60", "--steps", "5"]
+    options = parser.parse_args([*arguments, "--sensors", "poor"], argparse.Namespace(quick=False, output=tmp_path))
+    tree = json.loads(tables_hmd2.tables(options, {}).read_text())
+    assert tree["about"]["sensors"] == "poor"
+    assert set(tree["tables"]) == {tables_hmd2.FIRST, "Table 6.5: latency", "Table 6.7: steps"}
+    assert seen["full"] == ("poor", ("walk_test",))
+    assert seen["full, typical sensors"][0] == "typical"
+    assert seen["AvatarPoser-style (head and hands)"][0] == GIVEN
+    assert seen["5 steps"] == ("poor", ("walk_val",))
+    assert tree["percentiles"]["full"]["p95_hand_pe_cm"]["mean"] == 0.00123
+    assert len(tree["scenarios"]) == 3
+    shown = capsys.readouterr().out
+    assert "0.0012" in shown
+    assert "truth" in shown
+    assert "Table 6.10" in shown

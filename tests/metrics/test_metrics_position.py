@@ -49,8 +49,8 @@ def test_percentile_takes_whole_frames():
     true = torch.zeros(101, 2, 3)
     found = true.clone()
     found[:, 0, 2] = torch.arange(101) / 100.0  # the other joint is right: frame errors 0, 0.5, … 50 cm
-    assert position.error_percentile_cm(found, true).item() == pytest.approx(47.5)
-    assert position.error_percentile_cm(found, true, 50.0).item() == pytest.approx(25)
+    assert position.error_percentile_cm(position.joint_error_cm(found, true).mean(-1)).item() == pytest.approx(47.5)
+    assert position.error_percentile_cm(position.joint_error_cm(found, true).mean(-1), 50.0).item() == pytest.approx(25)
 
 
 def test_root_error():

@@ -37,6 +37,21 @@ def test_scores_of_the_truth_itself():
     assert scores["jitter_m_s3"] > 1
 
 
+def test_a_truth_row_holds_the_truths_own_values_to_enough_digits():
+    truth = wobbling()
+    sunk = replace(truth, t_world_root=truth.t_world_root - torch.tensor([0.0, 0.0, 0.2]))
+    standing = torch.ones(len(truth), len(FOOT_PATCHES), dtype=torch.bool)
+    rows = [Row("one", 0, len(truth), table.evaluate_motion(sunk, truth, standing))]
+    row = table.truth_row(table.aggregate(rows))
+    assert set(row) == {"jitter_m_s3", "foot_skate_cm_s", "physicality", "floor_penetration_cm"}
+    own = table.evaluate_motion(truth, truth, standing)
+    assert {name: value.mean for name, value in row.items()} == {name: own[name] for name in row}
+    shown = {0.001234: "0.0012", 12.345: "12.35", 0.0: "0.00", 0.0456: "0.046", 3e-9: "0.000000"}
+    assert {value: str(Summary(value, None, 1)) for value in shown} == shown
+    assert str(Summary(0.00123, 0.0004, 2)) == "0.0012 ± 0.0004"
+    assert str(Summary(math.nan, None, 1)) == "nan"
+
+
 def test_scores_of_a_shifted_motion():
     truth = wobbling()
     sunk = replace(truth, t_world_root=truth.t_world_root - torch.tensor([0.0, 0.0, 0.2]))

@@ -74,11 +74,15 @@ def test_every_score_of_a_motion_is_what_numpy_makes_of_it():
     true, found = climbing(0), climbing(1)
     touching = torch.rand(FRAMES, 4, generator=torch.Generator().manual_seed(2)) < 0.6
     scores = evaluate_motion(found, true, touching)
-    (t, sites), (t_true, _) = positions(found), positions(true)
+    (t, sites), (t_true, sites_true) = positions(found), positions(true)
     names = list(xsens23().joint_names)
     lower = [f"{side}_{name}" for side in SIDES for name in ("hip", "knee", "ankle", "toe")]
     upper = [name for name in names if name not in (*lower, "pelvis")]
-    frame_errors = np.mean([np.linalg.norm(t[n] - t_true[n], axis=1) for n in names], axis=0)
+    hands = ["left_wrist", "right_wrist"]
+    errors = {
+        key: 100 * np.mean([np.linalg.norm(t[n] - t_true[n], axis=1) for n in part], axis=0)
+        for key, part in {"cm": names, "hand_pe_cm": hands, "lower_pe_cm": lower, "upper_pe_cm": upper}.items()
+    }
     lowest = np.min([t[n][:, 2] for n in names], axis=0)
     lowest_true = np.min([t_true[n][:, 2] for n in names], axis=0)
     reach = int(10 * FPS)
@@ -93,7 +97,8 @@ def test_every_score_of_a_motion_is_what_numpy_makes_of_it():
         "hand_pe_cm": error(t, t_true, ("left_wrist", "right_wrist")),
         "lower_pe_cm": error(t, t_true, lower),
         "upper_pe_cm": error(t, t_true, upper),
-        "p95_cm": 100 * np.percentile(frame_errors, 95),
+        **{f"p95_{key}": np.percentile(value, 95) for key, value in errors.items()},
+        "p95_floor_penetration_cm": 100 * np.percentile(np.maximum(floor - lowest, 0), 95),
         "root_cm": error(t, t_true, ["pelvis"]),
         "mpjve_cm_s": 100 * FPS * np.mean([np.linalg.norm(np.diff(t[n] - t_true[n], axis=0), axis=1) for n in names]),
         "rotation_deg": np.degrees(turn.magnitude()).mean(),
@@ -103,6 +108,9 @@ def test_every_score_of_a_motion_is_what_numpy_makes_of_it():
         "physicality": physicality(t),
         "truth_physicality": physicality(t_true),
         "floor_penetration_cm": 100 * np.maximum(floor - lowest, 0).mean(),
+        "truth_jitter_m_s3": third_true,
+        "truth_foot_skate_cm_s": skate(sites_true, touching.numpy().reshape(FRAMES, 2, 2).any(-1)),
+        "truth_floor_penetration_cm": 0.0,
     }
     assert scores["floor_penetration_cm"] > 0.01
     assert set(scores) == set(expected)

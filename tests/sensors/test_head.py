@@ -42,6 +42,15 @@ def test_drift_grows_with_the_path_travelled():
     assert ends.std(0).mean() == pytest.approx(0.02 * path_length.sqrt().item(), rel=0.2)
 
 
+def test_drift_is_no_jitter():
+    motion = swaying_motion(1200)
+    exact = head_stream(motion, SEAT).t_world_device
+    noise = SlamNoise(jitter_m=0.0, jitter_deg=0.0, drift_share=0.02, yaw_drift_deg_per_sqrt_min=1.0)
+    off = head_stream(motion, SEAT, noise, np.random.default_rng(0)).t_world_device - exact
+    assert off[-1].norm() > 0.005
+    assert (off.diff(n=3, dim=0).norm(dim=-1) * 60**3).mean() < 1.0
+
+
 def test_heading_drifts_about_the_start():
     motion = swaying_motion(3600)
     noise = SlamNoise(jitter_m=0.0, jitter_deg=0.0, yaw_drift_deg_per_sqrt_min=2.0)

@@ -106,6 +106,31 @@ def test_attitude_and_heading_errors_are_as_large_as_asked():
     assert torch.stack(ends).std() == pytest.approx(1.0, rel=0.25)
 
 
+def test_a_strap_gives_under_acceleration_alone():
+    noise = replace(NONE, play_deg=4.0)
+    largest = []
+    for seed in range(20):
+        resting = synthesize_imu(still(60), "head", noise=noise, rng=np.random.default_rng(seed))
+        turned = rotation.geodesic(resting.R_world_imu, synthesize_imu(still(60), "head").R_world_imu)
+        assert turned.max() < 1e-3
+        motion = carousel(rate=3.0)
+        moved = synthesize_imu(motion, "left_wrist", noise=noise, rng=np.random.default_rng(seed))
+        largest.append(rotation.geodesic(moved.R_world_imu, motion.joint("left_wrist").R).rad2deg().max().item())
+    assert max(largest) < 4.01
+    assert np.mean(largest) > 1.5
+
+
+def test_calibration_leaves_a_heading_that_stays():
+    noise = replace(NONE, heading_deg=2.0)
+    yaw = []
+    for seed in range(100):
+        stream = synthesize_imu(still(60), "head", noise=noise, rng=np.random.default_rng(seed))
+        each = rotation.yaw_of(stream.R_world_imu).rad2deg()
+        assert each.std() < 1e-3
+        yaw.append(each[0])
+    assert torch.stack(yaw).std() == pytest.approx(2.0, rel=0.2)
+
+
 def test_a_clock_that_is_off_shifts_the_signal():
     motion = swaying_motion(600)
     exact = synthesize_imu(motion, "left_wrist")

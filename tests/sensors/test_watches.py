@@ -79,7 +79,6 @@ def test_mounting_is_taken_off():
         ),
         (lambda s: both(100.0, start=2.0), "logged from 2.00 s"),
         (lambda s: both(100.0, stop=3.0), "logged from 0.00 s to"),
-        (lambda s: {"left_wrist": s["right_wrist"], "right_wrist": s["left_wrist"]}, "seem to be swapped"),
         (lambda s: s | {"left_wrist": jumping(s["left_wrist"])}, "clock jumps, for 1.0"),
         (
             lambda s: s | {"left_wrist": replace(s["left_wrist"], timestamps=s["left_wrist"].timestamps.flip(0))},
@@ -90,6 +89,12 @@ def test_mounting_is_taken_off():
 def test_what_is_refused(change, message):
     with pytest.raises(WearcapError, match=message):
         watches_at(change(both(100.0)), CLOCK, "here")
+
+
+def test_raised_arms_are_captured_with_a_warning():
+    streams = both(100.0)
+    with pytest.warns(UserWarning, match="raised arms, or swapped watches"):
+        watches_at({"left_wrist": streams["right_wrist"], "right_wrist": streams["left_wrist"]}, CLOCK, "here")
 
 
 def jumping(stream: ImuStream) -> ImuStream:

@@ -96,4 +96,29 @@ def local_floor(
 
 def floor_penetration_cm(joints: Float[Tensor, "time joint 3"], floor: Float[Tensor, "time"]) -> Float[Tensor, ""]:
     """Mean over frames of the depth (cm) of the lowest joint below the local floor, 0 where it is above."""
-    return (floor - joints[..., 2].amin(-1)).clamp(min=0).mean() * 100.0
+    return floor_depth_cm(joints, floor).mean()
+
+
+def floor_depth_cm(joints: Float[Tensor, "time joint 3"], floor: Float[Tensor, "time"]) -> Float[Tensor, "time"]:
+    """Depth (cm) of the lowest joint below the local floor in every frame, 0 where it is above."""
+    return (floor - joints[..., 2].amin(-1)).clamp(min=0) * 100.0
+
+
+def plausibility(
+    skeleton: Skeleton,
+    T_world_joint: Rigid,
+    contact: Bool[Tensor, "time foot"],
+    floor: Float[Tensor, "time"],
+    fps: float,
+) -> dict[str, Tensor]:
+    """Jitter, foot skate, physicality and floor penetration by name with unit, of a captured or of the true motion.
+
+    contact: true contact of each foot; floor: height (m) of the floor below the wearer.
+    """
+    joints = T_world_joint.t
+    return {
+        "jitter_m_s3": jitter_m_s3(joints, fps),
+        "foot_skate_cm_s": foot_skate_cm_s(foot_points(skeleton, T_world_joint), contact, fps),
+        "physicality": physicality(joints[:, 0], foot_joints(skeleton, T_world_joint), fps),
+        "floor_penetration_cm": floor_penetration_cm(joints, floor),
+    }

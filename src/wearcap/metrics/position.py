@@ -46,15 +46,13 @@ def mpjve_cm_s(
     return (joints - joints_true).diff(dim=0).norm(dim=-1).mean() * (fps * CM_PER_M)
 
 
-def error_percentile_cm(
-    joints: Float[Tensor, "time joint 3"], joints_true: Float[Tensor, "time joint 3"], percent: float = 95.0
-) -> Float[Tensor, ""]:
-    """Percentile over one sequence's frames of the frame's mean joint error (cm).
+def error_percentile_cm(error_cm: Float[Tensor, "time"], percent: float = 95.0) -> Float[Tensor, ""]:
+    """Percentile over one sequence's frames of an error of each frame (cm), such as its mean joint error.
 
     Thesis §6.4.4 computes it within each sequence and averages over sequences, so that hard sequences alone do not
     determine the tail. Linear interpolation between frames.
     """
-    return torch.quantile(joint_error_cm(joints, joints_true).mean(-1), percent / 100.0)
+    return torch.quantile(error_cm, percent / 100.0)
 
 
 def root_error_cm(

@@ -3,6 +3,7 @@
 import json
 import math
 from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -18,8 +19,13 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.metrics import physics, position
 from wearcap.recording.motion import Motion
 
-PER_SEQUENCE = ("p95_cm",)
-"""Metrics that the thesis averages over sequences; all others are averaged over frames."""
+MAX_DECIMALS = 6
+P95 = "p95_"
+"""Beginning of the names of 95th percentiles, which the thesis averages over sequences (Table 6.6); all other metrics are
+averaged over frames."""
+
+TRUTH = "truth_"
+"""Beginning of the names of scores that belong to the true motion."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +47,22 @@ class Summary:
     seeds: int
 
     def __str__(self) -> str:
-        return f"{self.mean:.2f}" if self.std is None else f"{self.mean:.2f} ± {self.std:.2f}"
+        digits = decimals(self.mean)
+        return f"{self.mean:.{digits}f}" if self.std is None else f"{self.mean:.{digits}f} ± {self.std:.{digits}f}"
+
+
+def decimals(value: float, least: int = 2) -> int:
+    """Decimals that show two digits of a small value: 2 for 1.234, 4 for 0.0012, `least` for 0 and NaN."""
+    if not math.isfinite(value) or value == 0:
+        return least
+    return max(least, min(1 - math.floor(math.log10(abs(value))), MAX_DECIMALS))
 
 
 def evaluate_motion(
     prediction: Motion, truth: Motion, contact: Bool[Tensor, "time patch"] | None = None
 ) -> dict[str, float]:
-    """All metrics of one captured motion against ground truth, by name with unit.
+    """All metrics of one captured motion against ground truth, by name with unit; those of the truth alone begin with
+    `TRUTH`.
 
     contact: true contact of `FOOT_PATCHES` at the truth's frames; None: estimated from the true motion
     (`contact_from_motion`). Raises WearcapError unless both motions have the same joints and timestamps and finite
@@ -61,32 +76,28 @@ def evaluate_motion(
     pose, pose_true = _double_pose(prediction), _double_pose(truth)
     joints, joints_true = pose.t, pose_true.t
     floor = physics.local_floor(joints_true, fps)
-    points = physics.foot_points(prediction.skeleton, pose)
     if contact is None:
         points_true = physics.foot_points(truth.skeleton, pose_true)
         touching = physics.contact_from_motion(points_true, floor, fps)
     else:
         touching = physics.foot_contact(contact)
-    jitter, jitter_true = physics.jitter_m_s3(joints, fps), physics.jitter_m_s3(joints_true, fps)
+    plausible = physics.plausibility(prediction.skeleton, pose, touching, floor, fps)
+    plausible_true = physics.plausibility(truth.skeleton, pose_true, touching, floor, fps)
+    error = position.joint_error_cm(joints, joints_true)
     parts = {
-        f"{part}_pe_cm": position.mpjpe_cm(joints[:, indices], joints_true[:, indices])
-        for part, indices in position.body_parts(truth.skeleton).items()
+        f"{part}_pe_cm": error[:, indices].mean(-1) for part, indices in position.body_parts(truth.skeleton).items()
     }
+    tails = {"cm": error.mean(-1), **parts, "floor_penetration_cm": physics.floor_depth_cm(joints, floor)}
     scores = {
-        "mpjpe_cm": position.mpjpe_cm(joints, joints_true),
-        **parts,
-        "p95_cm": position.error_percentile_cm(joints, joints_true),
+        "mpjpe_cm": error.mean(),
+        **{name: value.mean() for name, value in parts.items()},
+        **{f"{P95}{name}": position.error_percentile_cm(value) for name, value in tails.items()},
         "root_cm": position.root_error_cm(joints[:, 0], joints_true[:, 0]),
         "mpjve_cm_s": position.mpjve_cm_s(joints, joints_true, fps),
         "rotation_deg": position.rotation_error_deg(prediction.R_parent_joint, truth.R_parent_joint),
-        "jitter_m_s3": jitter,
-        "jitter_ratio": jitter / jitter_true,
-        "foot_skate_cm_s": physics.foot_skate_cm_s(points, touching, fps),
-        "physicality": physics.physicality(joints[:, 0], physics.foot_joints(truth.skeleton, pose), fps),
-        "truth_physicality": physics.physicality(
-            joints_true[:, 0], physics.foot_joints(truth.skeleton, pose_true), fps
-        ),
-        "floor_penetration_cm": physics.floor_penetration_cm(joints, floor),
+        "jitter_ratio": plausible["jitter_m_s3"] / plausible_true["jitter_m_s3"],
+        **plausible,
+        **{f"{TRUTH}{name}": value for name, value in plausible_true.items()},
     }
     return {name: float(value) for name, value in scores.items()}
 
@@ -126,7 +137,7 @@ def _span(motion: Motion) -> str:
 
 
 def aggregate(rows: list[Row]) -> dict[str, Summary]:
-    """Mean over recordings within each seed, weighted by frames (`PER_SEQUENCE`: equally), then mean and
+    """Mean over recordings within each seed, weighted by frames (`P95`: equally), then mean and
     spread over seeds. Scores that are NaN (no contact, too few frames) are ignored.
 
     Raises WearcapError unless every seed was scored on the same recordings, once each.
@@ -143,7 +154,7 @@ def aggregate(rows: list[Row]) -> dict[str, Summary]:
     for name in rows[0].scores:
         means = []
         for recordings in by_seed.values():
-            weighted = [(row.scores[name], 1 if name in PER_SEQUENCE else row.frames) for row in recordings.values()]
+            weighted = [(row.scores[name], 1 if name.startswith(P95) else row.frames) for row in recordings.values()]
             weighted = [(score, weight) for score, weight in weighted if not math.isnan(score)]
             total = sum(weight for _, weight in weighted)
             means.append(sum(score * weight for score, weight in weighted) / total if total else math.nan)
@@ -164,24 +175,34 @@ Scores = dict[str, dict[str, Summary]]
 """Summaries by method ("ours", "mean pose" …) and metric."""
 
 
-def _cells(methods: Scores, metrics: tuple[str, ...] | None) -> list[list[str]]:
+def truth_row(scores: dict[str, Summary]) -> dict[str, Summary]:
+    """The truth's own values as a row beside that of a method, whose scores hold them under names with `TRUTH`."""
+    return {name.removeprefix(TRUTH): value for name, value in scores.items() if name.startswith(TRUTH)}
+
+
+Columns = Sequence[str] | Mapping[str, str]
+"""Metrics of a table, or the headings of their columns by metric."""
+
+
+def _cells(methods: Scores, metrics: Columns | None) -> list[list[str]]:
     """One line per method: its name, then its metrics (default: all metrics of the first method)."""
     columns = list(metrics or next(iter(methods.values())))
+    headings = list(metrics.values()) if isinstance(metrics, Mapping) else columns
     lines = [
         [method, *(str(scores[metric]) if metric in scores else "–" for metric in columns)]
         for method, scores in methods.items()
     ]
-    return [["method", *columns], *lines]
+    return [["method", *headings], *lines]
 
 
-def markdown_table(methods: Scores, metrics: tuple[str, ...] | None = None) -> str:
+def markdown_table(methods: Scores, metrics: Columns | None = None) -> str:
     """A table in Markdown: one line per method, one column per metric."""
     header, *lines = _cells(methods, metrics)
     rule = ["---", *["---:"] * (len(header) - 1)]
     return "\n".join("| " + " | ".join(line) + " |" for line in (header, rule, *lines))
 
 
-def rich_table(title: str, methods: Scores, metrics: tuple[str, ...] | None = None) -> Table:
+def rich_table(title: str, methods: Scores, metrics: Columns | None = None) -> Table:
     """A table for a terminal: one line per metric, one column per method."""
     table = Table(title=title)
     header, *lines = _cells(methods, metrics)

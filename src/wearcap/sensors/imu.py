@@ -33,6 +33,14 @@ class ImuNoise:
     clock_offset_s: float = 0.0
     """Largest offset of the sensor's clock, drawn uniformly."""
     clock_ppm: float = 0.0
+    play_deg: float = 0.0
+    """Largest angle by which the strap gives under the arm's acceleration."""
+    heading_deg: float = 0.0
+    """Deviation of the heading of the sensor's own world from the start, which calibration leaves."""
+
+
+PUSHED = 8.0
+"""Acceleration (m/s²) at which a strap has given three quarters of the most that it can."""
 
 
 def acceleration(position: Float[Tensor, "time axis"], fps: float, n: int = 4) -> Float[Tensor, "time axis"]:
@@ -83,7 +91,13 @@ def synthesize_imu(
         strap = np.deg2rad(noise.strap_deg) * rng.standard_normal(3) / np.sqrt(3)
         worn = R_joint_imu @ rotation.exp(torch.from_numpy(strap).float())
     fps, times = motion.fps, motion.timestamps
-    path = Trajectory(times, T_world_joint.R @ worn, T_world_joint.t)
+    R_world_imu = T_world_joint.R @ worn
+    if noise is not None and rng is not None and noise.play_deg:
+        pushed = mean_filter((R_world_imu.mT @ acceleration(T_world_joint.t, fps, n)[..., None])[..., 0], 3)
+        sideways, axis = torch.nn.functional.normalize(_normal(rng, 2, 3), dim=-1)
+        gives = torch.tanh((pushed @ sideways)[:, None] / PUSHED) * axis
+        R_world_imu = R_world_imu @ rotation.exp(np.deg2rad(noise.play_deg) * gives)
+    path = Trajectory(times, R_world_imu, T_world_joint.t)
     if noise is not None and rng is not None and (noise.clock_offset_s or noise.clock_ppm):
         # The path is sampled when the sensor's clock shows the recording's timestamps.
         offset = float(rng.uniform(-1, 1)) * noise.clock_offset_s
@@ -100,6 +114,8 @@ def synthesize_imu(
         attitude = smooth_noise(rng, len(R), 3, noise.attitude_period_s, fps)
         attitude = np.deg2rad(noise.attitude_deg) * attitude / np.sqrt(3)
         heading = heading_walk(rng, len(R), noise.heading_walk_deg_per_sqrt_min, fps)
+        if noise.heading_deg:
+            heading = rotation.about_axis("z", np.deg2rad(noise.heading_deg) * _normal(rng, 1))[0] @ heading
         R = heading @ R @ rotation.exp(attitude)
         acc_world = (R @ acc_imu[..., None])[..., 0] - gravity
     return ImuStream(times, joint, R, acc_world, acc_imu, gyro, R_joint_imu)

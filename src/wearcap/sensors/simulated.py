@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import HeadStream
 
@@ -36,6 +37,10 @@ def heading_walk(
     return rotation.about_axis("z", torch.from_numpy(np.cumsum(steps, 0)).float()[:, 0])
 
 
+DRIFT_S = 0.5
+"""Deviation (s) of the kernel that smooths a SLAM system's drift."""
+
+
 @dataclass(frozen=True)
 class SlamNoise:
     """Errors of a head-mounted SLAM system; zeros make it perfect."""
@@ -46,6 +51,15 @@ class SlamNoise:
     drift_share: float = 0.0
     """Standard deviation of the position error after travelling one metre, as a share (0 with loop closure)."""
     yaw_drift_deg_per_sqrt_min: float = 0.0
+    wander_m: float = 0.0
+    """Root mean square of a position error that varies over `wander_period_s`."""
+    wander_deg: float = 0.0
+    """Root mean square angle of an orientation error that varies likewise."""
+    wander_period_s: float = 4.0
+    lean_deg: float = 0.0
+    """Root mean square angle by which the world's vertical is off, constant in a recording."""
+    scale: float = 0.0
+    """Deviation of the world's scale, constant in a recording."""
 
 
 def head_stream(
@@ -58,18 +72,35 @@ def head_stream(
 
     Without `noise` exact; with it, `rng` draws jitter and drift.
     """
-    T_world_head = motion.joint("head")
-    R = T_world_head.R.contiguous()
-    t: Tensor = T_world_head @ t_head_device  # pyright: ignore[reportAssignmentType]
+    T_world_device = motion.joint("head") @ Rigid(torch.eye(3), t_head_device)
     if noise is not None:
         assert rng is not None, "noise needs a generator"
-        jitter = smooth_noise(rng, len(t), 6, noise.jitter_period_s, motion.fps)
-        R = R @ rotation.exp(np.deg2rad(noise.jitter_deg) * jitter[:, :3])
-        travelled = torch.cat([torch.zeros(1), t.diff(dim=0).norm(dim=-1)]).sqrt()[:, None]
-        t = t + noise.jitter_m * jitter[:, 3:]
-        if noise.drift_share or noise.yaw_drift_deg_per_sqrt_min:
-            walk = torch.from_numpy(rng.standard_normal((len(t), 3))).float() * travelled
-            t = t + noise.drift_share * walk.cumsum(0)
-            turn = heading_walk(rng, len(t), noise.yaw_drift_deg_per_sqrt_min, motion.fps)
-            R, t = turn @ R, t[:1] + (turn @ (t - t[:1])[..., None])[..., 0]
-    return HeadStream(motion.timestamps, R, t, torch.eye(3), t_head_device)
+        T_world_device, _ = slam_poses(T_world_device, motion.fps, noise, rng)
+    return HeadStream(motion.timestamps, T_world_device.R, T_world_device.t, torch.eye(3), t_head_device)
+
+
+def slam_poses(T_world_device: Rigid, fps: float, noise: SlamNoise, rng: np.random.Generator) -> tuple[Rigid, float]:
+    """A device's path as SLAM tracks it, in a world that begins at the true one; and that world's scale."""
+    R, t = T_world_device.R, T_world_device.t
+    jitter = smooth_noise(rng, len(t), 6, noise.jitter_period_s, fps)
+    R = R @ rotation.exp(np.deg2rad(noise.jitter_deg) * jitter[:, :3])
+    travelled = torch.cat([torch.zeros(1), t.diff(dim=0).norm(dim=-1)]).sqrt()[:, None]
+    t = t + noise.jitter_m * jitter[:, 3:]
+    if noise.drift_share or noise.yaw_drift_deg_per_sqrt_min:
+        walk = torch.from_numpy(rng.standard_normal((len(t), 3))).float() * travelled
+        turn = heading_walk(rng, len(t), noise.yaw_drift_deg_per_sqrt_min, fps)
+        off = noise.drift_share * walk.cumsum(0)
+        off = off + (turn @ (t + off - t[:1])[..., None])[..., 0] - (t + off - t[:1])
+        # SLAM drifts smoothly: the walk's steps from frame to frame are no jitter of the device.
+        off = scipy.ndimage.gaussian_filter1d(off.double().numpy(), DRIFT_S * fps, axis=0, mode="nearest")
+        R, t = turn @ R, t + torch.from_numpy(off - off[:1]).float()
+    if noise.wander_m or noise.wander_deg:
+        wander = smooth_noise(rng, len(t), 6, noise.wander_period_s, fps) / np.sqrt(3)
+        R, t = rotation.exp(np.deg2rad(noise.wander_deg) * wander[:, :3]) @ R, t + noise.wander_m * wander[:, 3:]
+    scale = 1.0
+    if noise.lean_deg or noise.scale:
+        lean, stretch = rng.standard_normal(2) / np.sqrt(2), rng.standard_normal()
+        world = rotation.exp(torch.tensor([*np.deg2rad(noise.lean_deg) * lean, 0.0]).float())
+        scale = 1 + noise.scale * float(stretch)
+        R, t = world @ R, t[:1] + scale * (t - t[:1]) @ world.mT
+    return Rigid(R, t), scale

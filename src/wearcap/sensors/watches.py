@@ -1,5 +1,6 @@
 """Preprocessing of two watches for MocapEvery: resampled to the camera's clock and filtered (§4.1, appendix C.1)."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -26,7 +27,7 @@ def watches_at(
     """Orientation and filtered free acceleration (m/s²) of the wrist joints at evenly spaced times.
 
     Orientations are interpolated by slerp; accelerations are averaged over each frame, then over 7 frames. Raises
-    WearcapError for a watch that is missing, has gaps, or lacks orientation or acceleration, and for watches that are
+    WearcapError for a watch that is missing, has gaps, or lacks orientation or acceleration; warns of watches that may be
     worn on the wrong arms.
     """
     worn = []
@@ -64,7 +65,8 @@ def watches_at(
     step = timestamps.diff().median().item() if len(timestamps) > 1 else 0.0
     frames = torch.arange(-(FILTER // 2), len(timestamps) + FILTER // 2).clamp(0, len(timestamps) - 1)
     R_world_wrist, acc_world = filtered(worn, timestamps, timestamps[frames], step)
-    require_sides(R_world_wrist, where)
+    if _point_up(R_world_wrist):  # as do 9 of CMU's 165 training recordings, with raised arms: no ground for refusal
+        warnings.warn(f"{where}: forearms point up most of the time: raised arms, or swapped watches", stacklevel=2)
     return R_world_wrist, acc_world
 
 
@@ -105,12 +107,17 @@ def filtered(
 
 
 def require_sides(R_world_wrist: Float[Tensor, "time wrist 3 3"], where: str) -> None:
-    """Raise WearcapError when left and right watch are swapped.
-
-    Arms hang most of the time: the left forearm's axis (+y of a T-pose) then points down, the right one's up.
-    """
-    up = R_world_wrist[:, :, 2, 1].mean(0)
-    if up[0] > _HANGING and up[1] < -_HANGING:
+    """Raise WearcapError when left and right watch are swapped, at a time when arms hang."""
+    if _point_up(R_world_wrist):
         what = "the watches seem to be swapped: both forearms would point up most of the time"
         fix = "Exchange the logs of the left and the right watch, or calibrate them again."
         raise WearcapError(what, where=where, fix=fix)
+
+
+def _point_up(R_world_wrist: Float[Tensor, "time wrist 3 3"]) -> bool:
+    """Whether both forearms point up on the mean, as those of swapped watches do where arms hang.
+
+    The left forearm's axis (+y of a T-pose) points down there, the right one's up.
+    """
+    up = R_world_wrist[:, :, 2, 1].mean(0)
+    return bool(up[0] > _HANGING and up[1] < -_HANGING)

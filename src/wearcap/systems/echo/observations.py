@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Float64
@@ -16,6 +17,7 @@ from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate_clamped, resample
 from wearcap.geometry.triangle_distance import TriangleIndex
+from wearcap.metrics.symmetry import Symmetry
 from wearcap.models.point_encoder import PointNeXt, bounds
 from wearcap.recording.acts import NO_OBJECT, Act, active_at
 from wearcap.recording.motion import Motion
@@ -52,6 +54,11 @@ class ObjectShape:
     """Condition for the object mirrored along its own y axis."""
     surface: TriangleIndex
     """Spatial index of the mesh's triangles."""
+
+    @cached_property
+    def symmetry(self) -> Symmetry:
+        """Turns that leave the object as it was."""
+        return Symmetry.of(self.mesh, self.cloud + self.middle, self.surface)
 
     def centred(self, T_world_object: Rigid) -> Rigid:
         """Pose of the bounding box's centre, given the mesh's pose."""

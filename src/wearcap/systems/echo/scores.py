@@ -15,9 +15,10 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate_clamped, nearest_frames, resample
 from wearcap.metrics import objects as object_metrics
 from wearcap.metrics.detection import detection_scores
-from wearcap.metrics.physics import jitter_m_s3
+from wearcap.metrics.physics import foot_contact, plausibility
 from wearcap.metrics.position import mpjpe_cm
-from wearcap.metrics.table import Row
+from wearcap.metrics.symmetry import closest_surface_error_cm
+from wearcap.metrics.table import TRUTH, Row
 from wearcap.recording import Motion, Recording
 from wearcap.recording.acts import active_at
 from wearcap.recording.timing import at_times
@@ -111,15 +112,19 @@ def foot_patches(recording: Recording) -> Bool[Tensor, "time patch"]:
 def score_echo(motion: Motion, truth: Truth, name: str, seed: int) -> Row:
     """ECHO's metrics of one capture in world coordinates without alignment: body over all frames, object over the
     frames in which one is active."""
-    joints, true, skeleton = motion.T_world_joint.t, truth.motion.T_world_joint.t, motion.skeleton
+    skeleton, fps = motion.skeleton, motion.fps
+    pose, pose_true = motion.T_world_joint.to(torch.float64), truth.motion.T_world_joint.to(torch.float64)
+    joints, true = motion.T_world_joint.t, truth.motion.T_world_joint.t
+    floor, touching = truth.floor_height, foot_contact(truth.foot_contact > 0.5)
     scores = {
         "mpjpe_mm": 10 * mpjpe_cm(joints, true).item(),
         "mpjve_mm": object_metrics.joint_step_error_mm(joints, true).item(),
-        "foot_contact": object_metrics.foot_contact_share(skeleton, joints, truth.floor_height).item(),
-        "true_foot_contact": object_metrics.foot_contact_share(skeleton, true, truth.floor_height).item(),
-        "jitter_m_s3": jitter_m_s3(joints, motion.fps).item(),
-        "true_jitter_m_s3": jitter_m_s3(true, motion.fps).item(),
+        "foot_contact": object_metrics.foot_contact_share(skeleton, joints, floor).item(),
+        f"{TRUTH}foot_contact": object_metrics.foot_contact_share(skeleton, true, floor).item(),
     }
+    scores |= {name: value.item() for name, value in plausibility(skeleton, pose, touching, floor, fps).items()}
+    plausible_true = plausibility(truth.motion.skeleton, pose_true, touching, floor, fps)
+    scores |= {f"{TRUTH}{name}": value.item() for name, value in plausible_true.items()}
     busy = truth.active >= 0
     if busy.any():
         scores["busy_mpjpe_mm"] = 10 * mpjpe_cm(joints[busy], true[busy]).item()
@@ -135,6 +140,8 @@ def score_echo(motion: Motion, truth: Truth, name: str, seed: int) -> Row:
                 "center_cm": object_metrics.center_error_cm(T_found, T_true, shape.cloud),
                 "rotation_deg": object_metrics.rotation_difference_deg(T_found, T_true),
                 "quaternion": object_metrics.quaternion_difference(T_found, T_true),
+                "symmetric_rotation_deg": shape.symmetry.rotation_difference_deg(T_found, T_true),
+                "add_s_cm": closest_surface_error_cm(T_found, T_true, shape.cloud, shape.middle, shape.surface),
             }.items():
                 parts.setdefault(key, []).append(value)
         scores |= {key: torch.cat(values).mean().item() for key, values in parts.items()}

@@ -104,7 +104,7 @@ class MocapEvery(LearnedSystem):
     def motions(self, sources: Sequence[CaptureInput], seeds: Sequence[int]) -> list[Motion]:
         """One motion per recording; the seeds have no effect.
 
-        Raises WearcapError for a recording without head poses, or whose watches are missing, silent or swapped.
+        Raises WearcapError for a recording without head poses, or whose watches are missing or silent.
         """
         return [self.run(source.recording).motion for source in sources]
 

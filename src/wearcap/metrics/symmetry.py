@@ -1,0 +1,113 @@
+"""Errors of objects that look the same from several sides: their symmetry, found from the surface, and ADD-S.
+
+A box that is turned by 180° is where it was: measured plainly its vertices are a length off. Inputs in metres, results in
+degrees and centimetres.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from wearcap.geometry.mesh import Mesh
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.rotation import geodesic
+from wearcap.geometry.triangle_distance import TriangleIndex
+
+SAME = 0.02
+"""Share of the object's size (the diagonal of its box) within which a turn brings 95 % of its surface back to itself."""
+STEPS = 24
+"""Turns about an axis that must all do so for an object that is round about it."""
+FEW = 10
+"""A tenth of the points rules most turns out."""
+EVERY = 5
+"""ADD-S is the mean over every fifth point of an object's cloud."""
+
+
+@dataclass(frozen=True, eq=False)
+class Symmetry:
+    """Rotations about an object's centre, in its own axes, that leave its surface where it is."""
+
+    turns: Float[Tensor, "turn 3 3"]
+    """The identity among them."""
+    axes: Float[Tensor, "axis 3"]
+    """Axes about which every turn does so: none of a suitcase, one of a bottle, three of a ball."""
+
+    @classmethod
+    def of(cls, mesh: Mesh, points: Float[Tensor, "point 3"], surface: TriangleIndex) -> "Symmetry":
+        """Found by trial: turns by quarters and thirds of the object's own and of its principal axes.
+
+        `points` lie on the mesh's surface, evenly by area.
+        """
+        cloud = points.double().numpy()
+        center, principal = _center_and_axes(mesh)
+        allowed = SAME * float(np.linalg.norm(np.ptp(cloud, axis=0)))
+
+        def kept(R: Float64[np.ndarray, "3 3"]) -> bool:
+            for part in (cloud[::FEW], cloud):
+                distance, _ = surface.nearest(np.ascontiguousarray((part - center) @ R.T + center))
+                if np.percentile(distance, 95) > allowed:
+                    return False
+            return True
+
+        turns = [frame.T @ R @ frame for frame in (np.eye(3), principal) for R in _cube_group()]
+        turns = [R for R in turns if kept(R)]
+        steps = 2 * np.pi / STEPS * np.arange(1, STEPS)
+        axes: list[Float64[np.ndarray, "3"]] = []
+        for axis in (*np.eye(3), *principal):
+            known = any(abs(axis @ other) > 0.97 for other in axes)
+            if not known and all(kept(R) for R in Rotation.from_rotvec(steps[:, None] * axis).as_matrix()):
+                axes.append(axis)
+        return cls(torch.from_numpy(np.stack(turns)), torch.from_numpy(np.array(axes).reshape(-1, 3)))
+
+    def rotation_difference_deg(self, T_found: Rigid, T_true: Rigid) -> Float[Tensor, "*batch"]:
+        """Smallest angle (degrees) between the captured and the true orientation, modulo the symmetry."""
+        found, true = T_found.R.double()[..., None, :, :] @ self.turns, T_true.R.double()[..., None, :, :]
+        if len(self.axes) > 1:
+            return torch.zeros(found.shape[:-3], dtype=torch.float64)
+        if len(self.axes) == 1:
+            ends = [(R @ self.axes[0][:, None])[..., 0] for R in (found, true.expand_as(found))]
+            away = torch.linalg.cross(*ends).norm(dim=-1)
+            return torch.atan2(away, (ends[0] * ends[1]).sum(-1)).amin(-1).rad2deg()
+        return geodesic(found, true.expand_as(found)).amin(-1).rad2deg()
+
+
+def _center_and_axes(mesh: Mesh) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3 3"]]:
+    """Centroid (m) of a surface, or of a cloud, and its principal axes, one per row."""
+    corners = mesh.vertices.astype(np.float64)[
+        mesh.faces if len(mesh.faces) else np.arange(len(mesh.vertices))[:, None]
+    ]
+    corners = np.broadcast_to(corners, (len(corners), 3, 3))
+    weight = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    weight = weight / weight.sum() if weight.sum() > 0 else np.full(len(corners), 1 / len(corners))
+    center = weight @ corners.mean(1)
+    inside = corners - center
+    # Second moment of a triangle about the origin: (Σ corners ⊗ corners + 9 middle ⊗ middle) / 12 of its area
+    spread = np.einsum("f,fki,fkj->ij", weight, inside, inside)
+    spread += 9 * np.einsum("f,fi,fj->ij", weight, inside.mean(1), inside.mean(1))
+    axes = np.linalg.eigh(spread)[1].T
+    return center, axes * np.linalg.det(axes)
+
+
+@cache
+def _cube_group() -> Float64[np.ndarray, "24 3 3"]:
+    """The rotations that bring a cube back to itself."""
+    return Rotation.create_group("O").as_matrix()
+
+
+def closest_surface_error_cm(
+    T_found: Rigid, T_true: Rigid, cloud: Float[Tensor, "point 3"], middle: Float[Tensor, "3"], surface: TriangleIndex
+) -> Float[Tensor, "time"]:
+    """ADD-S: mean distance (cm) of the captured object's points from the true object, whichever of its sides is near.
+
+    The nearest point of the true surface counts, not the nearest of its vertices as in Hinterstoisser et al.: their
+    spacing would add a constant. Poses are of the object's `middle`, to which `cloud` is relative.
+    """
+    T_true_found = T_true.to(torch.float64).inverse() @ T_found.to(torch.float64)
+    points: Tensor = T_true_found[:, None] @ cloud[::EVERY].double()  # pyright: ignore[reportAssignmentType]
+    distance, _ = surface.nearest(np.ascontiguousarray((points + middle.double()).flatten(0, 1).numpy()))
+    return 100 * torch.from_numpy(distance).unflatten(0, points.shape[:2]).mean(-1)
