@@ -253,6 +253,22 @@ def test_every_experiment_and_ablation_runs(changes, data, people, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["bodiffusion_object", "bodiffusion", "egoallo_human", "agrol_human"])
+def test_a_baseline_learns_in_a_few_steps_and_captures(name, data, people, tmp_path):
+    run, captured = tmp_path / "run", name if name.startswith("bodiffusion") else "bodiffusion"
+    small = ("trainer.max_steps=30", "data.loading.steps_per_epoch=30", "data.loading.batch_size=8")
+    train.main(arguments(f"baseline/{name}", data, people, run, *small, "optimizer.scheduler.warmup=2"))
+    losses = [float(loss) for loss in losses_of(run).values()]
+    assert sum(losses[-5:]) < 0.9 * sum(losses[:5])
+    checkpoint = f"checkpoint={run}/checkpoints/last.ckpt"
+    common = [checkpoint, f"recording={data}/c2", "video=false", "body=false", f"output={tmp_path}/c"]
+    capture.main([*common, f"pipeline=baseline/{captured}", f"hydra.run.dir={tmp_path}/c"])
+    motion = read_motion(tmp_path / "c" / "motion.npz")
+    assert motion.R_parent_joint.isfinite().all()
+    assert set(motion.object_motion or {}) == ({"box_1"} if name == "bodiffusion_object" else set())
+
+
+@pytest.mark.slow
 def test_stopped_and_resumed_equals_straight_through(data, people, tmp_path):
     """Batches, noise, levels and dropout are functions of seed and step."""
     more = (
