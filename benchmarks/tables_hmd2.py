@@ -13,7 +13,7 @@ from hmd2_runs import BASELINES, Case, Method, Result, run_method
 from joblib import Parallel, delayed
 from rich.console import Console
 from rich.table import Table
-from tabling import cell, finite, new_table
+from tabling import TRAINING, finite, new_table
 
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
@@ -33,6 +33,7 @@ COLUMNS = {
     "foot_skate_cm_s": "skate",
     "jitter_ratio": "jitter",
     "seam_ratio": "seam",
+    **TRAINING,
 }
 PAPER = {
     "EgoEgo": (16.61, 34.64, 35.69, 20.15, 3.68, 2.43),
@@ -42,11 +43,20 @@ PAPER = {
 }
 """Thesis Table 6.1, on Nymeria: MPJPE, hand, FID, Diversity (truth 16.13), Physicality (truth 0.56), floor penetration."""
 MODALITIES = {"full": "[points,images]", "w/o images": "[points]", "w/o points": "[images]", "head alone": "[]"}
+TRAINED = {
+    "EgoEgo-style": ("egoego_style", "baseline/egoego_style"),
+    "EgoAllo-style": ("egoallo_style", "baseline/egoallo_style"),
+    "AGRoL-style (head)": ("agrol_style", "baseline/agrol_style"),
+    "AvatarPoser-style (head)": ("avatarposer_head", "pose_regressor"),
+    "AvatarPoser-style (head and hands)": ("avatarposer_hands", "pose_regressor"),
+}
+"""Baselines: experiment and run, and pipeline. Each is trained by `wearcap train experiment=baseline/RUN data=hmd2
+paths.run=RUNS/RUN`; its checkpoint of the lowest validation loss is captured with."""
 STRIDES = (230, 180, 120, 60, 30, 10, 1)
 STEPS = (2, 3, 5, 10, 20, 40, 80)
 LOOKAHEAD = 20
 """Frames that our windows of the sweep look ahead; longer strides have no more than a window's room for it."""
-WIDTH = 170
+WIDTH = 200
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -66,12 +76,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seeds", type=int, default=8, help="repetitions (2 when quick)")
     parser.add_argument("--recordings", type=int, help="no more than so many of the split")
     parser.add_argument("--checkpoint", default="hmd2", help="the full model")
-    parser.add_argument("--egoego", default="egoego_style", help="the EgoEgo-style diffusion")
     parser.add_argument(
-        "--regressors",
-        nargs=2,
-        default=["pose_regressor_head", "pose_regressor_hands"],
-        help="AvatarPoser-style regressors of the head, and of head and hands",
+        "--runs", type=Path, default=Path("outputs/train"), help="folder of the baselines' trainings, by name"
     )
     parser.add_argument(
         "--separate",
@@ -183,9 +189,9 @@ def _latencies(options: argparse.Namespace, h: int) -> list[Method]:
 
 def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
     """Rows of the first table; those whose checkpoint is not there are named and left out."""
-    regressors = [
-        Method(f"AvatarPoser-style ({sees})", checkpoint, ("pipeline=pose_regressor",))
-        for sees, checkpoint in zip(("head", "head and hands"), options.regressors)
+    trained = [
+        Method(name, str(options.runs / run / "checkpoints" / "best.ckpt"), (f"pipeline={pipeline}",))
+        for name, (run, pipeline) in TRAINED.items()
     ]
     ablations = [_ours(options, name, f"pipeline.use={use}") for name, use in MODALITIES.items()]
     separate = [
@@ -194,8 +200,7 @@ def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
     ]
     wanted = [
         *(Method(name) for name in BASELINES),
-        Method("EgoEgo-style", options.egoego, ("pipeline=baseline/egoego_style",)),
-        *regressors,
+        *trained,
         *ablations,
         *separate,
         _ours(options, "full, the paper's windows", pipeline="paper/hmd2"),
@@ -204,14 +209,14 @@ def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
     there = [method for method in wanted if method.checkpoint is None or _exists(method.checkpoint)]
     for method in wanted:
         if method not in there:
-            console.print(f"left out: {method.name} (no checkpoint {method.checkpoint!r})")
+            console.print(f"left out: {method.name} (no checkpoint {method.checkpoint!r})", soft_wrap=True)
     return there
 
 
 def _table(title: str, results: list[Result]) -> Table:
     table = new_table(title, ["", *COLUMNS.values()])
     for result in results:
-        cells = [cell(asdict(result.scores[key])) if key in result.scores else "–" for key in COLUMNS]
+        cells = [str(result.scores[key]) if key in result.scores else "–" for key in COLUMNS]
         table.add_row(result.method, *cells)
     if results:
         first = results[0].scores

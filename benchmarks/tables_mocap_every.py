@@ -1,7 +1,7 @@
 """MocapEvery on held-out people and places: the paper's Tables 2 to 7 on the data at hand.
 
 Bodies are measured where they are put in the world. Checkpoints come by name (checkpoints/) or path; those of baselines
-and ablations from RUNS/NAME/checkpoints/last.ckpt, and further seeds of a training from RUNS/NAME_1 and RUNS/NAME_2: the
+and ablations from RUNS/NAME/checkpoints/best.ckpt, and further seeds of a training from RUNS/NAME_1 and RUNS/NAME_2: the
 table gives their mean and spread. A row without its checkpoint is left out, and the command that trains it is printed
 (`TRAININGS`).
 """
@@ -15,7 +15,7 @@ from mocap_every_calibration import GOALS, calibration_scores
 from mocap_every_rows import Method, body_row, captures, cue_row, floor_row, pipeline_of
 from rich.console import Console
 from rich.progress import Progress
-from tabling import finite, recordings_of
+from tabling import TRAINING, finite, recordings_of, training_of
 
 from wearcap.files import write_text
 from wearcap.metrics.table import Scores, Summary, aggregate, markdown_table
@@ -33,6 +33,7 @@ BODY = (
     "lower_pe_cm",
     "hand_pe_cm",
     "foot_skate_cm_s",
+    *TRAINING,
 )
 FLOOR = ("upper_pe_cm", "lower_pe_cm", "mpjpe_cm", "floor_cm", "floor_within_3cm", "floor_within_3cm_smoothed")
 CUES = ("right_hand_cm", "right_arm_cm", "upper_cm", "mpjpe_cm", "jitter_m_s3")
@@ -53,8 +54,9 @@ TRAININGS: dict[str, tuple[str, ...]] = {
 """Overrides of `wearcap train` by the run's name: ablations after the paper's Table 7 without its first stage, and
 without its data representation as well (world coordinates); and AvatarPoser's protocol 1, with tracked hands instead of
 accelerations."""
-STEPS = ("trainer.max_steps=1000", "data.loading.steps_per_epoch=250")
-"""All of these are trained so long."""
+STEPS = ("trainer.max_steps=3250", "data.loading.steps_per_epoch=250")
+"""All of these are trained as long as `mocap_every` was; captured with is each one's checkpoint of the lowest validation
+loss, as there."""
 TRAINED = {
     "AvatarPoser-style, watches": (
         "mocap_every_avatarposer",
@@ -129,7 +131,7 @@ def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
     ]
     trained = {}
     for name, (run, pipeline) in TRAINED.items():
-        paths = [options.runs / seeded / "checkpoints" / "last.ckpt" for seeded in (run, f"{run}_1", f"{run}_2")]
+        paths = [options.runs / seeded / "checkpoints" / "best.ckpt" for seeded in (run, f"{run}_1", f"{run}_2")]
         trained[name] = [Method(name, str(path), (*pipeline, level)) for path in paths if path.is_file()]
         if not trained[name]:
             command = shlex.join(
@@ -149,7 +151,7 @@ def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
             for seed, method in enumerate(methods)
             for recording, captured in captures(method, store, names, lambda b=bar: progress.advance(b))
         ]
-        scores[name] = aggregate(scored)
+        scores[name] = aggregate(scored) | training_of(methods[0].checkpoint)
     return f"Tables 2, 6, 7: CMU, {options.split}", BODY, scores | PAPER
 
 
@@ -161,7 +163,7 @@ def _floor(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[
         for floor in FLOORS
     ]
     run, pipeline = TRAINED["as in the paper"]
-    path = options.runs / run / "checkpoints" / "last.ckpt"
+    path = options.runs / run / "checkpoints" / "best.ckpt"
     if path.is_file():
         methods += [
             Method(f"as in the paper, floor {floor}", str(path), (*pipeline, f"pipeline.floor={floor}"))

@@ -8,8 +8,12 @@ from rich.table import Table
 
 from wearcap.errors import WearcapError
 from wearcap.metrics.table import Summary
+from wearcap.models.checkpoint import read_checkpoint
 from wearcap.recording import RecordingStore
 
+TRAINING = {"parameters_m": "M param.", "frames_seen_m": "M frames", "core_minutes": "core min"}
+"""Columns of what a row's training took: trained parameters and frames of drawn windows, both in millions, and minutes of a
+core; and their headings."""
 PREPARE = {
     "cmu": "Run: wearcap prepare cmu source=FOLDER",
     "simulated": "Run: wearcap prepare simulated",
@@ -44,6 +48,16 @@ def cell(summary: dict[str, Any], digits: int = 2) -> str:
     parts = Summary(summary["mean"], summary["std"], summary["seeds"])
     spread = "" if parts.std is None else f" ± {parts.std:.{digits}f}"
     return f"{parts.mean:.{digits}f}{spread}"
+
+
+def training_of(checkpoint: str) -> dict[str, Summary]:
+    """What a checkpoint's training took, as columns (`TRAINING`) of its row; NaN is what the checkpoint does not record."""
+    config, state = read_checkpoint(checkpoint)
+    taken: dict[str, Any] = config.get("training", {})
+    weights = sum(value.numel() for name, value in state.items() if name.startswith("net."))
+    counts = taken.get("parameters", weights) / 1e6, taken.get("frames", math.nan) / 1e6
+    values = *counts, taken.get("core_seconds", math.nan) / 60
+    return {name: Summary(value, None, int(math.isfinite(value))) for name, value in zip(TRAINING, values)}
 
 
 def new_table(title: str, columns: list[str]) -> Table:
