@@ -32,6 +32,11 @@ def pipeline_of(method: Method) -> Echo:
     return pipeline
 
 
+def scenario_of(echo: Echo, source: CaptureInput) -> Scenario:
+    """A recording with the objects of its environment."""
+    return echo.scenario(source.recording, echo.objects(source))
+
+
 @dataclass(frozen=True, eq=False)
 class Captured:
     """One recording, captured with one seed."""
@@ -54,7 +59,7 @@ def captured(
     jobs = [(name, seed) for name in ordered for seed in seeds]
     for start in range(0, len(jobs), items):
         batch = jobs[start : start + items]
-        observed_parts = {name: echo.scenario_of(CaptureInput(store.load(name), store.root)) for name, _ in batch}
+        observed_parts = {name: scenario_of(echo, CaptureInput(store.load(name), store.root)) for name, _ in batch}
         scenarios = [_observing(method, echo, observed_parts[name], store.root, seed) for name, seed in batch]
         motions = echo.capture_scenarios(scenarios, [seed for _, seed in batch])
         for (name, seed), motion in zip(batch, motions):

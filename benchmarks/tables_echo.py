@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from echo_rows import Captured, Method, captured, pipeline_of
+from echo_rows import Captured, Method, captured, pipeline_of, scenario_of
 from hydra.utils import instantiate
 from rich.console import Console
 from rich.progress import Progress
@@ -258,7 +258,7 @@ def _baseline(method: NearestEcho, store: RecordingStore, names: list[str], like
     made = []
     for name in names:
         source = CaptureInput(store.load(name), store.root)
-        motion = method.capture_scenarios([echo.scenario_of(source)], [0])[0]
+        motion = method.capture_scenarios([scenario_of(echo, source)], [0])[0]
         made.append(echo.score(motion, source, 0))
     return aggregate(made)
 

@@ -57,7 +57,7 @@ class ConfigInCheckpoint(Callback):
         self._clocks = _clocks()
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx: int) -> None:
-        frames = len(batch[0]) * getattr(trainer.datamodule.dataset("train"), "window", 1)
+        frames = len(batch[0]) * getattr(trainer.datamodule.train, "window", 1)  # pyright: ignore[reportAttributeAccessIssue]
         self._taken["frames"] += frames * trainer.world_size
 
     def on_save_checkpoint(self, trainer, pl_module, checkpoint: dict[str, Any]) -> None:
