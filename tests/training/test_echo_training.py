@@ -18,8 +18,10 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.models.checkpoint import load_trained
+from wearcap.recording import RecordingStore
 from wearcap.systems.echo.features import OBJECT_SIZE
 from wearcap.systems.echo.model import EchoDenoiser
+from wearcap.systems.echo.scores import score_echo
 from wearcap.systems.echo.training import EchoDiffusion
 from wearcap.systems.echo.training_windows import EchoContent, EchoWindow
 from wearcap_testing import benchmark, experiments, small_dataset
@@ -260,12 +262,12 @@ def test_a_baseline_learns_in_a_few_steps_and_captures(name, data, people, tmp_p
     train.main(arguments(f"baseline/{name}", data, people, run, *small, "optimizer.scheduler.warmup=2"))
     losses = [float(loss) for loss in losses_of(run).values()]
     assert sum(losses[-5:]) < 0.9 * sum(losses[:5])
-    checkpoint = f"checkpoint={run}/checkpoints/last.ckpt"
-    common = [checkpoint, f"recording={data}/c2", "video=false", "body=false", f"output={tmp_path}/c"]
-    capture.main([*common, f"pipeline=baseline/{captured}", f"hydra.run.dir={tmp_path}/c"])
-    motion = read_motion(tmp_path / "c" / "motion.npz")
-    assert motion.R_parent_joint.isfinite().all()
-    assert set(motion.object_motion or {}) == ({"box_1"} if name == "bodiffusion_object" else set())
+    rows = benchmark("echo_rows")
+    method = rows.Method(name, f"{run}/checkpoints/last.ckpt", (f"pipeline=baseline/{captured}",))
+    (one,) = rows.captured(method, RecordingStore.open(data), ["c2"], [0], items=1)
+    assert one.motion.R_parent_joint.isfinite().all()
+    assert set(one.motion.object_motion or {}) == ({"box_1"} if name == "bodiffusion_object" else set())
+    assert score_echo(one.motion, one.truth, "c2", 0).scores["mpjpe_mm"] < 1000
 
 
 @pytest.mark.slow
