@@ -259,7 +259,8 @@ def test_every_experiment_and_ablation_runs(changes, data, people, tmp_path):
 def test_a_baseline_learns_in_a_few_steps_and_captures(name, data, people, tmp_path):
     run, captured = tmp_path / "run", name if name.startswith("bodiffusion") else "bodiffusion"
     small = ("trainer.max_steps=30", "data.loading.steps_per_epoch=30", "data.loading.batch_size=8")
-    train.main(arguments(f"baseline/{name}", data, people, run, *small, "optimizer.scheduler.warmup=2"))
+    small += ("optimizer.scheduler.warmup=2", "optimizer.optimizer.lr=0.01")
+    train.main(arguments(f"baseline/{name}", data, people, run, *small))
     losses = [float(loss) for loss in losses_of(run).values()]
     assert sum(losses[-5:]) < 0.9 * sum(losses[:5])
     rows = benchmark("echo_rows")
