@@ -32,11 +32,6 @@ def pipeline_of(method: Method) -> Echo:
     return pipeline
 
 
-def scenario_of(echo: Echo, source: CaptureInput) -> Scenario:
-    """A recording with the objects of its environment."""
-    return echo.scenario(source.recording, echo.objects(source))
-
-
 @dataclass(frozen=True, eq=False)
 class Captured:
     """One recording, captured with one seed."""
@@ -66,6 +61,11 @@ def captured(
             scenario = observed_parts[name]
             item = batch_item_of(scenario, head_path(scenario.recording, echo.model.skeleton, echo.fps), reader)
             yield Captured(name, seed, motion, echo.truth(motion, CaptureInput(scenario.recording, store.root)), item)
+
+
+def scenario_of(echo: Echo, source: CaptureInput) -> Scenario:
+    """The recording with the objects of its own file."""
+    return echo.scenario(source.recording, echo.objects(source))
 
 
 def _observing(method: Method, echo: Echo, scenario: Scenario, root: Path, seed: int) -> Scenario:

@@ -34,15 +34,13 @@ class Row:
 
 @dataclass(frozen=True)
 class Summary:
-    """Mean and sample standard deviation over seeds (None for a single seed); of no seed, a NaN that was not recorded."""
+    """Mean and sample standard deviation over seeds (None for a single seed)."""
 
     mean: float
     std: float | None
     seeds: int
 
     def __str__(self) -> str:
-        if not self.seeds:
-            return "not recorded"
         return f"{self.mean:.2f}" if self.std is None else f"{self.mean:.2f} ± {self.std:.2f}"
 
 
