@@ -40,6 +40,8 @@ CUES = ("right_hand_cm", "right_arm_cm", "upper_cm", "mpjpe_cm", "jitter_m_s3")
 OURS = "experiment=mocap_every"
 TRAININGS: dict[str, tuple[str, ...]] = {
     "mocap_every_avatarposer": ("experiment=baseline/mocap_every_avatarposer",),
+    "mocap_every_agrol": ("experiment=baseline/mocap_every_agrol",),
+    "mocap_every_agrol_hands": ("experiment=baseline/mocap_every_agrol", "model.features.wrists=positions"),
     "mocap_every_paper": ("experiment=paper/mocap_every",),
     "mocap_every_neither": (
         OURS,
@@ -61,6 +63,11 @@ TRAINED = {
     "AvatarPoser-style, watches": (
         "mocap_every_avatarposer",
         ("pipeline=mocap_every", "pipeline.stride=1", "pipeline.lookahead=0", "pipeline.mirror_average=false"),
+    ),
+    "AGRoL's MLP, watches (AGRoL*)": ("mocap_every_agrol", ("pipeline=mocap_every", "pipeline.mirror_average=false")),
+    "AGRoL's MLP, hands tracked": (
+        "mocap_every_agrol_hands",
+        ("pipeline=mocap_every", "pipeline.mirror_average=false"),
     ),
     "as in the paper": ("mocap_every_paper", ("pipeline=paper/mocap_every",)),
     "neither": ("mocap_every_neither", ("pipeline=mocap_every",)),

@@ -99,11 +99,11 @@ class AdaptiveBlock(nn.Module):
 
 class MixingBlock(nn.Module):
     """A block of AGRoL's MLP (Du et al. 2023): a linear layer across the tokens, then one across the channels, each after
-    a layer norm and around a skip connection; the embedded level is added to the block's input."""
+    a layer norm and around a skip connection; the embedded level, if there is one, is added to the block's input."""
 
-    def __init__(self, width: int, max_tokens: int):
+    def __init__(self, width: int, max_tokens: int, has_level: bool = True):
         super().__init__()
-        self.level = nn.Linear(width, width)
+        self.level = nn.Linear(width, width) if has_level else nn.Identity()
         self.norm_tokens, self.norm_channels = nn.LayerNorm(width), nn.LayerNorm(width)
         self.tokens, self.channels = nn.Linear(max_tokens, max_tokens), nn.Linear(width, width)
 
