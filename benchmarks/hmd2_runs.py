@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from tabling import training_of
 
 from wearcap.cli.conf import compose, load_pipeline
 from wearcap.evaluation.baselines import BASELINES
@@ -43,7 +44,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Result:
-    """Scores of a row over seeds: of all recordings, and by what was mostly done in them."""
+    """Scores of a row over seeds, with what its training took: of all recordings, and by what was mostly done in them."""
 
     method: str
     scores: dict[str, Summary]
@@ -68,6 +69,8 @@ def run_method(method: Method, case: Case) -> Result:
     scores = aggregate(rows)
     if realism is not None:
         scores |= realism.scores(method.name)
+    if method.checkpoint is not None:
+        scores |= training_of(method.checkpoint)
     return Result(method.name, scores, _by_activity(rows, store))
 
 

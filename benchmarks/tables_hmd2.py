@@ -13,7 +13,7 @@ from hmd2_runs import BASELINES, Case, Method, Result, run_method
 from joblib import Parallel, delayed
 from rich.console import Console
 from rich.table import Table
-from tabling import TRAINING, finite, new_table, training_of
+from tabling import TRAINING, finite, new_table
 
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
@@ -120,7 +120,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     )
     jobs = [("Tables 6.1 and 6.3", case, _methods(options, console)), *sweeps]
     results = Parallel(n_jobs=options.jobs)(
-        delayed(_row)(method, where) for _, where, methods in jobs for method in methods
+        delayed(run_method)(method, where) for _, where, methods in jobs for method in methods
     )
     found: dict[str, list[Result]] = {}
     for title, _, methods in jobs:
@@ -161,14 +161,6 @@ def _case(options: argparse.Namespace) -> Case:
     seeds = tuple(range(2 if options.quick else options.seeds))
     realism = options.realism if _exists(options.realism) else None
     return Case(options.dataset, tuple(names), seeds, tuple(options.training), realism, options.device)
-
-
-def _row(method: Method, case: Case) -> Result:
-    """A method's scores, and what its training took."""
-    result = run_method(method, case)
-    if method.checkpoint is None:
-        return result
-    return replace(result, scores=result.scores | training_of(method.checkpoint))
 
 
 def _exists(checkpoint: str) -> bool:
