@@ -56,7 +56,7 @@ STRIDES = (230, 180, 120, 60, 30, 10, 1)
 STEPS = (2, 3, 5, 10, 20, 40, 80)
 LOOKAHEAD = 20
 """Frames that our windows of the sweep look ahead; longer strides have no more than a window's room for it."""
-WIDTH = 200
+WIDTH = 240
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
