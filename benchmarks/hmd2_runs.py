@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 from sensed import SensedStore
+from tabling import training_of
 
 from wearcap.cli.conf import compose, load_pipeline
 from wearcap.evaluation.baselines import BASELINES
@@ -51,7 +52,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Result:
-    """Scores of a row over seeds: of all recordings, and by what was mostly done in them."""
+    """Scores of a row over seeds, with what its training took: of all recordings, and by what was mostly done in them."""
 
     method: str
     scores: dict[str, Summary]
@@ -82,6 +83,8 @@ def run_method(method: Method, case: Case) -> Result:
         scores |= {f"best_{name}": value for name, value in aggregate(best_of(rows)).items() if name in BEST}
     if realism is not None:
         scores |= realism.scores(method.name)
+    if method.checkpoint is not None:
+        scores |= training_of(method.checkpoint)
     return Result(method.name, scores, _by_activity(rows, store))
 
 

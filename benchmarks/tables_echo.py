@@ -18,7 +18,7 @@ from hydra.utils import instantiate
 from result_pages import Grid, Page, Tree, Trees, figure_of, mean, picked, rows_of, score_grids
 from rich.console import Console
 from rich.progress import Progress
-from tabling import finite, recordings_of
+from tabling import TRAINING, finite, recordings_of, training_of
 
 from wearcap.cli.conf import compose
 from wearcap.files import write_text
@@ -37,6 +37,7 @@ BODY = {
     "floor_penetration_cm": "into the floor (cm)",
     "physicality": "physicality",
     "jitter_m_s3": "jitter (m/s³)",
+    **TRAINING,
 }
 """Columns of the tables of bodies. Ours of MPJVE is in the unit of ECHO's words, which its figures cannot have
 (`joint_step_error_mm`): they have a column of their own."""
@@ -67,10 +68,14 @@ TRAININGS: dict[str, tuple[str, ...]] = {
     "echo_paper_losses": (*SHORT, "model.loss_weights={object_vertices: 0.1, joints: 0.1, velocity: 0.0, skate: 0.05}"),
     "echo_three_streams": (*SHORT, "model.net.streams=3"),
     "bodiffusion_object": ("experiment=baseline/bodiffusion_object",),
+    "bodiffusion_object_window": ("experiment=baseline/bodiffusion_object", "features.frame=window"),
+    "bodiffusion": ("experiment=baseline/bodiffusion",),
+    "egoallo_human": ("experiment=baseline/egoallo_human",),
+    "agrol_human": ("experiment=baseline/agrol_human",),
 }
 """Overrides of `wearcap train` by the run's name: ECHO trained briefly, and each ablation of it trained as long: the
 paper's canonical frame (window) and none (world), the losses of the three modalities alone, the weights of ECHO eq. 13,
-and a token per frame and modality."""
+and a token per frame and modality; and the baselines, as long, in the same frames as ours."""
 ABLATIONS: dict[str, tuple[str, ...]] = {
     "ours without guidance, as long as the others": ("echo_short", *UNGUIDED),
     "the same, objects move untouched": ("echo_short", *UNGUIDED, "pipeline.contacts.static_threshold=null"),
@@ -83,7 +88,19 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "the paper's weights of losses": ("echo_paper_losses", *UNGUIDED),
     "three tokens per frame": ("echo_three_streams", *UNGUIDED),
     "BoDiffusion-style + object": ("bodiffusion_object", "pipeline=baseline/bodiffusion_object"),
+    "BoDiffusion-style + object, the paper's frame": (
+        "bodiffusion_object_window",
+        "pipeline=baseline/bodiffusion_object",
+    ),
+    "BoDiffusion-style": ("bodiffusion", "pipeline=baseline/bodiffusion"),
 }
+HUMANS: dict[str, tuple[str, ...]] = {
+    **{name: ABLATIONS[name] for name in ("ours without guidance, as long as the others", "no humans alone")},
+    **{name: ABLATIONS[name] for name in ("BoDiffusion-style + object", "BoDiffusion-style")},
+    "EgoAllo-style (head)": ("egoallo_human", "pipeline=baseline/bodiffusion"),
+    "AGRoL-style": ("agrol_human", "pipeline=baseline/bodiffusion"),
+}
+"""Rows of Table 2 with trainings of their own."""
 SETTINGS = {
     "ours": ("pipeline=echo",),
     "objects move untouched": ("pipeline=echo", "pipeline.contacts.static_threshold=null"),
@@ -179,7 +196,8 @@ def _objects(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapp
     for one in _captured(ours, options, progress, store, names):
         mine.append(score_echo(one.motion, one.truth, one.name, one.seed))
         stuck.append(score_echo(wrist.attached(one.motion, one.item), one.truth, one.name, one.seed))
-    scores |= {"ours, object stuck to the nearer wrist": aggregate(stuck), "ours": aggregate(mine)}
+    took = training_of(options.checkpoint)
+    scores |= {"ours, object stuck to the nearer wrist": aggregate(stuck), "ours": aggregate(mine) | took}
     alone = Method("ours, human alone", options.checkpoint, ("pipeline=echo", "pipeline.acts=none"))
     scores |= _scores([alone], options, progress, store, names)
     return f"Table 1: objects, {options.split}; {TRUTH_GIVEN}", OBJECTS, scores | PAPER
@@ -232,11 +250,7 @@ def _given(row: tuple[str, float] | None) -> str:
 def _human(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapping[str, str], Scores]:
     """Table 2: people without objects."""
     store, names = recordings_of(options, "cmu")
-    names_of = ("ours without guidance, as long as the others", "no humans alone", "BoDiffusion-style + object")
-    methods = [
-        Method("ours", options.checkpoint),
-        *_trained({name: ABLATIONS[name] for name in names_of}, options, progress),
-    ]
+    methods = [Method("ours", options.checkpoint), *_trained(HUMANS, options, progress)]
     scores = _scores(methods, options, progress, store, names)
     return f"Table 2: CMU, {options.split}; {TRUTH_GIVEN}", BODY, scores | PAPER_HUMAN
 
@@ -250,7 +264,7 @@ def _scores(
             score_echo(one.motion, one.truth, one.name, one.seed)
             for one in _captured(method, options, progress, store, names)
         ]
-        scores[method.name] = aggregate(made)
+        scores[method.name] = aggregate(made) | training_of(method.checkpoint)
         shown = (f"{key} {scores[method.name][key]}" for key in OBJECTS if key in scores[method.name])
         progress.console.print(f"{method.name}: {', '.join(shown)}", soft_wrap=True)
     return scores

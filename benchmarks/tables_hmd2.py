@@ -18,7 +18,7 @@ from result_pages import NONE, Grid, Page, Tree, Trees, figure_of, grid_of, mean
 from rich.console import Console
 from rich.table import Table
 from sensed import GIVEN, add_sensors
-from tabling import finite, new_table
+from tabling import TRAINING, finite, new_table
 
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
@@ -43,6 +43,7 @@ COLUMNS = {
     "jitter_ratio": "jitter",
     "seam_ratio": "seam",
     "world_mpjpe_cm": "world",
+    **TRAINING,
 }
 """Columns of the first table; "jitter" is of the truth's, "world" the MPJPE that is not anchored to the true head."""
 PARTS = {
@@ -73,13 +74,22 @@ OURS = "full"
 TRUTH_GIVEN = "hands of the AvatarPoser-style row that sees them (with exact sensors and bones), and the bones of rows that say so"
 """What of the truth is given to rows."""
 MODALITIES = {OURS: "[points,images]", "w/o images": "[points]", "w/o points": "[images]", "head alone": "[]"}
+TRAINED = {
+    "EgoEgo-style": ("egoego_style", "baseline/egoego_style", None),
+    "EgoAllo-style": ("egoallo_style", "baseline/egoallo_style", None),
+    "AGRoL-style (head)": ("agrol_style", "baseline/agrol_style", None),
+    "AvatarPoser-style (head)": ("avatarposer_head", "pose_regressor", None),
+    "AvatarPoser-style (head and hands)": ("avatarposer_hands", "pose_regressor", GIVEN),
+}
+"""Baselines: experiment and run, pipeline, and sensors (None: the table's). Each is trained by `wearcap train
+experiment=baseline/RUN data=hmd2 paths.run=RUNS/RUN`; its checkpoint of the lowest validation loss is captured with."""
 STRIDES = (230, 180, 120, 60, 30, 10, 1)
 STEPS = (2, 3, 5, 10, 20, 40, 80)
 LOOKAHEAD = 20
 """Frames that our windows of the sweep look ahead; longer strides have no more than a window's room for it."""
 SWEEP_STRIDE_S = 0.25
 """Distance of the windows of FID in the sweeps, whose recordings are fewer."""
-WIDTH = 190
+WIDTH = 260
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -100,12 +110,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seeds", type=int, default=8, help="repetitions (2 when quick)")
     parser.add_argument("--recordings", type=int, help="no more than so many of the split")
     parser.add_argument("--checkpoint", default="hmd2", help="the full model")
-    parser.add_argument("--egoego", default="egoego_style", help="the EgoEgo-style diffusion")
     parser.add_argument(
-        "--regressors",
-        nargs=2,
-        default=["pose_regressor_head", "pose_regressor_hands"],
-        help="AvatarPoser-style regressors of the head, and of head and hands",
+        "--runs", type=Path, default=Path("outputs/train"), help="folder of the baselines' trainings, by name"
     )
     parser.add_argument(
         "--separate",
@@ -245,9 +251,9 @@ def _latencies(options: argparse.Namespace, h: int) -> list[Method]:
 
 def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
     """Rows of the first table; those whose checkpoint is not there are named and left out."""
-    regressors = [
-        Method(f"AvatarPoser-style ({sees})", checkpoint, ("pipeline=pose_regressor",), sensors)
-        for sees, checkpoint, sensors in zip(("head", "head and hands"), options.regressors, (None, GIVEN))
+    trained = [
+        Method(name, str(options.runs / run / "checkpoints" / "best.ckpt"), (f"pipeline={pipeline}",), sensors)
+        for name, (run, pipeline, sensors) in TRAINED.items()
     ]
     full = _ours(options, OURS)
     sensing = [replace(full, name=f"full, {n} sensors", sensors=n) for n in WEARABLES if n != options.sensors]
@@ -259,8 +265,7 @@ def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
     ]
     wanted = [
         *(Method(name) for name in BASELINES),
-        Method("EgoEgo-style", options.egoego, ("pipeline=baseline/egoego_style",)),
-        *regressors,
+        *trained,
         *ablations,
         *sensing,
         *separate,
@@ -270,7 +275,7 @@ def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
     there = [method for method in wanted if method.checkpoint is None or _exists(method.checkpoint)]
     for method in wanted:
         if method not in there:
-            console.print(f"left out: {method.name} (no checkpoint {method.checkpoint!r})")
+            console.print(f"left out: {method.name} (no checkpoint {method.checkpoint!r})", soft_wrap=True)
     return there
 
 

@@ -2,7 +2,7 @@
 
 Heads, watches and what is known of the body have the errors of real devices (`--sensors`): the floor and the wearer's
 bones are given in the rows that say so alone. Bodies are measured where they are put in the world. Checkpoints come by name (checkpoints/) or path; those of baselines
-and ablations from RUNS/NAME/checkpoints/last.ckpt, and further seeds of a training from RUNS/NAME_1 and RUNS/NAME_2: the
+and ablations from RUNS/NAME/checkpoints/best.ckpt, and further seeds of a training from RUNS/NAME_1 and RUNS/NAME_2: the
 table gives their mean and spread. A row without its checkpoint is left out, and the command that trains it is printed
 (`TRAININGS`).
 """
@@ -18,7 +18,7 @@ from result_pages import Grid, Page, Tree, Trees, figure_of, mean, picked, range
 from rich.console import Console
 from rich.progress import Progress
 from sensed import GIVEN, add_sensors
-from tabling import finite, recordings_of
+from tabling import TRAINING, finite, recordings_of, training_of
 
 from wearcap.files import write_text
 from wearcap.metrics.table import Scores, Summary, aggregate, markdown_table, truth_row
@@ -40,6 +40,7 @@ BODY = (
     "jitter_m_s3",
     "physicality",
     "floor_penetration_cm",
+    *TRAINING,
 )
 FLOOR = (
     "upper_pe_cm",
@@ -54,6 +55,8 @@ CUES = ("right_hand_cm", "right_arm_cm", "upper_cm", "mpjpe_cm", "jitter_m_s3")
 OURS = "experiment=mocap_every"
 TRAININGS: dict[str, tuple[str, ...]] = {
     "mocap_every_avatarposer": ("experiment=baseline/mocap_every_avatarposer",),
+    "mocap_every_agrol": ("experiment=baseline/mocap_every_agrol",),
+    "mocap_every_agrol_hands": ("experiment=baseline/mocap_every_agrol", "model.features.wrists=positions"),
     "mocap_every_paper": ("experiment=paper/mocap_every",),
     "mocap_every_neither": (
         OURS,
@@ -68,12 +71,18 @@ TRAININGS: dict[str, tuple[str, ...]] = {
 """Overrides of `wearcap train` by the run's name: ablations after the paper's Table 7 without its first stage, and
 without its data representation as well (world coordinates); and AvatarPoser's protocol 1, with tracked hands instead of
 accelerations."""
-STEPS = ("trainer.max_steps=1000", "data.loading.steps_per_epoch=250")
-"""All of these are trained so long."""
+STEPS = ("trainer.max_steps=3250", "data.loading.steps_per_epoch=250")
+"""All of these are trained as long as `mocap_every` was; captured with is each one's checkpoint of the lowest validation
+loss, as there."""
 TRAINED = {
     "AvatarPoser-style, watches": (
         "mocap_every_avatarposer",
         ("pipeline=mocap_every", "pipeline.stride=1", "pipeline.lookahead=0", "pipeline.mirror_average=false"),
+    ),
+    "AGRoL's MLP, watches (AGRoL*)": ("mocap_every_agrol", ("pipeline=mocap_every", "pipeline.mirror_average=false")),
+    "AGRoL's MLP, hands tracked": (
+        "mocap_every_agrol_hands",
+        ("pipeline=mocap_every", "pipeline.mirror_average=false"),
     ),
     "as in the paper": ("mocap_every_paper", ("pipeline=paper/mocap_every",)),
     "neither": ("mocap_every_neither", ("pipeline=mocap_every",)),
@@ -253,7 +262,7 @@ def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
     ours.append(Method(given, options.checkpoint, GIVEN, ("pipeline=mocap_every", level)))
     trained = {}
     for name, (run, pipeline) in TRAINED.items():
-        paths = [options.runs / seeded / "checkpoints" / "last.ckpt" for seeded in (run, f"{run}_1", f"{run}_2")]
+        paths = [options.runs / seeded / "checkpoints" / "best.ckpt" for seeded in (run, f"{run}_1", f"{run}_2")]
         sensors = GIVEN if run in HANDS else usual
         trained[name] = [Method(name, str(path), sensors, (*pipeline, level)) for path in paths if path.is_file()]
         if not trained[name]:
@@ -274,7 +283,7 @@ def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
             for seed, method in enumerate(methods)
             for recording, _, captured in captures(method, store, names, lambda b=bar: progress.advance(b))
         ]
-        scores[name] = aggregate(scored)
+        scores[name] = aggregate(scored) | training_of(methods[0].checkpoint)
     scores["truth"] = truth_row(scores["ours"])
     title = f"Tables 2, 6, 7: CMU, {options.split}, {usual} sensors (hands tracked: exact, floor and bones given)"
     return title, BODY, scores | PAPER
@@ -283,19 +292,18 @@ def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
 def _totalcapture(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """Table 1: TotalCapture's real forearm sensors and true heads, all subjects, as none of them was trained on."""
     level = "pipeline.floor=fixed"
-    methods = [Method("ours", options.checkpoint, ("pipeline=mocap_every", level))]
-    methods += [Method("ours, heads as by SLAM", options.checkpoint, slam=True)]
+    methods = [Method("ours", options.checkpoint, GIVEN, ("pipeline=mocap_every", level))]
     run, pipeline = TRAINED["as in the paper"]
-    path = options.runs / run / "checkpoints" / "last.ckpt"
+    path = options.runs / run / "checkpoints" / "best.ckpt"
     if path.is_file():
-        methods.append(Method("as in the paper", str(path), (*pipeline, level)))
+        methods.append(Method("as in the paper", str(path), GIVEN, (*pipeline, level)))
     store, _ = recordings_of(options, "totalcapture")
     names = store.names()[: 3 if options.quick else options.recordings]
     scores = {}
     for method in methods:
         bar = progress.add_task(method.name, total=len(names))
-        pairs = captures(method, store, names, lambda b=bar: progress.advance(b))
-        scores[method.name] = aggregate([body_row(*pair) for pair in pairs])
+        found = captures(method, store, names, lambda b=bar: progress.advance(b))
+        scores[method.name] = aggregate([body_row(recording, captured) for recording, _, captured in found])
     return "TotalCapture, real sensors", BODY, scores | PAPER_TOTALCAPTURE
 
 
@@ -311,7 +319,7 @@ def _floor(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[
     others = [name for name in (*WEARABLES, GIVEN) if name != options.sensors]
     methods += [Method(_sensing(name), options.checkpoint, name) for name in others]
     run, pipeline = TRAINED["as in the paper"]
-    path = options.runs / run / "checkpoints" / "last.ckpt"
+    path = options.runs / run / "checkpoints" / "best.ckpt"
     if path.is_file():
         methods += [
             Method(

@@ -8,8 +8,18 @@ from rich.table import Table
 
 from wearcap.errors import WearcapError
 from wearcap.metrics.table import Summary
+from wearcap.models.checkpoint import read_checkpoint
 from wearcap.recording import RecordingStore
 
+TRAINING = {"parameters_m": "M param.", "frames_seen_m": "M frames", "core_minutes": "core min"}
+"""Columns of what a row's training took: trained parameters and frames of drawn windows, both in millions, and minutes of a
+core; and their headings."""
+_RECORDED = {
+    "parameters_m": ("parameters", 1e6),
+    "frames_seen_m": ("frames", 1e6),
+    "core_minutes": ("core_seconds", 60.0),
+}
+"""A checkpoint's own record of each, and how many of its units make one of the column's."""
 PREPARE = {
     "cmu": "Run: wearcap prepare cmu source=FOLDER",
     "simulated": "Run: wearcap prepare simulated",
@@ -47,6 +57,24 @@ def cell(summary: dict[str, Any], digits: int = 2) -> str:
     parts = Summary(summary["mean"], summary["std"], summary["seeds"])
     spread = "" if parts.std is None else f" ± {parts.std:.{digits}f}"
     return f"{parts.mean:.{digits}f}{spread}"
+
+
+class NotRecorded(Summary):
+    """A figure that a checkpoint does not carry."""
+
+    def __str__(self) -> str:
+        return "not recorded"
+
+
+def training_of(checkpoint: str) -> dict[str, Summary]:
+    """What a checkpoint's training took, as columns (`TRAINING`) of its row."""
+    config, state = read_checkpoint(checkpoint)
+    weights = sum(value.numel() for name, value in state.items() if name.startswith("net."))
+    taken: dict[str, Any] = {"parameters": weights, **config.get("training", {})}
+    return {
+        name: Summary(taken[key] / unit, None, 1) if key in taken else NotRecorded(math.nan, None, 0)
+        for name, (key, unit) in _RECORDED.items()
+    }
 
 
 def new_table(title: str, columns: list[str]) -> Table:

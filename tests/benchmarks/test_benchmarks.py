@@ -47,6 +47,22 @@ def test_a_figure_with_other_keys_is_refused(monkeypatch, tmp_path):
         run.run("askew")
 
 
+def test_a_row_prints_what_its_training_took(tmp_path):
+    import tabling
+
+    from wearcap.models.checkpoint import read_checkpoint
+
+    took = tabling.training_of("hmd2")
+    assert list(took) == list(tabling.TRAINING)
+    assert 5 < took["parameters_m"].mean < 7
+    assert "training" in read_checkpoint("hmd2")[0] or str(took["frames_seen_m"]) == "not recorded"
+    record = {"parameters": 2_500_000, "frames": 13_824_000, "core_seconds": 1815.0}
+    config = json.dumps({"model": {}, "training": record})
+    torch.save({"wearcap": {"config": config}, "state_dict": {"net.weight": torch.zeros(2)}}, tmp_path / "run.ckpt")
+    took = tabling.training_of(str(tmp_path / "run.ckpt"))
+    assert [str(value) for value in took.values()] == ["2.50", "13.82", "30.25"]
+
+
 def test_windows_from_the_store_are_faster_than_npz():
     import run
     import windows_vs_npz

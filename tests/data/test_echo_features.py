@@ -44,6 +44,19 @@ def test_body_and_object_come_back_as_they_went_in(walked, frame):
     torch.testing.assert_close(back.matrix(), box.matrix(), atol=1e-5, rtol=0)
 
 
+@pytest.mark.parametrize("frame", ["window", "own"])
+def test_a_head_alone_does_not_see_the_hands(walked, frame):
+    points, *_, floor = walked
+    waved = points._replace(t_world_point=points.t_world_point + torch.tensor([0.0, 0.1, 0.1])[:, None])
+    for seen, equal in ((["head"], True), (["head", "left_wrist", "right_wrist"], False)):
+        features = small_features(frame, points=seen)
+        condition = features.condition(points, floor, SIZE)
+        assert condition.shape[-1] == features.condition_size
+        assert torch.equal(features.condition(waved, floor, SIZE), condition) == equal
+    with pytest.raises(WearcapError, match="tracked points left_wrist"):
+        small_features(frame, points=["left_wrist"])
+
+
 @pytest.mark.parametrize("body", [True, False])
 @pytest.mark.parametrize(("frame", "size"), [("window", 54), ("world", 54), ("own", 56)])
 def test_sizes_are_the_papers(walked, frame, size, body):

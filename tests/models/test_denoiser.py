@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from wearcap.errors import WearcapError
 from wearcap.models.layers import Normalizer
 from wearcap.systems.hmd2.model import Conditions, MotionDenoiser
 
@@ -32,9 +33,9 @@ def inputs(time: int = 16):
     return (torch.randn(2, time, 12), torch.rand(2, 1), torch.randn(2, time, 5), torch.ones(2, time, dtype=torch.bool))
 
 
-@pytest.mark.parametrize("frames_per_token", [1, 4])
-def test_padding_changes_nothing_on_the_frames_that_exist(frames_per_token):
-    net = small(frames_per_token=frames_per_token)
+@pytest.mark.parametrize(("frames_per_token", "mixing"), [(1, "attention"), (4, "attention"), (1, "mlp")])
+def test_padding_changes_nothing_on_the_frames_that_exist(frames_per_token, mixing):
+    net = small(frames_per_token=frames_per_token, mixing=mixing)
     x_t, level, condition, valid = inputs()
     valid[:, 8:] = False
     out = denoise(net, x_t, level, condition, valid)
@@ -42,9 +43,19 @@ def test_padding_changes_nothing_on_the_frames_that_exist(frames_per_token):
     assert torch.allclose(denoise(net, x_t, level, condition, valid)[:, :8], out[:, :8], atol=1e-5)
 
 
-def test_a_window_without_any_frame_is_finite():
+@pytest.mark.parametrize("mixing", ["attention", "mlp"])
+def test_a_window_without_any_frame_is_finite(mixing):
     x_t, level, condition, valid = inputs()
-    assert denoise(small(), x_t, level, condition, valid & False).isfinite().all()
+    assert denoise(small(mixing=mixing), x_t, level, condition, valid & False).isfinite().all()
+
+
+def test_an_mlp_mixes_frames_and_other_ways_are_named():
+    net, (x_t, level, condition, valid) = small(mixing="mlp"), inputs()
+    before = denoise(net, x_t, level, condition, valid)
+    x_t[:, 0] += 1.0
+    assert (denoise(net, x_t, level, condition, valid) - before)[:, 15].abs().max() > 1e-4
+    with pytest.raises(WearcapError, match="no mixing 'convolution'"):
+        small(mixing="convolution")
 
 
 def test_level_per_frame_equals_level_per_window_when_all_are_the_same():

@@ -18,8 +18,10 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.models.checkpoint import load_trained
+from wearcap.recording import RecordingStore
 from wearcap.systems.echo.features import OBJECT_SIZE
 from wearcap.systems.echo.model import EchoDenoiser
+from wearcap.systems.echo.scores import score_echo
 from wearcap.systems.echo.training import EchoDiffusion
 from wearcap.systems.echo.training_windows import EchoContent, EchoWindow
 from wearcap_testing import benchmark, experiments, small_dataset
@@ -250,6 +252,23 @@ def test_every_experiment_and_ablation_runs(changes, data, people, tmp_path):
     system, _ = load_trained(tmp_path / "run" / "checkpoints" / "last.ckpt")
     assert isinstance(system, EchoDiffusion)
     assert not torch.equal(system.net.motion_normalizer.scale, torch.ones(sum(system.net.sizes)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bodiffusion_object", "bodiffusion", "egoallo_human", "agrol_human"])
+def test_a_baseline_learns_in_a_few_steps_and_captures(name, data, people, tmp_path):
+    run, captured = tmp_path / "run", name if name.startswith("bodiffusion") else "bodiffusion"
+    small = ("trainer.max_steps=30", "data.loading.steps_per_epoch=30", "data.loading.batch_size=8")
+    small += ("optimizer.scheduler.warmup=2", "optimizer.optimizer.lr=0.01")
+    train.main(arguments(f"baseline/{name}", data, people, run, *small))
+    losses = [float(loss) for loss in losses_of(run).values()]
+    assert sum(losses[-5:]) < 0.9 * sum(losses[:5])
+    rows = benchmark("echo_rows")
+    method = rows.Method(name, f"{run}/checkpoints/last.ckpt", (f"pipeline=baseline/{captured}",))
+    (one,) = rows.captured(method, RecordingStore.open(data), ["c2"], [0], items=1)
+    assert one.motion.R_parent_joint.isfinite().all()
+    assert set(one.motion.object_motion or {}) == ({"box_1"} if name == "bodiffusion_object" else set())
+    assert score_echo(one.motion, one.truth, "c2", 0).scores["mpjpe_mm"] < 1000
 
 
 @pytest.mark.slow

@@ -23,13 +23,16 @@ KINDS = (
     "contact_",
     "pose_regressor_",
     "egoego_",
+    "egoallo_",
+    "agrol_",
+    "avatarposer_",
     "egoview",
     "voxel_autoencoder",
     "hmd2",
     "mocap_every",
     "object_encoder",
     "echo",
-    "bodiffusion_object",
+    "bodiffusion",
 )
 SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
 
@@ -85,6 +88,11 @@ def test_a_run_leaves_its_record(checkpoint):
     run = checkpoint.parents[1]
     assert "max_steps: 4" in (run / "config.yaml").read_text()
     record = json.loads((run / "run.json").read_text())
+    training = read_checkpoint(checkpoint)[0]["training"]
+    assert training["machine"] == record["machine"]
+    assert (training["steps"], training["frames"]) == (4, 4 * 2 * 60)
+    assert 0 < training["core_seconds"] < 600
+    assert 0 < training["seconds"] < 600
     assert record["versions"]["torch"] == torch.__version__.split("+")[0] or torch.__version__
     assert list((run / "pictures").glob("*.png"))
 
@@ -92,6 +100,8 @@ def test_a_run_leaves_its_record(checkpoint):
 def test_the_checkpoint_rebuilds_the_system(checkpoint):
     system, config = load_trained(checkpoint)
     assert config["name"] == "debug_fast"
+    trained = (parameter.numel() for parameter in system.parameters() if parameter.requires_grad)
+    assert config["training"]["parameters"] == sum(trained)
     assert not torch.equal(system.net.motion_normalizer.scale, torch.ones_like(system.net.motion_normalizer.scale))
 
 
@@ -147,6 +157,8 @@ def test_a_run_resumed_in_its_folder_goes_on_with_its_log(data, tmp_path):
     more_steps = trained(6, "resume=auto")
     assert more_steps[:3] == first
     assert trained(9, f"resume={early}")[:6] == more_steps, "no step is there twice"
+    taken = read_checkpoint(run / "checkpoints/last.ckpt")[0]["training"]
+    assert (taken["steps"], taken["frames"]) == (9, 9 * 2 * 60), "the steps before it went on are counted"
     assert trained(3) == first, "a run from scratch begins its log anew"
 
 

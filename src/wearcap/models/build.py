@@ -43,7 +43,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "wearcap.models.point_encoder": ("ObjectNetwork", "PointNeXt"),
     "wearcap.models.pose_regressor": ("PoseRegressor",),
     "wearcap.models.voxel_autoencoder": ("VoxelAutoencoder",),
-    "wearcap.systems.mocap_every.model": ("LastPoseEstimator", "TwoStageEstimator"),
+    "wearcap.systems.mocap_every.model": ("LastPoseEstimator", "MLPEstimator", "TwoStageEstimator"),
     "wearcap.systems.ireplica.training": ("ContactDetection",),
     "wearcap.systems.echo.training": ("EchoDiffusion",),
     "wearcap.systems.hmd2.egoview_training": ("EgoView",),

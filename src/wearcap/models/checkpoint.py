@@ -164,7 +164,8 @@ def load_network(path: str | Path, kind: type[Network], experiment: str, *, part
 
 
 def share_checkpoint(source: str | Path, target: str | Path, dtype: str = "float32") -> None:
-    """Write a shareable file of a checkpoint: averaged weights, statistics, the model's config, names of the data.
+    """Write a shareable file of a checkpoint: averaged weights, statistics, the model's config, names of the data, and
+    what the training took.
 
     Weights of two or more axes are stored as `dtype` (of `DTYPES`); biases, norms and statistics stay as they are.
     Folders of this machine are left out. Raises WearcapError for a source that `read_checkpoint` refuses, a target
@@ -184,7 +185,7 @@ def share_checkpoint(source: str | Path, target: str | Path, dtype: str = "float
             what = f"weight {name!r} is not finite as {str(value.dtype).removeprefix('torch.')}"
             fix = "Choose dtype=float32, or another checkpoint."
             raise WearcapError(what, where=source, expected="a trained model", fix=fix)
-    shared = {name: config[name] for name in ("name", "model") if name in config}
+    shared = {name: config[name] for name in ("name", "model", "training") if name in config}
     data = config.get("data") or {}
     for key in ("sources", "val_sources"):
         roots = {name: {"root": source["root"]} for name, source in (data.get(key) or {}).items() if source}

@@ -7,6 +7,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from wearcap.errors import require_choice
+
 
 class LevelEmbedding(nn.Module):
     """Sinusoids of a noise level in [0, 1], then a two-layer MLP."""
@@ -93,6 +95,45 @@ class AdaptiveBlock(nn.Module):
         shift_a, scale_a, gate_a, shift_m, scale_m, gate_m = plan.chunk(6, -1)
         x = x + gate_a * self.attention(self.norm_attention(x) * (1 + scale_a) + shift_a, mask)
         return x + gate_m * self.mlp(self.norm_mlp(x) * (1 + scale_m) + shift_m)
+
+
+class MixingBlock(nn.Module):
+    """A block of AGRoL's MLP (Du et al. 2023): a linear layer across the tokens, then one across the channels, each after
+    a layer norm and around a skip connection; the embedded level, if there is one, is added to the block's input."""
+
+    def __init__(self, width: int, max_tokens: int, has_level: bool = True):
+        super().__init__()
+        self.level = nn.Linear(width, width) if has_level else nn.Identity()
+        self.norm_tokens, self.norm_channels = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.tokens, self.channels = nn.Linear(max_tokens, max_tokens), nn.Linear(width, width)
+
+    def plan(self, level: Float[Tensor, "batch #token width"]) -> Float[Tensor, "batch #token width"]:
+        """What the noise level adds."""
+        return self.level(F.silu(level))
+
+    def forward(
+        self,
+        x: Float[Tensor, "batch token width"],
+        plan: Float[Tensor, "#batch #token width"],
+        mask: Bool[Tensor, "batch 1 token token"],
+    ) -> Float[Tensor, "batch token width"]:
+        count, x = x.shape[1], x + plan
+        # Padding is what not all tokens attend to; shorter windows use the first tokens' weights.
+        valid = mask[:, 0].all(1)[..., None].to(x.dtype)
+        mixed = self.tokens.weight[:count, :count] @ (self.norm_tokens(x) * valid) + self.tokens.bias[:count, None]
+        x = x + F.silu(mixed)
+        return x + F.silu(self.channels(self.norm_channels(x)))
+
+
+def denoiser_block(
+    mixing: str, width: int, heads: int, feedforward: int, max_tokens: int, dropout: float, streams: int = 1
+) -> AdaptiveBlock | MixingBlock:
+    """A block of a denoiser, whose tokens see each other by "attention", or in an "mlp" without `heads`, `feedforward`
+    and `dropout`. Raises WearcapError for other ways."""
+    require_choice(mixing, ("attention", "mlp"), f"a denoiser has no mixing {mixing!r}")
+    if mixing == "mlp":
+        return MixingBlock(width, max_tokens * streams)
+    return AdaptiveBlock(width, heads, feedforward, max_tokens, dropout, streams)
 
 
 class Normalizer(nn.Module):

@@ -6,6 +6,7 @@ import io
 import json
 import platform
 import subprocess
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -29,13 +30,41 @@ TRAINING_STATE = ("state_dict", "optimizer_states", "lr_schedulers", "loops", "e
 
 
 class ConfigInCheckpoint(Callback):
-    """Adds the composed config and the version to every checkpoint."""
+    """Adds the composed config, the version and what the training has taken so far to every checkpoint.
+
+    The config's entry "training" holds the number of trained "parameters" and of "steps", the "frames" of all windows
+    drawn (samples, where they have no time axis), the "seconds" of training without its validations, the "core_seconds"
+    of the process meanwhile, and the "machine". A resumed run adds to what its checkpoint records.
+    """
 
     def __init__(self, config: dict[str, Any]):
         self.config = config
+        self._taken = {"frames": 0, "seconds": 0.0, "core_seconds": 0.0}
+        self._clocks = _clocks()
+
+    def on_load_checkpoint(self, trainer, pl_module, checkpoint: dict[str, Any]) -> None:
+        before = json.loads(checkpoint.get("wearcap", {}).get("config", "{}")).get("training", {})
+        self._taken = {name: before.get(name, value) for name, value in self._taken.items()}
+
+    def on_train_start(self, trainer, pl_module) -> None:
+        self._clocks = _clocks()
+
+    def on_validation_start(self, trainer, pl_module) -> None:
+        for name, start, end in zip(("seconds", "core_seconds"), self._clocks, _clocks()):
+            self._taken[name] += end - start
+
+    def on_validation_end(self, trainer, pl_module) -> None:
+        self._clocks = _clocks()
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx: int) -> None:
+        frames = len(batch[0]) * getattr(trainer.datamodule.train, "window", 1)  # pyright: ignore[reportAttributeAccessIssue]
+        self._taken["frames"] += frames * trainer.world_size
 
     def on_save_checkpoint(self, trainer, pl_module, checkpoint: dict[str, Any]) -> None:
-        checkpoint["wearcap"] = {"version": wearcap.__version__, "config": json.dumps(self.config)}
+        parameters = sum(each.numel() for each in pl_module.parameters() if each.requires_grad)
+        training = {"parameters": parameters, "steps": trainer.global_step, **self._taken, "machine": machine()}
+        config = json.dumps(self.config | {"training": training})
+        checkpoint["wearcap"] = {"version": wearcap.__version__, "config": config}
 
 
 class RunCheckpointIO(CheckpointIO):
@@ -119,6 +148,17 @@ def resume_path(resume: str | None, own: Path, runs: Path) -> Path | None:
     return found[-1] if found else None
 
 
+def _clocks() -> tuple[float, float]:
+    """Seconds of a clock on the wall, and of this process on all cores."""
+    return time.perf_counter(), time.process_time()
+
+
+def machine() -> str:
+    """The machine that trains: its processor or GPU, and its threads."""
+    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
+    return f"{platform.machine()}, {torch.get_num_threads()} threads, {device}"
+
+
 def record_run(folder: Path, config_yaml: str) -> None:
     """Write the config, the git commit and the library versions into a run's folder."""
     command = ["git", "describe", "--always", "--dirty", "--abbrev=40"]
@@ -131,8 +171,7 @@ def record_run(folder: Path, config_yaml: str) -> None:
     record = {
         "commit": commit,
         "python": platform.python_version(),
-        "machine": f"{platform.machine()}, {torch.get_num_threads()} threads, "
-        + (torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"),
+        "machine": machine(),
         "versions": {name: importlib.metadata.version(name) for name in names},
     }
     write_text(folder / "config.yaml", config_yaml)

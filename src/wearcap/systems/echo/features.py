@@ -60,14 +60,20 @@ class EchoFeatures:
     """Number of joints of the skeleton."""
     fps: float = 30.0
     """Frame rate of the model (Hz)."""
+    points: tuple[str, ...] | list[str] = POINTS
+    """Tracked points that the condition has, the head first: all, or for a baseline the head alone."""
 
     def __post_init__(self):
         require_choice(self.frame, FRAMES, f"ECHO has no frame {self.frame!r}")
+        if tuple(self.points) not in (POINTS[:1], POINTS):
+            what = f"tracked points {', '.join(self.points) or '(none)'}"
+            raise WearcapError(what, expected=f"{', '.join(POINTS)}, or the head alone")
 
     @property
     def condition_size(self) -> int:
-        """Features per frame: 54 (ECHO), 2 of the heading if frame is "own", and the head's height and limb lengths."""
-        return 54 + (2 if self.frame == "own" else 0) + (1 + len(LIMBS) if self.body else 0)
+        """Features per frame: 18 for each point (ECHO: 54), 2 of the heading if frame is "own", and the head's height and
+        limb lengths."""
+        return 18 * len(self.points) + (2 if self.frame == "own" else 0) + (1 + len(LIMBS) if self.body else 0)
 
     @property
     def human_size(self) -> int:
@@ -113,8 +119,8 @@ class EchoFeatures:
 
         `frame`: the canonical frame of the points, if it was computed already.
         """
-        R, t = points
         frame = self.canonical(points) if frame is None else frame
+        R, t = (part[:, :, : len(self.points)] for part in points)
         R_canonical_world = frame.R.mT[:, :, None]
         turn = torch.cat([torch.eye(3).to(R).expand_as(R[:, :1]), R[:, :-1].mT @ R[:, 1:]], 1)
         step = t.diff(dim=1) * self.fps

@@ -9,13 +9,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from wearcap.models.layers import (
-    AdaptiveBlock,
     LevelEmbedding,
     MotionEncoder,
     Normalizer,
     TemporalBlend,
     Widening,
     attention_mask,
+    denoiser_block,
 )
 from wearcap.runtime.graphs import Call, Graph, LevelPlan, PlanGraph, StepGraph, chosen, run_of
 
@@ -53,8 +53,10 @@ class EchoDenoiser(nn.Module):
         streams: int = 1,
         context: int = 7,
         blend: int = 0,
+        mixing: str = "attention",
     ):
-        """`context`: frames before and after its own that the convolution over conditions sees."""
+        """`context`: frames before and after its own that the convolution over conditions sees. `mixing`: see
+        `denoiser_block`."""
         super().__init__()
         if streams not in (1, len(MODALITIES)):
             raise ValueError(f"{streams} streams, but there are {len(MODALITIES)} modalities")
@@ -71,7 +73,7 @@ class EchoDenoiser(nn.Module):
         self.levels = nn.ModuleList(LevelEmbedding(width) for _ in self.sizes)
         self.stream = nn.Parameter(0.02 * torch.randn(streams, width)) if streams > 1 else None
         self.blocks = nn.ModuleList(
-            AdaptiveBlock(width, heads, feedforward, window, dropout, streams) for _ in range(layers)
+            denoiser_block(mixing, width, heads, feedforward, window, dropout, streams) for _ in range(layers)
         )
         self.norm = nn.LayerNorm(width)
         self.heads = nn.ModuleList(nn.Linear(width, size) for size in self.sizes)

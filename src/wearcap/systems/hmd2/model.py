@@ -12,13 +12,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from wearcap.models.layers import (
-    AdaptiveBlock,
     LevelEmbedding,
     MotionEncoder,
     Normalizer,
     TemporalBlend,
     Widening,
     attention_mask,
+    denoiser_block,
 )
 from wearcap.runtime.graphs import Graph, LevelPlan, PlanGraph, StepGraph, chosen, run_of, undisturbed
 
@@ -109,8 +109,9 @@ class MotionDenoiser(nn.Module):
         points_size: int = 0,
         image_size: int = 0,
         self_conditioning: bool = False,
+        mixing: str = "attention",
     ):
-        """`points_size` and `image_size` 0 leave a modality out; else one network runs with and without it."""
+        """`mixing`: see `denoiser_block`. `points_size` and `image_size` 0 leave a modality out; else one network runs with and without it."""
         super().__init__()
         if window % frames_per_token:
             raise ValueError(f"a window of {window} frames does not split into tokens of {frames_per_token}")
@@ -125,7 +126,8 @@ class MotionDenoiser(nn.Module):
         self.motion_encoder = MotionEncoder(motion_size * (2 if self_conditioning else 1), width, frames_per_token)
         self.level = LevelEmbedding(width)
         self.blocks = nn.ModuleList(
-            AdaptiveBlock(width, heads, feedforward, window // frames_per_token, dropout) for _ in range(layers)
+            denoiser_block(mixing, width, heads, feedforward, window // frames_per_token, dropout)
+            for _ in range(layers)
         )
         self.norm = nn.LayerNorm(width)
         self.head = nn.Linear(width, frames_per_token * motion_size)

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from wearcap.body.skeleton import FEET
-from wearcap.models.layers import Normalizer, TemporalBlend
+from wearcap.models.layers import MixingBlock, Normalizer, TemporalBlend, attention_mask
 from wearcap.models.pose_regressor import PoseRegressor
 from wearcap.runtime.graphs import Graph
 
@@ -152,7 +152,30 @@ class LastPoseEstimator(WatchEstimator):
         return Estimate(self.motion_normalizer.inverse(output[..., :-FEET]), output[..., -FEET:], None)
 
 
-TrainedEstimator = TwoStageEstimator | LastPoseEstimator
+class MLPEstimator(WatchEstimator):
+    """Baseline after AGRoL's network without its diffusion (Du et al. 2023): one MLP predicts all frames of a window."""
+
+    def __init__(self, feature_size: int, motion_size: int, window: int, width: int, layers: int):
+        super().__init__()
+        self.window = window
+        self.feature_normalizer, self.motion_normalizer = Normalizer(feature_size), Normalizer(motion_size)
+        self.ends_normalizer = Normalizer(ENDS_SIZE)
+        self.embed = nn.Linear(feature_size, width)
+        self.blocks = nn.ModuleList(MixingBlock(width, window, has_level=False) for _ in range(layers))
+        self.head = nn.Linear(width, motion_size + FEET)
+
+    def forward(self, features: Float[Tensor, "batch window feature"]) -> Estimate:
+        """Predict every frame of the window from raw features."""
+        x = self.embed(self.feature_normalizer(features))
+        no_level = torch.zeros_like(x[:1, :1])
+        mask = attention_mask(torch.ones(x.shape[:2], dtype=torch.bool, device=x.device))
+        for block in self.blocks:
+            x = block(x, no_level, mask)
+        motion, logit = self.head(x).split([len(self.motion_normalizer.mean), FEET], -1)
+        return Estimate(self.motion_normalizer.inverse(motion), logit, None)
+
+
+TrainedEstimator = TwoStageEstimator | LastPoseEstimator | MLPEstimator
 
 
 class _EstimatorOutput(nn.Module):
