@@ -175,8 +175,12 @@ def origin(about: Mapping[str, Any], spread: str = "") -> str:
 
 
 def markdown(grid: Grid) -> str:
+    """A table without the columns in which no row has anything."""
+    columns = range(len(grid.columns))
+    kept = [k for k in columns if k == 0 or any(k < len(row) and row[k] not in ("", NONE) for row in grid.rows)]
     rule = ["---", *["---:"] * (len(grid.columns) - 1)]
-    return "\n".join("| " + " | ".join(line) + " |" for line in (list(grid.columns), rule, *grid.rows))
+    lines = [[line[k] if k < len(line) else "" for k in kept] for line in (grid.columns, rule, *grid.rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def results(system: str, systems: Iterable[str], folder: Path = RESULTS) -> Trees:

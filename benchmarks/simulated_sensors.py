@@ -28,6 +28,7 @@ from wearcap.sensors.clock import mutual_pairs
 from wearcap.sensors.imu import GRAVITY, ImuNoise, synthesize_imu
 from wearcap.sensors.simulated import SlamNoise, head_stream
 from wearcap.sensors.suit import SUITS, SuitNoise, suit_motion
+from wearcap.sensors.wearables import WEARABLES
 from wearcap.simulation.recordings.hps import HpsConfig, Simulated, simulate_hps
 from wearcap.simulation.recordings.interaction_session import flat_of
 from wearcap.simulation.recordings.localization_noise import LocalizationNoise, by_gravity, localize_statistically
@@ -65,9 +66,9 @@ SQUARED = (
 )
 
 
-WATCHES = {"typical": ImuNoise()}
+WATCHES = {name: noise.watches for name, noise in WEARABLES.items()}
 """Watches by name."""
-HEADS = {"typical": SlamNoise()}
+HEADS = {name: noise.head for name, noise in WEARABLES.items()}
 """Head trackers by name."""
 
 

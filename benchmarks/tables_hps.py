@@ -6,6 +6,7 @@ Sessions, scans and the rig's clouds are kept in OUTPUT/hps/cache, pictures go t
 import argparse
 import json
 import math
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -127,8 +128,6 @@ HEADLINE = (
 def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     """What docs/results/hps.md says."""
     typical = trees["hps"]
-    sessions = typical["whole"]["ours"]["mpjpe_cm"]["seeds"]
-    spread = f"{sessions} sessions" if sessions > 1 else "one session"
     whole = {row: [tree["whole"][row]["mpjpe_cm"] for tree in trees.values()] for row in ("IMU", "HPS", "ours")}
     seconds = sum(stage["mean"] for stage in typical["stage_seconds"].get("ours", {}).values())
     end, all_of_it = typical["places"][-1], figure_of(speed, "hps_end_to_end_realtime")
@@ -137,7 +136,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         title="[HPS](../hps.md): figures",
         headline=Grid(
             f"Whole sessions in the world, and the Chamfer distance to depth cameras' clouds after {end}; means over "
-            f"{spread}, ± their deviation (cm).",
+            f"sessions, ± their deviation (cm).",
             (
                 "",
                 "joints",
@@ -160,7 +159,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         "statistics here; finding real photographs in a map is a test of its own (`make test-real`). The paper's row "
         "is from its own recordings: no comparison, but for the order of its rows.",
         limits=_limits(typical),
-        full=[grid_of(table, tree["about"], spread) for tree in trees.values() for table in _all_tables(tree)],
+        full=[grid for tree in trees.values() for grid in _grids(tree)],
         measured=f"joints {ranged(whole['ours'])} cm off over {end} and more, {_presets(trees)} (as published "
         f"{ranged(whole['HPS'])}; suit alone: {ranged(whole['IMU'], 0)})",
         speed=f"{typical['frames']['mean'] / 30 / seconds:.0f} × real time, localised cameras given{whole_way}"
@@ -183,8 +182,16 @@ CLOCKS = {
 
 
 def _presets(trees: Trees) -> str:
-    names = [tree["sensors"] for tree in trees.values()]
-    return f"with {names[0]} sensors" if len(names) == 1 else "with ideal to poor sensors"
+    names = [name for name in SUITS if name in {tree["sensors"] for tree in trees.values()}]
+    return f"with {names[0]} sensors" if len(names) == 1 else f"with {names[0]} to {names[-1]} sensors"
+
+
+def _grids(tree: Tree) -> list[Grid]:
+    """All tables of a preset."""
+    sessions = tree["whole"]["ours"]["mpjpe_cm"]["seeds"]
+    spread = f"{sessions} sessions" if sessions > 1 else "one session"
+    grids = [grid_of(table, tree["about"], spread) for table in _all_tables(tree)]
+    return [replace(grid, title=f"{tree['sensors']} sensors: {grid.title}") for grid in grids]
 
 
 def _headline(tree: Tree, row: str) -> list[str]:

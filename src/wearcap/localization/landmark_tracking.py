@@ -224,7 +224,7 @@ class LandmarkTracker:
 
 
 def track_video(
-    frames: Iterable[UInt8[np.ndarray, "height width 3"]],
+    frames: Iterable[UInt8[np.ndarray, "_ _ 3"]],
     timestamps: Float64[Tensor, "time"],
     camera: Camera | None,
     localizer: Localizer,
@@ -270,7 +270,7 @@ class _Frame:
 
 
 def _read_ahead(
-    frames: Iterable[UInt8[np.ndarray, "height width 3"]],
+    frames: Iterable[UInt8[np.ndarray, "_ _ 3"]],
     times: list[float],
     camera: Camera | None,
     localizer: Localizer,

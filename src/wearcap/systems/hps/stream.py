@@ -279,8 +279,8 @@ class HpsStream:
         first = int(torch.searchsorted(times, after - settings.behind_s)) if self.done is not None else 0
         recording = replace(self.about, suit=self.suit, localization=self.seen)
         data = self.hps.problem(recording, aligned, start, self.scan, self.R_head_cam)[first:]
-        if self.done is not None:
-            count = int((times[first:] <= self.done.timestamps[-1] + 0.5 / fps).sum())
+        count = int((times[first:] <= after + 0.5 / fps).sum())
+        if self.done is not None and count:
             data = self._tied(data, self.done.sliced(len(self.done) - count, len(self.done)))
         solution = self.hps.optimize(data)
         part = replace(start, motion=start.motion.sliced(first, len(times)))

@@ -141,7 +141,7 @@ class IReplicaValidation(Callback):
                 environment = read_environment(pipeline.environment_file(source))
                 assert recording.suit is not None
                 placed = pipeline.placed(environment, source)
-                captured = pipeline.interact(motion, pipeline.contacts(recording.suit), placed)
+                captured = pipeline.interact(motion, pipeline.contacts(recording), placed)
                 rows += score_interactions(captured, recording, environment).handlings
         pl_module.train(training)
         for name, value in summary(rows).items() if rows else ():
