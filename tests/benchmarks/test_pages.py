@@ -50,7 +50,7 @@ def test_a_page_has_its_sections_in_order_and_folds_the_full_tables():
     assert headings == ["# A system", "## Held out", "## Simulated", "## Limits", "## Speed", "## All tables"]
     assert "| row 1 | 1.00 |" in shown.split("## Held out")[0]
     assert "- One.\n- Two." in shown
-    assert "| `fast_fps` | everything; poses given | 90.4 | 30.0 | 3.01 | – | frames/s | 2026-11-01 |" in shown
+    assert "| `fast_fps` | everything; poses given | 90.4 | 30.0 | 3.01 | frames/s | 2026-11-01 |" in shown
     assert "slow_fps" not in shown
     folded = re.search(r"<details><summary>(.*?)</summary>\n\n(.*?)\n\n(\| .*)</details>", shown, re.DOTALL)
     assert folded is not None
