@@ -41,7 +41,7 @@ def dataset(split: str = "test", end_m: float = 30.0) -> tuple[Recording, Path]:
     """A recording with its video, scan and map, and their folder; made where it is missing."""
     folder = FOLDER / split
     settings = [f"recordings={{{split}: 1}}", "returns_m=[]", f"end_m={end_m}", "video_s=null", "video_fps=30"]
-    settings += ["photo_m=3", "localization=ideal", f"output={folder}"]
+    settings += ["photo_m=3", "camera_errors=ideal", f"output={folder}"]
     config = compose("prepare", ["prepare=simulated_hps", "preset=quick", *settings])
     tasks = instantiate(config.tasks, _convert_="all", _partial_=True)(splits=Splits.read(splits_dir() / config.splits))
     report = prepare(tasks, folder, jobs=1)
