@@ -297,15 +297,15 @@ def environment_errors(number: int, errors: EnvironmentErrors, rng: np.random.Ge
     """Of every object of a flat."""
     true = flat_of("test", number).environment
     found = []
-    for item, said in zip(true.objects, as_measured(true, errors, rng).objects):
-        turned = rotation.geodesic(said.R_world_object[None].double(), item.R_world_object[None].double())
-        middle = [torch.from_numpy(each.box_world.mean(0)) for each in (item, said)]
+    for item, measured in zip(true.objects, as_measured(true, errors, rng).objects):
+        turned = rotation.geodesic(measured.R_world_object[None].double(), item.R_world_object[None].double())
+        middle = [torch.from_numpy(each.box_world.mean(0)) for each in (item, measured)]
         values = {
             "placement_cm": 100 * (middle[1] - middle[0])[:2].norm().item(),
             "placement_deg": math.degrees(turned.item()),
         }
-        if item.freedom.pivot is not None and said.freedom.pivot is not None:
-            off = torch.tensor(said.freedom.pivot) - torch.tensor(item.freedom.pivot)
+        if item.freedom.pivot is not None and measured.freedom.pivot is not None:
+            off = torch.tensor(measured.freedom.pivot) - torch.tensor(item.freedom.pivot)
             values["hinge_cm"] = 100 * off[:2].norm().item()
         found.append(values)
     return found

@@ -180,7 +180,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         held_out="People, flats and objects are those of the test split; networks were trained on the training "
         "split, and all settings were chosen on the validation split.",
         simulated="All of it: people, flats, objects, suits and localisation (`typical`), and environments as people "
-        "measure them, with objects and hinges away from where they are said to be; sizes beside the literature's in "
+        "measure them, with objects and hinges away from their true places; sizes beside the literature's in "
         "[simulation](simulation.md). Every row captures the same motion.",
         limits=_limits(tree),
         full=[grid_of(table, about, spread) for table in shown],
