@@ -2,11 +2,10 @@
 initialisation, the suit's pose moved to the camera's path (§4.2.5, eq. 4.13).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import roma
-import scipy.signal
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
@@ -17,23 +16,13 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, nearest_frames, outlier_mask, resample
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Localization
+from wearcap.sensors.path_fusion import CameraSamples, DriftPrior, fuse_paths
 
 MAX_SPEED = 3.0
 """m/s between localised positions beyond which one of them is wrong (thesis §4.2.5)."""
-YAWS, BRIDGES = ("tangent", "orientation"), ("line", "suit")
-ANGLE_SCALE, DISTANCE_SCALE = 0.1, 0.15
-"""Robust scales (rad, m) of the smoothing residuals."""
+PATHS = ("tangent", "fused")
 TILT_SCALE = 0.05
 """Robust scale (rad) of the direction of gravity."""
-HEADING_WALK = np.deg2rad(3.0) / np.sqrt(60)
-"""Deviation (rad/√s) of the random walk of a suit's heading, by which its path bends where the camera is lost."""
-GAP_YAW, GAP_SCALE, GAP_END_M = np.deg2rad(0.5), 0.004, 0.03
-"""Deviations, at a gap's ends, of the heading (rad) and of the displacement (m); of the suit's distances within it."""
-GAP_S, NODE_S, MOST_SPREADS = 2.0, 0.5, 4.0
-"""Shortest gap (s) over which the path is bent, spacing (s) of the angles within it, and largest plausible miss of its
-end, in deviations."""
-PATH_SPAN_S = 1.0
-"""Duration (s) of the displacements, a metre or more: 5 cm of noise turn one by 4°, a hundred by 0.4°."""
 
 
 def align_suit(
@@ -182,30 +171,21 @@ def body_camera(motion: Motion, t_head_cam: Float[Tensor, "3"]) -> Float[Tensor,
 class InitializationSettings:
     """Settings of the initialisation; the thesis's values are marked."""
 
-    yaw: str = "orientation"
-    """"tangent": each frame's own direction of travel (thesis eq. 4.13). "orientation" (ours): the camera's
-    orientation against the suit's head, smoothed, which also gives the heading of a standing wearer."""
-    bridge: str = "suit"
-    """Gaps without localisation: "line", straight to the next position (the thesis), or (ours) "suit": the suit's
-    displacement, with the error at the far end spread over the gap."""
+    path: str = "fused"
+    """"tangent": the camera's positions, a straight line where there is none, and each frame's heading by its direction
+    of travel (thesis eq. 4.13). "fused" (ours): path and heading that suit, positions and orientations tell together,
+    also of a standing wearer and where the camera is lost (`fuse_paths`)."""
     tangent_s: float = 1 / 3
     """Time span of a tangent (thesis: 10 frames at 30 Hz)."""
     min_speed: float = 0.3
     """m/s over a tangent; slower frames are stationary."""
-    yaw_smoothing_s: float = 30.0
+    drift: DriftPrior = field(default_factory=DriftPrior)
     tilt: bool = True
     """Whether the suit's motion is tilted to gravity's direction in the map (ours)."""
-    path_smoothing_s: float = 1.0
-    """Standard deviation (as for yaw) of the smoothing of the difference between camera and suit path, for
-    bridge="suit" only; 0: none (thesis)."""
 
     def __post_init__(self):
-        for name, value, choices in (("yaw", self.yaw, YAWS), ("bridge", self.bridge, BRIDGES)):
-            if value not in choices:
-                raise WearcapError(f"{name}={value!r}", expected=f"one of {', '.join(choices)}")
-        if self.bridge == "line" and self.path_smoothing_s:
-            expected = "path_smoothing_s=0: smoothing applies to the difference from the suit's path"
-            raise WearcapError(f"bridge='line' with path_smoothing_s={self.path_smoothing_s:g}", expected=expected)
+        if self.path not in PATHS:
+            raise WearcapError(f"path={self.path!r}", expected=f"one of {', '.join(PATHS)}")
 
 
 @dataclass(frozen=True)
@@ -217,6 +197,9 @@ class Initialization:
     """Frames of the motion with an inlier camera position within a localisation step."""
     yaw_correction: Float[Tensor, "time"]
     """Angle (rad) about gravity by which each frame's root was turned."""
+    root_step: Float[Tensor, "pair 3"]
+    """Displacement of the root (m, scene) from each frame to the next: the suit's, turned by its frames' heading, or the
+    fused path's."""
 
 
 def initialize(
@@ -228,9 +211,9 @@ def initialize(
 ) -> Initialization:
     """Turn the aligned suit's root to the camera's heading and translate it so that its worn camera is at the camera's.
 
-    With "orientation" a yaw error of R_head_cam is estimated from the paths and corrected, so that
-    `estimate_head_camera` with the returned motion's head gives a better R_head_cam.
-    Outliers at 3 m/s are removed to convergence. Raises WearcapError when no frame is localised in the suit's time.
+    "fused" also corrects a yaw error of R_head_cam, so that `estimate_head_camera` with the returned motion's head gives a
+    better R_head_cam. Outliers at 3 m/s are removed to convergence. Raises WearcapError when no frame is localised in the
+    suit's time.
     """
     settings, suit, seen = settings or InitializationSettings(), suit_aligned, inliers(localization)
     seen &= (localization.timestamps >= suit.timestamps[0]) & (localization.timestamps <= suit.timestamps[-1])
@@ -242,128 +225,56 @@ def initialize(
     step = (localization.timestamps if len(seen) > 1 else suit.timestamps).diff().median().item()
     valid = (times[nearest_frames(times, suit.timestamps)] - suit.timestamps).abs() <= 1.5 * step
     body = body_camera(suit, t_head_cam)
-    camera = _interpolated(suit.timestamps, times, localization.t_world_cam[seen])
-    paths = _Paths(suit.timestamps, body.double(), camera, valid)
-    if settings.yaw == "tangent":
-        yaw = _tangent_yaw(paths, settings)
+    if settings.path == "tangent":
+        camera = _interpolated(suit.timestamps, times, localization.t_world_cam[seen])
+        yaw = _tangent_yaw(suit.timestamps, body.double(), camera, valid, settings)
     else:
-        # Angle about gravity from the suit's head to the head implied by the camera's orientation, robustly smoothed
-        head = suit.joint("head")
-        R_world_head = resample(Trajectory(suit.timestamps, head.R, head.t), times).R_world_body
-        angle, certainty = yaw_between(R_world_head, localization.R_world_cam[seen].to(head.R.dtype) @ R_head_cam.mT)
-        weight = (localization.confidence[seen] * certainty).double()
-        pointer = torch.stack([angle.cos(), angle.sin()], -1).double()
-        smooth = _robust_smooth(times, pointer, weight, settings.yaw_smoothing_s, ANGLE_SCALE)
-        frames = torch.from_numpy(np.unwrap(torch.atan2(smooth[:, 1], smooth[:, 0]).numpy()))
-        yaw = _interpolated(suit.timestamps, times, frames[:, None])[:, 0]
-        # Alignment with a nominal mount inherits the mount's yaw error; walking reveals it: the constant angle by which
-        # the suit's path, turned by `yaw`, still differs from the camera's.
-        body_step, camera_step, moving = paths.steps(PATH_SPAN_S, settings.min_speed)
-        turned = body_step * torch.polar(torch.ones_like(yaw), yaw)
-        product = (camera_step * turned.conj())[moving]
-        if len(product):
-            yaw = yaw + _robust_angle(product.angle(), product.abs(), scale_rad=ANGLE_SCALE).double()
-    if settings.bridge == "suit":
-        yaw = yaw + _bend(paths, yaw, settings.path_smoothing_s)
-        camera = _bridged(paths, yaw, settings)
+        samples = _samples(suit, localization, seen, R_head_cam)
+        yaw, camera = fuse_paths(suit.timestamps, body.double(), samples, settings.drift)
     turn = rotation.about_axis("z", yaw).to(body.dtype)
     R = suit.R_parent_joint.clone()
     R[:, 0] = turn @ R[:, 0]
     root = camera.to(body.dtype) - (turn @ (body - suit.t_world_root)[..., None])[..., 0]
-    return Initialization(replace(suit, R_parent_joint=R, t_world_root=root), valid, yaw.to(body.dtype))
+    step = root.diff(dim=0)
+    if settings.path == "tangent":
+        heading = rotation.about_axis("z", yaw[:-1] + rotation.wrap_angle(yaw.diff()) / 2).to(body.dtype)
+        step = (heading @ suit.t_world_root.diff(dim=0)[..., None])[..., 0]
+    return Initialization(replace(suit, R_parent_joint=R, t_world_root=root), valid, yaw.to(body.dtype), step)
 
 
-@dataclass(frozen=True)
-class _Paths:
-    """Paths of the head camera by the suit and by localisation, at the suit's timestamps."""
-
-    timestamps: Float64[Tensor, "time"]
-    body: Float64[Tensor, "time 3"]
-    camera: Float64[Tensor, "time 3"]
-    valid: Bool[Tensor, "time"]
-
-    def steps(self, span_s: float, min_speed: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Horizontal displacements during the next `span_s` by suit and camera (complex, m), and where they are valid
-        from start to end and faster than `min_speed` (m/s)."""
-        ahead = torch.searchsorted(self.timestamps, self.timestamps + span_s - 1e-6).clamp(max=len(self.timestamps) - 1)
-        body, camera = (torch.view_as_complex((p[ahead] - p)[:, :2].contiguous()) for p in (self.body, self.camera))
-        lost = torch.cat([self.valid.new_zeros(1), ~self.valid]).cumsum(0)
-        whole = (lost[ahead + 1] == lost[:-1]) & (self.timestamps[ahead] - self.timestamps > 0.9 * span_s)
-        least = min_speed * span_s
-        return body, camera, whole & (body.abs() > least) & (camera.abs() > least)
+def _samples(
+    suit: Motion, localization: Localization, seen: Bool[Tensor, "time"], R_head_cam: Float[Tensor, "3 3"]
+) -> CameraSamples:
+    """Positions and headings of the localised frames that are `seen`."""
+    times, head = localization.timestamps[seen], suit.joint("head")
+    R_world_head = resample(Trajectory(suit.timestamps, head.R, head.t), times).R_world_body
+    yaw, certainty = yaw_between(R_world_head, localization.R_world_cam[seen].to(head.R.dtype) @ R_head_cam.mT)
+    confidence = localization.confidence[seen].double()
+    position = localization.t_world_cam[seen].double()
+    return CameraSamples(times, position, yaw.double(), confidence, confidence * certainty.double())
 
 
-def _tangent_yaw(paths: _Paths, settings: InitializationSettings) -> Float64[Tensor, "time"]:
+def _tangent_yaw(
+    timestamps: Float64[Tensor, "time"],
+    body: Float64[Tensor, "time 3"],
+    camera: Float64[Tensor, "time 3"],
+    valid: Bool[Tensor, "time"],
+    settings: InitializationSettings,
+) -> Float64[Tensor, "time"]:
     """Angle from the suit's to the camera's direction of travel (thesis eq. 4.13; the angle itself, where the printed
     exp(v × v) turns by its sine). Frames that stand or are lost take the last moving one's, the first ones the first's.
     """
-    body, camera, moving = paths.steps(settings.tangent_s, settings.min_speed)
+    span_s, least_m = settings.tangent_s, settings.min_speed * settings.tangent_s
+    ahead = torch.searchsorted(timestamps, timestamps + span_s - 1e-6).clamp(max=len(timestamps) - 1)
+    by_suit, by_camera = (torch.view_as_complex((p[ahead] - p)[:, :2].contiguous()) for p in (body, camera))
+    lost = torch.cat([valid.new_zeros(1), ~valid]).cumsum(0)
+    moving = (lost[ahead + 1] == lost[:-1]) & (timestamps[ahead] - timestamps > 0.9 * span_s)
+    moving &= (by_suit.abs() > least_m) & (by_camera.abs() > least_m)
     if not moving.any():
         return torch.zeros(len(body), dtype=torch.float64)
     frame = torch.where(moving, torch.arange(len(body)), -1).cummax(0).values
     frame = torch.where(frame < 0, moving.nonzero()[0], frame)
-    return (camera * body.conj()).angle()[frame]
-
-
-def _bend(paths: _Paths, yaw: Float64[Tensor, "time"], smoothing_s: float) -> Float64[Tensor, "time"]:
-    """Angle (rad) by which the suit's heading most likely drifted further within each gap, so that its path, which is
-    bent by it, arrives where the camera is found again; 0 outside gaps.
-
-    The drift y is a random walk that is known at both ends to `GAP_YAW`. Of all drifts that lead to the displacement d
-    by which the suit misses the gap's end, the expected one is linear in it: cov(y, d) cov(d)⁻¹ d. A displacement
-    beyond `MOST_SPREADS` deviations has another cause.
-    """
-    times, apart = _apart(paths, _turned(paths, yaw), smoothing_s)
-    bend = torch.zeros_like(yaw)
-    edge = torch.cat([paths.valid.new_ones(1), paths.valid, paths.valid.new_ones(1)]).int().diff()
-    for first, stop in zip((edge == -1).nonzero()[:, 0].tolist(), (edge == 1).nonzero()[:, 0].tolist()):
-        if first == 0 or stop == len(yaw):
-            continue
-        span = (paths.timestamps[stop] - paths.timestamps[first]).item()
-        if span < GAP_S:
-            continue
-        after = torch.searchsorted(times, paths.timestamps[stop])
-        missed = (apart[after] - apart[after - 1])[:2]
-        nodes = torch.linspace(0.0, span, round(span / NODE_S) + 1, dtype=yaw.dtype)
-        at = torch.searchsorted(paths.timestamps, paths.timestamps[first] + nodes).clamp(max=len(yaw) - 1)
-        step = _turned(paths, yaw)[at, :2].diff(dim=0)
-        middle = (nodes[1:] + nodes[:-1]) / 2
-        bridge = torch.minimum(middle[:, None], middle) - middle[:, None] * middle / span
-        covariance = HEADING_WALK**2 * bridge + GAP_YAW**2
-        side = torch.stack([-step[:, 1], step[:, 0]], 1)
-        along = covariance @ side
-        whole = step.sum(0)
-        spread = side.T @ along + GAP_SCALE**2 * whole[:, None] * whole + GAP_END_M**2 * torch.eye(2, dtype=yaw.dtype)
-        pull = torch.linalg.solve(spread, missed)
-        if missed @ pull > MOST_SPREADS**2:
-            continue
-        drift = along @ pull
-        inside = slice(first, stop)
-        bend[inside] = _interpolated(paths.timestamps[inside] - paths.timestamps[first], middle, drift[:, None])[:, 0]
-    return bend
-
-
-def _turned(paths: _Paths, yaw: Float64[Tensor, "time"]) -> Float64[Tensor, "time 3"]:
-    """The suit's path from the origin, turned step by step."""
-    turn = rotation.about_axis("z", (yaw[1:] + yaw[:-1]) / 2)
-    steps = (turn @ paths.body.diff(dim=0)[..., None])[..., 0]
-    return torch.cat([torch.zeros(1, 3, dtype=steps.dtype), steps.cumsum(0)])
-
-
-def _bridged(paths: _Paths, yaw: Tensor, settings: InitializationSettings) -> Float64[Tensor, "time 3"]:
-    """The suit's path, turned step by step, plus the camera's difference from it, interpolated over gaps."""
-    suit_path = _turned(paths, yaw)
-    times, apart = _apart(paths, suit_path, settings.path_smoothing_s)
-    return suit_path + _interpolated(paths.timestamps, times, apart)
-
-
-def _apart(paths: _Paths, suit_path: Float64[Tensor, "time 3"], smoothing_s: float) -> tuple[Tensor, Tensor]:
-    """Times of the valid frames and the camera's difference (m) from the suit's path there, smoothed."""
-    times, apart = paths.timestamps[paths.valid], (paths.camera - suit_path)[paths.valid]
-    if smoothing_s:
-        ones = torch.ones(len(times), dtype=torch.float64)
-        apart = _robust_smooth(times, apart, ones, smoothing_s, DISTANCE_SCALE)
-    return times, apart
+    return (by_camera * by_suit.conj()).angle()[frame]
 
 
 def _interpolated(
@@ -372,26 +283,3 @@ def _interpolated(
     """Linear interpolation; the end samples are repeated outside."""
     columns = [np.interp(at.numpy(), times.numpy(), column) for column in value.double().numpy().T]
     return torch.from_numpy(np.stack(columns, -1))
-
-
-def _robust_smooth(
-    times: Float64[Tensor, "sample"],
-    value: Float64[Tensor, "sample axis"],
-    weight: Float64[Tensor, "sample"],
-    sigma_s: float,
-    scale: float,
-) -> Float64[Tensor, "sample axis"]:
-    """Gaussian mean over time, reweighted so that samples `scale` away count a quarter and far ones hardly."""
-    step = times.diff().median().item() if len(times) > 1 else 1.0
-    cell = ((times - times[0]) / step).round().long()
-    columns, w = value.numpy(), weight.numpy()
-    reach = int(4 * sigma_s / step) + 1
-    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1)[:, None] * step / sigma_s) ** 2)
-    for _ in range(6):
-        grid = np.zeros((int(cell[-1]) + 1, columns.shape[1] + 1))
-        np.add.at(grid, cell.numpy(), np.column_stack([w[:, None] * columns, w]))
-        grid = scipy.signal.fftconvolve(grid, kernel, mode="same", axes=0)[cell.numpy()]
-        smooth = grid[:, :-1] / grid[:, -1:]
-        off = np.linalg.norm(columns - smooth, axis=1)
-        w = weight.numpy() / (1 + (off / scale) ** 2) ** 2
-    return torch.from_numpy(smooth)

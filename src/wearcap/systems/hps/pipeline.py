@@ -189,8 +189,6 @@ class HPS(StagedSystem):
         if not self.evidence.confident:
             sure = (sure > 0).double()
         body = anny_body(motion.skeleton, recording.shape or None)
-        yaw = start.yaw_correction.double()
-        heading = rotation.about_axis("z", yaw[:-1] + rotation.wrap_angle(yaw.diff()) / 2)
         if aligned.contact_prob is None or len(aligned.contact_prob) != len(aligned):
             count = "no" if aligned.contact_prob is None else f"{len(aligned.contact_prob)} frames of"
             what = f"{count} foot contacts for {len(aligned)} frames of the suit's pose"
@@ -208,9 +206,7 @@ class HPS(StagedSystem):
             sure,
             sure * start.valid if self.evidence.confident else torch.ones_like(sure),
             contact.double(),
-            SuitSteps(
-                (heading @ aligned.t_world_root.double().diff(dim=0)[..., None])[..., 0], turns(root), turns(head)
-            ),
+            SuitSteps(start.root_step.double(), turns(root), turns(head)),
             scan.surface if scan else None,
         )
 

@@ -342,7 +342,7 @@ class HpsStream:
             move = self.done.t_world_root[-1] - carried.t_world_root[at]
             carried = replace(carried, t_world_root=carried.t_world_root + move)
         lost = torch.zeros(len(aligned), dtype=torch.bool)
-        return Initialization(carried, lost, self.yaw.expand(len(aligned)))
+        return Initialization(carried, lost, self.yaw.expand(len(aligned)), carried.t_world_root.diff(dim=0))
 
     def _forget(self, before_s: float) -> None:
         """Drop frames that no later window needs."""
