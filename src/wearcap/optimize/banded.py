@@ -135,7 +135,8 @@ class Stretch:
         length, n = len(data), LEGS + 3 * self.body.leg_chains.size
         pairs, leg = max(length - 1, 0), 6 + 3 * self.body.leg_chains.shape[1]
         every = len(joints) + 1
-        shapes = ((every, 3, 3), (every, 3), (every, 3, 3), (len(self.body.patch), 3), (2, 12, leg))
+        shapes = ((every, 3, 3), (every, 3), (every, 3, 3), (len(self.body.patch), 3))
+        shapes += (len(self.body.patch), 2, 3), (2, 12, leg)
         self.kin = Kinematics(*(np.empty((length, *shape)) for shape in shapes))
         small, feet = ((length, 3), (pairs, 3, 3, 3), (length, 3, 3)), ((length, 2, 12, 12), (pairs, 2, 12, 12))
         self.forms = Forms(*(np.empty(shape) for shape in (*small, *feet, (length, 2, 12), length, pairs)))
