@@ -41,6 +41,8 @@ class Body(NamedTuple):
     """(vertex, 2, 3) patch vertices in the axes of their leg's last two joints (m)."""
     shares: np.ndarray
     """(vertex, 2) skinning weights of these two joints."""
+    moments: np.ndarray
+    """(vertex, 64) products s s' (1, x, y, x yᵀ) of a vertex's weights and arms for each pair of the two joints."""
     patch: np.ndarray
 
 
@@ -66,9 +68,12 @@ class Forms(NamedTuple):
     """(pair, 3, 3, 3) couplings with the next frame, whose variables are the rows."""
     small_gradient: np.ndarray
     foot: np.ndarray
-    """(time, 2, 12, 12) forms of the foot twists, lower triangles."""
-    foot_step: np.ndarray
+    """(time, 2, 12, 12) forms of the foot twists by terms along a normal, lower triangles."""
     foot_gradient: np.ndarray
+    moments: np.ndarray
+    """(time, 2, 64) weighted sums of the vertices' moments by terms in all directions, of which `_add_form` makes forms."""
+    moments_step: np.ndarray
+    """(pair, 2, 64) the same for the coupling with the next frame."""
     pose: np.ndarray
     """(time) weights of the pose prior."""
     pose_step: np.ndarray
@@ -206,45 +211,46 @@ def _patch_points(R, c, leg_chains, arms, shares, patch, points, levers):
 
 
 @compiled
-def _add_moments(M, weight, shares, x, y):
-    """Add a vertex to the moments (2, 2, 16) of a form between its twists with levers x and levers y, of which
-    `_add_form` makes the form: w s s' of (1, x, y, x yᵀ) for each pair of the leg's last two joints."""
+def _add_form(Q, moments, R, S, sign):
+    """Add ±Σ w A Bᵀ of vertices to a form (12, 12) of the twists (v, ω) of a leg's last two joints, with rotations R
+    in the rows' frame and S in the columns' frame.
+
+    A vertex with levers x and y (world axes) moves by v + ω × x, so its blocks are I, -[y], [x] and (x · y) I - y xᵀ,
+    with [x] p = x × p.
+    """
+    x, y, half, xy = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     for a in range(2):
         for b in range(2):
-            w = weight * shares[a] * shares[b]
-            if w == 0.0:
+            first, v, u = 16 * (2 * a + b), 6 * a, 6 * b
+            m = moments[first : first + 16]
+            if m[0] == 0.0:
                 continue
-            m = M[a, b]
-            m[0] += w
             for i in range(3):
-                m[1 + i] += w * x[a, i]
-                m[4 + i] += w * y[b, i]
+                x[i] = sign * (R[a, i, 0] * m[1] + R[a, i, 1] * m[2] + R[a, i, 2] * m[3])
+                y[i] = sign * (S[b, i, 0] * m[4] + S[b, i, 1] * m[5] + S[b, i, 2] * m[6])
                 for k in range(3):
-                    m[7 + 3 * i + k] += w * x[a, i] * y[b, k]
+                    half[i, k] = R[a, i, 0] * m[7 + k] + R[a, i, 1] * m[10 + k] + R[a, i, 2] * m[13 + k]
+            for i in range(3):
+                for k in range(3):
+                    xy[i, k] = sign * (half[i, 0] * S[b, k, 0] + half[i, 1] * S[b, k, 1] + half[i, 2] * S[b, k, 2])
+            dot = xy[0, 0] + xy[1, 1] + xy[2, 2]
+            for i in range(3):
+                Q[v + i, u + i] += sign * m[0]
+                Q[v + 3 + i, u + 3 + i] += dot
+                for k in range(3):
+                    Q[v + 3 + i, u + 3 + k] -= xy[k, i]
+            for i, k, l in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+                Q[v + i, u + 3 + k] += y[l]
+                Q[v + k, u + 3 + i] -= y[l]
+                Q[v + 3 + i, u + k] -= x[l]
+                Q[v + 3 + k, u + i] += x[l]
 
 
 @compiled
-def _add_form(Q, M, sign):
-    """Add ±Σ w A Bᵀ of the vertices in moments M to a form (12, 12) of the twists (v, ω) of a leg's last two joints.
-
-    A vertex with lever x moves by v + ω × x, so its blocks are I, -[y], [x] and (x · y) I - y xᵀ, with [x] p = x × p.
-    """
-    for a in range(2):
-        for b in range(2):
-            m, v, u = M[a, b], 6 * a, 6 * b
-            if m[0] == 0.0:
-                continue
-            dot = m[7] + m[11] + m[15]
-            for i in range(3):
-                Q[v + i, u + i] += sign * m[0]
-                Q[v + 3 + i, u + 3 + i] += sign * dot
-                for k in range(3):
-                    Q[v + 3 + i, u + 3 + k] -= sign * m[7 + 3 * k + i]
-            for i, k, l in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-                Q[v + i, u + 3 + k] += sign * m[4 + l]
-                Q[v + k, u + 3 + i] -= sign * m[4 + l]
-                Q[v + 3 + i, u + k] -= sign * m[1 + l]
-                Q[v + 3 + k, u + i] += sign * m[1 + l]
+def _add_moments(total, moments, weight):
+    """Add a vertex's weighted moments."""
+    for i in range(64):
+        total[i] += weight * moments[i]
 
 
 @compiled
@@ -383,7 +389,7 @@ def _pose_change(j, joint, i, theta, theta_imu):
 @compiled
 def _gather_contact(j, body, rows, smooth, kin, forms, energy):
     """Add the terms of one frame's patch vertices, measured in all directions or along a normal."""
-    moments, along, r = np.zeros((2, 2, 2, 16)), np.empty(12), np.empty(3)
+    along, r = np.empty(12), np.empty(3)
     for n in range(len(body.patch)):
         f, levers, shares = body.patch[n] // 2, kin.levers[j, n], body.shares[n]
         Q, g = forms.foot[j, f], forms.foot_gradient[j, f]
@@ -395,7 +401,7 @@ def _gather_contact(j, body, rows, smooth, kin, forms, energy):
             _difference(kin.points[j, n], rows.points[slot, j, n], r)
             if normal < 0:
                 w = _rho(k, _square(r), share, rows, smooth, energy)
-                _add_moments(moments[f], w, shares, levers, levers)
+                _add_moments(forms.moments[j, f], body.moments[n], w)
                 _add_pull(g, shares, levers, r, w)
                 continue
             up = rows.points[normal, j, n]
@@ -407,14 +413,12 @@ def _gather_contact(j, body, rows, smooth, kin, forms, energy):
                 g[i] += w * distance * along[i]
                 for m in range(i + 1):
                     Q[i, m] += w * along[i] * along[m]
-    for f in range(2):
-        _add_form(forms.foot[j, f], moments[f], 1.0)
 
 
 @compiled
 def _gather_slide(j, k, body, rows, smooth, kin, forms, energy):
     """Add a term of the patch vertices' displacement to the next frame."""
-    moments, r = np.zeros((2, 3, 2, 2, 16)), np.empty(3)
+    r = np.empty(3)
     slot, _, factor = rows.slot[k]
     for n in range(len(body.patch)):
         share = rows.sole_share[factor, j, n]
@@ -424,15 +428,10 @@ def _gather_slide(j, k, body, rows, smooth, kin, forms, energy):
         _difference(kin.points[j + 1, n], kin.points[j, n], r)
         _difference(r, rows.points[slot, j, n], r)
         w = _rho(k, _square(r), share, rows, smooth, energy)
-        _add_moments(moments[f, 0], w, shares, here, here)
-        _add_moments(moments[f, 1], w, shares, after, after)
-        _add_moments(moments[f, 2], w, shares, after, here)
+        for moments in (forms.moments[j, f], forms.moments[j + 1, f], forms.moments_step[j, f]):
+            _add_moments(moments, body.moments[n], w)
         _add_pull(forms.foot_gradient[j, f], shares, here, r, -w)
         _add_pull(forms.foot_gradient[j + 1, f], shares, after, r, w)
-    for f in range(2):
-        _add_form(forms.foot[j, f], moments[f, 0], 1.0)
-        _add_form(forms.foot[j + 1, f], moments[f, 1], 1.0)
-        _add_form(forms.foot_step[j, f], moments[f, 2], -1.0)
 
 
 @compiled
@@ -522,17 +521,21 @@ def _fill_foot(j, f, theta, theta_imu, body, kin, forms, diagonal, below, gradie
                 below[j, at, at] -= w
                 gradient[j, at] -= w * change
                 gradient[j + 1, at] += w * change
-    Q = forms.foot[j, f]
+    Q, R = forms.foot[j, f], kin.R[j, chain[len(chain) - 2 :]]
+    for i in range(12):
+        for k in range(i):
+            Q[k, i] = Q[i, k]
+    _add_form(Q, forms.moments[j, f], R, R, 1.0)
     if Q[0, 0] + Q[6, 6] > 0:
-        for i in range(12):
-            for k in range(i):
-                Q[k, i] = Q[i, k]
         _scatter(diagonal[j], first, np.dot(T.T, np.dot(Q, T)))
         along = np.dot(T.T, forms.foot_gradient[j, f])
         for a in range(len(along)):
             gradient[j, a if a < 6 else first + a - 6] += along[a]
-    if j + 1 < len(diagonal) and forms.foot_step[j, f, 0, 0] + forms.foot_step[j, f, 6, 6] != 0:
-        _scatter(below[j], first, np.dot(kin.foot_maps[j + 1, f].T, np.dot(forms.foot_step[j, f], T)))
+    step = forms.moments_step[j, f] if j + 1 < len(diagonal) else forms.moments[j, f][:0]
+    if step.any():
+        Q[:] = 0.0
+        _add_form(Q, step, kin.R[j + 1, chain[len(chain) - 2 :]], R, -1.0)
+        _scatter(below[j], first, np.dot(kin.foot_maps[j + 1, f].T, np.dot(Q, T)))
 
 
 @compiled
