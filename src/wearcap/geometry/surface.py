@@ -128,6 +128,13 @@ def _find(x, y, z, keys):
 
 
 @compiled
+def _away(u, cell, cell_m):
+    """Squared distance (m²) along one axis from a position (in cells) to a cell."""
+    short = max(cell - u, u - cell - 1, 0.0) * cell_m
+    return short * short
+
+
+@compiled
 def _nearest_point(p, reach, grid):
     """(squared distance, row) of the nearest point within reach, else (inf, -1); searches shells of cells outwards."""
     points, cell_m, origin, keys, first, count = grid
@@ -140,9 +147,15 @@ def _nearest_point(p, reach, grid):
         if shell > 0 and (inner + (shell - 1) * cell_m) ** 2 >= best:
             break
         for x in range(cx - shell, cx + shell + 1):
+            away_x = _away(ux, x, cell_m)
             for y in range(cy - shell, cy + shell + 1):
+                away_xy = away_x + _away(uy, y, cell_m)
+                if away_xy >= best:
+                    continue
                 side = abs(x - cx) == shell or abs(y - cy) == shell
                 for z in range(cz - shell, cz + shell + 1, 1 if side or shell == 0 else 2 * shell):
+                    if away_xy + _away(uz, z, cell_m) >= best:
+                        continue
                     slot = _find(x, y, z, keys)
                     if slot < 0:
                         continue

@@ -135,10 +135,12 @@ class Stretch:
         length, n = len(data), LEGS + 3 * self.body.leg_chains.size
         pairs, leg = max(length - 1, 0), 6 + 3 * self.body.leg_chains.shape[1]
         every = len(joints) + 1
-        shapes = ((every, 3, 3), (every, 3), (every, 3, 3), (len(self.body.patch), 3), (2, 12, leg))
+        shapes = ((every, 3, 3), (every, 3), (every, 3, 3), (len(self.body.patch), 3))
+        shapes += (len(self.body.patch), 2, 3), (2, 12, leg)
         self.kin = Kinematics(*(np.empty((length, *shape)) for shape in shapes))
-        small, feet = ((length, 3), (pairs, 3, 3, 3), (length, 3, 3)), ((length, 2, 12, 12), (pairs, 2, 12, 12))
-        self.forms = Forms(*(np.empty(shape) for shape in (*small, *feet, (length, 2, 12), length, pairs)))
+        small, feet = ((length, 3), (pairs, 3, 3, 3), (length, 3, 3)), ((length, 2, 12, 12), (length, 2, 12))
+        feet += (length, 2, 64), (pairs, 2, 64)
+        self.forms = Forms(*(np.empty(shape) for shape in (*small, *feet, length, pairs)))
         self.system = np.empty((length, n, n)), np.empty((pairs, n, n)), np.empty((length, n))
         self.terms = sorted((name for name in TERMS if energy.weight(name) > 0), key=lambda name: TERMS[name].reach)
         """The weighted terms in the order of `rows`."""
@@ -331,12 +333,17 @@ def _active_body(patches: FootPatches) -> tuple[tuple[int, ...], Body]:
         what = "vertices of the foot patches are skinned to joints other than ankle and toe"
         raise WearcapError(what, expected="a body whose soles follow the feet")
     arms = body.rest_vertices[patches.vertex].double()[:, None] - skeleton.rest_joints.double()[last_two]
+    arms, shares = arms.numpy(), (shares / shares.sum(1, keepdim=True)).numpy()
+    powers = np.concatenate([np.ones((len(arms), 2, 1)), arms], 2)
+    products = np.einsum("vai,vbk->vabik", powers, powers) * (shares[:, :, None] * shares[:, None])[..., None, None]
+    flat = [products[..., 0, 0, None], products[..., 1:, 0], products[..., 0, 1:], products[..., 1:, 1:].reshape(-1, 2, 2, 9)]
     return joints, Body(
         parents=np.array([number[skeleton.parents[joint]] for joint in joints]),
         offsets=skeleton.t_parent_joint[list(joints)].double().numpy(),
         head_chain=np.array([number[joint] for joint in head]),
         leg_chains=np.array([[number[joint] for joint in leg] for leg in legs]),
-        arms=arms.numpy(),
-        shares=(shares / shares.sum(1, keepdim=True)).numpy(),
+        arms=arms,
+        shares=shares,
+        moments=np.concatenate(flat, -1).reshape(-1, 64),
         patch=patches.patch.numpy(),
     )

@@ -41,6 +41,8 @@ class Body(NamedTuple):
     """(vertex, 2, 3) patch vertices in the axes of their leg's last two joints (m)."""
     shares: np.ndarray
     """(vertex, 2) skinning weights of these two joints."""
+    moments: np.ndarray
+    """(vertex, 64) products s s' (1, x, y, x yᵀ) of a vertex's weights and arms for each pair of the two joints."""
     patch: np.ndarray
 
 
@@ -51,6 +53,8 @@ class Kinematics(NamedTuple):
     c: np.ndarray
     axes: np.ndarray
     points: np.ndarray
+    levers: np.ndarray
+    """(time, vertex, 2, 3) patch vertices from the origins of their leg's last two joints, in world axes (m)."""
     foot_maps: np.ndarray
     """(time, 2, 12, 6 + leg) Jacobians of the twists of each leg's last two joints."""
 
@@ -64,9 +68,12 @@ class Forms(NamedTuple):
     """(pair, 3, 3, 3) couplings with the next frame, whose variables are the rows."""
     small_gradient: np.ndarray
     foot: np.ndarray
-    """(time, 2, 12, 12) forms of the foot twists, lower triangles."""
-    foot_step: np.ndarray
+    """(time, 2, 12, 12) forms of the foot twists by terms along a normal, lower triangles."""
     foot_gradient: np.ndarray
+    moments: np.ndarray
+    """(time, 2, 64) weighted sums of the vertices' moments by terms in all directions, of which `_add_form` makes forms."""
+    moments_step: np.ndarray
+    """(pair, 2, 64) the same for the coupling with the next frame."""
     pose: np.ndarray
     """(time) weights of the pose prior."""
     pose_step: np.ndarray
@@ -188,39 +195,72 @@ def _pose_all(theta, R_root, t, parents, offsets, R, c, axes):
 
 
 @compiled
-def _patch_points(R, c, leg_chains, arms, shares, patch, points):
-    """Positions of patch vertices, each skinned to the last two joints of its leg."""
+def _patch_points(R, c, leg_chains, arms, shares, patch, points, levers):
+    """Positions and levers of patch vertices, each skinned to the last two joints of its leg."""
     for j in range(len(R)):
         for n in range(len(patch)):
             chain = leg_chains[patch[n] // 2]
             for i in range(3):
                 points[j, n, i] = 0.0
                 for h in range(2):
-                    joint, share = chain[len(chain) - 2 + h], shares[n, h]
-                    if share > 0:
-                        points[j, n, i] += share * c[j, joint, i]
-                        for k in range(3):
-                            points[j, n, i] += share * R[j, joint, i, k] * arms[n, h, k]
+                    joint, lever = chain[len(chain) - 2 + h], 0.0
+                    for k in range(3):
+                        lever += R[j, joint, i, k] * arms[n, h, k]
+                    levers[j, n, h, i] = lever
+                    points[j, n, i] += shares[n, h] * (c[j, joint, i] + lever)
 
 
 @compiled
-def _vertex_twist(R, chain, arms, shares, A):
-    """Transposed Jacobian (12, 3) of a patch vertex in the twists (v, ω) of its leg's last two joints; returns the
-    number of rows used: six if the second joint has no weight."""
+def _add_form(Q, moments, R, S, sign):
+    """Add ±Σ w A Bᵀ of vertices to a form (12, 12) of the twists (v, ω) of a leg's last two joints, with rotations R
+    in the rows' frame and S in the columns' frame.
+
+    A vertex with levers x and y (world axes) moves by v + ω × x, so its blocks are I, -[y], [x] and (x · y) I - y xᵀ,
+    with [x] p = x × p.
+    """
+    x, y, half, xy = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    for a in range(2):
+        for b in range(2):
+            first, v, u = 16 * (2 * a + b), 6 * a, 6 * b
+            m = moments[first : first + 16]
+            if m[0] == 0.0:
+                continue
+            for i in range(3):
+                x[i] = sign * (R[a, i, 0] * m[1] + R[a, i, 1] * m[2] + R[a, i, 2] * m[3])
+                y[i] = sign * (S[b, i, 0] * m[4] + S[b, i, 1] * m[5] + S[b, i, 2] * m[6])
+                for k in range(3):
+                    half[i, k] = R[a, i, 0] * m[7 + k] + R[a, i, 1] * m[10 + k] + R[a, i, 2] * m[13 + k]
+            for i in range(3):
+                for k in range(3):
+                    xy[i, k] = sign * (half[i, 0] * S[b, k, 0] + half[i, 1] * S[b, k, 1] + half[i, 2] * S[b, k, 2])
+            dot = xy[0, 0] + xy[1, 1] + xy[2, 2]
+            for i in range(3):
+                Q[v + i, u + i] += sign * m[0]
+                Q[v + 3 + i, u + 3 + i] += dot
+                for k in range(3):
+                    Q[v + 3 + i, u + 3 + k] -= xy[k, i]
+            for i, k, l in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+                Q[v + i, u + 3 + k] += y[l]
+                Q[v + k, u + 3 + i] -= y[l]
+                Q[v + 3 + i, u + k] -= x[l]
+                Q[v + 3 + k, u + i] += x[l]
+
+
+@compiled
+def _add_moments(total, moments, weight):
+    """Add a vertex's weighted moments."""
+    for i in range(64):
+        total[i] += weight * moments[i]
+
+
+@compiled
+def _add_pull(g, shares, x, r, weight):
+    """Add a vertex's weighted residual to the gradient (12) in the twists of its leg's last two joints."""
     for h in range(2):
-        share, joint = shares[h], chain[len(chain) - 2 + h]
-        if share == 0 and h == 1:
-            return 6
-        x = share * (R[joint, 0, 0] * arms[h, 0] + R[joint, 0, 1] * arms[h, 1] + R[joint, 0, 2] * arms[h, 2])
-        y = share * (R[joint, 1, 0] * arms[h, 0] + R[joint, 1, 1] * arms[h, 1] + R[joint, 1, 2] * arms[h, 2])
-        z = share * (R[joint, 2, 0] * arms[h, 0] + R[joint, 2, 1] * arms[h, 1] + R[joint, 2, 2] * arms[h, 2])
-        at = 6 * h
-        A[at : at + 6] = 0.0
-        A[at, 0] = A[at + 1, 1] = A[at + 2, 2] = share
-        A[at + 4, 0], A[at + 5, 0] = z, -y
-        A[at + 3, 1], A[at + 5, 1] = -z, x
-        A[at + 3, 2], A[at + 4, 2] = y, -x
-    return 12
+        w, at = weight * shares[h], 6 * h
+        for i, k, l in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            g[at + i] += w * r[i]
+            g[at + 3 + i] += w * (x[h, k] * r[l] - x[h, l] * r[k])
 
 
 @compiled
@@ -251,7 +291,7 @@ def _foot_map(c, axes, chain, T):
 def update_kinematics(theta, R_root, t, body, kin):
     """Compute joint poses, patch vertices and derivatives of a state."""
     _pose_all(theta, R_root, t, body.parents, body.offsets, kin.R, kin.c, kin.axes)
-    _patch_points(kin.R, kin.c, body.leg_chains, body.arms, body.shares, body.patch, kin.points)
+    _patch_points(kin.R, kin.c, body.leg_chains, body.arms, body.shares, body.patch, kin.points, kin.levers)
     for j in range(len(t)):
         for f in range(2):
             _foot_map(kin.c[j], kin.axes[j], body.leg_chains[f], kin.foot_maps[j, f])
@@ -349,27 +389,27 @@ def _pose_change(j, joint, i, theta, theta_imu):
 @compiled
 def _gather_contact(j, body, rows, smooth, kin, forms, energy):
     """Add the terms of one frame's patch vertices, measured in all directions or along a normal."""
-    A, along, r = np.empty((12, 3)), np.empty(12), np.empty(3)
+    along, r = np.empty(12), np.empty(3)
     for n in range(len(body.patch)):
-        f = body.patch[n] // 2
+        f, levers, shares = body.patch[n] // 2, kin.levers[j, n], body.shares[n]
         Q, g = forms.foot[j, f], forms.foot_gradient[j, f]
         for k in range(len(rows.reach)):
             slot, normal, factor = rows.slot[k]
             if rows.value[k] != SOLES or rows.reach[k] != 1 or rows.sole_share[factor, j, n] == 0:
                 continue
             share = rows.sole_share[factor, j, n]
-            width = _vertex_twist(kin.R[j], body.leg_chains[f], body.arms[n], body.shares[n], A)
             _difference(kin.points[j, n], rows.points[slot, j, n], r)
             if normal < 0:
                 w = _rho(k, _square(r), share, rows, smooth, energy)
-                _add_square(Q, A, width, w)
-                _add_gradient(g, A, width, r, w)
+                _add_moments(forms.moments[j, f], body.moments[n], w)
+                _add_pull(g, shares, levers, r, w)
                 continue
             up = rows.points[normal, j, n]
             distance = r[0] * up[0] + r[1] * up[1] + r[2] * up[2]
             w = _rho(k, distance * distance, share, rows, smooth, energy)
-            for i in range(width):
-                along[i] = A[i, 0] * up[0] + A[i, 1] * up[1] + A[i, 2] * up[2]
+            along[:] = 0.0
+            _add_pull(along, shares, levers, up, 1.0)
+            for i in range(12):
                 g[i] += w * distance * along[i]
                 for m in range(i + 1):
                     Q[i, m] += w * along[i] * along[m]
@@ -378,27 +418,20 @@ def _gather_contact(j, body, rows, smooth, kin, forms, energy):
 @compiled
 def _gather_slide(j, k, body, rows, smooth, kin, forms, energy):
     """Add a term of the patch vertices' displacement to the next frame."""
-    A, B, r = np.empty((12, 3)), np.empty((12, 3)), np.empty(3)
+    r = np.empty(3)
     slot, _, factor = rows.slot[k]
     for n in range(len(body.patch)):
         share = rows.sole_share[factor, j, n]
         if share == 0:
             continue
-        f = body.patch[n] // 2
-        width = _vertex_twist(kin.R[j], body.leg_chains[f], body.arms[n], body.shares[n], A)
-        _vertex_twist(kin.R[j + 1], body.leg_chains[f], body.arms[n], body.shares[n], B)
+        f, shares, here, after = body.patch[n] // 2, body.shares[n], kin.levers[j, n], kin.levers[j + 1, n]
         _difference(kin.points[j + 1, n], kin.points[j, n], r)
         _difference(r, rows.points[slot, j, n], r)
         w = _rho(k, _square(r), share, rows, smooth, energy)
-        _add_square(forms.foot[j, f], A, width, w)
-        _add_square(forms.foot[j + 1, f], B, width, w)
-        _add_gradient(forms.foot_gradient[j, f], A, width, r, -w)
-        _add_gradient(forms.foot_gradient[j + 1, f], B, width, r, w)
-        Q = forms.foot_step[j, f]
-        for i in range(width):
-            x, y, z = w * B[i, 0], w * B[i, 1], w * B[i, 2]
-            for m in range(width):
-                Q[i, m] -= x * A[m, 0] + y * A[m, 1] + z * A[m, 2]
+        for moments in (forms.moments[j, f], forms.moments[j + 1, f], forms.moments_step[j, f]):
+            _add_moments(moments, body.moments[n], w)
+        _add_pull(forms.foot_gradient[j, f], shares, here, r, -w)
+        _add_pull(forms.foot_gradient[j + 1, f], shares, after, r, w)
 
 
 @compiled
@@ -409,21 +442,6 @@ def _difference(a, b, r):
 @compiled
 def _square(r):
     return r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
-
-
-@compiled
-def _add_square(Q, A, width, weight):
-    """Q += weight A Aᵀ, the lower triangle, over the first `width` rows."""
-    for i in range(width):
-        x, y, z = weight * A[i, 0], weight * A[i, 1], weight * A[i, 2]
-        for k in range(i + 1):
-            Q[i, k] += x * A[k, 0] + y * A[k, 1] + z * A[k, 2]
-
-
-@compiled
-def _add_gradient(g, A, width, r, weight):
-    for i in range(width):
-        g[i] += weight * (A[i, 0] * r[0] + A[i, 1] * r[1] + A[i, 2] * r[2])
 
 
 @compiled
@@ -503,17 +521,21 @@ def _fill_foot(j, f, theta, theta_imu, body, kin, forms, diagonal, below, gradie
                 below[j, at, at] -= w
                 gradient[j, at] -= w * change
                 gradient[j + 1, at] += w * change
-    Q = forms.foot[j, f]
-    if Q[0, 0] > 0:
-        for i in range(12):
-            for k in range(i):
-                Q[k, i] = Q[i, k]
+    Q, R = forms.foot[j, f], kin.R[j, chain[len(chain) - 2 :]]
+    for i in range(12):
+        for k in range(i):
+            Q[k, i] = Q[i, k]
+    _add_form(Q, forms.moments[j, f], R, R, 1.0)
+    if Q[0, 0] + Q[6, 6] > 0:
         _scatter(diagonal[j], first, np.dot(T.T, np.dot(Q, T)))
         along = np.dot(T.T, forms.foot_gradient[j, f])
         for a in range(len(along)):
             gradient[j, a if a < 6 else first + a - 6] += along[a]
-    if j + 1 < len(diagonal) and forms.foot_step[j, f, 0, 0] != 0:
-        _scatter(below[j], first, np.dot(kin.foot_maps[j + 1, f].T, np.dot(forms.foot_step[j, f], T)))
+    step = forms.moments_step[j, f] if j + 1 < len(diagonal) else forms.moments[j, f][:0]
+    if step.any():
+        Q[:] = 0.0
+        _add_form(Q, step, kin.R[j + 1, chain[len(chain) - 2 :]], R, -1.0)
+        _scatter(below[j], first, np.dot(kin.foot_maps[j + 1, f].T, np.dot(Q, T)))
 
 
 @compiled
