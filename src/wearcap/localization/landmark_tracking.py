@@ -30,7 +30,7 @@ from wearcap.recording.recording import Localization
 _AHEAD = 24
 """Number of frames that are decoded ahead while a key frame is localised."""
 _TRACKED = 0.5
-"""Confidence from which a key frame is tracked."""
+"""Confidence from which a key frame is tracked, and below which a track is lost."""
 _ESTABLISHED = 2
 """Largest number of agreeing key frames that a track can set against a rival's."""
 _LEVELS = 3
@@ -213,7 +213,8 @@ class LandmarkTracker:
         pixels = ((end[kept] + 0.5) / scale - 0.5).astype(np.float32)
         matches = Matches(pixels, track.points_world[kept], camera)
         fit = matches.refined(track.fit, limit_px)
-        if fit.inlier.sum() < least:
+        trust = min(track.key.confidence, confidence(pixels[fit.inlier], camera))
+        if fit.inlier.sum() < least or trust < _TRACKED:
             return False
         track.before, track.fit = track.fit, fit
         track.pixels, track.points_world = pixels[fit.inlier], matches.points_world[fit.inlier]
@@ -221,7 +222,6 @@ class LandmarkTracker:
         R, t = (torch.from_numpy(part).float() for part in (fit.R_world_cam, fit.t_world_cam))
         drift = matches.covariance(fit)
         covariance = track.key.covariance + torch.from_numpy(drift).float()
-        trust = min(track.key.confidence, confidence(track.pixels, camera))
         pose = CameraPose(R, t, len(track.pixels), trust, covariance)
         track.poses.append(ChainedPose(pose, track.key, drift))
         return True

@@ -16,6 +16,8 @@ from wearcap.geometry import rotation
 from wearcap.localization.absolute_pose import CameraPose
 
 
+_PLAUSIBLE = 6.0
+"""Squared disagreement of tracking and a key frame, over its expectation, beyond which neither tells about the other."""
 _LEAST = 1e-10
 """Least variance (rad², m²) of a key frame's error."""
 
@@ -44,6 +46,8 @@ class _Link:
     """How far this key frame's pose is from the one by the landmarks before; None where there is none."""
     mean: Float64[np.ndarray, "6"]
     information: Float64[np.ndarray, "6 6"]
+    drift: Float64[np.ndarray, "6 6"]
+    """Covariance of what tracking added to `step`."""
 
 
 def joined(poses: Sequence[ChainedPose | None]) -> list[CameraPose | None]:
@@ -55,6 +59,8 @@ def joined(poses: Sequence[ChainedPose | None]) -> list[CameraPose | None]:
             after = chain[number + 1] if number + 1 < len(chain) else None
             for index, frame in enumerate(link.frames):
                 share = index / len(link.frames) if after is not None else 0.0
+                if after is not None:
+                    share *= min(1.0, np.trace(frame.drift[3:, 3:]) / max(np.trace(after.drift[3:, 3:]), 1e-12))
                 error, covariance = (1 - share) * link.mean, (1 - share) * np.linalg.inv(link.information)
                 if after is not None and after.step is not None:
                     error = error + share * (after.mean - after.step)
@@ -76,13 +82,17 @@ def _chains(poses: Sequence[ChainedPose | None]) -> Iterator[list[_Link]]:
             chain[-1].frames.append(frame)
             chain[-1].stop = number + 1
             continue
-        linked = last is not None and frame.before is not None and frame.before.key is last.key
-        if chain and not linked:
+        own = _covariance(frame.key)
+        link = _Link(number, number + 1, [frame], None, np.zeros(6), np.linalg.inv(own), np.zeros((6, 6)))
+        if last is not None and frame.before is not None and frame.before.key is last.key:
+            step, drift = _apart(frame.pose, frame.before.pose), frame.before.drift
+            expected = own + _covariance(last.key) + drift
+            if step @ np.linalg.solve(expected, step) < _PLAUSIBLE * len(step):
+                link.step, link.drift = step, drift
+        if chain and link.step is None:
             yield chain
             chain = []
-        step = _apart(frame.pose, frame.before.pose) if linked and frame.before is not None else None
-        information = np.linalg.inv(frame.key.covariance.double().numpy() + _LEAST * np.eye(6))
-        chain.append(_Link(number, number + 1, [frame], step, np.zeros(6), information))
+        chain.append(link)
     if chain:
         yield chain
 
@@ -103,15 +113,18 @@ def _estimate(chain: list[_Link]) -> None:
             mean = np.linalg.solve(total, information @ mean)
             following = number if backwards else number + 1
             if 0 < following < len(chain):
-                step, before = chain[following].step, chain[following].frames[0].before
+                step = chain[following].step
                 assert step is not None
-                assert before is not None
                 mean = mean - step if backwards else mean + step
-                information = np.linalg.inv(np.linalg.inv(total) + before.drift)
+                information = np.linalg.inv(np.linalg.inv(total) + chain[following].drift)
         messages.append(passed[::-1] if backwards else passed)
     for link, (left, left_mean), (right, right_mean) in zip(chain, *messages):
         link.information = link.information + left + right
         link.mean = np.linalg.solve(link.information, left @ left_mean + right @ right_mean)
+
+
+def _covariance(pose: CameraPose) -> Float64[np.ndarray, "6 6"]:
+    return pose.covariance.double().numpy() + _LEAST * np.eye(6)
 
 
 def _apart(pose: CameraPose, other: CameraPose) -> Float64[np.ndarray, "6"]:
