@@ -149,11 +149,13 @@ def _energy_and_slope(
     values = values.requires_grad_()
     constants = Constants.of(values.detach())
     nearer = with_constants(data, constants)
-    state = solver(energy, nearer).state
-    of_state, root = state_values(nearer, state), state.t_world_root[:, None]
+    solution = solver(energy, nearer)
+    of_state, root = state_values(nearer, solution.state), solution.state.t_world_root[:, None]
     of_data = data_values(nearer, find_ground(nearer, of_state["soles"], energy))
     soles = root + (of_state["soles"] - root) * (values[0] / constants.scale)
     now = of_state | of_data | {"soles": soles, "t_start": _start(data, values[0], values[1:])}
-    total = torch.stack(list(energy_of(energy, now).values())).sum()
+    touched = {name for value in ("soles", "t_start") for name in energy.reading(value)}
+    terms = replace(energy, weights={name: weight for name, weight in energy.weights.items() if name in touched})
+    total = torch.stack(list(energy_of(terms, now).values())).sum()
     (slope,) = torch.autograd.grad(total, values)
-    return float(total.detach()), slope
+    return min(entry["total"] for entry in solution.history), slope
