@@ -274,12 +274,9 @@ def test_pictures_are_localised_in_the_scenes_map(filmed):
     assert len(MapLocalization(RootSift(400))(recording, root).timestamps) == 2
 
 
-TRACKED = ("pipeline=hps", "head_camera@pipeline=tracked")
-
-
 def test_landmarks_are_tracked_between_key_frames(filmed, monkeypatch):
     root, recording, poses = filmed
-    tracking = instantiate(compose("capture", [*TRACKED, "recording=x"]).pipeline.localization.tracking)
+    tracking = instantiate(compose("capture", ["pipeline=hps", "recording=x"]).pipeline.localization.tracking)
     localize = MapLocalization(RootSift(400), every=1, tracking=tracking)
     key_frames = []
     monkeypatch.setattr(
@@ -298,9 +295,18 @@ def test_landmarks_are_tracked_between_key_frames(filmed, monkeypatch):
     assert len(key_frames) == 1 + 1 + 6
 
 
-@pytest.mark.parametrize("pipeline", ["hps", "paper/hps"])
-def test_each_frame_is_localised_unless_tracking_is_chosen(pipeline):
-    assert compose("capture", [f"pipeline={pipeline}", "recording=x"]).pipeline.localization.tracking is None
+@pytest.mark.parametrize(
+    ("choices", "tracks"),
+    [
+        (["pipeline=hps"], True),
+        (["pipeline=hps", "head_camera@pipeline=each_frame"], False),
+        (["pipeline=paper/hps"], False),
+        (["pipeline=baseline/hps_imu_cam"], False),
+    ],
+)
+def test_landmarks_are_tracked_by_default_and_not_in_published_rows(choices, tracks):
+    localization = compose("capture", [*choices, "recording=x"]).pipeline.localization
+    assert (localization.tracking is not None) == tracks
 
 
 def test_poses_that_are_there_are_taken_unless_a_map_is_given(filmed, walk):

@@ -41,15 +41,18 @@ class SurfaceIndex:
             raise WearcapError("points are NaN or infinite", expected="finite coordinates (m)")
         origin = points.min(0).astype(np.float64) - 1.0
         size = _CELL_M if cell_m is None else cell_m
-        key = _pack(points, origin, size)
-        while cell_m is None and len(points) > _POINTS_PER_CELL * len(np.unique(key)) and size > 0.004:
-            size /= 2
+        while True:
             key = _pack(points, origin, size)
-        order = np.argsort(key, kind="stable")
-        cells, first, count = np.unique(key[order], return_index=True, return_counts=True)
+            order = np.argsort(key, kind="stable")
+            key = key[order]
+            first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
+            if cell_m is not None or len(points) <= _POINTS_PER_CELL * len(first) or size <= 0.004:
+                break
+            size /= 2
+        cells, count = key[first], np.diff(first, append=len(key))
         slots = 1 << int(2 * len(cells)).bit_length()
         table = np.full(slots, -1), np.zeros(slots, np.int64), np.zeros(slots, np.int64)
-        _fill_table(cells, first.astype(np.int64), count.astype(np.int64), *table)
+        _fill_table(cells, first, count, *table)
         return cls(points[order], size, origin, *table)
 
     def nearest(

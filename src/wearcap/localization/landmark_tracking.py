@@ -24,12 +24,13 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.localization.absolute_pose import CameraPose, Fit, Matches
 from wearcap.localization.localizer import Localizer, confidence, counted, localization_of
 from wearcap.localization.point_map import check_size, undistortion
+from wearcap.localization.pose_chain import ChainedPose, joined
 from wearcap.recording.recording import Localization
 
 _AHEAD = 24
 """Number of frames that are decoded ahead while a key frame is localised."""
 _TRACKED = 0.5
-"""Confidence from which a key frame is tracked."""
+"""Confidence from which a key frame is tracked, and below which a track is lost."""
 _ESTABLISHED = 2
 """Largest number of agreeing key frames that a track can set against a rival's."""
 _LEVELS = 3
@@ -83,7 +84,7 @@ class _Track:
     """Pose in the frame before that, for the prediction."""
     started: int
     """Number of landmarks in the last key frame."""
-    poses: list[CameraPose]
+    poses: list[ChainedPose]
     votes: int = 1
     """Number of key frames that agree with the track."""
     error_px: float = 0.0
@@ -97,7 +98,7 @@ class LandmarkTracker:
         self.localizer, self.settings = localizer, settings
         self.key_frames = 0
         """Number of frames that were localised in the map."""
-        self._final: list[CameraPose | None] = []
+        self._final: list[ChainedPose | None] = []
         self._tracks: list[_Track] = []
         """The track, and the rival that contradicts it, if any."""
         self._grey: np.ndarray | None = None
@@ -105,7 +106,7 @@ class LandmarkTracker:
 
     def poses(self) -> list[CameraPose | None]:
         """Pose of each frame so far, None where none was found."""
-        return self._final + (self._tracks[0].poses if self._tracks else [])
+        return joined(self._final + (self._tracks[0].poses if self._tracks else []))
 
     def advance(self, time: float, frame: "_Frame") -> None:
         """Localise the next frame; `time` in s."""
@@ -120,7 +121,7 @@ class LandmarkTracker:
             self._key_time, self.key_frames = time, self.key_frames + 1
             pose = self._localized(frame)
         if not self._tracks:
-            self._final.append(pose)
+            self._final.append(pose and ChainedPose(replace(pose, matches=None), pose, np.zeros((6, 6))))
 
     def _localized(self, frame: "_Frame") -> CameraPose | None:
         """Pose of a key frame, which confirms a track, contradicts it, or begins one."""
@@ -136,7 +137,7 @@ class LandmarkTracker:
         if agreeing is not None:
             self._confirm(agreeing, new)
         elif alone and self._weak(self._tracks[0]):
-            if pose.confidence > self._tracks[0].poses[-1].confidence:
+            if pose.confidence > self._tracks[0].poses[-1].pose.confidence:
                 self._end(self._tracks)
                 self._tracks = [new]
         else:
@@ -148,9 +149,9 @@ class LandmarkTracker:
     def _confirm(self, track: _Track, new: _Track) -> None:
         """A key frame agrees with a track, which goes on with the new landmarks if they suffice."""
         others = [other for other in self._tracks if other is not track]
-        if new.key.confidence >= min(track.poses[-1].confidence, self.settings.min_confidence):
+        if new.key.confidence >= min(track.poses[-1].pose.confidence, self.settings.min_confidence):
             new.before, new.first, new.votes = track.before, track.first, track.votes
-            new.poses = [*track.poses[:-1], *new.poses]
+            new.poses = [*track.poses[:-1], replace(new.poses[0], before=track.poses[-1])]
             self._tracks[self._tracks.index(track)] = track = new
         track.votes += 1
         if all(other.votes < track.votes for other in others):
@@ -172,7 +173,8 @@ class LandmarkTracker:
         rank[order] = np.arange(len(cell)) - np.repeat(count.cumsum() - count, count)
         chosen = np.argsort(rank, kind="stable")[: self.settings.landmarks]
         pixels, pose = pixels[chosen].astype(np.float32), replace(pose, matches=None)
-        return _Track(self._now, pose, camera, pixels, points[chosen], fit, fit, len(chosen), [pose])
+        poses = [ChainedPose(pose, pose, np.zeros((6, 6)))]
+        return _Track(self._now, pose, camera, pixels, points[chosen], fit, fit, len(chosen), poses)
 
     def _limit_px(self, track: _Track) -> float:
         return self.localizer.settings.max_error_px * track.camera.width / 1000
@@ -182,7 +184,7 @@ class LandmarkTracker:
         settings = self.settings
         return (
             len(track.pixels) < settings.min_share * track.started
-            or track.poses[-1].confidence < settings.min_confidence
+            or track.poses[-1].pose.confidence < settings.min_confidence
             or track.error_px > settings.max_error_px * track.camera.width / 1000
         )
 
@@ -211,15 +213,17 @@ class LandmarkTracker:
         pixels = ((end[kept] + 0.5) / scale - 0.5).astype(np.float32)
         matches = Matches(pixels, track.points_world[kept], camera)
         fit = matches.refined(track.fit, limit_px)
-        if fit.inlier.sum() < least:
+        trust = min(track.key.confidence, confidence(pixels[fit.inlier], camera))
+        if fit.inlier.sum() < least or trust < _TRACKED:
             return False
         track.before, track.fit = track.fit, fit
         track.pixels, track.points_world = pixels[fit.inlier], matches.points_world[fit.inlier]
         track.error_px = float(np.median(matches.errors(fit)[fit.inlier]))
         R, t = (torch.from_numpy(part).float() for part in (fit.R_world_cam, fit.t_world_cam))
-        covariance = track.key.covariance + torch.from_numpy(matches.covariance(fit)).float()
-        trust = min(track.key.confidence, confidence(track.pixels, camera))
-        track.poses.append(CameraPose(R, t, len(track.pixels), trust, covariance))
+        drift = matches.covariance(fit)
+        covariance = track.key.covariance + torch.from_numpy(drift).float()
+        pose = CameraPose(R, t, len(track.pixels), trust, covariance)
+        track.poses.append(ChainedPose(pose, track.key, drift))
         return True
 
 

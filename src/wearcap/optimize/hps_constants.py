@@ -8,10 +8,10 @@ minimised. At such a minimum the derivative of the least energy in a constant is
 """
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.optimize
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -19,12 +19,14 @@ from torch import Tensor
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.optimize.hps import HpsData, HpsEnergy, Solution, data_values, energy_of, find_ground, state_values
 
+JOBS = 2
+"""Stretches that are solved at a time."""
 STRETCHES, STRETCH_S = 6, 10.0
 """Number and length of the stretches, evenly over the recording, from which constants are estimated."""
 INDEPENDENT_S = 1.0
 """Time between frames whose errors are independent: it weighs the energy against the priors."""
-EVALUATIONS = 10
-"""Largest number of times that the stretches are solved."""
+EVALUATIONS, LEAST_STEP = 8, 0.03
+"""Largest number of times that the stretches are solved, and the step (in prior deviations) below which it ends."""
 
 
 @dataclass(frozen=True)
@@ -95,19 +97,41 @@ def estimate_constants(
 
     def objective(unknown: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = 0.5 * float(unknown @ unknown), unknown.copy()
-        for part in parts:
-            energy_of_part, gradient = _energy_and_slope(energy, part, solver, constants(unknown))
+        with ThreadPoolExecutor(JOBS) as pool:
+            found = list(pool.map(lambda part: _energy_and_slope(energy, part, solver, constants(unknown)), parts))
+        for part, (energy_of_part, gradient) in zip(parts, found):
             share = len(part) / fps / INDEPENDENT_S
             value += share * energy_of_part
             slope += share * (deviations * gradient)[free].numpy()
         return value, slope
 
-    count = int(free.sum())
-    options = {"maxfun": EVALUATIONS, "ftol": 1e-4}
-    found = scipy.optimize.minimize(
-        objective, np.zeros(count), jac=True, method="L-BFGS-B", bounds=[(-3.0, 3.0)] * count, options=options
-    )
-    return Constants.of(constants(found.x))
+    return Constants.of(constants(_least(objective, int(free.sum()))))
+
+
+def _least(objective: Callable[[np.ndarray], tuple[float, np.ndarray]], count: int) -> np.ndarray:
+    """Where a function with a prior of deviation 1 in each unknown is least: quasi-Newton steps (BFGS), from 0.
+
+    There is no line search, which would need many evaluations where the value is known to a few digits only. Steps are
+    at most one deviation long, and half as long after one that led upwards.
+    """
+    place, inverse, reach = np.zeros(count), np.eye(count) / 10, 1.0
+    value, slope = objective(place)
+    best = value, place
+    for _ in range(EVALUATIONS - 1):
+        step = -inverse @ slope
+        step *= min(1.0, reach / max(float(np.linalg.norm(step)), 1e-12))
+        if np.linalg.norm(step) < LEAST_STEP:
+            break
+        place = np.clip(place + step, -3.0, 3.0)
+        before, (value, new) = value, objective(place)
+        change, slope = new - slope, new
+        curvature = float(step @ change)
+        if curvature > 1e-9:
+            left = np.eye(count) - np.outer(step, change) / curvature
+            inverse = left @ inverse @ left.T + np.outer(step, step) / curvature
+        reach = reach if value <= before else reach / 2
+        best = min(best, (value, place), key=lambda found: found[0])
+    return best[1]
 
 
 def _sample(data: HpsData, fps: float) -> list[HpsData]:
@@ -125,11 +149,13 @@ def _energy_and_slope(
     values = values.requires_grad_()
     constants = Constants.of(values.detach())
     nearer = with_constants(data, constants)
-    state = solver(energy, nearer).state
-    of_state, root = state_values(nearer, state), state.t_world_root[:, None]
+    solution = solver(energy, nearer)
+    of_state, root = state_values(nearer, solution.state), solution.state.t_world_root[:, None]
     of_data = data_values(nearer, find_ground(nearer, of_state["soles"], energy))
     soles = root + (of_state["soles"] - root) * (values[0] / constants.scale)
     now = of_state | of_data | {"soles": soles, "t_start": _start(data, values[0], values[1:])}
-    total = torch.stack(list(energy_of(energy, now).values())).sum()
+    touched = {name for value in ("soles", "t_start") for name in energy.reading(value)}
+    terms = replace(energy, weights={name: weight for name, weight in energy.weights.items() if name in touched})
+    total = torch.stack(list(energy_of(terms, now).values())).sum()
     (slope,) = torch.autograd.grad(total, values)
-    return float(total.detach()), slope
+    return min(entry["total"] for entry in solution.history), slope
