@@ -71,9 +71,16 @@ TRAININGS: dict[str, tuple[str, ...]] = {
 """Overrides of `wearcap train` by the run's name: ablations after the paper's Table 7 without its first stage, and
 without its data representation as well (world coordinates); and AvatarPoser's protocol 1, with tracked hands instead of
 accelerations."""
-STEPS = ("trainer.max_steps=3250", "data.loading.steps_per_epoch=250")
-"""All of these are trained as long as `mocap_every` was; captured with is each one's checkpoint of the lowest validation
-loss, as there."""
+STEPS = (
+    "trainer.max_steps=300",
+    "data.loading.steps_per_epoch=50",
+    "optimizer.scheduler.warmup=30",
+    "trainer.precision=bf16-mixed",
+    "callbacks.average.decay=0.98",
+    "early_stop=3",
+)
+"""One budget for all of these, ours among them: as many frames of the same data, in batches and precision alike, or
+until the validation loss has not fallen for three epochs. Captured with is each one's checkpoint of the lowest."""
 TRAINED = {
     "AvatarPoser-style, watches": (
         "mocap_every_avatarposer",

@@ -44,6 +44,8 @@ class Sampling:
     step: str = "posterior"
     rewindow: int | None = None
     """Frames by which overlapping windows advance that are each denoised from scratch; None: a conveyor."""
+    rewindow_steps: int | None = None
+    """Denoising steps of such a window; None: as many as a frame takes on the conveyor."""
 
 
 @dataclass
@@ -82,6 +84,9 @@ class Echo(LearnedSystem):
         if rewindow is not None and not 0 < rewindow <= ramp:
             what = f"windows that advance by {rewindow} frames"
             raise WearcapError(what, expected=f"1 to {ramp}, the window less the context")
+        if self.sampling.rewindow_steps is not None and (rewindow is None or self.sampling.rewindow_steps < 1):
+            what = f"rewindow_steps={self.sampling.rewindow_steps} with rewindow={rewindow}"
+            raise WearcapError(what, expected="at least one step, of windows (rewindow=FRAMES)")
         if rewindow is not None and self.sampling.step == "redraw":
             what = "step=redraw with windows that are denoised from scratch"
             raise WearcapError(what, expected="step=posterior, or rewindow=null")
@@ -226,7 +231,7 @@ class Echo(LearnedSystem):
         """An empty queue for a batch, with the bodies and objects that guidance needs, if any."""
         queue = EchoQueue(self, skeletons, seeds)
         if self.sampling.rewindow is not None:
-            queue = Rewindow(self, skeletons, seeds, self.sampling.rewindow)
+            queue = Rewindow(self, skeletons, seeds, self.sampling.rewindow, self.sampling.rewindow_steps)
         if self.contact_use.guidance is not None:
             queue.guided = pulled_by(skeletons, shapes, objects)
         return queue
