@@ -1,7 +1,7 @@
 """ECHO on held-out people, places and objects: the paper's Tables 1, 2, 3, 4 (ablation) and S2 on the data at hand.
 
 Bodies and objects are measured where they are put in the world, over whole recordings. Checkpoints come by name
-(checkpoints/) or path; those of baselines and ablations from RUNS/NAME/checkpoints/last.ckpt. A row without its
+(checkpoints/) or path; those of baselines and ablations from RUNS/NAME/checkpoints/best.ckpt. A row without its
 checkpoint is left out, and the command that trains it is printed (`TRAININGS`). Means and spreads are over seeds of the
 diffusion, as in the paper.
 """
@@ -50,11 +50,18 @@ OBJECTS = {
     "symmetric_rotation_deg": "modulo symmetry (°)",
     "quaternion": "quaternion",
     "touch_f1": "contact F1",
+    "training_minutes": "min. learned from",
 }
 WHOLE = ("mpjpe_mm", "mpjve_printed", "foot_contact", "v2v_cm", "center_cm", "rotation_deg", "quaternion")
 """The paper's columns of Table 1."""
 UNGUIDED = ("pipeline=echo", "pipeline.contacts.guidance=null")
-SHORT = ("experiment=echo", "trainer.max_steps=900")
+SHORT = ("experiment=echo",)
+BUDGET = ("trainer.max_steps=600", "data.loading.steps_per_epoch=100", "callbacks.average.decay=0.98", "early_stop=3")
+"""How long all of these are trained: 600 batches of some 960 frames, in windows of 60 or 98, or until the validation
+loss has not fallen for three epochs; captured with is the checkpoint of the lowest."""
+BATCH = "data.loading.batch_size=16"
+LONG = ("data.loading.batch_size=10",)
+"""Windows of a batch, and those of 98 frames."""
 TRAININGS: dict[str, tuple[str, ...]] = {
     "echo_short": SHORT,
     "echo_window": (*SHORT, "features.frame=window"),
@@ -71,7 +78,7 @@ TRAININGS: dict[str, tuple[str, ...]] = {
     "bodiffusion_object_window": ("experiment=baseline/bodiffusion_object", "features.frame=window"),
     "bodiffusion": ("experiment=baseline/bodiffusion",),
     "egoallo_human": ("experiment=baseline/egoallo_human",),
-    "agrol_human": ("experiment=baseline/agrol_human",),
+    "agrol_human": ("experiment=baseline/agrol_human", *LONG),
 }
 """Overrides of `wearcap train` by the run's name: ECHO trained briefly, and each ablation of it trained as long: the
 paper's canonical frame (window) and none (world), the losses of the three modalities alone, the weights of ECHO eq. 13,
@@ -87,6 +94,10 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "no auxiliary losses": ("echo_without_auxiliary", *UNGUIDED),
     "the paper's weights of losses": ("echo_paper_losses", *UNGUIDED),
     "three tokens per frame": ("echo_three_streams", *UNGUIDED),
+}
+RIVALS: dict[str, tuple[str, ...]] = {
+    "ours, the same budget": ("echo_short", "pipeline=echo"),
+    "ours, the same budget, without guidance": ("echo_short", *UNGUIDED),
     "BoDiffusion-style + object": ("bodiffusion_object", "pipeline=baseline/bodiffusion_object"),
     "BoDiffusion-style + object, the paper's frame": (
         "bodiffusion_object_window",
@@ -95,10 +106,10 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "BoDiffusion-style": ("bodiffusion", "pipeline=baseline/bodiffusion"),
 }
 HUMANS: dict[str, tuple[str, ...]] = {
-    **{name: ABLATIONS[name] for name in ("ours without guidance, as long as the others", "no humans alone")},
-    **{name: ABLATIONS[name] for name in ("BoDiffusion-style + object", "BoDiffusion-style")},
+    **{name: row for name, row in RIVALS.items() if "paper's frame" not in name and "guidance" not in name},
     "EgoAllo-style (head)": ("egoallo_human", "pipeline=baseline/bodiffusion"),
     "AGRoL-style": ("agrol_human", "pipeline=baseline/bodiffusion"),
+    "ours, the same budget, no humans alone": ABLATIONS["no humans alone"],
 }
 """Rows of Table 2 with trainings of their own."""
 SETTINGS = {
@@ -159,7 +170,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--parts",
         nargs="*",
-        default=["objects", "ablation", "sparse", "human"],
+        default=["objects", "rivals", "ablation", "sparse", "human"],
         choices=list(PARTS),
         help="tables to make",
     )
@@ -189,9 +200,11 @@ def _objects(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapp
         compose("train", ["experiment=echo", "paths.run=none", f"paths.datasets={options.datasets}"]).data,
         _convert_="all",
     )
-    training = data.dataset("train")
-    scores["nearest training window"] = _baseline(NearestEcho.fit(training), store, names, ours)
-    wrist = RigidWrist.fit(training)
+    training_windows = data.dataset("train")
+    minutes = sum(store.entries[name].duration_s for name in store.names("train")) / 60
+    nearest = _baseline(NearestEcho.fit(training_windows), store, names, ours)
+    scores["nearest training window"] = nearest | {"training_minutes": Summary(minutes, None, 1)}
+    wrist = RigidWrist.fit(training_windows)
     mine, stuck = [], []
     for one in _captured(ours, options, progress, store, names):
         mine.append(score_echo(one.motion, one.truth, one.name, one.seed))
@@ -217,21 +230,32 @@ def _ablation(options: argparse.Namespace, progress: Progress) -> tuple[str, Map
     return f"Ablation: {options.split}", OBJECTS, _scores(methods, options, progress, store, names)
 
 
+def _rivals(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapping[str, str], Scores]:
+    """Rows of Table 1 beside ours, all trained within one budget."""
+    store, names = recordings_of(options, "simulated_objects")
+    methods = _trained(RIVALS, options, progress)
+    return f"Table 1, equal budgets: {options.split}", OBJECTS, _scores(methods, options, progress, store, names)
+
+
 def _trained(rows: dict[str, tuple[str, ...]], options: argparse.Namespace, progress: Progress) -> list[Method]:
     """Those of which there is a training."""
     methods = []
     for name, (run, *pipeline) in rows.items():
-        path = options.runs / run / "checkpoints" / "last.ckpt"
+        path = options.runs / run / "checkpoints" / "best.ckpt"
         if path.is_file():
             methods.append(Method(name, str(path), tuple(pipeline)))
         else:
-            command = shlex.join(
-                ["wearcap", "train", *TRAININGS[run], f"name={run}", f"paths.run={options.runs / run}"]
-            )
+            command = shlex.join(["wearcap", "train", *training(run), f"name={run}", f"paths.run={options.runs / run}"])
             progress.console.print(
                 f"left out: {name} (no {path}); train it by: {command}", markup=False, soft_wrap=True
             )
     return methods
+
+
+def training(run: str) -> list[str]:
+    """Overrides that train a run within the common budget."""
+    batch = () if LONG[0] in TRAININGS[run] else (BATCH,)
+    return [*TRAININGS[run], *batch, *BUDGET]
 
 
 def _sparse(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapping[str, str], Scores]:
@@ -293,7 +317,14 @@ def _baseline(method: NearestEcho, store: RecordingStore, names: list[str], like
     return aggregate(made)
 
 
-PARTS = {"objects": _objects, "ablation": _ablation, "settings": _settings, "sparse": _sparse, "human": _human}
+PARTS = {
+    "objects": _objects,
+    "rivals": _rivals,
+    "ablation": _ablation,
+    "settings": _settings,
+    "sparse": _sparse,
+    "human": _human,
+}
 
 
 LABELS = {
@@ -314,21 +345,22 @@ LABELS = {
     "foot_skate_cm_s": ("skate (cm/s)", 1),
     "floor_penetration_cm": ("into the floor (cm)", 2),
     "physicality": ("physicality", 4),
+    "training_minutes": ("minutes learned from", 0),
 }
 """Columns of the page's tables with their digits."""
 HEADLINE = (
-    ("Table 1", "ours", "objects: **ours**"),
-    ("Table 1", "ours, object stuck to the nearer wrist", "objects: ours, the object stuck to the nearer wrist"),
-    ("Table 1", "nearest training window", "objects: nearest training window"),
-    ("Ablation", "ours without guidance, as long as the others", "objects: ours, short training, without guidance"),
-    ("Ablation", "BoDiffusion-style + object", "objects: BoDiffusion-style + object, trained as long"),
-    ("Ablation", "the paper's frame", "objects: ours, short training, the paper's frame"),
-    ("Settings", "initial object poses observed", "objects: ours, initial object poses given"),
-    ("Table 1", "truth", "objects: the truth itself"),
-    ("Table 1", "paper: BEHAVE", "the paper's, on BEHAVE"),
-    ("Table 1", "paper: BoDiffusion+Obj, BEHAVE", "the paper's BoDiffusion + object, on BEHAVE"),
+    ("Table 1:", "ours", "objects: **ours**"),
+    ("Table 1:", "ours, object stuck to the nearer wrist", "objects: ours, the object stuck to the nearer wrist"),
+    ("Table 1:", "nearest training window", "objects: nearest training window"),
+    ("Table 1, equal", "ours, the same budget", "objects: ours, the rivals' budget"),
+    ("Table 1, equal", "BoDiffusion-style + object", "objects: BoDiffusion-style + object, the same frame and budget"),
+    ("Table 1, equal", "BoDiffusion-style", "objects: BoDiffusion-style, the same frame and budget"),
+    ("Table 1:", "truth", "objects: the truth itself"),
+    ("Table 1:", "paper: BEHAVE", "the paper's, on BEHAVE"),
+    ("Table 1:", "paper: BoDiffusion+Obj, BEHAVE", "the paper's BoDiffusion + object, on BEHAVE"),
     ("Table 2", "ours", "people alone (CMU): **ours**"),
-    ("Table 2", "BoDiffusion-style + object", "people alone (CMU): BoDiffusion-style + object, short training"),
+    ("Table 2", "ours, the same budget", "people alone (CMU): ours, the rivals' budget"),
+    ("Table 2", "BoDiffusion-style", "people alone (CMU): BoDiffusion-style, the same budget"),
 )
 """Rows of the page's first table: table, row, and what the page calls it."""
 CLOCKS = {
@@ -342,7 +374,7 @@ CLOCKS = {
 
 def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     """What docs/results/echo.md says."""
-    objects, people = rows_of(trees, "Table 1"), rows_of(trees, "Table 2")
+    objects, people = rows_of(trees, "Table 1:"), rows_of(trees, "Table 2")
     ours, online = objects["ours"], figure_of(speed, "echo_online_small_fps")
     shown = {metric for title, row, _ in HEADLINE for metric in rows_of(trees, title).get(row, {})}
     columns = [(LABELS[name][0], (name,), LABELS[name][1]) for name in LABELS if name in shown and name in OBJECTS]

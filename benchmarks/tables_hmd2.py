@@ -7,6 +7,7 @@ out, which is printed. Checkpoints come by name (checkpoints/) or path.
 
 import argparse
 import json
+import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -75,14 +76,24 @@ TRUTH_GIVEN = "hands of the AvatarPoser-style row that sees them (with exact sen
 """What of the truth is given to rows."""
 MODALITIES = {OURS: "[points,images]", "w/o images": "[points]", "w/o points": "[images]", "head alone": "[]"}
 TRAINED = {
-    "EgoEgo-style": ("egoego_style", "baseline/egoego_style", None),
-    "EgoAllo-style": ("egoallo_style", "baseline/egoallo_style", None),
-    "AGRoL-style (head)": ("agrol_style", "baseline/agrol_style", None),
-    "AvatarPoser-style (head)": ("avatarposer_head", "pose_regressor", None),
-    "AvatarPoser-style (head and hands)": ("avatarposer_hands", "pose_regressor", GIVEN),
+    "EgoEgo-style": ("egoego_style", ("pipeline=baseline/egoego_style",), None),
+    "EgoAllo-style": ("egoallo_style", ("pipeline=baseline/egoallo_style",), None),
+    "AGRoL-style (head)": ("agrol_style", ("pipeline=baseline/agrol_style",), None),
+    "AvatarPoser-style (head)": ("avatarposer_head", ("pipeline=pose_regressor",), None),
+    "AvatarPoser-style (head and hands)": ("avatarposer_hands", ("pipeline=pose_regressor",), GIVEN),
+    "head alone, the rivals' budget": ("motion_diffusion_head", ("pipeline=hmd2", "pipeline.runtime=auto"), None),
 }
-"""Baselines: experiment and run, pipeline, and sensors (None: the table's). Each is trained by `wearcap train
-experiment=baseline/RUN data=hmd2 paths.run=RUNS/RUN`; its checkpoint of the lowest validation loss is captured with."""
+"""Baselines, and our network with as little training: run, overrides that capture, and sensors (None: the table's)."""
+BUDGET, BATCH = 500_000, 8
+"""Frames that each of these sees, and windows of a batch."""
+WINDOW = {
+    "egoego_style": 120,
+    "egoallo_style": 128,
+    "agrol_style": 196,
+    "avatarposer_head": 82,
+    "avatarposer_hands": 82,
+}
+"""Frames of a window that a network sees, where they are not 240: AvatarPoser's two pairs of poses see 41 each."""
 STRIDES = (230, 180, 120, 60, 30, 10, 1)
 STEPS = (2, 3, 5, 10, 20, 40, 80)
 LOOKAHEAD = 20
@@ -249,12 +260,26 @@ def _latencies(options: argparse.Namespace, h: int) -> list[Method]:
     ]
 
 
+def training(run: str, runs: Path) -> list[str]:
+    """The command that trains one of `TRAINED`: all on the motion of the same data, to the same number of frames, or until
+    the validation loss has not fallen for three epochs; captured with is the checkpoint of the lowest."""
+    steps = BUDGET // (BATCH * WINDOW.get(run, 240))
+    experiment = run if run == "motion_diffusion_head" else f"baseline/{run}"
+    return [
+        *("wearcap", "train", f"experiment={experiment}", "data=cmu_simulated", f"data.loading.batch_size={BATCH}"),
+        *(f"trainer.max_steps={steps}", f"data.loading.steps_per_epoch={steps // 6}", "trainer.precision=bf16-mixed"),
+        *("optimizer.optimizer.lr=1.0e-3", "callbacks.average.decay=0.98", "early_stop=3"),
+        *("callbacks.capture=null", f"name={run}", f"paths.run={runs / run}"),
+    ]
+
+
 def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
     """Rows of the first table; those whose checkpoint is not there are named and left out."""
     trained = [
-        Method(name, str(options.runs / run / "checkpoints" / "best.ckpt"), (f"pipeline={pipeline}",), sensors)
+        Method(name, str(options.runs / run / "checkpoints" / "best.ckpt"), pipeline, sensors)
         for name, (run, pipeline, sensors) in TRAINED.items()
     ]
+    commands = {name: shlex.join(training(run, options.runs)) for name, (run, _, _) in TRAINED.items()}
     full = _ours(options, OURS)
     sensing = [replace(full, name=f"full, {n} sensors", sensors=n) for n in WEARABLES if n != options.sensors]
     sensing.append(replace(full, name="full, the data's own sensors, bones given", sensors=GIVEN))
@@ -275,7 +300,8 @@ def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
     there = [method for method in wanted if method.checkpoint is None or _exists(method.checkpoint)]
     for method in wanted:
         if method not in there:
-            console.print(f"left out: {method.name} (no checkpoint {method.checkpoint!r})", soft_wrap=True)
+            how = f"; train it by: {commands[method.name]}" if method.name in commands else ""
+            console.print(f"left out: {method.name} (no checkpoint {method.checkpoint!r}){how}", soft_wrap=True)
     return there
 
 
