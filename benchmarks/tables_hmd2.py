@@ -269,7 +269,7 @@ def training(run: str, runs: Path) -> list[str]:
         *("wearcap", "train", f"experiment={experiment}", "data=cmu_simulated", f"data.loading.batch_size={BATCH}"),
         *(f"trainer.max_steps={steps}", f"data.loading.steps_per_epoch={steps // 6}", "trainer.precision=bf16-mixed"),
         *("optimizer.optimizer.lr=1.0e-3", "callbacks.average.decay=0.98", "early_stop=3"),
-        *("callbacks.capture=null", f"name={run}", f"paths.run={runs / run}"),
+        *("callbacks=averaged", f"name={run}", f"paths.run={runs / run}"),
     ]
 
 
