@@ -8,6 +8,7 @@ diffusion, as in the paper.
 
 import argparse
 import json
+import re
 import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -398,6 +399,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
             "Observed contacts leave the object unchanged within the spread, unlike in the paper, where they help it "
             "most.",
             "Body motion jitters between observed and generated frames.",
+            *_few(trees),
             *_conveyor(speed),
             *_briefly(rows_of(trees, "Table 1, equal"), people),
             "The trainings of the ablation have one seed each, and are scored without guidance but where the row says so.",
@@ -412,6 +414,25 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
             ("echo_table.png", "A table that is pushed: the act of median error"),
             ("echo_suitcase.png", "A suitcase that is carried: the act of median error"),
         ),
+    )
+
+
+def _few(trees: Trees) -> tuple[str, ...]:
+    """Which tables of objects are of a part of the test split alone."""
+    commands = [
+        about["command"]
+        for tree in trees.values()
+        for title, about in tree.get("origins", {}).items()
+        if title.startswith("Table 1")
+    ]
+    few = sorted(
+        int(found[1]) for found in (re.search(r"--recordings (\d+)", command) for command in commands) if found
+    )
+    if not few:
+        return ()
+    return (
+        f"Rows of objects beside ours are of {few[0]} recordings of two minutes of the test split, whose few objects they "
+        "depend on; the nearest window is of fewer recordings than our checkpoint was trained on.",
     )
 
 
