@@ -219,7 +219,8 @@ class Echo(LearnedSystem):
         # 3. Untouched objects are made static, and the body is anchored to the measured head.
         if (threshold := self.contact_use.static_threshold) is not None:
             outputs = [with_static_objects(item.conditioning, part, threshold) for item, part in zip(items, outputs)]
-        return [motion_of(item, part, self.anchor, self.settings()) for item, part in zip(items, outputs)]
+        settings, contacts = self.settings(), self.model.contacts
+        return [motion_of(item, part, self.anchor, settings, contacts) for item, part in zip(items, outputs)]
 
     def queue(
         self,
@@ -261,8 +262,11 @@ class Echo(LearnedSystem):
         return {"pipeline": "echo"} | {name: str(value) for name, value in settings.items()}
 
 
-def motion_of(item: BatchItem, outputs: Outputs, anchor: bool, provenance: dict[str, str]) -> Motion:
-    """Outputs of one batch item as a motion, if `anchor` anchored to the measured head except in observed frames."""
+def motion_of(
+    item: BatchItem, outputs: Outputs, anchor: bool, provenance: dict[str, str], contacts: bool = True
+) -> Motion:
+    """Outputs of one batch item as a motion, if `anchor` anchored to the measured head except in observed frames; without
+    touch of the object where `contacts` were not predicted."""
     path, contact = item.path, outputs.contact_prob[0]
     motion = Motion(
         path.timestamps,
@@ -270,7 +274,7 @@ def motion_of(item: BatchItem, outputs: Outputs, anchor: bool, provenance: dict[
         outputs.R_parent_joint[0],
         outputs.t_world_root[0],
         contact[:, BODY_POINTS:],
-        body_contact_prob=contact[:, :BODY_POINTS] * item.conditioning.has_object[0, :, None],
+        body_contact_prob=contact[:, :BODY_POINTS] * item.conditioning.has_object[0, :, None] if contacts else None,
         object_motion=object_tracks(item, outputs) or None,
         provenance=provenance,
     )
