@@ -444,7 +444,7 @@ def _few(trees: Trees) -> tuple[str, ...]:
     if not few:
         return ()
     return (
-        f"Rows of objects beside ours are of {few[0]} recordings of two minutes of the test split, whose few objects they "
+        f"Rows of objects are of {few[0]} recordings of two minutes of the test split, whose few objects they "
         "depend on; the nearest window is of fewer recordings than our checkpoint was trained on. The checkpoint learned from "
         "an earlier simulator, whose hands did not hover, rest or mime.",
     )
