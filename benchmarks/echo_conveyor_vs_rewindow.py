@@ -27,7 +27,7 @@ from wearcap.systems.echo.queue import Conditioning, EchoQueue, Rewindow
 STRIDE = 10
 EQUAL = "equal"
 DATASET = Path(__file__).resolve().parents[1] / "datasets" / "simulated_objects"
-SCORES = {"mpjpe_mm": "mm MPJPE", "v2v_cm": "cm E_v2v (seeds differ by more)", "jitter_m_s3": "m/s³ of the joints"}
+SCORES = {"mpjpe_mm": "mm MPJPE", "v2v_cm": "cm E_v2v", "jitter_m_s3": "m/s³ of the joints"}
 
 
 def measure(items: int = 4, rounds: int = 6, recordings: int = 4, seconds: float = 20.0) -> list[dict]:

