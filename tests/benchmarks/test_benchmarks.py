@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from wearcap.cli.conf import compose
+
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 GOALS = {"windows_vs_npz", "lightning_step_vs_loop", "ddp_gradient_error"}
 
@@ -283,3 +285,37 @@ def test_hmd2_tables_write_tails_scenarios_and_sweeps_on_validation(tmp_path, mo
     assert "0.0012" in shown
     assert "truth" in shown
     assert "Table 6.10" in shown
+
+
+def frames_of(overrides: list[str]) -> tuple[str, int]:
+    """Name of a training, and the frames of all windows that it draws."""
+    config = compose("train", overrides)
+    batches = config.trainer.max_steps * config.data.loading.batch_size
+    assert config.early_stop == 3
+    assert config.trainer.precision == "bf16-mixed"
+    return config.name, batches * config.data.dataset.window
+
+
+def test_learned_rivals_of_hmd2_see_as_many_frames_as_ours():
+    import tables_hmd2
+
+    for run, _, _ in tables_hmd2.TRAINED.values():
+        name, frames = frames_of(tables_hmd2.training(run, Path("runs"))[2:])
+        assert name == run
+        if run.startswith("avatarposer"):  # of 240 frames drawn, its two pairs of poses see 41 each
+            frames = frames * tables_hmd2.WINDOW[run] // 240
+        assert frames == pytest.approx(tables_hmd2.BUDGET, rel=0.02)
+
+
+def test_learned_rivals_of_echo_see_as_many_frames_as_ours():
+    import tables_echo
+
+    _, ours = frames_of(tables_echo.training("echo_short"))
+    for run in tables_echo.TRAININGS:
+        assert frames_of(tables_echo.training(run))[1] == pytest.approx(ours, rel=0.05), run
+
+
+def test_learned_rivals_of_mocap_every_see_as_many_frames_as_ours():
+    import tables_mocap_every as tables
+
+    assert len({frames_of([*overrides, *tables.STEPS])[1] for overrides in tables.TRAININGS.values()}) == 1

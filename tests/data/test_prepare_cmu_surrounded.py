@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from hydra.utils import instantiate
 
 import captured_motion as captured
-from wearcap.cli.conf import compose
+from wearcap.cli.conf import compose, splits_dir
 from wearcap.cli.prepare import run
 from wearcap.prepare import simulated
+from wearcap.prepare.engine import Splits
 from wearcap.recording import Recording, RecordingStore
 from wearcap.recording.recording import CameraStream, HeadStream
 from wearcap.recording.serialize import flatten
@@ -116,3 +118,20 @@ def test_a_recording_without_a_head_is_reported(tmp_path):
     report = surrounded(tmp_path / "cmu", tmp_path / "a", "camera=false")
     assert report.failed.keys() == MOTIONS.keys()
     assert "no head path" in report.failed["7_01"]
+
+
+def test_some_of_a_split_are_chosen_evenly(tmp_path, monkeypatch):
+    monkeypatch.setitem(MOTIONS, "35_03", MOTIONS["35_02"])
+    monkeypatch.setitem(MOTIONS, "35_04", MOTIONS["35_02"])
+    monkeypatch.setitem(MOTIONS, "35_05", MOTIONS["35_02"])
+    source(tmp_path / "cmu")
+
+    def chosen(recordings: str) -> list[str]:
+        settings = f"source={tmp_path / 'cmu'}", f"output={tmp_path / 'out'}", f"recordings={recordings}"
+        config = compose("prepare", ["prepare=cmu_surrounded", *settings])
+        tasks = instantiate(config.tasks, _convert_="all", _partial_=True)(splits=Splits.read(splits_dir() / "cmu.csv"))
+        return [task.name for task in tasks]
+
+    assert chosen("{test: 2}") == ["35_02", "35_04"]
+    assert chosen("{train: 5, test: 5}") == ["7_01", "35_02", "35_03", "35_04", "35_05"]
+    assert chosen("null") == ["35_02", "35_03", "35_04", "35_05", "7_01"]

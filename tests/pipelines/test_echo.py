@@ -1,6 +1,7 @@
 """ECHO on whole recordings: observations are kept, the frame of reference does not matter, batch items are
 independent."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -212,6 +213,31 @@ def test_every_frame_is_output_however_short_the_recording(seconds, rewindow):
 def test_windows_that_would_leave_frames_out_are_refused():
     with pytest.raises(WearcapError, match=r"advance by 9.*Expected 1 to 8"):
         drawn_echo(rewindow=9)
+
+
+def test_windows_take_as_many_steps_as_asked_for(monkeypatch):
+    echo, taken = drawn_echo(rewindow=3), []
+    given = replace(echo, sampling=replace(echo.sampling, rewindow_steps=2))
+    conveyor = replace(echo, sampling=replace(echo.sampling, rewindow_steps=echo.rolling.steps))
+    recording = carrying(1.0)
+    whole = echo.capture([recording], [0])[0].motion
+    assert torch.equal(conveyor.capture([recording], [0])[0].motion.R_parent_joint, whole.R_parent_joint)
+
+    def counted(self, queue, conditioning, frame):
+        denoise, correct = denoiser(self, queue, conditioning, frame)
+        return lambda x, level: taken.append(1) or denoise(x, level), correct
+
+    denoiser = Echo.denoiser
+    monkeypatch.setattr(Echo, "denoiser", counted)
+    motion = given.capture([recording], [0])[0].motion
+    assert len(taken) == 2 * math.ceil(len(motion) / 3)
+    assert not torch.allclose(motion.R_parent_joint, whole.R_parent_joint, atol=1e-3)
+
+
+@pytest.mark.parametrize("settings", [{"rewindow_steps": 4}, {"rewindow": 3, "rewindow_steps": 0}])
+def test_steps_of_windows_need_windows(settings):
+    with pytest.raises(WearcapError, match="rewindow_steps=.*Expected at least one step"):
+        drawn_echo(**settings)
 
 
 def test_redrawn_noise_needs_the_conveyor():

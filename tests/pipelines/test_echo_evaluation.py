@@ -104,6 +104,12 @@ def test_a_human_alone_has_no_scores_of_objects():
     assert "touch_f1" not in scores
 
 
+def test_touch_that_is_never_found_scores_nothing_and_of_a_human_alone_there_is_no_score(truth):
+    never = replace(perfect(truth), body_contact_prob=torch.zeros_like(truth.touch, dtype=torch.float32))
+    assert score_echo(never, truth, "a", 0).scores["touch_f1"] == 0.0
+    assert "touch_f1" not in score_echo(replace(never, object_motion=None), truth, "a", 0).scores
+
+
 def test_truth_is_read_at_a_captures_own_times(truth, scenario):
     fine = torch.arange(0.0, 1.2, 0.01, dtype=torch.float64)
     other = truth_of(scenario, fine, drawn_echo().reader())

@@ -170,6 +170,8 @@ def test_a_network_without_contacts_is_not_guided():
     unguided = replace(without, contacts=ContactUse(static_threshold=None))
     plain, asked = (one.capture_scenarios([scenario_of(recording)], [0])[0] for one in (unguided, without))
     assert torch.equal(plain.t_world_root, asked.t_world_root)
+    assert asked.body_contact_prob is None  # noise, which it never saw in training
+    assert echo.capture_scenarios([scenario_of(recording)], [0])[0].body_contact_prob is not None
 
 
 def test_each_batch_item_is_guided_by_its_own_objects():

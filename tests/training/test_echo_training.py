@@ -264,7 +264,11 @@ def test_a_baseline_learns_in_a_few_steps_and_captures(name, data, people, tmp_p
     losses = [float(loss) for loss in losses_of(run).values()]
     assert sum(losses[-5:]) < 0.9 * sum(losses[:5])
     rows = benchmark("echo_rows")
-    method = rows.Method(name, f"{run}/checkpoints/last.ckpt", (f"pipeline=baseline/{captured}",))
+    method = rows.Method(
+        name,
+        f"{run}/checkpoints/last.ckpt",
+        (f"pipeline=baseline/{captured}", f"pipeline.sampling.rewindow={WINDOW // 2}"),
+    )
     (one,) = rows.captured(method, RecordingStore.open(data), ["c2"], [0], items=1)
     assert one.motion.R_parent_joint.isfinite().all()
     assert set(one.motion.object_motion or {}) == ({"box_1"} if name == "bodiffusion_object" else set())

@@ -301,16 +301,31 @@ def _surrounded(file: Path, name: str, root: Path, camera: bool, look_round: boo
     return replace(recording, camera=stream)
 
 
+def _evenly(names: list[str], count: int) -> list[str]:
+    return [names[k * len(names) // count] for k in range(count)] if count < len(names) else names
+
+
 def cmu_surrounded_tasks(
-    source: str | Path, output: str | Path, splits: Splits, camera: bool, look_round: bool, seed: int
+    source: str | Path,
+    output: str | Path,
+    splits: Splits,
+    camera: bool,
+    look_round: bool,
+    seed: int,
+    recordings: Mapping[str, int] | None,
 ) -> list[Task]:
-    """One task per recording of the data set `source`, which `wearcap prepare cmu` made (floors at z = 0).
+    """One task per recording of the data set `source`, which `wearcap prepare cmu` made (floors at z = 0), or for
+    `recordings[split]` of each split, evenly chosen.
 
     Videos of the head camera go to `output`/videos. The hash covers the recording and the simulator's own source.
     """
     store, simulator = RecordingStore.open(source), source_files()
+    names = store.names()
+    if recordings is not None:
+        in_split = {split: [n for n in names if splits.of(store.entries[n].subject) == split] for split in recordings}
+        names = [name for split, count in recordings.items() for name in _evenly(in_split[split], count)]
     tasks = []
-    for name in store.names():
+    for name in names:
         entry = store.entries[name]
         make = partial(_surrounded, store.root / entry.file, name, Path(output), camera, look_round, seed)
         key = content_hash(entry.sha256, camera, look_round, seed, simulator)

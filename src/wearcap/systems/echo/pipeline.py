@@ -44,6 +44,8 @@ class Sampling:
     step: str = "posterior"
     rewindow: int | None = None
     """Frames by which overlapping windows advance that are each denoised from scratch; None: a conveyor."""
+    rewindow_steps: int | None = None
+    """Denoising steps of such a window; None: as many as a frame takes on the conveyor."""
 
 
 @dataclass
@@ -82,6 +84,9 @@ class Echo(LearnedSystem):
         if rewindow is not None and not 0 < rewindow <= ramp:
             what = f"windows that advance by {rewindow} frames"
             raise WearcapError(what, expected=f"1 to {ramp}, the window less the context")
+        if self.sampling.rewindow_steps is not None and (rewindow is None or self.sampling.rewindow_steps < 1):
+            what = f"rewindow_steps={self.sampling.rewindow_steps} with rewindow={rewindow}"
+            raise WearcapError(what, expected="at least one step, of windows (rewindow=FRAMES)")
         if rewindow is not None and self.sampling.step == "redraw":
             what = "step=redraw with windows that are denoised from scratch"
             raise WearcapError(what, expected="step=posterior, or rewindow=null")
@@ -214,7 +219,8 @@ class Echo(LearnedSystem):
         # 3. Untouched objects are made static, and the body is anchored to the measured head.
         if (threshold := self.contact_use.static_threshold) is not None:
             outputs = [with_static_objects(item.conditioning, part, threshold) for item, part in zip(items, outputs)]
-        return [motion_of(item, part, self.anchor, self.settings()) for item, part in zip(items, outputs)]
+        settings, contacts = self.settings(), self.model.contacts
+        return [motion_of(item, part, self.anchor, settings, contacts) for item, part in zip(items, outputs)]
 
     def queue(
         self,
@@ -226,7 +232,7 @@ class Echo(LearnedSystem):
         """An empty queue for a batch, with the bodies and objects that guidance needs, if any."""
         queue = EchoQueue(self, skeletons, seeds)
         if self.sampling.rewindow is not None:
-            queue = Rewindow(self, skeletons, seeds, self.sampling.rewindow)
+            queue = Rewindow(self, skeletons, seeds, self.sampling.rewindow, self.sampling.rewindow_steps)
         if self.contact_use.guidance is not None:
             queue.guided = pulled_by(skeletons, shapes, objects)
         return queue
@@ -256,8 +262,11 @@ class Echo(LearnedSystem):
         return {"pipeline": "echo"} | {name: str(value) for name, value in settings.items()}
 
 
-def motion_of(item: BatchItem, outputs: Outputs, anchor: bool, provenance: dict[str, str]) -> Motion:
-    """Outputs of one batch item as a motion, if `anchor` anchored to the measured head except in observed frames."""
+def motion_of(
+    item: BatchItem, outputs: Outputs, anchor: bool, provenance: dict[str, str], contacts: bool = True
+) -> Motion:
+    """Outputs of one batch item as a motion, if `anchor` anchored to the measured head except in observed frames; without
+    touch of the object where `contacts` were not predicted."""
     path, contact = item.path, outputs.contact_prob[0]
     motion = Motion(
         path.timestamps,
@@ -265,7 +274,7 @@ def motion_of(item: BatchItem, outputs: Outputs, anchor: bool, provenance: dict[
         outputs.R_parent_joint[0],
         outputs.t_world_root[0],
         contact[:, BODY_POINTS:],
-        body_contact_prob=contact[:, :BODY_POINTS] * item.conditioning.has_object[0, :, None],
+        body_contact_prob=contact[:, :BODY_POINTS] * item.conditioning.has_object[0, :, None] if contacts else None,
         object_motion=object_tracks(item, outputs) or None,
         provenance=provenance,
     )

@@ -219,12 +219,15 @@ class Rewindow(EchoQueue):
     """Windows that advance by `stride` frames: the last final frames (at most the context) are inpainted, the next
     `stride` frames become final, and the rest is discarded.
 
-    With the conveyor's context and steps, a frame sees as much of the past and future as on the conveyor.
+    With the conveyor's context, a frame sees as much of the past and future as on the conveyor. `steps` (None: those of
+    a frame on the conveyor) are a window's: as many network evaluations as the conveyor's are `per_frame` times `stride`.
     """
 
-    def __init__(self, pipeline: _Pipeline, skeletons: Sequence, seeds: Sequence[int], stride: int = 10):
+    def __init__(
+        self, pipeline: _Pipeline, skeletons: Sequence, seeds: Sequence[int], stride: int = 10, steps: int | None = None
+    ):
         super().__init__(pipeline, skeletons, seeds)
-        self.stride = stride
+        self.stride, self.steps = stride, steps or self.rolling.steps
 
     @torch.no_grad()
     def window(
@@ -235,7 +238,7 @@ class Rewindow(EchoQueue):
         count, observed_frames = conditioning.valid.shape[1], before.shape[1]
         observation = self._observation(conditioning, frame)
         denoise, correct = self.pipeline.denoiser(self, conditioning, frame)
-        levels = step_levels(self.rolling.steps, self.rolling.spacing)
+        levels = step_levels(self.steps, self.rolling.spacing)
         # Always a full window's noise: a batch item's noise must not depend on the length of the others.
         x = self._noise(self.rolling.window)[:, :count]
         observed = observation.observed.clone()

@@ -145,10 +145,11 @@ def score_echo(motion: Motion, truth: Truth, name: str, seed: int) -> Row:
             }.items():
                 parts.setdefault(key, []).append(value)
         scores |= {key: torch.cat(values).mean().item() for key, values in parts.items()}
-    if motion.body_contact_prob is not None and busy.any():
-        found = detection_scores(motion.body_contact_prob[busy].flatten(), truth.touch[busy].flatten())
-        precision, recall = found.precision, found.recall
-        scores["touch_f1"] = 2 * precision * recall / (precision + recall) if precision + recall else 0.0
+    touch = truth.touch[busy]
+    if motion.body_contact_prob is not None and motion.object_motion and touch.any():
+        found = detection_scores(motion.body_contact_prob[busy].flatten(), touch.flatten())
+        precision, recall = found.precision, found.recall  # without recall the precision may be undefined
+        scores["touch_f1"] = 2 * precision * recall / (precision + recall) if recall else 0.0
     return Row(name, seed, len(motion), scores)
 
 

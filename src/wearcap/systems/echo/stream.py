@@ -318,7 +318,8 @@ class EchoStream(HeadAndWristsStream):
         batch_item = BatchItem(path, conditioning, list(self._shapes.values()))
         if self._static is not None:
             outputs = self._static(conditioning, outputs)
-        return [motion_of(batch_item, outputs, self.pipeline.anchor, self.pipeline.settings())]
+        settings, contacts = self.pipeline.settings(), self.pipeline.model.contacts
+        return [motion_of(batch_item, outputs, self.pipeline.anchor, settings, contacts)]
 
 
 class EchoSession(Session):
