@@ -15,7 +15,6 @@ from jaxtyping import Float64
 from wearcap.geometry import rotation
 from wearcap.localization.absolute_pose import CameraPose
 
-
 _PLAUSIBLE = 6.0
 """Squared disagreement of tracking and a key frame, over its expectation, beyond which neither tells about the other."""
 _LEAST = 1e-10

@@ -336,7 +336,12 @@ def _active_body(patches: FootPatches) -> tuple[tuple[int, ...], Body]:
     arms, shares = arms.numpy(), (shares / shares.sum(1, keepdim=True)).numpy()
     powers = np.concatenate([np.ones((len(arms), 2, 1)), arms], 2)
     products = np.einsum("vai,vbk->vabik", powers, powers) * (shares[:, :, None] * shares[:, None])[..., None, None]
-    flat = [products[..., 0, 0, None], products[..., 1:, 0], products[..., 0, 1:], products[..., 1:, 1:].reshape(-1, 2, 2, 9)]
+    flat = [
+        products[..., 0, 0, None],
+        products[..., 1:, 0],
+        products[..., 0, 1:],
+        products[..., 1:, 1:].reshape(-1, 2, 2, 9),
+    ]
     return joints, Body(
         parents=np.array([number[skeleton.parents[joint]] for joint in joints]),
         offsets=skeleton.t_parent_joint[list(joints)].double().numpy(),
