@@ -214,7 +214,7 @@ class LandmarkTracker:
         back, again, _ = cv2.calcOpticalFlowPyrLK(after, before, end, start.copy(), **options)  # type: ignore[call-overload]
         returns = np.linalg.norm(back - start, axis=2)[:, 0] < _RETURN_PX
         end = end[:, 0]
-        kept = (status & again)[:, 0].astype(bool) & returns & (end > -0.5).all(1) & (end < size - 0.5).all(1)
+        kept = (status[:, 0] == 1) & (again[:, 0] == 1) & returns & (end > -0.5).all(1) & (end < size - 0.5).all(1)
         if kept.sum() < least:
             return False
         pixels = ((end[kept] + 0.5) / scale - 0.5).astype(np.float32)
