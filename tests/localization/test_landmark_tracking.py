@@ -32,6 +32,7 @@ SETTINGS = TrackingSettings(
     min_share=0.4,
     min_confidence=0.9,
     max_error_px=2.5,
+    max_drift_m=0.01,
     window_px=15,
     max_side=480,
 )

@@ -33,6 +33,8 @@ _TRACKED = 0.5
 """Confidence from which a key frame is tracked, and below which a track is lost."""
 _ESTABLISHED = 2
 """Largest number of agreeing key frames that a track can set against a rival's."""
+_RETURN_PX = 1.0
+"""Distance from where a landmark was, tracked to the next frame and back, beyond which it is lost."""
 _LEVELS = 3
 """Pyramid levels of the optical flow, for large displacements."""
 
@@ -53,6 +55,8 @@ class TrackingSettings:
     """Confidence below which tracking is weak."""
     max_error_px: float
     """Median reprojection error beyond which tracking is weak, at a picture 1000 pixels wide."""
+    max_drift_m: float
+    """Deviation (m) of the position by the tracked landmarks beyond which tracking is weak; beyond twice that it is lost."""
     window_px: int
     """Side of the optical flow's window."""
     max_side: int
@@ -60,7 +64,7 @@ class TrackingSettings:
 
     def __post_init__(self):
         shares = 0 <= self.min_share < 1 and 0 <= self.min_confidence < 1
-        sizes = min(self.max_error_px, self.window_px - 2, self.max_side - 31, self.landmarks - 3) > 0
+        sizes = min(self.max_error_px, self.max_drift_m, self.window_px - 2, self.max_side - 31, self.landmarks - 3) > 0
         if not (0 < self.retry_s <= self.key_s and shares and sizes):
             expected = "0 < retry_s <= key_s; shares in 0…1; 4 landmarks, a window of 3 px, sides of 32 px or more"
             raise WearcapError(f"tracking with {self}", expected=expected)
@@ -185,6 +189,7 @@ class LandmarkTracker:
         return (
             len(track.pixels) < settings.min_share * track.started
             or track.poses[-1].pose.confidence < settings.min_confidence
+            or _drift_m(track.poses[-1].drift) > settings.max_drift_m
             or track.error_px > settings.max_error_px * track.camera.width / 1000
         )
 
@@ -206,8 +211,10 @@ class LandmarkTracker:
         window = (self.settings.window_px, self.settings.window_px)
         options = {"winSize": window, "maxLevel": _LEVELS, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
         end, status, _ = cv2.calcOpticalFlowPyrLK(before, after, start, guess, **options)  # type: ignore[call-overload]
+        back, again, _ = cv2.calcOpticalFlowPyrLK(after, before, end, start.copy(), **options)  # type: ignore[call-overload]
+        returns = np.linalg.norm(back - start, axis=2)[:, 0] < _RETURN_PX
         end = end[:, 0]
-        kept = (status[:, 0] == 1) & (end > -0.5).all(1) & (end < size - 0.5).all(1)
+        kept = (status[:, 0] == 1) & (again[:, 0] == 1) & returns & (end > -0.5).all(1) & (end < size - 0.5).all(1)
         if kept.sum() < least:
             return False
         pixels = ((end[kept] + 0.5) / scale - 0.5).astype(np.float32)
@@ -216,11 +223,13 @@ class LandmarkTracker:
         trust = min(track.key.confidence, confidence(pixels[fit.inlier], camera))
         if fit.inlier.sum() < least or trust < _TRACKED:
             return False
+        drift = matches.covariance(fit)
+        if _drift_m(drift) > 2 * self.settings.max_drift_m:
+            return False
         track.before, track.fit = track.fit, fit
         track.pixels, track.points_world = pixels[fit.inlier], matches.points_world[fit.inlier]
         track.error_px = float(np.median(matches.errors(fit)[fit.inlier]))
         R, t = (torch.from_numpy(part).float() for part in (fit.R_world_cam, fit.t_world_cam))
-        drift = matches.covariance(fit)
         covariance = track.key.covariance + torch.from_numpy(drift).float()
         pose = CameraPose(R, t, len(track.pixels), trust, covariance)
         track.poses.append(ChainedPose(pose, track.key, drift))
@@ -254,6 +263,10 @@ def _expected(track: _Track) -> Float32[np.ndarray, "landmark 2"]:
     ahead = Fit(R, 2 * last.t_world_cam - before.t_world_cam, last.inlier)
     pixels, valid = ahead.project(track.points_world, track.camera)
     return np.where(valid[:, None], pixels, track.pixels).astype(np.float32)
+
+
+def _drift_m(covariance: Float64[np.ndarray, "6 6"]) -> float:
+    return float(np.sqrt(np.trace(covariance[3:, 3:])))
 
 
 def _agree(track: _Track, fit: Fit, limit_px: float) -> bool:
