@@ -57,7 +57,13 @@ WHOLE = ("mpjpe_mm", "mpjve_printed", "foot_contact", "v2v_cm", "center_cm", "ro
 """The paper's columns of Table 1."""
 UNGUIDED = ("pipeline=echo", "pipeline.contacts.guidance=null")
 SHORT = ("experiment=echo",)
-BUDGET = ("trainer.max_steps=400", "data.loading.steps_per_epoch=80", "callbacks.average.decay=0.98", "early_stop=3")
+BUDGET = (
+    "trainer.max_steps=400",
+    "data.loading.steps_per_epoch=80",
+    "optimizer.scheduler.warmup=40",
+    "callbacks.average.decay=0.98",
+    "early_stop=3",
+)
 """How long all of these are trained: 400 batches of some 960 frames, in windows of 60 or 98, or until the validation
 loss has not fallen for three epochs; captured with is the checkpoint of the lowest."""
 BATCH = "data.loading.batch_size=16"

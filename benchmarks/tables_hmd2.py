@@ -410,6 +410,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
             "Bad are arms out of the camera's sight, and CMU's dances and jumps.",
             *_briefly(simulated, real),
             *_transcribed(trees),
+            *_counted(trees),
             "FID needs more windows than CMU's held-out subjects have.",
             "No recording of a real head-mounted device has been scored.",
         ),
@@ -442,6 +443,16 @@ def _briefly(simulated: dict[str, Tree], real: dict[str, Tree]) -> tuple[str, ..
         f"checkpoint saw. MPJPE (cm), so trained: {'; '.join(said)}.",
         "Trained so briefly a diffusion with a token for each frame passes on noise that more training would remove; "
         f"jitter, of the truth's: {', '.join(jitters)}.",
+    )
+
+
+def _counted(trees: Trees) -> tuple[str, ...]:
+    """How much of CMU's test split its rows are of."""
+    about = trees.get("hmd2_cmu_surrounded", {}).get("about", {})
+    if about.get("transcribed") or "recordings" not in about:
+        return ()
+    return (
+        f"CMU's rows are of {about['recordings']} short recordings of held-out subjects, {about['seeds']} repetitions of each.",
     )
 
 
@@ -497,6 +508,7 @@ def _grids(trees: Trees) -> list[Grid]:
         )
         for name, tree in trees.items()
         for title, rows in tree["tables"].items()
+        if rows
     ]
     labels = {name: (title, 2) for name, title in COLUMNS.items()}
     for tree in trees.values():
