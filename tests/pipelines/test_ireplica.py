@@ -190,7 +190,9 @@ def test_what_is_touched_without_being_moved_stays_exactly(scene):
 
 def test_a_hand_may_come_within_reach_after_the_network_says_contact(scene):
     motion, environment = scene
-    near = replace(environment.objects[0], t_world_object=environment.objects[0].t_world_object + torch.tensor([0.5, 0, 0]))
+    near = replace(
+        environment.objects[0], t_world_object=environment.objects[0].t_world_object + torch.tensor([0.5, 0, 0])
+    )
     contacts = {"timestamps": motion.timestamps, "sliding": held_left()}
     late = Environment((near,))
     assert len(held_of(tracker(reach_m=0.2)(motion, contacts, late))) == 0

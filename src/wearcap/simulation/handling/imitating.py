@@ -25,7 +25,7 @@ from wearcap.simulation.places.outline import stays_apart
 NEAR_M, APART_M, TRIES = 1.6, 0.05, 8
 """Largest distance of the copy from the wearer, its distance from other objects, and the places that are tried."""
 COPY = "something"
-MIMED, STILL = 0.1, 0.45
+MIMED, STILL = 0.1, 0.1
 """Shares of imitated handlings in which hands go as if they touched, and stay where they are on the body."""
 MIMED_M, STILL_M, STRAY_M = 0.012, 0.012, 0.03
 """Deviation of hands' waves (m; `wandering`) in these, and in all others, in which they stray."""

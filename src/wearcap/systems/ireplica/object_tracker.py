@@ -190,6 +190,10 @@ class AttachmentSettings:
     does not hold it; infinity: any (thesis)."""
     rest_m: float = 0.0
     """Least displacement (m) of an object's corners in a hold; an object that moves by less was only touched."""
+    class_m: float | None = None
+    """Distance (m) that counts as much as a class that is e times as probable. Hands then hold by whichever class, and
+    take the object with the least sum of distance, displacement on it while it follows, and this; None: the nearest of
+    the class (thesis)."""
 
     def __post_init__(self):
         if self.anchor not in ANCHORS or not self.reach_m > 0:
@@ -268,9 +272,11 @@ class ObjectTracker:
             if name != "timestamps"
         }
         palms = site_positions(motion.skeleton, motion.T_world_joint, PALMS).double()
-        spans = class_intervals(prob, motion.timestamps, self.contact, self.attachment.one_class)
+        any_class = self.attachment.class_m is not None and len(prob) > 1
+        merged = {UNKNOWN_CLASS: torch.stack(list(prob.values())).amax(0)} if any_class else prob
+        spans = class_intervals(merged, motion.timestamps, self.contact, self.attachment.one_class)
         spans = settled(spans, palms, motion.timestamps, self.attachment.settle_s)
-        held = self._held(motion, palms, spans, environment)
+        held = self._held(motion, palms, spans, environment, prob if any_class else {})
         offset = palms.new_zeros(len(motion), 2) if self.correction is None else self.correction.finish(held)
         shift = torch.nn.functional.pad(offset, (0, 1))
         moved = replace(
@@ -283,9 +289,17 @@ class ObjectTracker:
         return moved if self.hands is None else self.hands(moved, held, environment)
 
     def _held(
-        self, motion: Motion, palms: Float64[Tensor, "time hand 3"], spans: list[Span], environment: Environment
+        self,
+        motion: Motion,
+        palms: Float64[Tensor, "time hand 3"],
+        spans: list[Span],
+        environment: Environment,
+        prob: dict[str, Float[Tensor, "time hand"]],
     ) -> list[Held]:
-        """Attach, correct, move and release: one interval after the other, each object being where it was left."""
+        """Attach, correct, move and release: one interval after the other, each object being where it was left.
+
+        `prob` has the contact probabilities by class that decide between objects, if any do.
+        """
         states = {one.name: ObjectState(one.T_world_object) for one in environment.objects}
         held, busy_until = [], [0, 0]
         if self.correction is not None:
@@ -303,7 +317,7 @@ class ObjectTracker:
                     before = row.scene_object
                     break
             if before is None:
-                found = self._taken(palms, contact, contact_class, motion.timestamps, states, environment)
+                found = self._taken(palms, contact, contact_class, motion.timestamps, states, environment, prob)
                 if found is None:
                     continue
                 before_start, scene_object = found
@@ -337,9 +351,10 @@ class ObjectTracker:
         timestamps: Float64[Tensor, "time"],
         states: dict[str, ObjectState],
         environment: Environment,
+        prob: dict[str, Float[Tensor, "time hand"]],
     ) -> tuple[int, SceneObject] | None:
         """The first frame of an interval, up to `seek_s` after its start, in which a hand is within reach of an object of
-        the class, and the nearest one; None where there is none: the contact is a false positive."""
+        the class, and the object that it takes (`class_m`); None where there is none: the contact is a false positive."""
         latest = timestamps[contact.start] + self.attachment.seek_s
         stop = min(int(torch.searchsorted(timestamps, latest, right=True)), contact.stop)
         touching = palms[contact.start : stop, torch.tensor(contact.hands)]
@@ -350,7 +365,46 @@ class ObjectTracker:
         if not len(within):
             return None
         frame = int(within[0])
+        if self.attachment.class_m is not None:
+            interval = replace(contact, start=contact.start + frame)
+            return interval.start, self._likeliest(palms, interval, states, environment, prob)
         return contact.start + frame, environment.objects[int(index[frame, distance[frame].argmin()])]
+
+    def _likeliest(
+        self,
+        palms: Float64[Tensor, "time hand 3"],
+        contact: ContactInterval,
+        states: dict[str, ObjectState],
+        environment: Environment,
+        prob: dict[str, Float[Tensor, "time hand"]],
+    ) -> SceneObject:
+        """Of the objects within reach, the one with the least sum of the hands' distance from it, the root mean square of
+        their displacements on it while it follows them, and what its class is less probable (`class_m`)."""
+        hands, frames = torch.tensor(contact.hands), slice(contact.start, contact.stop)
+        odds = {
+            name: self.attachment.class_m * value[frames][:, hands].mean().clamp(min=1e-3).log()
+            for name, value in prob.items()
+        }
+        costs = []
+        for item in environment.objects:
+            state = states[item.name]
+            away, _ = environment.distance(item.name, palms[contact.start, hands], state.T_world_object)
+            cost = float(away.min())
+            if cost <= self.attachment.reach_m:
+                slip = self._slip(palms[frames], hands, item, state)
+                costs.append(
+                    (cost + float(slip.square().mean().sqrt() - odds.get(item.freedom.contact_class, 0.0)), item)
+                )
+        return min(costs, key=lambda row: row[0])[1]
+
+    def _slip(
+        self, palms: Float64[Tensor, "time hand 3"], hands: Bool[Tensor, "hand"], item: SceneObject, state: ObjectState
+    ) -> Float64[Tensor, "time"]:
+        """Displacement (m) of the hands from their places on an object that follows them, the larger of both."""
+        T, _ = follow_hands(item, state, palms, hands, self.attachment.anchor)
+        T = T.to(torch.float64)
+        local = (T.R.mT[:, None] @ (palms[:, hands] - T.t[:, None])[..., None])[..., 0]
+        return (local - local.median(0).values).norm(dim=-1).amax(1)
 
     def _following(
         self,
@@ -365,10 +419,7 @@ class ObjectTracker:
         frames, most = palms[contact.start : contact.stop], self.attachment.slip_m
         if most == torch.inf:
             return contact
-        T, _ = follow_hands(scene_object, state, frames, hands, self.attachment.anchor)
-        T = T.to(torch.float64)
-        local = (T.R.mT[:, None] @ (frames[:, hands] - T.t[:, None])[..., None])[..., 0]
-        slip = (local - local.median(0).values).norm(dim=-1).amax(1)
+        slip = self._slip(frames, hands, scene_object, state)
         on = slip <= most
         if on.float().mean() < LEAST_FOLLOWING:
             return None
