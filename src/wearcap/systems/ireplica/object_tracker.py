@@ -39,9 +39,9 @@ from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 class ContactSettings:
     """Thresholds and gap filling. Raises WearcapError for a threshold outside 0…1 or a negative gap."""
 
-    threshold: float = 0.5
+    threshold: float = 0.3
     """Least probability of a contact."""
-    keep: float = 0.5
+    keep: float = 0.15
     """Least probability with which a contact above the threshold goes on, before and after (hysteresis)."""
     gap_s: float = 0.5
     """Longest gap (s) between two contacts of a hand that is filled (thesis Table 5.4)."""
@@ -172,7 +172,7 @@ def _slowest(speed: Float[Tensor, "time hand"], hold: list[Span], near: int, rea
 class AttachmentSettings:
     """Rules of attachment. Raises WearcapError for an unknown anchor or a reach that is not positive."""
 
-    reach_m: float = 0.5
+    reach_m: float = 0.2
     """Largest distance (m) from a contacting hand to the object it takes; a contact farther from every object of its
     class is a false positive (thesis §5.3.1)."""
     anchor: str = "middle"
@@ -185,9 +185,9 @@ class AttachmentSettings:
     """Whether the object stays when hands join or leave without a pause; False: it is searched again (thesis)."""
     seek_s: float = 0.0
     """Longest time (s) after an interval's start in which a hand may come within reach; 0: at its start only (thesis)."""
-    slip_m: float = torch.inf
+    slip_m: float | None = None
     """Largest displacement (m) of a hand on the object that follows it: a hand that moves otherwise than the object can
-    does not hold it; infinity: any (thesis)."""
+    does not hold it; None: any (thesis)."""
     rest_m: float = 0.0
     """Least displacement (m) of an object's corners in a hold; an object that moves by less was only touched."""
     class_m: float | None = None
@@ -417,7 +417,7 @@ class ObjectTracker:
         """The part of an interval in which the hands stay at their places of the object that follows them, within
         `slip_m`; None where they do not for half of it: they move otherwise than the object can."""
         frames, most = palms[contact.start : contact.stop], self.attachment.slip_m
-        if most == torch.inf:
+        if most is None:
             return contact
         slip = self._slip(frames, hands, scene_object, state)
         on = slip <= most
@@ -493,8 +493,11 @@ class ActSearch:
 
     checkpoints: Sequence[str]
     """Checkpoints of iReplica's contact networks."""
-    tracker: ObjectTracker = field(default_factory=lambda: ObjectTracker(None))
-    """Object tracker, without correction: the wearer stays where the head was measured."""
+    tracker: ObjectTracker = field(
+        default_factory=lambda: ObjectTracker(None, ContactSettings(0.5, 0.5), AttachmentSettings(reach_m=0.5))
+    )
+    """Object tracker, without correction: the wearer stays where the head was measured. Hands are not, as a suit's are:
+    they reach farther, and no motion of theirs is refused."""
     margin_s: float = MARGIN_S
     """Time (s) for which an object is already active before it is touched and still active after its release."""
 
