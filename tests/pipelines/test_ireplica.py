@@ -188,6 +188,23 @@ def test_what_is_touched_without_being_moved_stays_exactly(scene):
     assert (gone[-1] - gone[0]).norm() > 0.9
 
 
+def test_of_objects_within_reach_the_one_that_can_move_so_is_taken(scene):
+    """Both doors are as near; the hand goes round one's hinge. A class that is wrong but near gives way, too."""
+    motion, environment = scene
+    angle = 1.2 * ((torch.arange(FRAMES) - TAKE - 30) / 120.0).clamp(0, 1)
+    left = site_positions(motion.skeleton, motion.T_world_joint, PALMS)[0, 0]
+    path = torch.stack([0.8 * angle.sin(), 0.8 * (1 - angle.cos()), torch.zeros(FRAMES)], 1)
+    motion = replace(motion, t_world_root=motion.t_world_root[:1] + path)
+    place = left - torch.tensor([0.2, 0.0, 0.0])
+    right = cube("right", place, Freedom("hinge", pivot=tuple((left + torch.tensor([0.0, 0.8, 0.0])).tolist())))
+    wrong = cube("wrong", place, Freedom("hinge", pivot=tuple((left - torch.tensor([0.8, 0.0, 0.0])).tolist())))
+    objects = Environment((wrong, right, replace(environment.objects[1], t_world_object=left + 3.0)))
+    for classes in ({"hinged": 0.9, "sliding": 0.1}, {"hinged": 0.2, "sliding": 0.9}):
+        contacts = {"timestamps": motion.timestamps} | {name: held_left() * p for name, p in classes.items()}
+        captured = tracker(class_m=0.03)(motion, contacts, objects)
+        assert held_of(captured).objects == ("right",)
+
+
 def test_a_hand_may_come_within_reach_after_the_network_says_contact(scene):
     motion, environment = scene
     near = replace(
