@@ -382,7 +382,7 @@ class ObjectTracker:
         their displacements on it while it follows them, and what its class is less probable (`class_m`)."""
         hands, frames = torch.tensor(contact.hands), slice(contact.start, contact.stop)
         odds = {
-            name: self.attachment.class_m * value[frames][:, hands].mean().clamp(min=1e-3).log()
+            name: (self.attachment.class_m or 0.0) * value[frames][:, hands].mean().clamp(min=1e-3).log()
             for name, value in prob.items()
         }
         costs = []
@@ -445,16 +445,19 @@ class ObjectTracker:
         low, high = scene_object.mesh.vertices.min(0), scene_object.mesh.vertices.max(0)
         corners = torch.cartesian_prod(*torch.from_numpy(np.stack([low, high], 1)).double())
         rest = first.T_world_object.to(torch.float64)
-        moved = [
-            (row.T_world_object[:, None].to(torch.float64) @ corners - rest @ corners)
-            for row in (held[k] for k in chain)
-        ]
+        before, moved = _at(rest, corners), []
+        for k in chain:
+            moved.append(_at(held[k].T_world_object[:, None].to(torch.float64), corners) - before)
         if max(float(each.norm(dim=-1).max()) for each in moved) < self.attachment.rest_m:
             for k in chain:
                 count = len(held[k].T_world_object.t)
                 still = Rigid(rest.R.expand(count, 3, 3), rest.t.expand(count, 3))
                 held[k] = replace(held[k], state=first, T_world_object=still)
             states[scene_object.name] = first
+
+
+def _at(T: Rigid, points: Float64[Tensor, "point 3"]) -> Float64[Tensor, "*batch point 3"]:
+    return (T.R @ points[..., None])[..., 0] + T.t
 
 
 def object_trajectories(
