@@ -30,7 +30,7 @@ from wearcap.scene.objects import CONTACT_CLASSES, UNKNOWN_CLASS, Environment
 from wearcap.sensors.simulated import smooth_noise
 from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 from wearcap.systems.ireplica.detected_contacts import DetectedContacts
-from wearcap.systems.ireplica.object_tracker import ContactSettings, ObjectTracker
+from wearcap.systems.ireplica.object_tracker import ObjectTracker
 from wearcap.systems.ireplica.pipeline import IReplica
 from wearcap.systems.ireplica.published import held_when_near, interpolated_objects, nearness, static_objects
 from wearcap.systems.ireplica.scores import score_interactions
@@ -174,8 +174,10 @@ def _rows(
         "ours, no fit about hinges": track(replace(ours.tracker, correction=replace(correction, hinge=None)), "ours"),  # pyright: ignore[reportArgumentType, reportCallIssue]
         "ours, published networks": track(ours.tracker, "published"),
         "ours, right hand carries": track(changed(anchor="right"), "ours"),
+        "ours, the nearest of the class": track(changed(class_m=None), "ours"),
+        "ours, any motion of the hand": track(changed(slip_m=None, rest_m=0.0), "ours"),
         "ours, no gaps filled": track(_with_gap(ours.tracker, 0.0), "ours"),
-        "ours, classes in parallel": track(changed(one_class=False), "ours"),
+        "ours, classes in parallel": track(changed(one_class=False, class_m=None), "ours"),
         "ours, true contacts": lambda motion: ours.tracker(motion, oracle, placed),
     } | seen_rows
 
@@ -192,7 +194,7 @@ def _rig(seen: SeenFlat, case: Case, rows: dict[str, Motion]) -> dict[str, Any]:
 
 
 def _with_gap(tracker: ObjectTracker, gap_s: float) -> ObjectTracker:
-    return replace(tracker, contact=ContactSettings(tracker.contact.threshold, gap_s))
+    return replace(tracker, contact=replace(tracker.contact, gap_s=gap_s))
 
 
 def _contacts(pipeline: IReplica, case: Case) -> dict[str, Tensor]:

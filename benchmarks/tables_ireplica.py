@@ -214,8 +214,10 @@ def _limits(tree: Tree) -> tuple[str, ...]:
         f"{mean(without['w/o contact corr.'])}, without the fit about hinges {mean(without['no fit about hinges'])}: "
         "where these are smaller, the step wins nothing here.",
         "Contacts decide: with true ones ends are "
-        f"{mean(rows['ours, true contacts']['all']['end_cm'])} cm off. Simulated hands pose as if they touched for as "
-        "long as they touch, which poses alone cannot always tell apart; on the paper's real recordings they could.",
+        f"{mean(rows['ours, true contacts']['all']['end_cm'])} cm off. Simulated hands are in the poses of touching for "
+        "longer without a touch than with one: held out, straying, and rarely just as if they touched.",
+        "An object that was left at a wrong place, or that a missed contact did not move, is out of the hand's reach "
+        "later: one missed contact counts in every handling of that object that follows.",
         "Published contact networks were trained on simulated hands that did not pose so; the row that compares the "
         "trackers alone is the paper's tracker and path with our contacts.",
     )

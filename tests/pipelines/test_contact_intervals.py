@@ -21,6 +21,16 @@ def test_gaps_up_to_the_limit_are_filled_and_longer_ones_are_not():
     assert not held[60:].any()
 
 
+def test_a_sure_contact_goes_on_while_it_is_likely_and_a_likely_one_alone_is_none():
+    prob = torch.full((100, 2), 0.1)
+    prob[20:60, 0] = 0.4
+    prob[40:45, 0] = 0.8
+    prob[20:60, 1] = 0.4
+    held = active(prob, times(100), ContactSettings(threshold=0.7, keep=0.3))
+    assert held[:, 0].nonzero()[:, 0].tolist() == list(range(20, 60))
+    assert not held[:, 1].any()
+
+
 def test_an_interval_is_split_where_the_hands_change():
     held = torch.zeros(30, 2, dtype=torch.bool)
     held[5:20, 0] = True
@@ -40,3 +50,5 @@ def test_nothing_in_nothing_out():
 def test_settings_that_make_no_sense_are_refused():
     with pytest.raises(WearcapError, match="between 0 and 1"):
         ContactSettings(threshold=1.0)
+    with pytest.raises(WearcapError, match="between 0 and 1"):
+        ContactSettings(threshold=0.5, keep=0.6)

@@ -148,6 +148,75 @@ def test_a_hand_holds_one_thing_at_a_time(scene):
     labels_of(held_of(captured), LabelClock.of("r", motion.timestamps))
 
 
+def test_a_hand_that_moves_otherwise_than_the_object_can_does_not_hold_it(scene):
+    """The wearer walks a metre towards the door's hinge: no hand on a door does that."""
+    motion, environment = scene
+    contacts = {"timestamps": motion.timestamps, "hinged": held_left().flip(1)}
+    assert held_of(tracker()(motion, contacts, environment)).objects == ("door",)
+    checked = tracker(slip_m=0.1)(motion, contacts, environment)
+    held = held_of(checked)
+    assert all(stop - start < 2.0 for start, stop in zip(held.start_s, held.stop_s))
+    moving = (held.start_s > 1.6) & (held.stop_s < 3.3)
+    assert not moving.any()
+    sliding = {"timestamps": motion.timestamps, "sliding": held_left()}
+    assert held_of(tracker(slip_m=0.1)(motion, sliding, environment)).stop_s.item() == pytest.approx(LEAVE / FPS)
+
+
+def test_a_hand_that_leaves_the_surface_lets_go(scene):
+    """The hand rises by half a metre before the network notices the release; what slides on the floor stays behind."""
+    motion, environment = scene
+    rise = 0.5 * ((torch.arange(FRAMES) - 200) / 30.0).clamp(0, 1)
+    motion = replace(motion, t_world_root=motion.t_world_root + torch.nn.functional.pad(rise[:, None], (2, 0)))
+    contacts = {"timestamps": motion.timestamps, "sliding": held_left()}
+    (stop,) = held_of(tracker(slip_m=0.1)(motion, contacts, environment)).stop_s.tolist()
+    assert 200 / FPS < stop < 215 / FPS
+
+
+def test_what_is_touched_without_being_moved_stays_exactly(scene):
+    motion, environment = scene
+    drift = torch.linspace(0.0, 0.03, FRAMES)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    still = replace(motion, t_world_root=motion.t_world_root[:1] + drift)
+    both = held_left()
+    both[120:180, 1] = 0.9
+    contacts = {"timestamps": motion.timestamps, "sliding": both}
+    moved = objects_of(tracker()(still, contacts, environment))["near"].t_world_body
+    assert (moved[-1] - moved[0]).norm() > 0.01
+    kept = tracker(rest_m=0.05)(still, contacts, environment)
+    assert (objects_of(kept)["near"].t_world_body.diff(dim=0) == 0).all()
+    assert held_of(kept).objects == ("near",) * 3
+    gone = objects_of(tracker(rest_m=0.05)(motion, contacts, environment))["near"].t_world_body
+    assert (gone[-1] - gone[0]).norm() > 0.9
+
+
+def test_of_objects_within_reach_the_one_that_can_move_so_is_taken(scene):
+    """Both doors are as near; the hand goes round one's hinge. A class that is wrong but near gives way, too."""
+    motion, environment = scene
+    angle = 1.2 * ((torch.arange(FRAMES) - TAKE - 30) / 120.0).clamp(0, 1)
+    left = site_positions(motion.skeleton, motion.T_world_joint, PALMS)[0, 0]
+    path = torch.stack([0.8 * angle.sin(), 0.8 * (1 - angle.cos()), torch.zeros(FRAMES)], 1)
+    motion = replace(motion, t_world_root=motion.t_world_root[:1] + path)
+    place = left - torch.tensor([0.2, 0.0, 0.0])
+    right = cube("right", place, Freedom("hinge", pivot=tuple((left + torch.tensor([0.0, 0.8, 0.0])).tolist())))
+    wrong = cube("wrong", place, Freedom("hinge", pivot=tuple((left - torch.tensor([0.8, 0.0, 0.0])).tolist())))
+    objects = Environment((wrong, right, replace(environment.objects[1], t_world_object=left + 3.0)))
+    for classes in ({"hinged": 0.9, "sliding": 0.1}, {"hinged": 0.2, "sliding": 0.9}):
+        contacts = {"timestamps": motion.timestamps} | {name: held_left() * p for name, p in classes.items()}
+        captured = tracker(class_m=0.03)(motion, contacts, objects)
+        assert held_of(captured).objects == ("right",)
+
+
+def test_a_hand_may_come_within_reach_after_the_network_says_contact(scene):
+    motion, environment = scene
+    near = replace(
+        environment.objects[0], t_world_object=environment.objects[0].t_world_object + torch.tensor([0.5, 0, 0])
+    )
+    contacts = {"timestamps": motion.timestamps, "sliding": held_left()}
+    late = Environment((near,))
+    assert len(held_of(tracker(reach_m=0.2)(motion, contacts, late))) == 0
+    (start,) = held_of(tracker(reach_m=0.2, seek_s=3.0)(motion, contacts, late)).start_s.tolist()
+    assert start > TAKE / FPS + 0.5
+
+
 def test_captured_interactions_are_labels_on_an_uneven_clock(scene):
     motion, environment = scene
     uneven = motion.timestamps + 0.003 * torch.rand(FRAMES, generator=torch.Generator().manual_seed(0))

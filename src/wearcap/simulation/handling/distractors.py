@@ -21,6 +21,8 @@ Manner = Literal["move", "rest", "pretend"]
 """What is done with an object: it is moved; held without being moved; or neither moved nor touched."""
 SHORT_M = (0.05, 0.10)
 """Range of the palm's distance from the surface of an object that is not touched."""
+HOVER_M = 0.03
+"""Deviation of the waves of such hands (m; `wandering`)."""
 STAY_S, APART_S = (0.6, 3.0), 0.3
 """Range of the root of the time for which hands stay; mean delay of each hand in coming and in leaving."""
 STANCES: dict[str, tuple[bool, tuple[float, ...]]] = {
@@ -89,7 +91,7 @@ def _reach_out(
     stop, grips = leave, []
     for side, place in places.items():
         late, later = rng.exponential(APART_S, 2)
-        moves = wandering(still(T_world_object), rng) if free else still(T_world_object)
+        moves = wandering(still(T_world_object), rng, HOVER_M) if free else still(T_world_object)
         grip = Grip.drawn(place, moves, touch + late, max(leave, touch + late) + later, rng, briskness)
         if crouch > 0 or grip.start_s < plan.time:
             grip = replace(grip, reach_s=grip.touch_s - start)

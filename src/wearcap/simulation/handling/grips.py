@@ -32,8 +32,8 @@ def vector(values: Float[np.ndarray, "3"]) -> Vector:
     return x, y, z
 
 
-WANDER_M, WANDER_HZ = 0.012, (0.15, 0.8)
-"""Deviation (m) of each of three waves per axis, and range of their frequencies, of hands that are not held."""
+WANDER_HZ = (0.15, 0.8)
+"""Range of the frequencies of the waves in the paths of hands that are not held."""
 
 
 @dataclass(frozen=True)
@@ -143,10 +143,11 @@ def still(T_world_object: Rigid) -> Moves:
     )
 
 
-def wandering(moves: Moves, rng: np.random.Generator) -> Moves:
-    """The same motion with a drift of centimetres within seconds: hands that nothing holds do not keep their place."""
+def wandering(moves: Moves, rng: np.random.Generator, far_m: float) -> Moves:
+    """The same motion with a drift within seconds, three waves per axis of a deviation (m): hands that nothing holds do
+    not keep their place."""
     hertz, phase = rng.uniform(*WANDER_HZ, (3, 3)), rng.uniform(0.0, 2 * np.pi, (3, 3))
-    amount = rng.normal(0.0, WANDER_M, (3, 3))
+    amount = rng.normal(0.0, far_m, (3, 3))
 
     def wandered(times: Float[np.ndarray, "time"], T_world_chest: Rigid) -> Rigid:
         T = moves(times, T_world_chest)
@@ -154,6 +155,20 @@ def wandering(moves: Moves, rng: np.random.Generator) -> Moves:
         return Rigid(T.R, T.t + torch.from_numpy(waves.sum(2)))
 
     return wandered
+
+
+def posed(moves: Moves, at_s: float) -> Moves:
+    """A motion that keeps to the chest as it is at one time (s): hands held out, however the body goes on."""
+
+    def kept(times: Float[np.ndarray, "time"], T_world_chest: Rigid) -> Rigid:
+        if not len(times):
+            return moves(times, T_world_chest)
+        frame = int(np.abs(times - at_s).argmin())
+        T_world_then = T_world_chest[[frame]].to(torch.float64)
+        T_chest_object = T_world_then.inverse() @ moves(times[[frame]], T_world_then).to(torch.float64)
+        return T_world_chest.to(torch.float64) @ T_chest_object
+
+    return kept
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ class Habits:
     """Probability of using the last object again, unless it was in the hands for long."""
     near_m: float = 2.5
     """Distance per factor 1/e in the probability of an object's choice."""
-    alike: float = 1.05
+    alike: float = 1.4
     """Time of hands in the poses of touching that touch nothing, as a share of the hands' time in contact."""
     resting_share: float = 0.2
     """Probability of holding an object without moving it."""

@@ -1,8 +1,9 @@
-"""Motions of handling in which no object of the environment is touched: they are mimed, or done with something else.
+"""Poses of handling in which no object of the environment is touched.
 
 A copy of an object is put to a free place nearby and handled there. The copy belongs to no environment, its handling
-is no interaction, and it is gone afterwards: the wearer plays it, or handles a trolley, a basket or a stick that the
-environment does not know. The poses are those of a touch, and nothing is touched.
+is no interaction, and it is gone afterwards. The poses are those of a touch, for as long, but nothing guides or carries
+the hands (`loosened`): they stay where they are on the body, held out or with something else in them; or they stray as
+in gesturing. Rarely they go just as if they touched.
 """
 
 from dataclasses import replace
@@ -12,7 +13,7 @@ import torch
 from jaxtyping import Float
 
 from wearcap.geometry import rotation
-from wearcap.simulation.handling.grips import wandering
+from wearcap.simulation.handling.grips import Grip, posed, wandering
 from wearcap.simulation.handling.opening import operate
 from wearcap.simulation.handling.rearranging import rearrange, relocate
 from wearcap.simulation.people.plan import Plan
@@ -24,17 +25,31 @@ from wearcap.simulation.places.outline import stays_apart
 NEAR_M, APART_M, TRIES = 1.6, 0.05, 8
 """Largest distance of the copy from the wearer, its distance from other objects, and the places that are tried."""
 COPY = "something"
+MIMED, STILL = 0.1, 0.1
+"""Shares of imitated handlings in which hands go as if they touched, and stay where they are on the body."""
+MIMED_M, STILL_M, STRAY_M = 0.012, 0.012, 0.03
+"""Deviation of hands' waves (m; `wandering`) in these, and in all others, in which they stray."""
 
 
 def imitate(plan: Plan, house: House, rng: np.random.Generator, item: Movable | Openable, busy_s: float) -> bool:
     """Handle a copy of an object at a free place until hands were busy for some time (s); False, with nothing done, where
-    none is found. Nothing guides the hands: they stray from the paths of hands that hold something."""
+    none is found. Hands are `loosened` from the copy."""
     before = {side: len(grips) for side, grips in plan.grips.items()}
     done = _handle_copy(plan, house, rng, item, busy_s)
+    manner = rng.random()
     for side, count in before.items():
-        free = [replace(grip, moves=wandering(grip.moves, rng)) for grip in plan.grips[side][count:]]
-        plan.grips[side][count:] = free
+        plan.grips[side][count:] = [loosened(grip, rng, manner) for grip in plan.grips[side][count:]]
     return done
+
+
+def loosened(grip: Grip, rng: np.random.Generator, manner: float) -> Grip:
+    """The grip of a hand that nothing guides. `manner`, 0…1, says how it goes (`MIMED`, `STILL`)."""
+    if manner < MIMED:
+        return replace(grip, moves=wandering(grip.moves, rng, MIMED_M))
+    if manner < MIMED + STILL:
+        still = posed(grip.moves, rng.uniform(grip.touch_s, grip.release_s))
+        return replace(grip, moves=wandering(still, rng, STILL_M))
+    return replace(grip, moves=wandering(grip.moves, rng, STRAY_M))
 
 
 def _handle_copy(plan: Plan, house: House, rng: np.random.Generator, item: Movable | Openable, busy_s: float) -> bool:

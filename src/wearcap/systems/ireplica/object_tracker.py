@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
@@ -36,17 +37,20 @@ from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 
 @dataclass(frozen=True)
 class ContactSettings:
-    """Threshold and gap filling. Raises WearcapError for a threshold outside 0…1 or a negative gap."""
+    """Thresholds and gap filling. Raises WearcapError for a threshold outside 0…1 or a negative gap."""
 
-    threshold: float = 0.5
+    threshold: float = 0.3
     """Least probability of a contact."""
+    keep: float = 0.15
+    """Least probability with which a contact above the threshold goes on, before and after (hysteresis)."""
     gap_s: float = 0.5
     """Longest gap (s) between two contacts of a hand that is filled (thesis Table 5.4)."""
 
     def __post_init__(self):
-        if not 0.0 < self.threshold < 1.0 or self.gap_s < 0:
-            expected = "a probability between 0 and 1, and no negative time"
-            raise WearcapError(f"threshold {self.threshold}, gap {self.gap_s} s", expected=expected)
+        if not 0.0 < self.keep <= self.threshold < 1.0 or self.gap_s < 0:
+            expected = "probabilities between 0 and 1, the lower one to keep a contact, and no negative time"
+            what = f"threshold {self.threshold}, keep {self.keep}, gap {self.gap_s} s"
+            raise WearcapError(what, expected=expected)
 
 
 @dataclass(frozen=True)
@@ -69,8 +73,12 @@ Span = tuple[ContactInterval, str]
 def active(
     contact_prob: Float[Tensor, "time hand"], timestamps: Float64[Tensor, "time"], settings: ContactSettings
 ) -> Bool[Tensor, "time hand"]:
-    """Contacts of each hand after thresholding and gap filling."""
-    above = contact_prob >= settings.threshold
+    """Contacts of each hand after thresholding with hysteresis, and gap filling."""
+    sure, above = contact_prob >= settings.threshold, contact_prob >= settings.keep
+    if settings.keep < settings.threshold:
+        run = torch.nn.functional.pad((above[1:] != above[:-1]).long(), (0, 0, 1, 0)).cumsum(0)
+        count = torch.zeros_like(run).scatter_add_(0, run, sure.long())
+        above = above & (count.gather(0, run) > 0)
     frames = torch.arange(len(above))[:, None].expand_as(above)
     last = torch.where(above, frames, -1).cummax(0).values
     following = torch.where(above, frames, len(above)).flip(0).cummin(0).values.flip(0)
@@ -164,7 +172,7 @@ def _slowest(speed: Float[Tensor, "time hand"], hold: list[Span], near: int, rea
 class AttachmentSettings:
     """Rules of attachment. Raises WearcapError for an unknown anchor or a reach that is not positive."""
 
-    reach_m: float = 0.5
+    reach_m: float = 0.2
     """Largest distance (m) from a contacting hand to the object it takes; a contact farther from every object of its
     class is a false positive (thesis §5.3.1)."""
     anchor: str = "middle"
@@ -175,6 +183,17 @@ class AttachmentSettings:
     """Longest approach and retreat (s) at an interval's ends, cut off where the hands are slowest; 0: none (thesis)."""
     keep_object: bool = True
     """Whether the object stays when hands join or leave without a pause; False: it is searched again (thesis)."""
+    seek_s: float = 0.0
+    """Longest time (s) after an interval's start in which a hand may come within reach; 0: at its start only (thesis)."""
+    slip_m: float | None = None
+    """Largest displacement (m) of a hand on the object that follows it: a hand that moves otherwise than the object can
+    does not hold it; None: any (thesis)."""
+    rest_m: float = 0.0
+    """Least displacement (m) of an object's corners in a hold; an object that moves by less was only touched."""
+    class_m: float | None = None
+    """Distance (m) that counts as much as a class that is e times as probable. Hands then hold by whichever class, and
+    take the object with the least sum of distance, displacement on it while it follows, and this; None: the nearest of
+    the class (thesis)."""
 
     def __post_init__(self):
         if self.anchor not in ANCHORS or not self.reach_m > 0:
@@ -182,6 +201,8 @@ class AttachmentSettings:
             raise WearcapError(f"anchor {self.anchor!r}, reach {self.reach_m} m", expected=expected)
 
 
+LEAST_FOLLOWING = 0.5
+"""Least share of an interval in which hands stay at their places of the object."""
 PALMS = ("left_palm", "right_palm")
 """Keypoints in the middle of each hand (thesis §5.3.3)."""
 
@@ -251,9 +272,11 @@ class ObjectTracker:
             if name != "timestamps"
         }
         palms = site_positions(motion.skeleton, motion.T_world_joint, PALMS).double()
-        spans = class_intervals(prob, motion.timestamps, self.contact, self.attachment.one_class)
+        any_class = self.attachment.class_m is not None and len(prob) > 1
+        merged = {UNKNOWN_CLASS: torch.stack(list(prob.values())).amax(0)} if any_class else prob
+        spans = class_intervals(merged, motion.timestamps, self.contact, self.attachment.one_class)
         spans = settled(spans, palms, motion.timestamps, self.attachment.settle_s)
-        held = self._held(motion, palms, spans, environment)
+        held = self._held(motion, palms, spans, environment, prob if any_class else {})
         offset = palms.new_zeros(len(motion), 2) if self.correction is None else self.correction.finish(held)
         shift = torch.nn.functional.pad(offset, (0, 1))
         moved = replace(
@@ -266,9 +289,17 @@ class ObjectTracker:
         return moved if self.hands is None else self.hands(moved, held, environment)
 
     def _held(
-        self, motion: Motion, palms: Float64[Tensor, "time hand 3"], spans: list[Span], environment: Environment
+        self,
+        motion: Motion,
+        palms: Float64[Tensor, "time hand 3"],
+        spans: list[Span],
+        environment: Environment,
+        prob: dict[str, Float[Tensor, "time hand"]],
     ) -> list[Held]:
-        """Attach, correct, move and release: one interval after the other, each object being where it was left."""
+        """Attach, correct, move and release: one interval after the other, each object being where it was left.
+
+        `prob` has the contact probabilities by class that decide between objects, if any do.
+        """
         states = {one.name: ObjectState(one.T_world_object) for one in environment.objects}
         held, busy_until = [], [0, 0]
         if self.correction is not None:
@@ -285,15 +316,19 @@ class ObjectTracker:
                 if same and contact.continues(row.interval):
                     before = row.scene_object
                     break
-            scene_object, hands = before, torch.tensor(contact.hands)
-            if scene_object is None:
-                poses = {name: state.T_world_object for name, state in states.items()}
-                touching = palms[contact.start][hands]
-                found = environment.nearest(touching, poses, contact_class or None, self.attachment.reach_m)
-                if not bool((found.object_index >= 0).any()):
+            if before is None:
+                found = self._taken(palms, contact, contact_class, motion.timestamps, states, environment, prob)
+                if found is None:
                     continue
-                scene_object = environment.objects[int(found.object_index[found.distance.argmin()])]
-            state = states[scene_object.name]
+                before_start, scene_object = found
+                contact = replace(contact, start=before_start)
+                self._undo_rest(held, states, scene_object)
+            else:
+                scene_object = before
+            hands, state = torch.tensor(contact.hands), states[scene_object.name]
+            contact = self._following(palms, contact, hands, scene_object, state)
+            if contact is None:
+                continue
             _, points = environment.distance(scene_object.name, palms[contact.start], state.T_world_object)
             points[~hands] = torch.nan
             frames = palms[contact.start : contact.stop].clone()
@@ -304,7 +339,125 @@ class ObjectTracker:
             states[scene_object.name] = ObjectState(T[-1], float(value[-1]))
             held.append(Held(contact, scene_object, scene_object.freedom.contact_class, state, T))
             busy_until = [contact.stop if on else until for on, until in zip(contact.hands, busy_until)]
+        for scene_object in environment.objects:
+            self._undo_rest(held, states, scene_object)
         return sorted(held, key=lambda row: row.interval.start)
+
+    def _taken(
+        self,
+        palms: Float64[Tensor, "time hand 3"],
+        contact: ContactInterval,
+        contact_class: str,
+        timestamps: Float64[Tensor, "time"],
+        states: dict[str, ObjectState],
+        environment: Environment,
+        prob: dict[str, Float[Tensor, "time hand"]],
+    ) -> tuple[int, SceneObject] | None:
+        """The first frame of an interval, up to `seek_s` after its start, in which a hand is within reach of an object of
+        the class, and the object that it takes (`class_m`); None where there is none: the contact is a false positive."""
+        latest = timestamps[contact.start] + self.attachment.seek_s
+        stop = min(int(torch.searchsorted(timestamps, latest, right=True)), contact.stop)
+        touching = palms[contact.start : stop, torch.tensor(contact.hands)]
+        poses = {name: state.T_world_object for name, state in states.items()}
+        found = environment.nearest(touching.flatten(0, 1), poses, contact_class or None, self.attachment.reach_m)
+        index, distance = (value.unflatten(0, touching.shape[:2]) for value in (found.object_index, found.distance))
+        within = (index >= 0).any(1).nonzero()[:, 0]
+        if not len(within):
+            return None
+        frame = int(within[0])
+        if self.attachment.class_m is not None:
+            interval = replace(contact, start=contact.start + frame)
+            return interval.start, self._likeliest(palms, interval, states, environment, prob)
+        return contact.start + frame, environment.objects[int(index[frame, distance[frame].argmin()])]
+
+    def _likeliest(
+        self,
+        palms: Float64[Tensor, "time hand 3"],
+        contact: ContactInterval,
+        states: dict[str, ObjectState],
+        environment: Environment,
+        prob: dict[str, Float[Tensor, "time hand"]],
+    ) -> SceneObject:
+        """Of the objects within reach, the one with the least sum of the hands' distance from it, the root mean square of
+        their displacements on it while it follows them, and what its class is less probable (`class_m`)."""
+        hands, frames = torch.tensor(contact.hands), slice(contact.start, contact.stop)
+        odds = {
+            name: (self.attachment.class_m or 0.0) * value[frames][:, hands].mean().clamp(min=1e-3).log()
+            for name, value in prob.items()
+        }
+        costs = []
+        for item in environment.objects:
+            state = states[item.name]
+            away, _ = environment.distance(item.name, palms[contact.start, hands], state.T_world_object)
+            cost = float(away.min())
+            if cost <= self.attachment.reach_m:
+                slip = self._slip(palms[frames], hands, item, state)
+                costs.append(
+                    (cost + float(slip.square().mean().sqrt() - odds.get(item.freedom.contact_class, 0.0)), item)
+                )
+        return min(costs, key=lambda row: row[0])[1]
+
+    def _slip(
+        self, palms: Float64[Tensor, "time hand 3"], hands: Bool[Tensor, "hand"], item: SceneObject, state: ObjectState
+    ) -> Float64[Tensor, "time"]:
+        """Displacement (m) of the hands from their places on an object that follows them, the larger of both."""
+        T, _ = follow_hands(item, state, palms, hands, self.attachment.anchor)
+        T = T.to(torch.float64)
+        local = (T.R.mT[:, None] @ (palms[:, hands] - T.t[:, None])[..., None])[..., 0]
+        return (local - local.median(0).values).norm(dim=-1).amax(1)
+
+    def _following(
+        self,
+        palms: Float64[Tensor, "time hand 3"],
+        contact: ContactInterval,
+        hands: Bool[Tensor, "hand"],
+        scene_object: SceneObject,
+        state: ObjectState,
+    ) -> ContactInterval | None:
+        """The part of an interval in which the hands stay at their places of the object that follows them, within
+        `slip_m`; None where they do not for half of it: they move otherwise than the object can."""
+        frames, most = palms[contact.start : contact.stop], self.attachment.slip_m
+        if most is None:
+            return contact
+        slip = self._slip(frames, hands, scene_object, state)
+        on = slip <= most
+        if on.float().mean() < LEAST_FOLLOWING:
+            return None
+        middle = len(on) // 2 if on[len(on) // 2] else int(on.nonzero()[:, 0].median())
+        off = (~on).nonzero()[:, 0]
+        before, after = off[off < middle], off[off > middle]
+        start = int(before[-1]) + 1 if len(before) else 0
+        stop = int(after[0]) if len(after) else len(on)
+        return replace(contact, start=contact.start + start, stop=contact.start + stop)
+
+    def _undo_rest(self, held: list[Held], states: dict[str, ObjectState], scene_object: SceneObject) -> None:
+        """Leave an object where it was before its last hold if that moved it by less than `rest_m`: `held` and `states`
+        are changed."""
+        own = [k for k, row in enumerate(held) if row.scene_object is scene_object]
+        if not own or self.attachment.rest_m == 0.0:
+            return
+        chain = own[-1:]
+        for k in reversed(own[:-1]):
+            if not held[chain[0]].interval.continues(held[k].interval):
+                break
+            chain.insert(0, k)
+        first = held[chain[0]].state
+        low, high = scene_object.mesh.vertices.min(0), scene_object.mesh.vertices.max(0)
+        corners = torch.cartesian_prod(*torch.from_numpy(np.stack([low, high], 1)).double())
+        rest = first.T_world_object.to(torch.float64)
+        before, moved = _at(rest, corners), []
+        for k in chain:
+            moved.append(_at(held[k].T_world_object[:, None].to(torch.float64), corners) - before)
+        if max(float(each.norm(dim=-1).max()) for each in moved) < self.attachment.rest_m:
+            for k in chain:
+                count = len(held[k].T_world_object.t)
+                still = Rigid(rest.R.expand(count, 3, 3), rest.t.expand(count, 3))
+                held[k] = replace(held[k], state=first, T_world_object=still)
+            states[scene_object.name] = first
+
+
+def _at(T: Rigid, points: Float64[Tensor, "point 3"]) -> Float64[Tensor, "*batch point 3"]:
+    return (T.R @ points[..., None])[..., 0] + T.t
 
 
 def object_trajectories(
@@ -343,8 +496,11 @@ class ActSearch:
 
     checkpoints: Sequence[str]
     """Checkpoints of iReplica's contact networks."""
-    tracker: ObjectTracker = field(default_factory=lambda: ObjectTracker(None))
-    """Object tracker, without correction: the wearer stays where the head was measured."""
+    tracker: ObjectTracker = field(
+        default_factory=lambda: ObjectTracker(None, ContactSettings(0.5, 0.5), AttachmentSettings(reach_m=0.5))
+    )
+    """Object tracker, without correction: the wearer stays where the head was measured. Hands are not, as a suit's are:
+    they reach farther, and no motion of theirs is refused."""
     margin_s: float = MARGIN_S
     """Time (s) for which an object is already active before it is touched and still active after its release."""
 
