@@ -183,12 +183,21 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     }
     tree = {
         "about": facts,
-        "tables": {title: [asdict(result) for result in rows] for title, rows in found.items()},
+        "tables": {title: [_short(asdict(result)) for result in rows] for title, rows in found.items()},
         "percentiles": _plain(tail),
         "scenarios": {title: _plain(rows) for title, rows in scenarios.items()},
     }
     write_text(path, json.dumps(finite(tree), indent=1) + "\n")
     return path
+
+
+def _short(result: Tree) -> Tree:
+    """A result as JSON: by activity, what is shown alone."""
+    activities = {
+        name: {metric: scores[metric] for metric in PARTS if metric in scores}
+        for name, scores in result["activities"].items()
+    }
+    return result | {"activities": activities}
 
 
 def _plain(scores: Scores) -> dict[str, dict[str, Any]]:
