@@ -42,7 +42,7 @@ def test_a_card_states_what_when_and_how(name):
 def test_what_is_shared_is_weights_and_the_models_config(name, tmp_path):
     assert (FOLDER / f"{name}.safetensors").stat().st_size < MAX_BYTES
     config, state = read_checkpoint(name)
-    assert set(config) <= {"name", "model", "data"}
+    assert set(config) <= {"name", "model", "data", "training"}
     assert not re.search(r"'/|\.\./", str(config)), "a folder of the machine"
     assert all(value.isfinite().all() for value in state.values())
     share_checkpoint(name, tmp_path / "again.safetensors")

@@ -20,6 +20,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.optimize import banded_kernels as kernels
 from wearcap.optimize.banded_kernels import HEAD, LEGS, Body, Forms, Kinematics, Rows
+from wearcap.optimize.block_tridiagonal import factor_and_solve
 from wearcap.optimize.costs import LOSSES
 from wearcap.optimize.hps import TERMS, FootPatches, HpsData, HpsEnergy, HpsState, Solution, data_values, find_ground
 
@@ -168,7 +169,7 @@ class Stretch:
         if not (np.einsum("tii->ti", diagonal) > 0).all():
             expected = "weights of pose, hold and steps above zero"
             raise WearcapError("the energy does not determine the motion", expected=expected)
-        kernels.factor_and_solve(diagonal, below, gradient, damping)
+        factor_and_solve(diagonal, below, gradient, damping)
         kernels.apply_step(gradient, relaxation, self.theta, self.R_root, self.t, self.theta_imu, self.body, self.kin)
 
     def fill_system(self) -> None:

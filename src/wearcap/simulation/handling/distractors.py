@@ -19,7 +19,7 @@ from wearcap.simulation.people.posture import look_about, look_at
 
 Manner = Literal["move", "rest", "pretend"]
 """What is done with an object: it is moved; held without being moved; or neither moved nor touched."""
-SHORT_M = (0.05, 0.10)
+SHORT_M = (0.09, 0.14)
 """Range of the palm's distance from the surface of an object that is not touched."""
 HOVER_M = 0.03
 """Deviation of the waves of such hands (m; `wandering`)."""
