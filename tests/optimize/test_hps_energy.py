@@ -15,7 +15,8 @@ from wearcap.geometry.surface import SurfaceIndex
 from wearcap.optimize import costs
 from wearcap.optimize.adam_windows import AdamSettings, solve_adam_windows
 from wearcap.optimize.banded import BandedSettings, Stretch, solve_banded, solve_in_stretches
-from wearcap.optimize.banded_kernels import LEGS, factor_and_solve
+from wearcap.optimize.banded_kernels import LEGS
+from wearcap.optimize.block_tridiagonal import factor_and_solve
 from wearcap.optimize.costs import Loss
 from wearcap.optimize.hps import TERMS, FootPatches, HpsData, HpsEnergy, HpsState, SuitSteps, Term, energy_terms
 
