@@ -131,7 +131,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     whole = {row: [tree["whole"][row]["mpjpe_cm"] for tree in trees.values()] for row in ("IMU", "HPS", "ours")}
     seconds = sum(stage["mean"] for stage in typical["stage_seconds"].get("ours", {}).values())
     end, all_of_it = typical["places"][-1], figure_of(speed, "hps_end_to_end_realtime")
-    whole_way = f"; {all_of_it['ratio']:.1f} ×, localisation included" if all_of_it else ""
+    whole_way = f"; {all_of_it['value']:.1f} ×, localisation included" if all_of_it else ""
     return Page(
         title="[HPS](../hps.md): figures",
         headline=Grid(
