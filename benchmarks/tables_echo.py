@@ -424,14 +424,14 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
 
 def _orientation(objects: dict[str, Tree]) -> str:
     """How far objects are turned, beside what knows nothing but the nearest training window."""
-    said = [
+    phrases = [
         f"{mean(row['rotation_deg'], 0)}° ({mean(row['symmetric_rotation_deg'], 0)}° modulo its symmetry)"
         for row in (objects["ours"], objects["nearest training window"])
         if "symmetric_rotation_deg" in row
     ]
-    beside = f", that of the nearest training window's by {said[1]}" if len(said) > 1 else ""
+    beside = f", that of the nearest training window's by {phrases[1]}" if len(phrases) > 1 else ""
     return (
-        f"An object's orientation is off by {said[0] if said else mean(objects['ours']['rotation_deg'], 0) + '°'}{beside}: "
+        f"An object's orientation is off by {phrases[0] if phrases else mean(objects['ours']['rotation_deg'], 0) + '°'}{beside}: "
         "head and wrists tell little of it, and large objects' vertices go with it."
     )
 
@@ -480,7 +480,7 @@ def _briefly(objects: dict[str, Tree], people: dict[str, Tree]) -> tuple[str, ..
     if ours not in objects:
         return ()
     seen = mean(objects[ours]["frames_seen_m"], 2)
-    said = [
+    phrases = [
         f"{row} {mean(rows[row]['mpjpe_mm'])} mm off ({what}; ours so trained {mean(rows[ours]['mpjpe_mm'])})"
         for what, rows in (("objects", objects), ("people alone", people))
         for row in ("BoDiffusion-style + object", "BoDiffusion-style")
@@ -492,7 +492,7 @@ def _briefly(objects: dict[str, Tree], people: dict[str, Tree]) -> tuple[str, ..
     noise = ["Contacts of BoDiffusion-style rows are noise: they learn none."] if "touch_f1" in theirs else []
     return (
         f"Learned baselines, and ours beside them, saw {seen} million frames each, in one training, of a part of the "
-        f"simulated motion and of CMU's; the losses of all were still falling: {'; '.join(said)}. In the same frame and "
+        f"simulated motion and of CMU's; the losses of all were still falling: {'; '.join(phrases)}. In the same frame and "
         f"budget bodies are alike; what ours has over BoDiffusion-style + object are {' and '.join(rest)}.",
         *noise,
     )

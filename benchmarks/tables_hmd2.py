@@ -442,14 +442,14 @@ def _briefly(simulated: dict[str, Tree], real: dict[str, Tree]) -> tuple[str, ..
     def errors(rows: dict[str, Tree]) -> str:
         return ", ".join(f"{row} {mean(rows[row]['mpjpe_cm'])}" for row in (*rivals, BRIEF) if row in rows)
 
-    said = [f"on {what} {errors(rows)}" for what, rows in found.items()]
+    phrases = [f"on {what} {errors(rows)}" for what, rows in found.items()]
     jitters = [
         f"{row} {mean(one[row]['jitter_ratio'])}" for row in (*rivals, BRIEF) if "jitter_ratio" in one.get(row, {})
     ]
     return (
         f"Learned baselines that see the head alone, and ours beside them, saw {mean(one[BRIEF]['frames_seen_m'], 2)} "
         "million frames each, in one training, of a part of the simulated motion and of CMU's, which is far less than our "
-        f"checkpoint saw. MPJPE (cm), so trained: {'; '.join(said)}.",
+        f"checkpoint saw. MPJPE (cm), so trained: {'; '.join(phrases)}.",
         "Trained so briefly a diffusion with a token for each frame passes on noise that more training would remove; "
         f"jitter, of the truth's: {', '.join(jitters)}.",
     )
