@@ -15,7 +15,7 @@ from wearcap.body.model import BodyModel
 from wearcap.body.retarget import retarget
 from wearcap.body.skeletons import smplh52
 from wearcap.body.smpl_body import smpl_body
-from wearcap.cli.conf import hydra_main, load_pipeline
+from wearcap.cli.conf import hydra_main, load_pipeline, with_pipeline
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.io.datasets.amass import write_amass
@@ -121,4 +121,5 @@ def _live(system: System, config: DictConfig, folder: Path) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    hydra_main("capture", run, ["live=true" if argument == "--live" else argument for argument in arguments])
+    arguments = ["live=true" if argument == "--live" else argument for argument in arguments]
+    hydra_main("capture", run, with_pipeline(arguments))

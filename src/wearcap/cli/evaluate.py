@@ -7,7 +7,7 @@ from omegaconf import DictConfig, ListConfig
 from rich import print as show
 from rich.progress import Progress
 
-from wearcap.cli.conf import hydra_main, load_systems, trained_on
+from wearcap.cli.conf import hydra_main, load_systems, trained_on, with_pipeline
 from wearcap.errors import WearcapError
 from wearcap.evaluation.baselines import BASELINES
 from wearcap.evaluation.evaluate import Realism, evaluate
@@ -73,4 +73,4 @@ def _summaries(rows: list[Row], realism: Realism | None, method: str) -> dict[st
 
 
 def main(arguments: list[str]) -> None:
-    hydra_main("evaluate", run, arguments)
+    hydra_main("evaluate", run, with_pipeline(arguments))
