@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep
@@ -120,8 +121,13 @@ class _Guarded:
 
 
 def _compose(config_name: str, overrides: list[str]) -> DictConfig:
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return hydra.compose(config_name, overrides)
+    around = GlobalHydra.instance().hydra  # of the command that this config is composed in, if it is one
+    GlobalHydra.instance().clear()
+    try:
+        with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+            return hydra.compose(config_name, overrides)
+    finally:
+        GlobalHydra.instance().hydra = around
 
 
 @contextmanager
