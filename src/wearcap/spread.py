@@ -33,8 +33,8 @@ class Spread:
     """One of `BACKENDS`; "dask" without a `scheduler` has that many local workers."""
     scheduler: str | None = None
     """Address of a dask scheduler."""
-    threads: int = 1
-    """Threads of each local worker process."""
+    threads: int | None = 1
+    """Threads of each local worker process; None: as many as leave no core idle."""
 
     def __post_init__(self):
         if self.jobs == 0:
@@ -78,8 +78,9 @@ class Spread:
                 with joblib.parallel_config("ray"):
                     yield False
             elif self.backend == "loky":
+                threads = self.threads or max(1, joblib.cpu_count() // joblib.effective_n_jobs(self.jobs))
                 bound = bound_to_this_process(lock)
-                with joblib.parallel_config("loky", inner_max_num_threads=self.threads, **bound):
+                with joblib.parallel_config("loky", inner_max_num_threads=threads, **bound):
                     try:
                         yield True
                     finally:

@@ -8,7 +8,9 @@ from typing import ClassVar
 import lightning
 import pytest
 import torch
+from hydra.utils import instantiate
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.strategies import FSDPStrategy
 
 from wearcap.cli import evaluate, train
 from wearcap.cli.conf import compose
@@ -244,3 +246,15 @@ def test_progress_is_in_steps_of_the_whole_run(limits, total):
 
 def test_the_default_bar_is_this_one():
     assert compose("train", ["paths.run=x"]).callbacks.progress._target_.endswith("StepsProgressBar")
+
+
+def test_sharded_training_composes_and_wants_gpus(data, tmp_path):
+    """Lightning shards on GPUs alone: here the strategy is built, and the trainer refuses this machine in one line."""
+    config = compose("train", ["trainer=fsdp", "callbacks.average=null", "trainer.devices=4", "paths.run=x"]).trainer
+    strategy = instantiate(config.strategy)
+    assert isinstance(strategy, FSDPStrategy)
+    assert (config.devices, config.accelerator, config.gradient_clip_algorithm) == (4, "gpu", "value")
+    given = arguments(data, tmp_path, f"hydra.run.dir={tmp_path}/run", "callbacks.average=null", "trainer.devices=2")
+    with pytest.raises(WearcapError, match="FSDP") as caught:
+        train.main(["trainer=fsdp", *given])
+    assert "\n" not in str(caught.value)

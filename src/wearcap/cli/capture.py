@@ -15,6 +15,7 @@ from wearcap.body.model import BodyModel
 from wearcap.body.retarget import retarget
 from wearcap.body.skeletons import smplh52
 from wearcap.body.smpl_body import smpl_body
+from wearcap.cli.capture_all import capture_all, is_dataset
 from wearcap.cli.conf import hydra_main, load_pipeline, with_pipeline
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
@@ -31,18 +32,27 @@ from wearcap.scene.objects import Environment
 from wearcap.viewer.page_layers import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png, write_video
 
-HELP = "turn a recording into motion: wearcap capture recording=DATASET/NAME, checkpoint=… or pipeline=hps"
+HELP = "turn recordings into motion: wearcap capture recording=DATASET/NAME or DATASET, checkpoint=… or pipeline=hps"
 
 
 def run(config: DictConfig) -> Motion | None:
+    """Capture one recording, or all of a data set, or follow one that still grows (`live`)."""
+    if is_dataset(config):
+        return capture_all(config, captured)
+    system = load_pipeline(config.checkpoint, config.pipeline, config.device)
+    if config.live:
+        return _live(system, config, Path(config.output))
+    motion = captured(config, system)
+    show(f"{'motion' if motion is not None else 'report'}: {config.output}")
+    return motion
+
+
+def captured(config: DictConfig, system: System) -> Motion | None:
     """Capture one recording and write motion.npz, .bvh, .glb and .mp4 (beside the ground truth, if there is one).
 
     A pipeline with stages also writes report.json, and only that if `until` names a stage before the motion exists.
     """
-    system = load_pipeline(config.checkpoint, config.pipeline, config.device)
     folder = Path(config.output)
-    if config.live:
-        return _live(system, config, folder)
     if config.samples < 1:
         raise WearcapError(f"samples={config.samples}", expected="at least 1")
     recording, dataset = load_recording(config.recording), dataset_folder(config.recording)
@@ -68,7 +78,6 @@ def run(config: DictConfig) -> Motion | None:
             motion.provenance.update(checkpoint=str(config.checkpoint))
         motion.provenance.update(recording=str(config.recording))
         _write(motion, recording, environment, folder, config)
-    show(f"{'motion' if motion is not None else 'report'}: {folder}")
     return motion
 
 

@@ -30,6 +30,7 @@ from wearcap.errors import WearcapError, nearest
 from wearcap.files import resource
 from wearcap.models.checkpoint import read_checkpoint
 from wearcap.runtime.system import System, training_of
+from wearcap.spread import Spread
 
 
 def conf_dir() -> Path:
@@ -245,3 +246,9 @@ def trained_on(checkpoint: str | Path) -> tuple[list[str], str]:
     sources = [source["root"] for source in data["sources"].values() if source]
     validated = [source["root"] for source in (data.get("val_sources") or data["sources"]).values() if source]
     return sources, validated[0]
+
+
+def spread_of(config: DictConfig) -> Spread:
+    """How a command's recordings are spread: its `jobs` (null: one per core, on a GPU one), `backend`, `scheduler`."""
+    jobs = config.jobs if config.jobs is not None else -1 if config.device == "cpu" else 1
+    return Spread(jobs, config.backend, config.scheduler, threads=None)
