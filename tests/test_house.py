@@ -16,6 +16,7 @@ FLOORS = (
     ("models", "diffusion", "sensors", "localization", "io"),
     ("optimize", "tracking", "data", "training", "metrics", "runtime"),
     ("systems", "simulation"),
+    ("reading",),
     ("evaluation", "export", "viewer", "doctor", "prepare"),
     ("cli",),
 )

@@ -14,3 +14,16 @@ def load(pipeline: str, *overrides: str, checkpoint=None, device: str = "cpu"):
 
     config = compose("capture", [f"pipeline={pipeline}", *overrides, "recording=none"])
     return load_pipeline(checkpoint, config.pipeline, device, shared=True)
+
+
+def read(path, height: float | None = None):
+    """The `recording.Recording` in any file or folder that holds one: a prepared recording, MVNX, BVH, AMASS, MPS …
+
+    `height` (m) is the wearer's; without it, and without a skeleton in the file, it follows from how high the head is
+    carried. Raises WearcapError for what cannot be read.
+    """
+    from wearcap.body.skeleton import xsens23
+    from wearcap.reading import read as read_any
+    from wearcap.tracking.stature import with_stature
+
+    return with_stature(read_any(path), xsens23(), height)[0]

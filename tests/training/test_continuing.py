@@ -150,7 +150,8 @@ class Listening(Logger):
     """A logger that keeps what it is given."""
 
     heard: ClassVar[list[dict]] = []
-    name, version = "listening", "0"
+    name = property(lambda self: "listening")  # pyright: ignore[reportAssignmentType]
+    version = property(lambda self: "0")  # pyright: ignore[reportAssignmentType]
 
     def log_hyperparams(self, params, *args, **kwargs):
         self.heard.append(params)

@@ -7,7 +7,8 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from wearcap.body.model import BodyModel, contact_regions, four_weights
-from wearcap.body.skeleton import Site
+from wearcap.body.retarget import fit_offsets
+from wearcap.body.skeleton import Site, Skeleton
 from wearcap.body.skeletons import skeleton_by_name
 from wearcap.errors import WearcapError
 
@@ -77,3 +78,36 @@ def smpl_body(arrays: SmplArrays, betas: Float[Tensor, "beta"] | None = None) ->
         entries = arrays.pose_directions.unflatten(-1, (-1, 3, 3))[..., : len(named) - 1, :, :]
         blend = torch.einsum("dc,vcjab,ka,lb->jklvd", P, entries, P, P).flatten(0, 2).float()
     return BodyModel(skeleton, vertices.float(), arrays.faces, skin_joints, skin_weights.float(), regions, blend)
+
+
+def template_pelvis(arrays: SmplArrays, betas: Float[Tensor, "beta"]) -> Float[Tensor, "3"]:
+    """The pelvis (m) of a shape in the file's axes, which SMPL's translation leaves out."""
+    vertices = arrays.template + arrays.shape_directions[..., : len(betas)] @ betas.to(arrays.template)
+    return arrays.joint_regressor[0] @ vertices
+
+
+FITTED_BETAS = 10
+"""Most shape coefficients that `betas_of` fits; later ones change details, not bones."""
+BONE_M, FIT_STEPS = 0.005, 10
+"""Deviation (m) of a bone's length beside a coefficient's deviation of 1, and Gauss-Newton steps."""
+
+
+def betas_of(arrays: SmplArrays, skeleton: Skeleton) -> Float[Tensor, "beta"]:
+    """Shape coefficients of the body whose bones are as long as a wearer's: least squares over all bones' lengths, with
+    the model's own distribution of shapes (deviation 1 each) as prior."""
+    body = smpl_body(arrays)
+    wanted = fit_offsets(skeleton, body.skeleton).t_parent_joint[1:].double().norm(dim=-1)
+    count = min(FITTED_BETAS, arrays.shape_directions.shape[-1])
+    parents = torch.tensor(body.skeleton.parents[1:])
+    regressor = arrays.joint_regressor.double()
+    template = regressor @ arrays.template.double()
+    directions = torch.einsum("jv,vab->jab", regressor, arrays.shape_directions[..., :count].double())
+    bones, per_beta = (x[1 : len(parents) + 1] - x[parents] for x in (template, directions))
+    betas = bones.new_zeros(count)
+    for _ in range(FIT_STEPS):
+        vectors = bones + per_beta @ betas
+        lengths = vectors.norm(dim=-1)
+        jacobian = (vectors / lengths.clamp_min(1e-9)[:, None])[:, None] @ per_beta
+        A = jacobian[:, 0] / BONE_M
+        betas = betas + torch.linalg.solve(A.T @ A + torch.eye(count).to(A), A.T @ (wanted - lengths) / BONE_M - betas)
+    return betas.float()

@@ -2,19 +2,18 @@
 
 import json
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from omegaconf import DictConfig
 from rich import print as show
 from rich.console import Console
+from torch import Tensor
 
 from wearcap.body.anny_body import anny_body
-from wearcap.body.model import BodyModel
-from wearcap.body.retarget import retarget
-from wearcap.body.skeletons import smplh52
-from wearcap.body.smpl_body import smpl_body
+from wearcap.body.skeleton import xsens23
+from wearcap.body.smpl_body import SmplArrays, betas_of, smpl_body, template_pelvis
 from wearcap.cli.capture_all import capture_all, is_dataset
 from wearcap.cli.conf import hydra_main, load_pipeline, with_pipeline
 from wearcap.errors import WearcapError
@@ -25,10 +24,13 @@ from wearcap.io.formats.gltf import write_glb
 from wearcap.io.formats.motion_npz import write_motion
 from wearcap.io.formats.scene_folder import cloud_file, read_scan
 from wearcap.io.formats.smpl import read_smpl
+from wearcap.io.saving import on_skeleton, write_smplh
+from wearcap.reading import read
 from wearcap.recording import Motion, Recording
-from wearcap.recording.store import dataset_folder, load_recording
+from wearcap.recording.store import dataset_folder
 from wearcap.runtime.system import CaptureInput, StageOptions, System
 from wearcap.scene.objects import Environment
+from wearcap.tracking.stature import with_stature
 from wearcap.viewer.page_layers import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png, write_video
 
@@ -55,7 +57,12 @@ def captured(config: DictConfig, system: System) -> Motion | None:
     folder = Path(config.output)
     if config.samples < 1:
         raise WearcapError(f"samples={config.samples}", expected="at least 1")
-    recording, dataset = load_recording(config.recording), dataset_folder(config.recording)
+    recording, stature = with_stature(read(config.recording), xsens23(), config.height)
+    dataset = dataset_folder(config.recording)
+    if stature is None:
+        show(f"height unknown, {xsens23().stature:.2f} m assumed: give height=… (m)")
+    elif stature.source != "skeleton":
+        show(f"height: {stature}")
     source = CaptureInput.in_dataset(recording, dataset, config.scene, config.metres_per_unit)
     seeds = range(config.seed, config.seed + (config.samples if system.draws else 1))
     cache = None if config.cache is None else Path(config.cache)
@@ -86,12 +93,16 @@ def _write(
 ) -> None:
     write_motion(motion, folder / "motion.npz")
     write_bvh(motion, folder / "motion.bvh")
-    if config.smpl:
-        target = smplh52()
-        R_parent_joint, root = retarget(motion.skeleton, target, motion.R_parent_joint, motion.t_world_root)
-        smpl = Motion(motion.timestamps, target, R_parent_joint, root)
-        write_amass(smpl, folder / "motion_smplh.npz")
-    shown, body = _with_body(motion, recording, config.body)
+    shown, body = motion, anny_body(motion.skeleton, recording.shape or None) if config.body is True else None
+    if isinstance(config.body, str):  # on the skeleton of the user's SMPL model
+        arrays = read_smpl(config.body)
+        betas = _betas(arrays, recording, motion)
+        body = smpl_body(arrays, betas)
+        shown = on_skeleton(motion, body.skeleton)
+        if config.smpl:
+            write_amass(shown, folder / "motion_smplh.npz", betas, template_pelvis(arrays, betas).tolist())
+    elif config.smpl:
+        write_smplh(motion, folder / "motion_smplh.npz")
     write_glb(shown, folder / "motion.glb", body=body)
     if config.video:
         truth = with_objects(recording, environment)
@@ -100,16 +111,10 @@ def _write(
         write_video(folder / "motion.mp4", shown, environment=environment, max_seconds=seconds)
 
 
-def _with_body(motion: Motion, recording: Recording, chosen: bool | str) -> tuple[Motion, BodyModel | None]:
-    """The .glb's motion and surface: Anny's body, none, or on its own skeleton that of the user's SMPL model file."""
-    if not isinstance(chosen, str):
-        return motion, anny_body(motion.skeleton, recording.shape or None) if chosen else None
-    arrays = read_smpl(chosen)
-    betas = [value for name, value in recording.shape.items() if name.startswith("beta_")]
-    betas = torch.tensor(betas[: arrays.shape_directions.shape[-1]])
-    body = smpl_body(arrays, betas if len(betas) else None)
-    R, root = retarget(motion.skeleton, body.skeleton, motion.R_parent_joint, motion.t_world_root)
-    return replace(motion, skeleton=body.skeleton, R_parent_joint=R, t_world_root=root), body
+def _betas(arrays: SmplArrays, recording: Recording, motion: Motion) -> Float[Tensor, "beta"]:
+    """The recording's shape coefficients, or those that the wearer's bones tell."""
+    known = [value for name, value in recording.shape.items() if name.startswith("beta_")]
+    return torch.tensor(known[: arrays.shape_directions.shape[-1]]) if known else betas_of(arrays, motion.skeleton)
 
 
 def _live(system: System, config: DictConfig, folder: Path) -> None:

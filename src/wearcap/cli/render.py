@@ -8,7 +8,8 @@ from rich import print as show
 from wearcap.body.anny_body import anny_body
 from wearcap.cli.view import add_recording, read_motions
 from wearcap.errors import WearcapError
-from wearcap.recording.store import dataset_folder, load_recording
+from wearcap.reading import read
+from wearcap.recording.store import dataset_folder
 from wearcap.runtime.system import CaptureInput
 from wearcap.viewer.page_layers import with_objects
 from wearcap.viewer.picture import contact_sheet, draw_head_path, save_png, shared_frames, write_video
@@ -28,14 +29,15 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--sticks", action="store_true", help="bones instead of a body surface")
     parser.add_argument("--environment", help="objects to draw (default: what the recording names)")
     options = parser.parse_args(arguments)
-    recording = load_recording(options.recording)
+    recording = read(options.recording)
     out = options.out or Path(f"{recording.name}.png")
     if out.suffix not in (".png", ".mp4"):
         what = f"cannot draw a {out.suffix or 'file without an ending'}"
         raise WearcapError(what, where=out, expected=".png or .mp4")
     environment = CaptureInput(recording, dataset_folder(options.recording)).objects(options.environment)
     truth = with_objects(recording, environment)
-    motions = ({} if truth is None else {"truth": truth}) | read_motions(options.motion)
+    shown = {"truth": truth, "suit": recording.suit} if truth is None else {"truth": truth}
+    motions = {label: motion for label, motion in shown.items() if motion} | read_motions(options.motion)
     motions = {label: motion.between(options.start, options.stop) for label, motion in motions.items()}
     size = {"size": _size(options.size)} if options.size else {}
     if not motions:

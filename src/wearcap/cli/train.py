@@ -79,7 +79,8 @@ def _name_embeddings(config: DictConfig) -> None:
 def _callbacks(config: DictConfig) -> list[Callback]:
     """The config's callbacks, after the one that records the run."""
     chosen = [callback for callback in config.callbacks.values() if callback and "_target_" in callback]
-    callbacks: list[Callback] = [RunRecord(OmegaConf.to_container(config, resolve=True))]  # pyright: ignore[reportArgumentType]
+    composed: Any = OmegaConf.to_container(config, resolve=True)
+    callbacks: list[Callback] = [RunRecord(composed)]
     callbacks += [instantiate(callback, _convert_="all") for callback in chosen]
     if config.early_stop:
         best = config.callbacks.checkpoint

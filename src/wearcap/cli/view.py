@@ -34,7 +34,7 @@ def read_motions(paths: Sequence[str]) -> dict[str, Motion]:
 
 def add_recording(parser: argparse.ArgumentParser, purpose: str) -> None:
     """Add the recording and the option `--motion FILE …`, whose files `read_motions` reads."""
-    parser.add_argument("recording", help="DATASET/NAME or a recording's .safetensors file")
+    parser.add_argument("recording", help="DATASET/NAME, or any file or folder that holds a recording")
     text = f"captured motions (.npz that `wearcap capture` wrote) to {purpose}"
     parser.add_argument("--motion", nargs="+", action="extend", default=[], metavar="FILE", help=text)
 
@@ -46,11 +46,12 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--environment", help="objects to show (default: what the recording names)")
     options = parser.parse_args(arguments)
 
-    from wearcap.recording.store import dataset_folder, load_recording
+    from wearcap.reading import read
+    from wearcap.recording.store import dataset_folder
     from wearcap.runtime.system import CaptureInput
     from wearcap.viewer.page import Page
 
-    recording, folder = load_recording(options.recording), dataset_folder(options.recording)
+    recording, folder = read(options.recording), dataset_folder(options.recording)
     captures = read_motions(options.motion)
     environment = CaptureInput(recording, folder).objects(options.environment)
     page = Page(recording, captures, folder=folder, host=options.host, port=options.port, environment=environment)

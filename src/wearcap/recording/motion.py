@@ -1,8 +1,9 @@
 """The Motion (output of a pipeline, or ground truth), and interactions: which hands hold which object at which time."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -86,6 +87,16 @@ class Motion:
     def __len__(self) -> int:
         return len(self.timestamps)
 
+    def save(self, path: str | Path) -> None:
+        """Write a file of the kind that its name's ending says (`io.saving`): .npz, .bvh, .glb or _smplh.npz.
+
+        Raises WearcapError for another ending, and when the file cannot be written.
+        """
+        endings = [ending for ending in WRITERS if Path(path).name.endswith(ending)]
+        if not endings:
+            raise WearcapError("no kind of motion file", path, f"a name that ends with {', '.join(WRITERS)}")
+        WRITERS[max(endings, key=len)](self, Path(path))
+
     @property
     def fps(self) -> float:
         """Nominal frame rate (Hz): the inverse of the median time step."""
@@ -140,3 +151,7 @@ class Motion:
                 for name, track in objects.items()
             }
         return replace(self, R_parent_joint=R, t_world_root=self.t_world_root @ R_new.mT + t_new, object_motion=objects)
+
+
+WRITERS: dict[str, Callable[[Motion, Path], None]] = {}
+"""What writes a motion, by the ending of the file's name; entered by `io.saving`."""

@@ -4,6 +4,7 @@ AMASS' world is metric and z up; its joint frames are SMPL's (`io.formats.smpl`)
 template's origin, so the pelvis stands at `trans` + J₀ with J₀ the template's pelvis in SMPL's own axes.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -66,8 +67,15 @@ def read_amass(path: str | Path) -> Recording:
     )
 
 
-def write_amass(motion: Motion, path: str | Path, betas: Float[Tensor, "feature"] | None = None) -> None:
+def write_amass(
+    motion: Motion,
+    path: str | Path,
+    betas: Float[Tensor, "feature"] | None = None,
+    t_template_pelvis: Sequence[float] = PELVIS_SMPLH,
+) -> None:
     """Write a motion of an SMPL skeleton as an AMASS SMPL+H file of neutral gender; missing hands stay flat, gaps repeat the nearest frame.
+
+    `t_template_pelvis` (m, SMPL's axes) is J₀ of the body that these betas make.
 
     Raises WearcapError for another skeleton or values that are not finite.
     """
@@ -83,7 +91,7 @@ def write_amass(motion: Motion, path: str | Path, betas: Float[Tensor, "feature"
     known = [name for name in target.joint_names if name in motion.skeleton.joint_names]
     R[:, target.indices(*known)] = source[:, motion.skeleton.indices(*known)]
     R = torch.cat([R[:, :1] @ A, A.T @ R[:, 1:] @ A], 1)
-    trans = motion.t_world_root[frames].double() - torch.tensor(PELVIS_SMPLH, dtype=torch.float64)
+    trans = motion.t_world_root[frames].double() - torch.tensor(list(t_template_pelvis), dtype=torch.float64)
     shape = np.zeros(16)
     if betas is not None:
         shape[: len(betas[:16])] = betas[:16].double().numpy()

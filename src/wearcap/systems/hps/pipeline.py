@@ -31,6 +31,7 @@ from wearcap.recording.timing import resampled
 from wearcap.runtime.stages import Stage, StagedSystem
 from wearcap.runtime.system import CaptureInput
 from wearcap.scene.scan import Scan
+from wearcap.sensors.contacts import contacts_from_motion
 from wearcap.sensors.initialization import (
     Initialization,
     InitializationSettings,
@@ -178,8 +179,8 @@ class HPS(StagedSystem):
         """Data of the energy: initial state, localised cameras, contacts, the suit's motion from frame to frame, and
         `R_head_cam`, estimated from the localised frames (HPS paper eq. 4) unless it is given.
 
-        Contacts are the suit's flags, without patches that move faster than `max_contact_speed`. Raises WearcapError
-        when there are no flags, or not one per frame.
+        Contacts are the suit's flags, or follow from its feet's speed where it has none; without patches that move faster
+        than `max_contact_speed`. Raises WearcapError when there is not one per frame.
         """
         motion, (_, localization, _) = start.motion, required(recording)
         R_cam, sure = at_frames(localization, motion)
@@ -189,11 +190,10 @@ class HPS(StagedSystem):
         if not self.evidence.confident:
             sure = (sure > 0).double()
         body = anny_body(motion.skeleton, recording.shape or None)
-        if aligned.contact_prob is None or len(aligned.contact_prob) != len(aligned):
-            count = "no" if aligned.contact_prob is None else f"{len(aligned.contact_prob)} frames of"
-            what = f"{count} foot contacts for {len(aligned)} frames of the suit's pose"
-            raise WearcapError(what, expected="one per frame and patch", fix="wearcap.sensors.contacts derives them.")
-        contact = aligned.contact_prob >= 0.5
+        contact = contacts_from_motion(aligned) if aligned.contact_prob is None else aligned.contact_prob >= 0.5
+        if len(contact) != len(aligned):
+            what = f"{len(contact)} frames of foot contacts for {len(aligned)} frames of the suit's pose"
+            raise WearcapError(what, expected="one per frame and patch")
         if self.evidence.max_contact_speed is not None:
             patches = site_positions(aligned.skeleton, aligned.T_world_joint, FOOT_PATCHES)
             speed = finite_difference(patches, aligned.timestamps).norm(dim=-1)

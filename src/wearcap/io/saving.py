@@ -1,0 +1,38 @@
+"""What `Motion.save` writes, by the ending of the file's name."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from wearcap.body.anny_body import anny_body
+from wearcap.body.retarget import retarget
+from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeletons import smplh52
+from wearcap.errors import WearcapError
+from wearcap.io.datasets.amass import write_amass
+from wearcap.io.formats.bvh import write_bvh
+from wearcap.io.formats.gltf import write_glb
+from wearcap.io.formats.motion_npz import write_motion
+from wearcap.recording.motion import WRITERS, Motion
+
+
+def on_skeleton(motion: Motion, skeleton: Skeleton) -> Motion:
+    """The motion retargeted to another skeleton. Raises WearcapError where limbs are not recognised."""
+    R, root = retarget(motion.skeleton, skeleton, motion.R_parent_joint, motion.t_world_root)
+    return replace(motion, skeleton=skeleton, R_parent_joint=R, t_world_root=root)
+
+
+def write_smplh(motion: Motion, path: Path) -> None:
+    """SMPL+H's pose parameters as AMASS has them, of the neutral mean shape: rotations are right, bones are not the wearer's."""
+    write_amass(on_skeleton(motion, smplh52()), path)
+
+
+def write_surface(motion: Motion, path: Path) -> None:
+    """A .glb with a human surface, or with bones alone for a skeleton that it does not fit."""
+    try:
+        body = anny_body(motion.skeleton)
+    except WearcapError:
+        body = None
+    write_glb(motion, path, body=body)
+
+
+WRITERS |= {".npz": write_motion, ".bvh": write_bvh, ".glb": write_surface, "_smplh.npz": write_smplh}

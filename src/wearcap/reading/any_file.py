@@ -1,0 +1,130 @@
+"""One reader for whatever a user has: `read(path)` returns a Recording."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import torch
+
+import wearcap.io.saving  # noqa: F401  gives motions their `save`
+from wearcap.body.skeleton import FOOT_PATCHES
+from wearcap.errors import WearcapError
+from wearcap.io.datasets.adt import is_adt, read_adt
+from wearcap.io.datasets.amass import read_amass
+from wearcap.io.datasets.nymeria import is_nymeria, read_nymeria, read_xdata
+from wearcap.io.datasets.totalcapture import is_totalcapture, read_totalcapture, totalcapture_files
+from wearcap.io.devices.aria_mps import head_stream, is_mps_folder, read_closed_loop, read_mps
+from wearcap.io.formats.asf_amc import read_amc, read_asf
+from wearcap.io.formats.bvh import read_bvh
+from wearcap.io.formats.motion_npz import read_motion
+from wearcap.io.formats.mvnx import read_mvnx
+from wearcap.io.formats.npz import read_npz
+from wearcap.io.formats.poses import read_euroc, read_tum
+from wearcap.recording import HeadStream, Motion, Recording
+from wearcap.recording.store import MANIFEST, RecordingFile, load_recording
+from wearcap.sensors.contacts import contacts_from_motion
+
+PACKED = (".gz", ".xz")
+
+
+def read(where: str | Path) -> Recording:
+    """Read a recording from whatever holds one.
+
+    That is a prepared recording (DATASET/NAME or its .safetensors), MVNX, BVH, AMC with its ASF, AMASS or SMPL .npz, our
+    motion .npz, a trajectory (.csv, .txt, .tum), or a folder of Aria MPS, Nymeria, Aria Digital Twin or TotalCapture. A
+    suit without foot contacts gets those of its feet's speed. Names are those of the files. Raises WearcapError for what cannot be read.
+    """
+    path = Path(where)
+    if not path.exists() or (path / MANIFEST).is_file():
+        return load_recording(path)
+    if path.is_dir():
+        for is_kind, read_folder in _FOLDERS:
+            if is_kind(path):
+                return read_folder(path)
+        return load_recording(path)
+    kind = kind_of(path)
+    if kind is None:
+        fix = "Markers have no skeleton yet: solve them, and give the BVH." if path.suffix.lower() == ".c3d" else ""
+        raise WearcapError("not a kind of file that holds a recording", path, ", ".join(READERS), fix)
+    content = READERS[kind](path)
+    if isinstance(content, Motion):
+        content = Recording(path.name.split(".")[0], motion=content, skeleton=content.skeleton)
+    return _with_contacts(content)
+
+
+def kind_of(path: Path) -> str | None:
+    """Suffix that determines a file's format, without compression; None for one that `read` does not know."""
+    suffixes = [suffix.lower() for suffix in path.suffixes if suffix.lower() not in PACKED]
+    return suffixes[-1] if suffixes and suffixes[-1] in READERS else None
+
+
+def _with_contacts(recording: Recording) -> Recording:
+    """The recording with foot contacts of its suit, from the feet's speed where the suit reports none."""
+    suit = recording.suit
+    if suit is None or suit.contact_prob is not None or not set(FOOT_PATCHES) <= set(suit.skeleton.sites):
+        return recording
+    if len(suit) < 3:
+        return recording
+    return replace(recording, suit=replace(suit, contact_prob=contacts_from_motion(suit).float()))
+
+
+def amc_skeleton(path: Path) -> Path:
+    """The ASF beside an AMC file: the only one, or the one whose name it begins with. Raises WearcapError without one."""
+    beside = sorted(file for file in path.parent.iterdir() if ".asf" in (suffix.lower() for suffix in file.suffixes))
+    stem = path.name.split(".")[0]
+    named = [file for file in beside if stem.startswith(file.name.split(".")[0])]
+    if not (named or len(beside) == 1):
+        raise WearcapError("no skeleton for this motion", where=path, expected="an .asf file beside it")
+    return (named or beside)[-1]
+
+
+def _read_csv(path: Path) -> Recording:
+    if "closed_loop" in path.name or "aria_trajectory" in path.name:
+        track = read_closed_loop(path, up="y" if "aria_trajectory" in path.name else "z")[0]
+        return Recording(path.name.split(".")[0], head=head_stream(track, fps=None), source="Aria MPS")
+    return _read_poses(read_euroc, path)
+
+
+def _read_poses(read_trajectory: Callable, path: Path) -> Recording:
+    """A trajectory as the head's own path: x forward, y left, z up."""
+    path_of = read_trajectory(path)
+    head = HeadStream(path_of.timestamps, path_of.R_world_body, path_of.t_world_body, torch.eye(3), torch.zeros(3))
+    return Recording(path.name.split(".")[0], head=head)
+
+
+def _read_npz(path: Path) -> Recording | Motion:
+    """A wearcap motion, Nymeria's suit data, or an AMASS file, recognised by its arrays."""
+    if path.name == "xdata.npz":
+        return read_xdata(path)[0]
+    return read_motion(path) if read_npz(path, ("wearcap",)) else read_amass(path)
+
+
+def _suit(recording: Recording) -> Recording:
+    """A suit's own motion is what was sensed, not what is true."""
+    return replace(recording, suit=recording.motion, motion=None)
+
+
+def _totalcapture(folder: Path) -> Recording:
+    """A sequence in Vicon's skeleton; where the sensors are mounted is not known."""
+    found = read_totalcapture(totalcapture_files(folder)[0])
+    return Recording(folder.name, motion=found.motion, imu=found.imu, source="TotalCapture")
+
+
+_FOLDERS: tuple[tuple[Callable[[Path], bool], Callable[[Path], Recording]], ...] = (
+    (is_nymeria, read_nymeria),
+    (is_mps_folder, read_mps),
+    (is_adt, read_adt),
+    (is_totalcapture, _totalcapture),
+)
+READERS: dict[str, Callable[[Path], Recording | Motion]] = {
+    ".amc": lambda path: read_amc(read_asf(amc_skeleton(path)), path),
+    ".bvh": read_bvh,
+    ".mvnx": lambda path: _suit(read_mvnx(path)),
+    ".npz": _read_npz,
+    ".safetensors": lambda path: RecordingFile(path).load(),
+    ".csv": _read_csv,
+    ".txt": partial(_read_poses, read_tum),
+    ".tum": partial(_read_poses, read_tum),
+}
+"""Readers by suffix."""

@@ -1,0 +1,161 @@
+"""Any file is a recording: files of every kind in, a capture of what they hold out, and one clear line for the rest."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import wearcap
+from command_line import exit_code
+from mvnx_files import mvnx
+from wearcap.body.skeleton import skeleton_of_height, xsens23
+from wearcap.body.skeletons import smplh52
+from wearcap.errors import WearcapError
+from wearcap.io.datasets.amass import read_amass, write_amass
+from wearcap.io.formats.bvh import read_bvh, write_bvh
+from wearcap.io.formats.motion_npz import read_motion, write_motion
+from wearcap.reading import read
+from wearcap.recording import RecordingStore
+from wearcap.tracking.stature import estimate_stature, with_stature
+from wearcap_testing import PROJECT, recording_of, swaying_motion
+
+SECONDS = 1.0
+
+
+@pytest.fixture
+def take(tmp_path) -> Path:
+    """A suit's capture as MVN 2018 and earlier export it: without foot contacts."""
+    motion = replace(swaying_motion(round(240 * SECONDS), fps=240.0), contact_prob=torch.zeros(round(240 * SECONDS), 4))
+    text = mvnx(motion, contacts=[])
+    text = text.replace("<footContacts></footContacts>", "").replace(
+        "<footContactDefinition></footContactDefinition>", ""
+    )
+    path = tmp_path / "take.mvnx"
+    path.write_text(text)
+    return path
+
+
+def test_a_suit_is_what_was_sensed_and_gets_contacts(take):
+    recording = read(take)
+    assert recording.motion is None
+    assert recording.suit is not None
+    assert recording.suit.contact_prob is not None
+    assert recording.suit.contact_prob.shape == (round(240 * SECONDS), 4)
+    assert set(recording.imu) >= {"pelvis", "head"}
+
+
+def test_motions_of_every_kind_are_recordings(tmp_path):
+    motion = swaying_motion(60)
+    write_motion(motion, tmp_path / "a.npz")
+    write_bvh(motion, tmp_path / "a.bvh")
+    write_amass(swaying_motion(60, skeleton=smplh52()), tmp_path / "a_smplh.npz")
+    for name in ("a.npz", "a.bvh", "a_smplh.npz"):
+        recording = read(tmp_path / name)
+        assert recording.motion is not None
+        assert len(recording.motion) == 60
+
+
+def test_a_data_set_s_recordings_are_found_as_before(tmp_path):
+    RecordingStore(tmp_path).add(recording_of(swaying_motion(60), "only"), split="train", config_hash="")
+    for where in (tmp_path, tmp_path / "only", tmp_path / "recordings" / "only.safetensors"):
+        assert read(where).name == "only"
+
+
+def test_other_files_get_one_line(tmp_path):
+    (tmp_path / "marks.c3d").write_bytes(b"x")
+    with pytest.raises(WearcapError, match="Markers have no skeleton"):
+        read(tmp_path / "marks.c3d")
+    (tmp_path / "a.docx").write_bytes(b"x")
+    with pytest.raises(WearcapError, match="not a kind of file that holds a recording"):
+        read(tmp_path / "a.docx")
+    with pytest.raises(WearcapError, match="no recording here"):
+        read(tmp_path / "nothing.bvh")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(WearcapError, match="no recording here"):
+        read(tmp_path / "empty")
+
+
+def test_a_suit_becomes_files_without_a_camera(take, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    out = tmp_path / "out"
+    command = ["capture", "pipeline=recorded", f"recording={take}", f"hydra.run.dir={out}", "video_seconds=0.1"]
+    assert exit_code(command) == 0
+    names = {"motion.npz", "motion.bvh", "motion.glb", "motion.mp4", "motion_smplh.npz"}
+    assert {path.name for path in out.glob("motion*")} == names
+    suit = read(take).suit
+    assert suit is not None
+    assert (read_motion(out / "motion.npz").T_world_joint.t - suit.T_world_joint.t).abs().max() < 1e-4
+    assert (read_bvh(out / "motion.bvh").t_world_root - suit.t_world_root).abs().max() < 1e-3
+    smpl = read_amass(out / "motion_smplh.npz").motion
+    assert smpl is not None
+    legs = smpl.skeleton.indices("left_hip", "right_hip")
+    hips = suit.joint("left_hip").t + suit.joint("right_hip").t
+    assert (smpl.T_world_joint.t[:, legs].sum(1) - hips).abs().max() < 0.02
+    assert exit_code(["render", str(take), "--out", str(tmp_path / "sheet.png"), "--frames", "2"]) == 0
+    assert (tmp_path / "sheet.png").stat().st_size > 1000
+
+
+def test_a_pipeline_says_what_the_file_lacks(take):
+    with pytest.raises(WearcapError, match="no camera"):
+        wearcap.load("hps")(wearcap.read(take))
+    with pytest.raises(WearcapError, match="no motion in this recording"):
+        wearcap.load("recorded")(replace(read(take), suit=None))
+
+
+def test_motions_save_themselves_by_their_names(tmp_path):
+    motion = swaying_motion(10)
+    for name in ("a.npz", "a.bvh", "a.glb", "a_smplh.npz"):
+        motion.save(tmp_path / name)
+        assert (tmp_path / name).stat().st_size > 500
+    assert read_motion(tmp_path / "a.npz").skeleton == motion.skeleton
+    with pytest.raises(WearcapError, match=r"ends with \.npz, \.bvh, \.glb, _smplh\.npz"):
+        motion.save(tmp_path / "a.fbx")
+
+
+@pytest.mark.parametrize("height", [1.55, 1.9])
+def test_a_height_follows_from_the_head_over_a_known_floor(height):
+    skeleton = skeleton_of_height(height)
+    frames = 1200
+    motion = replace(swaying_motion(frames, skeleton=skeleton), skeleton=skeleton)
+    still = motion.R_parent_joint.clone()
+    still[:] = torch.eye(3)
+    motion = replace(motion, R_parent_joint=still)
+    recording = replace(recording_of(motion, "a"), motion=motion)
+    head, T = recording.head, motion.joint("head")
+    assert head is not None
+    head = replace(
+        head, timestamps=motion.timestamps, R_world_device=T.R, t_world_device=T.t, t_head_device=torch.zeros(3)
+    )
+    head = replace(head, R_head_device=torch.eye(3))
+    unknown = replace(recording, head=head, motion=None, skeleton=None, suit=None)
+    found = estimate_stature(unknown, xsens23())
+    assert found is not None
+    assert abs(found.height_m - height) < 2 * found.deviation_m
+    fitted, stature = with_stature(unknown, xsens23())
+    assert stature is not None
+    assert stature.source == "head"
+    assert fitted.skeleton is not None
+    assert abs(fitted.skeleton.stature - found.height_m) < 1e-4
+    given, stature = with_stature(unknown, xsens23(), 1.68)
+    assert str(stature) == "1.68 m, as given"
+    assert given.skeleton is not None
+    assert abs(given.skeleton.stature - 1.68) < 1e-4
+    assert with_stature(replace(unknown, floor=None, points=None), xsens23())[1] is None
+    with pytest.raises(WearcapError, match="a height of 17"):
+        with_stature(unknown, xsens23(), 17.0)
+
+
+@pytest.mark.real
+def test_the_real_aria_wearer_s_height_is_read_off_the_path():
+    """The head is 1.50 m above the floor on this walk, so the wearer is not as tall as the default body."""
+    recording = wearcap.read(PROJECT.parent / "shared" / "data" / "aria_mps")
+    assert recording.skeleton is not None
+    assert recording.skeleton.stature == pytest.approx(1.60, abs=0.05)
+
+
+def test_numbers_of_a_broken_npz_are_named(tmp_path):
+    np.savez(tmp_path / "a.npz", nothing=np.zeros(3))
+    with pytest.raises(WearcapError, match="holds no poses"):
+        read(tmp_path / "a.npz")
