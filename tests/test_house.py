@@ -9,7 +9,7 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "wearcap"
 ROOT = SOURCE.parents[1]
 FLOORS = (
-    ("errors", "files", "locks", "workers"),
+    ("errors", "files", "locks", "spread", "workers"),
     ("geometry",),
     ("body", "scene"),
     ("recording",),

@@ -8,14 +8,22 @@ from pathlib import Path
 import lightning
 import pytest
 import torch
+from hydra.utils import instantiate
+from PIL import Image
 from torch import nn
 
+from wearcap.cli.conf import compose
+from wearcap.errors import WearcapError
+from wearcap.io.formats.camera_json import write_photos
+from wearcap.io.formats.ply import Ply, write_ply
+from wearcap.localization.features import RootSift
+from wearcap.localization.point_map import PointMapper
 from wearcap.optimize.banded import BandedSettings, solve_banded
 from wearcap.optimize.costs import Loss
 from wearcap.optimize.hps import HpsEnergy
-from wearcap.recording import Localization, Recording
+from wearcap.recording import Localization, Recording, RecordingStore
 from wearcap.systems.hps.pipeline import HPS
-from wearcap.systems.hps.training import HpsValidation
+from wearcap.systems.hps.training import HpsValidation, TrainedFeatures
 
 SQUARES = ("self", "hold", "translation_step", "root_step", "head_step", "pose", "slide", "contact_plane")
 PIPELINE = HPS(
@@ -124,3 +132,82 @@ def test_a_recording_without_truth_has_no_error(data, tmp_path):
     scores = validated(PIPELINE, f"{tmp_path}/walk")
     assert scores["world_root_cm"] != scores["world_root_cm"]
     assert scores["localized_share"] == 1.0
+
+
+class LearnedSift(nn.Module):
+    """SIFT whose descriptors pass through a layer."""
+
+    name = "learned_sift"
+
+    def __init__(self):
+        super().__init__()
+        self.layer = nn.Linear(128, 128, bias=False)
+        nn.init.orthogonal_(self.layer.weight)
+
+    def forward(self, image):
+        found = RootSift(400)(image)
+        descriptors = nn.functional.normalize(self.layer(torch.from_numpy(found.descriptors)), dim=-1)
+        return replace(found, descriptors=descriptors.detach().numpy())
+
+
+class FeatureTraining(Offset):
+    """Turns its descriptors in every step: a map of other weights is of no use."""
+
+    def __init__(self):
+        super().__init__()
+        self.net = LearnedSift()
+
+    def on_train_batch_end(self, *batch):
+        nn.init.orthogonal_(self.net.layer.weight)
+
+
+def test_the_config_captures_with_the_features_of_the_weights_in_training(tmp_path):
+    for folder in ("localization", "pipelines"):
+        sys.path.append(str(Path(__file__).parents[1] / folder))
+    from hps_walk import hps_recording
+    from textured_room import CAMERA, looking, photo_poses, photograph, take_photos, textured_room
+
+    (tmp_path / "scene").mkdir()
+    mapper = PointMapper(textured_room(), 0.01)
+    write_photos(take_photos(mapper, CAMERA, photo_poses(10), tmp_path / "scene"), tmp_path / "scene")
+    write_ply(Ply(mapper.scan.points, None), tmp_path / "scene/pointcloud.ply")
+    for number in range(6):
+        pose = looking((2.0 + 0.05 * number, 2.0, 1.6), 0.3 + 0.02 * number, 0.1)
+        Image.fromarray(photograph(mapper, CAMERA, pose)).save(tmp_path / f"{number}.png")
+    walk = hps_recording(seconds=2.0)
+    assert walk.camera is not None
+    files = tuple(f"{number}.png" for number in range(6))
+    stream = replace(walk.camera, timestamps=walk.camera.timestamps[:6], camera=CAMERA, image_files=files)
+    store = RecordingStore(tmp_path)
+    store.add(replace(walk, camera=stream, localization=None), split="val", config_hash="x")
+
+    given = ["callbacks=localizer", f"callbacks.hps.localizer.scene={tmp_path}/scene", f"paths.run={tmp_path}/run"]
+    given += [f"callbacks.hps.recordings=[{tmp_path}/walk]", "callbacks.hps.every_n_epochs=1"]
+    given += ["+callbacks.hps.localizer.every=2", "callbacks.hps.pipeline.solver.settings.iterations=2"]
+    callback = instantiate(compose("train", given).callbacks.hps, _convert_="all")
+    assert isinstance(callback, HpsValidation)
+    logged = []
+
+    class Watch(lightning.Callback):
+        def on_validation_end(self, trainer, pl_module):
+            logged.append({name: value.item() for name, value in trainer.callback_metrics.items()})
+
+    lightning.Trainer(
+        accelerator="cpu",
+        max_epochs=2,
+        callbacks=[callback, Watch()],
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+    ).fit(FeatureTraining())
+    assert [epoch["hps/localized_share"] for epoch in logged] == [1.0, 1.0], "each map is of its epoch's weights"
+    assert all(epoch["hps/world_root_cm"] > 0 for epoch in logged)
+
+
+def test_a_model_without_features_is_named(tmp_path):
+    module = Offset()
+    module.net = nn.Linear(1, 1)
+    with pytest.raises(WearcapError, match="Offset extracts no features"):
+        TrainedFeatures(str(tmp_path), str(tmp_path / "map.safetensors"))(module)

@@ -1,7 +1,6 @@
 """The object encoder end to end: it trains, is scored, resumes, and its checkpoint encodes."""
 
 import csv
-import os
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,6 @@ from wearcap.models.point_encoder import PointNeXt
 from wearcap.systems.echo.features import EchoFeatures
 from wearcap.systems.echo.object_training import ObjectEncoding, instance_loss
 from wearcap.systems.echo.training_windows import EchoContent
-from wearcap.training.run import resume_path
 from wearcap_testing import experiments
 
 EXPERIMENTS = experiments("object_encoder")
@@ -96,17 +94,6 @@ def test_resuming_equals_training_straight_through(data, tmp_path, capsys):
     capsys.readouterr()
     trained("object_encoder", data, tmp_path / "again", "trainer.max_steps=6", *short, f"resume={resumed}")
     assert "no step was left to make" in capsys.readouterr().out
-
-
-def test_auto_goes_on_from_the_run_itself_before_a_newer_one(tmp_path):
-    own, newer = (tmp_path / name / "checkpoints/last.ckpt" for name in ("own", "newer"))
-    assert resume_path("auto", tmp_path / "own", tmp_path) is None
-    for path in (own, newer):
-        path.parent.mkdir(parents=True)
-        path.touch()
-    os.utime(own, (1, 1))
-    assert resume_path("auto", tmp_path / "own", tmp_path) == own
-    assert resume_path("auto", tmp_path / "fresh", tmp_path) == newer
 
 
 def test_an_object_is_found_by_its_other_view():

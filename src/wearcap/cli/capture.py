@@ -14,7 +14,8 @@ from torch import Tensor
 from wearcap.body.anny_body import anny_body
 from wearcap.body.skeleton import xsens23
 from wearcap.body.smpl_body import SmplArrays, betas_of, smpl_body, template_pelvis
-from wearcap.cli.conf import hydra_main, load_pipeline
+from wearcap.cli.capture_all import capture_all, is_dataset
+from wearcap.cli.conf import hydra_main, load_pipeline, with_pipeline
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.io.datasets.amass import write_amass
@@ -33,18 +34,27 @@ from wearcap.tracking.stature import with_stature
 from wearcap.viewer.page_layers import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png, write_video
 
-HELP = "turn a recording into motion: wearcap capture recording=DATASET/NAME, checkpoint=… or pipeline=hps"
+HELP = "turn recordings into motion: wearcap capture recording=DATASET/NAME or DATASET, checkpoint=… or pipeline=hps"
 
 
 def run(config: DictConfig) -> Motion | None:
+    """Capture one recording, or all of a data set, or follow one that still grows (`live`)."""
+    if is_dataset(config):
+        return capture_all(config, captured)
+    system = load_pipeline(config.checkpoint, config.pipeline, config.device)
+    if config.live:
+        return _live(system, config, Path(config.output))
+    motion = captured(config, system)
+    show(f"{'motion' if motion is not None else 'report'}: {config.output}")
+    return motion
+
+
+def captured(config: DictConfig, system: System) -> Motion | None:
     """Capture one recording and write motion.npz, .bvh, .glb and .mp4 (beside the ground truth, if there is one).
 
     A pipeline with stages also writes report.json, and only that if `until` names a stage before the motion exists.
     """
-    system = load_pipeline(config.checkpoint, config.pipeline, config.device)
     folder = Path(config.output)
-    if config.live:
-        return _live(system, config, folder)
     if config.samples < 1:
         raise WearcapError(f"samples={config.samples}", expected="at least 1")
     recording, stature = with_stature(read(config.recording), xsens23(), config.height)
@@ -75,7 +85,6 @@ def run(config: DictConfig) -> Motion | None:
             motion.provenance.update(checkpoint=str(config.checkpoint))
         motion.provenance.update(recording=str(config.recording))
         _write(motion, recording, environment, folder, config)
-    show(f"{'motion' if motion is not None else 'report'}: {folder}")
     return motion
 
 
@@ -126,4 +135,5 @@ def _live(system: System, config: DictConfig, folder: Path) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    hydra_main("capture", run, ["live=true" if argument == "--live" else argument for argument in arguments])
+    arguments = ["live=true" if argument == "--live" else argument for argument in arguments]
+    hydra_main("capture", run, with_pipeline(arguments))

@@ -10,7 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import ChoiceSweep
 from hydra.errors import (
     ConfigCompositionException,
     HydraException,
@@ -26,7 +29,8 @@ from omegaconf.errors import OmegaConfBaseException
 from wearcap.errors import WearcapError, nearest
 from wearcap.files import resource
 from wearcap.models.checkpoint import read_checkpoint
-from wearcap.runtime.system import System
+from wearcap.runtime.system import System, training_of
+from wearcap.spread import Spread
 
 
 def conf_dir() -> Path:
@@ -47,6 +51,29 @@ def compose(config_name: str, overrides: Iterable[str] = ()) -> DictConfig:
     overrides = list(overrides)
     with explained(config_name, overrides):
         return _compose(config_name, overrides)
+
+
+def with_pipeline(arguments: list[str]) -> list[str]:
+    """A command's arguments with the pipeline of their checkpoints' system, unless they choose one or there is none.
+
+    Raises WearcapError for checkpoints of several systems.
+    """
+    given: dict[str, Any] = {}
+    for argument in arguments:
+        with suppress(HydraException):  # its complaint comes when the config is composed
+            override = OverridesParser.create().parse_override(argument)
+            given[override.key_or_group] = override
+    if "pipeline" in given or "checkpoint" not in given or given["checkpoint"].value() is None:
+        return arguments
+    value = given["checkpoint"].value()
+    values = value.list if isinstance(value, ChoiceSweep) else value if isinstance(value, list) else [value]
+    flat = [part for each in values for part in (each if isinstance(each, list) else [each])]
+    owners = {path: training_of(path)[1] for path in (str(getattr(part, "text", part)) for part in flat)}
+    chosen = {path: owner.pipeline for path, owner in owners.items() if owner is not None and owner.pipeline}
+    if len(set(chosen.values())) > 1:
+        listed = ", ".join(f"{path} ({pipeline})" for path, pipeline in chosen.items())
+        raise WearcapError(f"checkpoints of several pipelines: {listed}", expected="checkpoints of one pipeline")
+    return [*(f"pipeline={pipeline}" for pipeline in sorted(set(chosen.values()))), *arguments]
 
 
 def hydra_main(config_name: str, task: Callable[[DictConfig], Any], arguments: list[str]) -> None:
@@ -95,8 +122,13 @@ class _Guarded:
 
 
 def _compose(config_name: str, overrides: list[str]) -> DictConfig:
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return hydra.compose(config_name, overrides)
+    around = GlobalHydra.instance().hydra  # of the command that this config is composed in, if it is one
+    GlobalHydra.instance().clear()
+    try:
+        with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+            return hydra.compose(config_name, overrides)
+    finally:
+        GlobalHydra.instance().hydra = around
 
 
 @contextmanager
@@ -214,3 +246,9 @@ def trained_on(checkpoint: str | Path) -> tuple[list[str], str]:
     sources = [source["root"] for source in data["sources"].values() if source]
     validated = [source["root"] for source in (data.get("val_sources") or data["sources"]).values() if source]
     return sources, validated[0]
+
+
+def spread_of(config: DictConfig) -> Spread:
+    """How a command's recordings are spread: its `jobs` (null: one per core, on a GPU one), `backend`, `scheduler`."""
+    jobs = config.jobs if config.jobs is not None else -1 if config.device == "cpu" else 1
+    return Spread(jobs, config.backend, config.scheduler, threads=None)

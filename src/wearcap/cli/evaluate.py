@@ -1,66 +1,182 @@
 """`wearcap evaluate`: whole recordings of a split, over seeds, beside the trivial baselines."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-from omegaconf import DictConfig, ListConfig
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from rich import get_console
 from rich import print as show
-from rich.progress import Progress
 
-from wearcap.cli.conf import hydra_main, load_systems, trained_on
+from wearcap.cli.conf import hydra_main, load_systems, spread_of, trained_on, with_pipeline
 from wearcap.errors import WearcapError
 from wearcap.evaluation.baselines import BASELINES
-from wearcap.evaluation.evaluate import Realism, evaluate
+from wearcap.evaluation.evaluate import Realism
+from wearcap.evaluation.whole import (
+    Outcome,
+    failures,
+    loaded,
+    outcome_table,
+    over_recordings,
+    require_all,
+    rows_of,
+    scored,
+    settings_key,
+    write_outcomes,
+)
 from wearcap.metrics.table import Row, Scores, Summary, aggregate, rich_table, write_scores
 from wearcap.recording import RecordingStore
-from wearcap.runtime.system import StageOptions, System
+from wearcap.runtime.system import System
+from wearcap.spread import Spread
 
 OURS = "wearcap"
 """Name of the evaluated checkpoint's method in the table."""
 
 HELP = "score a checkpoint: wearcap evaluate checkpoint=… [dataset=DIR] [split=test], or pipeline=hps dataset=DIR"
 
+LISTED = 30
+"""Most recordings that are shown one by one, if none failed; table.csv has them all."""
+
+CAPTURING = ("pipeline", "scene", "metres_per_unit", "batch_size", "device")
+"""Settings on which scores depend, beside checkpoint and seeds."""
+
 
 def run(config: DictConfig) -> Scores:
-    """Evaluate the checkpoint(s) and baselines, or a pipeline that needs none; prints and saves the table."""
+    """Evaluate the checkpoint(s) and baselines, or a pipeline that needs none; shows and saves the table.
+
+    Raises WearcapError when no recording could be scored, and after the table of the others when some could not.
+    """
     given = config.checkpoint
     checkpoints = [str(path) for path in given] if isinstance(given, ListConfig) else [given] if given else []
     systems = load_systems(checkpoints, config.pipeline, config.device)
-    baselines = systems[0].baselines if config.baselines else ()
-    sources, validated = [], None
-    if checkpoints and (baselines or not config.dataset) and not systems[0].joins_checkpoints:
-        sources, validated = trained_on(checkpoints[0])
-    if config.dataset is None and validated is None:
-        raise WearcapError("dataset has no value", fix="Give it on the command line: dataset=DIR.")
-    store = RecordingStore.open(config.dataset or validated)
-    name = OURS if systems[0].draws else systems[0].name
+    store = RecordingStore.open(config.dataset or _validated(checkpoints, systems[0]))
     realism = None if config.realism is None else Realism.load(config.realism)
-    scores: Scores = {}
-    with Progress(transient=True) as progress:
-
-        def scored(system: System, seeds: list[int], title: str, method: str) -> Iterable[Row]:
-            names = store.names(config.split)
-            measure = system.score if realism is None else realism.beside(system.score, method)
-            options = StageOptions(None if config.cache is None else Path(config.cache), console=progress.console)
-            place = config.scene, config.metres_per_unit
-            found = evaluate(system, store, names, seeds, config.batch_size, measure, *place, options)
-            return progress.track(found, total=len(names) * len(seeds), description=title)
-
-        rows: list[Row] = []
-        for index, system in enumerate(systems):
-            seeds = [index * 1000 + seed for seed in config.seeds] if system.draws else list(config.seeds)[:1]
-            title = Path(checkpoints[index]).parts[-3:][0] if name == OURS else name
-            rows += scored(system, seeds, title, name)
-        scores[name] = _summaries(rows, realism, name)
-        for label in baselines:
-            baseline = BASELINES[label].fit([RecordingStore.open(source) for source in sources])
-            rows = list(scored(baseline, [0], label, label))
-            scores[label] = _summaries(rows, realism, label)
+    scoring = _Scoring(config, store, realism)
+    name = OURS if systems[0].draws else systems[0].name
+    outcomes: list[Outcome] = []
+    together = [checkpoints] if len(systems) == 1 else [[checkpoint] for checkpoint in checkpoints]
+    for index, (system, own) in enumerate(zip(systems, together)):
+        seeds = [index * 1000 + seed for seed in config.seeds] if system.draws else list(config.seeds)[:1]
+        outcomes += scoring.of(system, own, seeds, f"{name}-{index}" if index else name, name)
+    failed = failures(outcomes)
+    rows = rows_of(outcomes, failed)
+    if not rows:
+        require_all(outcomes, store.root)
+        raise WearcapError(f"no recordings of split {config.split}", store.root, fix="Choose another split.")
+    scores = {name: _summaries(rows, realism, name)}
+    if config.baselines and systems[0].baselines:
+        scores |= _baselines(scoring, systems[0].baselines, checkpoints[0], {row.recording for row in rows})
     about = {"dataset": str(store.root), "split": config.split, "checkpoint": ", ".join(checkpoints) or "None"}
+    if len(outcomes) <= LISTED or failed:
+        show(outcome_table(f"{name}, {len(outcomes)} recordings", outcomes))
     show(rich_table(f"{store.root.name}, {config.split} split", scores))
     write_scores(config.output, scores, about)
+    write_outcomes(Path(config.output).with_suffix(".csv"), outcomes)
     show(f"table: {config.output}")
+    require_all(outcomes, store.root)
     return scores
+
+
+def _validated(checkpoints: Sequence[str], system: System) -> str:
+    """The data set that a checkpoint was validated on. Raises WearcapError where that is not one data set."""
+    if not checkpoints or system.joins_checkpoints:
+        raise WearcapError("dataset has no value", fix="Give it on the command line: dataset=DIR.")
+    return trained_on(checkpoints[0])[1]
+
+
+class _Scoring:
+    """Scores the recordings of an evaluation with one method after the other."""
+
+    def __init__(self, config: DictConfig, store: RecordingStore, realism: Realism | None):
+        self.config, self.store, self.realism = config, store, realism
+        frames = store.entries
+        self.names = sorted(store.names(config.split), key=lambda name: frames[name].frames)
+
+    def of(
+        self, system: System, checkpoints: Sequence[str], seeds: Sequence[int], title: str, method: str
+    ) -> list[Outcome]:
+        """Outcomes of a configured system, whose workers load it by themselves."""
+        plain: Any = OmegaConf.to_container(self.config, resolve=True)
+        key = settings_key({name: plain[name] for name in CAPTURING} | {"seeds": list(seeds)}, checkpoints)
+        loaded(key, lambda: system)
+        make = partial(_load, list(checkpoints), plain["pipeline"], self.config.device)
+        return self.outcomes(self.names, system, make, key, seeds, title, method, spread_of(self.config))
+
+    def outcomes(
+        self,
+        names: Sequence[str],
+        system: System,
+        make: Callable[[], System],
+        key: str,
+        seeds: Sequence[int],
+        title: str,
+        method: str,
+        how: Spread,
+    ) -> list[Outcome]:
+        """Outcomes of a system that `make` makes; with `realism`, whose latents are kept here, in this process."""
+        config, realism = self.config, self.realism
+        chunk = max(1, config.batch_size // len(seeds)) if system.draws else 1
+        measure = None if realism is None else realism.beside(system.score, method)
+        work = partial(
+            scored,
+            system=make,
+            key=key,
+            root=self.store.root,
+            seeds=list(seeds),
+            batch_size=config.batch_size,
+            scene=config.scene,
+            metres_per_unit=config.metres_per_unit,
+            cache=None if config.cache is None else Path(config.cache),
+            measure=measure,
+        )
+        notes = Path(config.output).with_suffix(".finished") / title.replace(" ", "_")
+        found = over_recordings(
+            work,
+            self.store,
+            names,
+            how if realism is None else Spread(jobs=1),
+            chunk=chunk,
+            notes=notes if realism is None else None,
+            settings=key,
+            scene=config.scene,
+            overwrite=config.overwrite,
+        )
+        return list(found)
+
+
+def _load(checkpoints: list[str], pipeline: dict[str, Any], device: str) -> System:
+    return load_systems(checkpoints, OmegaConf.create(pipeline), device)[0]
+
+
+def _baselines(scoring: _Scoring, labels: Sequence[str], checkpoint: str, names: set[str]) -> Scores:
+    """Scores of the baselines, on the recordings that were scored; a line says why one is left out."""
+    scores: Scores = {}
+    turned_off = "baselines=false turns them off."
+    try:
+        stores = [RecordingStore.open(source) for source in trained_on(checkpoint)[0]]
+    except WearcapError as error:
+        what = f"left out: {', '.join(labels)}, which need the data that the checkpoint was trained on. {error}"
+        _notice(f"{what} {turned_off}")
+        return scores
+    for label in labels:
+        try:
+            baseline = BASELINES[label].fit(stores)
+            key = settings_key({"baseline": label}, [], "wearcap.evaluation.baselines")
+            key += "".join(entry.sha256 for store in stores for entry in store.entries.values())
+            chosen = [name for name in scoring.names if name in names]
+            outcomes = scoring.outcomes(
+                chosen, baseline, lambda made=baseline: made, key, [0], label, label, Spread(jobs=1)
+            )
+            require_all(outcomes, scoring.store.root)
+            scores[label] = _summaries(rows_of(outcomes), scoring.realism, label)
+        except WearcapError as error:
+            _notice(f"left out: {label}. {error} {turned_off}")
+    return scores
+
+
+def _notice(text: str) -> None:
+    get_console().print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)
 
 
 def _summaries(rows: list[Row], realism: Realism | None, method: str) -> dict[str, Summary]:
@@ -73,4 +189,4 @@ def _summaries(rows: list[Row], realism: Realism | None, method: str) -> dict[st
 
 
 def main(arguments: list[str]) -> None:
-    hydra_main("evaluate", run, arguments)
+    hydra_main("evaluate", run, with_pipeline(arguments))

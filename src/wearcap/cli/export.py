@@ -3,7 +3,7 @@
 from omegaconf import DictConfig
 from rich import print as show
 
-from wearcap.cli.conf import hydra_main, load_pipeline
+from wearcap.cli.conf import hydra_main, load_pipeline, with_pipeline
 from wearcap.export.files import ExportReport, write_exports
 from wearcap.models.checkpoint import load_trained, share_checkpoint
 
@@ -31,4 +31,4 @@ def run(config: DictConfig) -> dict[str, ExportReport]:
 
 
 def main(arguments: list[str]) -> None:
-    hydra_main("export", run, arguments)
+    hydra_main("export", run, with_pipeline(arguments))

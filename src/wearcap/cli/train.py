@@ -6,16 +6,27 @@ from pathlib import Path
 
 import lightning
 from hydra.utils import instantiate
-from lightning.pytorch.callbacks import EarlyStopping
+from lightning.pytorch.callbacks import Callback, EarlyStopping
 from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 from rich import print as show
 
-from wearcap.cli.conf import hydra_main
+from wearcap.cli import evaluate
+from wearcap.cli.conf import compose, explained, hydra_main, with_pipeline
 from wearcap.data.surroundings import embeddings_of
+from wearcap.errors import WearcapError
 from wearcap.locks import folder_lock
 from wearcap.recording.store import RecordingStore
-from wearcap.training.run import ConfigInCheckpoint, RunCheckpointIO, fit, keep_freed_memory, record_run, resume_path
+from wearcap.training.run import (
+    RunCheckpointIO,
+    RunRecord,
+    fit,
+    keep_freed_memory,
+    last_checkpoint,
+    record_run,
+    resume_path,
+    run_to_continue,
+)
 
 HELP = "train a model: wearcap train experiment=motion_diffusion_head data=cmu"
 
@@ -23,41 +34,84 @@ HELP = "train a model: wearcap train experiment=motion_diffusion_head data=cmu"
 def train(config: DictConfig) -> float:
     """Train the config's model; returns the last validation loss (which a sweep minimises).
 
-    Raises WearcapError when another process trains in the run's folder.
+    Raises WearcapError when another process trains in the run's folder, and for settings that exclude each other.
     """
     run = Path(config.paths.run)
     with folder_lock(run, "train") if rank_zero_only.rank == 0 else nullcontext():
         lightning.seed_everything(config.seed, workers=True, verbose=False)
         keep_freed_memory()
-        surroundings = config.get("surroundings")
-        if surroundings and surroundings.images and "surroundings" in config.data.dataset.get("content", {}):
-            # The name and the dimension of the image embeddings are those in the data (`surroundings.images=clip`).
-            stores = [RecordingStore.open(source.root) for source in config.data.sources.values() if source]
-            surroundings.images, surroundings.image_size = embeddings_of(surroundings.images, stores)
+        _name_embeddings(config)
         # Each run has its own folder; users cannot fix Lightning's internal deprecations.
         warnings.filterwarnings("ignore", "Experiment logs directory")
         warnings.filterwarnings("ignore", ".*LeafSpec")
-        record_run(run, OmegaConf.to_yaml(config, resolve=True))
-        resume = resume_path(config.resume, run, Path(config.paths.outputs) / "train" / config.name)
+        record = OmegaConf.to_yaml(config, resolve=True)
+        resume = resume_path(config.resume, run, record)
+        if resume and config.init and config.resume != "auto":
+            raise WearcapError(f"resume={resume} and init={config.init}", expected="one of them")
+        record_run(run, record)
         data, system = instantiate(config.data, _convert_="all"), instantiate(config.model, _convert_="all")
-        chosen = [callback for callback in config.callbacks.values() if callback and "_target_" in callback]
-        callbacks = [instantiate(callback, _convert_="all") for callback in chosen]
-        callbacks.insert(0, ConfigInCheckpoint(OmegaConf.to_container(config, resolve=True)))
-        if config.early_stop:
-            best = config.callbacks.checkpoint
-            callbacks.append(EarlyStopping(best.monitor, mode=best.get("mode", "min"), patience=config.early_stop))
+        if config.test and system.system is None:
+            raise WearcapError(f"test=true, but no pipeline captures with {type(system).__name__}", fix="Leave it out.")
         loggers = [instantiate(logger, _convert_="all") for logger in (config.logger or {}).values() if logger]
         trainer: lightning.Trainer = instantiate(
-            config.trainer, callbacks=callbacks, logger=loggers or False, plugins=[RunCheckpointIO(run)]
+            config.trainer, callbacks=_callbacks(config), logger=loggers or False, plugins=[RunCheckpointIO(run)]
         )
-        show(f"[bold]{config.name}[/bold] in {run}" + (f", going on from {resume}" if resume else ""))
-        fit(system, data, trainer, resume)
-        last = run / "checkpoints" / "last.ckpt"
+        start = f", going on from {resume}" if resume else f", from the weights of {config.init}" if config.init else ""
+        show(f"[bold]{config.name}[/bold] in {run}{start}")
+        fit(system, data, trainer, resume, config.init)
+        last = last_checkpoint(run)
         if trainer.is_global_zero:
             nothing_new = f"no step was left to make: {resume} has made {trainer.global_step}"
             show(f"checkpoint: {last}" if last.is_file() else nothing_new)
+            if config.test:
+                _test(config, run, str(trainer.strategy.root_device))
         return float(trainer.callback_metrics.get("val/loss", float("nan")))
 
 
+def _name_embeddings(config: DictConfig) -> None:
+    """Set name and dimension of the image embeddings to those in the data (`surroundings.images=clip`)."""
+    surroundings = config.get("surroundings")
+    if surroundings and surroundings.images and "surroundings" in config.data.dataset.get("content", {}):
+        stores = [RecordingStore.open(source.root) for source in config.data.sources.values() if source]
+        surroundings.images, surroundings.image_size = embeddings_of(surroundings.images, stores)
+
+
+def _callbacks(config: DictConfig) -> list[Callback]:
+    """The config's callbacks, after the one that records the run."""
+    chosen = [callback for callback in config.callbacks.values() if callback and "_target_" in callback]
+    composed: Any = OmegaConf.to_container(config, resolve=True)
+    callbacks: list[Callback] = [RunRecord(composed)]
+    callbacks += [instantiate(callback, _convert_="all") for callback in chosen]
+    if config.early_stop:
+        best = config.callbacks.checkpoint
+        callbacks.append(EarlyStopping(best.monitor, mode=best.get("mode", "min"), patience=config.early_stop))
+    return callbacks
+
+
+def _test(config: DictConfig, run: Path, device: str) -> None:
+    """Score the best checkpoint on the test split, as `wearcap evaluate` does, in test.json."""
+    best = run / "checkpoints" / "best.ckpt"
+    checkpoint = best if best.is_file() else last_checkpoint(run)
+    given = [f"checkpoint='{checkpoint}'", f"paths.run='{run}'", f"output='{run / 'test.json'}'", f"device={device}"]
+    settings = compose("evaluate", with_pipeline(given))
+    if config.pipeline.get("_target_") == settings.pipeline._target_:
+        settings.pipeline = config.pipeline  # as its settings were chosen for the training's captures
+    evaluate.run(settings)
+
+
+def _in_own_folder(arguments: list[str]) -> list[str]:
+    """Arguments that continue the folder of an earlier run with the same config for resume=auto, if there is one."""
+    own = ("-", "hydra.run.dir=", "paths.run=")  # a sweep's runs and those with a folder of their own go on in theirs
+    if "resume=auto" not in arguments or any(argument.startswith(own) for argument in arguments):
+        return arguments
+    config = compose("train", [*arguments, "paths.run=RUN"])
+    _name_embeddings(config)
+    runs = Path(config.paths.outputs) / "train" / config.name
+    run = run_to_continue(runs, OmegaConf.to_yaml(config, resolve=True))
+    return arguments if run is None else [*arguments, f"hydra.run.dir='{run}'"]
+
+
 def main(arguments: list[str]) -> None:
+    with explained("train", arguments):
+        arguments = _in_own_folder(arguments)
     hydra_main("train", train, arguments)

@@ -150,6 +150,12 @@ def check_weights(own: Mapping[str, Tensor], state: Mapping[str, Tensor], where:
         raise WearcapError(what, where=where, expected="a checkpoint of the same model", fix=fix)
 
 
+def target_of(name: str) -> Callable[..., Any]:
+    """The class or function of a `_target_` of `TARGETS`."""
+    module, attribute = _BY_NAME[name]
+    return getattr(importlib.import_module(module), attribute)
+
+
 def _made(value: Any) -> Any:
     """Instantiates every part of a config that has a target, inner parts first."""
     if isinstance(value, list):
@@ -159,8 +165,7 @@ def _made(value: Any) -> Any:
     arguments = {key: _made(item) for key, item in value.items() if key not in (_TARGET, _PARTIAL)}
     if _TARGET not in value:
         return arguments
-    module, name = _BY_NAME[value[_TARGET]]
-    target: Callable[..., Any] = getattr(importlib.import_module(module), name)
+    target = target_of(value[_TARGET])
     return partial(target, **arguments) if value.get(_PARTIAL, False) else target(**arguments)
 
 

@@ -9,31 +9,27 @@ import hashlib
 import json
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import joblib
 import numba
 import torch
-from joblib.externals.loky import get_reusable_executor
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from wearcap.errors import WearcapError, require_choice
+from wearcap.errors import WearcapError
 from wearcap.files import remove_leftovers, sha256_of
 from wearcap.io.formats.poses import are_rotations
 from wearcap.locks import folder_lock
 from wearcap.recording.recording import MIN_DURATION_S, Recording
 from wearcap.recording.serialize import flatten
 from wearcap.recording.store import SPLITS, Entry, RecordingStore, recording_path, save_recording
-from wearcap.workers import bound_to_this_process
+from wearcap.spread import Spread, progress_bar, reason_of
 
-BACKENDS = ("loky", "threading", "dask", "ray")
 REGISTER_EVERY_S = 1.0
 """Least interval (s) between writes of the manifest: a large data set's has megabytes."""
 
@@ -41,9 +37,6 @@ BY_HASH = "hash"
 """Split of a pattern's subjects by the hash of their names: 5 % val, 15 % test, the others train."""
 NOTE = "note"
 """Key of a motion's provenance that the report repeats: notes on cut, dropped or guessed data."""
-
-MAX_REASON = 500
-"""Most characters of the reported reason why a recording failed."""
 
 
 @dataclass(frozen=True)
@@ -148,16 +141,14 @@ def prepare(
     if len(names) < len(tasks):
         twice = Counter(task.name for task in tasks).most_common(1)[0][0]
         raise WearcapError(f"two sources give a recording the name {twice!r}", expected="unique names")
-    if jobs == 0:
-        raise WearcapError("0 jobs", expected="a number of jobs, or -1 for one per core")
-    require_choice(backend, BACKENDS, f"no backend {backend!r}")
+    spread = Spread(jobs, backend, scheduler)
     with folder_lock(output, "prepare") as lock:
         store = RecordingStore(output)
         store.register({})  # missing permission or space should show now and not after the first hour
         remove_leftovers(store.root, below=True)
         todo = tasks if overwrite else [task for task in tasks if not _is_current(store, task)]
         report = Report(current=sorted(names - {task.name for task in todo}))
-        outcomes = _outcomes(todo, store.root, jobs, backend, scheduler, lock)
+        outcomes = spread.run(partial(_run, root=store.root), todo, lock)
         try:
             with closing(outcomes), registering(store, len(tasks), len(report.current)) as finish:
                 for name, outcome, note in outcomes:
@@ -197,63 +188,13 @@ def _run(task: Task, root: Path) -> tuple[str, Entry | str, str]:
                 raise WearcapError(f"the source made a recording {recording.name!r}", expected=task.name)
             check_recording(recording)
         except Exception as error:
-            reason = str(error) if isinstance(error, WearcapError) else f"{type(error).__name__}: {error}"
-            return task.name, " ".join(reason.split())[:MAX_REASON], ""
+            return task.name, reason_of(error), ""
         save_recording(recording, recording_path(root, task.name))
         note = recording.motion.provenance.get(NOTE, "") if recording.motion else ""
         return task.name, Entry.of(recording, root, task.split, task.hash), note
     finally:
         torch.set_num_threads(threads[0])
         numba.set_num_threads(threads[1])
-
-
-def _outcomes(
-    todo: list[Task], root: Path, jobs: int, backend: str, scheduler: str | None, lock: int | None
-) -> Generator[tuple[str, Entry | str, str], None, None]:
-    if not todo:
-        return
-    with _backend(backend, jobs, scheduler, lock) as as_generator:
-        chunk_size = len(todo) if as_generator else 64  # without a generator, results arrive chunk by chunk
-        results_as = "generator_unordered" if as_generator else "list"
-        parallel = joblib.Parallel(n_jobs=jobs, batch_size=1, return_as=results_as)
-        for start in range(0, len(todo), chunk_size):
-            results: Any = parallel(joblib.delayed(_run)(task, root) for task in todo[start : start + chunk_size])
-            yield from results
-
-
-@contextmanager
-def _backend(backend: str, jobs: int, scheduler: str | None, lock: int | None) -> Iterator[bool]:
-    """Activate joblib's backend; yields whether it can return results as they are finished.
-
-    Its local workers end with this process, and before the `lock` is released.
-    """
-    try:
-        if backend == "dask":
-            from dask.distributed import Client  # type: ignore[import-not-found]
-
-            workers = joblib.cpu_count() if jobs < 1 else jobs
-            local = {"n_workers": workers, "threads_per_worker": 1, "dashboard_address": None}
-            with Client(scheduler) if scheduler else Client(**local), joblib.parallel_config("dask"):
-                yield True
-        elif backend == "ray":
-            from ray.util.joblib import register_ray  # type: ignore[import-not-found]
-
-            register_ray()
-            with joblib.parallel_config("ray"):
-                yield False
-        elif backend == "loky":
-            with joblib.parallel_config("loky", inner_max_num_threads=1, **bound_to_this_process(lock)):
-                try:
-                    yield True
-                finally:
-                    if joblib.effective_n_jobs(jobs) > 1:
-                        get_reusable_executor(reuse=True).shutdown(kill_workers=True)
-        else:
-            with joblib.parallel_config(backend):
-                yield True
-    except ModuleNotFoundError as error:
-        fix = f"pip install {'wearcap[cluster]' if backend == 'dask' else 'ray'}"
-        raise WearcapError(f"the backend {backend!r} needs the package {error.name!r}", fix=fix) from error
 
 
 @contextmanager
@@ -278,15 +219,6 @@ def registering(store: RecordingStore, total: int, done: int = 0) -> Iterator[Ca
             yield finish
     finally:
         store.register(pending)
-
-
-@contextmanager
-def progress_bar(total: int, done: int) -> Iterator[Callable[[], None]]:
-    """Progress bar of recordings on stderr; the yielded function is called for each finished one."""
-    columns = (TextColumn("recordings"), BarColumn(), MofNCompleteColumn(), TextColumn("left:"), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        line = bar.add_task("recordings", total=total, completed=done)
-        yield lambda: bar.advance(line)
 
 
 RATES_HZ = (1.0, 2000.0)

@@ -1,7 +1,8 @@
-"""Resampling of motions, and concatenation of consecutive pieces."""
+"""Resampling of motions, concatenation of consecutive pieces, and the beginning of a recording."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float64
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from wearcap.geometry.trajectory import Trajectory, interpolate, slerp
 from wearcap.recording.motion import PER_FRAME, PROBABILITIES, Interactions, Motion
+from wearcap.recording.recording import Recording
 
 _POSES = ("timestamps", "R_world_body", "t_world_body")
 
@@ -72,3 +74,35 @@ def joined(parts: Sequence[Motion]) -> Motion | None:
 def _probabilities(motion: Motion, change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
     there = {name: getattr(motion, name) for name in PROBABILITIES}
     return {name: change(prob) for name, prob in there.items() if prob is not None}
+
+
+def first_seconds(recording: Recording, seconds: float) -> Recording:
+    """The beginning of a recording: `seconds` of every stream, counted from the first pose of head or motion.
+
+    Points, and intervals of an evaluation, stay as they are; interactions that begin later are left out.
+    """
+    lead = recording.head or recording.suit or recording.motion
+    if lead is None or not len(lead.timestamps):
+        return recording
+    stop_s = lead.timestamps[0].item() + seconds
+    parts = {each.name: getattr(recording, each.name) for each in fields(recording)}
+    cut = {name: _until(part, stop_s) for name, part in parts.items()}
+    if recording.interactions is not None:
+        rows = [(start, min(stop, stop_s), *rest) for start, stop, *rest in recording.interactions.rows]
+        cut["interactions"] = Interactions.of(row for row in rows if row[0] < row[1])
+    return replace(recording, **cut)
+
+
+def _until(part: Any, stop_s: float) -> Any:
+    """The frames of a stream, or of several by name, before a time; whatever has no timestamps stays as it is."""
+    if isinstance(part, dict):
+        return {name: _until(each, stop_s) for name, each in part.items()}
+    times = getattr(part, "timestamps", None)
+    if times is None or len(times) <= 3:  # three numbers may also be those of a mount
+        return part
+    stop = int(torch.searchsorted(times, stop_s))
+    if isinstance(part, Motion):
+        return part.sliced(0, stop)
+    values = {each.name: getattr(part, each.name) for each in fields(part)}
+    along = {name: value for name, value in values.items() if isinstance(value, Tensor | tuple)}
+    return replace(part, **{name: value[:stop] for name, value in along.items() if len(value) == len(times)})

@@ -22,7 +22,8 @@ from wearcap.io.formats.environment import FILE_NAME, read_environment
 from wearcap.io.formats.scene_folder import cloud_file, read_scan
 from wearcap.metrics.scores import score
 from wearcap.metrics.table import Row
-from wearcap.models.checkpoint import load_trained
+from wearcap.models.build import target_of
+from wearcap.models.checkpoint import load_trained, read_checkpoint
 from wearcap.recording import Motion, Recording
 from wearcap.runtime.graphs import Exports
 from wearcap.scene.objects import Environment
@@ -112,6 +113,8 @@ class System(ABC):
     """Name in tables and in a motion's provenance."""
     environment: str | Path | None = None
     """File of the objects; None: the file that each recording names."""
+    pipeline: ClassVar[str | None] = None
+    """Config (pipeline=…) that runs the system's checkpoints unless another one is chosen; None: it has no network."""
     experiment: ClassVar[str | None] = None
     """Experiments that train the network, as the command line names them; None: the system has no network."""
     shared: ClassVar[tuple[str, ...]] = ()
@@ -129,11 +132,20 @@ class System(ABC):
 
         Raises WearcapError for a checkpoint that this system did not train.
         """
+        cls.require_own(checkpoints[0])
         module, _ = load_trained(checkpoints[0])
-        if getattr(module, "system", None) is not cls:
-            what = f"{cls.__name__} cannot run {type(module).__name__}'s network"
-            raise WearcapError(what, where=checkpoints[0], expected=f"a checkpoint of {cls.experiment}")
         return make(**module.pipeline_parts(), device=device)
+
+    @classmethod
+    def require_own(cls, checkpoint: str | Path) -> None:
+        """Raise WearcapError unless a checkpoint is of this system; it names the pipeline that runs the checkpoint."""
+        training, owner = training_of(checkpoint)
+        if owner is cls:
+            return
+        runs = None if owner is None else owner.pipeline
+        fix = "" if runs is None else f"Leave pipeline=… out, or give pipeline={runs}."
+        what = f"{cls.__name__} cannot run {training}'s network"
+        raise WearcapError(what, where=checkpoint, expected=f"a checkpoint of {cls.experiment}", fix=fix)
 
     @abstractmethod
     def capture(
@@ -172,6 +184,17 @@ class System(ABC):
         if module != "pipeline" or importlib.util.find_spec(f"{package}.{name}") is None:
             raise WearcapError(f"pipeline {self.name!r} is none that {ability}", fix="Choose another pipeline=….")
         return importlib.import_module(f"{package}.{name}")
+
+
+def training_of(checkpoint: str | Path) -> tuple[str, type[System] | None]:
+    """(name of the class that trained a checkpoint, the system that captures with its network).
+
+    The training says which system that is; None: no system captures with that network alone. Raises WearcapError as
+    `read_checkpoint` does.
+    """
+    target = read_checkpoint(checkpoint)[0]["model"].get("_target_")
+    training = None if target is None else target_of(target)
+    return getattr(training, "__name__", "another model"), getattr(training, "system", None)
 
 
 class LearnedSystem(System):

@@ -1,17 +1,19 @@
 """Callbacks, which observe a training run and do not change it."""
 
+import math
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import lightning
 import torch
 from lightning.pytorch import Callback
+from lightning.pytorch.callbacks import RichProgressBar
+from rich.progress import TaskID
 
-from wearcap.metrics.scores import score
 from wearcap.metrics.table import aggregate
 from wearcap.recording import Motion, RecordingStore
-from wearcap.runtime.system import System
+from wearcap.recording.timing import first_seconds
+from wearcap.runtime.system import CaptureInput, System
 from wearcap.training.base import Training
 
 
@@ -50,22 +52,45 @@ class CaptureValidation(Callback):
         # Some, evenly chosen, and their first seconds only: this does not replace an evaluation.
         names = store.names("val")
         chosen = names[:: max(1, len(names) // self.recordings)][: self.recordings]
-        recordings = []
-        for recording in map(store.load, chosen):
-            head, motion, contacts = recording.head, recording.motion, recording.contacts
-            assert head is not None
-            assert motion is not None
-            stop = int(torch.searchsorted(head.timestamps, head.timestamps[0] + self.max_seconds))
-            streams = "timestamps", "R_world_device", "t_world_device"
-            head = replace(head, **{name: getattr(head, name)[:stop] for name in streams})
-            if contacts is not None:
-                contacts = replace(contacts, timestamps=contacts.timestamps[:stop], contact=contacts.contact[:stop])
-            recordings.append(replace(recording, head=head, motion=motion.sliced(0, stop), contacts=contacts))
-        motions = [captured.motion for captured in pipeline.capture(recordings, [0] * len(recordings))]
-        rows = [score(m, r, r.name, 0) for m, r in zip(motions, recordings)]
+        recordings = [first_seconds(recording, self.max_seconds) for recording in map(store.load, chosen)]
+        sources = [CaptureInput.in_dataset(recording, store.root) for recording in recordings]
+        # Lightning validates in inference mode, whose tensors a pipeline's own gradient steps cannot use.
+        with torch.inference_mode(False), torch.no_grad():
+            motions = [captured.motion for captured in pipeline.capture(sources, [0] * len(sources))]
+            rows = [pipeline.score(motion, source, 0) for motion, source in zip(motions, sources) if motion]
         for key, summary in aggregate(rows).items():
             pl_module.log(f"capture/{key}", summary.mean, rank_zero_only=True)
         pl_module.get_submodule("net").train()
         if self.draw is not None:
             path = self.folder / f"step_{trainer.global_step:06d}_{recordings[0].name}.png"
             self.draw(path, {"truth": recordings[0].motion, "capture": motions[0]})
+
+
+class StepsProgressBar(RichProgressBar):
+    """Progress in steps out of all that the run will make, in place of an epoch's batches."""
+
+    @property
+    def total_train_batches(self) -> int | float:
+        """The run's steps: `max_steps`, or those of `max_epochs` (infinite without either)."""
+        if self.trainer.max_steps > 0:
+            return self.trainer.max_steps
+        epochs = self.trainer.max_epochs
+        per_epoch = math.ceil(self.trainer.num_training_batches / self.trainer.accumulate_grad_batches)
+        return epochs * per_epoch if epochs is not None and epochs > 0 else math.inf
+
+    def on_train_epoch_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """Begin the bar in the first epoch; in later ones only their number changes."""
+        if self.train_progress_bar_id is None:
+            super().on_train_epoch_start(trainer, pl_module)
+            self._update(self.train_progress_bar_id, trainer.global_step)
+        elif self.progress is not None:
+            self.progress.update(
+                self.train_progress_bar_id, description=self._get_train_description(trainer.current_epoch)
+            )
+
+    def _update(self, progress_bar_id: TaskID | None, current: int, visible: bool = True, hard: bool = False) -> None:
+        steps = self.trainer.global_step if progress_bar_id == self.train_progress_bar_id else current
+        super()._update(progress_bar_id, steps, visible, hard)
+
+    def _get_train_description(self, current_epoch: int) -> str:
+        return f"epoch {current_epoch}, steps"

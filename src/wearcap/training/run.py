@@ -7,12 +7,13 @@ import json
 import platform
 import subprocess
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import lightning
 import torch
+import yaml
 from lightning.fabric.plugins.io.checkpoint_io import CheckpointIO
 from lightning.pytorch import Callback
 from torch import Tensor
@@ -22,15 +23,25 @@ from wearcap.data.datamodule import WindowsModule
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, write_text
 from wearcap.models.build import check_weights
-from wearcap.models.checkpoint import read_run_file
+from wearcap.models.checkpoint import read_checkpoint, read_run_file
 from wearcap.training.base import Training
 
+FREE_TO_CHANGE = (
+    *("paths.", "resume.", "init.", "test.", "logger.", "early_stop.", "callbacks.progress.", "data.loading.workers."),
+    *(
+        f"trainer.{name}."
+        for name in ("accelerator", "default_root_dir", "enable_model_summary", "enable_progress_bar")
+    ),
+    *(f"trainer.{name}." for name in ("log_every_n_steps", "max_epochs", "max_steps", "max_time")),
+)
+"""Parts of a config that may change when a run goes on: its length, its record, its machine."""
 TRAINING_STATE = ("state_dict", "optimizer_states", "lr_schedulers", "loops", "epoch", "global_step")
 """Entries of a checkpoint that resuming a training requires."""
 
 
-class ConfigInCheckpoint(Callback):
-    """Adds the composed config, the version and what the training has taken so far to every checkpoint.
+class RunRecord(Callback):
+    """Adds the composed config, the version and what the training has taken so far to every checkpoint, and config and
+    number of trained parameters to every logger.
 
     The config's entry "training" holds the number of trained "parameters" and of "steps", the "frames" of all windows
     drawn (samples, where they have no time axis), the "seconds" of training without its validations, the "core_seconds"
@@ -41,6 +52,11 @@ class ConfigInCheckpoint(Callback):
         self.config = config
         self._taken = {"frames": 0, "seconds": 0.0, "core_seconds": 0.0}
         self._clocks = _clocks()
+
+    def setup(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, stage: str) -> None:
+        if stage == "fit":
+            for logger in trainer.loggers:
+                logger.log_hyperparams(self.config | {"parameters": trained_parameters(pl_module)})
 
     def on_load_checkpoint(self, trainer, pl_module, checkpoint: dict[str, Any]) -> None:
         before = json.loads(checkpoint.get("wearcap", {}).get("config", "{}")).get("training", {})
@@ -61,10 +77,19 @@ class ConfigInCheckpoint(Callback):
         self._taken["frames"] += frames * trainer.world_size
 
     def on_save_checkpoint(self, trainer, pl_module, checkpoint: dict[str, Any]) -> None:
-        parameters = sum(each.numel() for each in pl_module.parameters() if each.requires_grad)
-        training = {"parameters": parameters, "steps": trainer.global_step, **self._taken, "machine": machine()}
+        training = {
+            "parameters": trained_parameters(pl_module),
+            "steps": trainer.global_step,
+            **self._taken,
+            "machine": machine(),
+        }
         config = json.dumps(self.config | {"training": training})
         checkpoint["wearcap"] = {"version": wearcap.__version__, "config": config}
+
+
+def trained_parameters(module: torch.nn.Module) -> int:
+    """Number of a module's trained parameters."""
+    return sum(each.numel() for each in module.parameters() if each.requires_grad)
 
 
 class RunCheckpointIO(CheckpointIO):
@@ -97,12 +122,23 @@ class RunCheckpointIO(CheckpointIO):
             path.unlink(missing_ok=True)
 
 
-def fit(system: Training, data: WindowsModule, trainer: lightning.Trainer, resume: Path | None = None) -> None:
-    """Train from scratch or resume from a checkpoint; a killed run resumes without repeating or skipping a step."""
-    if resume is None:
-        system.set_statistics(data.dataset("train"))
-    else:
+def fit(
+    system: Training,
+    data: WindowsModule,
+    trainer: lightning.Trainer,
+    resume: Path | None = None,
+    init: str | Path | None = None,
+) -> None:
+    """Train from scratch, from the weights and statistics of the checkpoint `init`, or resume from a checkpoint.
+
+    A killed run resumes without repeating or skipping a step.
+    """
+    if resume is not None:
         require_resumable(resume, system.state_dict())
+    elif init is not None:
+        start_from(init, system)
+    else:
+        system.set_statistics(data.dataset("train"))
     trainer.fit(system, datamodule=data, ckpt_path=resume, weights_only=True)
 
 
@@ -133,19 +169,104 @@ def keep_freed_memory() -> None:
     libc.mallopt(trim_threshold, 2**31 - 1)
 
 
-def resume_path(resume: str | None, own: Path, runs: Path) -> Path | None:
-    """The checkpoint to resume from: none, a path, or ("auto") the run's own `last.ckpt`, else the newest in `runs`."""
+def resume_path(resume: str | None, run: Path, config_yaml: str) -> Path | None:
+    """The checkpoint to resume from: none, a path, or ("auto") the `last.ckpt` of the run's own folder if it has one.
+
+    Raises WearcapError for a missing file, and for "auto" in the folder of a run with another config.
+    """
     if resume is None:
         return None
     if resume != "auto":
         if not Path(resume).is_file():
-            expected = "a run's .ckpt file, or resume=auto for the newest"
+            expected = "a run's .ckpt file, or resume=auto for this run's own"
             raise WearcapError("no such checkpoint to resume from", where=resume, expected=expected)
         return Path(resume)
-    if (mine := own / "checkpoints" / "last.ckpt").is_file():
-        return mine
-    found = sorted(runs.glob("**/last.ckpt"), key=lambda path: path.stat().st_mtime)
-    return found[-1] if found else None
+    last = last_checkpoint(run)
+    if not last.is_file():
+        return None
+    if not (run / "config.yaml").is_file():
+        raise WearcapError("no config.yaml of the run to go on with", run, fix=f"Give resume={last}.")
+    if different := differing_keys((run / "config.yaml").read_text(encoding="utf-8"), config_yaml):
+        raise _another_config(run, different)
+    return last
+
+
+def last_checkpoint(run: Path) -> Path:
+    """The newest checkpoint of a run's folder."""
+    return run / "checkpoints" / "last.ckpt"
+
+
+def run_to_continue(runs: Path, config_yaml: str) -> Path | None:
+    """The newest run in a folder that was trained with a config, its seed included; None if no run has its seed.
+
+    Raises WearcapError, with the differing keys, when the runs of that seed have other configs.
+    """
+    seed, refused = yaml.safe_load(config_yaml)["seed"], None
+    found = [path.parents[1] for path in runs.glob("**/last.ckpt") if (path.parents[1] / "config.yaml").is_file()]
+    for run in sorted(found, key=lambda run: last_checkpoint(run).stat().st_mtime, reverse=True):
+        recorded = (run / "config.yaml").read_text(encoding="utf-8")
+        if yaml.safe_load(recorded).get("seed") != seed:
+            continue
+        different = differing_keys(recorded, config_yaml)
+        if not different:
+            return run
+        refused = refused or _another_config(run, different)
+    if refused is not None:
+        raise refused
+    return None
+
+
+def differing_keys(before: str, now: str) -> list[str]:
+    """Keys, with both values, in which two configs (YAML) would train differently; `FREE_TO_CHANGE` does not count."""
+    values = [dict(_leaves(config, config["paths"]["run"])) for config in map(yaml.safe_load, (before, now))]
+    keys = [key for key in {**values[0], **values[1]} if not f"{key}.".startswith(FREE_TO_CHANGE)]
+    none = "nothing"
+    pairs = [(key, values[0].get(key, none), values[1].get(key, none)) for key in keys]
+    return [f"{key} ({old}, now {new})" for key, old, new in pairs if old != new]
+
+
+def _leaves(config: Any, run: str, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Values of a config by dotted key; a path within the run's folder is given relative to it."""
+    if isinstance(config, dict) and config:
+        for name, value in config.items():
+            yield from _leaves(value, run, f"{key}.{name}" if key else str(name))
+    elif isinstance(config, str) and config.startswith(run):
+        yield key, f"RUN{config.removeprefix(run)}"
+    else:
+        yield key, config
+
+
+def _another_config(run: Path, different: list[str]) -> WearcapError:
+    shown = ", ".join(different[:8]) + (f" and {len(different) - 8} more" if len(different) > 8 else "")
+    fix = (
+        f"Give resume={last_checkpoint(run)} to go on with these settings, another name=…, or leave resume=auto out to "
+        "train anew."
+    )
+    return WearcapError(f"this run was trained with another config: {shown}", run, "the same config and seed", fix)
+
+
+def start_from(checkpoint: str | Path, system: Training) -> None:
+    """Give a system the weights and statistics of a checkpoint; its optimiser starts anew.
+
+    Raises WearcapError that names the tensors that are missing, unexpected or of another size.
+    """
+    own, (_, state) = system.state_dict(), read_checkpoint(checkpoint)
+    sizes = {
+        f"{name} ({list(state[name].shape)}, here {list(value.shape)})": None
+        for name, value in own.items()
+        if name in state and state[name].shape != value.shape
+    }
+    missing, unexpected = (dict.fromkeys(sorted(set(a) - set(b))) for a, b in ((own, state), (state, own)))
+    wrong = {"missing": missing, "unexpected": unexpected, "of another size": sizes}
+    if any(wrong.values()):
+        parts = [
+            f"{len(names)} {kind}: {', '.join(list(names)[:6])}{' …' if len(names) > 6 else ''}"
+            for kind, names in wrong.items()
+            if names
+        ]
+        fix = "Give init=… a checkpoint of the same experiment, or the settings that it was trained with."
+        raise WearcapError(f"its weights are not this model's; {'; '.join(parts)}", checkpoint, fix=fix)
+    system.load_state_dict(state)
 
 
 def _clocks() -> tuple[float, float]:

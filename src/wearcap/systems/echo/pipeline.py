@@ -71,6 +71,7 @@ class Echo(LearnedSystem):
     device: str = "cpu"
 
     name = "echo"
+    pipeline = "echo"
     experiment = "experiment=echo"
     shared = ("echo",)
     baselines = ()

@@ -93,6 +93,7 @@ class HMD2(LearnedSystem):
     device: str = "cpu"
 
     name = "hmd2"
+    pipeline = "hmd2"
     experiment = "experiment=hmd2"
     shared = ("hmd2",)
 

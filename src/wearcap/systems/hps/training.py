@@ -1,19 +1,46 @@
 """Validation of a localiser in training by the motion that HPS captures with its current weights."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import lightning
 import torch
 from lightning.pytorch import Callback
 
 from wearcap.body.anny_body import anny_body
+from wearcap.errors import WearcapError
+from wearcap.io.formats.scene_folder import read_scene
+from wearcap.localization.features import Extractor
+from wearcap.localization.map_builder import MapSettings, build_map
 from wearcap.metrics.scores import score
 from wearcap.metrics.surface import foot_surface, foot_vertices
 from wearcap.recording.store import dataset_folder, load_recording
 from wearcap.runtime.system import CaptureInput
-from wearcap.systems.hps.camera import Localize
+from wearcap.systems.hps.camera import Localize, MapLocalization
 from wearcap.systems.hps.pipeline import HPS
+
+
+@dataclass(frozen=True)
+class TrainedFeatures:
+    """Localisation by the features of a module in training, in a map of the scene that is built with the same weights."""
+
+    scene: str
+    """Folder of the scene: its scan and photos, or a COLMAP model."""
+    file: str
+    """File of that map."""
+    every: int | None = None
+    """Step between localised frames; None: as `MapLocalization` chooses."""
+    settings: MapSettings = field(default_factory=MapSettings)
+
+    def __call__(self, module: lightning.LightningModule) -> MapLocalization:
+        """Raises WearcapError for a scene that cannot be read, and for a module whose `net` extracts no features."""
+        extractor = module.get_submodule("net")
+        if not isinstance(extractor, Extractor):
+            expected = "a model whose `net` is a localization.features.Extractor"
+            raise WearcapError(f"{type(module).__name__} extracts no features", expected=expected)
+        photos, source = read_scene(self.scene)
+        build_map(photos, source, extractor, settings=self.settings).save(self.file)
+        return MapLocalization(extractor, map=self.file, every=self.every)
 
 
 class HpsValidation(Callback):
@@ -21,7 +48,7 @@ class HpsValidation(Callback):
     share.
 
     HPS has no network of its own: `localizer` builds its localisation step from the module in training, such as
-    `MapLocalization` with that module as extractor and a map built with the same weights.
+    `TrainedFeatures`. It must come before the weight averaging in the list of callbacks, to see the averaged weights.
     """
 
     def __init__(

@@ -46,13 +46,19 @@ class IReplica(StagedSystem):
     """Frame rate of contacts, objects and output motion, independent of the registration's."""
     name: str = "ireplica"
 
+    pipeline = "ireplica"
     experiment = "experiment=contact_sequence, or of the contact transformers, one for each class"
     shared = ("contact_sequence",)
     joins_checkpoints = True
 
     @classmethod
     def trained(cls, make: Callable[..., "IReplica"], checkpoints: Sequence[str | Path], device: str) -> "IReplica":
-        """`make`, the configured constructor, with the contact networks of checkpoints, one per class of interaction."""
+        """`make`, the configured constructor, with the contact networks of checkpoints, one per class of interaction.
+
+        Raises WearcapError for a checkpoint of another system.
+        """
+        for checkpoint in checkpoints:
+            cls.require_own(checkpoint)
         return make(predictor=ContactPredictor.load(*checkpoints))
 
     def stages(self, source: CaptureInput) -> list[Stage]:

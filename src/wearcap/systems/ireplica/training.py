@@ -32,6 +32,8 @@ from wearcap.training.callbacks import is_due
 class ContactDetection(Training):
     """Trains a contact network for some classes of interaction; loss and scores are per frame."""
 
+    system = IReplica
+
     def __init__(
         self,
         net: Callable[..., ContactNetwork],

@@ -81,6 +81,7 @@ class MocapEvery(LearnedSystem):
     device: str = "cpu"
 
     name = "mocap_every"
+    pipeline = "mocap_every"
     experiment = "experiment=mocap_every"
     shared = ("mocap_every",)
 

@@ -33,6 +33,7 @@ class PoseRegressorCapture(LearnedSystem):
     device: str = "cpu"
 
     name = "pose_regressor"
+    pipeline = "pose_regressor"
     experiment = "experiment=pose_regressor_head or pose_regressor_hands"
     shared = ("pose_regressor_hands",)
 
