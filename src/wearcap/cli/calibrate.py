@@ -22,7 +22,7 @@ from wearcap.errors import WearcapError, nearest
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.devices.watch_log import read_watch_log
 from wearcap.io.formats.camera_json import write_camera
-from wearcap.io.formats.poses import read_tum
+from wearcap.io.formats.trajectory import read_trajectory
 from wearcap.io.formats.video import read_pictures
 from wearcap.localization.checkerboard import Board, Calibration, calibrate_from_pictures
 from wearcap.locks import folder_lock
@@ -120,7 +120,7 @@ def run_watches(config: DictConfig) -> WornCalibration | None:
     if config.steps != "watches":
         raise WearcapError(f"no steps {config.steps!r}", fix=nearest(str(config.steps), ["watches"]))
     watches = {joint: read_watch_log(config[joint.split("_")[0]], joint) for joint in WRISTS}
-    slam = None if config.camera is None else read_tum(config.camera)
+    slam = None if config.camera is None else read_trajectory(config.camera)
     if slam is None and (given := [key for key in OF_CAMERA if config[key] is not None]):
         raise WearcapError(f"{', '.join(given)} without a camera", fix="Give its path, too: camera=TRAJ.txt.")
     session = WatchSession(watches, slam)

@@ -38,8 +38,8 @@ from wearcap.io.formats.mvnx import read_mvnx
 from wearcap.io.formats.npz import read_npz
 from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply
-from wearcap.io.formats.poses import read_euroc, read_tum
 from wearcap.io.formats.text import read_json_object
+from wearcap.io.formats.trajectory import read_trajectory
 from wearcap.recording import FloorTrack, HeadStream, Motion, PointCloud, Recording, RecordingStore
 from wearcap.recording.store import RecordingFile
 from wearcap.scene.floor import estimate_floor
@@ -242,7 +242,7 @@ def _read_csv(path: Path) -> Recording | Trajectory:
     if "closed_loop" in path.name or "aria_trajectory" in path.name:
         track = read_closed_loop(path, up="y" if "aria_trajectory" in path.name else "z")[0]
         return Recording(name=path.name, head=head_stream(track, fps=None), source="Aria MPS")
-    return read_euroc(path)
+    return read_trajectory(path)
 
 
 def _read_npz(path: Path) -> Recording | Motion:
@@ -270,8 +270,8 @@ _READERS: dict[str, Callable] = {
     **_MOTIONS,
     ".safetensors": lambda path: read_map(path) if is_map(path) else RecordingFile(path).load(),
     ".csv": _read_csv,
-    ".txt": read_tum,
-    ".tum": read_tum,
+    ".txt": read_trajectory,
+    ".tum": read_trajectory,
     ".ply": read_ply,
     ".pcd": read_pcd,
     ".json": read_environment_file,

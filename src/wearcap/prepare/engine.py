@@ -200,7 +200,7 @@ def _run(task: Task, root: Path) -> tuple[str, Entry | str, str]:
             reason = str(error) if isinstance(error, WearcapError) else f"{type(error).__name__}: {error}"
             return task.name, " ".join(reason.split())[:MAX_REASON], ""
         save_recording(recording, recording_path(root, task.name))
-        note = recording.motion.provenance.get(NOTE, "") if recording.motion else ""
+        note = recording.note or (recording.motion.provenance.get(NOTE, "") if recording.motion else "")
         return task.name, Entry.of(recording, root, task.split, task.hash), note
     finally:
         torch.set_num_threads(threads[0])

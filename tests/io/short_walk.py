@@ -1,0 +1,129 @@
+"""A short walk of a head, and writers of foreign files by NumPy and SciPy alone: nothing here is wearcap's own."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+CAMERA_IN_HEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""OpenCV's camera axes (x right, y down, z forward) in the head's (x forward, y left, z up)."""
+
+
+def walk(seconds: float = 8.0, fps: float = 30.0, start: float = 1000.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times (s), rotations and places (m) of a head that walks round a bend and nods: x ahead, y left, z up."""
+    time = np.arange(int(seconds * fps)) / fps
+    course = 0.35 * time + 0.2 * np.sin(0.7 * time)
+    speed = np.stack([np.cos(course), np.sin(course)], 1) * 1.1 / fps
+    place = np.concatenate([np.cumsum(speed, 0), 1.62 + 0.02 * np.sin(11 * time)[:, None]], 1)
+    angles = np.stack([course + 0.2 * np.sin(2 * time), 0.1 + 0.1 * np.sin(1.7 * time), 0.05 * np.sin(2.3 * time)], 1)
+    return start + time, Rotation.from_euler("ZYX", angles).as_matrix(), place
+
+
+def quat_xyzw(R: np.ndarray) -> np.ndarray:
+    return Rotation.from_matrix(R).as_quat()
+
+
+def apart(found, time: np.ndarray, R: np.ndarray, t: np.ndarray) -> tuple[float, float, float]:
+    """Largest differences (s, m, degrees) of a read trajectory from the walk."""
+    off = Rotation.from_matrix(np.swapaxes(found.R_world_body.double().numpy(), 1, 2) @ R).magnitude().max()
+    return (
+        np.abs(found.timestamps.numpy() - time).max(),
+        np.linalg.norm(found.t_world_body.double().numpy() - t, axis=1).max(),
+        np.degrees(off),
+    )
+
+
+def lines(path: Path, rows, head: str = "", between: str = " ") -> Path:
+    path.write_text(head + "\n".join(between.join(row) for row in rows) + "\n")
+    return path
+
+
+def numbers(*parts) -> list[list[str]]:
+    """Rows of the columns side by side, seven digits after the point; whole numbers stay whole."""
+    columns = [np.asarray(part).reshape(len(part), -1) for part in parts]
+    return [
+        [
+            str(value) if isinstance(value, int) else f"{value:.7f}"
+            for column in columns
+            for value in column[row].tolist()
+        ]
+        for row in range(len(columns[0]))
+    ]
+
+
+def tum(path: Path, time, R, t) -> Path:
+    return lines(path, numbers(time, t, quat_xyzw(R)))
+
+
+def euroc(path: Path, time, R, t) -> Path:
+    head = (
+        "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v [m s^-1]\n"
+    )
+    nano = np.round(time * 1e9).astype(np.int64)
+    return lines(path, numbers(nano, t, quat_xyzw(R)[:, [3, 0, 1, 2]], 0 * time), head, ",")
+
+
+def in_camera(R, t) -> tuple[np.ndarray, np.ndarray]:
+    """Scalar-first quaternions and translations of the world in the body."""
+    back = np.swapaxes(R, 1, 2)
+    return quat_xyzw(back)[:, [3, 0, 1, 2]], -np.einsum("nij,nj->ni", back, t)
+
+
+def colmap_text(path: Path, time, R, t) -> Path:
+    """Pictures in any order, each followed by a line of its points, which may be empty."""
+    quat, shift = in_camera(R, t)
+    rows = []
+    for k in np.random.default_rng(0).permutation(len(time)):
+        rows += [[str(k + 1), *numbers(quat, shift)[k], "1", f"{time[k]:.6f}.png"], ["10.5 20.5 -1"] if k % 2 else [""]]
+    return lines(
+        path,
+        rows,
+        "# Image list with two lines of data per image:\n#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n",
+    )
+
+
+def colmap_binary(path: Path, time, R, t) -> Path:
+    quat, shift = in_camera(R, t)
+    content = struct.pack("<Q", len(time))
+    for k, moment in enumerate(time):
+        content += (
+            struct.pack("<I7dI", k + 1, *quat[k], *shift[k], 1) + f"cam/{round(moment * 1e9)}.png".encode() + b"\0"
+        )
+        content += struct.pack("<Q2dq", 1, 1.5, 2.5, 7)
+    path.write_bytes(content)
+    return path
+
+
+def hloc(path: Path, time, R, t) -> Path:
+    quat, shift = in_camera(R, t)
+    rows = [[f"query/{round(moment * 1e6)}.jpg", *row] for moment, row in zip(time, numbers(quat, shift))]
+    return lines(path, rows)
+
+
+def droid(path: Path, time, R, t) -> Path:
+    """A reconstruction's folder: poses of the world in the camera, and times."""
+    quat, shift = in_camera(R, t)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, np.concatenate([shift, quat[:, [1, 2, 3, 0]]], 1).astype(np.float32))
+    np.save(path.with_name("tstamps.npy"), time)
+    np.save(path.with_name("disps.npy"), np.ones((len(time), 2, 2), np.float32))
+    return path
+
+
+def droid_archive(path: Path, time, R, t) -> Path:
+    np.savez(path, traj_est=np.concatenate([t, quat_xyzw(R)], 1), tstamps=time)
+    return path
+
+
+def kitti(path: Path, time, R, t) -> Path:
+    lines(path.with_name("times.txt"), numbers(time))
+    return lines(path, numbers(np.concatenate([R, t[:, :, None]], 2).reshape(len(R), 12)))
+
+
+def mps(path: Path, time, R, t) -> Path:
+    names = "graph_uid,tracking_timestamp_us,utc_timestamp_ns,tx_world_device,ty_world_device,tz_world_device"
+    names += ",qx_world_device,qy_world_device,qz_world_device,qw_world_device\n"
+    micro = np.round(time * 1e6).astype(np.int64)
+    rows = [["a-b", *row] for row in numbers(micro, micro * 0 - 1, t, quat_xyzw(R))]
+    return lines(path, rows, names, ",")
