@@ -127,3 +127,69 @@ def mps(path: Path, time, R, t) -> Path:
     micro = np.round(time * 1e6).astype(np.int64)
     rows = [["a-b", *row] for row in numbers(micro, micro * 0 - 1, t, quat_xyzw(R))]
     return lines(path, rows, names, ",")
+
+
+# --- headsets: OpenXR's axes (x right, y up, z backward), and Unity's by turning z around ----------------------------
+
+_TO_OPENXR = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
+_DEVICE = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+_HAND_JOINT = {
+    "left": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "right": np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]),
+}
+"""Columns: the hand joint's x, y (out of the back) and z (to the elbow) in a wrist's own axes, whose T-pose faces x."""
+_GRIP = {
+    "left": np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
+    "right": np.array([[0.0, 0.0, -1.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0]]),
+}
+"""Columns: a grip's x (left: out of the hand's back; right: into the palm), y (along the fingers), z (from the thumb)."""
+
+
+def wrists(time, R, t) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Rotations and places of both wrists, which swing before the walking head."""
+    course = np.arctan2(R[:, 1, 0], R[:, 0, 0])
+    turn = Rotation.from_euler("z", course[:, None])
+    found = {}
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        swing = 0.5 * np.sin(3 * time + sign)
+        local = Rotation.from_euler("XYZ", np.stack([sign * -1.2 + 0.1 * swing, swing, sign * 0.3 + swing], 1))
+        at = np.stack([0.25 + 0.1 * swing, sign * 0.22 + 0 * swing, -0.55 + 0.05 * swing], 1)
+        found[side] = (turn * local).as_matrix(), t + turn.apply(at)
+    return found
+
+
+def headset_poses(time, R, t, convention: str, kind: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Matrices and places of head, left and right in a convention; hands as OpenXR's wrist joints or grips."""
+    axes = {"head": _DEVICE} | (_HAND_JOINT if kind == "wrist" else _GRIP)
+    bodies = {"head": (R, t)} | wrists(time, R, t)
+    found = {}
+    for name, (R_body, t_body) in bodies.items():
+        if kind == "grip" and name != "head":
+            t_body = t_body + 0.08 * (R_body @ _GRIP[name])[:, :, 1]
+        R_xr, t_xr = _TO_OPENXR @ R_body @ axes[name], t_body @ _TO_OPENXR.T
+        flip = np.diag([1.0, 1.0, -1.0 if convention == "unity" else 1.0])
+        found[name] = flip @ R_xr @ flip, t_xr @ flip
+    return found
+
+
+def headset_csv(path: Path, time, poses, names: dict[str, str], order: str = "xyzw", between: str = ",") -> Path:
+    """A table; `names` gives each device's pattern, such as "head_{quantity}_{axis}", and "time" the first column's name."""
+    head, parts = [names["time"]], [time]
+    for device, (R, t) in poses.items():
+        quantity = names.get("quantities", "pos rot").split()
+        head += [names[device].format(quantity=quantity[0], axis=axis) for axis in names.get("axes", "xyz")]
+        head += [names[device].format(quantity=quantity[1], axis=axis) for axis in names.get("quat", order)]
+        parts += [t, quat_xyzw(R)[:, ["xyzw".index(axis) for axis in order]]]
+    return lines(path, numbers(*parts), between.join(head) + "\n", between)
+
+
+def headset_frames(time, poses, order: str = "xyzw", wrap: str = "") -> list[dict]:
+    """Nested frames with arrays."""
+    frames = []
+    for k, moment in enumerate(time.tolist()):
+        devices = {}
+        for device, (R, t) in poses.items():
+            quat = quat_xyzw(R[k])[["xyzw".index(axis) for axis in order]]
+            devices[device] = {"position": t[k].tolist(), "orientation": quat.tolist()}
+        frames.append({"timestamp": moment, **({wrap: devices} if wrap else devices)})
+    return frames

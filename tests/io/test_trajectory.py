@@ -155,7 +155,7 @@ def test_times_of_no_recording_are_refused_without_a_grid(tmp_path):
     tracemalloc.start()
     try:
         read_trajectory(path)
-        with pytest.raises(WearcapError, match="poses over"):
+        with pytest.raises(WearcapError, match="a gap of"):
             read_trajectory(path, time_unit="s")
         with pytest.raises(WearcapError, match="poses in .* % of"):
             read_trajectory(sparse)

@@ -105,7 +105,7 @@ def read_trajectory_file(path: str | Path, time_unit: str | None = None, fps: fl
         table = _inverted(table, path)
     seconds, unit = _seconds(table, time_unit, fps, path)
     trajectory = checked_trajectory(seconds, table.translation, table.quat_wxyz, path, table.name)
-    _check_span(seconds, path, table.name)
+    check_span(seconds, path, table.name)
     return TrajectoryFile(trajectory, table.format, unit, table.of_camera, table.metric)
 
 
@@ -508,7 +508,7 @@ def time_unit_of(times: np.ndarray, named: str | None, where: str | Path) -> str
     return (since_1970 or possible)[0]
 
 
-def _check_span(seconds: np.ndarray, path: Path, name: Callable[[int], str]) -> None:
+def check_span(seconds: np.ndarray, path: Path, name: Callable[[int], str]) -> None:
     """Raise WearcapError for times that no recording has: nothing made of them is much larger than the file."""
     steps = np.diff(seconds)
     if not len(steps):
