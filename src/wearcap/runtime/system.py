@@ -89,7 +89,7 @@ class Captured:
     motion: Motion | None
     """None if a stage before the motion was the last one to run."""
     report: dict[str, Any] | None = None
-    """Findings of the stages as plain data for JSON; None for a system without stages."""
+    """Findings of the stages, or notes on the input, as plain data for JSON; None where there are none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,4 +195,5 @@ class LearnedSystem(System):
             raise WearcapError(what, expected="a pipeline with stages, such as pipeline=hps")
         once = {id(recording): CaptureInput.of(recording) for recording in recordings}
         motions = self.motions([once[id(recording)] for recording in recordings], seeds)
-        return [Captured(motion) for motion in motions]
+        notes = [motion.provenance.get("note") for motion in motions]
+        return [Captured(motion, {"notes": [note]} if note else None) for motion, note in zip(motions, notes)]
