@@ -28,11 +28,13 @@ from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry import rotation
-from wearcap.geometry.rotation import quat_wxyz_from_matrix
+from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
 from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.formats.bounded import understood
+from wearcap.io.formats.text import read_json_object
 from wearcap.recording.recording import FloorTrack, ImuStream, Recording
 from wearcap.sensors.camera_alignment import HeadMount, SlamAlignment
-from wearcap.sensors.clock import SwingClock, fit_swing_clock, swing_peaks
+from wearcap.sensors.clock import Clock, SwingClock, fit_swing_clock, swing_peaks
 from wearcap.sensors.stillness import StepCheck, Stretch, during, require, still_intervals, unstillness_deg
 from wearcap.sensors.watches import require_sides
 
@@ -279,7 +281,8 @@ class WatchSession:
 
 
 _WATCH = ("R_world_ref", "R_joint_imu", "board_still_deg", "board_tilt_deg", "pose_still_deg")
-_CAMERA = ("scale", "residual_m", "scale_spread", "corner_deg", "R_world_slam", "t_world_slam")
+_QUALITY = ("residual_m", "scale_spread", "corner_deg", "scale_std", "gravity_std_deg")
+_CAMERA = ("scale", *_QUALITY, "R_world_slam", "t_world_slam")
 
 
 def write_watch_calibration(
@@ -313,7 +316,55 @@ def _row(one: object, names: Sequence[str]) -> dict[str, Any]:
     row = {}
     for name in names:
         value = getattr(one, name)
+        if value is None:
+            continue
         if name.startswith("R_"):
             name, value = f"{name}_wxyz", quat_wxyz_from_matrix(value.double())
         row[name] = value.tolist() if isinstance(value, Tensor) else value
     return row
+
+
+def read_watch_calibration(path: str | Path) -> WornCalibration:
+    """What `write_watch_calibration` wrote. Raises WearcapError for a file that is no calibration."""
+    content = read_json_object(path)
+    with understood("not a calibration of watches", path, "the file of wearcap calibrate steps=watches"):
+        watches = {
+            joint: WatchCalibration(
+                joint, *_tensors(row, _WATCH[:2], torch.float32), *(float(row[k]) for k in _WATCH[2:])
+            )
+            for joint, row in content["watches"].items()
+        }
+        clocks = {joint: _clock(row) for joint, row in content.get("clocks", {}).items()}
+        camera, head = content.get("camera"), content.get("head")
+        if camera is not None:
+            R, t = _tensors(camera, ("R_world_slam", "t_world_slam"), torch.float64)
+            quality = {name: float(camera[name]) for name in _QUALITY if name in camera}
+            camera = SlamAlignment(float(camera["scale"]), R, t, **quality)
+            if not (0 < camera.scale < 1e6 and bool(t.isfinite().all())):
+                raise ValueError("a scale or place of the camera that is no number")
+        if head is not None:
+            R, t = _tensors(head, ("R_head_cam", "t_head_cam"), torch.float32)
+            head = HeadMount(R, t, float(head["still_deg"]))
+        if set(watches) != set(WRISTS):
+            raise ValueError(f"watches on {', '.join(watches) or 'nothing'}")
+        return WornCalibration(watches, clocks, camera, head)
+
+
+def _clock(row: dict[str, Any]) -> SwingClock:
+    knots = [torch.tensor([float(value) for value in row[key]], dtype=torch.float64) for key in ("camera_s", "watch_s")]
+    if not len(knots[0]) or len(knots[0]) != len(knots[1]) or not bool(torch.cat(knots).isfinite().all()):
+        raise ValueError("a clock without knots")
+    drift, residual = float(row["drift_s_per_hour"]), float(row["residual_s"])
+    return SwingClock(Clock(*knots, drift, residual, int(row["swings"])), float(row["std_s"]))
+
+
+def _tensors(row: dict[str, Any], names: Sequence[str], dtype: torch.dtype) -> list[Tensor]:
+    """Rotations of unit quaternions, scalar first, and vectors."""
+    found = []
+    for name in names:
+        key, size = (f"{name}_wxyz", 4) if name.startswith("R_") else (name, 3)
+        value = torch.tensor([float(number) for number in row[key]], dtype=torch.float64)
+        if value.shape != (size,) or not value.isfinite().all() or (size == 4 and abs(value.norm() - 1) > 0.01):
+            raise ValueError(f"{key} of {row[key]}"[:100])
+        found.append((matrix_from_quat_wxyz(value) if size == 4 else value).to(dtype))
+    return found

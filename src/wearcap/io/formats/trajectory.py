@@ -134,13 +134,19 @@ _IN_FOLDERS = (
 """Files of a folder that hold its trajectory, the first that is there."""
 
 
+def trajectory_file(folder: str | Path) -> Path | None:
+    """The file in a folder that holds its trajectory, by the formats' usual names; None where there is none."""
+    return next((path for name in _IN_FOLDERS if (path := Path(folder) / name).is_file()), None)
+
+
 def _file_of(path: Path) -> Path:
     if not os.path.isdir(path):  # a path that may not be looked at is refused when it is opened
         return path
-    for name in _IN_FOLDERS:
-        if (path / name).is_file():
-            return path / name
-    raise WearcapError("a folder without a trajectory", path, ", ".join(_IN_FOLDERS[:5]) + ", …", "Give its file.")
+    found = trajectory_file(path)
+    if found is None:
+        expected = ", ".join(_IN_FOLDERS[:5]) + ", …"
+        raise WearcapError("a folder without a trajectory", path, expected, "Give its file.")
+    return found
 
 
 def _read(path: Path) -> _Table:
