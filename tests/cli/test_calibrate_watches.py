@@ -248,8 +248,8 @@ def test_scale_and_vertical_without_the_board(walked, kit, tmp_path, capsys, by)
     assert "residual_m" not in content["camera"]
     recording = load_recording(tmp_path / "worn.safetensors")
     assert recording.skeleton.stature == pytest.approx(1.68, abs=1e-3)
-    up = recording.points.points_world[:, 2]
-    assert up.median().abs() < 0.03  # most of them are the floor's
+    floor = recording.points.points_world[:, 2].abs() < 0.03
+    assert 0.3 < floor.float().mean() < 0.7
     head = recording.head
     upright = (head.timestamps > STANDING[0]) & (head.timestamps < STANDING[1])
     assert head.t_world_device[upright, 2].mean() == pytest.approx(walked.measured.standing_m, abs=0.02)
@@ -279,13 +279,18 @@ def test_logs_of_different_times_are_named_with_their_spans(made, files, tmp_pat
         calibrate(given)
 
 
+def numbers_of(tree) -> list[float]:
+    parts = tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ()
+    return [tree] if isinstance(tree, int | float) else [number for part in parts for number in numbers_of(part)]
+
+
 def test_a_calibration_is_read_as_it_was_written(made, files, tmp_path):
     calibrate(arguments(made, files, tmp_path))
     found = read_watch_calibration(tmp_path / "calibration.json")
     write_watch_calibration(found, tmp_path / "again.json")
     first, again = (json.loads((tmp_path / name).read_text()) for name in ("calibration.json", "again.json"))
     for part in ("watches", "clocks", "camera", "head"):
-        assert str(again[part])[:60] == str(first[part])[:60]
+        assert numbers_of(again[part]) == pytest.approx(numbers_of(first[part]), abs=1e-6)
     (tmp_path / "bad.json").write_text('{"watches": {"left_wrist": {"R_world_ref_wxyz": [0, 0, 0, 0]}}}')
     with pytest.raises(WearcapError, match="not a calibration of watches"):
         read_watch_calibration(tmp_path / "bad.json")

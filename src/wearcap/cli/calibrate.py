@@ -133,9 +133,10 @@ def run_watches(config: DictConfig) -> WornCalibration | None:
     if slam is None and (given := [key for key in OF_CAMERA if config[key] is not None]):
         raise WearcapError(f"{', '.join(given)} without a camera", fix="Give its path, too: camera=TRAJ.txt.")
     session = WatchSession(watches, slam)
-    needed = ("board", "tpose") if slam is None else ("board", "tpose", "standing")
-    if slam is not None and config.head_imu is None and (config.points is None or config.camera_height_m is None):
-        needed += ("marks", "distances_m")  # else the floor or the head's sensor tells scale and vertical
+    # Without the board's marks the floor or the head's sensor tells scale and vertical.
+    marked = config.head_imu is None and (config.points is None or config.camera_height_m is None)
+    of_board = ("marks", "distances_m") if marked else ()
+    needed = ("board", "tpose") if slam is None else ("board", "tpose", *of_board, "standing")
     missing = [key for key in needed if config[key] is None]
     if config.guide or missing:
         _guide(config, session)

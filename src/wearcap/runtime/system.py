@@ -119,6 +119,8 @@ class System(ABC):
     """Whether several checkpoints make one system; otherwise each of them makes its own."""
     draws: ClassVar[bool] = True
     """Whether captures depend on the seed."""
+    required: ClassVar[tuple[Any, ...]] = ()
+    """Inputs of a recording that the system needs or profits from (`runtime.needs.Need`)."""
     baselines: ClassVar[tuple[str, ...]] = ()
     """Names of the trivial methods that an evaluation scores beside the system (`evaluation.baselines`)."""
 
@@ -165,6 +167,10 @@ class System(ABC):
     def exports(self) -> Exports:
         """The networks as graphs for ONNX and torch.export. Raises WearcapError for a system without any."""
         return self._room("export", "has a network to export").exports(self)
+
+    def needs(self) -> tuple[Any, ...]:
+        """`required`, as far as this configured system uses it."""
+        return self.required
 
     def _room(self, name: str, ability: str) -> ModuleType:
         package, _, module = type(self).__module__.rpartition(".")

@@ -93,7 +93,7 @@ class SlamAlignment:
         more = "Walk with turns for half a minute, or look at more of the floor."
         step = "camera on the board" if self.corner_deg is not None else "camera's scale and vertical"
         for what, measured, factor, limit, unit, fix in (
-            ("scales by the distances differ", self.scale_spread, 100, limits.scale_spread, "%", ruler),
+            ("scales by the two distances differ", self.scale_spread, 100, limits.scale_spread, "%", ruler),
             ("axes miss a right angle", self.corner_deg, 1, limits.corner_deg, "°", axes),
             ("residual", self.residual_m, 1, limits.residual_m, "m", ruler),
             ("deviation of the scale", self.scale_std, 100, limits.scale_std, "%", more),

@@ -59,8 +59,8 @@ class SceneEvidence:
         else:
             found = None
         if found is not None:
-            R, gravity_std_deg = found.R_world_slam, found.gravity_std_deg
-            scale, scale_std = found.scale, found.scale_std / found.scale
+            R, gravity_std_deg = found.R_world_slam, float(found.gravity_std_deg)
+            scale, scale_std = float(found.scale), float(found.scale_std / found.scale)
         spread = None
         if self.walks:
             scale, spread = scale_by_walks(slam, self.walks)

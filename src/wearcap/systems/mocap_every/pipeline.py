@@ -17,6 +17,7 @@ from wearcap.recording import Motion, Recording
 from wearcap.recording.recording import FloorTrack
 from wearcap.recording.timing import at_times
 from wearcap.runtime.graphs import Run, chosen, run_of
+from wearcap.runtime.needs import HEAD, HEIGHT, POINTS, WATCHES
 from wearcap.runtime.system import CaptureInput, LearnedSystem
 from wearcap.scene.floor import FloorFixed, FloorFollow, FloorFollower, FloorUpdate
 from wearcap.sensors.watches import watch_gaps, watches_at
@@ -83,6 +84,7 @@ class MocapEvery(LearnedSystem):
     name = "mocap_every"
     experiment = "experiment=mocap_every"
     shared = ("mocap_every",)
+    required = (HEAD, WATCHES, POINTS, HEIGHT)
 
     def __post_init__(self):
         self._run: Run | None = None
