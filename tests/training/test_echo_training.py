@@ -252,6 +252,12 @@ def test_every_experiment_and_ablation_runs(changes, data, people, tmp_path):
     system, _ = load_trained(tmp_path / "run" / "checkpoints" / "last.ckpt")
     assert isinstance(system, EchoDiffusion)
     assert not torch.equal(system.net.motion_normalizer.scale, torch.ones(sum(system.net.sizes)))
+    with open(tmp_path / "run/metrics.csv") as file:
+        captured = [row for row in csv.DictReader(file) if row.get("capture/v2v_cm")]
+    baseline = "baseline/" in " ".join(changes)  # they leave that out
+    assert bool(captured) != baseline, "ECHO captures validation recordings, with their objects, in training"
+    assert bool(list((tmp_path / "run").glob("pictures/*.png"))) != baseline
+    assert all(0 < float(row["capture/mpjpe_mm"]) < 5000 for row in captured)
 
 
 @pytest.mark.slow
