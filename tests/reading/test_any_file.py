@@ -13,8 +13,10 @@ from mvnx_files import mvnx
 from wearcap.body.skeleton import skeleton_of_height, xsens23
 from wearcap.body.skeletons import smplh52
 from wearcap.errors import WearcapError
+from wearcap.geometry.camera import Camera
 from wearcap.io.datasets.amass import read_amass, write_amass
 from wearcap.io.formats.bvh import read_bvh, write_bvh
+from wearcap.io.formats.camera_json import write_camera
 from wearcap.io.formats.motion_npz import read_motion, write_motion
 from wearcap.reading import read
 from wearcap.recording import RecordingStore
@@ -159,3 +161,27 @@ def test_numbers_of_a_broken_npz_are_named(tmp_path):
     np.savez(tmp_path / "a.npz", nothing=np.zeros(3))
     with pytest.raises(WearcapError, match="holds no poses"):
         read(tmp_path / "a.npz")
+
+
+def test_a_take_is_prepared_alone_and_with_a_localised_camera(take, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert exit_code(["prepare", "mvnx", f"source={take}", "output=alone"]) == 0
+    alone = read(tmp_path / "alone")
+    assert alone.suit is not None
+    assert alone.camera is None
+    poses = [f"{k / 30:.4f} {0.01 * k} 0 1.7 0.5 -0.5 0.5 -0.5" for k in range(30)]
+    (tmp_path / "camera.txt").write_text("\n".join(poses))
+    write_camera(Camera("pinhole", 64, 48, 50.0, 50.0, 31.5, 23.5), tmp_path / "camera.json", {})
+    command = ["prepare", "mvnx", f"source={take}", "output=both", "camera_poses=camera.txt"]
+    assert exit_code(command) == 2  # no intrinsics
+    assert exit_code([*command, "camera=camera.json"]) == 0
+    both = read(tmp_path / "both")
+    assert both.localization is not None
+    assert both.camera is not None
+    assert len(both.localization.timestamps) == 30
+    assert torch.allclose(both.localization.t_world_cam[-1], torch.tensor([0.29, 0.0, 1.7]))
+    late = (
+        (tmp_path / "camera.txt").read_text().replace("\n", "\n9").replace("0.0000 0.0 0 1.7", "90.0000 0.0 0 1.7", 1)
+    )
+    (tmp_path / "camera.txt").write_text(late)
+    assert exit_code([*command, "camera=camera.json", "overwrite=true"]) == 2

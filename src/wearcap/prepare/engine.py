@@ -249,7 +249,7 @@ def check_recording(recording: Recording) -> None:
                 wrong = f"{int(bad.sum())} matrices of {key} are no rotations"
                 expected = f"orthogonal within {ORTHOGONAL_WITHIN}, determinant +1"
                 raise WearcapError(wrong, where=where, expected=expected)
-    for part in ("motion", "head"):
+    for part in ("motion", "suit", "head"):
         times = tensors.get(f"{part}.timestamps")
         if times is None:
             continue
@@ -261,5 +261,5 @@ def check_recording(recording: Recording) -> None:
             what = f"{part} runs at {fps:.4g} frames per second"
             fix = "Give the true frame rate of the source."
             raise WearcapError(what, where=where, expected=f"{RATES_HZ[0]:g} to {RATES_HZ[1]:g}", fix=fix)
-    if recording.motion is None and recording.head is None:
-        raise WearcapError("neither a motion nor a head path", where=where, expected="one at least")
+    if recording.motion is None and recording.suit is None and recording.head is None:
+        raise WearcapError("no motion, no suit and no head path", where=where, expected="one at least")

@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import wearcap.io.saving  # noqa: F401  gives motions their `save`
-from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.doctor.logs import is_kit, log_kind, read_kit, read_table
 from wearcap.errors import WearcapError
 from wearcap.io.datasets.adt import is_adt, read_adt
@@ -16,13 +15,12 @@ from wearcap.io.devices.aria_mps import head_stream, is_mps_folder, read_closed_
 from wearcap.io.formats.asf_amc import read_amc, read_asf
 from wearcap.io.formats.bvh import read_bvh
 from wearcap.io.formats.motion_npz import read_motion
-from wearcap.io.formats.mvnx import read_mvnx
 from wearcap.io.formats.npz import read_npz
 from wearcap.io.formats.trajectory import trajectory_format
 from wearcap.prepare.logs import HeadsetSettings, TrajectorySettings, read_path
+from wearcap.prepare.suits import read_suit
 from wearcap.recording import Motion, Recording
 from wearcap.recording.store import MANIFEST, RecordingFile, load_recording
-from wearcap.sensors.contacts import contacts_from_motion
 
 PACKED = (".gz", ".xz")
 
@@ -50,23 +48,13 @@ def read(where: str | Path) -> Recording:
     content = READERS[kind](path)
     if isinstance(content, Motion):
         content = Recording(path.name.split(".")[0], motion=content, skeleton=content.skeleton)
-    return _with_contacts(content)
+    return content
 
 
 def kind_of(path: Path) -> str | None:
     """Suffix that determines a file's format, without compression; None for one that `read` does not know."""
     suffixes = [suffix.lower() for suffix in path.suffixes if suffix.lower() not in PACKED]
     return suffixes[-1] if suffixes and suffixes[-1] in READERS else None
-
-
-def _with_contacts(recording: Recording) -> Recording:
-    """The recording with foot contacts of its suit, from the feet's speed where the suit reports none."""
-    suit = recording.suit
-    if suit is None or suit.contact_prob is not None or not set(FOOT_PATCHES) <= set(suit.skeleton.sites):
-        return recording
-    if len(suit) < 3:
-        return recording
-    return replace(recording, suit=replace(suit, contact_prob=contacts_from_motion(suit).float()))
 
 
 def amc_skeleton(path: Path) -> Path:
@@ -101,11 +89,6 @@ def _read_npz(path: Path) -> Recording | Motion:
     return read_motion(path) if read_npz(path, ("wearcap",)) else read_amass(path)
 
 
-def _suit(recording: Recording) -> Recording:
-    """A suit's own motion is what was sensed, not what is true."""
-    return replace(recording, suit=recording.motion, motion=None)
-
-
 def _totalcapture(folder: Path) -> Recording:
     """A sequence in Vicon's skeleton; where the sensors are mounted is not known."""
     found = read_totalcapture(totalcapture_files(folder)[0])
@@ -122,7 +105,7 @@ _FOLDERS: tuple[tuple[Callable[[Path], bool], Callable[[Path], Recording]], ...]
 READERS: dict[str, Callable[[Path], Recording | Motion]] = {
     ".amc": lambda path: read_amc(read_asf(amc_skeleton(path)), path),
     ".bvh": read_bvh,
-    ".mvnx": lambda path: _suit(read_mvnx(path)),
+    ".mvnx": read_suit,
     ".npz": _read_npz,
     ".safetensors": lambda path: RecordingFile(path).load(),
     **dict.fromkeys((".csv", ".txt", ".tum", ".log", ".json", ".jsonl", ".npy", ".bin"), _read_log),

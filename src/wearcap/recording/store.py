@@ -48,7 +48,7 @@ class Entry:
         """The manifest entry of a recording whose file has been written."""
         require_choice(split, SPLITS, f"no split {split!r}")
         path = recording_path(root, recording.name)
-        stream = recording.motion or recording.head
+        stream = recording.motion or recording.suit or recording.head
         frames = len(stream.timestamps) if stream else 0
         fps = round(1 / stream.timestamps.diff().median().item(), 4) if stream and frames > 1 else 0.0
         about = {name: getattr(recording, name) for name in ("subject", "location", "activity", "license")}
