@@ -81,7 +81,8 @@ def over_recordings(
     writes there, or a worker was killed.
     """
     todo: list[tuple[str, str]] = []
-    with nullcontext() if notes is None else folder_lock(notes, "evaluate") as lock, progress_bar(len(names)) as done:
+    locked = nullcontext() if notes is None else folder_lock(notes, "capture or evaluation")
+    with locked as lock, progress_bar(len(names), transient=True) as done:
         for name in names:
             try:
                 key = "" if notes is None else digest(settings, *_inputs(store, name, scene))
