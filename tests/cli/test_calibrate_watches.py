@@ -1,6 +1,7 @@
 """`wearcap calibrate steps=watches`: from a simulated session's files to calibration.json and a recording."""
 
 import json
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -12,9 +13,10 @@ from wearcap.cli import calibrate as verb
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.formats.poses import write_tum
-from wearcap.recording import ImuStream, RecordingStore
-from wearcap.recording.store import load_recording
+from wearcap.recording import HeadStream, ImuStream, PointCloud, Recording, RecordingStore
+from wearcap.recording.store import load_recording, save_recording
 from wearcap.sensors.clock import Clock
+from wearcap.sensors.watch_calibration import read_watch_calibration, write_watch_calibration
 from wearcap.sensors.watches import watches_at
 from wearcap_testing import benchmark, recording_of, swaying_motion
 
@@ -189,3 +191,106 @@ def test_swapped_logs_are_noticed(made, files, tmp_path):
     given = arguments(made, files, tmp_path, camera=False)
     with pytest.raises(WearcapError, match="swapped|disagree"):
         calibrate(given | {"left": given["right"], "right": given["left"]})
+
+
+@pytest.fixture(scope="module")
+def walked() -> CalibrationSession:
+    return simulated.simulate_calibration(1, watch_fps=50.0, camera_fps=30.0, walk_s=60.0)
+
+
+@pytest.fixture(scope="module")
+def kit(walked, tmp_path_factory) -> Path:
+    """Files of other programs: EuRoC's nanoseconds, a cloud as a table, x-IMU3's Inertial.csv; with two bursts of outliers."""
+    folder = tmp_path_factory.mktemp("kit")
+    for joint, stream in walked.watches.items():
+        write_sensor_log(stream, folder / f"{joint.split('_')[0]}.csv")
+    slam, rows = walked.slam, ["#timestamp [ns], p_x [m], p_y [m], p_z [m], q_w [], q_x [], q_y [], q_z []"]
+    place = slam.t_world_body.double().clone()
+    for at in (2000, 2400):
+        place[at : at + 4] += 5 / walked.planted.scale
+    quaternion = rotation.quat_wxyz_from_matrix(slam.R_world_body.double())
+    for time, pose in zip(slam.timestamps.tolist(), torch.cat([place, quaternion], 1).tolist()):
+        rows.append(",".join([str(round(time * 1e9)), *(f"{value:.9f}" for value in pose)]))
+    (folder / "data.csv").write_text("\n".join(rows) + "\n")
+    cloud = "\n".join(",".join(f"{value:.6f}" for value in point) for point in walked.points_slam.tolist())
+    (folder / "points.csv").write_text(f"x,y,z\n{cloud}\n")
+    names = [
+        f"{kind} {axis} ({unit})" for kind, unit in (("Gyroscope", "deg/s"), ("Accelerometer", "g")) for axis in "XYZ"
+    ]
+    imu = walked.head_imu
+    table = torch.cat([imu.timestamps[:, None], torch.zeros(len(imu.timestamps), 3), imu.acc_imu.double() / G], 1)
+    felt = "\n".join(",".join(f"{value:.9f}" for value in row) for row in table.tolist())
+    (folder / "Inertial.csv").write_text(",".join(["Time (s)", *names]) + f"\n{felt}\n")
+    return folder
+
+
+@pytest.mark.parametrize("by", ["floor", "head_imu", "walks"])
+def test_scale_and_vertical_without_the_board(walked, kit, tmp_path, capsys, by):
+    """The camera's world comes from the floor, the head's sensor, or walks; outliers go, points, height and floor come along."""
+    given = arguments(walked, kit, tmp_path) | {"camera": f"{kit}/data.csv", "camera_fps": "30"}
+    for key in ("marks", "distances_m", "mark_height_m"):
+        del given[key]
+    given |= {"camera_height_m": str(walked.measured.standing_m), "height": "1.68"}
+    given |= {"recording": f"{tmp_path}/worn.safetensors", "points": f"{kit}/points.csv"}
+    if by != "floor":
+        given["head_imu"] = f"{kit}/Inertial.csv"
+    if by == "walks":
+        slam = walked.slam
+        first, last = slam.timestamps[0].item() + 85, slam.timestamps[0].item() + 86
+        ends = [slam.t_world_body[(slam.timestamps - at).abs().argmin()] for at in (first, last)]
+        metres = (ends[1] - ends[0]).norm().item() * walked.planted.scale
+        given["walks"] = f"[[85.0,86.0,{metres:.4f}]]"
+    calibrate(given)
+    assert "8 outliers of" in capsys.readouterr().out
+    content = json.loads((tmp_path / "calibration.json").read_text())
+    assert content["camera"]["scale"] == pytest.approx(walked.planted.scale, rel=0.02)
+    assert apart_deg(content["camera"]["R_world_slam_wxyz"], walked.planted.R_world_slam) < 3.0
+    assert "residual_m" not in content["camera"]
+    recording = load_recording(tmp_path / "worn.safetensors")
+    assert recording.skeleton.stature == pytest.approx(1.68, abs=1e-3)
+    floor = recording.points.points_world[:, 2].abs() < 0.03
+    assert 0.3 < floor.float().mean() < 0.7
+    head = recording.head
+    upright = (head.timestamps > STANDING[0]) & (head.timestamps < STANDING[1])
+    assert head.t_world_device[upright, 2].mean() == pytest.approx(walked.measured.standing_m, abs=0.02)
+    speed = head.t_world_device.diff(dim=0).norm(dim=-1) / head.timestamps.diff()
+    assert speed.max() < 6
+
+
+def test_points_of_a_recording_come_along(made, files, tmp_path):
+    """A recording of the camera's own path and points, in the SLAM's world, gets both in the calibrated one."""
+    slam = made.slam
+    head = HeadStream(slam.timestamps, slam.R_world_body, slam.t_world_body, torch.eye(3), torch.zeros(3))
+    points = PointCloud(torch.cat([slam.t_world_body[::50], torch.randn(20, 3)]))
+    save_recording(Recording("worn", head=head, points=points), tmp_path / "worn.safetensors")
+    calibrate(arguments(made, files, tmp_path) | {"recording": f"{tmp_path}/worn.safetensors"})
+    found = load_recording(tmp_path / "worn.safetensors")
+    path = found.head.t_world_device[::50]
+    torch.testing.assert_close(found.points.points_world[: len(path)], path, atol=0.02, rtol=0)
+
+
+def test_logs_of_different_times_are_named_with_their_spans(made, files, tmp_path):
+    late = replace(made.watches["right_wrist"], timestamps=made.watches["right_wrist"].timestamps + 5000)
+    write_sensor_log(late, tmp_path / "late.csv")
+    given = arguments(made, files, tmp_path) | {"right": f"{tmp_path}/late.csv"}
+    with pytest.raises(
+        WearcapError, match=r"left_wrist from .* to .* s, right_wrist from .* to .* s: they share 0.00 s"
+    ):
+        calibrate(given)
+
+
+def numbers_of(tree) -> list[float]:
+    parts = tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ()
+    return [tree] if isinstance(tree, int | float) else [number for part in parts for number in numbers_of(part)]
+
+
+def test_a_calibration_is_read_as_it_was_written(made, files, tmp_path):
+    calibrate(arguments(made, files, tmp_path))
+    found = read_watch_calibration(tmp_path / "calibration.json")
+    write_watch_calibration(found, tmp_path / "again.json")
+    first, again = (json.loads((tmp_path / name).read_text()) for name in ("calibration.json", "again.json"))
+    for part in ("watches", "clocks", "camera", "head"):
+        assert numbers_of(again[part]) == pytest.approx(numbers_of(first[part]), abs=1e-6)
+    (tmp_path / "bad.json").write_text('{"watches": {"left_wrist": {"R_world_ref_wxyz": [0, 0, 0, 0]}}}')
+    with pytest.raises(WearcapError, match="not a calibration of watches"):
+        read_watch_calibration(tmp_path / "bad.json")

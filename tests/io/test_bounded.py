@@ -26,16 +26,16 @@ from wearcap.io.formats.npz import read_npz
 from wearcap.io.formats.ocamcalib import OCamModel
 from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply
-from wearcap.io.formats.poses import read_euroc, read_tum
 from wearcap.io.formats.restricted_pickle import read_pickle
 from wearcap.io.formats.text import read_json, read_text
+from wearcap.io.formats.trajectory import read_trajectory
 from wearcap.io.formats.video import read_frames, read_image, video_info
 from wearcap.io.formats.wavefront import read_obj
 
 MIB = 1 << 20
 READERS = {
-    "a.txt": read_tum,
-    "a.csv": read_euroc,
+    "a.txt": read_trajectory,
+    "a.csv": read_trajectory,
     "a.bvh": read_bvh,
     "a.asf": read_asf,
     "a.mvnx": read_mvnx,
@@ -90,8 +90,8 @@ def little_free(monkeypatch):
 @pytest.mark.parametrize(
     ("name", "read", "line"),
     [
-        ("a.txt", read_tum, b"0 1 2 3 0 0 0 1\n"),
-        ("a.csv", read_euroc, b"1,0,0,0,1,0,0,0\n"),
+        ("a.txt", read_trajectory, b"0 1 2 3 0 0 0 1\n"),
+        ("a.csv", read_trajectory, b"1,0,0,0,1,0,0,0\n"),
         ("a.bvh", read_text, b"JOINT a {\n"),
         ("a.mvnx", read_mvnx, b"<!-- a comment -->\n"),
     ],

@@ -18,7 +18,7 @@ from wearcap.geometry.camera import Camera
 from wearcap.io.formats.camera_json import read_camera, write_camera
 from wearcap.io.formats.colmap import read_colmap
 from wearcap.io.formats.ply import read_ply
-from wearcap.io.formats.poses import read_tum
+from wearcap.io.formats.trajectory import read_trajectory
 from wearcap.io.formats.video import write_frames
 from wearcap.localization import tracking
 from wearcap.localization.structure import MappingSettings, colmap_camera
@@ -127,7 +127,7 @@ def test_from_a_finished_model(tmp_path, monkeypatch, capsys):
     assert report["reprojection_px"] == pytest.approx(1.5, abs=1e-3)
     assert report["gaps"] == [{"start_s": 0.3, "stop_s": 0.6, "interpolated": True}]
     assert report["scale"].startswith("arbitrary")
-    assert len(read_tum(out / "trajectory.txt")) == 12
+    assert len(read_trajectory(out / "trajectory.txt")) == 12
     np.testing.assert_allclose(read_ply(out / "points.ply").points, points, atol=1e-6)
     camera = read_camera(out / "camera.json")
     assert (camera.width, camera.height, camera.cx) == (WIDTH, HEIGHT, WIDTH / 2 - 0.5)
@@ -194,7 +194,7 @@ def test_real_photos_are_tracked(real_data, tmp_path):
     assert report["placed"] == 24
     assert report["reprojection_px"] < 1.0
     assert read_camera(tmp_path / "out/camera.json").fx == pytest.approx(camera.fx)
-    found = read_tum(tmp_path / "out/trajectory.txt")
+    found = read_trajectory(tmp_path / "out/trajectory.txt")
     t = torch.stack([truth[name].T_world_cam.t for name in sorted(truth)[:24]])
     R = torch.stack([truth[name].T_world_cam.R for name in sorted(truth)[:24]])
     turn, move, scale = roma.rigid_points_registration(found.t_world_body.double(), t, compute_scaling=True)

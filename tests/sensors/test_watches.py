@@ -79,7 +79,6 @@ def test_mounting_is_taken_off():
         ),
         (lambda s: both(100.0, start=2.0), "logged from 2.00 s"),
         (lambda s: both(100.0, stop=3.0), "logged from 0.00 s to"),
-        (lambda s: s | {"left_wrist": jumping(s["left_wrist"])}, "clock jumps, for 1.0"),
         (
             lambda s: s | {"left_wrist": replace(s["left_wrist"], timestamps=s["left_wrist"].timestamps.flip(0))},
             "do not grow",
@@ -97,10 +96,24 @@ def test_raised_arms_are_captured_with_a_warning():
         watches_at({"left_wrist": streams["right_wrist"], "right_wrist": streams["left_wrist"]}, CLOCK, "here")
 
 
-def jumping(stream: ImuStream) -> ImuStream:
-    times = stream.timestamps.clone()
-    times[200:] += 1.0
-    return replace(stream, timestamps=times)
+def test_a_gap_is_bridged_as_streams_do_it():
+    """Last orientation, no acceleration; a warning says so, and outside of the gap nothing changes."""
+    streams = both(100.0)
+    left = streams["left_wrist"]
+    kept = (left.timestamps < 2.0) | (left.timestamps > 3.2)
+    cut = ImuStream(left.timestamps[kept], "left_wrist", left.R_world_imu[kept], left.acc_world[kept])
+    gapped = streams | {"left_wrist": cut}
+    with pytest.warns(UserWarning, match="left_wrist is silent, or its clock jumps, 1 times for 1.2. s in all"):
+        R, acc = watches_at(gapped, CLOCK, "here")
+    whole_R, whole_acc = watches_at(streams, CLOCK, "here")
+    inside = (CLOCK > 2.2) & (CLOCK < 3.0)
+    last = left.R_world_imu[left.timestamps < 2.0][-1]
+    assert geodesic(R[inside, 0], last.expand(int(inside.sum()), 3, 3)).max().rad2deg() < 0.05
+    assert acc[inside, 0].abs().max() < 1e-6
+    outside = (CLOCK < 1.8) | (CLOCK > 3.4)
+    torch.testing.assert_close(R[outside], whole_R[outside], atol=1e-5, rtol=0)
+    torch.testing.assert_close(acc[outside], whole_acc[outside], atol=1e-4, rtol=0)
+    torch.testing.assert_close(R[:, 1], whole_R[:, 1], atol=1e-5, rtol=0)
 
 
 def test_a_silence_outside_the_capture_does_not_matter():

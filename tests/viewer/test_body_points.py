@@ -215,7 +215,7 @@ def test_a_row_of_the_sheet_has_its_own_objects():
     motion = carrying()
     away = replace(motion, object_motion=None)
     first, second = _actors({"a": motion, "b": away}, anny_body(motion.skeleton), HOUSE)
-    places = [actor.meshes(12)[-2].vertices.mean(0) for actor in (first, second)]
+    places = [actor.objects(12)[-2].vertices.mean(0) for actor in (first, second)]
     np.testing.assert_allclose(places[0], motion.joint("left_wrist").t[12], atol=1e-4)
     np.testing.assert_allclose(places[1], [3.0, 3.0, 0.2], atol=1e-4)
 

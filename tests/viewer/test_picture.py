@@ -10,6 +10,7 @@ from PIL import Image
 
 from wearcap.cli import render as render_verb
 from wearcap.errors import WearcapError
+from wearcap.geometry.mesh import Mesh
 from wearcap.recording import Motion, PointCloud, Recording
 from wearcap.recording.timing import at_times
 from wearcap.viewer.picture import SKY, contact_sheet, draw_head_path, save_png, shared_frames, write_video
@@ -111,3 +112,28 @@ def test_png_is_written_whole(tmp_path):
     image = np.zeros((4, 5, 3), np.uint8)
     save_png(tmp_path / "a.png", image)
     assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), image)
+
+
+def test_the_camera_looks_past_what_would_hide_the_person():
+    """A wall in the usual line of sight, farther from the person than what is cut away anyway: seen through nothing."""
+    from wearcap.viewer.camera_path import azimuths, smoothed
+    from wearcap.viewer.picture import DISTANCE_M, TILT, VIEW_RAD
+
+    body = np.random.default_rng(0).uniform([-0.2, -0.2, 0.0], [0.2, 0.2, 1.7], (20, 3))
+    toward = np.array([np.cos(VIEW_RAD), np.sin(VIEW_RAD), 0.0])
+    aside = np.array([-toward[1], toward[0], 0.0])
+    corners = np.stack([-0.5 * toward + s * 0.8 * aside + [0, 0, z] for s in (-1, 1) for z in (0.0, 2.5)])
+    wall = Mesh(corners.astype(np.float32), np.array([[0, 1, 2], [1, 3, 2]], np.int32), np.full(3, 0.5, np.float32))
+    free = azimuths([body] * 6, [[]] * 6, VIEW_RAD, TILT, DISTANCE_M)
+    assert (free == VIEW_RAD).all()
+    turned = azimuths([body] * 6, [[], [wall], [wall], [wall], [wall], []], VIEW_RAD, TILT, DISTANCE_M)
+    assert abs(turned[2] - VIEW_RAD) > 0.7
+    times = np.linspace(0, 2.5, 76)
+    path = smoothed(turned, np.arange(6) * 0.5, times)
+    assert np.abs(np.diff(path)).max() < 0.1
+
+
+def test_videos_drawn_by_several_threads_have_their_frames_in_order():
+    from wearcap.viewer.picture import _in_parallel
+
+    assert [int(x[0]) for x in _in_parallel(lambda t: np.array([t]), [float(k) for k in range(50)])] == list(range(50))

@@ -5,7 +5,7 @@ come out. The steps are MocapEvery's (appendix C.2): board, T-pose, four camera 
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +16,22 @@ from rich import print as show
 from rich.markup import escape
 from rich.table import Table
 
-from wearcap.body.skeleton import WRISTS
+from wearcap.body.skeleton import WRISTS, skeleton_of_height
 from wearcap.cli.conf import hydra_main
 from wearcap.errors import WearcapError, nearest
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.devices.watch_log import read_watch_log
 from wearcap.io.formats.camera_json import write_camera
-from wearcap.io.formats.poses import read_tum
+from wearcap.io.formats.trajectory import read_trajectory
 from wearcap.io.formats.video import read_pictures
 from wearcap.localization.checkerboard import Board, Calibration, calibrate_from_pictures
 from wearcap.locks import folder_lock
+from wearcap.prepare.logs import read_cloud, read_head_imu
 from wearcap.recording import Recording, RecordingStore
 from wearcap.recording.store import load_recording, save_recording
 from wearcap.sensors.camera_alignment import HeadMount, SlamAlignment, align_by_marks, mark_positions, mount_by_standing
+from wearcap.sensors.clock import require_overlap
+from wearcap.sensors.slam_alignment import SceneEvidence, align_cleaned, facing, pose_of
 from wearcap.sensors.stillness import StepCheck, Stretch, require
 from wearcap.sensors.watch_calibration import (
     WatchSession,
@@ -102,13 +105,17 @@ STEPS = {
     "board": "Lay both watches on the board for 3 s: backs down, 12 o'clock along the board's y axis. Touch nothing.",
     "tpose": "Put them on, stand in a T-pose that faces the board's y for 3 s: arms level, palms down.",
     "marks": "Put the camera on C1 and C2 (y axis), then C3 and C4 (x axis), for 3 s each, and measure |C1 C2| and |C3 C4|"
-    " (distances_m=[…,…]) and the camera's height over the floor (mark_height_m=…).",
+    " (distances_m=[…,…]) and the camera's height over the floor (mark_height_m=…). Or, without the board: points=CLOUD.ply"
+    " camera_height_m=… (measured while standing), or head_imu=LOG.csv; walks=[[from,to,metres],…] for the scale alone.",
     "standing": "Put the camera on, stand upright for 10 s with hanging arms and look ahead along the board's y.",
     "swings": "Swing the stretched arms from hanging to before the camera and back, ten times, at uneven intervals; note the"
     " times of the frames in which the hands are nearest.",
 }
 OF_CAMERA = ("marks", "standing", "swings")
-_ABOUT = ("board", "tpose", "swings_in", "marks", "distances_m", "mark_height_m", "standing", "facing_deg")
+_ABOUT = (
+    *("board", "tpose", "swings_in", "marks", "distances_m", "mark_height_m", "standing", "facing_deg"),
+    *("camera_height_m", "walks"),
+)
 """Settings that a calibration's file repeats, followed by those of the swings."""
 
 
@@ -120,11 +127,16 @@ def run_watches(config: DictConfig) -> WornCalibration | None:
     if config.steps != "watches":
         raise WearcapError(f"no steps {config.steps!r}", fix=nearest(str(config.steps), ["watches"]))
     watches = {joint: read_watch_log(config[joint.split("_")[0]], joint) for joint in WRISTS}
-    slam = None if config.camera is None else read_tum(config.camera)
+    fix = "Give the logs of one session; watches count their time since 1970."
+    require_overlap({joint: watch.timestamps for joint, watch in watches.items()}, fix)
+    slam = None if config.camera is None else read_trajectory(config.camera, fps=float(config.camera_fps))
     if slam is None and (given := [key for key in OF_CAMERA if config[key] is not None]):
         raise WearcapError(f"{', '.join(given)} without a camera", fix="Give its path, too: camera=TRAJ.txt.")
     session = WatchSession(watches, slam)
-    needed = ("board", "tpose") if slam is None else ("board", "tpose", "marks", "distances_m", "standing")
+    # Without the board's marks the floor or the head's sensor tells scale and vertical.
+    marked = config.head_imu is None and (config.points is None or config.camera_height_m is None)
+    of_board = ("marks", "distances_m") if marked else ()
+    needed = ("board", "tpose") if slam is None else ("board", "tpose", *of_board, "standing")
     missing = [key for key in needed if config[key] is None]
     if config.guide or missing:
         _guide(config, session)
@@ -137,7 +149,9 @@ def run_watches(config: DictConfig) -> WornCalibration | None:
     if target is not None:
         new = target.suffix == ".safetensors" and not target.exists()
         recording = Recording(target.stem) if new else load_recording(target)
-    found, checks = _measured(config, session)
+        if config.height is not None:
+            recording = replace(recording, skeleton=skeleton_of_height(float(config.height)))
+    found, session, checks = _measured(config, session)
     _show_checks(checks)
     require(checks)
     files = {key: Path(config[key]).name for key in ("left", "right", "camera") if config[key] is not None}
@@ -148,12 +162,14 @@ def run_watches(config: DictConfig) -> WornCalibration | None:
     if recording is not None and target is not None:
         if not found.clocks:
             show("[yellow]note: without arm swings the watches stay on their own clock[/]")
-        _store(session.added_to(recording, found), target)
+        points = None if config.points is None else read_cloud(config.points).points_world
+        _store(session.added_to(recording, found, points), target)
         show(f"recording: {escape(str(config.recording))}")
     return found
 
 
-def _measured(config: DictConfig, session: WatchSession) -> tuple[WornCalibration, list[StepCheck]]:
+def _measured(config: DictConfig, session: WatchSession) -> tuple[WornCalibration, WatchSession, list[StepCheck]]:
+    """The calibration, the session with the camera's path without outliers, and all checks."""
     board, t_pose = (_stretch(key, config[key], session.watch_zero) for key in ("board", "tpose"))
     watches = measure_watches(session.watches, board, t_pose)
     limits = instantiate(config.watch_limits)
@@ -164,7 +180,8 @@ def _measured(config: DictConfig, session: WatchSession) -> tuple[WornCalibratio
     require_watches(session.watches, watches, t_pose, limits)
     camera, head, clocks = None, None, {}
     if session.slam is not None:
-        camera, head, more = _camera(config, session.slam, session.camera_zero)
+        camera, head, clean, more = _camera(config, session.slam, session.camera_zero)
+        session = replace(session, slam=clean)
         checks += more
         if config.swings is not None:
             seen_s = torch.tensor(_numbers(config, "swings"), dtype=torch.float64)
@@ -175,18 +192,47 @@ def _measured(config: DictConfig, session: WatchSession) -> tuple[WornCalibratio
                 watch = watches[joint].apply(stream)
                 clocks[joint] = session.swing_clock(watch, seen_s, stretch, config.camera_fps)
             checks += [check for joint, clock in clocks.items() for check in clock.checks(joint)]
-    return WornCalibration(watches, clocks, camera, head), checks
+    return WornCalibration(watches, clocks, camera, head), session, checks
 
 
-def _camera(config: DictConfig, slam: Trajectory, zero: float) -> tuple[SlamAlignment, HeadMount, list[StepCheck]]:
+def _camera(
+    config: DictConfig, slam: Trajectory, zero: float
+) -> tuple[SlamAlignment, HeadMount, Trajectory, list[StepCheck]]:
+    """Alignment of the camera's world by the board's marks, else by the floor or the head's sensor; mount; clean path."""
     limits = instantiate(config.camera_limits)
-    marks, moved, turned = mark_positions(slam, [_stretch("marks", mark, zero) for mark in config.marks])
-    first, second = _numbers(config, "distances_m", 2)
-    camera = align_by_marks(marks, (first, second), config.mark_height_m)
-    x, y, z = _numbers(config, "t_head_cam", 3)
     standing = _stretch("standing", config.standing, zero)
-    head = mount_by_standing(camera.apply(slam), standing, config.facing_deg, (x, y, z))
-    return camera, head, camera.checks(camera.scale * moved, turned, limits) + head.checks(limits)
+    stretches = [] if config.marks is None else [_stretch("marks", mark, zero) for mark in config.marks]
+    evidence = None if stretches else _evidence(config, standing, zero)
+
+    def align(path: Trajectory) -> SlamAlignment:
+        if evidence is not None:
+            return facing(evidence.align(path), path, standing, config.facing_deg)
+        first, second = _numbers(config, "distances_m", 2)
+        return align_by_marks(mark_positions(path, stretches)[0], (first, second), config.mark_height_m)
+
+    burst = float(config.max_acceleration), float(config.max_burst_s)
+    camera, clean, outliers = align_cleaned(slam, align, *burst)
+    if outliers:
+        show(outliers)
+    moved, turned = None, []
+    if stretches:
+        _, moved, turned = mark_positions(clean, stretches)
+        moved = camera.scale * moved
+    x, y, z = _numbers(config, "t_head_cam", 3)
+    head = mount_by_standing(camera.apply(clean), standing, config.facing_deg, (x, y, z))
+    return camera, head, clean, camera.checks(moved, turned, limits) + head.checks(limits)
+
+
+def _evidence(config: DictConfig, standing: Stretch, zero: float) -> SceneEvidence:
+    """What shows scale and vertical without the board."""
+    try:
+        walks = tuple((float(a) + zero, float(b) + zero, float(metres)) for a, b, metres in config.walks or ())
+    except (TypeError, ValueError) as error:
+        raise WearcapError(f"walks={config.walks}", expected="[[from,to,metres],…]") from error
+    height = None if config.camera_height_m is None else float(config.camera_height_m)
+    imu = None if config.head_imu is None else read_head_imu(config.head_imu)
+    points = None if config.points is None else read_cloud(config.points).points_world
+    return SceneEvidence(points, standing, height, imu, pose_of(config.T_cam_imu, "T_cam_imu"), walks)
 
 
 def _stretch(key: str, value: Any, zero: float) -> Stretch:

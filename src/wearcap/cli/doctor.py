@@ -3,14 +3,20 @@
 import argparse
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 
+from hydra.utils import instantiate
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
+from wearcap.cli.conf import compose
 from wearcap.doctor import Report, examine
+from wearcap.doctor.preflight import preflight
+from wearcap.runtime.system import System
 
 HELP = "report what a recording holds, what looks wrong in it, and how to fix it"
 _COLOR = {"ok": "green", "note": "cyan", "warning": "yellow", "error": "bold red"}
@@ -21,13 +27,20 @@ def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="wearcap doctor", description=HELP)
     parser.add_argument(
         "path",
-        help="data set folder, DATASET/NAME, recording file, Aria MPS folder, scene folder, environment.json, motion capture file or folder",
+        help="data set folder, DATASET/NAME, recording file, Aria MPS folder, scene folder, environment.json, motion capture file or folder, watch log, trajectory, headset log, or a folder with such logs of one session",
+    )
+    parser.add_argument(
+        "--for",
+        dest="pipeline",
+        metavar="PIPELINE",
+        help="or for=PIPELINE: what does hps, ireplica, hmd2, mocap_every or echo lack?",
     )
     parser.add_argument("--json", action="store_true", help="print the findings as JSON")
     parser.add_argument("--quiet", action="store_true", help="leave out what is sound")
-    options = parser.parse_args(arguments)
+    options = parser.parse_args([f"--{word}" if word.startswith("for=") else word for word in arguments])
+    check = None if options.pipeline is None else _preflight(options.pipeline)
     if options.json:
-        report = examine(options.path)
+        report = examine(options.path, preflight=check)
         findings = {name: [asdict(finding) for finding in found] for name, found in report.findings.items()}
         content = {"source": report.source, "sound": report.sound, "findings": findings}
         print(json.dumps(content, indent=1, ensure_ascii=False))
@@ -35,7 +48,9 @@ def main(arguments: list[str]) -> None:
         console = Console()
         with Progress(console=Console(stderr=True), transient=True) as progress:
             task = progress.add_task("examining", total=None)
-            report = examine(options.path, lambda done, total: progress.update(task, completed=done, total=total))
+            report = examine(
+                options.path, lambda done, total: progress.update(task, completed=done, total=total), check
+            )
         console.print(_table(report, options.quiet))
         counts = {severity: len(report.of_severity(severity)) for severity in ("error", "warning", "note")}
         listed = ", ".join(f"{count} {severity}{'s' if count != 1 else ''}" for severity, count in counts.items())
@@ -44,6 +59,13 @@ def main(arguments: list[str]) -> None:
         console.print(f"{count} recording{'s' if count != 1 else ''}: {verdict} ({listed})")
     if not report.sound:
         sys.exit(1)
+
+
+def _preflight(name: str) -> Callable:
+    """The check of what a pipeline, by its config's name, needs; its network is not loaded."""
+    made = instantiate(compose("capture", ["recording=none", f"pipeline={name}"]).pipeline, _convert_="all")
+    needs = made.needs() if isinstance(made, System) else made.func.required
+    return partial(preflight, name=name, needs=needs)
 
 
 def _table(report: Report, quiet: bool) -> Table:

@@ -53,6 +53,8 @@ def main(arguments: list[str]) -> None:
 
     recording, folder = read(options.recording), dataset_folder(options.recording)
     captures = read_motions(options.motion)
+    if recording.motion is None and recording.suit is not None:
+        captures = {"suit": recording.suit} | captures
     environment = CaptureInput(recording, folder).objects(options.environment)
     page = Page(recording, captures, folder=folder, host=options.host, port=options.port, environment=environment)
     print(f"{recording.name}: open {page.url} (Ctrl+C ends; space plays, J and L jump by a second)")

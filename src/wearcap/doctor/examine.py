@@ -20,17 +20,18 @@ from wearcap.doctor.agreement import (
     check_points,
 )
 from wearcap.doctor.body import check_contact_prob, check_motion
+from wearcap.doctor.logs import as_head, is_kit, read_kit, read_table
 from wearcap.doctor.places import is_map, is_place, read_environment_file, read_map, read_place
 from wearcap.doctor.report import SEVERITIES, Check, Finding, Report, has_error, refusal
 from wearcap.doctor.streams import check_clock, check_spans, check_track
 from wearcap.errors import WearcapError
-from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.adt import is_adt, read_adt
 from wearcap.io.datasets.amass import read_amass
 from wearcap.io.datasets.hps import hps_names, read_hps_sequence
 from wearcap.io.datasets.nymeria import is_nymeria, read_nymeria, read_xdata
 from wearcap.io.datasets.totalcapture import is_totalcapture, read_totalcapture, totalcapture_files
-from wearcap.io.devices.aria_mps import find_mps_file, head_stream, is_mps_folder, read_closed_loop, read_mps
+from wearcap.io.devices.aria_mps import find_mps_file, is_mps_folder, read_closed_loop, read_mps
+from wearcap.io.devices.headset_log import is_headset_log
 from wearcap.io.formats.asf_amc import read_amc, read_asf
 from wearcap.io.formats.bvh import read_bvh
 from wearcap.io.formats.motion_npz import read_motion
@@ -38,17 +39,22 @@ from wearcap.io.formats.mvnx import read_mvnx
 from wearcap.io.formats.npz import read_npz
 from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply
-from wearcap.io.formats.poses import read_euroc, read_tum
 from wearcap.io.formats.text import read_json_object
-from wearcap.recording import FloorTrack, HeadStream, Motion, PointCloud, Recording, RecordingStore
+from wearcap.io.formats.trajectory import read_trajectory_file, trajectory_file
+from wearcap.recording import FloorTrack, Motion, PointCloud, Recording, RecordingStore
 from wearcap.recording.store import RecordingFile
 from wearcap.scene.floor import estimate_floor
 
 
-def examine(source: Recording | str | Path, progress: Callable[[int, int], None] | None = None) -> Report:
+def examine(
+    source: Recording | str | Path,
+    progress: Callable[[int, int], None] | None = None,
+    preflight: Callable[[Recording, Path | None], list[Finding]] | None = None,
+) -> Report:
     """Examine a recording, or all in a data set, recording file, MPS folder, motion capture file or folder of them.
 
-    Unreadable files are errors in the report; `progress(done, all)` is called after each recording.
+    Unreadable files are errors in the report; `progress(done, all)` is called after each recording. `preflight` adds
+    findings on a recording and the folder of its files.
     Raises WearcapError when there is nothing to examine.
     """
     if isinstance(source, Recording):
@@ -61,6 +67,8 @@ def examine(source: Recording | str | Path, progress: Callable[[int, int], None]
         except WearcapError as error:
             findings[name] = (refusal(error),)
         else:
+            if preflight is not None:
+                read = [*read, *preflight(recording, _folder_of(Path(source)))]
             only_read = read and recording.points is None and not _clocks(recording)  # with the reader's errors
             findings[name] = tuple(read if only_read else [*read, *examine_recording(recording)])
         if progress:
@@ -148,7 +156,7 @@ def _patients(path: Path) -> dict[str, Callable[[], Loaded]]:
     if (path / "manifest.json").is_file():
         store = RecordingStore.open(path)
         return {name: partial(_read_stored, store, name) for name in store.names()}
-    for is_kind, read in _FOLDERS:
+    for is_kind, read in (*_FOLDERS, (is_kit, read_kit), (trajectory_file, _read_trajectory)):
         if is_kind(path):
             return {path.resolve().name: partial(read, path)}
     if names := hps_names(path):
@@ -178,11 +186,6 @@ def _read_file(path: Path) -> Loaded:
         return content, []
     if isinstance(content, Motion):
         return Recording(name=name, motion=content, skeleton=content.skeleton), []
-    if isinstance(content, Trajectory):
-        head = HeadStream(content.timestamps, content.R_world_body, content.t_world_body, torch.eye(3), torch.zeros(3))
-        evidence, fix = "a trajectory file does not name its axes", "x forward, y left, z up is assumed."
-        note = Check("head: axes").note("taken as the head's own pose", evidence, fix)
-        return Recording(name=name, head=head), [note]
     return Recording(name=name, points=PointCloud(torch.from_numpy(content.points))), []
 
 
@@ -238,17 +241,28 @@ def _read_amc(path: Path) -> Motion:
     return read_amc(read_asf((named or beside)[-1]), path)
 
 
-def _read_csv(path: Path) -> Recording | Trajectory:
-    if "closed_loop" in path.name or "aria_trajectory" in path.name:
-        track = read_closed_loop(path, up="y" if "aria_trajectory" in path.name else "z")[0]
-        return Recording(name=path.name, head=head_stream(track, fps=None), source="Aria MPS")
-    return read_euroc(path)
+def _read_trajectory(path: Path) -> Loaded:
+    """A trajectory of any format, also a folder of COLMAP's or DROID-SLAM's."""
+    return as_head(read_trajectory_file(path), path.resolve().name)
 
 
-def _read_npz(path: Path) -> Recording | Motion:
-    """A wearcap motion, Nymeria's suit data, or an AMASS file, recognised by its arrays."""
+def _read_json(path: Path) -> Loaded:
+    return read_table(path) if is_headset_log(path) else read_environment_file(path)
+
+
+def _folder_of(path: Path) -> Path | None:
+    """Folder of the files that recordings at a path name: that of their data set."""
+    if path.is_dir():
+        return path
+    return path.parent if path.parent.is_dir() else None
+
+
+def _read_npz(path: Path) -> Recording | Motion | Loaded:
+    """A wearcap motion, Nymeria's suit data, an AMASS file, or DROID-SLAM's poses, recognised by its arrays."""
     if path.name == "xdata.npz":
         return read_xdata(path)[0]
+    if read_npz(path, ("traj_est", "tstamps", "tstamp")):
+        return _read_trajectory(path)
     return read_motion(path) if read_npz(path, ("wearcap",)) else read_amass(path)
 
 
@@ -269,10 +283,14 @@ _MOTIONS = {".amc": _read_amc, ".bvh": read_bvh, ".mvnx": read_mvnx, ".npz": _re
 _READERS: dict[str, Callable] = {
     **_MOTIONS,
     ".safetensors": lambda path: read_map(path) if is_map(path) else RecordingFile(path).load(),
-    ".csv": _read_csv,
-    ".txt": read_tum,
-    ".tum": read_tum,
+    ".csv": read_table,
+    ".txt": read_table,
+    ".tum": read_table,
+    ".log": read_table,
+    ".jsonl": read_table,
+    ".npy": _read_trajectory,
+    ".bin": _read_trajectory,
     ".ply": read_ply,
     ".pcd": read_pcd,
-    ".json": read_environment_file,
+    ".json": _read_json,
 }

@@ -23,7 +23,8 @@ from wearcap.geometry.rigid import Rigid
 
 NEAR_M = 0.02
 """Nothing closer to the camera than this (m) is drawn."""
-_MAP_SIZE = 512
+_MAP_SIZES = (256, 512)
+"""Texels along each side of a shadow map, of pictures up to that size and of larger ones."""
 _CONTACT_FADE = 0.08
 
 
@@ -117,7 +118,7 @@ def render(
         in_cam,
         np.concatenate([np.zeros((0, 3)), *colors]).astype(np.float32),
         np.array([*to_light, light.key, light.ambient_below, light.ambient_above]),
-        _shadow_maps(scene, light),
+        _shadow_maps(scene, light, _MAP_SIZES[max(fine.width, fine.height) > 2 * _MAP_SIZES[0]]),
         np.ascontiguousarray(np.broadcast_to(255 * np.asarray(background, np.float32), (camera.height, 3))),
         *picture,
     )
@@ -196,22 +197,22 @@ def _pixel_rays(camera: Camera) -> np.ndarray:
     return (rays if camera.is_fisheye else rays / rays[..., 2:].clamp(min=1e-6)).numpy()
 
 
-def _shadow_maps(scene: raster.Triangles, light: Light) -> raster.Shadows:
+def _shadow_maps(scene: raster.Triangles, light: Light, size: int) -> raster.Shadows:
     """Height maps of the faces that cast shadows; empty ones without shadows."""
     if light.shadow_center is None or not scene.casts.any():
         return raster.Shadows()
     casters = [Mesh(scene.vertices.astype(np.float32), scene.faces[scene.casts], np.ones(3, np.float32))]
-    where = (light.shadow_center, light.shadow_radius, _MAP_SIZE)
+    where = (light.shadow_center, light.shadow_radius, size)
     nearest, key_axes = _orthographic_map(casters, light.to_light, *where)
     nearest = np.maximum(nearest, np.float32(-1e6))
     below, down_axes = _orthographic_map(casters, (0.0, 0.0, -1.0), *where)
     return raster.Shadows(
         np.concatenate([key_axes, down_axes]),
-        _MAP_SIZE / (2 * light.shadow_radius),
+        size / (2 * light.shadow_radius),
         nearest,
         ndimage.maximum_filter(nearest, size=4, origin=-1),
         ndimage.minimum_filter(nearest, size=4, origin=-1),
-        ndimage.gaussian_filter(np.exp(np.clip(below / _CONTACT_FADE, -80, 80)), sigma=2.5),
+        ndimage.gaussian_filter(np.exp(np.clip(below / _CONTACT_FADE, -80, 80)), sigma=2.5 * size / _MAP_SIZES[-1]),
         _CONTACT_FADE,
     )
 

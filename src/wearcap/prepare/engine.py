@@ -190,7 +190,7 @@ def _run(task: Task, root: Path) -> tuple[str, Entry | str, str]:
         except Exception as error:
             return task.name, reason_of(error), ""
         save_recording(recording, recording_path(root, task.name))
-        note = recording.motion.provenance.get(NOTE, "") if recording.motion else ""
+        note = recording.note or (recording.motion.provenance.get(NOTE, "") if recording.motion else "")
         return task.name, Entry.of(recording, root, task.split, task.hash), note
     finally:
         torch.set_num_threads(threads[0])

@@ -175,6 +175,8 @@ class Recording:
     activity: str = ""
     source: str = ""
     license: str = ""
+    note: str = ""
+    """What was detected or assumed when the recording was made, in a sentence."""
     session: str | None = None
     """Recordings of several wearers with the same session share clock and world."""
 

@@ -91,7 +91,7 @@ class Captured:
     motion: Motion | None
     """None if a stage before the motion was the last one to run."""
     report: dict[str, Any] | None = None
-    """Findings of the stages as plain data for JSON; None for a system without stages."""
+    """Findings of the stages, or notes on the input, as plain data for JSON; None where there are none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +123,8 @@ class System(ABC):
     """Whether several checkpoints make one system; otherwise each of them makes its own."""
     draws: ClassVar[bool] = True
     """Whether captures depend on the seed."""
+    required: ClassVar[tuple[Any, ...]] = ()
+    """Inputs of a recording that the system needs or profits from (`runtime.needs.Need`)."""
     baselines: ClassVar[tuple[str, ...]] = ()
     """Names of the trivial methods that an evaluation scores beside the system (`evaluation.baselines`)."""
 
@@ -179,6 +181,10 @@ class System(ABC):
         """The networks as graphs for ONNX and torch.export. Raises WearcapError for a system without any."""
         return self._room("export", "has a network to export").exports(self)
 
+    def needs(self) -> tuple[Any, ...]:
+        """`required`, as far as this configured system uses it."""
+        return self.required
+
     def _room(self, name: str, ability: str) -> ModuleType:
         package, _, module = type(self).__module__.rpartition(".")
         if module != "pipeline" or importlib.util.find_spec(f"{package}.{name}") is None:
@@ -219,4 +225,5 @@ class LearnedSystem(System):
             raise WearcapError(what, expected="a pipeline with stages, such as pipeline=hps")
         once = {id(recording): CaptureInput.of(recording) for recording in recordings}
         motions = self.motions([once[id(recording)] for recording in recordings], seeds)
-        return [Captured(motion) for motion in motions]
+        notes = [motion.provenance.get("note") for motion in motions]
+        return [Captured(motion, {"notes": [note]} if note else None) for motion, note in zip(motions, notes)]

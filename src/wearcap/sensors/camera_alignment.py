@@ -40,22 +40,31 @@ class AlignmentLimits:
     mark_still_deg: float = 1.0
     stand_still_deg: float = 4.0
     view_deg: float = 60.0
+    scale_std: float = 0.04
+    gravity_std_deg: float = 2.0
 
 
 @dataclass(frozen=True)
 class SlamAlignment:
-    """Similarity transform from a SLAM's world to the metric world, and how well the four positions fit."""
+    """Similarity transform from a SLAM's world to the metric world, and how well what determined it fits.
+
+    Of the board's four positions: residual, spread of scales and corner; of the floor or an inertial sensor: deviations.
+    """
 
     scale: float
     """Metres per unit of the SLAM."""
     R_world_slam: Float64[Tensor, "3 3"]
     t_world_slam: Float64[Tensor, "3"]
-    residual_m: float
+    residual_m: float | None = None
     """Root mean square residual of the refinement: off-axis coordinates, heights, distances."""
-    scale_spread: float
-    """Relative difference between the scales from the two distances."""
-    corner_deg: float
+    scale_spread: float | None = None
+    """Relative difference between the scales from the measured distances."""
+    corner_deg: float | None = None
     """Deviation of the two lines from a right angle."""
+    scale_std: float | None = None
+    """Relative standard deviation of the scale."""
+    gravity_std_deg: float | None = None
+    """Standard deviation of the vertical's direction."""
 
     def points(self, points_slam: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Positions in the world (m)."""
@@ -68,22 +77,30 @@ class SlamAlignment:
         return Trajectory(trajectory.timestamps, R, self.points(trajectory.t_world_body))
 
     def checks(
-        self, moved_m: Float[Tensor, "mark"], turned_deg: Sequence[float], limits: AlignmentLimits = AlignmentLimits()
+        self,
+        moved_m: Float[Tensor, "mark"] | None = None,
+        turned_deg: Sequence[float] = (),
+        limits: AlignmentLimits = AlignmentLimits(),
     ) -> list[StepCheck]:
-        """Quality checks of the camera's four positions; `moved_m` and `turned_deg` as from `mark_positions`."""
+        """Quality checks; `moved_m` and `turned_deg` as from `mark_positions`, where the camera was on the board."""
         still = "Let go of the camera, or give a stretch in which it rests."
         ruler = "Measure |C1 C2| and |C3 C4| again, and check which position is which."
         rows = []
-        for name, moved, turned in zip(MARKS, moved_m.tolist(), turned_deg):
+        for name, moved, turned in zip(MARKS, [] if moved_m is None else moved_m.tolist(), turned_deg):
             rows.append(StepCheck(f"camera on {name}", "moves", moved, limits.mark_still_m, "m", still))
             rows.append(StepCheck(f"camera on {name}", "turns", turned, limits.mark_still_deg, "°", still))
         axes = "Put C1 and C2 on the y axis, C3 and C4 on the x axis."
-        for check in (
-            ("scales by the two distances differ", 100 * self.scale_spread, 100 * limits.scale_spread, "%", ruler),
-            ("axes miss a right angle", self.corner_deg, limits.corner_deg, "°", axes),
-            ("residual", self.residual_m, limits.residual_m, "m", ruler),
+        more = "Walk with turns for half a minute, or look at more of the floor."
+        step = "camera on the board" if self.corner_deg is not None else "camera's scale and vertical"
+        for what, measured, factor, limit, unit, fix in (
+            ("scales by the two distances differ", self.scale_spread, 100, limits.scale_spread, "%", ruler),
+            ("axes miss a right angle", self.corner_deg, 1, limits.corner_deg, "°", axes),
+            ("residual", self.residual_m, 1, limits.residual_m, "m", ruler),
+            ("deviation of the scale", self.scale_std, 100, limits.scale_std, "%", more),
+            ("deviation of the vertical", self.gravity_std_deg, 1, limits.gravity_std_deg, "°", more),
         ):
-            rows.append(StepCheck("camera on the board", *check))
+            if measured is not None:
+                rows.append(StepCheck(step, what, factor * measured, factor * limit, unit, fix))
         return rows
 
 

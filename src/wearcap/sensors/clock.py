@@ -3,6 +3,7 @@ swings, the times of the highest forearm against those of the hands nearest to t
 more reliable than claps, whose impact may disturb a wrist sensor).
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -99,6 +100,16 @@ def fit_clock(
     clock = Clock(*knots, drift_s_per_hour=3600 * rate, residual_s=0.0, claps=len(suit))
     off = torch.from_numpy(camera) - clock.to_camera(torch.from_numpy(suit))
     return replace(clock, residual_s=off.square().mean().sqrt().item())
+
+
+def require_overlap(times: Mapping[str, Float64[Tensor, "_"]], fix: str, least_s: float = 1.0) -> None:
+    """Raise WearcapError, with all spans, unless streams share at least `least_s` seconds of one clock."""
+    spans = {name: (stamps[0].item(), stamps[-1].item()) for name, stamps in times.items() if len(stamps)}
+    shared = min(stop for _, stop in spans.values()) - max(start for start, _ in spans.values())
+    if shared < least_s:
+        listed = ", ".join(f"{name} from {start:.2f} to {stop:.2f} s" for name, (start, stop) in spans.items())
+        what = f"{listed}: they share {max(shared, 0):.2f} s"
+        raise WearcapError(what, where="logs", expected="logs of one session on one clock", fix=fix)
 
 
 def retime(recording: Recording, clock: Clock) -> Recording:

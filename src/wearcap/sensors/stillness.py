@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -10,12 +11,14 @@ from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.geometry.trajectory import Trajectory, resample
+from wearcap.geometry.trajectory import Trajectory, find_gaps, resample
 
 Stretch = tuple[float, float]
 """Start and stop time (s, on the log's clock)."""
 _LOOK_S = 0.5
 """Interval over which rotation is measured: it averages out gyroscope noise, but not a hand's tremor."""
+
+_GAP_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,12 @@ def unstillness_deg(R: Float[Tensor, "time 3 3"]) -> float:
 def still_intervals(
     timestamps: Float64[Tensor, "time"], R: Float[Tensor, "time 3 3"], min_s: float = 2.0, still_deg: float = 4.0
 ) -> list[Stretch]:
-    """Stretches during which a sensor turns by less than `still_deg` in any half second, their ends trimmed."""
+    """Stretches during which a sensor turns by less than `still_deg` in any half second, their ends trimmed; none spans a
+    gap of `_GAP_S`, so that no grid is longer than the samples make it."""
+    if len(gaps := find_gaps(timestamps, _GAP_S)):
+        edges = [0, *(gaps + 1).tolist(), len(timestamps)]
+        parts = [slice(first, last) for first, last in pairwise(edges)]
+        return [one for part in parts for one in still_intervals(timestamps[part], R[part], min_s, still_deg)]
     if len(timestamps) < 2 or timestamps[-1] - timestamps[0] < max(min_s, _LOOK_S):
         return []
     at = torch.arange(timestamps[0].item(), timestamps[-1].item() - _LOOK_S, 0.05, dtype=torch.float64)

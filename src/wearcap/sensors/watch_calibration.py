@@ -20,6 +20,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import roma
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
@@ -28,11 +29,13 @@ from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry import rotation
-from wearcap.geometry.rotation import quat_wxyz_from_matrix
-from wearcap.geometry.trajectory import Trajectory
-from wearcap.recording.recording import FloorTrack, ImuStream, Recording
+from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
+from wearcap.geometry.trajectory import Trajectory, interpolate
+from wearcap.io.formats.bounded import understood
+from wearcap.io.formats.text import read_json_object
+from wearcap.recording.recording import FloorTrack, HeadStream, ImuStream, PointCloud, Recording
 from wearcap.sensors.camera_alignment import HeadMount, SlamAlignment
-from wearcap.sensors.clock import SwingClock, fit_swing_clock, swing_peaks
+from wearcap.sensors.clock import Clock, SwingClock, fit_swing_clock, swing_peaks
 from wearcap.sensors.stillness import StepCheck, Stretch, during, require, still_intervals, unstillness_deg
 from wearcap.sensors.watches import require_sides
 
@@ -265,8 +268,14 @@ class WatchSession:
         clock = replace(clock, camera_s=clock.camera_s + self.camera_zero, suit_s=clock.suit_s + self.watch_zero)
         return SwingClock(clock, found.std_s)
 
-    def added_to(self, recording: Recording, found: WornCalibration) -> Recording:
-        """The recording with the calibrated streams; z = 0 of its world is the floor the wearer stands on: MocapEvery's h_0."""
+    def added_to(
+        self, recording: Recording, found: WornCalibration, points_slam: Float[Tensor, "point 3"] | None = None
+    ) -> Recording:
+        """The recording with the calibrated streams; z = 0 of its world is the floor the wearer stands on: MocapEvery's h_0.
+
+        Points of the camera's SLAM, else those that the recording has beside a head stream, come into the same world.
+        Raises WearcapError for a recording whose head stream is not that of the camera.
+        """
         imu = {joint: found.watches[joint].apply(stream) for joint, stream in self.watches.items()}
         for joint, clock in found.clocks.items():
             imu[joint] = replace(imu[joint], timestamps=clock.clock.to_camera(self.watches[joint].timestamps))
@@ -274,12 +283,45 @@ class WatchSession:
         if self.slam is None or found.camera is None or found.head is None:
             return recording
         head = found.head.apply(found.camera.apply(self.slam))
+        points = recording.points
+        if points_slam is not None:
+            points = PointCloud(found.camera.points(points_slam))
+        elif points is not None and recording.head is not None:
+            points = replace(points, points_world=_moved_along(points.points_world, recording.head, head))
         floor = recording.floor or FloorTrack(head.timestamps[:1], torch.zeros(1))
-        return replace(recording, head=head, floor=floor)
+        return replace(recording, head=head, points=points, floor=floor)
 
 
 _WATCH = ("R_world_ref", "R_joint_imu", "board_still_deg", "board_tilt_deg", "pose_still_deg")
-_CAMERA = ("scale", "residual_m", "scale_spread", "corner_deg", "R_world_slam", "t_world_slam")
+_SAME_PATH_M = 0.05
+
+
+def _moved_along(points: Float[Tensor, "point 3"], before: HeadStream, after: HeadStream) -> Float[Tensor, "point 3"]:
+    """Points of the world of one head stream in that of another of the same head: by the similarity of the two paths."""
+    start, stop = (
+        pick(a, b)
+        for pick, a, b in (
+            (max, before.timestamps[0], after.timestamps[0]),
+            (min, before.timestamps[-1], after.timestamps[-1]),
+        )
+    )
+    at = after.timestamps[(after.timestamps >= start) & (after.timestamps <= stop)]
+    fix = "Give the camera's own points: points=CLOUD.ply."
+    if len(at) < 10:
+        what = "the recording's points cannot be brought into the calibrated world: its head stream is of another time"
+        raise WearcapError(what, expected="the path that the camera has", fix=fix)
+    x, y = (interpolate(head.timestamps, head.t_world_device.double(), at) for head in (before, after))
+    similarity: Any = roma.rigid_points_registration(x, y, compute_scaling=True)
+    R, t, scale = similarity
+    off = (scale * x @ R.mT + t - y).square().sum(-1).mean().sqrt().item()
+    if not off < _SAME_PATH_M:
+        what = f"the recording's points cannot be brought into the calibrated world: its head's path is {off:.2f} m off"
+        raise WearcapError(what, expected=f"at most {_SAME_PATH_M} m", fix=fix)
+    return (scale * points.double() @ R.mT + t).to(points.dtype)
+
+
+_QUALITY = ("residual_m", "scale_spread", "corner_deg", "scale_std", "gravity_std_deg")
+_CAMERA = ("scale", *_QUALITY, "R_world_slam", "t_world_slam")
 
 
 def write_watch_calibration(
@@ -313,7 +355,55 @@ def _row(one: object, names: Sequence[str]) -> dict[str, Any]:
     row = {}
     for name in names:
         value = getattr(one, name)
+        if value is None:
+            continue
         if name.startswith("R_"):
             name, value = f"{name}_wxyz", quat_wxyz_from_matrix(value.double())
         row[name] = value.tolist() if isinstance(value, Tensor) else value
     return row
+
+
+def read_watch_calibration(path: str | Path) -> WornCalibration:
+    """What `write_watch_calibration` wrote. Raises WearcapError for a file that is no calibration."""
+    content = read_json_object(path)
+    with understood("not a calibration of watches", path, "the file of wearcap calibrate steps=watches"):
+        watches = {
+            joint: WatchCalibration(
+                joint, *_tensors(row, _WATCH[:2], torch.float32), *(float(row[k]) for k in _WATCH[2:])
+            )
+            for joint, row in content["watches"].items()
+        }
+        clocks = {joint: _clock(row) for joint, row in content.get("clocks", {}).items()}
+        camera, head = content.get("camera"), content.get("head")
+        if camera is not None:
+            R, t = _tensors(camera, ("R_world_slam", "t_world_slam"), torch.float64)
+            quality = {name: float(camera[name]) for name in _QUALITY if name in camera}
+            camera = SlamAlignment(float(camera["scale"]), R, t, **quality)
+            if not (0 < camera.scale < 1e6 and bool(t.isfinite().all())):
+                raise ValueError("a scale or place of the camera that is no number")
+        if head is not None:
+            R, t = _tensors(head, ("R_head_cam", "t_head_cam"), torch.float32)
+            head = HeadMount(R, t, float(head["still_deg"]))
+        if set(watches) != set(WRISTS):
+            raise ValueError(f"watches on {', '.join(watches) or 'nothing'}")
+        return WornCalibration(watches, clocks, camera, head)
+
+
+def _clock(row: dict[str, Any]) -> SwingClock:
+    knots = [torch.tensor([float(value) for value in row[key]], dtype=torch.float64) for key in ("camera_s", "watch_s")]
+    if not len(knots[0]) or len(knots[0]) != len(knots[1]) or not bool(torch.cat(knots).isfinite().all()):
+        raise ValueError("a clock without knots")
+    drift, residual = float(row["drift_s_per_hour"]), float(row["residual_s"])
+    return SwingClock(Clock(*knots, drift, residual, int(row["swings"])), float(row["std_s"]))
+
+
+def _tensors(row: dict[str, Any], names: Sequence[str], dtype: torch.dtype) -> list[Tensor]:
+    """Rotations of unit quaternions, scalar first, and vectors."""
+    found = []
+    for name in names:
+        key, size = (f"{name}_wxyz", 4) if name.startswith("R_") else (name, 3)
+        value = torch.tensor([float(number) for number in row[key]], dtype=torch.float64)
+        if value.shape != (size,) or not value.isfinite().all() or (size == 4 and abs(value.norm() - 1) > 0.01):
+            raise ValueError(f"{key} of {row[key]}"[:100])
+        found.append((matrix_from_quat_wxyz(value) if size == 4 else value).to(dtype))
+    return found

@@ -27,8 +27,8 @@ def watches_at(
     """Orientation and filtered free acceleration (m/s²) of the wrist joints at evenly spaced times.
 
     Orientations are interpolated by slerp; accelerations are averaged over each frame, then over 7 frames. Raises
-    WearcapError for a watch that is missing, has gaps, or lacks orientation or acceleration; warns of watches that may be
-    worn on the wrong arms.
+    WearcapError for a watch that is missing or lacks orientation or acceleration; warns of gaps, during which a watch is
+    taken as static, and of watches that may be worn on the wrong arms.
     """
     worn = []
     for joint in WRISTS:
@@ -50,24 +50,51 @@ def watches_at(
             expected = f"{timestamps[0].item():.2f} s to {timestamps[-1].item():.2f} s, as the camera did"
             fix = "Put both on one clock (wearcap calibrate), or cut the recording to what they share."
             raise WearcapError(what, where=place, expected=expected, fix=fix)
-        gaps = find_gaps(times, MAX_GAP_S)
-        inside = [g for g in gaps.tolist() if times[g + 1] > timestamps[0] and times[g] < timestamps[-1]]
-        if inside:
-            first = inside[0]
-            raise WearcapError(
-                f"the watch is silent, or its clock jumps, for {steps[first].item():.2f} s at {times[first].item():.2f} s "
-                f"({len(inside)} such gaps)",
-                where=place,
-                expected=f"no gap above {MAX_GAP_S} s",
-                fix="Cut the recording there.",
-            )
-        worn.append(stream)
+        worn.append(bridged(stream))
+    for gap in watch_gaps(streams, timestamps):
+        warnings.warn(f"{where}: {gap}", stacklevel=2)
     step = timestamps.diff().median().item() if len(timestamps) > 1 else 0.0
     frames = torch.arange(-(FILTER // 2), len(timestamps) + FILTER // 2).clamp(0, len(timestamps) - 1)
     R_world_wrist, acc_world = filtered(worn, timestamps, timestamps[frames], step)
     if _point_up(R_world_wrist):  # as do 9 of CMU's 165 training recordings, with raised arms: no ground for refusal
         warnings.warn(f"{where}: forearms point up most of the time: raised arms, or swapped watches", stacklevel=2)
     return R_world_wrist, acc_world
+
+
+def bridged(stream: ImuStream) -> ImuStream:
+    """The stream with its gaps longer than `MAX_GAP_S` filled as streaming captures do: last orientation, no acceleration."""
+    gaps = find_gaps(stream.timestamps, MAX_GAP_S)
+    if not len(gaps):
+        return stream
+    times, step = stream.timestamps, stream.timestamps.diff().median()
+    edge = torch.minimum(step, (times[gaps + 1] - times[gaps]) / 4)
+    added = torch.stack([times[gaps] + edge, times[gaps + 1] - edge], 1).flatten()
+    order = torch.cat([times, added]).argsort()
+    rows = torch.cat([torch.arange(len(times)), gaps.repeat_interleave(2)])[order]
+    acc = stream.acc_world
+    if acc is not None:
+        acc = torch.cat([acc, acc.new_zeros(len(added), 3)])[order]
+    R = None if stream.R_world_imu is None else stream.R_world_imu[rows]
+    return ImuStream(torch.cat([times, added])[order], stream.joint, R, acc, R_joint_imu=stream.R_joint_imu)
+
+
+def watch_gaps(streams: Mapping[str, ImuStream], timestamps: Float64[Tensor, "time"]) -> list[str]:
+    """A sentence for each watch that is silent while the camera records."""
+    found = []
+    for joint, stream in streams.items():
+        times = stream.timestamps
+        inside = [
+            g
+            for g in find_gaps(times, MAX_GAP_S).tolist()
+            if times[g + 1] > timestamps[0] and times[g] < timestamps[-1]
+        ]
+        if inside:
+            silent_s = sum((times[g + 1] - times[g]).item() for g in inside)
+            found.append(
+                f"the watch on {joint} is silent, or its clock jumps, {len(inside)} times for {silent_s:.2f} s in all, first "
+                f"at {times[inside[0]].item():.2f} s: taken as static there"
+            )
+    return found
 
 
 def filtered(

@@ -204,9 +204,11 @@ class Page(ServedPage):
         gui, clock = self.server.gui, self.timeline
         gui.add_markdown(f"**{recording.name}**  \n{recording.activity or recording.source}")
         self._play = gui.add_button("Play")
-        self._slider = gui.add_slider(
-            "Time (s)", min=clock.start, max=max(clock.stop, clock.start + 1e-3), step=0.01, initial_value=clock.start
-        )
+        longest = max(clock.stop - clock.start, 1e-3)
+        self._slider = gui.add_slider("Time (s)", min=0.0, max=longest, step=0.01, initial_value=0.0)
+        self._device_time = None
+        if clock.start != 0.0:
+            self._device_time = gui.add_text("Device's clock (s)", f"{clock.start:.2f}", disabled=True)
         self._speed = gui.add_dropdown("Speed", SPEEDS, initial_value="1×")
         self._follow = gui.add_checkbox("Follow with the camera", initial_value=False)
         # The surroundings of one motion would overlap the others where these are shown side by side.
@@ -235,8 +237,14 @@ class Page(ServedPage):
 
     def jump(self, seconds: float) -> None:
         self.timeline.seek(self.timeline.time + seconds)
-        self._slider.value = self.timeline.time
+        self._show_time()
         self.show()
+
+    def _show_time(self) -> None:
+        """Move the slider, which counts from the start, and name the device's own time."""
+        self._slider.value = self.timeline.time - self.timeline.start
+        if self._device_time is not None:
+            self._device_time.value = f"{self.timeline.time:.2f}"
 
     def _layouts(self) -> tuple[str, ...]:
         return (OVER, BESIDE, *self.bodies)
@@ -254,7 +262,8 @@ class Page(ServedPage):
     def scrubbed(self, event: viser.GuiEvent) -> None:
         """Seek to the slider's time, if a person moved it and not the page while playing."""
         if event.client is not None:
-            self.timeline.seek(self._slider.value)
+            self.timeline.seek(self.timeline.start + self._slider.value)
+            self._show_time()
             self.show()
 
     def show(self) -> None:
@@ -289,7 +298,7 @@ class Page(ServedPage):
                 self.show()
                 shown += 1
                 if shown % 6 == 0:  # the slider need not be as smooth as the body
-                    self._slider.value = self.timeline.time
+                    self._show_time()
             last = now
             wall.sleep(max(0.0, 1 / UPDATES_PER_S - (wall.monotonic() - now)))
 

@@ -1,7 +1,11 @@
 """Pictures and videos without a screen: ground truth and captures side by side, shaded, with contacts; a head's path."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+import math
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -27,6 +31,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.recording.motion import HANDS, Motion
 from wearcap.recording.recording import Recording
 from wearcap.scene.objects import Environment
+from wearcap.viewer.camera_path import KEY_S, azimuths, smoothed
 from wearcap.viewer.page_layers import by_height, lit_points, posed_meshes, stick_body
 
 PALETTE = np.array([[0.45, 0.55, 0.66], [0.86, 0.55, 0.30], [0.44, 0.62, 0.42], [0.62, 0.45, 0.62]])
@@ -36,9 +41,12 @@ CONTACT_COLOR = np.array([0.80, 0.18, 0.12])
 HOLD_COLOR = np.array([0.20, 0.62, 0.25])
 TILES = np.array([[0.90, 0.90, 0.89], [0.80, 0.81, 0.82]])
 SKY = (0.965, 0.97, 0.975)
-VIEW = (-0.62, 0.78)
-"""Direction in which the camera looks at someone facing +x: from the front left."""
+VIEW_RAD, TILT, DISTANCE_M = math.atan2(0.78, -0.62), -0.30, 4.2
+"""Azimuth of the direction in which the camera looks, from the front left at someone facing +x, its vertical part beside a
+horizontal part of 1, and the camera's distance from the person."""
 PATH_COLOR, LOOK_COLOR = (0.85, 0.35, 0.12), (0.15, 0.35, 0.70)
+CUT_AWAY_M = 0.75
+"""Objects that stand between the camera and the person, nearer to it by more than this (m), are not drawn."""
 LOOKS = 12
 """Number of viewing directions drawn along the path."""
 HEIGHT_COLORS = ((0.35, 0.45, 0.55), (0.80, 0.68, 0.45))
@@ -58,7 +66,7 @@ class _Actor:
     """Objects that are drawn at the poses of the motion's `object_motion`."""
 
     def meshes(self, frame: int) -> list[Mesh]:
-        """Body, marks of feet in contact, contact points (without them: marks of hands in contact), and objects."""
+        """Body, marks of feet in contact, contact points (without them: marks of hands in contact)."""
         T = self.motion.T_world_joint[frame]
         vertices = self.body.vertices(T).detach().numpy().astype(np.float32)
         body = Mesh(vertices, self.body.faces.numpy().astype(np.int32), self.color.astype(np.float32), smooth=True)
@@ -69,10 +77,20 @@ class _Actor:
         else:
             lit = lit_points(self._points, self.motion, frame)
             touching = [] if lit is None else [lit]
+        return [body, *feet, *touching]
+
+    def objects(self, frame: int) -> list[Mesh]:
+        """Objects of the environment where the motion has them."""
         if self.environment is None:
-            return [body, *feet, *touching]
-        objects = posed_meshes(self.environment, self.motion.object_motion or {}, self.motion.timestamps[frame].item())
-        return [body, *feet, *touching, *objects]
+            return []
+        return posed_meshes(self.environment, self.motion.object_motion or {}, self.motion.timestamps[frame].item())
+
+    def azimuths(self, frames: Sequence[int], distance: float) -> Float[np.ndarray, "frame"]:
+        """Azimuths (rad) from which objects hide as little of the body as may be, over a sequence of frames."""
+        if self.environment is None:
+            return np.full(len(frames), VIEW_RAD)
+        bodies = [self.motion.T_world_joint.t[frame].double().numpy() for frame in frames]
+        return azimuths(bodies, [self.objects(frame) for frame in frames], VIEW_RAD, TILT, distance)
 
     @cached_property
     def _points(self) -> BodyModel:
@@ -133,16 +151,35 @@ def _panel(
     size: tuple[int, int],
     *,
     supersample: int = 2,
-    distance: float = 4.2,
+    distance: float = DISTANCE_M,
+    azimuth: float = VIEW_RAD,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """One actor at one frame, on a chequered floor."""
-    camera, T_world_cam = _looking((*VIEW, -0.30), target, distance, size, 1.75 * min(size[1], size[0] * 1.3))
+    """One actor at one frame, on a chequered floor, seen in the direction of an azimuth (rad)."""
+    direction, focal = (math.cos(azimuth), math.sin(azimuth), TILT), 1.75 * min(size[1], size[0] * 1.3)
+    camera, T_world_cam = _looking(direction, target, distance, size, focal)
     ground = np.array([target[0], target[1], actor.floor_z])
     stage = checker_floor(ground, 3.0, 0.5, TILES, np.array(SKY))
     below = (float(target[0]), float(target[1]), float(ground[2]))
     light = Light(to_light=(0.55, -0.35, 1.0), shadow_center=below, shadow_radius=1.6)
-    meshes = [*actor.meshes(frame), stage]
+    objects = [_visible(mesh, camera, T_world_cam, distance - CUT_AWAY_M) for mesh in actor.objects(frame)]
+    meshes = [*actor.meshes(frame), *(mesh for mesh in objects if mesh is not None), stage]
     return render(camera, T_world_cam, meshes, light=light, background=SKY, supersample=supersample).color
+
+
+def _visible(mesh: Mesh, camera: Camera, T_world_cam: Rigid, nearest_m: float) -> Mesh | None:
+    """The faces of a mesh that reach farther from the camera than a distance (m); None for a mesh outside the picture."""
+    R, t = T_world_cam.R.double().numpy(), T_world_cam.t.double().numpy()
+    in_cam = (mesh.vertices - t) @ R
+    low, high = in_cam.min(0), in_cam.max(0)
+    (x, y, depth), radius = (low + high) / 2, 0.5 * float(np.linalg.norm(high - low))
+    wide, tall = camera.width / (2 * camera.fx), camera.height / (2 * camera.fy)
+    outside = max(abs(x) - wide * depth, abs(y) - tall * depth) > radius * (1 + max(wide, tall))
+    faces = mesh.faces[in_cam[mesh.faces, 2].max(1) > nearest_m]
+    if outside or not len(faces):
+        return None
+    if mesh.color.ndim == 2 and len(mesh.color) == len(mesh.faces):  # coloured by face
+        return mesh if len(faces) == len(mesh.faces) else None
+    return mesh if len(faces) == len(mesh.faces) else replace(mesh, faces=faces)
 
 
 def contact_sheet(
@@ -153,7 +190,7 @@ def contact_sheet(
     size: tuple[int, int] = (200, 240),
     body: BodyModel | None = None,
     environment: Environment | None = None,
-    distance: float = 4.2,
+    distance: float = DISTANCE_M,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Frames of motions on a shared clock, one row per motion, with the camera following the first motion's root.
 
@@ -173,10 +210,10 @@ def contact_sheet(
     sheet = Image.new("RGB", (width * min(columns, len(frames)), height * len(shown) * len(bands)), "white")
     for band, chosen in enumerate(bands):
         for column, frame in enumerate(chosen):
-            target = _focus(shown[0].motion, frame)
+            target, (azimuth,) = _focus(shown[0].motion, frame), shown[0].azimuths([frame], distance)
             for row, (actor, clock) in enumerate(zip(shown, clocks)):
                 nearest = frame if row == 0 else int(np.abs(clock - clocks[0][frame]).argmin())
-                image = _panel(actor, nearest, target, size, distance=distance)
+                image = _panel(actor, nearest, target, size, distance=distance, azimuth=azimuth)
                 seconds = clock[nearest] - clocks[0][0]
                 text = f"{actor.label}  {seconds:.2f} s" if column == 0 else f"{seconds:.2f} s"
                 sheet.paste(captioned(image, text), (column * width, (band * len(shown) + row) * height))
@@ -276,14 +313,36 @@ def write_video(
     clocks = [actor.motion.timestamps.numpy() for actor in shown]
     with atomic_path(path) as temporary, av.open(str(temporary), "w", format="mp4") as container:
         codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"  # H.264 where PyAV was built with it
-        stream = container.add_stream(codec, rate=round(fps))
+        stream = container.add_stream(
+            codec, rate=round(fps), options={"preset": "veryfast"} if codec == "libx264" else {}
+        )
         assert isinstance(stream, av.VideoStream)
         stream.width, stream.height, stream.pix_fmt = size[0] * len(shown), size[1], "yuv420p"
-        for time in track(times, f"video {Path(path).name}", console=Console(stderr=True)):
+        keys = times[:: max(round(KEY_S * fps), 1)]
+        turned = shown[0].azimuths([int(np.abs(clocks[0] - time).argmin()) for time in keys], DISTANCE_M)
+        looks = dict(zip(times.tolist(), smoothed(turned, keys, times)))
+
+        def drawn(time: float) -> UInt8[np.ndarray, "height width 3"]:
             frames = [int(np.abs(clock - time).argmin()) for clock in clocks]
             target = _focus(shown[0].motion, frames[0])
-            images = [_panel(actor, frame, target, size, supersample=1) for actor, frame in zip(shown, frames)]
-            panels = [np.asarray(captioned(image, actor.label)) for image, actor in zip(images, shown)]
-            picture = av.VideoFrame.from_ndarray(np.concatenate(panels, 1), format="rgb24")
-            container.mux(stream.encode(picture))
+            look = {"supersample": 1, "azimuth": looks[time]}
+            images = [_panel(actor, frame, target, size, **look) for actor, frame in zip(shown, frames)]
+            return np.concatenate([np.asarray(captioned(image, actor.label)) for image, actor in zip(images, shown)], 1)
+
+        about, console = f"video {Path(path).name}", Console(stderr=True)
+        for picture in track(_in_parallel(drawn, times.tolist()), about, len(times), console=console):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         container.mux(stream.encode(None))
+
+
+def _in_parallel(draw: Callable[[float], np.ndarray], times: Iterable[float]) -> Iterator[np.ndarray]:
+    """Pictures of all times in order, drawn by a thread per core (the renderer releases the GIL), few ahead of their use."""
+    workers = os.cpu_count() or 1
+    with ThreadPoolExecutor(workers) as pool:
+        ahead: deque[Future[np.ndarray]] = deque()
+        for time in times:
+            ahead.append(pool.submit(draw, time))
+            if len(ahead) > 2 * workers:
+                yield ahead.popleft().result()
+        while ahead:
+            yield ahead.popleft().result()

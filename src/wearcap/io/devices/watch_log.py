@@ -1,11 +1,13 @@
-"""Motion logs of a watch: SensorLog's CSV, and Sensor Logger's or Apple Watch's WristMotion.csv (MocapEvery §4.2).
+"""Motion logs of a watch: SensorLog's CSV, and Sensor Logger's or Apple Watch's WristMotion.csv (MocapEvery §4.2); and
+x-IMU3's Inertial.csv (degrees a second, g) with Quaternion.csv beside.
 
-Both hold Core Motion's output: attitude, turn rate, the direction of gravity and the acceleration without it. The
+The watches' hold Core Motion's output: attitude, turn rate, the direction of gravity and the acceleration without it. The
 conventions of a file are inferred from its values: the unit from the length of gravity, the direction of the attitude
 (watch to world or back) from which of the two turns gravity upright, and the sign from whether gravity points down
 (Core Motion, whose accelerations have the sign reversed: at rest it reports -1 g along the axis that is up) or up.
 """
 
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 
@@ -15,8 +17,10 @@ import torch
 from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import matrix_from_quat_wxyz
+from wearcap.geometry.trajectory import slerp
 from wearcap.io.formats.bounded import understood
 from wearcap.io.formats.csv_table import read_columns, read_header
+from wearcap.io.formats.poses import check_finite
 from wearcap.recording import ImuStream
 
 G_M_S2 = 9.80665
@@ -37,6 +41,9 @@ _SENSOR_LOG = {
     "quaternion": [f"motionQuaternion{axis}(R)" for axis in "WXYZ"],
 }
 
+_X_IMU = [f"{name} {axis} ({unit})" for name, unit in (("Gyroscope", "deg/s"), ("Accelerometer", "g")) for axis in _XYZ]
+_X_QUATERNION = {"W", "X", "Y", "Z"}
+
 
 def read_watch_log(path: str | Path, joint: str) -> ImuStream:
     """A watch's stream: attitude in a world with z up, free acceleration there (m/s²), specific force, turn rate.
@@ -47,6 +54,12 @@ def read_watch_log(path: str | Path, joint: str) -> ImuStream:
     """
     if joint not in WRISTS:
         raise WearcapError(f"a watch on {joint!r}", path, " or ".join(WRISTS))
+    if set(_X_IMU) & set(read_header(path)):
+        stream = read_inertial_log(path, joint)
+        if stream.acc_world is None:
+            fix = "Put the sensor's Quaternion.csv beside its Inertial.csv."
+            raise WearcapError("a sensor's log without orientation", path, "attitude and acceleration", fix)
+        return stream
     seconds, parts = _columns(path)
     _require_times(seconds, path)
     for name, values in parts.items():
@@ -83,6 +96,66 @@ def read_watch_log(path: str | Path, joint: str) -> ImuStream:
         acc_imu=torch.from_numpy(felt).float(),
         gyro_imu=turn,
     )
+
+
+def is_watch_log(path: str | Path) -> bool:
+    """Whether a CSV has the header of one of these logs; raises WearcapError for a file that cannot be opened."""
+    try:
+        header = set(read_header(path))
+    except WearcapError:
+        if Path(path).is_file():
+            return False
+        raise
+    return bool(header & {"quaternionW", "motionQuaternionW(R)", _X_IMU[-1]} or header >= _X_QUATERNION)
+
+
+def read_inertial_log(path: str | Path, joint: str) -> ImuStream:
+    """x-IMU3's log of one sensor: Inertial.csv, Quaternion.csv, or each with the other beside; times count from its start.
+
+    What no file has is None; free acceleration needs both. Raises WearcapError as `read_watch_log` does.
+    """
+    path = Path(path)
+    header = set(read_header(path))
+    inertial = path if _X_IMU[-1] in header else path.with_name("Inertial.csv")
+    quaternion = path if header >= _X_QUATERNION else path.with_name("Quaternion.csv")
+    seconds, R, turn, felt = None, None, None, None
+    if inertial.is_file():
+        seconds, table = _x_table(inertial, _X_IMU)
+        turn, felt = torch.from_numpy(np.deg2rad(table[:, :3])).float(), torch.from_numpy(G_M_S2 * table[:, 3:])
+    if quaternion.is_file():
+        times, table = _x_table(quaternion, ("W", "X", "Y", "Z"))
+        norm = np.linalg.norm(table, axis=1)
+        if (np.abs(norm - 1) > 0.01).any():
+            row = int(np.argmax(np.abs(norm - 1)))
+            raise WearcapError(f"attitude of length {norm[row]:.3g} in row {row}", quaternion, "1")
+        R = matrix_from_quat_wxyz(torch.from_numpy(table))
+        if seconds is not None:
+            times = torch.from_numpy(times)
+            at = torch.from_numpy(seconds).clamp(times[0].item(), times[-1].item())
+            R = slerp(times, R, at)
+        else:
+            seconds = times
+    assert seconds is not None, "one of the two is the given file"
+    free = None
+    if R is not None and felt is not None:
+        free = (R @ felt[..., None])[..., 0] - torch.tensor([0.0, 0.0, G_M_S2])
+        upright = (torch.nn.functional.normalize(felt, dim=-1)[..., None] * R.mT[:, :, 2:]).sum((1, 2)).mean().item()
+        if upright < 0.8:
+            fix = "The attitude turns the sensor into a world with z up; take both files of one recording."
+            raise WearcapError(f"gravity is {upright:.2f} upright by the attitude", path, "0.8 or more", fix)
+    parts = [None if part is None else part.float() for part in (R, free, felt)]
+    return ImuStream(torch.from_numpy(seconds), joint, parts[0], parts[1], parts[2], turn)
+
+
+def _x_table(path: Path, columns: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Times (s) and columns of a file of x-IMU3."""
+    time = next((name for name in read_header(path) if name.startswith(("Time (", "Timestamp ("))), "Timestamp (us)")
+    table = read_columns(path, [time, *columns])
+    values = np.stack([table[name] for name in columns], 1)
+    check_finite({"time": table[time], "values": values}, path)
+    seconds = table[time] * (1e-6 if "(us)" in time else 1.0)
+    _require_times(seconds, path)
+    return seconds, values
 
 
 def _columns(path: str | Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:

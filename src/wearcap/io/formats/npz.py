@@ -1,4 +1,4 @@
-"""Arrays from untrusted .npz files: no pickles, no sizes that the file cannot hold."""
+"""Arrays from untrusted .npz and .npy files: no pickles, no sizes that the file cannot hold."""
 
 import io
 import lzma
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from wearcap.errors import WearcapError
-from wearcap.io.formats.bounded import Budget, file_size, understood
+from wearcap.io.formats.bounded import Budget, file_size, read_bytes, understood
 
 MAX_BYTES = 1 << 32
 """Largest total size of the arrays that are read from one file (4 GiB)."""
@@ -49,6 +49,13 @@ def read_npz(
             with readable(".npz", where, "arrays saved by NumPy"), archive.open(members[name]) as file:
                 arrays[name] = _read_array(file, members[name].file_size, where, budget)
         return arrays
+
+
+def read_npy(path: str | Path, max_bytes: int | None = None) -> np.ndarray:
+    """The array of an .npy file. Raises WearcapError as `read_npz` does."""
+    content = read_bytes(path, max_bytes, MAX_BYTES)
+    with readable(".npy", path, "an array saved by NumPy"):
+        return _read_array(io.BytesIO(content), len(content), str(path), Budget(path, len(content)))
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from wearcap.metrics.table import Row
 from wearcap.recording import Motion, Recording
 from wearcap.recording.acts import Act, true_acts
 from wearcap.runtime.graphs import chosen
+from wearcap.runtime.needs import HEAD, HEIGHT, TRACKED_WRISTS
 from wearcap.runtime.system import CaptureInput, LearnedSystem
 from wearcap.scene.objects import Environment
 from wearcap.systems.echo.contacts import ContactUse, GuidedScene, with_static_objects
@@ -78,6 +79,7 @@ class Echo(LearnedSystem):
     pipeline = "echo"
     experiment = "experiment=echo"
     shared = ("echo",)
+    required = (HEAD, TRACKED_WRISTS, HEIGHT)
     baselines = ()
 
     def __post_init__(self):

@@ -19,6 +19,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import Motion, PointCloud, Recording
+from wearcap.runtime.needs import HEAD, HEIGHT, POINTS
 from wearcap.runtime.system import CaptureInput, LearnedSystem
 from wearcap.scene.voxels import voxelize
 from wearcap.systems.hmd2.features import HeadFeatures
@@ -96,6 +97,7 @@ class HMD2(LearnedSystem):
     pipeline = "hmd2"
     experiment = "experiment=hmd2"
     shared = ("hmd2",)
+    required = (HEAD, POINTS, HEIGHT)
 
     def __post_init__(self):
         self._steps: StepRunner | None = None

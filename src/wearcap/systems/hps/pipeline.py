@@ -28,6 +28,7 @@ from wearcap.recording import Motion, Recording
 from wearcap.recording.growing import follow_pieces
 from wearcap.recording.recording import Localization
 from wearcap.recording.timing import resampled
+from wearcap.runtime.needs import CAMERA, CONTACTS, LOCALIZATION, SCAN, SUIT, Need
 from wearcap.runtime.stages import Stage, StagedSystem
 from wearcap.runtime.system import CaptureInput
 from wearcap.scene.scan import Scan
@@ -77,6 +78,12 @@ class HPS(StagedSystem):
     name: str = "hps"
     synchronization: Synchronization = field(default_factory=Synchronization)
     localization: Localize = field(default_factory=MapLocalization)
+
+    required = (SUIT, CONTACTS, CAMERA, LOCALIZATION, SCAN)
+
+    def needs(self) -> tuple[Need, ...]:
+        """All that is required; the scan only where a term of the energy reads it."""
+        return tuple(need for need in self.required if need is not SCAN or self.energy.reading("on_ground"))
 
     def stages(self, source: CaptureInput) -> list[Stage]:
         """The steps from a recording to the solution. Raises WearcapError without suit, head camera, localisation or

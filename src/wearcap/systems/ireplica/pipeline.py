@@ -17,6 +17,7 @@ from wearcap.metrics.objects import summary
 from wearcap.metrics.table import Row
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import resampled
+from wearcap.runtime.needs import CAMERA, CONTACTS, LOCALIZATION, OBJECTS, SCAN, SUIT
 from wearcap.runtime.stages import Stage, StagedSystem, run_stages
 from wearcap.runtime.system import CaptureInput
 from wearcap.scene.objects import Environment
@@ -50,6 +51,7 @@ class IReplica(StagedSystem):
     experiment = "experiment=contact_sequence, or of the contact transformers, one for each class"
     shared = ("contact_sequence",)
     joins_checkpoints = True
+    required = (SUIT, CONTACTS, CAMERA, LOCALIZATION, SCAN, OBJECTS)
 
     @classmethod
     def trained(cls, make: Callable[..., "IReplica"], checkpoints: Sequence[str | Path], device: str) -> "IReplica":

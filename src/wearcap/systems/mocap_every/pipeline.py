@@ -17,9 +17,10 @@ from wearcap.recording import Motion, Recording
 from wearcap.recording.recording import FloorTrack
 from wearcap.recording.timing import at_times
 from wearcap.runtime.graphs import Run, chosen, run_of
+from wearcap.runtime.needs import HEAD, HEIGHT, POINTS, WATCHES
 from wearcap.runtime.system import CaptureInput, LearnedSystem
 from wearcap.scene.floor import FloorFixed, FloorFollow, FloorFollower, FloorUpdate
-from wearcap.sensors.watches import watches_at
+from wearcap.sensors.watches import watch_gaps, watches_at
 from wearcap.systems.mocap_every.energy import LatentSolution
 from wearcap.systems.mocap_every.features import Sensed, WatchFeatures, synthetic_wrists
 from wearcap.systems.mocap_every.model import Estimate, WatchEstimator
@@ -84,6 +85,7 @@ class MocapEvery(LearnedSystem):
     pipeline = "mocap_every"
     experiment = "experiment=mocap_every"
     shared = ("mocap_every",)
+    required = (HEAD, WATCHES, POINTS, HEIGHT)
 
     def __post_init__(self):
         self._run: Run | None = None
@@ -105,7 +107,8 @@ class MocapEvery(LearnedSystem):
     def motions(self, sources: Sequence[CaptureInput], seeds: Sequence[int]) -> list[Motion]:
         """One motion per recording; the seeds have no effect.
 
-        Raises WearcapError for a recording without head poses, or whose watches are missing or silent.
+        Raises WearcapError for a recording without head poses, or whose watches are missing. A watch that is silent for a
+        while is taken as static, and the motion's note says so.
         """
         return [self.run(source.recording).motion for source in sources]
 
@@ -122,7 +125,9 @@ class MocapEvery(LearnedSystem):
         whole = FinalPoses(*(torch.cat(part)[frames] for part in zip(*output)))
         poses = path.timestamps, path.skeleton, whole.R_parent_joint, whole.t_world_root
         contact_prob = repeat(whole.contact_prob, "time foot -> time (foot patch)", patch=2)
-        motion = Motion(*poses, contact_prob, provenance=self.settings())
+        gaps = watch_gaps(recording.imu, path.timestamps)
+        about = self.settings() | ({"note": "; ".join(gaps)} if gaps else {})
+        motion = Motion(*poses, contact_prob, provenance=about)
         # 4. anchor the body to the measured head
         if self.anchor:
             motion = anchored_to_head(motion, path.T_world_head)

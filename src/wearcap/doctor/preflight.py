@@ -1,0 +1,121 @@
+"""Preflight: whether a recording has what a system needs, before anything slow runs."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from wearcap.body.skeleton import WRISTS
+from wearcap.doctor.report import Check, Finding
+from wearcap.errors import WearcapError
+from wearcap.recording import Recording
+from wearcap.runtime.needs import Need
+from wearcap.runtime.system import CaptureInput
+from wearcap.scene.floor import estimate_floor
+
+LEAST_OVERLAP = 0.9
+"""Least share of the head's or suit's span that every needed stream covers."""
+COVERED = 0.5
+"""Least share of the path below which points show a floor."""
+UNUSUAL_M = 0.10
+"""Difference of the head's usual height from that of the assumed body beyond which the wearer's height is doubtful."""
+_FLOOR_CONFIDENCE = 0.3
+
+
+def preflight(recording: Recording, folder: Path | None, name: str, needs: Sequence[Need]) -> list[Finding]:
+    """Findings on every need of the system called `name`: there or missing, time spans, floor below the path, height."""
+    source = CaptureInput(recording) if folder is None else CaptureInput.in_dataset(recording, folder)
+    findings = []
+    for need in needs:
+        check = Check(f"{name} needs: {need.what}")
+        if need.has(source):
+            findings.append(check.ok("there"))
+        else:
+            what = "missing" if need.required else "missing, and helps"
+            findings.append(check.found("error" if need.required else "warning", what, "", need.fix))
+    findings += _spans(recording, name, {need.stream for need in needs if need.stream})
+    if any(need.stream == "head" for need in needs):
+        findings += _floor(recording) + _height(recording)
+    return findings
+
+
+def _spans(recording: Recording, name: str, streams: set[str]) -> list[Finding]:
+    """Whether every needed stream covers the one that leads: the suit's motion, else the head's path."""
+    leads = next((part for part in ("suit", "head") if part in streams and getattr(recording, part) is not None), None)
+    if leads is None:
+        return []
+    reference = getattr(recording, leads).timestamps
+    check, findings = Check(f"{name}: overlap"), []
+    for other, times in _times(recording, streams - {leads}).items():
+        start, stop = max(times[0], reference[0]).item(), min(times[-1], reference[-1]).item()
+        span = (reference[-1] - reference[0]).item()
+        share = max(stop - start, 0.0) / max(span, 1e-9)
+        evidence = (
+            f"{leads} {reference[0].item():.2f} … {reference[-1].item():.2f} s, "
+            f"{other} {times[0].item():.2f} … {times[-1].item():.2f} s"
+        )
+        if share <= 0:
+            fix = "Bring both to one clock (wearcap calibrate), or take the logs of one session."
+            findings.append(check.error(f"{other} shares no time with {leads}", evidence, fix))
+        elif share < LEAST_OVERLAP:
+            fix = "Cut the recording to what all streams cover."
+            findings.append(check.warning(f"{other} covers {100 * share:.0f} % of {leads}", evidence, fix))
+        else:
+            findings.append(check.ok(f"{other} covers {100 * share:.0f} % of {leads}", evidence))
+    return findings
+
+
+def _times(recording: Recording, streams: set[str]) -> dict[str, Float64[Tensor, "_"]]:
+    found = {}
+    for part in sorted(streams):
+        value = getattr(recording, part)
+        parts = (
+            {joint: value[joint] for joint in WRISTS if joint in value} if isinstance(value, dict) else {part: value}
+        )
+        found |= {name: one.timestamps for name, one in parts.items() if one is not None and len(one.timestamps) > 1}
+    return found
+
+
+def _floor(recording: Recording) -> list[Finding]:
+    """Share of the head's path below which the points show a floor."""
+    head, points = recording.head, recording.points
+    if head is None or points is None or len(head.timestamps) < 2:
+        return []
+    check = Check("floor below the path")
+    # Every half second is enough, and quick.
+    step = max(1, round(0.5 / head.timestamps.diff().median().clamp_min(1e-3).item()))
+    path = head.t_world_device[::step]
+    covered, height = 0.0, None
+    with suppress(WearcapError):
+        found = estimate_floor(points.points_world, path)
+        covered = (found.confidence > _FLOOR_CONFIDENCE).double().mean().item()
+        height = (path[:, 2] - found.height).median().item()
+    evidence = f"{100 * covered:.0f} % of the path" + ("" if height is None else f", the head {height:.2f} m above it")
+    if covered < COVERED:
+        fix = "Look at the floor while walking; without it the floor follows from the head's height."
+        return [check.warning("points hardly show it", evidence, fix)]
+    return [check.ok("points show it", evidence)]
+
+
+def _height(recording: Recording) -> list[Finding]:
+    """The head's usual height above a known floor against that of the body that is assumed."""
+    head = recording.head
+    if head is None or recording.skeleton is None or (recording.floor is None and recording.points is None):
+        return []
+    level = torch.zeros(1) if recording.floor is None else recording.floor.height
+    joint = head.T_world_head.t
+    if recording.floor is None and recording.points is not None:
+        try:
+            level = estimate_floor(recording.points.points_world, head.t_world_device).height
+        except WearcapError:
+            return []
+    above = torch.quantile((joint[:: len(joint) // 5000 + 1, 2] - level.median()).double(), 0.9).item()
+    assumed = recording.skeleton.height_of("head")
+    check, evidence = Check("height"), f"head joint {above:.2f} m above the floor, {assumed:.2f} m by the body"
+    if abs(above - assumed) > UNUSUAL_M:
+        fix = f"A height of {recording.skeleton.stature * above / assumed:.2f} m fits, if the wearer stood upright."
+        return [check.warning("the body does not fit how high the head is carried", evidence, fix)]
+    return [check.ok(f"a body of {recording.skeleton.stature:.2f} m fits", evidence)]

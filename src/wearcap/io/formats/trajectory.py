@@ -1,0 +1,539 @@
+"""The one reader of trajectories, which knows a file by its content.
+
+TUM: lines of `timestamp tx ty tz qx qy qz qw`. EuRoC: CSV of `#timestamp [ns], p x y z, q w x y z`, more columns may
+follow; a header that names its columns decides their order. COLMAP: images.txt or images.bin, poses of the world in the
+camera. hloc: lines of `name qw qx qy qz tx ty tz`, likewise. DROID-SLAM: arrays (.npy, .npz) of `tx ty tz qx qy qz qw`;
+poses.npy of a reconstruction's folder holds the world in the camera, with tstamps.npy beside. MPS: closed-loop CSV.
+KITTI: 12 numbers a line, the first three rows of the camera's matrix in the world, times in times.txt beside.
+
+Times are checked before anything is made of them: the unit follows from the step between rows (a header's unit and
+seconds since 1970 decide where two are possible), and nothing that is spread over a longer time than its rows can
+cover is accepted. So whoever resamples a trajectory gets at most ten times its rows.
+"""
+
+import os
+import re
+from array import array
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain, islice
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from wearcap.errors import WearcapError
+from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.formats.bounded import open_bytes
+from wearcap.io.formats.colmap import read_image_poses
+from wearcap.io.formats.csv_table import read_columns
+from wearcap.io.formats.npz import read_npy, read_npz
+from wearcap.io.formats.poses import are_rotations, check_finite, checked_trajectory, row_name
+from wearcap.io.formats.text import numbered_lines
+
+UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Seconds per unit of time."""
+STEP_S = (0.9e-3, 2.0)
+"""Least and largest median time between poses: 1.1 kHz to one in two seconds."""
+MAX_GAP_S, MAX_SPAN_S = 600.0, 12 * 3600.0
+MAX_SPARSITY = 10.0
+"""Largest ratio of a file's span to what its rows cover at their median step."""
+_EPOCH_S = 9e8, 4.2e9
+"""Seconds since 1970 of the years 1998 to 2103."""
+_MATRIX_WITHIN = 0.02
+_FRAMES = 1e6
+"""Whole numbers below are frame numbers (nine hours at 30 Hz), larger ones times."""
+FORMATS = "TUM, EuRoC, COLMAP's images, hloc's poses, DROID-SLAM's arrays, MPS' closed loop, KITTI"
+_FIX = "Lines of `timestamp tx ty tz qx qy qz qw` (TUM) are the simplest."
+_SLOTS = {"time", "x", "y", "z", "qw", "qx", "qy", "qz"}
+_MPS = "tracking_timestamp_us", "tx_world_device"
+
+
+@dataclass(frozen=True)
+class TrajectoryFile:
+    """A trajectory, and what its file is."""
+
+    trajectory: Trajectory
+    format: str
+    time_unit: str
+    """Unit of the file's times: s, ms, us, ns or frames."""
+    of_camera: bool
+    """Whether the format's poses are a camera's, with OpenCV's axes; otherwise the file does not name its axes."""
+    metric: bool
+    """Whether the format's unit of length is the metre; structure from motion and one camera's SLAM know no unit."""
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Columns as they stand in a file."""
+
+    format: str
+    times: np.ndarray | None
+    translation: np.ndarray
+    quat_wxyz: np.ndarray
+    unit: str | None = None
+    """Unit that a header names."""
+    inverse: bool = False
+    """Whether poses are those of the world in the body."""
+    of_camera: bool = False
+    metric: bool = True
+    name: Callable[[int], str] = row_name
+
+
+def read_trajectory(path: str | Path, time_unit: str | None = None, fps: float | None = None) -> Trajectory:
+    """Trajectory in the file's own world and body axes (s; m where the format has metres).
+
+    `time_unit` (s, ms, us, ns) overrides what the numbers say; `fps` is for files with frame numbers or no times.
+    Raises WearcapError for a file that is none of the formats, rows that are NaN, doubled or unsorted (named by line),
+    quaternions far from unit norm, and times that are no recording's.
+    """
+    return read_trajectory_file(path, time_unit, fps).trajectory
+
+
+def read_trajectory_file(path: str | Path, time_unit: str | None = None, fps: float | None = None) -> TrajectoryFile:
+    """A trajectory with its format and unit of time; raises as `read_trajectory` does."""
+    if time_unit not in (None, *UNITS):
+        raise WearcapError(f"time_unit={time_unit!r}", expected=f"one of {', '.join(UNITS)}")
+    if fps is not None and not 0 < fps < 2000:
+        raise WearcapError(f"fps={fps}", expected="frames per second, above 0")
+    path = _file_of(Path(path))
+    table = _read(path)
+    if not len(table.translation):
+        raise WearcapError("no poses in the file", path, FORMATS)
+    if table.inverse:
+        table = _inverted(table, path)
+    seconds, unit = _seconds(table, time_unit, fps, path)
+    trajectory = checked_trajectory(seconds, table.translation, table.quat_wxyz, path, table.name)
+    check_span(seconds, path, table.name)
+    return TrajectoryFile(trajectory, table.format, unit, table.of_camera, table.metric)
+
+
+def trajectory_format(path: str | Path) -> str | None:
+    """Format of a file that looks like a trajectory, by its beginning alone; None for any other file.
+
+    Raises WearcapError for a file that cannot be opened.
+    """
+    path = Path(path)
+    with open_bytes(path) as file:
+        begin = file.read(6)
+    if begin.startswith((b"\x93NUMPY", b"PK")) or path.name == "images.bin":
+        return "COLMAP" if path.name == "images.bin" else "DROID-SLAM" if path.suffix == ".npy" else None
+    try:
+        return _kind(_first_lines(path))[0]
+    except WearcapError:
+        return None
+
+
+_IN_FOLDERS = (
+    *("images.bin", "images.txt", "sparse/0/images.bin", "sparse/0/images.txt", "poses.npy"),
+    *(f"{part}closed_loop_trajectory.csv{packed}" for part in ("", "slam/") for packed in ("", ".gz", ".xz")),
+    *("mav0/state_groundtruth_estimate0/data.csv", "state_groundtruth_estimate0/data.csv", "data.csv"),
+    *("trajectory.txt", "traj.txt", "poses.txt"),
+)
+"""Files of a folder that hold its trajectory, the first that is there."""
+
+
+def trajectory_file(folder: str | Path) -> Path | None:
+    """The file in a folder that holds its trajectory, by the formats' usual names; None where there is none."""
+    return next((path for name in _IN_FOLDERS if (path := Path(folder) / name).is_file()), None)
+
+
+def _file_of(path: Path) -> Path:
+    if not os.path.isdir(path):  # a path that may not be looked at is refused when it is opened
+        return path
+    found = trajectory_file(path)
+    if found is None:
+        expected = ", ".join(_IN_FOLDERS[:5]) + ", …"
+        raise WearcapError("a folder without a trajectory", path, expected, "Give its file.")
+    return found
+
+
+def _read(path: Path) -> _Table:
+    """Columns of a file, by its content."""
+    with open_bytes(path) as file:
+        begin = file.read(6)
+    if not begin:
+        raise WearcapError("no poses in the file", path, FORMATS)
+    if begin.startswith(b"\x93NUMPY"):
+        return _droid(path, read_npy(path), _times_beside(path))
+    if begin.startswith(b"PK"):
+        return _droid_archive(path)
+    if path.name == "images.bin":
+        return _from_images(path)
+    first = _first_lines(path)
+    kind, header = _kind(first)
+    if kind is None:
+        _refuse(first, path)
+    if kind == "MPS":
+        return _mps(path)
+    if kind == "COLMAP":
+        return _from_images(path)
+    if kind == "hloc":
+        return _hloc(path)
+    if kind == "KITTI":
+        return _kitti(path)
+    return _named_columns(path, kind or "", header)
+
+
+# --- text ----------------------------------------------------------------------------------------------------------
+
+
+def _first_lines(path: Path) -> list[tuple[int, str]]:
+    """Comments and the first two other lines, with their numbers."""
+    found: list[tuple[int, str]] = []
+    rows = 0
+    for number, line in islice(numbered_lines(path), 100):
+        if line.strip():
+            found.append((number, line.strip()))
+            rows += not line.startswith("#")
+        if rows == 2:
+            break
+    return found
+
+
+def _words(line: str) -> list[str]:
+    return [word.strip() for word in line.split(",")] if "," in line else line.split()
+
+
+def _number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _kind(first: Sequence[tuple[int, str]]) -> tuple[str | None, dict[str, int] | None]:
+    """Format of a text by its first lines, and the places of its columns by name, where a header has them."""
+    header = None
+    for _, line in first:
+        words = _words(line.lstrip("#").strip())
+        comment = line.startswith("#")
+        if _MPS[0] in words and _MPS[1] in words:
+            return "MPS", None
+        if comment or not any(map(_number, words)):
+            slots = _slots(words)
+            if slots is None and not comment:
+                return None, None
+            header = slots or header
+            continue
+        numbers = sum(map(_number, words))
+        if header is not None and numbers == len(words) > max(header.values()):
+            return "EuRoC" if "," in line else "TUM", header
+        if not _number(words[0]) and len(words) == 8 and numbers == 7:
+            return "hloc", None
+        if len(words) >= 10 and "," not in line and all(map(_number, words[:9])) and not _number(words[9]):
+            return "COLMAP", None
+        if len(words) == 12 and numbers == 12 and "," not in line:
+            return "KITTI", None
+        if len(words) == 8 and "," not in line:
+            return "TUM", None
+        if len(words) >= 8 and "," in line and _number(words[0]):
+            return "EuRoC", None
+        return None, None
+    return None, None
+
+
+_ALIASES = {
+    "time": ("timestamp", "time", "t", "ts", "stamp", "timestamps"),
+    **{axis: (f"t{axis}", f"p{axis}", axis, f"pos{axis}", f"position{axis}", f"prsr{axis}") for axis in "xyz"},
+    **{f"q{axis}": (f"q{axis}", f"quat{axis}", f"rot{axis}", f"orientation{axis}", f"qrs{axis}") for axis in "wxyz"},
+}
+
+
+def _slots(words: Sequence[str]) -> dict[str, int] | None:
+    """Columns of a header that names time, position and quaternion; None for any other line."""
+    plain = [re.sub(r"\[.*?\]|\(.*?\)|[^a-z]", "", word.lower()) for word in words]
+    plain = [re.sub(r"^(time|timestamp)(?:ns|us|ms|sec|seconds|s)$", r"\1", word) for word in plain]
+    found = {}
+    for slot, names in _ALIASES.items():
+        place = next((plain.index(name) for name in names if name in plain), None)
+        if place is not None:
+            found[slot] = place
+    return found if found.keys() == _SLOTS else None
+
+
+_EUROC = {"time": 0, "x": 1, "y": 2, "z": 3, "qw": 4, "qx": 5, "qy": 6, "qz": 7}
+_TUM = {"time": 0, "x": 1, "y": 2, "z": 3, "qx": 4, "qy": 5, "qz": 6, "qw": 7}
+
+
+def _named_columns(path: Path, kind: str, header: dict[str, int] | None) -> _Table:
+    """TUM's and EuRoC's lines of numbers, and those of any header."""
+    slots = header or (_EUROC if kind == "EuRoC" else _TUM)
+    places = [slots[name] for name in ("time", "x", "y", "z", "qw", "qx", "qy", "qz")]
+    exact = header is None and kind == "TUM"
+    expected = "timestamp tx ty tz qx qy qz qw" if exact else "timestamp, x, y, z, qw, qx, qy, qz in every line"
+    values, lines, unit = array("d"), array("l"), None
+    for number, line in numbered_lines(path):
+        text = line.split("#")[0].strip()
+        if not text:
+            unit = unit or _unit_of(line)
+            continue
+        words = _words(text)
+        if not values and not any(map(_number, words)):
+            unit = unit or _unit_of(line)  # a header without #
+            continue
+        if len(words) != 8 if exact else len(words) <= max(places):
+            raise WearcapError(f"line {number} has {len(words)} fields", path, expected)
+        try:
+            values.extend([float(words[place]) for place in places])
+        except ValueError as error:
+            raise WearcapError(f"line {number}: {error}"[:200], path, expected) from error
+        lines.append(number)
+    table = np.asarray(values).reshape(-1, 8)
+    return _Table(kind, table[:, 0], table[:, 1:4], table[:, 4:], unit, name=_by_line(lines))
+
+
+def _by_line(lines: Sequence[int]) -> Callable[[int], str]:
+    return lambda row: f"line {lines[row]}"
+
+
+def _unit_of(header: str) -> str | None:
+    """Unit of time that a header's first column names."""
+    first = re.split(r"[,\s]\s*(?=[a-z])", header.lower().lstrip("# \t"), maxsplit=1)[0]
+    found = re.search(r"(?:\[|\(|_)(ns|us|µs|ms|s|sec)\b", first)
+    return {"µs": "us", "sec": "s"}.get(found[1], found[1]) if found else None
+
+
+def _refuse(first: Sequence[tuple[int, str]], path: Path) -> None:
+    """Raise WearcapError for a text that is no trajectory, with the first line that is none."""
+    rows = [(number, line) for number, line in first if not line.startswith("#")]
+    if not rows:
+        raise WearcapError("no poses in the file", path, FORMATS)
+    number, line = next(((n, text) for n, text in rows if any(map(_number, _words(text)))), rows[0])
+    words = _words(line)
+    what = f"line {number} has {len(words)} fields, no pose of a known format" if len(words) < 8 else "not a trajectory"
+    raise WearcapError(what, path, FORMATS, _FIX)
+
+
+def _mps(path: Path) -> _Table:
+    columns = [f"{part}_world_device" for part in ("tx", "ty", "tz", "qw", "qx", "qy", "qz")]
+    table = read_columns(path, [_MPS[0], *columns])
+    pose = np.stack([table[name] for name in columns], 1)
+    return _Table("MPS", table[_MPS[0]], pose[:, :3], pose[:, 3:], "us", of_camera=True, name=_after_header)
+
+
+def _after_header(row: int) -> str:
+    return f"line {row + 2}"
+
+
+def _kitti(path: Path) -> _Table:
+    values, lines = array("d"), array("l")
+    for number, line in numbered_lines(path):
+        words = line.split("#")[0].split()
+        if words and (len(words) != 12 or not all(map(_number, words))):
+            raise WearcapError(f"line {number} has {len(words)} fields", path, "12 numbers in every line")
+        if words:
+            values.extend(map(float, words))
+            lines.append(number)
+    matrices = np.asarray(values).reshape(-1, 3, 4)
+    return _of_matrices("KITTI", matrices, _times_beside(path), path, _by_line(lines))
+
+
+# --- names of pictures as times ------------------------------------------------------------------------------------
+
+
+def _from_images(path: Path) -> _Table:
+    images = read_image_poses(path)
+    poses = ((image.name, (*image.quaternion_wxyz, *image.translation)) for image in images)
+    return _of_pictures("COLMAP", poses, path)
+
+
+def _hloc(path: Path) -> _Table:
+    def rows() -> Iterator[tuple[str, tuple[float, ...]]]:
+        for number, line in numbered_lines(path):
+            words = line.split("#")[0].split()
+            if words and (len(words) != 8 or not all(map(_number, words[1:]))):
+                raise WearcapError(f"line {number} is no pose", path, "name qw qx qy qz tx ty tz")
+            if words:
+                yield words[0], tuple(map(float, words[1:]))
+
+    return _of_pictures("hloc", rows(), path)
+
+
+def _of_pictures(kind: str, rows: Iterator[tuple[str, tuple[float, ...]]], path: Path) -> _Table:
+    """Poses of the world in the pictures' cameras, in the order of the times in their names."""
+    names: list[str] = []
+    values, times = array("d"), array("d")
+    whole = True
+    for name, pose in rows:
+        text = _last_number(name)
+        if text is None:
+            fix = "Name the pictures after their times or frame numbers."
+            raise WearcapError(
+                f"picture {name[:60]!r} has no number in its name", path, "times, such as 12.345.png", fix
+            )
+        names.append(name)
+        times.append(float(text))
+        values.extend(pose)
+        whole &= text.isdigit() and float(text) < _FRAMES
+    order = np.argsort(np.asarray(times), kind="stable")
+    table = np.asarray(values).reshape(-1, 7)[order]
+    return _Table(
+        kind,
+        np.asarray(times)[order],
+        table[:, 4:],
+        table[:, :4],
+        "frames" if whole else None,
+        inverse=True,
+        of_camera=True,
+        metric=False,
+        name=lambda row: f"picture {names[order[row]]!r}",
+    )
+
+
+def _last_number(name: str) -> str | None:
+    stem = re.sub(r"\.[A-Za-z]\w{1,4}$", "", name.rsplit("/", 1)[-1])
+    found = re.findall(r"\d+(?:\.\d+)?", stem[-200:])
+    return found[-1] if found else None
+
+
+# --- arrays --------------------------------------------------------------------------------------------------------
+
+_TIMES = ("tstamps", "tstamp", "timestamps", "times")
+_POSES = ("traj_est", "traj", "trajectory", "poses", "cam_c2w", "arr_0")
+
+
+def _droid_archive(path: Path) -> _Table:
+    arrays = read_npz(path, (*_POSES, *_TIMES))
+    poses = next((name for name in _POSES if name in arrays), None)
+    if poses is None:
+        raise WearcapError("no array of poses", path, f"one of {', '.join(_POSES)}")
+    times = next((arrays[name] for name in _TIMES if name in arrays), None)
+    return _droid(path, arrays[poses], times, inverse=poses == "poses")
+
+
+def _droid(path: Path, poses: np.ndarray, times: np.ndarray | None, inverse: bool | None = None) -> _Table:
+    """DROID-SLAM's arrays: with the scalar last; those of a reconstruction are the world's in the camera."""
+    if poses.dtype.kind not in "fiu" or (times is not None and times.dtype.kind not in "fiu"):
+        raise WearcapError(f"an array of {poses.dtype}"[:80], path, "real numbers")
+    if inverse is None:
+        inverse = path.name == "poses.npy" and (path.parent / "disps.npy").is_file()
+    if times is not None:
+        times = times.astype(np.float64).ravel()
+    if poses.ndim == 3 and poses.shape[1:] in ((3, 4), (4, 4)):
+        return _of_matrices("DROID-SLAM", poses[:, :3], times, path, row_name)
+    if poses.ndim == 2 and poses.shape[1] == 8 and times is None:
+        times, poses = poses[:, 0].astype(np.float64), poses[:, 1:]
+    if poses.ndim != 2 or poses.shape[1] != 7:
+        what = f"an array of shape {poses.shape}"
+        raise WearcapError(what, path, "(poses, 7): tx ty tz qx qy qz qw; or (poses, 8) with times; or 4×4 matrices")
+    _same_length(times, len(poses), path)
+    poses, frames = poses.astype(np.float64), times is not None and bool((times == np.floor(times)).all())
+    unit = "frames" if frames and times is not None and np.abs(times).max(initial=0) < _FRAMES else None
+    quat_wxyz = poses[:, [6, 3, 4, 5]]
+    return _Table("DROID-SLAM", times, poses[:, :3], quat_wxyz, unit, inverse=inverse, of_camera=True, metric=False)
+
+
+def _of_matrices(
+    kind: str, matrices: np.ndarray, times: np.ndarray | None, path: Path, name: Callable[[int], str]
+) -> _Table:
+    """Rows of [R | t], the camera's pose in the world."""
+    _same_length(times, len(matrices), path)
+    matrices = matrices.astype(np.float64)
+    check_finite({"matrix": matrices}, path, name)
+    R = torch.from_numpy(np.ascontiguousarray(matrices[:, :, :3]))
+    bad = (~are_rotations(R, _MATRIX_WITHIN)).numpy()
+    if bad.any():
+        what = f"{name(int(bad.argmax()))} is no rotation and translation ({int(bad.sum())} such rows)"
+        raise WearcapError(what, path, "[R | t], three rows of four numbers")
+    quat = quat_wxyz_from_matrix(R).numpy()
+    unit = "frames" if times is None else None
+    return _Table(kind, times, matrices[:, :, 3], quat, unit, of_camera=True, metric=kind == "KITTI", name=name)
+
+
+def _times_beside(path: Path) -> np.ndarray | None:
+    """Times in a file of its own beside the poses; None where there is none."""
+    for name in _TIMES:
+        for suffix in (".npy", ".txt"):
+            file = path.with_name(name + suffix)
+            if file == path or not file.is_file():
+                continue
+            if suffix == ".npy":
+                return read_npy(file)
+            numbers = chain.from_iterable(line.split("#")[0].split() for _, line in numbered_lines(file))
+            try:
+                return np.asarray(array("d", map(float, numbers)))
+            except ValueError as error:
+                raise WearcapError(
+                    f"a time that is no number ({error})"[:120], file, "one number in each line"
+                ) from error
+    return None
+
+
+def _same_length(times: np.ndarray | None, count: int, path: Path) -> None:
+    if times is not None and len(times) != count:
+        raise WearcapError(f"{len(times)} times of {count} poses", path, "one time for each pose")
+
+
+# --- times ---------------------------------------------------------------------------------------------------------
+
+
+def _inverted(table: _Table, path: Path) -> _Table:
+    """The bodies' poses in the world, of those of the world in the body."""
+    check_finite({"translation": table.translation, "quaternion": table.quat_wxyz}, path, table.name)
+    R = matrix_from_quat_wxyz(torch.from_numpy(np.ascontiguousarray(table.quat_wxyz))).numpy()
+    center = -np.einsum("nji,nj->ni", R, table.translation)
+    quat = table.quat_wxyz * np.array([1.0, -1.0, -1.0, -1.0])
+    return _Table(table.format, table.times, center, quat, table.unit, False, table.of_camera, table.metric, table.name)
+
+
+def _seconds(table: _Table, time_unit: str | None, fps: float | None, path: Path) -> tuple[np.ndarray, str]:
+    """Times in seconds, and the unit that they have in the file."""
+    times, count = table.times, len(table.translation)
+    if times is None or (table.unit == "frames" and time_unit is None):
+        if fps is None:
+            what = "frame numbers instead of times" if times is not None else "poses without times"
+            raise WearcapError(what, path, "times of the poses", "Give the video's rate: fps=30.")
+        return (np.arange(count) if times is None else times) / fps, "frames"
+    check_finite({"timestamp": times}, path, table.name)
+    unit = time_unit or time_unit_of(times, table.unit, path)
+    # Whole nanoseconds since 1970 are beyond a float's 53 bits; what is lost is below a microsecond.
+    return times * UNITS[unit], unit
+
+
+def time_unit_of(times: np.ndarray, named: str | None, where: str | Path) -> str:
+    """Unit of times by their median step; the named one, then seconds since 1970, decide between two that are possible.
+
+    Raises WearcapError when no unit gives a plausible rate.
+    """
+    steps = np.diff(times)
+    rising = steps[steps > 0]
+    if not len(rising):
+        possible = list(UNITS)
+    else:
+        step = float(np.median(rising))
+        possible = [unit for unit, s in UNITS.items() if STEP_S[0] <= step * s <= STEP_S[1]]
+        if not possible:
+            what = f"{step:.4g} between successive times, which is no recording's in seconds, ms, µs or ns"
+            raise WearcapError(what, where, "0.5 to 1100 poses in a second", "Give time_unit=s, ms, us or ns.")
+    if named in possible:
+        return str(named)
+    since_1970 = [unit for unit in possible if _EPOCH_S[0] <= float(times[0]) * UNITS[unit] <= _EPOCH_S[1]]
+    return (since_1970 or possible)[0]
+
+
+def check_span(seconds: np.ndarray, path: Path, name: Callable[[int], str]) -> None:
+    """Raise WearcapError for times that no recording has: nothing made of them is much larger than the file."""
+    steps = np.diff(seconds)
+    if not len(steps):
+        return
+    widest, span = int(steps.argmax()), float(seconds[-1] - seconds[0])
+    covered = float(np.median(steps)) * len(seconds)
+    cut = "A time is damaged, or two recordings stand in one file: cut it there."
+    if steps[widest] > MAX_GAP_S:
+        what = f"a gap of {_plain_span(steps[widest])} before {name(widest + 1)}"
+        raise WearcapError(what, path, f"gaps below {MAX_GAP_S / 60:.0f} minutes", cut)
+    if span > MAX_SPAN_S:
+        what = f"poses over {_plain_span(span)}"
+        raise WearcapError(what, path, f"a recording of less than {MAX_SPAN_S / 3600:.0f} hours", cut)
+    if span > MAX_SPARSITY * covered + 10.0:
+        what = (
+            f"poses in {100 * covered / span:.0f} % of {_plain_span(span)}, the longest gap before {name(widest + 1)}"
+        )
+        raise WearcapError(what, path, f"poses in {100 / MAX_SPARSITY:.0f} % of the time at least", cut)
+
+
+def _plain_span(seconds: float) -> str:
+    return f"{seconds / 3600:.3g} hours" if seconds >= 3600 else f"{seconds:.4g} s"

@@ -1,0 +1,372 @@
+"""A wearer's own logs as recordings: a head's trajectory, two watches with a head camera, a headset's log.
+
+Each source has a function that lists its recordings as tasks, preceded by the one that makes a recording of it.
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from wearcap.body.skeleton import WRISTS, Skeleton, skeleton_of_height
+from wearcap.errors import WearcapError
+from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.rotation import swing_between
+from wearcap.io.devices.aria_mps import T_HEAD_DEVICE, is_mps_folder, read_mps, read_points
+from wearcap.io.devices.axes import CAMERA, DEVICES, UPRIGHT, WORLDS, DeviceAxes, device_axes, to_head_axes
+from wearcap.io.devices.headset_log import is_headset_log, read_headset_log
+from wearcap.io.devices.watch_log import read_inertial_log, read_watch_log
+from wearcap.io.formats.camera_json import read_camera
+from wearcap.io.formats.csv_table import read_columns, read_header
+from wearcap.io.formats.pcd import read_pcd
+from wearcap.io.formats.ply import read_ply
+from wearcap.io.formats.poses import check_finite
+from wearcap.io.formats.trajectory import TrajectoryFile, read_trajectory_file, trajectory_file, trajectory_format
+from wearcap.io.formats.video import video_info
+from wearcap.prepare.engine import Splits, Task, content_hash
+from wearcap.recording.recording import CameraStream, FloorTrack, HeadStream, ImuStream, PointCloud, Recording
+from wearcap.sensors.camera_alignment import SlamAlignment
+from wearcap.sensors.clock import require_overlap
+from wearcap.sensors.monocular_slam import clean_track
+from wearcap.sensors.slam_alignment import SceneEvidence, align_cleaned, pose_of
+from wearcap.sensors.watch_calibration import WatchSession, read_watch_calibration
+from wearcap.sensors.watches import watch_gaps
+
+VERSION = {"trajectory": 1, "watches": 1, "headset": 1}
+"""Versions of the conversions, increased when the same source and settings yield another recording."""
+Numbers = Sequence[float | int]
+
+
+@dataclass(frozen=True)
+class TrajectorySettings:
+    """How a trajectory becomes a head's path in metres, z up; None: from the file's content."""
+
+    up: str = "auto"
+    axes: str = "auto"
+    time_unit: str | None = None
+    fps: float | int | None = None
+    scale: float | int | None = None
+    T_head_device: Numbers | None = None
+    height: float | int | None = None
+    points: str | None = None
+    standing: Numbers | None = None
+    camera_height_m: float | int | None = None
+    head_imu: str | None = None
+    T_cam_imu: Numbers | None = None
+    walks: Sequence[Numbers] | None = None
+    video: str | None = None
+    camera: str | None = None
+    video_start_s: float | int = 0.0
+    max_acceleration: float | int = 40.0
+    max_burst_s: float | int = 1.0
+
+    def files(self) -> list[Path]:
+        """The other files that a recording is made of; a video counts by its size."""
+        return [Path(file) for file in (self.points, self.head_imu, self.camera) if file is not None]
+
+    def skeleton(self) -> Skeleton | None:
+        return None if self.height is None else skeleton_of_height(float(self.height))
+
+    def mount(self) -> Rigid:
+        """T_head_device: the given one, else the nominal one of glasses and headsets."""
+        return pose_of(self.T_head_device, "T_head_device") or T_HEAD_DEVICE
+
+    def evidence(self, read: TrajectoryFile, up: Tensor | None) -> SceneEvidence:
+        """What is known of scale and vertical; times of the config count from the first pose."""
+        start_s = read.trajectory.timestamps[0].item()
+        standing = None if self.standing is None else _times(self.standing, 2, "standing", start_s)
+        walks = tuple((*_times(walk[:2], 2, "walks", start_s), float(walk[2])) for walk in self.walks or ())
+        imu = None if self.head_imu is None else read_head_imu(self.head_imu)
+        scale = self.scale if self.scale is not None else 1.0 if read.metric else None
+        points = None if self.points is None else read_cloud(self.points).points_world
+        return SceneEvidence(
+            points,
+            standing,
+            None if self.camera_height_m is None else float(self.camera_height_m),
+            imu,
+            pose_of(self.T_cam_imu, "T_cam_imu"),
+            walks,
+            None if scale is None else float(scale),
+            up,
+        )
+
+
+def _times(values: Numbers, count: int, name: str, start_s: float) -> tuple[float, float]:
+    try:
+        first, last = (start_s + float(value) for value in values)
+    except (TypeError, ValueError) as error:
+        raise WearcapError(
+            f"{name}={list(values)}", expected=f"{count} numbers in seconds from the first pose"
+        ) from error
+    return first, last
+
+
+def read_head_imu(path: str | Path) -> ImuStream:
+    """An inertial sensor on the head: a log of a watch, a phone, or x-IMU3."""
+    if {"Accelerometer X (g)"} & set(read_header(path)):
+        return replace(read_inertial_log(path, "head"), joint="head")
+    return replace(read_watch_log(path, WRISTS[0]), joint="head")
+
+
+def read_cloud(path: str | Path) -> PointCloud:
+    """Points of a .ply, .pcd, MPS' semi-dense points, or a table with columns x, y, z.
+
+    Raises WearcapError for any other file.
+    """
+    suffixes = {suffix.lower() for suffix in Path(path).suffixes}
+    if ".ply" in suffixes or ".pcd" in suffixes:
+        return PointCloud(torch.from_numpy((read_ply if ".ply" in suffixes else read_pcd)(path).points).float())
+    header = read_header(path)
+    if "px_world" in header:
+        return read_points(path)
+    table = read_columns(path, ["x", "y", "z"])
+    columns = {name: table[name] for name in "xyz"}
+    check_finite(columns, path)
+    return PointCloud(torch.stack([torch.from_numpy(column) for column in columns.values()], 1).float())
+
+
+def _trajectory(file: Path, name: str, about: dict[str, str], settings: TrajectorySettings, output: Path) -> Recording:
+    """The head's path, points and camera of one trajectory."""
+    if file.is_dir() and is_mps_folder(file):
+        read = read_mps(file)
+        return replace(
+            read, name=name, skeleton=settings.skeleton(), note="Aria's MPS folder: nominal glasses", **about
+        )
+    unit, fps = settings.time_unit, settings.fps
+    read = read_trajectory_file(file, unit, None if fps is None else float(fps))
+    head, alignment, note = head_of(read, settings, str(file))
+    points = None
+    if settings.points is not None:
+        cloud = read_cloud(settings.points)
+        points = replace(cloud, points_world=alignment.points(cloud.points_world))
+    floor = None
+    if settings.camera_height_m is not None:
+        floor = FloorTrack(head.timestamps[:1], torch.zeros(1))
+    camera = _camera(settings, head, output)
+    skeleton = settings.skeleton()
+    if skeleton is None:
+        note += "; height not given: a body of 1.75 m is assumed"
+    return Recording(name, head, camera=camera, points=points, floor=floor, skeleton=skeleton, note=note, **about)
+
+
+def head_of(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tuple[HeadStream, SlamAlignment, str]:
+    """(the head stream in metres with z up, alignment of the file's world, and what was detected)."""
+    axes, up, vertical = _axes(read, settings, where)
+    R_device_cam = DEVICES[axes].mT @ CAMERA
+    slam = replace(read.trajectory, R_world_body=read.trajectory.R_world_body @ R_device_cam)
+    evidence = settings.evidence(read, up)
+    limits = float(settings.max_acceleration), float(settings.max_burst_s)
+    alignment, clean, outliers = align_cleaned(slam, evidence.align, *limits)
+    track = to_head_axes(alignment.apply(clean), DeviceAxes("z", "camera", 1.0))
+    mount = settings.mount()
+    head = HeadStream(track.timestamps, track.R_world_body, track.t_world_body, mount.R, mount.t)
+    unit = "in metres" if alignment.scale == 1 else f"a unit is {alignment.scale:.4g} m"
+    notes = [f"{read.format}, times in {read.time_unit}", vertical, f"the device has {axes}'s axes", unit]
+    return head, alignment, "; ".join([*notes, *([outliers] if outliers else [])])
+
+
+def _axes(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tuple[str, Tensor | None, str]:
+    """(the device's axes, rotation to a world with z up, how it is known); None where scene or sensor will tell."""
+    given = settings.axes if settings.axes != "auto" or not read.of_camera else "camera"
+    if settings.head_imu is not None or (settings.points and settings.standing and settings.camera_height_m):
+        if given not in ("auto", *DEVICES):
+            raise WearcapError(f"axes={given!r}", expected=f"one of auto, {', '.join(DEVICES)}")
+        device = "camera" if given == "auto" else given
+        return device, None, f"vertical by the {'head sensor' if settings.head_imu is not None else 'floor'}"
+    try:
+        axes = device_axes(read.trajectory, settings.up, given, where)
+    except WearcapError:
+        up = -read.trajectory.R_world_body[:, :, 1].double().mean(0)
+        if settings.up != "auto" or given != "camera" or up.norm() < UPRIGHT:
+            raise
+        # Structure from motion has an arbitrary world: a worn camera is upright on average.
+        R = swing_between(up / up.norm(), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+        return (
+            "camera",
+            R,
+            "vertical by the camera's mean tilt, some degrees off (better: head_imu=, or points= of the floor)",
+        )
+    return axes.device, WORLDS[axes.up], f"{axes.up} is up (the device is upright by {axes.upright:.2f})"
+
+
+def _camera(settings: TrajectorySettings, head: HeadStream, output: Path) -> CameraStream | None:
+    """The video's camera, which looks along the device's forward axis: its frames begin `video_start_s` after the first pose."""
+    if settings.video is None:
+        return None
+    if settings.camera is None:
+        fix = "Calibrate it: wearcap calibrate source=VIDEO; then camera=camera.json."
+        raise WearcapError("a video without its camera's intrinsics", settings.video, fix=fix)
+    info, lens = video_info(settings.video), read_camera(settings.camera)
+    if not info.frames or not info.fps:
+        raise WearcapError("a video that does not say how many frames it has", settings.video, "a whole video")
+    start = head.timestamps[0].item() + float(settings.video_start_s)
+    times = start + torch.arange(info.frames, dtype=torch.float64) / float(info.fps)
+    if times[-1] < head.timestamps[0] or times[0] > head.timestamps[-1]:
+        what = f"the video from {times[0]:.2f} to {times[-1]:.2f} s"
+        expected = f"it and the path, {head.timestamps[0]:.2f} to {head.timestamps[-1]:.2f} s, at the same time"
+        raise WearcapError(what, settings.video, expected, "Give video_start_s=SECONDS.")
+    R = head.R_head_device @ CAMERA
+    video = os.path.relpath(settings.video, output)
+    return CameraStream(times, lens, R, head.t_head_device, video=video)
+
+
+def trajectory_tasks(
+    source: str | Path, output: str | Path, splits: Splits, subject: str, license: str, settings: TrajectorySettings
+) -> list[Task]:
+    """One task per trajectory: a file, a folder that is one, or each trajectory in a folder.
+
+    Raises WearcapError where there is none, and for points, a video or an inertial log of several trajectories.
+    """
+    source = Path(source)
+    if not source.exists():
+        raise WearcapError("no such file or folder", where=source, fix="Give it as source=FILE or source=DIR.")
+    if source.is_dir() and not is_mps_folder(source) and trajectory_file(source) is None:
+        found = [path for path in sorted(source.iterdir()) if path.is_dir() and trajectory_file(path)]
+        found += [path for path in sorted(source.iterdir()) if path.is_file() and trajectory_format(path)]
+    else:
+        found = [source]
+    if not found:
+        raise WearcapError("no trajectory in this folder", source, "a file that wearcap doctor knows as one")
+    if len(found) > 1 and (settings.files() or settings.video):
+        what = f"{len(found)} trajectories, but points, video or head_imu of one"
+        raise WearcapError(what, where=source, fix="Prepare that one alone: source=FILE.")
+    files = settings.files()
+    return [_task("trajectory", path, _trajectory, output, splits, subject, license, settings, files) for path in found]
+
+
+def _watches(camera: Path, name: str, about: dict[str, str], settings: "WatchesSettings", output: Path) -> Recording:
+    """The head's path and both watches, calibrated where a calibration is given."""
+    watches = {joint: read_watch_log(path, joint) for joint, path in settings.logs().items()}
+    way = settings.camera
+    fps = None if way.fps is None else float(way.fps)
+    read = read_trajectory_file(camera, way.time_unit, fps)
+    recording, notes = Recording(name, skeleton=way.skeleton(), **about), []
+    if settings.calibration is not None:
+        found = read_watch_calibration(settings.calibration)
+        slam = read.trajectory
+        if found.camera is not None:
+            slam, kept, _ = clean_track(slam, float(way.max_acceleration) / found.camera.scale, float(way.max_burst_s))
+            notes += [f"{int((~kept).sum())} outliers of {len(kept)} camera poses removed"] if not kept.all() else []
+        recording = WatchSession(watches, slam).added_to(recording, found)
+        notes.append(f"calibrated by {Path(settings.calibration).name}")
+    else:
+        recording = replace(recording, imu=watches)
+        notes.append(
+            "watches not calibrated: their heading and how they sit on the wrists are taken as they are "
+            "(wearcap calibrate steps=watches)"
+        )
+    if recording.head is None:
+        head, _, note = head_of(read, way, str(camera))
+        recording = replace(recording, head=head)
+        notes.insert(0, note)
+    assert recording.head is not None
+    fix = "Calibrate their clocks (wearcap calibrate steps=watches … swings=[…]), or take the logs of one session."
+    require_overlap(
+        {**{joint: imu.timestamps for joint, imu in recording.imu.items()}, "camera": recording.head.timestamps}, fix
+    )
+    for gap in watch_gaps(recording.imu, recording.head.timestamps):
+        notes.append(gap)
+    if recording.skeleton is None:
+        notes.append("height not given: a body of 1.75 m is assumed")
+    return replace(recording, note="; ".join(notes))
+
+
+@dataclass(frozen=True)
+class WatchesSettings:
+    """The logs of two watches, their calibration, and how the camera's trajectory is read."""
+
+    left: str
+    right: str
+    calibration: str | None
+    camera: TrajectorySettings
+
+    def logs(self) -> dict[str, Path]:
+        """Both logs by joint."""
+        return dict(zip(WRISTS, (Path(self.left), Path(self.right))))
+
+
+def watches_tasks(
+    camera: str | Path, output: str | Path, splits: Splits, subject: str, license: str, settings: WatchesSettings
+) -> list[Task]:
+    """The one recording of two watches and a head camera; hashed by all files."""
+    others = [*settings.logs().values(), *([Path(settings.calibration)] if settings.calibration else [])]
+    files = [Path(camera), *others, *settings.camera.files()]
+    if missing := [str(file) for file in files if not file.exists()]:
+        raise WearcapError("no such file", where=missing[0], fix="Give left=CSV right=CSV camera=TRAJECTORY.")
+    return [_task("watches", Path(camera), _watches, output, splits, subject, license, settings, files[1:])]
+
+
+@dataclass(frozen=True)
+class HeadsetSettings:
+    """How a headset's log is read, and who wore it; "auto" and None: from the file's content."""
+
+    axes: str = "auto"
+    quaternion: str = "auto"
+    hands: str = "auto"
+    time_unit: str | None = None
+    T_head_device: Numbers | None = None
+    height: float | int | None = None
+
+    def read(self, path: Path, name: str, about: dict[str, str]) -> Recording:
+        """Head, wrists and floor of a log."""
+        log = read_headset_log(path, self.axes, self.quaternion, self.hands, self.time_unit)
+        mount = pose_of(self.T_head_device, "T_head_device") or T_HEAD_DEVICE
+        head = HeadStream(log.head.timestamps, log.head.R_world_body, log.head.t_world_body, mount.R, mount.t)
+        notes = [*log.notes, *([] if self.height is not None else ["height not given: a body of 1.75 m is assumed"])]
+        return Recording(
+            name,
+            head=head,
+            tracked=log.wrists,
+            floor=FloorTrack(head.timestamps[:1], torch.zeros(1)) if log.floor else None,
+            skeleton=None if self.height is None else skeleton_of_height(float(self.height)),
+            note="; ".join(notes),
+            **about,
+        )
+
+
+def _headset(path: Path, name: str, about: dict[str, str], settings: HeadsetSettings, output: Path) -> Recording:
+    return settings.read(path, name, about)
+
+
+def headset_tasks(
+    source: str | Path, output: str | Path, splits: Splits, subject: str, license: str, settings: HeadsetSettings
+) -> list[Task]:
+    """One task per log: a file, or each in a folder. Raises WearcapError where there is none."""
+    source = Path(source)
+    if not source.exists():
+        raise WearcapError("no such file or folder", where=source, fix="Give it as source=FILE or source=DIR.")
+    kinds = (".csv", ".json", ".jsonl", ".txt")
+    found = [source]
+    if source.is_dir():
+        files = [path for path in sorted(source.rglob("*")) if path.is_file() and set(path.suffixes) & set(kinds)]
+        found = [path for path in files if is_headset_log(path)]
+    if not found:
+        raise WearcapError("no headset's log in this folder", source, "CSV or JSON with time, head_pos_x, …")
+    return [_task("headset", path, _headset, output, splits, subject, license, settings) for path in found]
+
+
+def _task(
+    kind: str,
+    path: Path,
+    make: Callable[..., Recording],
+    output: str | Path,
+    splits: Splits,
+    subject: str,
+    license: str,
+    settings: Any,
+    files: Sequence[Path] = (),
+) -> Task:
+    """A task that is hashed by its files and settings, and named after its file or folder."""
+    name = path.resolve().name if path.is_dir() else path.name.split(".")[0]
+    if name in ("images", "data", "poses", "trajectory", "closed_loop_trajectory"):
+        name = path.resolve().parent.name
+    read = [path] if path.is_file() else [file for file in sorted(path.rglob("*")) if file.is_file()]
+    small = [file for file in (*read, *files) if file.stat().st_size < 1 << 30]
+    key = content_hash(kind, name, subject, license, asdict(settings), VERSION[kind], *small)
+    about = {"subject": subject, "license": license, "source": f"{kind} {path.name}"}
+    return Task(name or kind, partial(make, path, name or kind, about, settings, Path(output)), splits.of(subject), key)
