@@ -16,8 +16,8 @@ FLOORS = (
     ("models", "diffusion", "sensors", "localization", "io"),
     ("optimize", "tracking", "data", "training", "metrics", "runtime"),
     ("systems", "simulation"),
-    ("reading",),
     ("evaluation", "export", "viewer", "doctor", "prepare"),
+    ("reading",),
     ("cli",),
 )
 MAY_SIMULATE = ("simulation", "prepare", "cli")

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from wearcap.body.skeleton import xsens23
 from wearcap.doctor.agreement import (
     check_camera,
     check_claps,
@@ -25,6 +26,7 @@ from wearcap.doctor.places import is_map, is_place, read_environment_file, read_
 from wearcap.doctor.report import SEVERITIES, Check, Finding, Report, has_error, refusal
 from wearcap.doctor.streams import check_clock, check_spans, check_track
 from wearcap.errors import WearcapError
+from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.adt import is_adt, read_adt
 from wearcap.io.datasets.amass import read_amass
 from wearcap.io.datasets.hps import hps_names, read_hps_sequence
@@ -44,6 +46,10 @@ from wearcap.io.formats.trajectory import read_trajectory_file, trajectory_file
 from wearcap.recording import FloorTrack, Motion, PointCloud, Recording, RecordingStore
 from wearcap.recording.store import RecordingFile
 from wearcap.scene.floor import estimate_floor
+from wearcap.tracking.stature import estimate_stature
+
+UNUSUAL_M = 0.10
+"""Difference of heights beyond which a wearer's body is doubtful."""
 
 
 def examine(
@@ -108,6 +114,8 @@ def examine_recording(recording: Recording) -> list[Finding]:
     body = bodies.get("motion", bodies.get("suit"))
     if head is not None and body is not None:
         findings += check_head_against_body(head, body)
+    if head is not None:
+        findings += _check_height(recording)
     if head is not None and "head" in recording.cues:
         findings.append(check_head_cue(head, recording.cues["head"]))
     for name, imu in recording.imu.items():
@@ -127,6 +135,25 @@ def examine_recording(recording: Recording) -> list[Finding]:
         findings += check_localization(recording.localization, bodies.get("suit", body))
     findings += check_claps(recording)
     return sorted(findings, key=lambda finding: -SEVERITIES.index(finding.severity))
+
+
+def _check_height(recording: Recording) -> list[Finding]:
+    """The wearer's height as the head's height over a known floor tells it, against that of the skeleton, if there is one."""
+    own = recording.skeleton or (None if recording.motion is None else recording.motion.skeleton)
+    found, check = estimate_stature(recording, own or xsens23()), Check("height")
+    if found is None:
+        return []
+    if own is None:
+        fix = "Give height=… (m) where it is known better."
+        return [check.note(str(found), "no skeleton in the recording", fix)]
+    evidence = f"{found}; the skeleton is {own.stature:.2f} m tall"
+    if abs(found.height_m - own.stature) > UNUSUAL_M:
+        return [
+            check.warning(
+                "the body does not fit how high the head is carried", evidence, f"Give height={found.height_m:.2f}."
+            )
+        ]
+    return [check.ok("the body fits how high the head is carried", evidence)]
 
 
 def _clocks(recording: Recording) -> dict[str, Float64[Tensor, "_"]]:

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-import torch
 from jaxtyping import Float64
 from torch import Tensor
 
@@ -20,13 +19,11 @@ LEAST_OVERLAP = 0.9
 """Least share of the head's or suit's span that every needed stream covers."""
 COVERED = 0.5
 """Least share of the path below which points show a floor."""
-UNUSUAL_M = 0.10
-"""Difference of the head's usual height from that of the assumed body beyond which the wearer's height is doubtful."""
 _FLOOR_CONFIDENCE = 0.3
 
 
 def preflight(recording: Recording, folder: Path | None, name: str, needs: Sequence[Need]) -> list[Finding]:
-    """Findings on every need of the system called `name`: there or missing, time spans, floor below the path, height."""
+    """Findings on every need of the system called `name`: there or missing, time spans, floor below the path."""
     source = CaptureInput(recording) if folder is None else CaptureInput.in_dataset(recording, folder)
     findings = []
     for need in needs:
@@ -38,7 +35,7 @@ def preflight(recording: Recording, folder: Path | None, name: str, needs: Seque
             findings.append(check.found("error" if need.required else "warning", what, "", need.fix))
     findings += _spans(recording, name, {need.stream for need in needs if need.stream})
     if any(need.stream == "head" for need in needs):
-        findings += _floor(recording) + _height(recording)
+        findings += _floor(recording)
     return findings
 
 
@@ -98,24 +95,3 @@ def _floor(recording: Recording) -> list[Finding]:
         fix = "Look at the floor while walking; without it the floor follows from the head's height."
         return [check.warning("points hardly show it", evidence, fix)]
     return [check.ok("points show it", evidence)]
-
-
-def _height(recording: Recording) -> list[Finding]:
-    """The head's usual height above a known floor against that of the body that is assumed."""
-    head = recording.head
-    if head is None or recording.skeleton is None or (recording.floor is None and recording.points is None):
-        return []
-    level = torch.zeros(1) if recording.floor is None else recording.floor.height
-    joint = head.T_world_head.t
-    if recording.floor is None and recording.points is not None:
-        try:
-            level = estimate_floor(recording.points.points_world, head.t_world_device).height
-        except WearcapError:
-            return []
-    above = torch.quantile((joint[:: len(joint) // 5000 + 1, 2] - level.median()).double(), 0.9).item()
-    assumed = recording.skeleton.height_of("head")
-    check, evidence = Check("height"), f"head joint {above:.2f} m above the floor, {assumed:.2f} m by the body"
-    if abs(above - assumed) > UNUSUAL_M:
-        fix = f"A height of {recording.skeleton.stature * above / assumed:.2f} m fits, if the wearer stood upright."
-        return [check.warning("the body does not fit how high the head is carried", evidence, fix)]
-    return [check.ok(f"a body of {recording.skeleton.stature:.2f} m fits", evidence)]

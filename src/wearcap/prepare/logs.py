@@ -130,7 +130,7 @@ def read_cloud(path: str | Path) -> PointCloud:
     return PointCloud(torch.stack([torch.from_numpy(column) for column in columns.values()], 1).float())
 
 
-def _trajectory(file: Path, name: str, about: dict[str, str], settings: TrajectorySettings, output: Path) -> Recording:
+def read_path(file: Path, name: str, about: dict[str, str], settings: TrajectorySettings, output: Path) -> Recording:
     """The head's path, points and camera of one trajectory."""
     if file.is_dir() and is_mps_folder(file):
         read = read_mps(file)
@@ -236,7 +236,7 @@ def trajectory_tasks(
         what = f"{len(found)} trajectories, but points, video or head_imu of one"
         raise WearcapError(what, where=source, fix="Prepare that one alone: source=FILE.")
     files = settings.files()
-    return [_task("trajectory", path, _trajectory, output, splits, subject, license, settings, files) for path in found]
+    return [_task("trajectory", path, read_path, output, splits, subject, license, settings, files) for path in found]
 
 
 def _watches(camera: Path, name: str, about: dict[str, str], settings: "WatchesSettings", output: Path) -> Recording:

@@ -2,13 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-
-import torch
 
 import wearcap.io.saving  # noqa: F401  gives motions their `save`
 from wearcap.body.skeleton import FOOT_PATCHES
+from wearcap.doctor.logs import is_kit, log_kind, read_kit, read_table
 from wearcap.errors import WearcapError
 from wearcap.io.datasets.adt import is_adt, read_adt
 from wearcap.io.datasets.amass import read_amass
@@ -20,8 +18,9 @@ from wearcap.io.formats.bvh import read_bvh
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.io.formats.mvnx import read_mvnx
 from wearcap.io.formats.npz import read_npz
-from wearcap.io.formats.poses import read_euroc, read_tum
-from wearcap.recording import HeadStream, Motion, Recording
+from wearcap.io.formats.trajectory import trajectory_format
+from wearcap.prepare.logs import HeadsetSettings, TrajectorySettings, read_path
+from wearcap.recording import Motion, Recording
 from wearcap.recording.store import MANIFEST, RecordingFile, load_recording
 from wearcap.sensors.contacts import contacts_from_motion
 
@@ -32,8 +31,9 @@ def read(where: str | Path) -> Recording:
     """Read a recording from whatever holds one.
 
     That is a prepared recording (DATASET/NAME or its .safetensors), MVNX, BVH, AMC with its ASF, AMASS or SMPL .npz, our
-    motion .npz, a trajectory (.csv, .txt, .tum), or a folder of Aria MPS, Nymeria, Aria Digital Twin or TotalCapture. A
-    suit without foot contacts gets those of its feet's speed. Names are those of the files. Raises WearcapError for what cannot be read.
+    motion .npz, a trajectory, a watch's or a headset's log, or a folder of Aria MPS, Nymeria, Aria Digital Twin or
+    TotalCapture, or of one session's logs. A suit without foot contacts gets those of its feet's speed. Names are those of
+    the files. Raises WearcapError for what cannot be read.
     """
     path = Path(where)
     if not path.exists() or (path / MANIFEST).is_file():
@@ -79,24 +79,25 @@ def amc_skeleton(path: Path) -> Path:
     return (named or beside)[-1]
 
 
-def _read_csv(path: Path) -> Recording:
-    if "closed_loop" in path.name or "aria_trajectory" in path.name:
+def _read_log(path: Path) -> Recording:
+    """A watch's or headset's log, or a trajectory of any format, by content; with what was detected as its note."""
+    name, kind = path.name.split(".")[0], log_kind(path)
+    if kind == "watch":
+        return replace(read_table(path)[0], name=name)
+    if kind == "headset":
+        return HeadsetSettings().read(path, name, {})
+    if "aria_trajectory" in path.name or (kind == "trajectory" and trajectory_format(path) == "MPS"):
         track = read_closed_loop(path, up="y" if "aria_trajectory" in path.name else "z")[0]
-        return Recording(path.name.split(".")[0], head=head_stream(track, fps=None), source="Aria MPS")
-    return _read_poses(read_euroc, path)
-
-
-def _read_poses(read_trajectory: Callable, path: Path) -> Recording:
-    """A trajectory as the head's own path: x forward, y left, z up."""
-    path_of = read_trajectory(path)
-    head = HeadStream(path_of.timestamps, path_of.R_world_body, path_of.t_world_body, torch.eye(3), torch.zeros(3))
-    return Recording(path.name.split(".")[0], head=head)
+        return Recording(name, head=head_stream(track, fps=None), source="Aria MPS")
+    return read_path(path, name, {}, TrajectorySettings(), path.parent)
 
 
 def _read_npz(path: Path) -> Recording | Motion:
-    """A wearcap motion, Nymeria's suit data, or an AMASS file, recognised by its arrays."""
+    """A wearcap motion, Nymeria's suit data, DROID-SLAM's poses, or an AMASS file, recognised by its arrays."""
     if path.name == "xdata.npz":
         return read_xdata(path)[0]
+    if read_npz(path, ("traj_est", "tstamps", "tstamp")):
+        return read_path(path, path.stem, {}, TrajectorySettings(), path.parent)
     return read_motion(path) if read_npz(path, ("wearcap",)) else read_amass(path)
 
 
@@ -116,6 +117,7 @@ _FOLDERS: tuple[tuple[Callable[[Path], bool], Callable[[Path], Recording]], ...]
     (is_mps_folder, read_mps),
     (is_adt, read_adt),
     (is_totalcapture, _totalcapture),
+    (is_kit, lambda folder: read_kit(folder)[0]),
 )
 READERS: dict[str, Callable[[Path], Recording | Motion]] = {
     ".amc": lambda path: read_amc(read_asf(amc_skeleton(path)), path),
@@ -123,8 +125,6 @@ READERS: dict[str, Callable[[Path], Recording | Motion]] = {
     ".mvnx": lambda path: _suit(read_mvnx(path)),
     ".npz": _read_npz,
     ".safetensors": lambda path: RecordingFile(path).load(),
-    ".csv": _read_csv,
-    ".txt": partial(_read_poses, read_tum),
-    ".tum": partial(_read_poses, read_tum),
+    **dict.fromkeys((".csv", ".txt", ".tum", ".log", ".json", ".jsonl", ".npy", ".bin"), _read_log),
 }
 """Readers by suffix."""
