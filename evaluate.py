@@ -1,4 +1,4 @@
-"""Score a checkpoint on whole recordings: `python evaluate.py checkpoint=… data=cmu` (see `--help`)."""
+"""Score a checkpoint on whole recordings: `python evaluate.py checkpoint=…` (see `--help`)."""
 
 import sys
 

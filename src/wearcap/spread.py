@@ -102,10 +102,15 @@ def reason_of(error: Exception) -> str:
 
 
 @contextmanager
-def progress_bar(total: int, done: int = 0) -> Iterator[Callable[[], None]]:
-    """Progress bar of recordings on stderr; the yielded function is called for each finished one."""
+def progress_bar(total: int, done: int = 0, transient: bool = False) -> Iterator[Callable[[], None]]:
+    """Progress bar of recordings on stderr; the yielded function is called for each finished one.
+
+    `transient`: it is shown on a terminal only, and only while it progresses.
+    """
     columns = (TextColumn("recordings"), BarColumn(), MofNCompleteColumn(), TextColumn("left:"), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    console = Console(stderr=True)
+    hidden = transient and not console.is_terminal
+    with Progress(*columns, console=console, transient=transient, disable=hidden) as bar:
         line = bar.add_task("recordings", total=total, completed=done)
         yield lambda: bar.advance(line)
 

@@ -13,6 +13,7 @@ from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.formats.environment import write_environment
 from wearcap.metrics.objects import vertex_error_cm
 from wearcap.recording import RecordingStore
 from wearcap.runtime.system import CaptureInput
@@ -194,3 +195,16 @@ def test_baselines_are_functions_of_the_training_split_alone(dataset):
     np.testing.assert_array_equal(one.frames["box"].numpy(), two.frames["box"].numpy())
     assert RecordingStore.open(dataset.recordings[0][0].root).names("train") == ["c0"]
     assert len(boxes()) == 1
+
+
+def test_few_environments_stay_in_memory(tmp_path):
+    """Of a data set in which each recording has its own objects only the last few are kept, and scores are the same."""
+    echo, motion = drawn_echo(), perfect(truth_of(scenario_of(RECORDING), TIMES, drawn_echo().reader()))
+    scores = []
+    for number in range(20):
+        folder = tmp_path / f"{number}"
+        write_environment(boxes(), folder)
+        recording = replace(RECORDING, environment=f"{number}/environment.json")
+        scores.append(echo.score(motion, CaptureInput.in_dataset(recording, tmp_path), 0).scores["v2v_cm"])
+        assert len(echo._environments) <= 16
+    assert scores == [pytest.approx(0.0, abs=0.05)] * 20

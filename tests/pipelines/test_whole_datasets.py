@@ -3,7 +3,11 @@
 import csv
 import gc
 import json
+import os
 import shutil
+import subprocess
+import sys
+import time
 import weakref
 from pathlib import Path
 
@@ -306,3 +310,28 @@ def test_the_key_of_settings_is_of_files_and_code(tmp_path):
     assert settings_key(config, ["hmd2"]) != settings_key(config, ["echo"])
     other = {**config, "pipeline": config["pipeline"] | {"_target_": "wearcap.systems.echo.pipeline.Echo"}}
     assert settings_key(other, []) != settings_key(config, [])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="kills a process")
+def test_a_killed_capture_goes_on_with_what_is_left(checkpoint, tmp_path):
+    """Two workers, killed with their parent after the first recordings; nothing finished is captured again."""
+    store, output = RecordingStore(tmp_path / "data"), tmp_path / "out"
+    for index in range(8):
+        store.add(recording_of(swaying_motion(400, index), f"r{index}"), split="test", config_hash="x")
+    given = [f"checkpoint={checkpoint}", f"recording={store.root}", f"output={output}", f"hydra.run.dir={tmp_path}/run"]
+    command = [sys.executable, "-m", "wearcap.cli.main", "capture", *given, "video=false", "body=false", FEW_STEPS]
+    process = subprocess.Popen([*command, "jobs=2"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not list(output.glob("finished/*.json")):
+        assert process.poll() is None, "it ended before anything was finished"
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    process.kill()
+    process.wait()
+    finished = {path.stem: path.stat().st_mtime_ns for path in output.glob("finished/*.json")}
+    capturing(checkpoint, store.root, output, "jobs=1")
+    after = {path.stem: path.stat().st_mtime_ns for path in output.glob("finished/*.json")}
+    assert set(after) == set(store.names())
+    assert finished.items() <= after.items()
+    assert len(table(output / "recordings.csv")) == 8

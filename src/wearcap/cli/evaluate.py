@@ -97,8 +97,12 @@ class _Scoring:
         self, system: System, checkpoints: Sequence[str], seeds: Sequence[int], title: str, method: str
     ) -> list[Outcome]:
         """Outcomes of a configured system, whose workers load it by themselves."""
-        plain: Any = OmegaConf.to_container(self.config, resolve=True)
-        key = settings_key({name: plain[name] for name in CAPTURING} | {"seeds": list(seeds)}, checkpoints)
+        values = {name: self.config[name] for name in CAPTURING}
+        plain: dict[str, Any] = {
+            name: OmegaConf.to_container(value, resolve=True) if isinstance(value, DictConfig) else value
+            for name, value in values.items()
+        }
+        key = settings_key(plain | {"seeds": list(seeds)}, checkpoints)
         loaded(key, lambda: system)
         make = partial(_load, list(checkpoints), plain["pipeline"], self.config.device)
         return self.outcomes(self.names, system, make, key, seeds, title, method, spread_of(self.config))

@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich import print as show
 
 from wearcap.cli import evaluate
-from wearcap.cli.conf import compose, explained, hydra_main, with_pipeline
+from wearcap.cli.conf import compose, explained, hydra_main, trained_on, with_pipeline
 from wearcap.data.surroundings import embeddings_of
 from wearcap.errors import WearcapError
 from wearcap.locks import folder_lock
@@ -92,8 +92,9 @@ def _test(config: DictConfig, run: Path, device: str) -> None:
     """Score the best checkpoint on the test split, as `wearcap evaluate` does, in test.json."""
     best = run / "checkpoints" / "best.ckpt"
     checkpoint = best if best.is_file() else last_checkpoint(run)
-    given = [f"checkpoint='{checkpoint}'", f"paths.run='{run}'", f"output='{run / 'test.json'}'", f"device={device}"]
-    settings = compose("evaluate", with_pipeline(given))
+    places = {"checkpoint": checkpoint, "dataset": trained_on(checkpoint)[1], "output": run / "test.json"}
+    given = [f"{key}='{path}'" for key, path in (places | {"paths.run": run}).items()]
+    settings = compose("evaluate", with_pipeline([*given, f"device={device}"]))
     if config.pipeline.get("_target_") == settings.pipeline._target_:
         settings.pipeline = config.pipeline  # as its settings were chosen for the training's captures
     evaluate.run(settings)

@@ -33,7 +33,7 @@ from wearcap.runtime.stages import code_digest, digest
 from wearcap.runtime.system import StageOptions, System
 from wearcap.spread import Spread, divided, progress_bar, reason_of
 
-SHOWN = 4
+SHOWN = 3
 """Metrics of a table of recordings; its file has them all."""
 _DAMAGE = (OSError, ValueError, KeyError, TypeError, AttributeError, WearcapError)
 
@@ -81,7 +81,8 @@ def over_recordings(
     writes there, or a worker was killed.
     """
     todo: list[tuple[str, str]] = []
-    with nullcontext() if notes is None else folder_lock(notes, "evaluate") as lock, progress_bar(len(names)) as done:
+    locked = nullcontext() if notes is None else folder_lock(notes, "capture or evaluation")
+    with locked as lock, progress_bar(len(names), transient=True) as done:
         for name in names:
             try:
                 key = "" if notes is None else digest(settings, *_inputs(store, name, scene))
@@ -259,13 +260,17 @@ def outcome_table(title: str, outcomes: Iterable[Outcome]) -> Table:
     """A table for a terminal: recording, seconds, frames, its first metrics, error."""
     table, rows = Table(title=title), sorted(outcomes, key=lambda outcome: outcome.recording)
     metrics = [name for name in _metrics(rows) if not name.startswith(TRUTH)][:SHOWN]
-    for heading in ("recording", "seconds", "frames", *metrics, *(["error"] if failures(rows) else [])):
-        table.add_column(heading, justify="left" if heading in ("recording", "error") else "right")
+    failed = bool(failures(rows))
+    table.add_column("recording", no_wrap=True)
+    for heading in ("seconds", "frames", *metrics):
+        table.add_column(heading, justify="right")
+    if failed:
+        table.add_column("error", overflow="fold")
     for row in rows:
         scores = row.scores()
         values = [scores.get(name, math.nan) for name in metrics]
         cells = ["–" if math.isnan(value) else f"{value:.{decimals(value)}f}" for value in values]
-        table.add_row(row.recording, f"{row.seconds:.1f}", str(row.frames), *cells, row.error)
+        table.add_row(row.recording, f"{row.seconds:.1f}", str(row.frames), *cells, *([row.error] if failed else []))
     return table
 
 

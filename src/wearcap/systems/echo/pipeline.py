@@ -49,6 +49,10 @@ class Sampling:
     """Denoising steps of such a window; None: as many as a frame takes on the conveyor."""
 
 
+MAX_ENVIRONMENTS = 16
+"""Most environments that a pipeline keeps in memory."""
+
+
 @dataclass
 class Echo(LearnedSystem):
     """Captures recordings with a rolling schedule over frames (the conveyor); batching does not change results."""
@@ -140,16 +144,19 @@ class Echo(LearnedSystem):
         return self.capture_scenarios([once[id(source)] for source in sources], seeds)
 
     def objects(self, source: CaptureInput) -> Environment | None:
-        """The objects of a recording; each file is read once. Raises WearcapError for a file that cannot be read."""
+        """The objects of a recording; the last few files are kept. Raises WearcapError for a file that cannot be read."""
         path = source.environment_file(self.environment)
         if path is not None and path not in self._environments:
+            if len(self._environments) >= MAX_ENVIRONMENTS:
+                # The reader knows shapes by their meshes, which go with the environments.
+                self._environments, self._reader = {}, None
             self._environments[path] = read_environment(path)
         return None if path is None else self._environments[path]
 
     def truth(self, motion: Motion, source: CaptureInput) -> Truth:
         """The ground truth at a capture's frames, whichever active objects the capture was conditioned on."""
-        self._reader = self._reader or self.reader()
         environment, recording = self.objects(source), source.recording
+        self._reader = self._reader or self.reader()
         has_objects = environment is not None and bool(recording.object_motion)
         acts = tuple(true_acts(recording)) if has_objects else ()
         return truth_of(Scenario(recording, environment, acts), motion.timestamps, self._reader)
