@@ -180,8 +180,6 @@ def test_a_take_is_prepared_alone_and_with_a_localised_camera(take, tmp_path, mo
     assert both.camera is not None
     assert len(both.localization.timestamps) == 30
     assert torch.allclose(both.localization.t_world_cam[-1], torch.tensor([0.29, 0.0, 1.7]))
-    late = (
-        (tmp_path / "camera.txt").read_text().replace("\n", "\n9").replace("0.0000 0.0 0 1.7", "90.0000 0.0 0 1.7", 1)
-    )
-    (tmp_path / "camera.txt").write_text(late)
-    assert exit_code([*command, "camera=camera.json", "overwrite=true"]) == 2
+    (tmp_path / "camera.txt").write_text("\n".join(f"9{line}" for line in poses))
+    assert exit_code([*command, "camera=camera.json"]) == 1
+    assert exit_code([*command, "camera=camera.json", "video=nothing.mp4"]) == 2
