@@ -93,7 +93,7 @@ def test_bad_logs_are_refused(tmp_path):
         with pytest.raises(WearcapError, match=match):
             read_watch_log(path, "right_wrist")
 
-    refused([*lines[:5], lines[6], lines[5], *lines[7:]], "time does not grow at row 5")
+    refused([*lines[:5], lines[6], lines[5], *lines[7:]], "time does not grow at line 7")
     refused(lines[:2], "1 rows")
     refused([lines[0], *lines[1::5]], "10.0 rows a second")
     refused([*lines[:3], lines[3].rpartition(",")[0] + ",nan", *lines[4:]], "quaternion of row 2 is not finite")

@@ -25,6 +25,7 @@ from wearcap.doctor.places import is_map, is_place, read_environment_file, read_
 from wearcap.doctor.report import SEVERITIES, Check, Finding, Report, has_error, refusal
 from wearcap.doctor.streams import check_clock, check_spans, check_track
 from wearcap.errors import WearcapError
+from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.adt import is_adt, read_adt
 from wearcap.io.datasets.amass import read_amass
 from wearcap.io.datasets.hps import hps_names, read_hps_sequence

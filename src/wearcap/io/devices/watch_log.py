@@ -187,7 +187,7 @@ def _require_times(seconds: np.ndarray, path: str | Path) -> None:
     step = np.diff(seconds)
     if (step <= 0).any():
         row = int(np.flatnonzero(step <= 0)[0]) + 1
-        what = f"time does not grow at row {row} ({step[row - 1]:+.3f} s)"
+        what = f"time does not grow at line {row + 2} ({step[row - 1]:+.3f} s)"
         raise WearcapError(what, path, fix="Sort the rows by time and leave repeated ones out.")
     if np.median(step) > 1 / MIN_RATE_HZ:
         what = f"{1 / np.median(step):.1f} rows a second"
