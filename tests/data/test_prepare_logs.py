@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import short_walk
 from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.devices.aria_mps import read_mps
 from wearcap.recording import RecordingStore
 
 G = 9.80665
@@ -112,7 +113,7 @@ def test_outliers_are_removed_and_said(tmp_path, capsys):
 def test_a_folder_of_trajectories_is_a_recording_each(tmp_path):
     time, R, t = short_walk.walk()
     (tmp_path / "in").mkdir()
-    for name, write in (("a.txt", short_walk.tum), ("b.csv", short_walk.euroc), ("c.csv", short_walk.mps)):
+    for name, write in (("a.txt", short_walk.tum), ("b.csv", short_walk.euroc), ("c.txt", short_walk.kitti)):
         write(tmp_path / "in" / name, time, R @ short_walk.CAMERA_IN_HEAD, t)
     (tmp_path / "in/readme.txt").write_text("nothing")
     assert prepare("trajectory", tmp_path, f"source={tmp_path}/in") == 0
@@ -190,9 +191,11 @@ def test_what_is_missing_is_said(tmp_path, capsys):
 
 @pytest.mark.real
 def test_a_real_aria_trajectory_as_a_file(real_data, tmp_path):
-    """MPS' closed-loop file by itself: the left SLAM camera's pose, upright and moving ahead as a camera does."""
+    """MPS' closed-loop file by itself gives the head stream of its folder."""
     source = real_data / "aria_mps/closed_loop_trajectory.csv.xz"
     assert prepare("trajectory", tmp_path, f"source={source}", "height=1.7") == 0
     recording = only(tmp_path)
     assert recording.note.startswith("MPS, times in us; z is up")
-    assert abs(recording.duration_s - 11.5) < 0.5
+    folder = read_mps(real_data / "aria_mps").head
+    torch.testing.assert_close(recording.head.t_world_device, folder.t_world_device, atol=1e-3, rtol=0)
+    torch.testing.assert_close(recording.head.R_world_device, folder.R_world_device, atol=1e-3, rtol=0)
