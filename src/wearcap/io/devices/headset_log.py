@@ -239,7 +239,7 @@ def _flat(value: Any, key: str = "", depth: int = 0) -> dict[str, Any]:
 
 def _parts(name: str) -> list[str]:
     """Lower-case words and numbers of a column's name; a unit in brackets is left out."""
-    plain = re.sub(r"[\[(].*?[\])]", " ", name)
+    plain = re.sub(r"[\[(][^\[\]()]*[\])]", " ", name)
     split = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", plain)
     return [word.lower() for word in re.findall(r"[A-Za-zµ]+|\d+", split)]
 
