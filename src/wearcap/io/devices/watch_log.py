@@ -54,7 +54,8 @@ def read_watch_log(path: str | Path, joint: str) -> ImuStream:
     """
     if joint not in WRISTS:
         raise WearcapError(f"a watch on {joint!r}", path, " or ".join(WRISTS))
-    if set(_X_IMU) & set(read_header(path)):
+    header = set(read_header(path))
+    if set(_X_IMU) & header or header >= _X_QUATERNION:
         stream = read_inertial_log(path, joint)
         if stream.acc_world is None:
             fix = "Put the sensor's Quaternion.csv beside its Inertial.csv."
