@@ -35,6 +35,7 @@ import totalcapture_files  # noqa: E402
 from PIL import Image  # noqa: E402
 
 import keypoint_files  # noqa: E402
+import short_walk  # noqa: E402
 from wearcap.body.skeletons import smplh52  # noqa: E402
 from wearcap.geometry.camera import Camera  # noqa: E402
 from wearcap.geometry.rigid import Rigid  # noqa: E402
@@ -50,7 +51,7 @@ from wearcap.io.datasets import (  # noqa: E402
     omomo,
     totalcapture,
 )
-from wearcap.io.devices import aria_mps, watch_log  # noqa: E402
+from wearcap.io.devices import aria_mps, headset_log, watch_log  # noqa: E402
 from wearcap.io.formats import (  # noqa: E402
     asf_amc,
     bvh,
@@ -77,6 +78,7 @@ from wearcap.io.formats import (  # noqa: E402
 from wearcap.localization import keypoints  # noqa: E402
 from wearcap.recording import Cue  # noqa: E402
 from wearcap.scene.scan import Photo  # noqa: E402
+from wearcap.sensors import watch_calibration  # noqa: E402
 from wearcap_testing import swaying_motion  # noqa: E402
 
 
@@ -94,6 +96,11 @@ FRAMES = 12
 """Of data sets whose files are long: short ones show the same faults sooner."""
 TUM = "".join(f"{0.1 * k:.1f} {k} 2 3 0 0 0 1\n" for k in range(12))
 EUROC = "#timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z\n" + "".join(f"{10**9 * k},{k},0,0,1,0,0,0\n" for k in range(1, 9))
+_WATCH = '{"R_world_ref_wxyz": [1, 0, 0, 0], "R_joint_imu_wxyz": [1, 0, 0, 0], "board_still_deg": 0.1, "board_tilt_deg": 0.2, "pose_still_deg": 1}'
+_CLOCK = '{"camera_s": [1, 2], "watch_s": [3, 4], "swings": 9, "drift_s_per_hour": 0, "residual_s": 0, "std_s": 0.001}'
+WORN = f"""{{"watches": {{"left_wrist": {_WATCH}, "right_wrist": {_WATCH}}}, "clocks": {{"left_wrist": {_CLOCK}}},
+ "camera": {{"scale": 2, "R_world_slam_wxyz": [1, 0, 0, 0], "t_world_slam": [0, 0, 1], "residual_m": 0.01}},
+ "head": {{"R_head_cam_wxyz": [1, 0, 0, 0], "t_head_cam": [0, 0, 0], "still_deg": 1}}}}"""
 POINTS = "uid,graph_uid,px_world,py_world,pz_world,inv_dist_std,dist_std\n1,g,1,2,0,0.001,0.001\n2,g,1,2,9,0.1,1\n"
 ASCII_PLY = """ply
 format ascii 1.0
@@ -128,6 +135,31 @@ def _one(name: str, content: str | bytes, read: Callable[[Path], Any]) -> Reader
 def _made(name: str, write: Callable[[Path], Any], read: Callable[[Path], Any]) -> Reader:
     """A reader of one file that another function writes."""
     return Reader(lambda folder: write(folder / name), lambda folder: read(folder / name))
+
+
+def _headset_poses() -> tuple:
+    time, R, t = short_walk.walk(seconds=3.0)
+    return time, short_walk.headset_poses(time, R, t, "unity", "grip")
+
+
+def _headset_csv(path: Path) -> None:
+    names = {name: name + "_{quantity}_{axis}" for name in ("head", "left", "right")}
+    short_walk.headset_csv(path, *_headset_poses(), {"time": "time"} | names)
+
+
+def _headset_json(path: Path, dumps: Callable[[list[dict]], str]) -> None:
+    path.write_text(dumps(short_walk.headset_frames(*_headset_poses())))
+
+
+def _x_imu(folder: Path) -> None:
+    """Inertial.csv and Quaternion.csv of a sensor at rest."""
+    names = [
+        f"{kind} {axis} ({unit})" for kind, unit in (("Gyroscope", "deg/s"), ("Accelerometer", "g")) for axis in "XYZ"
+    ]
+    rows = "".join(f"{20000 * k},0.1,0.2,0.3,0,0,1\n" for k in range(30))
+    (folder / "Inertial.csv").write_text(",".join(["Timestamp (us)", *names]) + "\n" + rows)
+    rows = "".join(f"{20000 * k},1,0,0,0\n" for k in range(30))
+    (folder / "Quaternion.csv").write_text("Timestamp (us),W,X,Y,Z\n" + rows)
 
 
 def _points(count: int = 8) -> np.ndarray:
@@ -379,6 +411,30 @@ READERS: dict[str, Reader] = {
         lambda folder: totalcapture_files.write_totalcapture(folder, frames=6),
         lambda folder: totalcapture.read_totalcapture(totalcapture.totalcapture_files(folder)[0]),
     ),
+    **{
+        f"trajectory_{name}": Reader(
+            lambda folder, write=write, file=file: write(folder / file, *short_walk.walk(seconds=1.0)),
+            lambda folder, file=file: trajectory.read_trajectory(folder / file),
+        )
+        for name, file, write in (
+            ("colmap_text", "images.txt", short_walk.colmap_text),
+            ("colmap_binary", "images.bin", short_walk.colmap_binary),
+            ("hloc", "poses.txt", short_walk.hloc),
+            ("droid", "poses.npy", short_walk.droid),
+            ("droid_archive", "poses.npz", short_walk.droid_archive),
+            ("kitti", "poses.txt", short_walk.kitti),
+            ("mps", "closed_loop_trajectory.csv", short_walk.mps),
+        )
+    },
+    "headset_csv": _made("h.csv", _headset_csv, headset_log.read_headset_log),
+    "headset_json": _made("h.json", lambda path: _headset_json(path, json.dumps), headset_log.read_headset_log),
+    "headset_lines": _made(
+        "h.jsonl",
+        lambda path: _headset_json(path, lambda frames: "\n".join(map(json.dumps, frames))),
+        headset_log.read_headset_log,
+    ),
+    "x_imu": Reader(_x_imu, lambda folder: watch_log.read_inertial_log(folder / "Inertial.csv", "left_wrist")),
+    "watch_calibration": _one("c.json", WORN, watch_calibration.read_watch_calibration),
     "tum": _one("t.txt", TUM, trajectory.read_trajectory),
     "tum_gz": _one("t.txt.gz", gzip.compress(TUM.encode()), trajectory.read_trajectory),
     "tum_xz": _one("t.txt.xz", lzma.compress(TUM.encode()), trajectory.read_trajectory),

@@ -1,5 +1,6 @@
 """Watch logs: what their numbers mean is found in them."""
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import torch
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.devices.watch_log import G_M_S2, read_watch_log
+from wearcap.io.devices.watch_log import G_M_S2, is_watch_log, read_inertial_log, read_watch_log
 from wearcap.recording import ImuStream
 
 
@@ -93,7 +94,7 @@ def test_bad_logs_are_refused(tmp_path):
         with pytest.raises(WearcapError, match=match):
             read_watch_log(path, "right_wrist")
 
-    refused([*lines[:5], lines[6], lines[5], *lines[7:]], "time does not grow at row 5")
+    refused([*lines[:5], lines[6], lines[5], *lines[7:]], "time does not grow at line 7")
     refused(lines[:2], "1 rows")
     refused([lines[0], *lines[1::5]], "10.0 rows a second")
     refused([*lines[:3], lines[3].rpartition(",")[0] + ",nan", *lines[4:]], "quaternion of row 2 is not finite")
@@ -120,3 +121,43 @@ def test_a_real_watch_knows_where_up_is(real_data, name):
     )
     error = (turned - watch.gyro_imu[1:]).norm(dim=-1)[near]
     assert error.median() < 0.1 * watch.gyro_imu.norm(dim=-1).median()
+
+
+def x_imu(watch: ImuStream, folder: Path) -> Path:
+    """x-IMU3's files: microseconds, degrees a second, g; the attitude's file at half the rate."""
+    names = [
+        f"{kind} {axis} ({unit})" for kind, unit in (("Gyroscope", "deg/s"), ("Accelerometer", "g")) for axis in "XYZ"
+    ]
+    time = (watch.timestamps - watch.timestamps[0]).mul(1e6).round().long().tolist()
+    inertial = torch.cat([watch.gyro_imu.double().rad2deg(), watch.acc_imu.double() / G_M_S2], 1).tolist()
+    rows = [",".join(map(str, [at, *row])) for at, row in zip(time, inertial)]
+    (folder / "Inertial.csv").write_text("\n".join([",".join(["Timestamp (us)", *names]), *rows]) + "\n")
+    attitude = rotation.quat_wxyz_from_matrix(watch.R_world_imu.double()).tolist()
+    rows = [",".join(map(str, [at, *row])) for at, row in zip(time[::2], attitude[::2])]
+    (folder / "Quaternion.csv").write_text("\n".join(["Timestamp (us),W,X,Y,Z", *rows]) + "\n")
+    return folder / "Inertial.csv"
+
+
+@pytest.mark.parametrize("given", ["Inertial.csv", "Quaternion.csv"])
+def test_x_imu_has_its_attitude_beside(tmp_path, given):
+    made = moved()
+    x_imu(made, tmp_path)
+    assert is_watch_log(tmp_path / given)
+    for read in (read_inertial_log, read_watch_log):
+        found = read(tmp_path / given, "left_wrist")
+        inner = slice(2, -2)
+        torch.testing.assert_close(found.acc_imu, made.acc_imu, atol=1e-3, rtol=1e-4)
+        torch.testing.assert_close(found.gyro_imu, made.gyro_imu, atol=1e-3, rtol=1e-4)
+        assert rotation.geodesic(found.R_world_imu[inner], made.R_world_imu[inner]).max() < 0.01
+        assert (found.acc_world[inner] - made.acc_world[inner]).abs().max() < 0.4
+
+
+def test_a_sensor_without_attitude_is_read_by_the_doctor_alone(tmp_path):
+    path = x_imu(moved(), tmp_path)
+    (tmp_path / "Quaternion.csv").unlink()
+    assert read_inertial_log(path, "left_wrist").R_world_imu is None
+    with pytest.raises(WearcapError, match="without orientation.*Quaternion.csv"):
+        read_watch_log(path, "left_wrist")
+    other = x_imu(replace(moved(), R_world_imu=rotation.about_axis("x", torch.full((120,), 2.0))), tmp_path)
+    with pytest.raises(WearcapError, match="upright by the attitude"):
+        read_inertial_log(other, "left_wrist")

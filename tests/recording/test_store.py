@@ -89,6 +89,7 @@ def full_recording(name: str = "all") -> Recording:
         activity="walk",
         source="test",
         license="MIT",
+        note="axes detected",
         session="pair",
     )
 

@@ -182,18 +182,16 @@ def read_kit(folder: Path) -> Loaded:
 def _sides(watches: list[Path], findings: list[Finding]) -> dict[Path, str]:
     """Wrists of the watches' logs, by their names, else in their order."""
     check = Check("watches")
+    if len(watches) == 1:
+        fix = "MocapEvery needs two: put the other's log beside."
+        findings.append(check.warning("one watch", watches[0].name, fix))
+    for path in watches[2:]:
+        findings.append(check.warning("more than two watches", f"{path.name} is left out", "Keep one log per wrist."))
     sides = {path: side for path in watches if (side := _side(path)) is not None}
     if len(set(sides.values())) == len(watches) <= 2:
         return sides
     named: dict[Path, str] = dict(zip(watches[:2], WRISTS))
     listed = ", ".join(f"{path.name} on the {joint.replace('_', ' ')}" for path, joint in named.items())
-    if watches:
-        fix = "Put left and right into the files' names."
-        findings.append(check.warning("sides are guessed from the order of the names", listed, fix))
-    if len(watches) == 1:
-        findings.append(
-            check.warning("one watch", watches[0].name, "MocapEvery needs two: put the other's log beside.")
-        )
-    for path in watches[2:]:
-        findings.append(check.warning("more than two watches", f"{path.name} is left out", "Keep one log per wrist."))
+    fix = "Put left and right into the files' names."
+    findings.append(check.warning("sides are guessed from the order of the names", listed, fix))
     return named

@@ -4,14 +4,15 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from jaxtyping import Float64
+import torch
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS
-from wearcap.doctor.report import Check, Finding
+from wearcap.doctor.report import Check, Finding, refusal
 from wearcap.errors import WearcapError
-from wearcap.recording import Recording
-from wearcap.runtime.needs import Need
+from wearcap.recording import Localization, Recording
+from wearcap.runtime.needs import SCAN, Need
 from wearcap.runtime.system import CaptureInput
 from wearcap.scene.floor import estimate_floor
 
@@ -20,6 +21,8 @@ LEAST_OVERLAP = 0.9
 COVERED = 0.5
 """Least share of the path below which points show a floor."""
 _FLOOR_CONFIDENCE = 0.3
+MAX_POINTS = 1_000_000
+"""Points of a scan that are looked at."""
 
 
 def preflight(recording: Recording, folder: Path | None, name: str, needs: Sequence[Need]) -> list[Finding]:
@@ -36,6 +39,8 @@ def preflight(recording: Recording, folder: Path | None, name: str, needs: Seque
     findings += _spans(recording, name, {need.stream for need in needs if need.stream})
     if any(need.stream == "head" for need in needs):
         findings += _floor(recording)
+    if recording.localization is not None and any(need.what == SCAN.what for need in needs):
+        findings += _scanned(source, recording.localization)
     return findings
 
 
@@ -54,7 +59,11 @@ def _spans(recording: Recording, name: str, streams: set[str]) -> list[Finding]:
             f"{leads} {reference[0].item():.2f} … {reference[-1].item():.2f} s, "
             f"{other} {times[0].item():.2f} … {times[-1].item():.2f} s"
         )
-        if share <= 0:
+        by_claps = leads == "suit" and other in ("camera", "localization") and set(WRISTS) & set(recording.imu)
+        if share <= 0 and by_claps:
+            what = f"{other} shares no time with {leads}: their clocks must be joined by claps"
+            findings.append(check.note(what, evidence, "Clap at the beginning and at the end."))
+        elif share <= 0:
             fix = "Bring both to one clock (wearcap calibrate), or take the logs of one session."
             findings.append(check.error(f"{other} shares no time with {leads}", evidence, fix))
         elif share < LEAST_OVERLAP:
@@ -76,22 +85,44 @@ def _times(recording: Recording, streams: set[str]) -> dict[str, Float64[Tensor,
     return found
 
 
+def _scanned(source: CaptureInput, path: Localization) -> list[Finding]:
+    """Share of the localised path below which the scan shows a floor."""
+    known = (path.confidence > 0) & path.t_world_cam.isfinite().all(-1)
+    if known.sum() < 2:
+        return [
+            Check("floor below the path").error("no frame is localised", "", "Localise again, or build another map.")
+        ]
+    try:
+        scan = source.read_scan()
+    except WearcapError as error:
+        return [refusal(error, "scan")]
+    if scan is None:
+        return []
+    points = torch.from_numpy(scan.points[:: len(scan.points) // MAX_POINTS + 1]).float()
+    return _floor_below(path.timestamps[known], path.t_world_cam[known], points)
+
+
 def _floor(recording: Recording) -> list[Finding]:
     """Share of the head's path below which the points show a floor."""
     head, points = recording.head, recording.points
     if head is None or points is None or len(head.timestamps) < 2:
         return []
+    return _floor_below(head.timestamps, head.t_world_device, points.points_world)
+
+
+def _floor_below(
+    times: Float64[Tensor, "time"], path: Float[Tensor, "time 3"], points: Float[Tensor, "point 3"]
+) -> list[Finding]:
     check = Check("floor below the path")
     # Every half second is enough, and quick.
-    step = max(1, round(0.5 / head.timestamps.diff().median().clamp_min(1e-3).item()))
-    path = head.t_world_device[::step]
+    path = path[:: max(1, round(0.5 / times.diff().median().clamp_min(1e-3).item()))]
     covered, height = 0.0, None
     with suppress(WearcapError):
-        found = estimate_floor(points.points_world, path)
+        found = estimate_floor(points, path)
         covered = (found.confidence > _FLOOR_CONFIDENCE).double().mean().item()
         height = (path[:, 2] - found.height).median().item()
     evidence = f"{100 * covered:.0f} % of the path" + ("" if height is None else f", the head {height:.2f} m above it")
     if covered < COVERED:
-        fix = "Look at the floor while walking; without it the floor follows from the head's height."
+        fix = "Look at the floor while walking, or scan the whole way; check that path and points are in one world."
         return [check.warning("points hardly show it", evidence, fix)]
     return [check.ok("points show it", evidence)]

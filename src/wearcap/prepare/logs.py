@@ -17,7 +17,8 @@ from wearcap.body.skeleton import WRISTS, Skeleton, skeleton_of_height
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import swing_between
-from wearcap.io.devices.aria_mps import T_HEAD_DEVICE, is_mps_folder, read_mps, read_points
+from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.devices.aria_mps import T_HEAD_DEVICE, head_stream, is_mps_folder, read_mps, read_points
 from wearcap.io.devices.axes import CAMERA, DEVICES, UPRIGHT, WORLDS, DeviceAxes, device_axes, to_head_axes
 from wearcap.io.devices.headset_log import is_headset_log, read_headset_log
 from wearcap.io.devices.watch_log import read_inertial_log, read_watch_log
@@ -156,6 +157,10 @@ def read_path(file: Path, name: str, about: dict[str, str], settings: Trajectory
 
 def head_of(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tuple[HeadStream, SlamAlignment, str]:
     """(the head stream in metres with z up, alignment of the file's world, and what was detected)."""
+    if read.format == "MPS":  # Aria's frame is that of a camera on its side: taken to the pupils' midpoint
+        worn = head_stream(read.trajectory, fps=60.0, where=where)
+        path = Trajectory(worn.timestamps, worn.R_world_device, worn.t_world_device)
+        read = replace(read, trajectory=path, of_camera=False)
     axes, up, vertical = _axes(read, settings, where)
     R_device_cam = DEVICES[axes].mT @ CAMERA
     slam = replace(read.trajectory, R_world_body=read.trajectory.R_world_body @ R_device_cam)

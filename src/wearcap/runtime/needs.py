@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from wearcap.body.skeleton import WRISTS
-from wearcap.recording import Recording
 from wearcap.runtime.system import CaptureInput
 
 
@@ -34,8 +33,9 @@ def _tracked(source: CaptureInput) -> bool:
     return set(WRISTS) <= set(recording.tracked) or (not recording.tracked and recording.motion is not None)
 
 
-def _contacts(recording: Recording) -> bool:
-    return recording.suit is not None and recording.suit.contact_prob is not None
+def _contacts(source: CaptureInput) -> bool:
+    suit = source.recording.suit
+    return suit is not None and suit.contact_prob is not None
 
 
 def _file(source: CaptureInput, name: str | None) -> bool:

@@ -25,7 +25,7 @@ from wearcap.files import parse_json
 from wearcap.geometry.rotation import matrix_from_quat_wxyz
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.devices.axes import CONVENTIONS, detected_convention, turned, wrist_of_hand
-from wearcap.io.formats.bounded import open_bytes
+from wearcap.io.formats.bounded import open_bytes, understood
 from wearcap.io.formats.poses import check_finite, checked_trajectory
 from wearcap.io.formats.text import numbered_lines, read_json
 from wearcap.io.formats.trajectory import UNITS, check_span, time_unit_of
@@ -96,10 +96,16 @@ class _Columns:
 
     @property
     def complete(self) -> bool:
-        return (len(self.position) == 3 and len(self.quaternion) == 4) or len(self.matrix) in (12, 16)
+        named = set(self.quaternion) in (set("xyzw"), set("0123"))
+        return (set(self.position) == set("xyz") and named) or self.as_matrix
+
+    @property
+    def as_matrix(self) -> bool:
+        """Whether the pose is given as rows of [R | t]."""
+        return set(self.matrix) in (set(range(12)), set(range(16)))
 
     def places(self) -> list[Any]:
-        if len(self.matrix) in (12, 16):
+        if self.as_matrix:
             return [self.matrix[number] for number in sorted(self.matrix)][:12]
         numbered = all(name.isdigit() for name in self.quaternion)
         names = "0123" if numbered else "xyzw"
@@ -179,7 +185,8 @@ def _csv_rows(path: Path) -> Iterator[Any]:
     if header is None:
         raise WearcapError("no rows", path, "a header line with column names")
     separator = max(",;\t", key=header[1].count)
-    names = [name.strip() for name in next(csv.reader([header[1]], delimiter=separator))][:_MAX_COLUMNS]
+    with understood("a header that is no row of names", path, errors=csv.Error):
+        names = [name.strip() for name in next(csv.reader([header[1]], delimiter=separator))][:_MAX_COLUMNS]
     yield {name: place for place, name in enumerate(names)}
     for number, line in lines:
         row = line.rstrip("\r\n").split(separator)
@@ -239,7 +246,7 @@ def _flat(value: Any, key: str = "", depth: int = 0) -> dict[str, Any]:
 
 def _parts(name: str) -> list[str]:
     """Lower-case words and numbers of a column's name; a unit in brackets is left out."""
-    plain = re.sub(r"[\[(].*?[\])]", " ", name)
+    plain = re.sub(r"[\[(][^\[\]()]*[\])]", " ", name)
     split = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", plain)
     return [word.lower() for word in re.findall(r"[A-Za-zµ]+|\d+", split)]
 
@@ -356,7 +363,7 @@ def _seen(table: np.ndarray) -> np.ndarray:
 
 def _order(head: np.ndarray, columns: _Columns, quaternion: str) -> tuple[str, list[str]]:
     """Order of the quaternions and a note; in unnamed ones, that in which the head is more upright."""
-    if columns.matrix:
+    if columns.as_matrix:
         return "matrix", ["poses as matrices"]
     if "x" in columns.quaternion:
         return "xyzw", []

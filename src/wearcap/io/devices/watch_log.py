@@ -54,7 +54,8 @@ def read_watch_log(path: str | Path, joint: str) -> ImuStream:
     """
     if joint not in WRISTS:
         raise WearcapError(f"a watch on {joint!r}", path, " or ".join(WRISTS))
-    if set(_X_IMU) & set(read_header(path)):
+    header = set(read_header(path))
+    if set(_X_IMU) & header or header >= _X_QUATERNION:
         stream = read_inertial_log(path, joint)
         if stream.acc_world is None:
             fix = "Put the sensor's Quaternion.csv beside its Inertial.csv."
@@ -187,7 +188,7 @@ def _require_times(seconds: np.ndarray, path: str | Path) -> None:
     step = np.diff(seconds)
     if (step <= 0).any():
         row = int(np.flatnonzero(step <= 0)[0]) + 1
-        what = f"time does not grow at row {row} ({step[row - 1]:+.3f} s)"
+        what = f"time does not grow at line {row + 2} ({step[row - 1]:+.3f} s)"
         raise WearcapError(what, path, fix="Sort the rows by time and leave repeated ones out.")
     if np.median(step) > 1 / MIN_RATE_HZ:
         what = f"{1 / np.median(step):.1f} rows a second"

@@ -244,7 +244,7 @@ _ALIASES = {
 
 def _slots(words: Sequence[str]) -> dict[str, int] | None:
     """Columns of a header that names time, position and quaternion; None for any other line."""
-    plain = [re.sub(r"\[.*?\]|\(.*?\)|[^a-z]", "", word.lower()) for word in words]
+    plain = [re.sub(r"\[[^\[\]]*\]|\([^()]*\)|[^a-z]", "", word.lower()) for word in words]
     plain = [re.sub(r"^(time|timestamp)(?:ns|us|ms|sec|seconds|s)$", r"\1", word) for word in plain]
     found = {}
     for slot, names in _ALIASES.items():

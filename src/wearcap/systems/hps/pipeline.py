@@ -82,8 +82,17 @@ class HPS(StagedSystem):
     required = (SUIT, CONTACTS, CAMERA, LOCALIZATION, SCAN)
 
     def needs(self) -> tuple[Need, ...]:
-        """All that is required; the scan only where a term of the energy reads it."""
-        return tuple(need for need in self.required if need is not SCAN or self.energy.reading("on_ground"))
+        """All that is required: poses or pictures with this pipeline's map, and the scan only where the energy reads it."""
+
+        def localizable(source: CaptureInput) -> bool:
+            try:
+                self.localization.reads(source.recording, source.folder or Path())
+            except WearcapError:
+                return False
+            return True
+
+        found = (replace(need, has=localizable) if need is LOCALIZATION else need for need in self.required)
+        return tuple(need for need in found if need is not SCAN or self.energy.reading("on_ground"))
 
     def stages(self, source: CaptureInput) -> list[Stage]:
         """The steps from a recording to the solution. Raises WearcapError without suit, head camera, localisation or

@@ -193,3 +193,13 @@ def headset_frames(time, poses, order: str = "xyzw", wrap: str = "") -> list[dic
             devices[device] = {"position": t[k].tolist(), "orientation": quat.tolist()}
         frames.append({"timestamp": moment, **({wrap: devices} if wrap else devices)})
     return frames
+
+
+def exit_code(verb: str, arguments: list[str]) -> int:
+    """What a verb of the command line leaves with."""
+    from wearcap.cli.main import run_verb
+
+    try:
+        return run_verb(verb, arguments) or 0
+    except SystemExit as left:
+        return int(left.code or 0)
