@@ -15,7 +15,7 @@ from wearcap.body.anny_body import anny_body
 from wearcap.body.skeleton import xsens23
 from wearcap.body.smpl_body import SmplArrays, betas_of, smpl_body, template_pelvis
 from wearcap.cli.capture_all import capture_all, is_dataset
-from wearcap.cli.conf import hydra_main, load_pipeline, with_pipeline
+from wearcap.cli.conf import hydra_main, load_pipeline, with_pipeline, with_pipeline_of_content
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.io.datasets.amass import write_amass
@@ -41,7 +41,7 @@ def run(config: DictConfig) -> Motion | None:
     """Capture one recording, or all of a data set, or follow one that still grows (`live`)."""
     if is_dataset(config):
         return capture_all(config, captured)
-    system = load_pipeline(config.checkpoint, config.pipeline, config.device)
+    system = load_pipeline(config.checkpoint, config.pipeline, config.device, shared=True)
     if config.live:
         return _live(system, config, Path(config.output))
     motion = captured(config, system)
@@ -136,4 +136,4 @@ def _live(system: System, config: DictConfig, folder: Path) -> None:
 
 def main(arguments: list[str]) -> None:
     arguments = ["live=true" if argument == "--live" else argument for argument in arguments]
-    hydra_main("capture", run, with_pipeline(arguments))
+    hydra_main("capture", run, with_pipeline_of_content(with_pipeline(arguments)))

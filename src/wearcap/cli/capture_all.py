@@ -50,7 +50,7 @@ def capture_all(config: DictConfig, capture: Capture) -> None:
     if not names:
         what = f"no recordings{f' of split {config.split}' if config.split else ''}"
         raise WearcapError(what, store.root, fix="Choose another split, or leave it out.")
-    load_pipeline(config.checkpoint, config.pipeline, config.device)  # settings are complained about once
+    load_pipeline(config.checkpoint, config.pipeline, config.device, shared=True)  # settings are complained about once
     plain: Any = OmegaConf.to_container(config, resolve=True)
     settings = {key: value for key, value in plain.items() if key not in WITHOUT_EFFECT}
     given = plain["checkpoint"] or []
@@ -78,7 +78,7 @@ def _captured(names: Sequence[str], plain: dict[str, Any], key: str, capture: Ca
     (name,) = names
     folder, root = Path(plain["output"]) / name, Path(plain["recording"])
     config = OmegaConf.create(plain | {"recording": str(root / name), "output": str(folder)})
-    system = loaded(key, partial(load_pipeline, config.checkpoint, config.pipeline, config.device))
+    system = loaded(key, partial(load_pipeline, config.checkpoint, config.pipeline, config.device, shared=True))
     begin = time.perf_counter()
     motion = capture(config, system)
     seconds = time.perf_counter() - begin

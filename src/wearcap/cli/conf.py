@@ -29,7 +29,11 @@ from omegaconf.errors import OmegaConfBaseException
 from wearcap.errors import WearcapError, nearest
 from wearcap.files import resource
 from wearcap.models.checkpoint import read_checkpoint
-from wearcap.runtime.system import System, training_of
+from wearcap.reading import read
+from wearcap.recording import RecordingStore
+from wearcap.recording.store import MANIFEST, dataset_folder
+from wearcap.runtime.needs import Need
+from wearcap.runtime.system import CaptureInput, System, training_of
 from wearcap.spread import Spread
 
 
@@ -58,11 +62,7 @@ def with_pipeline(arguments: list[str]) -> list[str]:
 
     Raises WearcapError for checkpoints of several systems.
     """
-    given: dict[str, Any] = {}
-    for argument in arguments:
-        with suppress(HydraException):  # its complaint comes when the config is composed
-            override = OverridesParser.create().parse_override(argument)
-            given[override.key_or_group] = override
+    given = _given(arguments)
     if "pipeline" in given or "checkpoint" not in given or given["checkpoint"].value() is None:
         return arguments
     value = given["checkpoint"].value()
@@ -74,6 +74,44 @@ def with_pipeline(arguments: list[str]) -> list[str]:
         listed = ", ".join(f"{path} ({pipeline})" for path, pipeline in chosen.items())
         raise WearcapError(f"checkpoints of several pipelines: {listed}", expected="checkpoints of one pipeline")
     return [*(f"pipeline={pipeline}" for pipeline in sorted(set(chosen.values()))), *arguments]
+
+
+def with_pipeline_of_content(arguments: list[str]) -> list[str]:
+    """Arguments of a capture with the pipeline that the recording's streams suggest, where they name neither pipeline nor
+    checkpoint: the first of the config's `by_content` all whose required inputs it has.
+
+    Raises WearcapError for a recording that cannot be read, and for one that suits none of them.
+    """
+    given = _given(arguments)
+    if {"pipeline", "checkpoint", "live"} & set(given) or "recording" not in given or "-m" in arguments:
+        return arguments
+    where = str(getattr(value := given["recording"].value(), "text", value))
+    if (Path(where) / MANIFEST).is_file() and len(RecordingStore.open(where).names()) != 1:
+        return arguments
+    source, lacks = CaptureInput.in_dataset(read(where), dataset_folder(where)), {}
+    for name in compose("capture", ["recording=none"]).by_content:
+        made = instantiate(compose("capture", ["recording=none", f"pipeline={name}"]).pipeline, _convert_="all")
+        needs = made.needs() if isinstance(made, System) else made.func.required
+        lacks[name] = [need.what for need in needs if need.required and not _holds(need, source)]
+        if not lacks[name]:
+            print(f"pipeline={name}, by what the recording holds", file=sys.stderr)
+            return [f"pipeline={name}", *arguments]
+    listed = "; ".join(f"{name} lacks {', '.join(what)}" for name, what in lacks.items())
+    raise WearcapError(f"no pipeline suits this recording: {listed}", where, fix="Give pipeline=… to insist on one.")
+
+
+def _holds(need: Need, source: CaptureInput) -> bool:
+    return need.has(source) and (need.stream is None or bool(getattr(source.recording, need.stream)))
+
+
+def _given(arguments: list[str]) -> dict[str, Any]:
+    """Overrides of a command line by their keys."""
+    given: dict[str, Any] = {}
+    for argument in arguments:
+        with suppress(HydraException):  # its complaint comes when the config is composed
+            override = OverridesParser.create().parse_override(argument)
+            given[override.key_or_group] = override
+    return given
 
 
 def hydra_main(config_name: str, task: Callable[[DictConfig], Any], arguments: list[str]) -> None:

@@ -72,7 +72,17 @@ SUIT = Need(
     "Record the suit's motion (MVNX), and prepare both together.",
     stream="suit",
 )
-CONTACTS = Need("foot contacts of the suit", _contacts, "Export MVNX with contacts, or derive them (sensors.contacts).")
+CONTACTS = Need(
+    "foot contacts of the suit",
+    _contacts,
+    "Export MVNX with contacts; without them they follow from the feet's speed.",
+    required=False,
+)
+MOTION = Need(
+    "a motion",
+    lambda source: source.recording.suit is not None or source.recording.motion is not None,
+    "Choose a pipeline that makes motion of these sensors.",
+)
 CAMERA = Need(
     "a head camera",
     lambda source: source.recording.camera is not None,

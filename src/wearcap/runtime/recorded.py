@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 from wearcap.errors import WearcapError
 from wearcap.recording import Recording
+from wearcap.runtime.needs import MOTION
 from wearcap.runtime.system import Captured, CaptureInput, StageOptions, System
 
 
@@ -14,6 +15,7 @@ class RecordedMotion(System):
 
     name: str = "recorded"
     draws = False
+    required = (MOTION,)
 
     def capture(
         self, recordings: Sequence[Recording | CaptureInput], seeds: Sequence[int], options: StageOptions | None = None
