@@ -8,6 +8,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from wearcap.cli.conf import compose, conf_dir, explained, nearest, splits_dir
+from wearcap.doctor import require_sound
 from wearcap.errors import WearcapError
 from wearcap.prepare.engine import Report, Splits, prepare
 from wearcap.recording.store import SPLITS, RecordingStore
@@ -27,7 +28,8 @@ def run(config: DictConfig) -> Report:
         splits = Splits.read(listed if listed.is_file() else Path(config.splits))
         tasks = instantiate(config.tasks, _convert_="all", _partial_=True)(splits=splits)
         options = {key: config[key] for key in ("jobs", "backend", "scheduler", "overwrite")}
-        report = prepare(tasks, config.output, **options)
+        inspect = require_sound if config.get("check") else None
+        report = prepare(tasks, config.output, **options, inspect=inspect)
     _show_report(report, RecordingStore.open(config.output))
     return report
 

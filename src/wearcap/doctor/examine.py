@@ -121,6 +121,14 @@ def examine_recording(recording: Recording) -> list[Finding]:
     return sorted(findings, key=lambda finding: -SEVERITIES.index(finding.severity))
 
 
+def require_sound(recording: Recording) -> None:
+    """Raise WearcapError with the first of a recording's errors."""
+    for finding in examine_recording(recording):
+        if finding.severity == "error":
+            fix = f"{finding.fix} check=false writes it as it is.".strip()
+            raise WearcapError(f"the doctor finds, {finding.check}: {finding.what} ({finding.evidence})", fix=fix)
+
+
 def _clocks(recording: Recording) -> dict[str, Float64[Tensor, "_"]]:
     streams = {name: getattr(recording, name) for name in ("head", "motion", "suit", "camera", "localization")}
     streams |= {f"imu {name}": imu for name, imu in recording.imu.items()}

@@ -69,6 +69,16 @@ class ForeignReport:
             *self.notes,
         ]
 
+    def summary(self) -> str:
+        """The report in one line."""
+        mean = sum(mean for mean, _ in self.residual_m.values()) / len(self.residual_m)
+        worst = max(worst for _, worst in self.residual_m.values())
+        frames = self.frames.split(",")[0]
+        return (
+            f"names {self.convention}, {self.unit}, {self.up} up, frames from {frames}; {1000 * mean:.1f} mm from the "
+            f"file's joints (worst {1000 * worst:.1f})"
+        )
+
 
 @dataclass(frozen=True)
 class ForeignMotion:

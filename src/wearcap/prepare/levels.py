@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wearcap.body.landmarks import head_level, with_head_face
@@ -28,10 +28,10 @@ _NOD = 0.35
 
 @dataclass(frozen=True)
 class Levels:
-    """Tilts of the captured frames: `R_head_face`, and `R_ankle_sole` by side; None or absent where not known."""
+    """Tilts of the captured frames: of the head, and of ankles and toes by joint; None or absent where not known."""
 
     R_head_face: Float[Tensor, "3 3"] | None
-    R_ankle_sole: dict[str, Float[Tensor, "3 3"]]
+    R_joint_sole: dict[str, Float[Tensor, "3 3"]]
 
 
 def levels_in(motions: Sequence[Motion], head_trusted: bool = False) -> Levels:
@@ -45,40 +45,41 @@ def levels_in(motions: Sequence[Motion], head_trusted: bool = False) -> Levels:
         face = None
     soles = {}
     for side in ("left", "right"):
-        up = torch.cat([_up_in_standing_foot(motion, side) for motion in motions])
-        if len(up) < LEAST_FRAMES:
+        still = [_standing(motion, side) for motion in motions]
+        if sum(int(frames.sum()) for frames in still) < LEAST_FRAMES:
             continue
-        direction = torch.nn.functional.normalize(up.median(0).values, dim=0)
-        if direction[2] > torch.tensor(_LARGEST_TILT).cos():
-            soles[side] = swing_between(direction.new_tensor([0.0, 0.0, 1.0]), direction)
+        for name in (f"{side}_ankle", f"{side}_toe"):
+            up = torch.cat([motion.joint(name).R[frames, 2] for motion, frames in zip(motions, still)])
+            direction = torch.nn.functional.normalize(up.median(0).values, dim=0)
+            if direction[2] > torch.tensor(_LARGEST_TILT).cos():
+                soles[name] = swing_between(direction.new_tensor([0.0, 0.0, 1.0]), direction)
     return Levels(face, soles)
 
 
-def _up_in_standing_foot(motion: Motion, side: str) -> Float[Tensor, "frame 3"]:
-    """The vertical in a foot's frame, in the frames in which that foot stands."""
-    ankle, toe = (motion.joint(f"{side}_{name}") for name in ("ankle", "toe"))
+def _standing(motion: Motion, side: str) -> Bool[Tensor, "time"]:
+    """Frames in which a foot stands on its whole sole: ankle and toes are still, and the ankle is low."""
+    still = torch.zeros(len(motion), dtype=torch.bool)
     if len(motion) < 3:
-        return ankle.R.new_zeros(0, 3)
-    step_s = (motion.timestamps[2:] - motion.timestamps[:-2]).to(ankle.t)[:, None]
-    slow = [((T.t[2:] - T.t[:-2]) / step_s).norm(dim=-1) < STILL_M_S for T in (ankle, toe)]
-    still = torch.nn.functional.pad(slow[0] & slow[1], (1, 1))
-    if not still.any():
-        return ankle.R.new_zeros(0, 3)
-    still &= ankle.t[:, 2] < ankle.t[still, 2].quantile(0.1) + LOW_M
-    return ankle.R[still][:, 2, :]
+        return still
+    step_s = (motion.timestamps[2:] - motion.timestamps[:-2]).to(motion.t_world_root)[:, None]
+    ankle, toe = (motion.joint(f"{side}_{name}").t for name in ("ankle", "toe"))
+    slow = [((t[2:] - t[:-2]) / step_s).norm(dim=-1) < STILL_M_S for t in (ankle, toe)]
+    still[1:-1] = slow[0] & slow[1]
+    return still & (ankle[:, 2] < ankle[still, 2].quantile(0.1) + LOW_M) if still.any() else still
 
 
 def with_levels(motion: Motion, levels: Levels) -> Motion:
-    """The motion with head and foot frames turned level; no joint moves."""
+    """The motion with the frames of head, ankles and toes turned level; no joint moves."""
     R, skeleton = motion.R_parent_joint, motion.skeleton
     if levels.R_head_face is not None:
         R = with_head_face(skeleton, R, levels.R_head_face)
     offsets, R = skeleton.t_parent_joint.clone(), R.clone()
-    for side, tilt in levels.R_ankle_sole.items():
+    for side in ("left", "right"):
         ankle, toe = skeleton.indices(f"{side}_ankle", f"{side}_toe")
-        R[:, ankle] = R[:, ankle] @ tilt
-        R[:, toe] = tilt.T @ R[:, toe] @ tilt
-        offsets[toe] = tilt.T @ offsets[toe]
+        of_ankle, of_toe = (levels.R_joint_sole.get(f"{side}_{name}", torch.eye(3)) for name in ("ankle", "toe"))
+        R[:, ankle] = R[:, ankle] @ of_ankle
+        R[:, toe] = of_ankle.T @ R[:, toe] @ of_toe
+        offsets[toe] = of_ankle.T @ offsets[toe]
     skeleton = replace(skeleton, t_parent_joint=offsets)
     return replace(motion, skeleton=_flat_soles(skeleton), R_parent_joint=R)
 
