@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -81,15 +82,15 @@ def examine_recording(recording: Recording) -> list[Finding]:
     findings += check_spans({name: times for name, times in clocks.items() if name in usable})
     # Each usable stream, then pairs of streams; streams with errors are not compared.
     head = recording.head if "head" in usable else None
+    on_head: list[Finding] = []
     if head is not None:
-        found = check_track("head", Trajectory(head.timestamps, head.R_world_device, head.t_world_device))
-        findings += found
-        head = None if has_error(found) else head
+        on_head = check_track("head", Trajectory(head.timestamps, head.R_world_device, head.t_world_device))
+    tracked = None if has_error(on_head) else head
     floor = recording.floor
-    if floor is None and recording.points is not None and head is not None:
+    if floor is None and recording.points is not None and tracked is not None:
         with suppress(WearcapError):
-            below = estimate_floor(recording.points.points_world, head.t_world_device)
-            floor = FloorTrack(head.timestamps, below.height) if below.confidence.median() > 0.3 else None
+            below = estimate_floor(recording.points.points_world, tracked.t_world_device)
+            floor = FloorTrack(tracked.timestamps, below.height) if below.confidence.median() > 0.3 else None
     bodies = {}
     for name, motion in (("motion", recording.motion), ("suit", recording.suit)):
         if motion is not None and name in usable:
@@ -98,6 +99,10 @@ def examine_recording(recording: Recording) -> list[Finding]:
             if not has_error(found):
                 bodies[name] = motion
     body = bodies.get("motion", bodies.get("suit"))
+    if head is not None and body is not None and has_error(on_head):
+        on_head = _explained_by(body, head, on_head)
+    findings += on_head
+    head = None if has_error(on_head) else head
     if head is not None and body is not None:
         findings += check_head_against_body(head, body)
     if head is not None and "head" in recording.cues:
@@ -119,6 +124,17 @@ def examine_recording(recording: Recording) -> list[Finding]:
         findings += check_localization(recording.localization, bodies.get("suit", body))
     findings += check_claps(recording)
     return sorted(findings, key=lambda finding: -SEVERITIES.index(finding.severity))
+
+
+def _explained_by(body: Motion, head: HeadStream, findings: list[Finding]) -> list[Finding]:
+    """Findings of a head that is not upright, no errors where it rides on a sound body that bends down or lies."""
+    if has_error(check_head_against_body(head, body)):
+        return findings
+    fix = "Its wearer bends down or lies, as the body does."
+    return [
+        replace(f, severity="warning", fix=fix) if f.severity == "error" and f.check == "head: up axis" else f
+        for f in findings
+    ]
 
 
 def require_sound(recording: Recording) -> None:
