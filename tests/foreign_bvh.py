@@ -98,7 +98,7 @@ class Convention:
     """Position channels on every joint."""
     order: str = "ZXY"
     bind_first: bool = False
-    """The bind pose as the first frame."""
+    """The bind pose as the first frame, which the reader leaves out."""
     parents: dict[str, str] = field(default_factory=dict)
     """Joints that hang on another joint than in `BODY`."""
 
@@ -112,6 +112,8 @@ def _frames(convention: Convention, joints: list[str], parents: dict[str, str]) 
     rng, frames = np.random.default_rng(3), {}
     for joint in joints:
         frames[joint] = convention.axes.T
+        if joint == "ground":
+            continue
         if convention.rest == "a":
             frames[joint] = turn("x", A_POSE.get(joint, 0.0)).T @ convention.axes.T
         elif convention.rest in ("own x", "zero"):
@@ -148,8 +150,6 @@ def write(path: Path, convention: Convention, R: dict, p: dict, fps: float = 60.
         yaw = np.arctan2(R["pelvis"][:, 1, 0], R["pelvis"][:, 0, 0])
         R["ground"], p["ground"] = turn("z", yaw), p["pelvis"] * np.array([1.0, 1, 0])
     B = _frames(convention, joints, parents)
-    if convention.ground:
-        B["ground"] = convention.axes.T
     M, scale = convention.axes, 1 / convention.unit_m
     world = {joint: M @ R[joint] @ B[joint] for joint in joints}
     local, place = {}, {}

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from acclaim import acclaim_places
 from foreign_bvh import CONVENTIONS, NAMES, Convention, turn, walk, write
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
@@ -177,3 +178,48 @@ def test_odd_files_are_read_or_refused(truth, tmp_path):
         else:
             assert motion.R_parent_joint.isfinite().all()
             assert motion.t_world_root.isfinite().all()
+
+
+@pytest.mark.real
+def test_cmus_conversions_stand_as_tall_as_people(real_data):
+    """cgspeed's files: their unit, the T-pose before the motion, and the bone that they lost."""
+    trials = sorted((real_data / "cmu_mocap" / "trials").glob("*/*.bvh.xz"))
+    assert len(trials) == 5
+    for trial in trials:
+        read = read_foreign_motion(trial)
+        motion, report = read.motion, read.report
+        assert report.convention == "CMU, cgspeed's conversion"
+        assert report.unit == "CMU's units"
+        assert "first frame" in report.notes[0]
+        assert motion.fps == pytest.approx(120)
+        crown = motion.joint("head").t[:, 2] + motion.skeleton.sites["crown"].t_joint_site[2]
+        assert 1.4 < crown.median() < 1.85, trial
+        assert motion.skeleton.t_parent_joint[motion.skeleton.index("neck"), 2] > 0.08
+
+
+ACCLAIM = {"knee": "tibia", "ankle": "foot", "elbow": "radius", "wrist": "hand"}
+"""CMU's bones by the joint at their start; `wrist` in CMU's files is the middle of the forearm."""
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(
+    ("folder", "trial"),
+    [
+        ("cmu_mocap/trials/007", "07_01"),
+        ("cmu_mocap/trials/001", "01_03"),
+        ("cmu_mocap/trials/014", "14_06"),
+        ("cmu_mocap/trials/005", "05_10"),
+        ("hdm05/trials/HDM_mm", "HDM_mm_grabHighR_022_120"),
+        ("hdm05/trials/HDM_bk", "HDM_bk_lieDownFloor_005_120"),
+    ],
+)
+def test_acclaim_files_keep_their_joints_places(real_data, folder, trial):
+    """Against forward kinematics of the format's own definition, written in NumPy here."""
+    amc = real_data / folder / f"{trial}.amc.xz"
+    true = acclaim_places(next((real_data / folder).glob("*.asf*")), amc)
+    motion = read_foreign_motion(amc).motion
+    for side in ("left", "right"):
+        for ours, theirs in ACCLAIM.items():
+            gap = np.linalg.norm(motion.joint(f"{side}_{ours}").t.numpy() - true[side[0] + theirs], axis=-1)
+            assert gap.mean() < 0.002, (side, ours)
+            assert gap.max() < 0.005, (side, ours)

@@ -90,8 +90,8 @@ def _read_bvh(path: Path) -> Take:
     joints, eye = len(content.names), torch.eye(3, dtype=R.dtype)
     R = torch.cat([R, eye.expand(len(R), len(names) - joints, 3, 3)], 1)
     notes = ()
-    if _begins_in_bind_pose(R):
-        R, t, notes = R[1:], t[1:], ("The first frame, the bind pose before the motion, is left out.",)
+    if _begins_with_a_leap(R[:4, 1:]):
+        R, t, notes = R[1:], t[1:], ("The first frame, a pose far from the motion that follows, is left out.",)
     skeleton = Skeleton("file", tuple(str(k) for k in range(len(names))), tuple(parents), rest.float())
     world = forward_kinematics(skeleton, R.contiguous(), t[:, 0].contiguous(), t.contiguous())
     rest[0] = 0
@@ -100,14 +100,12 @@ def _read_bvh(path: Path) -> Take:
     return Take(tuple(names), tuple(parents), flat.t, world.R, world.t, times, joints, notes=notes)
 
 
-def _begins_in_bind_pose(R_parent_joint: Float[Tensor, "time joint 3 3"]) -> bool:
-    """Whether only the first frame is the bind pose, and the motion begins with a leap."""
-    if len(R_parent_joint) < 3:
+def _begins_with_a_leap(R_parent_joint: Float[Tensor, "time joint 3 3"]) -> bool:
+    """Whether the first frame is a calibration pose: all joints leap to the second, and move little from there."""
+    if len(R_parent_joint) < 4:
         return False
-    R = R_parent_joint[:3, 1:]
-    off = rotation.geodesic(R[0], torch.eye(3, dtype=R.dtype).expand_as(R[0]))
-    leap, step = (rotation.geodesic(R[k], R[k + 1]).mean().item() for k in (0, 1))
-    return off.max().item() < 1e-3 and leap > max(0.05, 5 * step)
+    leap, *steps = (rotation.geodesic(R_parent_joint[k], R_parent_joint[k + 1]).mean().item() for k in range(3))
+    return leap > max(0.1, 8 * max(steps))
 
 
 def _read_amc(path: Path, asf: Path, fps: float | int) -> Take:

@@ -9,7 +9,7 @@ import math
 import warnings
 from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
@@ -42,9 +42,6 @@ _END_SITES = {
 """wearcap's names of End Sites, by the joint's name without its side."""
 STRETCH_M = 0.005
 """Largest change of a bone's length without a warning."""
-CGSPEED_UNIT_M = 0.0254 / 0.45
-CGSPEED_THORAX = (0.0, 2.07, 0.0)
-"""Offset (file units) that cgspeed's BVH conversion of the CMU database dropped between thorax and neck or shoulders."""
 UNITS_M = {
     "metres": 1.0,
     "decimetres": 0.1,
@@ -207,17 +204,12 @@ class BvhContent:
     step_s: float
 
 
-def read_bvh_content(path: str | Path, offsets: dict[str, tuple[float, float, float]] | None = None) -> BvhContent:
-    """Read a .bvh file (plain, .gz or .xz) as it stands. Raises WearcapError naming file and line.
-
-    `offsets` (file units) replaces OFFSETs that are known to be wrong.
-    """
+def read_bvh_content(path: str | Path) -> BvhContent:
+    """Read a .bvh file (plain, .gz or .xz) as it stands. Raises WearcapError naming file and line."""
     path = Path(path)
     lines = numbered_lines(path)
     joints, motion_line = _Hierarchy.read(path, lines)
     step_s, values = _parse_motion(path, lines, motion_line, sum(len(joint.channels) for joint in joints))
-    for joint in joints:
-        joint.offset = list((offsets or {}).get(joint.name, joint.offset))
     t, R = _channels(joints, values)
     ends = ((None if joint.end is None else (joint.end[0], joint.end[1], joint.end[2])) for joint in joints)
     return BvhContent(
@@ -232,23 +224,17 @@ def read_bvh_content(path: str | Path, offsets: dict[str, tuple[float, float, fl
 
 
 def read_bvh(
-    path: str | Path,
-    *,
-    unit_m: float | int = 0.01,
-    up: str = "y",
-    forward: str = "z",
-    check: bool = True,
-    offsets: dict[str, tuple[float, float, float]] | None = None,
+    path: str | Path, *, unit_m: float | int = 0.01, up: str = "y", forward: str = "z", check: bool = True
 ) -> Motion:
     """Read a .bvh file (plain, .gz or .xz). Rest is the file's bind pose; End Sites become sites.
 
     `unit_m`: metres per unit. `up`, `forward`: the file's axes ("x", "-y" …) that point up, and ahead of the body in
-    its bind pose. `offsets` (file units) replaces OFFSETs that are known to be wrong. Raises WearcapError naming file
+    its bind pose. Raises WearcapError naming file
     and line, and, unless `check` is False, when the body is no person's size or lies down, with the setting that fixes it.
     """
     path = Path(path)
     R_world_file = axes_rotation(path, up, forward)
-    content = read_bvh_content(path, offsets)
+    content = read_bvh_content(path)
     bones = _bones(path, content, float(unit_m))
     to_world = float(unit_m) * R_world_file.T
     skeleton = Skeleton("bvh", content.names, content.parents, (bones @ to_world).float(), _sites(content, to_world))
@@ -262,19 +248,6 @@ def read_bvh(
     if check:
         _check_body(motion, path, float(unit_m), R_world_file)
     return motion
-
-
-def read_cmu_bvh(path: str | Path) -> Motion:
-    """Read one of cgspeed's BVH conversions of the CMU database: its unit, its lost thorax bone, its T-pose frame.
-
-    Raises WearcapError as `read_bvh` does.
-    """
-    lost = ("Neck", "LeftShoulder", "RightShoulder")
-    motion = read_bvh(path, unit_m=CGSPEED_UNIT_M, offsets=dict.fromkeys(lost, CGSPEED_THORAX))
-    if len(motion) < 2:
-        raise WearcapError("only the T-pose frame", path, "frames of motion after it")
-    motion = motion.sliced(1, len(motion))
-    return replace(motion, timestamps=motion.timestamps - motion.timestamps[0])
 
 
 def axes_rotation(path: Path, up: str, forward: str) -> Tensor:
