@@ -56,7 +56,7 @@ def standing_rotation(
     if min(across.norm(), up.norm(), bones.min()) < 0.02 * max(bones.max(), torch.tensor(1e-9)):
         return None, "its joints lie on one another"
     R = _frame(1, across, 2, up)
-    nearest = roma.special_procrustes(_snapped(R))
+    nearest = _nearest(_snapped(R))
     if torch.rad2deg(_angle(R, nearest)) < _SNAP_DEG:
         R = nearest
     p = rest @ R  # the frame's columns are our axes in the file's: this is R^T rest
@@ -79,6 +79,11 @@ def standing_rotation(
 def _snapped(R: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
     """The axes nearest to a frame's."""
     return torch.where(R.abs() == R.abs().amax(0, keepdim=True), R.sign(), torch.zeros_like(R))
+
+
+def _nearest(M: Float[Tensor, "*t 3 3"]) -> Float[Tensor, "*t 3 3"]:
+    """The rotations nearest to matrices."""
+    return roma.special_procrustes(M)  # pyright: ignore[reportReturnType]
 
 
 def _angle(a: Tensor, b: Tensor) -> Tensor:
@@ -112,7 +117,7 @@ def foreign_tree(
     names = {joint: role for role, joint in roles.items()}
     if R_ours_rest is None:
         frames = _frames_in_motion(parents, positions, found, kept, new_parents)
-        turns = [roma.special_procrustes(_mean(R_world[:, joint].mT @ F, w)) for joint, (F, w) in zip(kept, frames)]
+        turns = [_nearest(_mean(R_world[:, joint].mT @ F, w)) for joint, (F, w) in zip(kept, frames)]
         C = torch.stack(turns)
     else:
         C = R_ours_rest.T.expand(len(kept), 3, 3)
@@ -164,7 +169,7 @@ def _frames_in_motion(
     known: dict[int, tuple[Tensor, Tensor]] = {}
     for k, joint in enumerate(trunk):
         share = min(1.0, 1.5 * k / max(len(trunk) - 1, 1))
-        known[joint] = (roma.special_procrustes((1 - share) * pelvis + share * chest), sure)  # pyright: ignore
+        known[joint] = (_nearest((1 - share) * pelvis + share * chest), sure)
     known[kept[0]] = (pelvis, sure)
     for side, sign in zip(SIDES, (1.0, -1.0)):
         hip, knee, ankle = found.limb[f"{side}_leg"]

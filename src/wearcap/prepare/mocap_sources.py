@@ -19,7 +19,7 @@ from wearcap.prepare.levels import Levels, levels_in
 from wearcap.prepare.mocap import About, MocapSettings, mocap_recording
 from wearcap.recording.recording import Recording
 
-CMU_VERSION, BVH_VERSION, AMASS_VERSION = 3, 1, 1
+CMU_VERSION, BVH_VERSION, AMASS_VERSION = 3, 1, 2
 """Versions of the conversions, increased when the same source and settings yield another recording."""
 
 MOTION_SUFFIXES = (".amc", ".amc.xz", ".amc.gz", ".bvh", ".bvh.xz", ".bvh.gz")
