@@ -160,9 +160,11 @@ def _frames_in_motion(
     parents: Sequence[int], t: Float[Tensor, "time joint 3"], found: BodyJoints, kept: list[int], above: list[int]
 ) -> list[tuple[Tensor, Tensor]]:
     """Per kept joint: the frame that the T-pose's would take in each frame of the motion, and how sure it is."""
-    sure = torch.ones(len(t), dtype=t.dtype)
     hips, shoulders = ([found.limb[f"{side}_{part}"][0] for side in SIDES] for part in LIMBS)
     spine_up = t[:, shoulders].mean(1) - t[:, hips].mean(1)
+    # Pelvis and spine are at rest where the thighs run on along the trunk, as in standing and walking.
+    thighs = t[:, [found.limb[f"{side}_leg"][1] for side in SIDES]].mean(1) - t[:, hips].mean(1)
+    sure = (-torch.nn.functional.cosine_similarity(spine_up, thighs, dim=-1)).clamp_min(0) ** 4 + 1e-4
     pelvis = _frame(1, t[:, hips[0]] - t[:, hips[1]], 2, spine_up)
     chest = _frame(1, t[:, shoulders[0]] - t[:, shoulders[1]], 2, spine_up)
     trunk = [joint for joint in kept if joint in ancestors(parents, found.head)]
@@ -171,6 +173,7 @@ def _frames_in_motion(
         share = min(1.0, 1.5 * k / max(len(trunk) - 1, 1))
         known[joint] = (_nearest((1 - share) * pelvis + share * chest), sure)
     known[kept[0]] = (pelvis, sure)
+    known[found.head] = (chest, torch.ones_like(sure))  # a head turns to both sides, but not in any one posture
     for side, sign in zip(SIDES, (1.0, -1.0)):
         hip, knee, ankle = found.limb[f"{side}_leg"]
         thigh, shin = t[:, knee] - t[:, hip], t[:, ankle] - t[:, knee]

@@ -128,7 +128,7 @@ def examine_recording(recording: Recording) -> list[Finding]:
 
 def _explained_by(body: Motion, head: HeadStream, findings: list[Finding]) -> list[Finding]:
     """Findings of a head that is not upright, no errors where it rides on a sound body that bends down or lies."""
-    if has_error(check_head_against_body(head, body)):
+    if any(f.severity in ("error", "warning") for f in check_head_against_body(head, body)):
         return findings
     fix = "Its wearer bends down or lies, as the body does."
     return [

@@ -177,17 +177,17 @@ def find_axes(
 ) -> tuple[str, str]:
     """The file's axes that point up, and along our x.
 
-    Up is where heads are above feet. A body that stands along another axis than its bind pose is believed only if it
-    stands: one that lies is within 0.8 m of the bind pose's ground in all frames.
+    Up is where heads are above feet, and where the lowest joint stays on one floor. A body that stands along another
+    axis than its bind pose is believed only if it stands: one that lies is within 0.8 m of the bind pose's ground.
     """
     ankles = take.t[:, [found.limb[f"{side}_leg"][2] for side in SIDES]].mean(1)
     upward = torch.nn.functional.normalize(take.t[:, found.head] - ankles, dim=-1).mean(0)
+    thin = take.t[:: max(1, len(take.t) // 1000), [found.head, *(j for triple in found.limb.values() for j in triple)]]
+    floors = torch.cat([thin.amin(1), -thin.amax(1)], -1) * unit_m  # along x, y, z, -x, -y, -z
+    wander = floors.quantile(0.95, 0) - floors.quantile(0.05, 0)
+    up = AXES[int((torch.cat([upward, -upward]) - wander).argmax())]
     bind = None if R_ours_rest is None else _axis(R_ours_rest[2])
-    seen = _axis(upward)
-    up = seen
-    if upward.abs().max() < 0.6:  # it lies, or turns over
-        up = bind or "y"
-    elif bind is not None and bind != seen:
+    if bind is not None and bind != up:
         heights = take.t[..., "xyz".index(bind[-1])] * (-1 if bind[0] == "-" else 1) * unit_m
         if heights.amax() < 0.8 and heights.amin() > -0.3:
             up = bind
