@@ -116,15 +116,16 @@ def read_foreign_motion(
     with placed(path):
         tree = foreign_tree(path.name.split(".")[0], take.parents, R_world_file @ take.R, t_world, found, R_ours_rest)
         motion = _fitted(tree, take.timestamps)
-    if levels is None:
-        levels = levels_in([motion], head_trusted=R_ours_rest is not None and take.format == "bvh")
+    naming = convention(take.names)
+    if levels is None:  # CMU's head frames are those of markers, in whatever format
+        levels = levels_in([motion], head_trusted=R_ours_rest is not None and not naming.startswith("CMU"))
     motion = with_levels(motion, levels)
     if not (motion.R_parent_joint.isfinite().all() and motion.t_world_root.isfinite().all()):
         raise WearcapError("no skeleton can be fitted to its joints", path, "joints apart from one another")
     roles = joint_roles(found)
     report = ForeignReport(
         path.name,
-        convention(take.names),
+        naming,
         found_by,
         unit,
         unit_m,
