@@ -379,7 +379,9 @@ def test_foreign_files_become_recordings_and_what_the_doctor_refuses_does_not(fo
     motion = RecordingStore.open(foreign_folder / "out").load("anna__anna-a").motion
     assert motion is not None
     assert "The unit is centimetres (0.01 m)" in motion.provenance["conventions"]
-    verb.main([*arguments, "check=false"])
+    verb.main([*arguments, "check=false", r"subject=(anna|ben)/[\w-]+\.bvh"])
+    store = RecordingStore.open(foreign_folder / "out")
+    assert {store.entries[n].subject for n in ("anna__anna-a", "ben__ben-b")} == {"anna", "ben"}
     assert "1 written, 4 current, 0 failed" in capfd.readouterr().out
     one = foreign_folder / "in" / "ben" / "ben-a.bvh"
     verb.main(["bvh", f"source={one}", f"output={foreign_folder / 'single'}", "jobs=1", "subject=ben"])

@@ -78,13 +78,20 @@ def main(arguments: list[str]) -> None:
         print(sources()[source].read_text(encoding="utf-8"))
         print(_shared_settings())
     else:
-        overrides = [f"prepare={source}", *(argument for argument in arguments if argument != source)]
+        overrides = [f"prepare={source}", *(_plain_pattern(argument) for argument in arguments if argument != source)]
         with explained("prepare", overrides):
             config = compose("prepare", overrides)
             OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # a missing value raises here
             report = run(config)
         if report.failed:
             sys.exit(1)
+
+
+def _plain_pattern(argument: str) -> str:
+    """A `subject=` in the quotes that a regular expression needs, unless it has them."""
+    key, _, value = argument.partition("=")
+    bare = key == "subject" and "(" in value and value[0] not in "'\""
+    return f"{key}='{value}'" if bare else argument
 
 
 def _shared_settings() -> str:
