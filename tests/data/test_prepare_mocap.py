@@ -20,7 +20,7 @@ from wearcap.geometry import rotation
 from wearcap.io.datasets.amass import write_amass
 from wearcap.io.formats.text import read_bytes
 from wearcap.prepare import Splits, check_recording
-from wearcap.prepare.mocap import About, CleaningLimits, MocapSettings, mocap_recording, without_glitches
+from wearcap.prepare.mocap import About, CleaningLimits, MocapSettings, foot_patches, mocap_recording, without_glitches
 from wearcap.prepare.mocap_sources import amass_tasks, bvh_tasks, cmu_tasks
 from wearcap.recording import Motion, RecordingStore
 from wearcap.recording.timing import resampled
@@ -396,3 +396,27 @@ def test_another_laboratorys_files_land_in_its_people(real_data):
     subjects = [task.make.args[2].subject for task in tasks]  # pyright: ignore[reportFunctionMemberAccess]
     assert len(subjects) == 232
     assert set(subjects) == {"HDM_bd", "HDM_bk", "HDM_dg", "HDM_mm"}
+
+
+@pytest.mark.real
+@pytest.mark.slow
+def test_standing_soles_lie_on_the_floor(real_data):
+    """Heels and toe tips of CMU's standing feet; when soles kept the bind pose's tilt, heels were at 1.5 cm in the median."""
+    tasks = {task.name: task for task in cmu_tasks(real_data / "cmu_mocap", SPLITS, SETTINGS, 120, "CMU")}
+    heights = []
+    for name in ("07_01", "10_01", "14_14", "16_05", "35_20", "55_28", "13_29", "29_01", "127_03", "43_02"):
+        if name not in tasks:
+            continue
+        motion = tasks[name].make().motion
+        assert motion is not None
+        positions, speed = foot_patches(motion)
+        for heel, tip in ((0, 1), (2, 3)):
+            low = positions[:, [heel, tip], 2].amin(1) < 0.06
+            standing = (speed[:, heel] < 0.1) & (speed[:, tip] < 0.1) & low
+            if standing.sum() > 5:
+                heights.append(positions[standing][:, [heel, tip], 2].median(0).values)
+    assert len(heights) > 8
+    heels, tips = torch.stack(heights).unbind(-1)
+    assert heels.median().abs() < 0.005
+    assert tips.median().abs() < 0.005
+    assert heels.abs().mean() < 0.013
