@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from acclaim import acclaim_places
-from foreign_bvh import CONVENTIONS, NAMES, Convention, turn, walk, write
+from foreign_bvh import CONVENTIONS, NAMES, Y_UP, Convention, turn, walk, write
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.prepare.foreign import read_foreign_motion
@@ -123,6 +123,16 @@ def without(part: str) -> Convention:
     return replace(
         CONVENTIONS["mixamo"], names={k: v for k, v in CONVENTIONS["mixamo"].names.items() if k not in part.split()}
     )
+
+
+def test_left_handed_axes_are_turned_right(truth, tmp_path):
+    mirrored = replace(CONVENTIONS["mixamo"], axes=np.diag([-1.0, 1, 1]) @ Y_UP)
+    write(tmp_path / "left.bvh", mirrored, *truth)
+    write(tmp_path / "right.bvh", CONVENTIONS["mixamo"], *truth)
+    left, right = (read_foreign_motion(tmp_path / f"{side}.bvh") for side in ("left", "right"))
+    assert "left-handed" in left.report.notes[0]
+    assert right.report.notes == ()
+    torch.testing.assert_close(left.motion.T_world_joint.t, right.motion.T_world_joint.t, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize(

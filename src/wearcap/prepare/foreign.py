@@ -23,6 +23,7 @@ from wearcap.prepare.foreign_conventions import (
     find_axes,
     find_body,
     find_unit,
+    is_mirrored,
     read_mapping,
     with_thorax,
     with_toes,
@@ -107,6 +108,7 @@ def read_foreign_motion(
     take = read_take(path, amc_fps, asf)
     found, found_by = find_body(take, given, path)
     take, found = with_toes(take, found)
+    take = take.mirrored() if is_mirrored(take, found) else take
     unit, unit_m, height_m = find_unit(take, found, given, path)
     take = with_thorax(take, unit_m)
     R_ours_rest, odd = standing_rotation(take.rest, found)

@@ -118,6 +118,22 @@ def with_toes(take: Take, found: BodyJoints) -> tuple[Take, BodyJoints]:
     return take, BodyJoints(found.head, found.limb, toes)
 
 
+def is_mirrored(take: Take, found: BodyJoints) -> bool:
+    """Whether toes point backwards and knees bend forwards, as seen from hips that are named left and right."""
+    ankles = take.t[:, [found.limb[f"{side}_leg"][2] for side in SIDES]].mean(1)
+    hips = [found.limb[f"{side}_leg"][0] for side in SIDES]
+    across = take.t[:, hips[0]] - take.t[:, hips[1]]
+    forward = torch.linalg.cross(across, take.t[:, found.head] - ankles)
+    backwards, bends = [], []
+    for side in SIDES:
+        hip, knee, ankle = (take.t[:, joint] for joint in found.limb[f"{side}_leg"])
+        bends.append((torch.linalg.cross(knee - hip, ankle - knee) * across).sum(-1).mean() < 0)
+        if side in found.toe:
+            toe = take.t[:, found.toe[side]] - ankle
+            backwards.append(((forward * toe).sum(-1) < 0).double().mean() > 0.7)
+    return len(backwards) == 2 and all(backwards) and all(bends)
+
+
 def find_unit(take: Take, found: BodyJoints, mapping: Mapping, path: Path) -> tuple[str, float, float]:
     """The unit's name, the unit (m), and the person's height (m) by its bones.
 

@@ -51,6 +51,12 @@ class Take:
         rest[joint] = rest[parent] + share * (rest[joint] - rest[parent])
         return replace(self, t=t, rest=rest)
 
+    def mirrored(self) -> "Take":
+        """The same take with its x axis reversed."""
+        S = torch.diag(torch.tensor([-1.0, 1.0, 1.0], dtype=self.t.dtype))
+        note = "Left and right are exchanged in it, as in left-handed axes: its x axis is reversed."
+        return replace(self, R=S @ self.R @ S, t=self.t @ S, rest=self.rest @ S, notes=(*self.notes, note))
+
     def lifted(self, joints: list[int], offset: Float[Tensor, "3"]) -> "Take":
         """The same take with an offset, in the frames of their parents, added to joints and all below them."""
         t, rest = self.t.clone(), self.rest.clone()
