@@ -86,7 +86,7 @@ def cmu_tasks(
             activities = {row["trial"]: row.get("category") for row in csv.DictReader(file) if row.get("trial")}
     trials: dict[str, Path] = {}
     for path in _motion_files(source):
-        name = path.name.split(".")[0]
+        name = _stem(path)
         if name in trials and path.parent != trials[name].parent:
             raise WearcapError(f"two trials are called {name!r}: {trials[name]} and {path}", fix="Rename one.")
         trials.setdefault(name, path)  # .amc comes first
@@ -111,10 +111,16 @@ def bvh_tasks(
     CMU's SUBJECT_TRIAL names, else the folder.
     """
     source = Path(source)
+    if source.is_file() and not source.name.lower().endswith(MOTION_SUFFIXES):
+        raise WearcapError("no motion file", source, f"a name that ends in {', '.join(MOTION_SUFFIXES)}")
     files = [source] if source.is_file() else _motion_files(source_folder(source))
     root = source.parent if source.is_file() else source
-    trials = {"__".join([*path.relative_to(root).parent.parts, path.name.split(".")[0]]): path for path in files[::-1]}
-    trials = {name.replace(" ", "_"): trials[name] for name in sorted(trials)}
+    trials: dict[str, Path] = {}
+    for path in files:
+        name = "__".join([*path.relative_to(root).parent.parts, _stem(path)]).replace(" ", "_")
+        if name in trials and (trials[name].parent, _stem(trials[name])) != (path.parent, _stem(path)):
+            raise WearcapError(f"two files are called {name!r}: {trials[name]} and {path}", fix="Rename one.")
+        trials.setdefault(name, path)  # .amc comes first
     subjects = _subjects(root, trials, subject)
     abouts = {name: About(name, subjects[name], "bvh", license) for name in trials}
     given = Mapping() if mapping is None else read_mapping(mapping)
@@ -127,6 +133,12 @@ def _motion_files(source: Path) -> list[Path]:
     if not files:
         raise WearcapError("no .amc or .bvh files", where=source, expected="motion files, plain or .xz or .gz")
     return files
+
+
+def _stem(path: Path) -> str:
+    """A motion file's name without the endings of its format."""
+    ending = next(ending for ending in sorted(MOTION_SUFFIXES, key=len)[::-1] if path.name.lower().endswith(ending))
+    return path.name[: -len(ending)]
 
 
 def _motion_tasks(
