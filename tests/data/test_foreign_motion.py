@@ -125,6 +125,18 @@ def without(part: str) -> Convention:
     )
 
 
+def test_bones_that_change_their_length_are_fitted_as_near_as_constant_ones_reach(truth, tmp_path):
+    """All places 2 % nearer to the pelvis and farther from it, in turn: the report says how far that is."""
+    R, p = truth
+    breath = 1 + 0.02 * np.sin(np.linspace(0, 9, len(p["pelvis"])))[:, None]
+    stretched = {joint: p["pelvis"] + breath * (places - p["pelvis"]) for joint, places in p.items()}
+    write(tmp_path / "stretched.bvh", CONVENTIONS["studio"], R, stretched)
+    report = read_foreign_motion(tmp_path / "stretched.bvh").report
+    knees, wrists = report.residual_m["left_knee"], report.residual_m["right_wrist"]
+    assert 0.002 < knees[0] < knees[1] < 0.012  # 2 % of a thigh of 42 cm
+    assert 0.002 < wrists[0] < wrists[1] < 0.03
+
+
 def test_left_handed_axes_are_turned_right(truth, tmp_path):
     mirrored = replace(CONVENTIONS["mixamo"], axes=np.diag([-1.0, 1, 1]) @ Y_UP)
     write(tmp_path / "left.bvh", mirrored, *truth)
