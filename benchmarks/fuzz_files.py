@@ -34,6 +34,7 @@ import test_watch_log  # noqa: E402
 import totalcapture_files  # noqa: E402
 from PIL import Image  # noqa: E402
 
+import foreign_bvh  # noqa: E402
 import keypoint_files  # noqa: E402
 import short_walk  # noqa: E402
 from wearcap.body.skeletons import smplh52  # noqa: E402
@@ -76,6 +77,7 @@ from wearcap.io.formats import (  # noqa: E402
     wavefront,
 )
 from wearcap.localization import keypoints  # noqa: E402
+from wearcap.prepare import foreign  # noqa: E402
 from wearcap.recording import Cue  # noqa: E402
 from wearcap.scene.scan import Photo  # noqa: E402
 from wearcap.sensors import watch_calibration  # noqa: E402
@@ -282,6 +284,12 @@ HCONTACT_JSON = json.dumps(hoi_files.smpl_content(hoi_files.motion(4)))
 LENSES = {"cam0": ocam_files.lens(0.2), "cam1": ocam_files.lens(0.2)}
 PICKLED = pickle.dumps({"a": [1, 2.5, "x", (None, True)], "b": np.arange(12.0).reshape(3, 4), "c": np.float32(2)})
 
+
+def _foreign_walk(path: Path) -> None:
+    """Bones along each joint's own x, position channels on every joint, a root on the ground."""
+    foreign_bvh.write(path, foreign_bvh.CONVENTIONS["studio"], *foreign_bvh.walk(6))
+
+
 READERS: dict[str, Reader] = {
     "adt_skeleton": _made("s.json", test_adt.skeleton_file, adt.read_skeleton),
     "adt_objects": Reader(_adt_objects, adt.read_moving_objects),
@@ -302,6 +310,7 @@ READERS: dict[str, Reader] = {
     ),
     "behave_mesh": Reader(one_object_files.write_behave, lambda folder: behave.read_behave_mesh(folder, "boxlarge")),
     "bvh": _made("a.bvh", lambda path: bvh.write_bvh(swaying_motion(4), path), bvh.read_bvh),
+    "foreign_bvh": _made("a.bvh", _foreign_walk, foreign.read_foreign_motion),
     "camera_json": _made("c.json", lambda path: camera_json.write_camera(LENS, path), camera_json.read_camera),
     "colmap_text": Reader(test_colmap.write_text_model, colmap.read_colmap),
     "colmap_binary": Reader(test_colmap.write_binary_model, colmap.read_colmap),

@@ -1,13 +1,17 @@
 """Motion capture to recordings: rates, glitches, floors, contacts, the head's path; CMU's and AMASS's layouts."""
 
 import math
+import shutil
+import warnings
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from foreign_bvh import CONVENTIONS, walk, write
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
 from wearcap.cli import prepare as verb
 from wearcap.cli.conf import compose, splits_dir
@@ -16,14 +20,15 @@ from wearcap.geometry import rotation
 from wearcap.io.datasets.amass import write_amass
 from wearcap.io.formats.text import read_bytes
 from wearcap.prepare import Splits, check_recording
-from wearcap.prepare.mocap import About, CleaningLimits, MocapSettings, mocap_recording, without_glitches
-from wearcap.prepare.mocap_sources import BvhSettings, _cmu_recording, amass_tasks, cmu_tasks
+from wearcap.prepare.mocap import About, CleaningLimits, MocapSettings, foot_patches, mocap_recording, without_glitches
+from wearcap.prepare.mocap_sources import amass_tasks, bvh_tasks, cmu_tasks
 from wearcap.recording import Motion, RecordingStore
 from wearcap.recording.timing import resampled
 
 LIMITS = CleaningLimits(8.0, 15.0, 0.5, 0.06, 0.12)
 SETTINGS = MocapSettings(60.0, (0.09, 0.0, 0.09), LIMITS)
 ABOUT = About("a", "1", "test", "none")
+SPLITS = Splits(Path("any.csv"), (("*", "train"),))
 
 
 def standing(seconds: float = 2.0, fps: float = 120.0, floor: float = 0.4) -> Motion:
@@ -278,7 +283,7 @@ def test_cmus_split_covers_every_subject_and_keeps_its_largest_for_training():
 def test_every_kind_of_cmu_trial_becomes_a_recording(real_data):
     config = compose("prepare", ["prepare=cmu"])
     splits = Splits.read(splits_dir() / "cmu.csv")
-    tasks = cmu_tasks(real_data / "cmu_mocap", splits, SETTINGS, BvhSettings(0.01, "y", "z"), config.amc_fps, "CMU")
+    tasks = cmu_tasks(real_data / "cmu_mocap", splits, SETTINGS, config.amc_fps, "CMU")
     indices = [path.read_text(encoding="utf-8") for path in (real_data / "cmu_mocap").glob("index*.csv")]
     assert len(tasks) == sum(len(text.splitlines()) - 1 for text in indices) >= 240
     by_name = {task.name: task for task in tasks}
@@ -306,10 +311,112 @@ def test_xz_and_plain_give_the_same_recording(real_data, tmp_path):
     folder = real_data / "cmu_mocap/trials/035"
     plain = tmp_path / "35_20.amc"
     plain.write_bytes(read_bytes(folder / "35_20.amc.xz"))
+    shutil.copy(folder / "35.asf", tmp_path)
     first, second = (
-        _cmu_recording(path, folder / "35.asf", ABOUT, 120, BvhSettings(0.01, "y", "z"), SETTINGS).motion
-        for path in (folder / "35_20.amc.xz", plain)
+        next(task for task in bvh_tasks(file, SPLITS, SETTINGS, 120, "CMU")).make().motion
+        for file in (folder / "35_20.amc.xz", plain)
     )
     assert first is not None
     assert second is not None
     assert torch.equal(first.R_parent_joint, second.R_parent_joint)
+
+
+@pytest.fixture
+def foreign_folder(tmp_path) -> Path:
+    """Two people's walks in one convention, a folder each."""
+    R, p = walk(frames=90)
+    for person in ("anna", "ben"):
+        (tmp_path / "in" / person).mkdir(parents=True)
+        for take in ("a", "b"):
+            write(tmp_path / "in" / person / f"{person}-{take}.bvh", CONVENTIONS["studio"], R, p)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("rule", "subjects", "warned"),
+    [
+        (None, {"anna", "ben"}, False),
+        ("folder", {"anna", "ben"}, False),
+        (r"/(\w+)-\w\.bvh", {"anna", "ben"}, False),
+        (r"(an|ben)", {"an", "ben"}, False),
+        ("everyone", {"everyone"}, False),
+        (r"([^/]+)\.bvh", {"anna-a", "anna-b", "ben-a", "ben-b"}, True),
+    ],
+)
+def test_subjects_follow_a_pattern_the_folder_or_a_name(rule, subjects, warned, foreign_folder):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        tasks = bvh_tasks(foreign_folder / "in", SPLITS, SETTINGS, 120, "none", subject=rule)
+    assert [task.name for task in tasks] == [f"{p}__{p}-{take}" for p in ("anna", "ben") for take in ("a", "b")]
+    assert {task.make.args[2].subject for task in tasks} == subjects  # pyright: ignore[reportFunctionMemberAccess]
+    assert any("subject=" in str(warning.message) for warning in caught) == warned
+
+
+@pytest.mark.parametrize(
+    ("rule", "message"), [("(a", "subject=.a: "), ("(a)(b)", "2 groups"), ("(carl)", "does not match anna/anna-a.bvh")]
+)
+def test_a_pattern_that_finds_no_subject_is_refused(rule, message, foreign_folder):
+    with pytest.raises(WearcapError, match=message):
+        bvh_tasks(foreign_folder / "in", SPLITS, SETTINGS, 120, "none", subject=rule)
+
+
+def test_foreign_files_become_recordings_and_what_the_doctor_refuses_does_not(foreign_folder, capfd):
+    """A walk that lies on its side is reported as failed; the others are written with what was detected."""
+    R, p = walk(frames=90)
+    over = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    lying = {joint: over @ turns for joint, turns in R.items()}, {joint: places @ over.T for joint, places in p.items()}
+    write(foreign_folder / "in" / "ben" / "lying.bvh", CONVENTIONS["mixamo"], *lying)
+    (foreign_folder / "up.yaml").write_text("up: y\nforward: z\n")
+    arguments = ["bvh", f"source={foreign_folder / 'in'}", f"output={foreign_folder / 'out'}", "jobs=1"]
+    arguments += [f"mapping={foreign_folder / 'up.yaml'}"]
+    with pytest.raises(SystemExit):
+        verb.main(arguments)
+    printed = capfd.readouterr()
+    assert "failed: ben__lying: the doctor finds, motion: up axis: the body stands along" in printed.err
+    assert "check=false" in printed.err
+    assert "4 written, 0 current, 1 failed" in printed.out
+    assert "anna__anna-a: names MotionBuilder, centimetres, y up, frames from the motion" in printed.out
+    motion = RecordingStore.open(foreign_folder / "out").load("anna__anna-a").motion
+    assert motion is not None
+    assert "The unit is centimetres (0.01 m)" in motion.provenance["conventions"]
+    verb.main([*arguments, "check=false", r"subject=(anna|ben)/[\w-]+\.bvh"])
+    store = RecordingStore.open(foreign_folder / "out")
+    assert {store.entries[n].subject for n in ("anna__anna-a", "ben__ben-b")} == {"anna", "ben"}
+    assert "1 written, 4 current, 0 failed" in capfd.readouterr().out
+    one = foreign_folder / "in" / "ben" / "ben-a.bvh"
+    verb.main(["bvh", f"source={one}", f"output={foreign_folder / 'single'}", "jobs=1", "subject=ben"])
+    store = RecordingStore.open(foreign_folder / "single")
+    assert store.names() == ["ben-a"]
+    assert store.entries["ben-a"].subject == "ben"
+
+
+@pytest.mark.real
+def test_another_laboratorys_files_land_in_its_people(real_data):
+    tasks = bvh_tasks(real_data / "hdm05" / "trials", SPLITS, SETTINGS, 120, "none")
+    subjects = [task.make.args[2].subject for task in tasks]  # pyright: ignore[reportFunctionMemberAccess]
+    assert len(subjects) == 232
+    assert set(subjects) == {"HDM_bd", "HDM_bk", "HDM_dg", "HDM_mm"}
+
+
+@pytest.mark.real
+@pytest.mark.slow
+def test_standing_soles_lie_on_the_floor(real_data):
+    """Heels and toe tips of CMU's standing feet; when soles kept the bind pose's tilt, heels were at 1.5 cm in the median."""
+    tasks = {task.name: task for task in cmu_tasks(real_data / "cmu_mocap", SPLITS, SETTINGS, 120, "CMU")}
+    heights = []
+    for name in ("07_01", "10_01", "14_14", "16_05", "35_20", "55_28", "13_29", "29_01", "127_03", "43_02"):
+        if name not in tasks:
+            continue
+        motion = tasks[name].make().motion
+        assert motion is not None
+        positions, speed = foot_patches(motion)
+        for heel, tip in ((0, 1), (2, 3)):
+            low = positions[:, [heel, tip], 2].amin(1) < 0.06
+            standing = (speed[:, heel] < 0.1) & (speed[:, tip] < 0.1) & low
+            if standing.sum() > 5:
+                heights.append(positions[standing][:, [heel, tip], 2].median(0).values)
+    assert len(heights) > 8
+    heels, tips = torch.stack(heights).unbind(-1)
+    assert heels.median().abs() < 0.005
+    assert tips.median().abs() < 0.005
+    assert heels.abs().mean() < 0.013

@@ -5,26 +5,18 @@ position in the tree, since their number and names differ most.
 """
 
 import math
-import re
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wearcap.body.joint_matching import joints_by_name
 from wearcap.body.kinematics import forward_kinematics, local_rotations
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import swing_between
 
-_LEGS = """hip knee ankle, femur tibia foot, upleg leg foot, thigh shin foot, thigh calf foot, upperleg lowerleg foot,
-    hip knee foot, upleg lowleg foot"""
-_ARMS = """humerus radius hand, shoulder elbow wrist, arm forearm fingerbase, arm forearm hand, upperarm forearm hand,
-    upperarm lowerarm hand, shldr forearm hand, uparm loarm hand, shoulder elbow hand"""
-"""Names of (hip, knee, ankle) and (shoulder, elbow, wrist) in use: xsens and SMPL, CMU, Mixamo, Poser, Unreal …
-
-CMU's `lwrist` is the middle of the forearm (its only freedom is the forearm's twist); `lhand` is the wrist.
-"""
 _SPLAY = 0.17
 """Lateral angle (rad) of a bind pose's shins above which its feet are taken to be rolled with them."""
 _UPRIGHT = math.cos(math.radians(25))
@@ -49,42 +41,11 @@ class Landmarks:
     """Joint that rotates the forearm at the wrist, by side (the elbow, or a twist joint below it)."""
 
 
-def _plain(name: str) -> str:
-    """A name without rig prefixes, separators and case: "mixamorig:LeftUpLeg" → "leftupleg"."""
-    name = name.rsplit(":", 1)[-1]
-    name = re.sub(r"^(bip\d*|biped|valvebiped|cc_base|character\d*|def)[ _.-]", "", name, flags=re.IGNORECASE)
-    side = re.fullmatch(r"(.+?)[ _.-]([lr])", name, flags=re.IGNORECASE)
-    if side:
-        name = side.group(2) + side.group(1)
-    plain = re.sub(r"[ _.-]|\d+$", "", name).lower()
-    return re.sub(r"^(.*?)(left|right)$", r"\2\1", plain)
-
-
-def _limb(by_name: dict[str, int], side: str, limb: str, skeleton: Skeleton) -> tuple[int, int, int]:
-    alternatives = [names.split() for names in (_LEGS if limb == "leg" else _ARMS).split(",")]
-    for names in alternatives:
-        for prefix in (side, side[0]):
-            first, second, third = (by_name.get(prefix + name, -1) for name in names)
-            if min(first, second, third) >= 0:
-                return first, second, third
-    what = f"the {side} {limb} of skeleton {skeleton.name!r} is not recognised"
-    expected = "joints named like " + " or ".join("/".join(n) for n in alternatives[:3])
-    raise WearcapError(what, expected=expected, fix=f"It has {', '.join(skeleton.joint_names)}; rename them.")
-
-
 def landmarks(skeleton: Skeleton) -> Landmarks:
     """Find the parts of the body. Raises WearcapError naming the limb that is not recognised."""
-    by_name: dict[str, int] = {}
-    for joint, name in enumerate(skeleton.joint_names):
-        by_name.setdefault(_plain(name), joint)
-    if "head" not in by_name:
-        fix = f"It has {', '.join(skeleton.joint_names)}; rename one."
-        raise WearcapError(f"skeleton {skeleton.name!r} has no joint named head", fix=fix)
-    head = by_name["head"]
-    limb, collar, toe, forearm = {}, {}, {}, {}
+    found = joints_by_name(skeleton.joint_names, skeleton.parents, skeleton.name)
+    head, limb, collar, toe, forearm = found.head, found.limb, {}, {}, {}
     for side in ("left", "right"):
-        limb[f"{side}_leg"] = _limb(by_name, side, "leg", skeleton)
-        limb[f"{side}_arm"] = _limb(by_name, side, "arm", skeleton)
         below = [joint for joint, parent in enumerate(skeleton.parents) if parent == limb[f"{side}_leg"][2]]
         toe[side] = max(below, key=lambda joint: skeleton.t_parent_joint[joint, 0].item(), default=None)
         forearm[side] = skeleton.parents[limb[f"{side}_arm"][2]]

@@ -8,6 +8,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from wearcap.cli.conf import compose, conf_dir, explained, nearest, splits_dir
+from wearcap.doctor import require_sound
 from wearcap.errors import WearcapError
 from wearcap.prepare.engine import Report, Splits, prepare
 from wearcap.recording.store import SPLITS, RecordingStore
@@ -27,7 +28,8 @@ def run(config: DictConfig) -> Report:
         splits = Splits.read(listed if listed.is_file() else Path(config.splits))
         tasks = instantiate(config.tasks, _convert_="all", _partial_=True)(splits=splits)
         options = {key: config[key] for key in ("jobs", "backend", "scheduler", "overwrite")}
-        report = prepare(tasks, config.output, **options)
+        inspect = require_sound if config.get("check") else None
+        report = prepare(tasks, config.output, **options, inspect=inspect)
     _show_report(report, RecordingStore.open(config.output))
     return report
 
@@ -76,13 +78,20 @@ def main(arguments: list[str]) -> None:
         print(sources()[source].read_text(encoding="utf-8"))
         print(_shared_settings())
     else:
-        overrides = [f"prepare={source}", *(argument for argument in arguments if argument != source)]
+        overrides = [f"prepare={source}", *(_plain_pattern(argument) for argument in arguments if argument != source)]
         with explained("prepare", overrides):
             config = compose("prepare", overrides)
             OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # a missing value raises here
             report = run(config)
         if report.failed:
             sys.exit(1)
+
+
+def _plain_pattern(argument: str) -> str:
+    """A `subject=` in the quotes that a regular expression needs, unless it has them."""
+    key, _, value = argument.partition("=")
+    bare = key == "subject" and "(" in value and value[0] not in "'\""
+    return f"{key}='{value}'" if bare else argument
 
 
 def _shared_settings() -> str:

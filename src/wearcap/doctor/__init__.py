@@ -4,7 +4,7 @@ Open `examine.py` first, which also reads what is examined; `streams.py` (with t
 `agreement.py` and `places.py` check it; `report.py` holds checks, findings and their report.
 """
 
-from wearcap.doctor.examine import examine, examine_recording
+from wearcap.doctor.examine import examine, examine_recording, require_sound
 from wearcap.doctor.report import Finding, Report
 
-__all__ = ["Finding", "Report", "examine", "examine_recording"]
+__all__ = ["Finding", "Report", "examine", "examine_recording", "require_sound"]

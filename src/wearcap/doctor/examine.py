@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -34,8 +35,6 @@ from wearcap.io.datasets.nymeria import is_nymeria, read_nymeria, read_xdata
 from wearcap.io.datasets.totalcapture import is_totalcapture, read_totalcapture, totalcapture_files
 from wearcap.io.devices.aria_mps import find_mps_file, is_mps_folder, read_closed_loop, read_mps
 from wearcap.io.devices.headset_log import is_headset_log
-from wearcap.io.formats.asf_amc import read_amc, read_asf
-from wearcap.io.formats.bvh import read_bvh
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.io.formats.mvnx import read_mvnx
 from wearcap.io.formats.npz import read_npz
@@ -43,6 +42,7 @@ from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.text import read_json_object
 from wearcap.io.formats.trajectory import read_trajectory_file, trajectory_file
+from wearcap.prepare.foreign import read_foreign_motion
 from wearcap.recording import FloorTrack, Motion, PointCloud, Recording, RecordingStore
 from wearcap.recording.store import RecordingFile
 from wearcap.scene.floor import estimate_floor
@@ -95,15 +95,15 @@ def examine_recording(recording: Recording) -> list[Finding]:
     findings += check_spans({name: times for name, times in clocks.items() if name in usable})
     # Each usable stream, then pairs of streams; streams with errors are not compared.
     head = recording.head if "head" in usable else None
+    on_head: list[Finding] = []
     if head is not None:
-        found = check_track("head", Trajectory(head.timestamps, head.R_world_device, head.t_world_device))
-        findings += found
-        head = None if has_error(found) else head
+        on_head = check_track("head", Trajectory(head.timestamps, head.R_world_device, head.t_world_device))
+    tracked = None if has_error(on_head) else head
     floor = recording.floor
-    if floor is None and recording.points is not None and head is not None:
+    if floor is None and recording.points is not None and tracked is not None:
         with suppress(WearcapError):
-            below = estimate_floor(recording.points.points_world, head.t_world_device)
-            floor = FloorTrack(head.timestamps, below.height) if below.confidence.median() > 0.3 else None
+            below = estimate_floor(recording.points.points_world, tracked.t_world_device)
+            floor = FloorTrack(tracked.timestamps, below.height) if below.confidence.median() > 0.3 else None
     bodies = {}
     for name, motion in (("motion", recording.motion), ("suit", recording.suit)):
         if motion is not None and name in usable:
@@ -112,6 +112,10 @@ def examine_recording(recording: Recording) -> list[Finding]:
             if not has_error(found):
                 bodies[name] = motion
     body = bodies.get("motion", bodies.get("suit"))
+    if head is not None and body is not None and has_error(on_head):
+        on_head = _explained_by(body, head, on_head)
+    findings += on_head
+    head = None if has_error(on_head) else head
     if head is not None and body is not None:
         findings += check_head_against_body(head, body)
     if head is not None:
@@ -154,6 +158,25 @@ def _check_height(recording: Recording) -> list[Finding]:
             )
         ]
     return [check.ok("the body fits how high the head is carried", evidence)]
+
+
+def _explained_by(body: Motion, head: HeadStream, findings: list[Finding]) -> list[Finding]:
+    """Findings of a head that is not upright, no errors where it rides on a sound body that bends down or lies."""
+    if any(f.severity in ("error", "warning") for f in check_head_against_body(head, body)):
+        return findings
+    fix = "Its wearer bends down or lies, as the body does."
+    return [
+        replace(f, severity="warning", fix=fix) if f.severity == "error" and f.check == "head: up axis" else f
+        for f in findings
+    ]
+
+
+def require_sound(recording: Recording) -> None:
+    """Raise WearcapError with the first of a recording's errors."""
+    for finding in examine_recording(recording):
+        if finding.severity == "error":
+            fix = f"{finding.fix} check=false writes it as it is.".strip()
+            raise WearcapError(f"the doctor finds, {finding.check}: {finding.what} ({finding.evidence})", fix=fix)
 
 
 def _clocks(recording: Recording) -> dict[str, Float64[Tensor, "_"]]:
@@ -258,14 +281,11 @@ def _read_mps(folder: Path) -> Loaded:
     return recording, [*findings, check.ok("MPS reports success", services)]
 
 
-def _read_amc(path: Path) -> Motion:
-    """An AMC file with the ASF beside it: the only one, or the one whose name it begins with."""
-    beside = sorted(file for file in path.parent.iterdir() if ".asf" in file.suffixes)
-    stem = path.name.split(".")[0]
-    named = [file for file in beside if stem.startswith(file.name.split(".")[0])]
-    if not (named or len(beside) == 1):
-        raise WearcapError("no skeleton for this motion", where=path, expected="an .asf file beside it")
-    return read_amc(read_asf((named or beside)[-1]), path)
+def _read_foreign(path: Path) -> Loaded:
+    """A motion file of any origin, with what was detected."""
+    found = read_foreign_motion(path)
+    recording = Recording(name=path.name, motion=found.motion, skeleton=found.motion.skeleton)
+    return recording, [Check("file").ok("a body was found", " ".join(found.report.lines()))]
 
 
 def _read_trajectory(path: Path) -> Loaded:
@@ -306,7 +326,7 @@ _FOLDERS: tuple[tuple[Callable[[Path], bool], Callable[[Path], Loaded]], ...] = 
     (is_totalcapture, lambda folder: (_totalcapture(folder), [])),
     (is_place, read_place),
 )
-_MOTIONS = {".amc": _read_amc, ".bvh": read_bvh, ".mvnx": read_mvnx, ".npz": _read_npz}
+_MOTIONS = {".amc": _read_foreign, ".bvh": _read_foreign, ".mvnx": read_mvnx, ".npz": _read_npz}
 _READERS: dict[str, Callable] = {
     **_MOTIONS,
     ".safetensors": lambda path: read_map(path) if is_map(path) else RecordingFile(path).load(),

@@ -128,8 +128,9 @@ def prepare(
     backend: str = "loky",
     scheduler: str | None = None,
     overwrite: bool = False,
+    inspect: Callable[[Recording], None] | None = None,
 ) -> Report:
-    """Make every recording that is missing or out of date.
+    """Make every recording that is missing or out of date; `inspect` (picklable) raises WearcapError for a bad one.
 
     `jobs` is joblib's (-1: all cores); with backend "dask" and no `scheduler` address, that many local workers.
     A recording that cannot be made is reported, and the others continue. Raises WearcapError when the output cannot be
@@ -148,7 +149,7 @@ def prepare(
         remove_leftovers(store.root, below=True)
         todo = tasks if overwrite else [task for task in tasks if not _is_current(store, task)]
         report = Report(current=sorted(names - {task.name for task in todo}))
-        outcomes = spread.run(partial(_run, root=store.root), todo, lock)
+        outcomes = spread.run(partial(_run, root=store.root, inspect=inspect), todo, lock)
         try:
             with closing(outcomes), registering(store, len(tasks), len(report.current)) as finish:
                 for name, outcome, note in outcomes:
@@ -176,7 +177,7 @@ def _is_current(store: RecordingStore, task: Task) -> bool:
     return path.is_file() and path.stat().st_size == entry.bytes and sha256_of(path) == entry.sha256
 
 
-def _run(task: Task, root: Path) -> tuple[str, Entry | str, str]:
+def _run(task: Task, root: Path, inspect: Callable[[Recording], None] | None = None) -> tuple[str, Entry | str, str]:
     """In a worker: make, check and write one recording; returns (name, entry or reason of failure, note)."""
     threads = torch.get_num_threads(), numba.get_num_threads()
     torch.set_num_threads(1)  # recordings are the unit of parallelism, and sums over threads differ in their last bits
@@ -187,6 +188,8 @@ def _run(task: Task, root: Path) -> tuple[str, Entry | str, str]:
             if recording.name != task.name:
                 raise WearcapError(f"the source made a recording {recording.name!r}", expected=task.name)
             check_recording(recording)
+            if inspect is not None:
+                inspect(recording)
         except Exception as error:
             return task.name, reason_of(error), ""
         save_recording(recording, recording_path(root, task.name))

@@ -20,6 +20,10 @@ TRUNK = ("pelvis", "l5", "l3", "t12", "t8", "neck", "head", "left_hip", "right_h
 """Joints of xsens23 that no limb can swing."""
 
 
+_STANDING, _LEAST_STANDING = 0.25, 10
+"""Share of the contact speed below which both ends of a sole stand still, and number of such soles that tell the floor."""
+
+
 @dataclass(frozen=True)
 class CleaningLimits:
     """Thresholds for a glitch, a planted foot and a level floor."""
@@ -60,7 +64,8 @@ class About:
 def mocap_recording(motion: Motion, about: About, settings: MocapSettings) -> Recording:
     """Retarget to xsens23, cut glitches, resample, level the floor, find contacts, put a device on the head.
 
-    The floor is at the median height of the lowest of `FOOT_PATCHES` while that patch is planted. On ground that is not
+    The floor is at the median height of the soles of feet that stand still on heel and toes, else of the lowest of
+    `FOOT_PATCHES` while that patch is planted. On ground that is not
     level (steps, ladders) there is no `floor`, contacts follow from the patches' speed alone, and z = 0 is the 5th
     percentile of these heights, the lowest ground trodden. The source's height is kept in the provenance as `floor_m`.
     """
@@ -73,7 +78,7 @@ def mocap_recording(motion: Motion, about: About, settings: MocapSettings) -> Re
     planted = planted if len(planted) else height
     low, middle, high = planted.quantile(torch.tensor([0.05, 0.5, 0.95])).tolist()
     level = high - low <= settings.limits.level_within
-    floor = middle if level else low
+    floor = _sole_height(positions, speed, middle, settings.limits) if level else low
     if level:
         slow &= positions[..., 2] < floor + settings.limits.contact_height
     # Single frames follow their neighbours.
@@ -96,6 +101,16 @@ def mocap_recording(motion: Motion, about: About, settings: MocapSettings) -> Re
         floor=FloorTrack(times, torch.zeros(len(times))) if level else None,
         skeleton=motion.skeleton,
     )
+
+
+def _sole_height(
+    positions: Float[Tensor, "time patch 3"], speed: Float[Tensor, "time patch"], middle: float, limits: CleaningLimits
+) -> float:
+    """Median height (m) of the middles of soles that stand near `middle`; `middle` where none stands."""
+    heights = positions[..., 2].unflatten(1, (2, 2)).mean(-1)
+    still = (speed < _STANDING * limits.contact_speed).unflatten(1, (2, 2)).all(-1)
+    standing = heights[still & ((heights - middle).abs() < limits.contact_height)]
+    return standing.median().item() if len(standing) >= _LEAST_STANDING else middle
 
 
 def on_xsens23(motion: Motion) -> Motion:

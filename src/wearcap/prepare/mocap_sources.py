@@ -1,98 +1,78 @@
-"""Motion capture without sensors: CMU's (ASF/AMC and BVH), any folder of BVH files, and AMASS (SMPL-H or SMPL-X files)."""
+"""Motion capture without sensors: CMU's, BVH and ASF/AMC files of any origin, and AMASS (SMPL-H or SMPL-X files)."""
 
 import csv
+import re
+import warnings
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from contextlib import suppress
+from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
-from wearcap.body.landmarks import head_level, with_head_face
 from wearcap.errors import WearcapError, nearest
 from wearcap.io.datasets.amass import read_amass
-from wearcap.io.formats.asf_amc import read_amc, read_asf
-from wearcap.io.formats.bvh import read_bvh, read_cmu_bvh
-from wearcap.io.formats.text import read_text
-from wearcap.prepare.engine import Splits, Task, content_hash, source_folder
-from wearcap.prepare.mocap import About, MocapSettings, mocap_recording, on_xsens23
-from wearcap.recording.motion import Motion
+from wearcap.prepare.engine import NOTE, Splits, Task, content_hash, source_folder
+from wearcap.prepare.foreign import read_foreign_motion
+from wearcap.prepare.foreign_conventions import Mapping, read_mapping
+from wearcap.prepare.foreign_files import asf_beside
+from wearcap.prepare.levels import Levels, levels_in
+from wearcap.prepare.mocap import About, MocapSettings, mocap_recording
 from wearcap.recording.recording import Recording
 
-CMU_VERSION, AMASS_VERSION = 2, 1
+CMU_VERSION, BVH_VERSION, AMASS_VERSION = 3, 1, 2
 """Versions of the conversions, increased when the same source and settings yield another recording."""
 
 MOTION_SUFFIXES = (".amc", ".amc.xz", ".amc.gz", ".bvh", ".bvh.xz", ".bvh.gz")
-HEAD_TRIALS, HEAD_FRAME_STEP = 6, 12
-"""Number of a subject's trials, and stride of their frames, from which the tilt of the head's markers is estimated."""
-
-CGSPEED_JOINT = "LHipJoint"
-"""Joint by which cgspeed's conversions of CMU are recognised."""
+LEVEL_TRIALS = 6
+"""Number of a subject's trials from which the tilts of head and feet are estimated."""
 
 NO_MOTION = ("shape.npz", "stagei.npz")
 """Name suffixes of AMASS's files that hold no motion."""
 
 
-@dataclass(frozen=True)
-class BvhSettings:
-    """Units and axes of BVH files other than CMU's, whose units and axes are known."""
-
-    unit_m: float | int
-    up: str
-    forward: str
-
-
-def _cmu_recording(
+def _foreign_recording(
     file: Path,
     asf: Path | None,
     about: About,
     amc_fps: float | int,
-    bvh: BvhSettings,
+    mapping: Mapping,
     settings: MocapSettings,
     same_subject: tuple[Path, ...] = (),
 ) -> Recording:
-    """One file of motion, with its skeleton file where the format needs one.
+    """One file of motion, fitted to its joints; what was detected is kept in the motion's provenance as `conventions`.
 
-    The tilt of the head's markers is estimated from `same_subject`, trials of the same subject and skeleton file. Raises
+    The tilts of head and feet are estimated from `same_subject`, trials of the same subject and skeleton file. Raises
     WearcapError for an AMC file without a skeleton.
     """
-    if ".amc" in file.name.lower():
-        if asf is None:
-            fix = "An AMC file needs its subject's .asf."
-            expected = f"{file.name.split('_')[0]}.asf, or one .asf file"
-            raise WearcapError("no skeleton beside it", where=file, fix=fix, expected=expected)
-        motion = read_amc(read_asf(asf), file, amc_fps)
-    elif CGSPEED_JOINT in read_text(file)[:4096]:
-        motion = read_cmu_bvh(file)
-    else:
-        motion = read_bvh(file, unit_m=bvh.unit_m, up=bvh.up, forward=bvh.forward)
-    motion = on_xsens23(motion)
-    face = None if asf is None else _head_face(asf, same_subject, amc_fps)
-    if face is not None:
-        motion = replace(motion, R_parent_joint=with_head_face(motion.skeleton, motion.R_parent_joint, face))
-    return mocap_recording(motion, about, settings)
+    levels = None if asf is None else _levels(asf, same_subject, amc_fps)
+    read = read_foreign_motion(file, mapping, amc_fps=amc_fps, asf=asf, levels=levels)
+    recording = mocap_recording(read.motion, about, settings)
+    assert recording.motion is not None
+    known = recording.motion.provenance
+    notes = [known[NOTE]] if NOTE in known else []
+    notes += [read.report.summary()] if about.source != "cmu" else []
+    found = {"conventions": " ".join(read.report.lines())} | ({NOTE: "; ".join(notes)} if notes else {})
+    return replace(recording, motion=replace(recording.motion, provenance=known | found))
 
 
 @cache
-def _head_face(asf: Path, files: tuple[Path, ...], fps: float | int) -> Float[Tensor, "3 3"] | None:
-    """Tilt of a subject's face in the captured head frame: CMU's head markers sit 5…45° off, by subject."""
-    skeleton, poses = read_asf(asf), []
+def _levels(asf: Path, files: tuple[Path, ...], amc_fps: float | int) -> Levels | None:
+    """Tilts of a subject's head and feet in the captured frames: CMU's head markers sit 5…45° off, by subject."""
+    motions = []
     for file in files:
-        try:
-            motion = read_amc(skeleton, file, fps)
-        except WearcapError:  # reported by the trial's own task
-            continue
-        thin = slice(None, None, HEAD_FRAME_STEP)
-        R, t = motion.R_parent_joint[thin], motion.t_world_root[thin]
-        motion = on_xsens23(Motion(motion.timestamps[thin], motion.skeleton, R, t))
-        poses.append(motion.R_parent_joint)
-    return head_level(motion.skeleton, torch.cat(poses)) if poses else None
+        with suppress(WearcapError):  # reported by the trial's own task
+            read = read_foreign_motion(file, amc_fps=amc_fps, asf=asf, levels=Levels(None, {}))
+            motions.append(read.motion)
+    return levels_in(motions) if motions else None
 
 
 def cmu_tasks(
-    source: str | Path, splits: Splits, settings: MocapSettings, bvh: BvhSettings, amc_fps: float | int, license: str
+    source: str | Path,
+    splits: Splits,
+    settings: MocapSettings,
+    amc_fps: float | int,
+    license: str,
+    subject: str | None = None,
 ) -> list[Task]:
     """One task per trial found anywhere below `source`.
 
@@ -104,38 +84,124 @@ def cmu_tasks(
     if index.is_file():
         with open(index, newline="", encoding="utf-8") as file:
             activities = {row["trial"]: row.get("category") for row in csv.DictReader(file) if row.get("trial")}
-    trials: dict[str, tuple[Path, Path | None]] = {}  # motion file, and skeleton file of an AMC
-    for path in sorted(p for p in source.rglob("*") if p.name.lower().endswith(MOTION_SUFFIXES)):
-        name, asf = path.name.split(".")[0], None
-        if name in trials and path.parent != trials[name][0].parent:
-            raise WearcapError(f"two trials are called {name!r}: {trials[name][0]} and {path}", fix="Rename one.")
-        if ".amc" in path.name.lower():  # its skeleton is its subject's .asf, else the only one in the folder
-            skeletons = sorted(p for p in path.parent.iterdir() if p.name.lower().split(".")[1:2] == ["asf"])
-            own = [p for p in skeletons if p.name.split(".")[0] == path.name.split("_")[0]]
-            asf = (own or skeletons)[0] if len(own or skeletons) == 1 else None
-        trials.setdefault(name, (path, asf))  # .amc comes first
-    if not trials:
+    trials: dict[str, Path] = {}
+    for path in _motion_files(source):
+        name = _stem(path)
+        if name in trials and path.parent != trials[name].parent:
+            raise WearcapError(f"two trials are called {name!r}: {trials[name]} and {path}", fix="Rename one.")
+        trials.setdefault(name, path)  # .amc comes first
+    subjects = _subjects(source, trials, subject)
+    abouts = {name: About(name, subjects[name], "cmu", license, activities.get(name) or "") for name in trials}
+    return _motion_tasks(trials, abouts, splits, settings, amc_fps, Mapping(), CMU_VERSION)
+
+
+def bvh_tasks(
+    source: str | Path,
+    splits: Splits,
+    settings: MocapSettings,
+    amc_fps: float | int,
+    license: str,
+    mapping: str | Path | None = None,
+    subject: str | None = None,
+) -> list[Task]:
+    """One task per .bvh or .amc (also .xz, .gz) that `source` is or that lies anywhere below it, named by its path.
+
+    `mapping`, a YAML file, overrides what is detected of all files' conventions. `subject` is a regular expression with
+    one group, searched in the path below `source`; or "folder"; or one name for all. By default it is the number of
+    CMU's SUBJECT_TRIAL names, else the folder.
+    """
+    source = Path(source)
+    if source.is_file() and not source.name.lower().endswith(MOTION_SUFFIXES):
+        raise WearcapError("no motion file", source, f"a name that ends in {', '.join(MOTION_SUFFIXES)}")
+    files = [source] if source.is_file() else _motion_files(source_folder(source))
+    root = source.parent if source.is_file() else source
+    trials: dict[str, Path] = {}
+    for path in files:
+        name = "__".join([*path.relative_to(root).parent.parts, _stem(path)]).replace(" ", "_")
+        if name in trials and (trials[name].parent, _stem(trials[name])) != (path.parent, _stem(path)):
+            raise WearcapError(f"two files are called {name!r}: {trials[name]} and {path}", fix="Rename one.")
+        trials.setdefault(name, path)  # .amc comes first
+    subjects = _subjects(root, trials, subject)
+    abouts = {name: About(name, subjects[name], "bvh", license) for name in trials}
+    given = Mapping() if mapping is None else read_mapping(mapping)
+    return _motion_tasks(trials, abouts, splits, settings, amc_fps, given, BVH_VERSION)
+
+
+def _motion_files(source: Path) -> list[Path]:
+    """Motion files anywhere below a folder, a trial's .amc before its .bvh. Raises WearcapError when there are none."""
+    files = sorted(p for p in source.rglob("*") if p.name.lower().endswith(MOTION_SUFFIXES))
+    if not files:
         raise WearcapError("no .amc or .bvh files", where=source, expected="motion files, plain or .xz or .gz")
+    return files
+
+
+def _stem(path: Path) -> str:
+    """A motion file's name without the endings of its format."""
+    ending = next(ending for ending in sorted(MOTION_SUFFIXES, key=len)[::-1] if path.name.lower().endswith(ending))
+    return path.name[: -len(ending)]
+
+
+def _motion_tasks(
+    trials: dict[str, Path],
+    abouts: dict[str, About],
+    splits: Splits,
+    settings: MocapSettings,
+    amc_fps: float | int,
+    mapping: Mapping,
+    version: int,
+) -> list[Task]:
+    skeletons: dict[str, Path | None] = {}
     same: dict[tuple[str, Path | None], list[Path]] = {}
-    for name, (path, asf) in trials.items():
-        same.setdefault((_subject(name), asf), []).append(path)
+    for name, path in trials.items():
+        skeletons[name] = None
+        if ".amc" in path.name.lower():
+            with suppress(WearcapError):  # raised again by the trial's own task
+                skeletons[name] = asf_beside(path)
+        same.setdefault((abouts[name].subject, skeletons[name]), []).append(path)
     tasks = []
-    for name, (path, asf) in trials.items():
-        subject = _subject(name)
-        about = About(name, subject, "cmu", license, activities.get(name) or "")
-        others = same[subject, asf]
-        spread = tuple(others[:: -(-len(others) // HEAD_TRIALS)]) if asf is not None else ()
-        make = partial(_cmu_recording, path, asf, about, amc_fps, bvh, settings, spread)
-        described = [asdict(about), asdict(settings), asdict(bvh), amc_fps, CMU_VERSION]
+    for name, path in trials.items():
+        asf, about = skeletons[name], abouts[name]
+        others = same[about.subject, asf]
+        spread = tuple(others[:: -(-len(others) // LEVEL_TRIALS)]) if asf is not None else ()
+        make = partial(_foreign_recording, path, asf, about, amc_fps, mapping, settings, spread)
+        described = [asdict(about), asdict(settings), asdict(mapping), amc_fps, version]
         sources = [path] if asf is None else [path, asf, *spread]
-        tasks.append(Task(name, make, splits.of(subject), content_hash(*described, *sources)))
+        tasks.append(Task(name, make, splits.of(about.subject), content_hash(*described, *sources)))
     return tasks
 
 
-def _subject(name: str) -> str:
-    """ "07" of "07_12" → "7"; a name without a subject's number is its own subject."""
-    first = name.split("_")[0]
-    return str(int(first)) if first.isdigit() and "_" in name else name
+def _subjects(source: Path, trials: dict[str, Path], subject: str | None) -> dict[str, str]:
+    """The subject of each trial by the rule `subject`; a warning says when each trial is a subject of its own."""
+    found = {name: _subject(path, source, subject) for name, path in trials.items()}
+    if len(set(found.values())) == len(found) > 1:
+        name, path = next(iter(trials.items()))
+        warnings.warn(
+            f"each of the {len(found)} files is a subject of its own ({path.name}: {found[name]!r}), so that one person "
+            "may be in training and in test: give subject=PATTERN with one group, subject=folder or subject=NAME",
+            stacklevel=3,
+        )
+    return found
+
+
+def _subject(path: Path, source: Path, rule: str | None) -> str:
+    below = path.relative_to(source)
+    folder = below.parent.as_posix() if below.parent.parts else source.resolve().name
+    if rule is None:
+        number = path.name.split("_")[0]
+        return str(int(number)) if number.isdecimal() and "_" in path.name else folder
+    if rule == "folder" or "(" not in rule:
+        return folder if rule == "folder" else rule
+    try:
+        pattern = re.compile(rule)
+    except re.error as error:
+        raise WearcapError(f"subject={rule}: {error}", expected="a regular expression with one group") from error
+    if pattern.groups != 1:
+        raise WearcapError(f"subject={rule} has {pattern.groups} groups", expected="one group, around the subject")
+    match = pattern.search(below.as_posix())
+    if not (match and match[1]):
+        expected = "a pattern that finds the subject in each path"
+        raise WearcapError(f"subject={rule} does not match {below.as_posix()}", where=source, expected=expected)
+    return match[1]
 
 
 def _amass(file: Path, about: About, settings: MocapSettings) -> Recording:

@@ -25,7 +25,7 @@ from wearcap.prepare.mocap import About, MocapSettings, foot_patches, mocap_reco
 from wearcap.recording.recording import Recording
 from wearcap.scene.objects import Environment, Freedom, SceneObject
 
-VERSION = 1
+VERSION = 2
 """Version of both conversions, increased when the same source and settings yield another recording."""
 
 LOOKED_AT = 20

@@ -12,11 +12,10 @@ from wearcap.io.datasets.amass import read_amass
 from wearcap.io.datasets.nymeria import is_nymeria, read_nymeria, read_xdata
 from wearcap.io.datasets.totalcapture import is_totalcapture, read_totalcapture, totalcapture_files
 from wearcap.io.devices.aria_mps import head_stream, is_mps_folder, read_closed_loop, read_mps
-from wearcap.io.formats.asf_amc import read_amc, read_asf
-from wearcap.io.formats.bvh import read_bvh
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.io.formats.npz import read_npz
 from wearcap.io.formats.trajectory import trajectory_format
+from wearcap.prepare.foreign import read_foreign_motion
 from wearcap.prepare.logs import HeadsetSettings, TrajectorySettings, read_path
 from wearcap.prepare.suits import read_suit
 from wearcap.recording import Motion, Recording
@@ -57,14 +56,11 @@ def kind_of(path: Path) -> str | None:
     return suffixes[-1] if suffixes and suffixes[-1] in READERS else None
 
 
-def amc_skeleton(path: Path) -> Path:
-    """The ASF beside an AMC file: the only one, or the one whose name it begins with. Raises WearcapError without one."""
-    beside = sorted(file for file in path.parent.iterdir() if ".asf" in (suffix.lower() for suffix in file.suffixes))
-    stem = path.name.split(".")[0]
-    named = [file for file in beside if stem.startswith(file.name.split(".")[0])]
-    if not (named or len(beside) == 1):
-        raise WearcapError("no skeleton for this motion", where=path, expected="an .asf file beside it")
-    return (named or beside)[-1]
+def _read_foreign(path: Path) -> Recording:
+    """A motion file of any origin on our skeleton; the note says what was detected."""
+    found = read_foreign_motion(path)
+    name = path.name.split(".")[0]
+    return Recording(name, motion=found.motion, skeleton=found.motion.skeleton, note=found.report.summary())
 
 
 def _read_log(path: Path) -> Recording:
@@ -103,8 +99,8 @@ _FOLDERS: tuple[tuple[Callable[[Path], bool], Callable[[Path], Recording]], ...]
     (is_kit, lambda folder: read_kit(folder)[0]),
 )
 READERS: dict[str, Callable[[Path], Recording | Motion]] = {
-    ".amc": lambda path: read_amc(read_asf(amc_skeleton(path)), path),
-    ".bvh": read_bvh,
+    ".amc": _read_foreign,
+    ".bvh": _read_foreign,
     ".mvnx": read_suit,
     ".npz": _read_npz,
     ".safetensors": lambda path: RecordingFile(path).load(),

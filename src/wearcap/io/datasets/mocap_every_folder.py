@@ -10,13 +10,11 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
 from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
-from wearcap.files import MAX_JSON_DEPTH
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
@@ -27,13 +25,12 @@ from wearcap.io.formats.npz import require
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import checked_trajectory
 from wearcap.io.formats.restricted_pickle import read_pickle, read_pickled_dict
-from wearcap.io.formats.text import finite_floats, read_text
+from wearcap.io.formats.text import finite_floats, read_text, read_yaml_object
 from wearcap.io.formats.video import video_info
 from wearcap.recording import CameraStream, HeadStream, ImuStream, PointCloud, Recording
 
 FPS = 30.0
 """Frame rate (Hz) of SLAM's input pictures."""
-_MAX_CONFIG_BYTES = 1 << 16
 TRAJECTORY, CONFIG, MARKS = "cam_traj.pkl", "config.yaml", "camera_calib.pkl"
 POINTS, VIDEO = "sfm/pointcloud/pcd_results.ply", "video/ego_video.MP4"
 UNDISTORTED, LENS = "sfm/undistort_calib.txt", "sfm/calib.txt"
@@ -90,7 +87,7 @@ def read_mocap_every_folder(folder: str | Path) -> MocapEveryFolder:
     pickles that hold anything but data, and for any other file that is there and not as documented.
     """
     folder = Path(folder)
-    config = _config(folder / CONFIG)
+    config = read_yaml_object(folder / CONFIG) if (folder / CONFIG).is_file() else {}
     # Times (s) of the calibration movements along x and y (start, stop), and of the shutter
     marks = read_pickled_dict(folder / MARKS, "a dict of times") if (folder / MARKS).is_file() else {}
     noted = marks.get("shutter")
@@ -162,27 +159,6 @@ def mocap_every_recording(folder: MocapEveryFolder, scale: float = 1.0, T_world_
         points=cloud,
         source="MocapEvery capture folder",
     )
-
-
-def _config(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        return {}
-    damage = (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError)
-    with understood("not readable YAML", path, errors=damage):
-        text = read_text(path, usual=_MAX_CONFIG_BYTES)
-        # Aliases and deep nesting take quadratic time to parse.
-        depth = 0
-        for event in yaml.parse(text, yaml.SafeLoader):
-            if isinstance(event, yaml.AliasEvent):
-                fix = "Write them out: such references can blow up."
-                raise WearcapError("it refers to its own parts (&name, *name)", path, "plain keys with values", fix)
-            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > MAX_JSON_DEPTH:
-                raise WearcapError("YAML that is nested too deeply", path, f"at most {MAX_JSON_DEPTH} levels")
-        content = yaml.safe_load(text)
-    if not isinstance(content, dict | None):
-        raise WearcapError(f"it holds a {type(content).__name__}", path, "keys with values")
-    return content or {}
 
 
 def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], folder: Path) -> _BoardWalks | None:

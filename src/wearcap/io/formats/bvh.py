@@ -9,7 +9,7 @@ import math
 import warnings
 from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
@@ -42,9 +42,6 @@ _END_SITES = {
 """wearcap's names of End Sites, by the joint's name without its side."""
 STRETCH_M = 0.005
 """Largest change of a bone's length without a warning."""
-CGSPEED_UNIT_M = 0.0254 / 0.45
-CGSPEED_THORAX = (0.0, 2.07, 0.0)
-"""Offset (file units) that cgspeed's BVH conversion of the CMU database dropped between thorax and neck or shoulders."""
 UNITS_M = {
     "metres": 1.0,
     "decimetres": 0.1,
@@ -191,46 +188,61 @@ def _parse_motion(
     return step_s, np.asarray(values).reshape(count, channels)
 
 
+@dataclass(frozen=True)
+class BvhContent:
+    """What a BVH file says, in its own axes and units."""
+
+    names: tuple[str, ...]
+    parents: tuple[int, ...]
+    t_rest: Float[Tensor, "joint 3"]
+    """OFFSETs: places in the parent's frame in the bind pose."""
+    ends: tuple[tuple[float, float, float] | None, ...]
+    """End Sites."""
+    R_parent_joint: Float[Tensor, "time joint 3 3"]
+    t_parent_joint: Float[Tensor, "time joint 3"]
+    """Places in the parent's frame (the root's in the world), of position channels where a joint has them."""
+    step_s: float
+
+
+def read_bvh_content(path: str | Path) -> BvhContent:
+    """Read a .bvh file (plain, .gz or .xz) as it stands. Raises WearcapError naming file and line."""
+    path = Path(path)
+    lines = numbered_lines(path)
+    joints, motion_line = _Hierarchy.read(path, lines)
+    step_s, values = _parse_motion(path, lines, motion_line, sum(len(joint.channels) for joint in joints))
+    t, R = _channels(joints, values)
+    ends = ((None if joint.end is None else (joint.end[0], joint.end[1], joint.end[2])) for joint in joints)
+    return BvhContent(
+        tuple(joint.name for joint in joints),
+        tuple(joint.parent for joint in joints),
+        torch.tensor([joint.offset for joint in joints], dtype=torch.float64),
+        tuple(ends),
+        R,
+        t,
+        step_s,
+    )
+
+
 def read_bvh(
-    path: str | Path,
-    *,
-    unit_m: float | int = 0.01,
-    up: str = "y",
-    forward: str = "z",
-    check: bool = True,
-    offsets: dict[str, tuple[float, float, float]] | None = None,
+    path: str | Path, *, unit_m: float | int = 0.01, up: str = "y", forward: str = "z", check: bool = True
 ) -> Motion:
     """Read a .bvh file (plain, .gz or .xz). Rest is the file's bind pose; End Sites become sites.
 
     `unit_m`: metres per unit. `up`, `forward`: the file's axes ("x", "-y" …) that point up, and ahead of the body in
-    its bind pose. `offsets` (file units) replaces OFFSETs that are known to be wrong. Raises WearcapError naming file
+    its bind pose. Raises WearcapError naming file
     and line, and, unless `check` is False, when the body is no person's size or lies down, with the setting that fixes it.
     """
     path = Path(path)
-    R_world_file = _axes(path, up, forward)
-    lines = numbered_lines(path)
-    joints, motion_line = _Hierarchy.read(path, lines)
-    step_s, values = _parse_motion(path, lines, motion_line, sum(len(joint.channels) for joint in joints))
-    for joint in joints:
-        joint.offset = list((offsets or {}).get(joint.name, joint.offset))
-    translation, R = _channels(joints, values)
-    bones = _bones(path, joints, translation, float(unit_m))
+    R_world_file = axes_rotation(path, up, forward)
+    content = read_bvh_content(path)
+    bones = _bones(path, content, float(unit_m))
     to_world = float(unit_m) * R_world_file.T
-    skeleton = Skeleton(
-        "bvh",
-        tuple(joint.name for joint in joints),
-        tuple(joint.parent for joint in joints),
-        (bones @ to_world).float(),
-        _sites(joints, to_world),
-    )
-    root = translation[0]
-    if root is None:
-        root = torch.tensor(joints[0].offset, dtype=torch.float64).expand(len(values), 3)
+    skeleton = Skeleton("bvh", content.names, content.parents, (bones @ to_world).float(), _sites(content, to_world))
     motion = Motion(
-        torch.arange(len(values), dtype=torch.float64) / nominal_fps(1 / step_s),
+        torch.arange(len(content.R_parent_joint), dtype=torch.float64) / nominal_fps(1 / content.step_s),
         skeleton,
-        (R_world_file @ R @ R_world_file.T).float(),
-        (root @ to_world).float(),
+        (R_world_file @ content.R_parent_joint @ R_world_file.T).float(),
+        (content.t_parent_joint[:, 0] @ to_world).float(),
         provenance={"source": path.name, "format": "bvh"},
     )
     if check:
@@ -238,20 +250,7 @@ def read_bvh(
     return motion
 
 
-def read_cmu_bvh(path: str | Path) -> Motion:
-    """Read one of cgspeed's BVH conversions of the CMU database: its unit, its lost thorax bone, its T-pose frame.
-
-    Raises WearcapError as `read_bvh` does.
-    """
-    lost = ("Neck", "LeftShoulder", "RightShoulder")
-    motion = read_bvh(path, unit_m=CGSPEED_UNIT_M, offsets=dict.fromkeys(lost, CGSPEED_THORAX))
-    if len(motion) < 2:
-        raise WearcapError("only the T-pose frame", path, "frames of motion after it")
-    motion = motion.sliced(1, len(motion))
-    return replace(motion, timestamps=motion.timestamps - motion.timestamps[0])
-
-
-def _axes(path: Path, up: str, forward: str) -> Tensor:
+def axes_rotation(path: Path, up: str, forward: str) -> Tensor:
     """R_world_file from the names of the axes that point up and forward."""
     rows = {}
     for name in (up, forward):
@@ -266,66 +265,67 @@ def _axes(path: Path, up: str, forward: str) -> Tensor:
     return torch.stack([rows[forward], torch.linalg.cross(rows[up], rows[forward]), rows[up]])
 
 
-def _channels(joints: list[_Joint], values: np.ndarray) -> tuple[list[Tensor | None], Float[Tensor, "time joint 3 3"]]:
-    """Per joint its translations "time 3" (file units; None without position channels), and all rotations."""
+def _channels(
+    joints: list[_Joint], values: np.ndarray
+) -> tuple[Float[Tensor, "time joint 3"], Float[Tensor, "time joint 3 3"]]:
+    """Places in the parents' frames (file units) and rotations.
+
+    Some writers give children displacements from OFFSET, near zero, instead of the whole offset: they are added to it.
+    """
     columns = torch.from_numpy(values)
     starts = np.cumsum([0, *(len(joint.channels) for joint in joints)]).tolist()
-    translation: list[Tensor | None] = []
+    t = torch.tensor([joint.offset for joint in joints], dtype=torch.float64).repeat(len(values), 1, 1)
     by_order: dict[str, list[int]] = {}
+    moved = set()
     for k, joint in enumerate(joints):
-        moved = torch.tensor(joint.offset, dtype=torch.float64).repeat(len(values), 1)
         for column, (kind, axis) in enumerate(joint.channels, starts[k]):
             if kind == "p":
-                moved[:, "xyz".index(axis)] = columns[:, column]
-        translation.append(moved if any(kind == "p" for kind, _ in joint.channels) else None)
+                t[:, k, "xyz".index(axis)] = columns[:, column]
+                moved.add(k)
         by_order.setdefault("".join(axis for kind, axis in joint.channels if kind == "r"), []).append(k)
+    children = sorted(moved - {0})
+    if children:
+        median = t[:, children].median(0).values
+        rest = torch.tensor([joints[k].offset for k in children], dtype=torch.float64)
+        if (median - rest).norm(dim=-1).sum() > median.norm(dim=-1).sum():
+            t[:, children] += rest
     R = torch.eye(3, dtype=torch.float64).repeat(len(values), len(joints), 1, 1)
     for order, members in by_order.items():
         for axis in order:
             index = [starts[k] + joints[k].channels.index(("r", axis)) for k in members]
             R[:, members] = R[:, members] @ about_axis(axis, columns[:, index] * (math.pi / 180))
-    return translation, R
+    return t, R
 
 
-def _bones(
-    path: Path, joints: list[_Joint], translation: list[Tensor | None], unit_m: float
-) -> Float[Tensor, "joint 3"]:
+def _bones(path: Path, content: BvhContent, unit_m: float) -> Float[Tensor, "joint 3"]:
     """Constant bone offsets (file units; the root's is zero), from OFFSET or from the position channels' median."""
-    bones = torch.tensor([joint.offset for joint in joints], dtype=torch.float64)
-    moved = {k: t for k, t in enumerate(translation) if t is not None and k > 0}
-    if moved:
-        median = {k: t.median(0).values for k, t in moved.items()}
-        # Some writers give children displacements from OFFSET, near zero, instead of the whole offset.
-        whole = sum((median[k] - bones[k]).norm() for k in moved) <= sum(median[k].norm() for k in moved)
-        stretch = {k: (t - median[k]).norm(dim=-1).max().item() * unit_m for k, t in moved.items()}
-        worst = max(stretch, key=lambda k: stretch[k])
-        if stretch[worst] > STRETCH_M:
-            warnings.warn(
-                f"{path}: bone {joints[worst].name!r} changes its length by up to {stretch[worst]:.3f} m; "
-                "its median is kept",
-                stacklevel=3,
-            )
-        for k in moved:
-            bones[k] = median[k] if whole else bones[k] + median[k]
-    bones[0] = 0
+    bones = content.t_parent_joint.median(0).values
+    stretch = (content.t_parent_joint - bones).norm(dim=-1).amax(0) * unit_m
+    stretch[0], bones[0] = 0, 0
+    worst = int(stretch.argmax())
+    if stretch[worst] > STRETCH_M:
+        warnings.warn(
+            f"{path}: bone {content.names[worst]!r} changes its length by up to {stretch[worst]:.3f} m; "
+            "its median is kept",
+            stacklevel=3,
+        )
     return bones
 
 
-def _sites(joints: list[_Joint], to_world: Float[Tensor, "3 3"]) -> dict[str, Site]:
+def _sites(content: BvhContent, to_world: Float[Tensor, "3 3"]) -> dict[str, Site]:
     """End Sites, under wearcap's names where their joints' names are known ("LeftToeBase", "l_wrist" …)."""
     sites = {}
-    for joint in joints:
-        if joint.end is None:
+    for joint, end in zip(content.names, content.ends):
+        if end is None:
             continue
-        plain = joint.name.lower().replace("_", "")
+        plain = joint.lower().replace("_", "")
         named = [
             f"{side}_{_END_SITES[plain.removeprefix(start)]}"
             for side, start in (("left", "left"), ("right", "right"), ("left", "l"), ("right", "r"))
             if plain.startswith(start) and plain.removeprefix(start) in _END_SITES
         ]
-        name = "crown" if plain == "head" else [*named, f"{joint.name}_end"][0]
-        end = torch.tensor(joint.end, dtype=torch.float64) @ to_world
-        sites[name] = Site(joint.name, tuple(end.tolist()))
+        name = "crown" if plain == "head" else [*named, f"{joint}_end"][0]
+        sites[name] = Site(joint, tuple((torch.tensor(end, dtype=torch.float64) @ to_world).tolist()))
     return sites
 
 

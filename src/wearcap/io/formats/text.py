@@ -13,16 +13,19 @@ from typing import Any
 from xml.etree.ElementTree import Element, ParseError
 
 import numpy as np
+import yaml
 from defusedxml.common import DefusedXmlException
 
 from wearcap.errors import WearcapError
-from wearcap.files import parse_json
-from wearcap.io.formats.bounded import open_bytes, read_bytes
+from wearcap.files import MAX_JSON_DEPTH, parse_json
+from wearcap.io.formats.bounded import open_bytes, read_bytes, understood
 
 MAX_BYTES = 1 << 29
 """Largest text that is taken into memory as a whole (512 MiB: over an hour of 120 Hz motion)."""
 MAX_JSON_BYTES = 1 << 28
 """Largest JSON file that is read (256 MiB): as Python objects it takes up to twenty times as much."""
+MAX_YAML_BYTES = 1 << 16
+"""Largest YAML file that is read: a page of settings."""
 MAX_STREAMED_BYTES = 1 << 32
 """Largest text that is read line by line (4 GiB)."""
 MAX_LINE = 1 << 24
@@ -99,6 +102,26 @@ def read_json_object(path: str | Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise WearcapError(f"it holds a {type(content).__name__}", path, "a JSON object")
     return content
+
+
+def read_yaml_object(path: str | Path) -> dict[str, Any]:
+    """Keys and values of a small YAML file. Raises WearcapError for anything else, and for references in it."""
+    damage = (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError)
+    with understood("not readable YAML", path, errors=damage):
+        text = read_text(path, usual=MAX_YAML_BYTES)
+        # Aliases and deep nesting take quadratic time to parse.
+        depth = 0
+        for event in yaml.parse(text, yaml.SafeLoader):
+            if isinstance(event, yaml.AliasEvent):
+                fix = "Write them out: such references can blow up."
+                raise WearcapError("it refers to its own parts (&name, *name)", path, "plain keys with values", fix)
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > MAX_JSON_DEPTH:
+                raise WearcapError("YAML that is nested too deeply", path, f"at most {MAX_JSON_DEPTH} levels")
+        content = yaml.safe_load(text)
+    if not isinstance(content, dict | None):
+        raise WearcapError(f"it holds a {type(content).__name__}", path, "keys with values")
+    return content or {}
 
 
 @contextmanager

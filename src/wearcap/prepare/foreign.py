@@ -1,0 +1,157 @@
+"""Motion files of any origin on our skeleton: BVH and ASF/AMC, their conventions found in the file.
+
+The body is found by names or by its tree, unit and up axis by its size and by how it stands; our skeleton takes the
+bones' lengths, repeats the rotations, and is fitted to the places of the file's joints in every frame.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.body.foreign_tree import ForeignTree, foreign_tree, joint_roles, standing_rotation
+from wearcap.body.joint_matching import convention
+from wearcap.body.position_fit import fit_positions
+from wearcap.body.retarget import fit_offsets, retarget
+from wearcap.body.skeleton import xsens23
+from wearcap.errors import WearcapError
+from wearcap.io.formats.bounded import placed
+from wearcap.io.formats.bvh import axes_rotation
+from wearcap.prepare.foreign_conventions import (
+    Mapping,
+    find_axes,
+    find_body,
+    find_unit,
+    is_mirrored,
+    read_mapping,
+    with_thorax,
+    with_toes,
+)
+from wearcap.prepare.foreign_files import read_take
+from wearcap.prepare.levels import Levels, levels_in, with_levels
+from wearcap.recording.motion import Motion
+
+
+@dataclass(frozen=True)
+class ForeignReport:
+    """What was detected in a file, and how near the result is to it."""
+
+    source: str
+    convention: str
+    found_by: str
+    unit: str
+    unit_m: float
+    height_m: float
+    up: str
+    facing: str
+    frames: str
+    """Where the joints' frames come from: the bind pose or the motion."""
+    joints: dict[str, str]
+    """Names in the file by xsens23's names."""
+    residual_m: dict[str, tuple[float, float]]
+    """Mean and worst distance to the file's joints, by xsens23's names."""
+    notes: tuple[str, ...] = ()
+
+    def lines(self) -> list[str]:
+        """The report in plain sentences."""
+        mean = sum(mean for mean, _ in self.residual_m.values()) / len(self.residual_m)
+        worst = max(self.residual_m, key=lambda name: self.residual_m[name][1])
+        each = (f"{name} {1000 * m:.1f} ({1000 * w:.1f})" for name, (m, w) in self.residual_m.items())
+        return [
+            f"Joint names are {self.convention}; the body was found by {self.found_by}.",
+            f"The unit is {self.unit} ({self.unit_m:.6g} m): a person of about {self.height_m:.2f} m.",
+            f"Up is {self.up}, {self.facing}.",
+            f"The joints' frames come from {self.frames}.",
+            "Joints: " + ", ".join(f"{ours} = {theirs}" for ours, theirs in self.joints.items()) + ".",
+            f"The fit is {1000 * mean:.1f} mm from the file's joints on average, at worst "
+            f"{1000 * self.residual_m[worst][1]:.1f} mm ({worst}).",
+            "By joint, mean (worst) in mm: " + ", ".join(each) + ".",
+            *self.notes,
+        ]
+
+    def summary(self) -> str:
+        """The report in one line."""
+        mean = sum(mean for mean, _ in self.residual_m.values()) / len(self.residual_m)
+        worst = max(worst for _, worst in self.residual_m.values())
+        frames = self.frames.split(",")[0]
+        return (
+            f"names {self.convention}, {self.unit}, {self.up} up, frames from {frames}; {1000 * mean:.1f} mm from the "
+            f"file's joints (worst {1000 * worst:.1f})"
+        )
+
+
+@dataclass(frozen=True)
+class ForeignMotion:
+    """A file's motion on xsens23 (z up, metres, the file's times), and what was found out about the file."""
+
+    motion: Motion
+    report: ForeignReport
+
+
+def read_foreign_motion(
+    path: str | Path,
+    mapping: str | Path | Mapping | None = None,
+    *,
+    amc_fps: float | int = 120,
+    asf: Path | None = None,
+    levels: Levels | None = None,
+) -> ForeignMotion:
+    """Read a .bvh, or an .amc with `asf` or the skeleton file beside it (plain, .xz or .gz), onto xsens23.
+
+    `mapping` (a YAML file with any of joints, unit, up, forward) overrides what is detected; `levels` replaces what the
+    file itself shows of how head and feet are level. Raises WearcapError for a file that is damaged or holds no body
+    with head, arms and legs, saying what is missing.
+    """
+    path = Path(path)
+    given = mapping if isinstance(mapping, Mapping) else Mapping() if mapping is None else read_mapping(mapping)
+    take = read_take(path, amc_fps, asf)
+    found, found_by = find_body(take, given, path)
+    take, found = with_toes(take, found)
+    take = take.mirrored() if is_mirrored(take, found) else take
+    unit, unit_m, height_m = find_unit(take, found, given, path)
+    take = with_thorax(take, unit_m)
+    R_ours_rest, odd = standing_rotation(take.rest, found)
+    up, forward = find_axes(take, found, R_ours_rest, given, unit_m)
+    R_world_file = axes_rotation(path, up, forward)
+    t_world = take.t @ R_world_file.T * unit_m
+    with placed(path):
+        tree = foreign_tree(path.name.split(".")[0], take.parents, R_world_file @ take.R, t_world, found, R_ours_rest)
+        motion = _fitted(tree, take.timestamps)
+    naming = convention(take.names)
+    if levels is None:  # CMU's head frames are those of markers, in whatever format
+        levels = levels_in([motion], head_trusted=R_ours_rest is not None and not naming.startswith("CMU"))
+    motion = with_levels(motion, levels)
+    if not (motion.R_parent_joint.isfinite().all() and motion.t_world_root.isfinite().all()):
+        raise WearcapError("no skeleton can be fitted to its joints", path, "joints apart from one another")
+    roles = joint_roles(found)
+    report = ForeignReport(
+        path.name,
+        naming,
+        found_by,
+        unit,
+        unit_m,
+        height_m,
+        up,
+        f"{forward} is ahead in the bind pose" if odd == "" else f"{forward} is our x",
+        "the bind pose" if odd == "" else f"the motion, for in the bind pose {odd}",
+        {ours: take.names[joint] for ours, joint in roles.items()},
+        _residuals(motion, {name: t_world[:, joint] for name, joint in roles.items()}),
+        take.notes,
+    )
+    return ForeignMotion(replace(motion, provenance={"source": path.name, "format": take.format}), report)
+
+
+def _fitted(tree: ForeignTree, timestamps: Float[Tensor, "time"]) -> Motion:
+    """The motion on an xsens23 of its wearer's bones, its joints at the file's."""
+    target = fit_offsets(tree.skeleton, xsens23())
+    R, t = retarget(tree.skeleton, target, tree.R_parent_joint, tree.t_world_root)
+    named = {name: tree.positions[:, k] for k, name in enumerate(tree.skeleton.joint_names) if name in target}
+    R, t = fit_positions(target, R, t, named)
+    return Motion(timestamps.double(), target, R.float(), t.float())
+
+
+def _residuals(motion: Motion, goals: dict[str, Float[Tensor, "time 3"]]) -> dict[str, tuple[float, float]]:
+    t = motion.T_world_joint.t
+    gaps = {name: (t[:, motion.skeleton.index(name)] - goal).norm(dim=-1) for name, goal in goals.items()}
+    return {name: (gap.mean().item(), gap.max().item()) for name, gap in gaps.items()}

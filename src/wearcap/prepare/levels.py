@@ -1,0 +1,96 @@
+"""How a wearer's head and feet are level: constant tilts of a motion's joint frames, found from how people stand.
+
+Marker sets leave the head's frame pitched by 5…45°, and bind poses that stand on tiptoe or on heels tilt the soles.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from wearcap.body.landmarks import head_level, with_head_face
+from wearcap.body.skeleton import Site, Skeleton
+from wearcap.geometry.rotation import swing_between
+from wearcap.recording.motion import Motion
+
+STILL_M_S = 0.12
+"""Speed of ankle and toes below which a foot may stand."""
+LOW_M = 0.03
+"""Height above the usual lowest ankle within which a slow foot stands."""
+LEAST_FRAMES = 5
+_LARGEST_TILT = 0.6
+"""Largest tilt (rad) of a sole that is taken for a frame's; more is a foot that does not stand."""
+_NOD = 0.35
+"""Tilt (rad) of an upright person's head from which the bind pose's frame of the head is doubted."""
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Tilts of the captured frames: of the head, and of ankles and toes by joint; None or absent where not known."""
+
+    R_head_face: Float[Tensor, "3 3"] | None
+    R_joint_sole: dict[str, Float[Tensor, "3 3"]]
+
+
+def levels_in(motions: Sequence[Motion], head_trusted: bool = False) -> Levels:
+    """Estimate the tilts from motions of one wearer, all on one skeleton.
+
+    A trusted head frame is corrected only if it is clearly off.
+    """
+    skeleton = motions[0].skeleton
+    face = head_level(skeleton, torch.cat([motion.R_parent_joint for motion in motions]))
+    if face is not None and head_trusted and face[2, 2] > torch.tensor(_NOD).cos():
+        face = None
+    soles = {}
+    for side in ("left", "right"):
+        still = [_standing(motion, side) for motion in motions]
+        if sum(int(frames.sum()) for frames in still) < LEAST_FRAMES:
+            continue
+        for name in (f"{side}_ankle", f"{side}_toe"):
+            up = torch.cat([motion.joint(name).R[frames, 2] for motion, frames in zip(motions, still)])
+            direction = torch.nn.functional.normalize(up.median(0).values, dim=0)
+            if direction[2] > torch.tensor(_LARGEST_TILT).cos():
+                soles[name] = swing_between(direction.new_tensor([0.0, 0.0, 1.0]), direction)
+    return Levels(face, soles)
+
+
+def _standing(motion: Motion, side: str) -> Bool[Tensor, "time"]:
+    """Frames in which a foot stands on its whole sole: ankle and toes are still, and the ankle is low."""
+    still = torch.zeros(len(motion), dtype=torch.bool)
+    if len(motion) < 3:
+        return still
+    step_s = (motion.timestamps[2:] - motion.timestamps[:-2]).to(motion.t_world_root)[:, None]
+    ankle, toe = (motion.joint(f"{side}_{name}").t for name in ("ankle", "toe"))
+    slow = [((t[2:] - t[:-2]) / step_s).norm(dim=-1) < STILL_M_S for t in (ankle, toe)]
+    still[1:-1] = slow[0] & slow[1]
+    return still & (ankle[:, 2] < ankle[still, 2].quantile(0.1) + LOW_M) if still.any() else still
+
+
+def with_levels(motion: Motion, levels: Levels) -> Motion:
+    """The motion with the frames of head, ankles and toes turned level; no joint moves."""
+    R, skeleton = motion.R_parent_joint, motion.skeleton
+    if levels.R_head_face is not None:
+        R = with_head_face(skeleton, R, levels.R_head_face)
+    offsets, R = skeleton.t_parent_joint.clone(), R.clone()
+    for side in ("left", "right"):
+        ankle, toe = skeleton.indices(f"{side}_ankle", f"{side}_toe")
+        of_ankle, of_toe = (levels.R_joint_sole.get(f"{side}_{name}", torch.eye(3)) for name in ("ankle", "toe"))
+        R[:, ankle] = R[:, ankle] @ of_ankle
+        R[:, toe] = of_ankle.T @ R[:, toe] @ of_toe
+        offsets[toe] = of_ankle.T @ offsets[toe]
+    skeleton = replace(skeleton, t_parent_joint=offsets)
+    return replace(motion, skeleton=_flat_soles(skeleton), R_parent_joint=R)
+
+
+def _flat_soles(skeleton: Skeleton) -> Skeleton:
+    """Heels and toe tips of each foot on one level, that of the lower one, when the foot is level."""
+    sites = dict(skeleton.sites)
+    for side in ("left", "right"):
+        heel, tip = (sites[f"{side}_{name}"] for name in ("heel", "toe_tip"))
+        toe_z = skeleton.t_parent_joint[skeleton.index(f"{side}_toe"), 2].item()
+        low = min(heel.t_joint_site[2], tip.t_joint_site[2] + toe_z)
+        sites[f"{side}_heel"] = Site(heel.joint, (*heel.t_joint_site[:2], low))
+        sites[f"{side}_toe_tip"] = Site(tip.joint, (*tip.t_joint_site[:2], low - toe_z))
+    return replace(skeleton, sites=sites)
