@@ -43,7 +43,7 @@ from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.text import read_json_object
 from wearcap.io.formats.trajectory import read_trajectory_file, trajectory_file
 from wearcap.prepare.foreign import read_foreign_motion
-from wearcap.recording import FloorTrack, Motion, PointCloud, Recording, RecordingStore
+from wearcap.recording import FloorTrack, HeadStream, Motion, PointCloud, Recording, RecordingStore
 from wearcap.recording.store import RecordingFile
 from wearcap.scene.floor import estimate_floor
 from wearcap.tracking.stature import estimate_stature
