@@ -43,6 +43,16 @@ def test_logs_are_known_by_their_content_not_their_name(tmp_path):
     assert not any("error" in one for one in found.values()), found
 
 
+def test_a_folder_of_headsets_logs_is_a_recording_each(tmp_path):
+    time, R, t = short_walk.walk()
+    poses = short_walk.headset_poses(time, R, t, "unity", "grip")
+    for name in ("a.csv", "b.csv"):
+        short_walk.headset_csv(tmp_path / name, time, poses, NAMES)
+    report = examine(tmp_path)
+    assert list(report.findings) == ["a.csv", "b.csv"]
+    assert report.sound
+
+
 def test_a_table_that_is_no_log(tmp_path):
     (tmp_path / "prices.csv").write_text("item,price\npear,3\n")
     report = examine(tmp_path / "prices.csv")

@@ -10,7 +10,7 @@ from wearcap.data.transforms import joint_twins
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis
 from wearcap.metrics.scores import score_in_world
-from wearcap.recording import HeadStream
+from wearcap.recording import HeadStream, ImuStream
 from wearcap.systems.mocap_every.features import WatchFeatures
 from wearcap.systems.mocap_every.model import LastPoseEstimator
 
@@ -167,3 +167,18 @@ def test_onnx_gives_the_same(recording):
     pytest.importorskip("onnxruntime")
     eager, fast = (drawn_pipeline(floor="fixed")(recording), drawn_pipeline(floor="fixed", runtime="onnx")(recording))
     torch.testing.assert_close(eager.T_world_joint.t, fast.T_world_joint.t, atol=1e-4, rtol=0)
+
+
+def test_a_silent_watch_is_bridged_and_reported(recording):
+    """The capture goes on over the watch's gap; the motion's note and the capture's report say which, when and how long."""
+    left = recording.imu["left_wrist"]
+    kept = (left.timestamps < 1.0) | (left.timestamps > 2.5)
+    cut = ImuStream(left.timestamps[kept], "left_wrist", left.R_world_imu[kept], left.acc_world[kept])
+    system = drawn_pipeline()
+    with pytest.warns(UserWarning, match="left_wrist is silent"):
+        captured = system.capture([replace(recording, imu=recording.imu | {"left_wrist": cut})], [0])[0]
+    assert captured.report is not None
+    assert "left_wrist is silent, or its clock jumps, 1 times for 1.5" in captured.report["notes"][0]
+    assert captured.motion.provenance["note"] == captured.report["notes"][0]
+    assert captured.motion.t_world_root.isfinite().all()
+    assert system.capture([recording], [0])[0].report is None

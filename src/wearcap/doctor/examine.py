@@ -22,7 +22,7 @@ from wearcap.doctor.agreement import (
     check_points,
 )
 from wearcap.doctor.body import check_contact_prob, check_motion
-from wearcap.doctor.logs import as_head, is_kit, read_kit, read_table
+from wearcap.doctor.logs import as_head, is_kit, log_files, read_kit, read_table
 from wearcap.doctor.places import is_map, is_place, read_environment_file, read_map, read_place
 from wearcap.doctor.report import SEVERITIES, Check, Finding, Report, has_error, refusal
 from wearcap.doctor.streams import check_clock, check_spans, check_track
@@ -212,11 +212,12 @@ def _patients(path: Path) -> dict[str, Callable[[], Loaded]]:
     if names := hps_names(path):
         return {name: partial(_read_hps, path, name) for name in names}
     files = [file for file in sorted(path.rglob("*")) if file.is_file() and _kind(file) in _MOTIONS]
+    files = files or list(log_files(path))
     if not files:
         raise WearcapError(
             "nothing to examine here",
             where=path,
-            expected=f"a data set (manifest.json), an MPS, Nymeria, ADT, TotalCapture or HPS folder, a scene (pointcloud.ply, photos.json), an environment (environment.json), or files like {', '.join(_MOTIONS)}",
+            expected=f"a data set (manifest.json), an MPS, Nymeria, ADT, TotalCapture or HPS folder, a scene (pointcloud.ply, photos.json), an environment (environment.json), logs of watches, headsets or trajectories, or files like {', '.join(_MOTIONS)}",
         )
     return {file.relative_to(path).as_posix(): partial(_read_file, file) for file in files}
 

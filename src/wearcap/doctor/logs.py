@@ -124,7 +124,7 @@ def _headset(path: Path) -> Loaded:
 # --- kits ----------------------------------------------------------------------------------------------------------
 
 
-def _logs(folder: Path) -> dict[Path, str]:
+def log_files(folder: Path) -> dict[Path, str]:
     """Logs of a folder with their kinds; of a sensor's files in a folder of its own the inertial one."""
     found = {}
     for path in sorted(folder.iterdir())[:_MOST]:
@@ -139,8 +139,9 @@ def _logs(folder: Path) -> dict[Path, str]:
 
 
 def is_kit(folder: Path) -> bool:
-    """Whether a folder holds watches' or headsets' logs."""
-    return bool({"watch", "headset"} & set(_logs(folder).values()))
+    """Whether a folder holds the logs of one session: watches', or one headset's."""
+    kinds = list(log_files(folder).values())
+    return "watch" in kinds or kinds.count("headset") == 1
 
 
 def read_kit(folder: Path) -> Loaded:
@@ -148,7 +149,7 @@ def read_kit(folder: Path) -> Loaded:
 
     What cannot be read, is missing or stands beside is a finding.
     """
-    logs, findings = _logs(folder), list[Finding]()
+    logs, findings = log_files(folder), list[Finding]()
     parts = Recording(name=folder.resolve().name)
     watches = [path for path, kind in logs.items() if kind == "watch"]
     sides = _sides(watches, findings)
