@@ -7,9 +7,14 @@ from pathlib import Path
 
 from rich import print as show
 
+from wearcap.body.anny_body import anny_body
 from wearcap.cli import capture, evaluate, export, prepare, train
-from wearcap.recording import RecordingStore
+from wearcap.io.formats.motion_npz import read_motion
+from wearcap.recording import Motion, Recording, RecordingStore
+from wearcap.viewer.picture import contact_sheet, save_png, shared_frames
 
+SHARED = "hmd2"
+"""Shared checkpoint that is shown beside the one that is trained."""
 HELP = "prepare simulated data, train, evaluate, capture and export in minutes"
 
 
@@ -32,19 +37,35 @@ def main(arguments: list[str]) -> None:
         "data.loading.batch_size=16",
     ]
     _step("Training", train.main, training)
-    trained = f"checkpoint={checkpoint}"
-    table = [trained, f"hydra.run.dir={out}/evaluate", "seeds=[0]", f"output={out}/table.json"]
-    _step("Evaluation", evaluate.main, table)
-    name = RecordingStore.open(data).names("test")[0]
-    motion = [trained, f"recording={data}/{name}", f"hydra.run.dir={out}/capture", "video_seconds=10"]
-    _step("Capture", capture.main, motion)
+    trained, store = f"checkpoint={checkpoint}", RecordingStore.open(data)
+    both = f"checkpoint=[{checkpoint},{SHARED}]"
+    table = [both, f"hydra.run.dir={out}/evaluate", "seeds=[0]", f"output={out}/table.json"]
+    _step("Evaluation, beside the shared checkpoint, which was trained for hours", evaluate.main, table)
+    name = store.names("test")[0]
+    for title, taken, folder in (
+        ("Capture", trained, "capture"),
+        ("The same, shared", f"checkpoint={SHARED}", "shared"),
+    ):
+        motion = [taken, f"recording={data}/{name}", f"hydra.run.dir={out}/{folder}", "video_seconds=10"]
+        _step(title, capture.main, motion)
     _step("Export", export.main, [trained, f"hydra.run.dir={out}/export", f"output={out}/denoiser.onnx"])
+    motions = {f"{options.steps} steps": out / "capture/motion.npz", "shared checkpoint": out / "shared/motion.npz"}
+    _picture(out / "demo.png", store.load(name), {label: read_motion(path) for label, path in motions.items()})
     show(
         f"\n[bold]Done in {(time.monotonic() - started) / 60:.1f} minutes.[/bold]\n"
-        f"table    {out / 'table.json'}\nvideo    {out / 'capture/motion.mp4'}\n"
-        f"motion   {out / 'capture/motion.glb'} (and .bvh, .npz)\nmodel    {out / 'denoiser.onnx'}\n"
-        f"watch    wearcap view {data}/{name} --motion {out / 'capture/motion.npz'}"
+        f"picture  {out / 'demo.png'}: the truth, these {options.steps} steps, the shared checkpoint\n"
+        f"table    {out / 'table.json'}\nvideo    {out / 'shared/motion.mp4'}, {out / 'capture/motion.mp4'}\n"
+        f"motion   {out / 'shared/motion.glb'} (and .bvh, .npz, SMPL)\nmodel    {out / 'denoiser.onnx'}\n"
+        f"watch    wearcap view {data}/{name} --motion {out / 'capture/motion.npz'} {out / 'shared/motion.npz'}"
     )
+
+
+def _picture(path: Path, recording: Recording, captures: dict[str, Motion]) -> None:
+    """The recording's true motion above the captures, as people."""
+    assert recording.motion is not None
+    motions = {"truth": recording.motion} | captures
+    body = anny_body(recording.motion.skeleton, recording.shape or None)
+    save_png(path, contact_sheet(motions, shared_frames(motions, 6), size=(240, 260), body=body))
 
 
 def _step(title: str, verb: Callable[[list[str]], None], arguments: list[str]) -> None:

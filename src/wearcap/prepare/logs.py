@@ -151,7 +151,7 @@ def read_path(file: Path, name: str, about: dict[str, str], settings: Trajectory
     camera = _camera(settings, head, output)
     skeleton = settings.skeleton()
     if skeleton is None:
-        note += "; height not given: a body of 1.75 m is assumed"
+        note += "; height not given: taken from how high the head is carried, where the floor is known"
     return Recording(name, head, camera=camera, points=points, floor=floor, skeleton=skeleton, note=note, **about)
 
 
@@ -277,7 +277,7 @@ def _watches(camera: Path, name: str, about: dict[str, str], settings: "WatchesS
     for gap in watch_gaps(recording.imu, recording.head.timestamps):
         notes.append(gap)
     if recording.skeleton is None:
-        notes.append("height not given: a body of 1.75 m is assumed")
+        notes.append("height not given: taken from how high the head is carried, where the floor is known")
     return replace(recording, note="; ".join(notes))
 
 
@@ -322,7 +322,14 @@ class HeadsetSettings:
         log = read_headset_log(path, self.axes, self.quaternion, self.hands, self.time_unit)
         mount = pose_of(self.T_head_device, "T_head_device") or T_HEAD_DEVICE
         head = HeadStream(log.head.timestamps, log.head.R_world_body, log.head.t_world_body, mount.R, mount.t)
-        notes = [*log.notes, *([] if self.height is not None else ["height not given: a body of 1.75 m is assumed"])]
+        notes = [
+            *log.notes,
+            *(
+                []
+                if self.height is not None
+                else ["height not given: taken from how high the head is carried, where the floor is known"]
+            ),
+        ]
         return Recording(
             name,
             head=head,

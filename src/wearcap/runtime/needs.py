@@ -111,7 +111,7 @@ OBJECTS = Need(
 HEIGHT = Need(
     "the wearer's height",
     lambda source: source.recording.skeleton is not None or source.recording.motion is not None,
-    "Prepare with height=METRES: a body of 1.75 m is assumed.",
+    "Give height=METRES; without it, it follows from how high the head is carried over a known floor.",
     required=False,
 )
 
