@@ -30,7 +30,7 @@ from wearcap.recording import Motion, Recording
 from wearcap.recording.store import dataset_folder
 from wearcap.runtime.system import CaptureInput, StageOptions, System
 from wearcap.scene.objects import Environment
-from wearcap.tracking.stature import with_stature
+from wearcap.tracking.stature import skeleton_of, with_stature
 from wearcap.viewer.page_layers import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png, write_video
 
@@ -57,7 +57,8 @@ def captured(config: DictConfig, system: System) -> Motion | None:
     folder = Path(config.output)
     if config.samples < 1:
         raise WearcapError(f"samples={config.samples}", expected="at least 1")
-    recording, stature = with_stature(read(config.recording), xsens23(), config.height)
+    body = None if config.skeleton is None else skeleton_of(read(config.skeleton))
+    recording, stature = with_stature(read(config.recording), xsens23(), config.height, body)
     dataset = dataset_folder(config.recording)
     if stature is None:
         show(f"height unknown, {xsens23().stature:.2f} m assumed: give height=… (m)")

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import wearcap.io.saving  # noqa: F401  gives motions their `save`
 from wearcap.doctor.logs import is_kit, log_kind, read_kit, read_table
 from wearcap.errors import WearcapError
 from wearcap.io.datasets.adt import is_adt, read_adt

@@ -1,5 +1,6 @@
 """The Motion (output of a pipeline, or ground truth), and interactions: which hands hold which object at which time."""
 
+import importlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -92,6 +93,8 @@ class Motion:
 
         Raises WearcapError for another ending, and when the file cannot be written.
         """
+        if not WRITERS:  # the writers stand above this module, and enter themselves
+            importlib.import_module("wearcap.io.saving")
         endings = [ending for ending in WRITERS if Path(path).name.endswith(ending)]
         if not endings:
             raise WearcapError("no kind of motion file", path, f"a name that ends with {', '.join(WRITERS)}")

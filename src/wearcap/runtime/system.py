@@ -16,7 +16,6 @@ from typing import Any, ClassVar
 
 from rich.console import Console
 
-import wearcap.io.saving  # noqa: F401  gives motions their `save`
 from wearcap.errors import WearcapError
 from wearcap.io.formats.environment import FILE_NAME, read_environment
 from wearcap.io.formats.scene_folder import cloud_file, read_scan

@@ -39,17 +39,19 @@ class Stature:
 
 
 def with_stature(
-    recording: Recording, default: Skeleton, height_m: float | None = None
+    recording: Recording, default: Skeleton, height_m: float | None = None, skeleton: Skeleton | None = None
 ) -> tuple[Recording, Stature | None]:
     """The recording with the skeleton of its wearer's height, and that height.
 
-    A given height (m) comes first, then the skeleton that the recording has, then `estimate_stature`; where none is known,
-    the recording is returned as it is, with None. Raises WearcapError for a height that is no person's.
+    A given height (m) and skeleton come first, then the skeleton that the recording has, then `estimate_stature`; where none
+    is known, the recording is returned as it is, with None. Raises WearcapError for a height that is no person's.
     """
+    if skeleton is not None:
+        recording = replace(recording, skeleton=skeleton)
     if height_m is not None:
-        skeleton = skeleton_of_height(height_m, _own(recording) or default)
+        skeleton = skeleton_of_height(height_m, skeleton_of(recording) or default)
         return replace(recording, skeleton=skeleton), Stature(height_m, 0.0, "given")
-    own = _own(recording)
+    own = skeleton_of(recording)
     if own is not None:
         return recording, Stature(own.stature, 0.0, "skeleton")
     found = estimate_stature(recording, default)
@@ -94,6 +96,7 @@ def estimate_stature(recording: Recording, skeleton: Skeleton) -> Stature | None
     return Stature(height_m, (POSTURE_M**2 + spread**2) ** 0.5, "head")
 
 
-def _own(recording: Recording) -> Skeleton | None:
+def skeleton_of(recording: Recording) -> Skeleton | None:
+    """The wearer's skeleton, as the recording or one of its motions has it."""
     motions = [motion.skeleton for motion in (recording.motion, recording.suit) if motion is not None]
     return recording.skeleton or next(iter(motions), None)
