@@ -198,8 +198,8 @@ COLUMNS = (
 )
 """Columns of the page's first table: heading, metrics of which a row has one, digits."""
 CLOCKS = {
-    "mocap_every_online_fps": "head poses and watch samples to poses, three frames at a time, then a window for "
-    "every frame; sensors' logs given; against real time",
+    "mocap_every_online_fps": "head poses, points and watch samples to poses, the floor followed, three frames at a time, "
+    "then a window for every frame, then without points on a given floor; against real time",
     "mocap_every_offline_fps": "whole recordings, windows one after the other, mirror test-time augmentation; "
     "PyTorch, then ONNX Runtime; against real time",
     "latent_optimisation_vs_best_adam": "editing by wrists in the picture, to an equal energy; 2D wrists given; "
