@@ -451,3 +451,26 @@ def test_detections_of_another_recording_are_refused(scene, tmp_path):
         detected(motion, tmp_path).contacts(Recording("r", suit=motion))
     with pytest.raises(WearcapError, match="no detections for s"):
         detected(motion, tmp_path).contacts(replace(filmed(motion), name="s"))
+
+
+def test_what_a_missed_contact_moved_is_found_where_it_is_touched(scene, displacement):
+    """A drawer was pulled by half a metre unseen; the next hand on it says where it is, if it then follows the hand."""
+    motion, _ = scene
+    left = site_positions(motion.skeleton, motion.T_world_joint, PALMS)[0, 0]
+    along = Freedom("axis", axis=(1.0, 0.0, 0.0), limits=(0.0, 1.6))
+    drawer = cube(
+        "drawer", left + torch.tensor([0.2 - 0.5 - 0.4, 0.0, 0.0]), along
+    )  # its far face was left of the hand
+    contacts = {"timestamps": motion.timestamps, "sliding": held_left(), "hinged": torch.zeros(FRAMES, 2)}
+    rules = {"slip_m": 0.15, "rest_m": 0.06, "reach_m": 0.2}
+    assert len(held_of(tracker(**rules)(motion, contacts, Environment((drawer,))))) == 0
+    captured = tracker(found_m=0.1, **rules)(motion, contacts, Environment((drawer,)))
+    assert held_of(captured).objects == ("drawer",)
+    track = objects_of(captured)["drawer"].t_world_body[:, 0]
+    torch.testing.assert_close(
+        track[LEAVE - 1] - track[TAKE], (displacement[LEAVE - 1] - displacement[TAKE]).float(), atol=1e-3, rtol=0
+    )
+    assert abs(track[TAKE] + 0.2 - left[0]) < 0.04  # the nearest face that reaches the hand
+    still = {**contacts, "sliding": held_left()}
+    still["sliding"][TAKE + 20 : LEAVE] = 0.0  # a touch that moves nothing finds nothing
+    assert len(held_of(tracker(found_m=0.1, **rules)(motion, still, Environment((drawer,))))) == 0

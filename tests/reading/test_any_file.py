@@ -183,3 +183,23 @@ def test_a_take_is_prepared_alone_and_with_a_localised_camera(take, tmp_path, mo
     (tmp_path / "camera.txt").write_text("\n".join(f"9{line}" for line in poses))
     assert exit_code([*command, "camera=camera.json"]) == 1
     assert exit_code([*command, "camera=camera.json", "video=nothing.mp4"]) == 2
+
+
+def test_one_recording_is_scored_where_it_is_true(take, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    RecordingStore(tmp_path / "data").add(recording_of(swaying_motion(90), "only"), split="train", config_hash="")
+    given = [
+        "evaluate",
+        "checkpoint=mocap_every",
+        "baselines=false",
+        "seeds=[0]",
+        "jobs=1",
+        f"hydra.run.dir={tmp_path}/out",
+    ]
+    assert exit_code([*given, f"recording={tmp_path}/data/only"]) == 0
+    apart = tmp_path / "apart.safetensors"
+    apart.write_bytes((tmp_path / "data" / "recordings" / "only.safetensors").read_bytes())
+    assert exit_code([*given, f"recording={apart}", "output=apart/table.json"]) == 0
+    capsys.readouterr()
+    assert exit_code([*given, f"recording={take}"]) == 2
+    assert "nothing to score against" in capsys.readouterr().err

@@ -26,7 +26,9 @@ from wearcap.evaluation.whole import (
     write_outcomes,
 )
 from wearcap.metrics.table import Row, Scores, Summary, aggregate, rich_table, write_scores
+from wearcap.reading import read
 from wearcap.recording import RecordingStore
+from wearcap.recording.store import MANIFEST, dataset_folder
 from wearcap.runtime.system import System
 from wearcap.spread import Spread
 
@@ -50,9 +52,9 @@ def run(config: DictConfig) -> Scores:
     given = config.checkpoint
     checkpoints = [str(path) for path in given] if isinstance(given, ListConfig) else [given] if given else []
     systems = load_systems(checkpoints, config.pipeline, config.device)
-    store = RecordingStore.open(config.dataset or _validated(checkpoints, systems[0]))
+    store, names = _chosen(config, checkpoints, systems[0])
     realism = None if config.realism is None else Realism.load(config.realism)
-    scoring = _Scoring(config, store, realism)
+    scoring = _Scoring(config, store, names, realism)
     name = OURS if systems[0].draws else systems[0].name
     outcomes: list[Outcome] = []
     together = [checkpoints] if len(systems) == 1 else [[checkpoint] for checkpoint in checkpoints]
@@ -78,6 +80,22 @@ def run(config: DictConfig) -> Scores:
     return scores
 
 
+def _chosen(config: DictConfig, checkpoints: Sequence[str], system: System) -> tuple[RecordingStore, list[str]]:
+    """The data set and its recordings that are scored: those of a split, or the one of `recording`; a file that belongs to
+    no data set is put into one of its own beside the output. Raises WearcapError where there is no true motion."""
+    if config.recording is None:
+        store = RecordingStore.open(config.dataset or _validated(checkpoints, system))
+        return store, store.names(config.split)
+    recording, folder = read(config.recording), dataset_folder(config.recording)
+    if recording.motion is None:
+        expected = "a recording with a true motion beside its sensors"
+        raise WearcapError("nothing to score against", config.recording, expected, "Capture it instead.")
+    if not (folder / MANIFEST).is_file():
+        folder = Path(config.output).parent / "recording"
+        RecordingStore(folder).add(recording, split="test", config_hash="")
+    return RecordingStore.open(folder), [recording.name]
+
+
 def _validated(checkpoints: Sequence[str], system: System) -> str:
     """The data set that a checkpoint was validated on. Raises WearcapError where that is not one data set."""
     if not checkpoints or system.joins_checkpoints:
@@ -88,10 +106,9 @@ def _validated(checkpoints: Sequence[str], system: System) -> str:
 class _Scoring:
     """Scores the recordings of an evaluation with one method after the other."""
 
-    def __init__(self, config: DictConfig, store: RecordingStore, realism: Realism | None):
+    def __init__(self, config: DictConfig, store: RecordingStore, names: Sequence[str], realism: Realism | None):
         self.config, self.store, self.realism = config, store, realism
-        frames = store.entries
-        self.names = sorted(store.names(config.split), key=lambda name: frames[name].frames)
+        self.names = sorted(names, key=lambda name: store.entries[name].frames)
 
     def of(
         self, system: System, checkpoints: Sequence[str], seeds: Sequence[int], title: str, method: str

@@ -190,6 +190,10 @@ class AttachmentSettings:
     does not hold it; None: any (thesis)."""
     rest_m: float = 0.0
     """Least displacement (m) of an object's corners in a hold; an object that moves by less was only touched."""
+    found_m: float | None = None
+    """Largest distance (m) from a hand of an object that turns about a hinge or slides along an axis and is taken to stand
+    elsewhere on its way, where the touch finds it: for contacts with nothing within reach, and only if it then follows the
+    hand by `rest_m`. What a missed contact has moved is found again so. None: it is where it was left (thesis)."""
     class_m: float | None = None
     """Distance (m) that counts as much as a class that is e times as probable. Hands then hold by whichever class, and
     take the object with the least sum of distance, displacement on it while it follows, and this; None: the nearest of
@@ -201,6 +205,8 @@ class AttachmentSettings:
             raise WearcapError(f"anchor {self.anchor!r}, reach {self.reach_m} m", expected=expected)
 
 
+FOUND_STEPS, FOUND_WITHIN_M = 61, 0.01
+"""Places on an object's way at which it is sought, and distances (m) from the hand that count as alike."""
 LEAST_FOLLOWING = 0.5
 """Least share of an interval in which hands stay at their places of the object."""
 PALMS = ("left_palm", "right_palm")
@@ -318,14 +324,16 @@ class ObjectTracker:
                     break
             if before is None:
                 found = self._taken(palms, contact, contact_class, motion.timestamps, states, environment, prob)
+                found = found or self._found_again(palms, contact, contact_class, states, environment)
                 if found is None:
                     continue
-                before_start, scene_object = found
+                before_start, scene_object, state = found
                 contact = replace(contact, start=before_start)
                 self._undo_rest(held, states, scene_object)
+                state = state or states[scene_object.name]
             else:
-                scene_object = before
-            hands, state = torch.tensor(contact.hands), states[scene_object.name]
+                scene_object, state = before, states[before.name]
+            hands = torch.tensor(contact.hands)
             contact = self._following(palms, contact, hands, scene_object, state)
             if contact is None:
                 continue
@@ -352,7 +360,7 @@ class ObjectTracker:
         states: dict[str, ObjectState],
         environment: Environment,
         prob: dict[str, Float[Tensor, "time hand"]],
-    ) -> tuple[int, SceneObject] | None:
+    ) -> tuple[int, SceneObject, None] | None:
         """The first frame of an interval, up to `seek_s` after its start, in which a hand is within reach of an object of
         the class, and the object that it takes (`class_m`); None where there is none: the contact is a false positive."""
         latest = timestamps[contact.start] + self.attachment.seek_s
@@ -367,8 +375,47 @@ class ObjectTracker:
         frame = int(within[0])
         if self.attachment.class_m is not None:
             interval = replace(contact, start=contact.start + frame)
-            return interval.start, self._likeliest(palms, interval, states, environment, prob)
-        return contact.start + frame, environment.objects[int(index[frame, distance[frame].argmin()])]
+            return interval.start, self._likeliest(palms, interval, states, environment, prob), None
+        return contact.start + frame, environment.objects[int(index[frame, distance[frame].argmin()])], None
+
+    def _found_again(
+        self,
+        palms: Float64[Tensor, "time hand 3"],
+        contact: ContactInterval,
+        contact_class: str,
+        states: dict[str, ObjectState],
+        environment: Environment,
+    ) -> tuple[int, SceneObject, ObjectState] | None:
+        """An object that would be within `found_m` of the hands elsewhere on its way and then follow them, with that state;
+        of several the nearest; None where there is none."""
+        most = self.attachment.found_m
+        if most is None:
+            return None
+        hands, frames = torch.tensor(contact.hands), palms[contact.start : contact.stop]
+        touching, best = frames[0, hands], None
+        for item in environment.objects:
+            limits = item.freedom.limits
+            wrong = contact_class not in (UNKNOWN_CLASS, item.freedom.contact_class)
+            if wrong or limits is None or item.freedom.kind not in ("hinge", "axis"):
+                continue
+            values = torch.linspace(*limits, FOUND_STEPS, dtype=torch.float64)
+            T = item.freedom.moved(item.T_world_object, values)
+            away = torch.stack(
+                [environment.distance(item.name, p.expand(FOUND_STEPS, 3), T)[0] for p in touching]
+            ).amin(0)
+            change = (values - states[item.name].value).abs()
+            near = (
+                away <= away.min() + FOUND_WITHIN_M
+            )  # among places that fit alike, the one nearest to where it was left
+            k = int(torch.where(near, change, torch.inf).argmin())
+            state = ObjectState(T[k], float(values[k]))
+            if away[k] > most or (best is not None and away[k] >= best[0]):
+                continue
+            slips = self._slip(frames, hands, item, state).quantile(0.75) > (self.attachment.slip_m or torch.inf)
+            rests = (frames[:, hands] - touching).norm(dim=-1).amax() < self.attachment.rest_m
+            if not slips and not rests:
+                best = (float(away[k]), contact.start, item, state)
+        return None if best is None else best[1:]
 
     def _likeliest(
         self,
