@@ -176,6 +176,7 @@ def _rows(
         "ours, right hand carries": track(changed(anchor="right"), "ours"),
         "ours, the nearest of the class": track(changed(class_m=None), "ours"),
         "ours, any motion of the hand": track(changed(slip_m=None, rest_m=0.0), "ours"),
+        "ours, objects not found again": track(changed(found_m=None), "ours"),
         "ours, no gaps filled": track(_with_gap(ours.tracker, 0.0), "ours"),
         "ours, classes in parallel": track(changed(one_class=False, class_m=None), "ours"),
         "ours, true contacts": lambda motion: ours.tracker(motion, oracle, placed),
