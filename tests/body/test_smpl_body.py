@@ -1,5 +1,7 @@
 """SMPL-family files of the tests' own making: read, shaped, posed by the model's formula, refused when broken."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,11 +9,12 @@ import torch
 from wearcap.body.anny_body import anny_body
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeletons import skeleton_by_name
-from wearcap.body.smpl_body import smpl_body
-from wearcap.cli.capture import _with_body
+from wearcap.body.smpl_body import betas_of, smpl_body, template_pelvis
+from wearcap.cli.capture import _on_smpl
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
+from wearcap.io.datasets.amass import write_amass
 from wearcap.io.formats.gltf import write_glb
 from wearcap.io.formats.smpl import read_smpl
 from wearcap.recording import Recording
@@ -113,10 +116,29 @@ def test_a_capture_is_shown_with_the_users_own_body(tmp_path):
     model_file(tmp_path / "model.npz", "smplh52")
     motion = swaying_motion(4)
     recording = Recording("r", motion=motion, shape={"beta_0": 0.5, "height": 1.7})
-    shown, body = _with_body(motion, recording, str(tmp_path / "model.npz"))
+    shown, body, betas, _ = _on_smpl(motion, recording, str(tmp_path / "model.npz"))
+    assert betas.tolist() == [0.5]
     assert shown.skeleton.name == "smplh52"
     write_glb(shown, tmp_path / "motion.glb", body=body)
     assert (tmp_path / "motion.glb").stat().st_size > 36 * len(body.rest_vertices)
     before, after = (m.joint("head").t for m in (motion, shown))
     assert (before - after).norm(dim=-1).max() < 0.3
-    assert _with_body(motion, recording, False) == (motion, None)
+
+
+def test_bones_tell_the_shape_and_the_file_places_the_body(tmp_path):
+    """A wearer with the bones of a shape gets bones of these lengths, and AMASS' translation is that of the same shape."""
+    model_file(tmp_path / "model.npz", "smplh52")
+    arrays = read_smpl(tmp_path / "model.npz")
+    tall, wide = 0.06 * arrays.template, 0.04 * arrays.template * torch.tensor([1.0, 0.0, 0.0])
+    arrays = replace(arrays, shape_directions=torch.stack([tall, wide], -1))
+    true = torch.tensor([1.2, -0.8])
+    wearer = smpl_body(arrays, true).skeleton
+    found = smpl_body(arrays, betas_of(arrays, wearer)).skeleton
+    lengths = [each.t_parent_joint[1:].norm(dim=-1) for each in (wearer, found, smpl_body(arrays).skeleton)]
+    assert (lengths[1] - lengths[0]).abs().mean() < 0.1 * (lengths[2] - lengths[0]).abs().mean()
+    motion = swaying_motion(5, skeleton=wearer)
+    pelvis = template_pelvis(arrays, true)
+    write_amass(motion, tmp_path / "out.npz", true, pelvis.tolist())
+    written = np.load(tmp_path / "out.npz")
+    np.testing.assert_allclose(written["betas"][:2], true.numpy(), atol=1e-6)
+    np.testing.assert_allclose(written["trans"], motion.t_world_root.numpy() - pelvis.numpy(), atol=1e-5)

@@ -15,7 +15,6 @@ import pytest
 
 from wearcap.errors import WearcapError
 from wearcap.io.datasets.hcontact import read_smpl_json
-from wearcap.io.datasets.mocap_every_folder import _config
 from wearcap.io.formats import bounded
 from wearcap.io.formats.asf_amc import read_asf
 from wearcap.io.formats.bvh import read_bvh
@@ -27,7 +26,7 @@ from wearcap.io.formats.ocamcalib import OCamModel
 from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.restricted_pickle import read_pickle
-from wearcap.io.formats.text import read_json, read_text
+from wearcap.io.formats.text import read_json, read_text, read_yaml_object
 from wearcap.io.formats.trajectory import read_trajectory
 from wearcap.io.formats.video import read_frames, read_image, video_info
 from wearcap.io.formats.wavefront import read_obj
@@ -263,11 +262,11 @@ def test_whole_numbers_of_json_beyond_64_bits(tmp_path):
 def test_yaml_that_unfolds(tmp_path):
     path = tmp_path / "config.yaml"
     path.write_text("a0: &a0 [x, x]\n" + "".join(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}]\n" for k in range(1, 40)))
-    refused(_config, path, "refers to its own parts")
+    refused(read_yaml_object, path, "refers to its own parts")
     path.write_text("a: " + "[" * 20_000)
-    refused(_config, path, "YAML")
+    refused(read_yaml_object, path, "YAML")
     path.write_text("a: " + "x" * 100_000)
-    refused(_config, path, "larger than 64 KiB")
+    refused(read_yaml_object, path, "larger than 64 KiB")
 
 
 # What is no regular file ---------------------------------------------------------------------------------------------

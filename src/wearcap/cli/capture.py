@@ -12,8 +12,9 @@ from rich.console import Console
 from torch import Tensor
 
 from wearcap.body.anny_body import anny_body
+from wearcap.body.model import BodyModel
 from wearcap.body.skeleton import xsens23
-from wearcap.body.smpl_body import SmplArrays, betas_of, smpl_body, template_pelvis
+from wearcap.body.smpl_body import betas_of, smpl_body, template_pelvis
 from wearcap.cli.capture_all import capture_all, is_dataset
 from wearcap.cli.conf import hydra_main, load_pipeline, with_pipeline, with_pipeline_of_content
 from wearcap.errors import WearcapError
@@ -95,13 +96,10 @@ def _write(
     write_motion(motion, folder / "motion.npz")
     write_bvh(motion, folder / "motion.bvh")
     shown, body = motion, anny_body(motion.skeleton, recording.shape or None) if config.body is True else None
-    if isinstance(config.body, str):  # on the skeleton of the user's SMPL model
-        arrays = read_smpl(config.body)
-        betas = _betas(arrays, recording, motion)
-        body = smpl_body(arrays, betas)
-        shown = on_skeleton(motion, body.skeleton)
+    if isinstance(config.body, str):
+        shown, body, betas, pelvis = _on_smpl(motion, recording, config.body)
         if config.smpl:
-            write_amass(shown, folder / "motion_smplh.npz", betas, template_pelvis(arrays, betas).tolist())
+            write_amass(shown, folder / "motion_smplh.npz", betas, pelvis)
     elif config.smpl:
         write_smplh(motion, folder / "motion_smplh.npz")
     write_glb(shown, folder / "motion.glb", body=body)
@@ -112,10 +110,16 @@ def _write(
         write_video(folder / "motion.mp4", shown, environment=environment, max_seconds=seconds)
 
 
-def _betas(arrays: SmplArrays, recording: Recording, motion: Motion) -> Float[Tensor, "beta"]:
-    """The recording's shape coefficients, or those that the wearer's bones tell."""
+def _on_smpl(
+    motion: Motion, recording: Recording, file: str
+) -> tuple[Motion, BodyModel, Float[Tensor, "beta"], list[float]]:
+    """The motion on the body of the user's SMPL model file, with the recording's shape coefficients or those that the
+    wearer's bones tell; the body, these, and the template's pelvis."""
+    arrays = read_smpl(file)
     known = [value for name, value in recording.shape.items() if name.startswith("beta_")]
-    return torch.tensor(known[: arrays.shape_directions.shape[-1]]) if known else betas_of(arrays, motion.skeleton)
+    betas = torch.tensor(known[: arrays.shape_directions.shape[-1]]) if known else betas_of(arrays, motion.skeleton)
+    body = smpl_body(arrays, betas)
+    return on_skeleton(motion, body.skeleton), body, betas, template_pelvis(arrays, betas).tolist()
 
 
 def _live(system: System, config: DictConfig, folder: Path) -> None:

@@ -6,11 +6,11 @@ import tracemalloc
 
 import numpy as np
 import pytest
-import short_walk
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import short_walk
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
