@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 import pytest
-import short_walk
 
+import short_walk
 from wearcap.errors import WearcapError
 from wearcap.io.devices.headset_log import is_headset_log, read_headset_log
 
