@@ -363,11 +363,6 @@ FAULTS = {
         replace(PIPELINE, synchronization=Synchronization("claps")),
         "a camera without a video",
     ),
-    "no contacts": (
-        lambda r: replace(r, suit=replace(r.suit, contact_prob=None)),
-        PIPELINE,
-        "no foot contacts for 360 frames",
-    ),
 }
 
 
@@ -376,6 +371,12 @@ def test_what_is_missing_is_reported(fault, walk):
     change, pipeline, message = FAULTS[fault]
     with pytest.raises(WearcapError, match=message):
         pipeline(CaptureInput(change(walk), scan=Scan(floor_points())))
+
+
+def test_a_suit_without_contacts_is_registered_with_those_of_its_feet(walk):
+    source = CaptureInput(replace(walk, suit=replace(walk.suit, contact_prob=None)), scan=Scan(floor_points()))
+    derived, given = PIPELINE(source), PIPELINE(CaptureInput(walk, scan=Scan(floor_points())))
+    assert (derived.T_world_joint.t - given.T_world_joint.t).norm(dim=-1).mean() < 0.02
 
 
 def test_settings_that_cannot_be_are_refused():

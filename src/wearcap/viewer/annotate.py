@@ -127,7 +127,7 @@ def _predicted(motion: Motion) -> Interactions | None:
         return None
     if prob.shape != (len(motion), len(HANDS)):
         raise WearcapError(f"hand contacts of shape {tuple(prob.shape)}", expected=f"({len(motion)}, {len(HANDS)})")
-    contact = active(prob, motion.timestamps, ContactSettings())
+    contact = active(prob, motion.timestamps, ContactSettings(0.3, 0.15, 0.5))
     # Start times of frames, and the end of the last.
     edges = torch.cat([motion.timestamps, motion.timestamps[-1:] + motion.timestamps.diff().median()])
     rows = []

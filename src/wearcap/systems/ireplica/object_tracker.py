@@ -39,12 +39,12 @@ from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 class ContactSettings:
     """Thresholds and gap filling. Raises WearcapError for a threshold outside 0…1 or a negative gap."""
 
-    threshold: float = 0.3
+    threshold: float = 0.15
     """Least probability of a contact."""
-    keep: float = 0.15
+    keep: float = 0.08
     """Least probability with which a contact above the threshold goes on, before and after (hysteresis)."""
-    gap_s: float = 0.5
-    """Longest gap (s) between two contacts of a hand that is filled (thesis Table 5.4)."""
+    gap_s: float = 1.0
+    """Longest gap (s) between two contacts of a hand that is filled (thesis Table 5.4: 0.5)."""
 
     def __post_init__(self):
         if not 0.0 < self.keep <= self.threshold < 1.0 or self.gap_s < 0:
@@ -544,7 +544,7 @@ class ActSearch:
     checkpoints: Sequence[str]
     """Checkpoints of iReplica's contact networks."""
     tracker: ObjectTracker = field(
-        default_factory=lambda: ObjectTracker(None, ContactSettings(0.5, 0.5), AttachmentSettings(reach_m=0.5))
+        default_factory=lambda: ObjectTracker(None, ContactSettings(0.5, 0.5, 0.5), AttachmentSettings(reach_m=0.5))
     )
     """Object tracker, without correction: the wearer stays where the head was measured. Hands are not, as a suit's are:
     they reach farther, and no motion of theirs is refused."""
