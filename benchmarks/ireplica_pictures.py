@@ -41,9 +41,8 @@ def draw(dataset: Path, split: str, checkpoint: str, folder: Path) -> None:
                 best[kind] = (worth, name, object_name, start, stop)
     for kind, (_, name, object_name, start, stop) in best.items():
         case = Case.load(dataset, name)
-        motion = pipeline.interact(
-            pipeline.registered(case.source), pipeline.contacts(case.recording), case.environment
-        )
+        placed = pipeline.placed(case.environment, case.source)
+        motion = pipeline.interact(pipeline.registered(case.source), pipeline.contacts(case.recording), placed)
         truth = with_objects(case.recording)
         assert truth is not None
         true = replace(at_times(truth, motion.timestamps), object_motion=truth.object_motion)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rich import print as show
+from rich.markup import escape
 
 from wearcap.body.anny_body import anny_body
 from wearcap.cli import capture, evaluate, export, prepare, train
@@ -38,9 +39,11 @@ def main(arguments: list[str]) -> None:
     ]
     _step("Training", train.main, training)
     trained, store = f"checkpoint={checkpoint}", RecordingStore.open(data)
-    both = f"checkpoint=[{checkpoint},{SHARED}]"
-    table = [both, f"hydra.run.dir={out}/evaluate", "seeds=[0]", f"output={out}/table.json"]
-    _step("Evaluation, beside the shared checkpoint, which was trained for hours", evaluate.main, table)
+    table = [trained, f"hydra.run.dir={out}/evaluate", "seeds=[0]", f"output={out}/table.json"]
+    _step("Evaluation", evaluate.main, table)
+    table = [f"checkpoint={SHARED}", f"dataset={data}", f"hydra.run.dir={out}/evaluate_shared", "seeds=[0]"]
+    table += ["baselines=false", f"output={out}/table_shared.json"]
+    _step("The shared checkpoint, which was trained for longer", evaluate.main, table)
     name = store.names("test")[0]
     for title, taken, folder in (
         ("Capture", trained, "capture"),
@@ -54,7 +57,7 @@ def main(arguments: list[str]) -> None:
     show(
         f"\n[bold]Done in {(time.monotonic() - started) / 60:.1f} minutes.[/bold]\n"
         f"picture  {out / 'demo.png'}: the truth, these {options.steps} steps, the shared checkpoint\n"
-        f"table    {out / 'table.json'}\nvideo    {out / 'shared/motion.mp4'}, {out / 'capture/motion.mp4'}\n"
+        f"table    {out / 'table.json'}, {out / 'table_shared.json'}\nvideo    {out / 'shared/motion.mp4'}, {out / 'capture/motion.mp4'}\n"
         f"motion   {out / 'shared/motion.glb'} (and .bvh, .npz, SMPL)\nmodel    {out / 'denoiser.onnx'}\n"
         f"watch    wearcap view {data}/{name} --motion {out / 'capture/motion.npz'} {out / 'shared/motion.npz'}"
     )
@@ -69,5 +72,5 @@ def _picture(path: Path, recording: Recording, captures: dict[str, Motion]) -> N
 
 
 def _step(title: str, verb: Callable[[list[str]], None], arguments: list[str]) -> None:
-    show(f"\n[bold]{title}[/bold]: wearcap {verb.__module__.rpartition('.')[2]} {' '.join(arguments)}")
+    show(f"\n[bold]{title}[/bold]: wearcap {verb.__module__.rpartition('.')[2]} {escape(' '.join(arguments))}")
     verb(arguments)
