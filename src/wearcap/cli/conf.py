@@ -83,7 +83,11 @@ def with_pipeline_of_content(arguments: list[str]) -> list[str]:
     Raises WearcapError for a recording that cannot be read, and for one that suits none of them.
     """
     given = _given(arguments)
-    if {"pipeline", "checkpoint", "live"} & set(given) or "recording" not in given or "-m" in arguments:
+    if (
+        {"pipeline", "checkpoint", "live"} & set(given)
+        or "recording" not in given
+        or {"-m", "--multirun"} & set(arguments)
+    ):
         return arguments
     where = str(getattr(value := given["recording"].value(), "text", value))
     if (Path(where) / MANIFEST).is_file() and len(RecordingStore.open(where).names()) != 1:
