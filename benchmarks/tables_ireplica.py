@@ -190,7 +190,11 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         clocks=CLOCKS,
         pictures=tuple(
             (f"ireplica_{name}.png", f"{what}: truth above and captured below, hands in contact green")
-            for name, what in (("door", "A door"), ("sofa", "A sofa, pushed with both hands"), ("table", "A table"))
+            for name, what in (
+                ("door", "A door that an earlier mistake left at another angle, and that rests in the hand"),
+                ("sofa", "A sofa, pushed with both hands"),
+                ("table", "A table"),
+            )
         ),
     )
 
