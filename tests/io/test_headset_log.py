@@ -54,14 +54,14 @@ def compare(found, time, R, t) -> None:
 
 @pytest.mark.parametrize("convention", ["unity", "openxr", "steamvr"])
 @pytest.mark.parametrize("kind", ["wrist", "grip"])
-@pytest.mark.parametrize("told", [True, False])
-def test_conventions_are_detected_or_given(tmp_path, convention, kind, told):
+@pytest.mark.parametrize("given", [True, False])
+def test_conventions_are_detected_or_given(tmp_path, convention, kind, given):
     time, R, t = short_walk.walk()
     poses = short_walk.headset_poses(time, R, t, convention, kind)
     path = short_walk.headset_csv(tmp_path / "a.csv", time, poses, SNAKE)
-    found = read_headset_log(path, axes=convention if told else "auto", hands=kind)
+    found = read_headset_log(path, axes=convention if given else "auto", hands=kind)
     compare(found, time, R, t)
-    assert found.axes == (convention if told or convention == "unity" else "openxr")
+    assert found.axes == (convention if given or convention == "unity" else "openxr")
     assert found.floor
     assert any("axes" in note for note in found.notes)
 
@@ -133,7 +133,7 @@ def test_hands_that_are_lost(tmp_path):
     assert "left_wrist is not tracked in 30 of 240 rows" in found.notes
 
 
-def test_a_seated_player_is_told_by_the_hands(tmp_path):
+def test_the_axes_of_a_seated_player_follow_from_the_hands(tmp_path):
     time, R, t = short_walk.walk()
     t = t * [0, 0, 1] + [0.3, 0.1, -0.4]
     R = R * 0 + np.eye(3)

@@ -119,7 +119,7 @@ def read_headset_log(
     are (wrist: OpenXR's hand joint; grip: a controller's), and `time_unit` (s, ms, us, ns) override what is detected.
 
     Raises WearcapError for a file without a headset's poses and times, numbers that are none, rows of the head that
-    repeat or go back in time (named by line), and where a convention can be told from nothing in the log.
+    repeat or go back in time (named by line), and where nothing in the log determines a convention.
     """
     for name, value, allowed in (
         ("axes", axes, CONVENTIONS),
