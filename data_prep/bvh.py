@@ -1,4 +1,4 @@
-"""The same as `wearcap prepare cmu`: python data_prep/cmu.py source=DIR [key=value …]"""
+"""The same as `wearcap prepare bvh`: python data_prep/bvh.py source=DIR [key=value …]"""
 
 import sys
 

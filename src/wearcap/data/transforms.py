@@ -261,9 +261,11 @@ class Scale:
 
 @dataclass(frozen=True)
 class SensorErrors:
-    """Errors of trackers and of the floor that are constant within a window, and white noise of accelerations.
+    """Errors of trackers, of the floor and of the body's size that are constant within a window, and white noise of
+    accelerations.
 
-    All are standard deviations, those of orientations about each axis. Values that a window lacks are left out.
+    All are standard deviations, those of orientations about each axis and of positions along each. Values that a window
+    lacks are left out.
     """
 
     head_deg: float = 0.0
@@ -271,6 +273,12 @@ class SensorErrors:
     """Orientation of a wrist's sensor: strap, attitude, heading."""
     acc_m_s2: float = 0.0
     floor_m: float = 0.0
+    head_m: float = 0.0
+    """Where the device sits on the head, in the head's axes."""
+    wrist_m: float = 0.0
+    """Where a tracked wrist is, in its own axes."""
+    size: float = 0.0
+    """Of each measure of the body's size, as a share."""
 
     def __call__(self, window: Window, random: Draws) -> Window:
         values, changed = window.values, {}
@@ -284,6 +292,14 @@ class SensorErrors:
             changed["acc_world_wrist"] = (turn[:2] @ acc[..., None])[..., 0] + self.acc_m_s2 * noise
         floor = self.floor_m * torch.randn(1, generator=random.generator)
         changed |= {name: value + floor for name, value in values.items() if name.startswith("floor")}
+        seat = torch.randn(3, 3, generator=random.generator)
+        seat = seat * torch.tensor([[self.wrist_m], [self.wrist_m], [self.head_m]])
+        for point, order in (("wrist", [0, 1]), ("head", 2), ("point", [2, 0, 1])):
+            t, R = f"t_world_{point}", f"R_world_{point}"
+            if t in values and R in values:
+                changed[t] = values[t] + (values[R] @ seat[order][..., None])[..., 0]
+        if (size := values.get("size")) is not None:
+            changed["size"] = size * (1 + self.size * torch.randn(size.shape, generator=random.generator))
         return window.changed(**changed)
 
 

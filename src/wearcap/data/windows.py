@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
+from wearcap.data.bodies import OtherBodies, Proportions
 from wearcap.data.transforms import Cut, Draws, TimeStretch, TimeTransform, Transform, Window
 from wearcap.errors import WearcapError
 from wearcap.models.layers import Normalizer
@@ -33,6 +34,8 @@ class Source:
 
     root: str
     weight: float = 1.0
+    bodies: bool = True
+    """Whether other people do its motion, too, where there are any (`OtherBodies`)."""
 
 
 class Content:
@@ -42,6 +45,8 @@ class Content:
     """Names of the uniform numbers that are drawn first for every sample, in this order (`Draws`)."""
     requires: ClassVar[str] = ""
     """What usable recordings have, as the end of the message when none is (" with points")."""
+    any_body: ClassVar[bool] = False
+    """Whether `open` can give a motion to people of other proportions."""
     tracks_at_once: ClassVar[int | None] = None
     """Number of tracks that are kept in memory; None: all."""
 
@@ -61,8 +66,16 @@ class Content:
         stride = windows.stride * every
         return Cut(start, windows.window, frames, stride=stride, step=every, stretch=windows.stretch)
 
-    def open(self, store: RecordingStore, name: str, every: int) -> Any:
-        """The track of a recording: what is kept of it in memory, for `read` to cut windows out of."""
+    def varied(self, store: RecordingStore, name: str) -> bool:
+        """Whether a recording's motion can be given to people of other proportions: if no objects are handled."""
+        keys = open_recording(store.path_of(name)).keys
+        return self.any_body and not any(key.startswith("object_motion.") for key in keys)
+
+    def open(self, store: RecordingStore, name: str, every: int, body: Proportions | None = None) -> Any:
+        """The track of a recording: what is kept of it in memory, for `read` to cut windows out of.
+
+        `body`: proportions of another person who does the same, for recordings that are `varied`; None: as recorded.
+        """
         raise NotImplementedError
 
     def read(self, track: Any, cut: Cut, random: Draws) -> Window:
@@ -93,13 +106,15 @@ class Windows(Dataset):
         fps: float,
         every: int | None = 1,
         balance: float = 1.0,
+        bodies: OtherBodies | None = None,
         transforms: dict[str, TimeTransform | Transform | None] | None = None,
     ):
         """Windows of `window` frames at `fps` that begin `stride` frames apart; `every`-th frames of recordings are used.
 
         `every` None takes recordings at any multiple of `fps`. `transforms` by name apply to `augmented` windows, those
         of time first, each group in its order. In training a recording is drawn in proportion to its number of windows
-        to the power of `balance`: 1 samples all windows equally, 0 all recordings. Raises WearcapError for a recording
+        to the power of `balance`: 1 samples all windows equally, 0 all recordings. `bodies` do the motion of `augmented`
+        windows in turn with the wearer, where the content is `varied`. Raises WearcapError for a recording
         at another rate, and when there are no windows.
         """
         self.content, self.window, self.stride, self.fps = content, window, stride, fps
@@ -108,7 +123,9 @@ class Windows(Dataset):
         self.in_space = tuple(each for each in chosen if not isinstance(each, TimeTransform))
         self.stretch = max((each.factor for each in self.in_time if isinstance(each, TimeStretch)), default=1.0)
         self.recordings: list[tuple[RecordingStore, str, int]] = []
-        self._tracks: dict[int, Any] = {}
+        self._varied: list[bool] = []
+        self.bodies = bodies if augmented else None
+        self._tracks: dict[tuple[int, int], Any] = {}
         stores = [RecordingStore.open(source.root) for source in sources]
         content.prepare(stores, split)
         least, starts, weights = content.min_frames(window, self.stretch), [], []
@@ -123,6 +140,7 @@ class Windows(Dataset):
                     starts += [(len(self.recordings), k * stride * rate, frames) for k in range(count)]
                     weights += [source.weight * count ** (power - 1) / total] * count
                 self.recordings.append((store, name, rate))
+                self._varied.append(source.bodies)
         if not starts:
             what = f"no windows in split {split!r}"
             expected = f"recordings of at least {least} frames{content.requires}"
@@ -135,19 +153,26 @@ class Windows(Dataset):
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_tracks": {}}
 
-    def track(self, number: int) -> Any:
-        """A whole recording, by its index in `recordings`."""
-        if number not in self._tracks:
+    def track(self, number: int, person: int = 0) -> Any:
+        """A whole recording, by its index in `recordings`, of its wearer (0) or of one of the other `bodies`."""
+        if (number, person) not in self._tracks:
             if len(self._tracks) == self.content.tracks_at_once:
                 self._tracks.pop(next(iter(self._tracks)))
-            self._tracks[number] = self.content.open(*self.recordings[number])
-        return self._tracks[number]
+            body = self.bodies.proportions(1_000_003 * number + person) if self.bodies and person else None
+            self._tracks[number, person] = self.content.open(*self.recordings[number], body)
+        return self._tracks[number, person]
+
+    def _person(self, number: int, seed: int) -> int:
+        """Who does the motion of a sample."""
+        if self.bodies is None or not self._varied[number] or not self.content.varied(*self.recordings[number][:2]):
+            return 0
+        return seed % (self.bodies.count + 1)
 
     def __getitem__(self, item: tuple[int, int] | int) -> tuple[Tensor, ...]:
         index, seed = item if isinstance(item, tuple) else (item, item)
         number, start, frames = self.starts[index].tolist()
         random = Draws(seed, self.content.draws)
-        track = self.track(number)
+        track = self.track(number, self._person(number, seed))
         cut = self.content.cut(track, start, frames, self.recordings[number][2], self)
         for transform in self.in_time:
             cut = transform.retimed(cut, random)

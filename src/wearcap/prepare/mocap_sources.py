@@ -103,12 +103,13 @@ def bvh_tasks(
     license: str,
     mapping: str | Path | None = None,
     subject: str | None = None,
+    activity: str | None = None,
 ) -> list[Task]:
     """One task per .bvh or .amc (also .xz, .gz) that `source` is or that lies anywhere below it, named by its path.
 
-    `mapping`, a YAML file, overrides what is detected of all files' conventions. `subject` is a regular expression with
-    one group, searched in the path below `source`; or "folder"; or one name for all. By default it is the number of
-    CMU's SUBJECT_TRIAL names, else the folder.
+    `mapping`, a YAML file, overrides what is detected of all files' conventions. `subject` and `activity` are each a
+    regular expression with one group, searched in the path below `source`; or "folder"; or one name for all. By default
+    the subject is the number of CMU's SUBJECT_TRIAL names, else the folder, and there is no activity.
     """
     source = Path(source)
     if source.is_file() and not source.name.lower().endswith(MOTION_SUFFIXES):
@@ -122,7 +123,10 @@ def bvh_tasks(
             raise WearcapError(f"two files are called {name!r}: {trials[name]} and {path}", fix="Rename one.")
         trials.setdefault(name, path)  # .amc comes first
     subjects = _subjects(root, trials, subject)
-    abouts = {name: About(name, subjects[name], "bvh", license) for name in trials}
+    activities = {
+        name: "" if activity is None else _named(path, root, "activity", activity) for name, path in trials.items()
+    }
+    abouts = {name: About(name, subjects[name], "bvh", license, activities[name]) for name in trials}
     given = Mapping() if mapping is None else read_mapping(mapping)
     return _motion_tasks(trials, abouts, splits, settings, amc_fps, given, BVH_VERSION)
 
@@ -184,23 +188,32 @@ def _subjects(source: Path, trials: dict[str, Path], subject: str | None) -> dic
 
 
 def _subject(path: Path, source: Path, rule: str | None) -> str:
-    below = path.relative_to(source)
-    folder = below.parent.as_posix() if below.parent.parts else source.resolve().name
-    if rule is None:
-        number = path.name.split("_")[0]
-        return str(int(number)) if number.isdecimal() and "_" in path.name else folder
+    if rule is not None:
+        return _named(path, source, "subject", rule)
+    number = path.name.split("_")[0]
+    return str(int(number)) if number.isdecimal() and "_" in path.name else _folder(path, source)
+
+
+def _folder(path: Path, source: Path) -> str:
+    below = path.relative_to(source).parent
+    return below.as_posix() if below.parts else source.resolve().name
+
+
+def _named(path: Path, source: Path, what: str, rule: str) -> str:
+    """A file's subject or activity by a rule: a pattern with one group, "folder", or the name itself."""
     if rule == "folder" or "(" not in rule:
-        return folder if rule == "folder" else rule
+        return _folder(path, source) if rule == "folder" else rule
     try:
         pattern = re.compile(rule)
     except re.error as error:
-        raise WearcapError(f"subject={rule}: {error}", expected="a regular expression with one group") from error
+        raise WearcapError(f"{what}={rule}: {error}", expected="a regular expression with one group") from error
     if pattern.groups != 1:
-        raise WearcapError(f"subject={rule} has {pattern.groups} groups", expected="one group, around the subject")
-    match = pattern.search(below.as_posix())
+        raise WearcapError(f"{what}={rule} has {pattern.groups} groups", expected=f"one group, around the {what}")
+    below = path.relative_to(source).as_posix()
+    match = pattern.search(below)
     if not (match and match[1]):
-        expected = "a pattern that finds the subject in each path"
-        raise WearcapError(f"subject={rule} does not match {below.as_posix()}", where=source, expected=expected)
+        expected = f"a pattern that finds the {what} in each path"
+        raise WearcapError(f"{what}={rule} does not match {below}", where=source, expected=expected)
     return match[1]
 
 

@@ -1,7 +1,9 @@
 """Loss terms: pure functions of predictions and ground truth, averaged over weighted frames (0 on padding)."""
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional as F
 
 EPSILON_M2 = 1e-6
 """Keeps the gradient of a distance finite where prediction and target meet."""
@@ -43,6 +45,14 @@ def joint_velocity(
     """Squared difference of joint velocities (m²/s²; ours)."""
     error = (prediction - target).diff(dim=1) * fps
     return masked_mean(error.square().sum(-1).mean(-1), weight[:, 1:])
+
+
+def balanced_cross_entropy(
+    logit: Float[Tensor, "batch time foot"], contact: Float[Tensor, "batch time foot"], share: float
+) -> Float[Tensor, ""]:
+    """Cross entropy in which contact, a `share` of the training's labels, and its absence weigh alike (ours)."""
+    weight = torch.where(contact > 0.5, 0.5 / share, 0.5 / (1 - share))
+    return F.binary_cross_entropy_with_logits(logit, contact, weight)
 
 
 def foot_skate(

@@ -11,6 +11,7 @@ from torch import Tensor
 from wearcap.body.anny_body import anny_body
 from wearcap.body.contact_points import TOUCH_M, contact_points, mirrored_points
 from wearcap.body.skeleton import FOOT_PATCHES, MIRROR, Skeleton
+from wearcap.data.bodies import Proportions, with_proportions
 from wearcap.data.features import body_size
 from wearcap.data.transforms import Cut, Draws, Window, joint_twins
 from wearcap.data.windows import Content, Windows
@@ -153,6 +154,7 @@ class EchoContent(Content):
     """
 
     draws = ("shift", "mirror", "ends", "end")
+    any_body = True
 
     def __init__(
         self,
@@ -175,8 +177,9 @@ class EchoContent(Content):
     def min_frames(self, window: int, stretch: float) -> int:
         return 2 * MIN_FRAMES
 
-    def open(self, store: RecordingStore, name: str, every: int) -> EchoTrack:
+    def open(self, store: RecordingStore, name: str, every: int, body: Proportions | None = None) -> EchoTrack:
         recording = RecordingFile(store.path_of(name)).load()
+        recording = recording if body is None else with_proportions(recording, body)
         file = recording.environment if self.objects else None
         environment = None if file is None else _environment(store.root / file)
         return EchoTrack.read(recording, environment, self._reader, every, self.within_m)

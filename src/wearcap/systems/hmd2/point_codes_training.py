@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wearcap.data.bodies import Proportions
 from wearcap.data.transforms import Cut, Draws, Window
 from wearcap.data.windows import Content, Windows, drawn_batches
 from wearcap.metrics.detection import distance_mae_cm, occupancy_iou, occupied_distance_mae_cm
@@ -41,7 +42,9 @@ class PlaceContent(Content):
     def min_frames(self, window: int, stretch: float) -> int:
         return 1
 
-    def open(self, store: RecordingStore, name: str, every: int) -> tuple[VoxelMap, HeadStream]:
+    def open(
+        self, store: RecordingStore, name: str, every: int, body: Proportions | None = None
+    ) -> tuple[VoxelMap, HeadStream]:
         file = RecordingFile(store.path_of(name))
         cloud, head, surroundings = file.part("points"), file.part("head"), VoxelMap(self.grid)
         surroundings.add(cloud.points_world, cloud.first_seen)

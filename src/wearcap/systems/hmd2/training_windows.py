@@ -10,12 +10,12 @@ from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import FEET, Skeleton
+from wearcap.data.bodies import Proportions, with_proportions
 from wearcap.data.features import body_size, true_foot_contact
 from wearcap.data.surroundings import NOTHING, Surroundings, embeddings_of
 from wearcap.data.transforms import Cut, Draws, Window, joint_twins
 from wearcap.data.windows import Content, open_recording
 from wearcap.errors import WearcapError
-from wearcap.geometry.rigid import Rigid
 from wearcap.recording.store import RecordingFile, RecordingStore
 from wearcap.tracking.floor import floor_from_path, floor_from_points
 
@@ -66,16 +66,19 @@ class _HeadTrack:
     store: RecordingStore
     name: str
     file: RecordingFile
-    T_device_head: Rigid
+    R_head_device: Float[Tensor, "3 3"]
     values: dict[str, Tensor]
     constants: dict[str, Tensor]
     twins: dict[str, list[int]]
+    surrounded: bool
+    """Whether points and pictures belong to this body."""
 
 
 class HeadContent(Content):
     """Windows of head paths and motions. Codes of points are computed where they are missing."""
 
     draws = ("shift", "mirror", "ends", "end")
+    any_body = True
 
     def __init__(self, surroundings: Surroundings = NOTHING):
         self.surroundings, self.image_size = surroundings, 0
@@ -90,12 +93,12 @@ class HeadContent(Content):
     def min_frames(self, window: int, stretch: float) -> int:
         return MIN_FRAMES
 
-    def open(self, store: RecordingStore, name: str, every: int) -> _HeadTrack:
+    def open(self, store: RecordingStore, name: str, every: int, body: Proportions | None = None) -> _HeadTrack:
         file = open_recording(store.path_of(name))
         if file.length("head.timestamps") != file.length("motion.timestamps"):
             what, fix = "head and motion have different lengths", "Prepare the recording again."
             raise WearcapError(what, where=file.path, expected="both on one clock", fix=fix)
-        recording = file.load()
+        recording = file.load() if body is None else with_proportions(file.load(), body)
         head, motion = recording.head, recording.motion
         assert head is not None
         assert motion is not None
@@ -103,24 +106,23 @@ class HeadContent(Content):
         from_path = floor_from_path(head.timestamps, t_world_head, stature)
         from_points = floor_from_points(recording.points, t_world_head, stature)
         values = {
+            "t_world_head": t_world_head,
             "floor_height": from_path if from_points is None else from_points,
             "floor_from_head": from_path,
             "foot_contact": true_foot_contact(recording).float(),
         }
         constants = {"t_parent_joint": motion.skeleton.t_parent_joint, "size": body_size(motion.skeleton)}
         twins = dict.fromkeys(("R_parent_joint", "t_parent_joint"), joint_twins(motion.skeleton))
-        T_device_head = Rigid(head.R_head_device, head.t_head_device).inverse()
-        return _HeadTrack(store, name, file, T_device_head, values, constants, twins | {"foot_contact": [1, 0]})
+        twins |= {"foot_contact": [1, 0]}
+        return _HeadTrack(store, name, file, head.R_head_device, values, constants, twins, surrounded=body is None)
 
     def read(self, track: _HeadTrack, cut: Cut, random: Draws) -> Window:
         start, stop = cut.bounds
-        device = (track.file.window(f"head.{name}_world_device", start, stop) for name in ("R", "t"))
-        head = Rigid(*device) @ track.T_device_head
+        R_world_head = track.file.window("head.R_world_device", start, stop) @ track.R_head_device.mT
         local = track.file.window("motion.R_parent_joint", start, stop)
         values = {
             "R_parent_joint": cut.take("R_parent_joint", local, start),
-            "R_world_head": cut.take("R_world_head", head.R, start, sensed=True),
-            "t_world_head": cut.take("t_world_head", head.t, start, sensed=True),
+            "R_world_head": cut.take("R_world_head", R_world_head, start, sensed=True),
         }
         values |= {name: cut.take(name, part, sensed=name != "foot_contact") for name, part in track.values.items()}
         return Window(values | track.constants, track.twins)
@@ -135,7 +137,12 @@ class HeadContent(Content):
         return HeadWindow(
             **window.values,
             valid=cut.valid,
-            **{name: part[cut.frames - start] for name, part in seen.items()},
+            **{
+                name: part[cut.frames - start] & track.surrounded
+                if name.endswith("valid")
+                else part[cut.frames - start]
+                for name, part in seen.items()
+            },
             noise=torch.randn(cut.count, 6 * len(track.constants["t_parent_joint"]) + FEET, generator=random.generator),
             level=torch.rand(1, generator=random.generator),
             chance=torch.rand(3, generator=random.generator),

@@ -6,7 +6,6 @@ import torch
 from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional as F
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
@@ -16,8 +15,8 @@ from wearcap.systems.mocap_every.features import ENDS, WatchFeatures
 from wearcap.systems.mocap_every.model import TrainedEstimator
 from wearcap.systems.mocap_every.pipeline import MocapEvery, WatchModel
 from wearcap.systems.mocap_every.training_windows import WatchWindow
+from wearcap.training import losses
 from wearcap.training.base import OptimizerOf, SchedulerOf, Training
-from wearcap.training.losses import EPSILON_M2
 
 
 class WatchRegression(Training):
@@ -25,7 +24,7 @@ class WatchRegression(Training):
 
     Loss terms, weighted by `loss_weights`, are means over frames and joints: "root" and "rotation" (eq. 2), "position"
     with `joint_weights` for hands and feet (eq. 3), "mid" and "consistency" of the first stage (eq. 4), "contact"
-    (cross entropy), "foot_velocity"; "velocity" of all joints is ours.
+    (cross entropy), "foot_velocity"; "velocity" of all joints and "skate" of feet in contact are ours.
     """
 
     _joint_weights: Tensor
@@ -42,13 +41,17 @@ class WatchRegression(Training):
         optimizer: OptimizerOf,
         scheduler: SchedulerOf = None,
         end_weight: float = 1.0,
+        contact_share: float = 0.5,
         seed: int = 0,
     ):
-        """`end_weight`: weight of hands and feet relative to the other joints in "position"."""
+        """`end_weight`: weight of hands and feet relative to the other joints in "position". `contact_share`: share of
+        the labels with contact, by which both classes weigh alike in "contact"; 0.5: plain cross entropy."""
         super().__init__(optimizer, scheduler, loss_weights, seed)
         self.net = net(feature_size=features.size, motion_size=features.motion_size)
         self.features, self.skeleton, self.fps = features, skeleton, fps
+        self.contact_share = contact_share
         self._ends = skeleton.indices(*ENDS)
+        self._feet = skeleton.indices("left_ankle", "left_toe", "right_ankle", "right_toe")
         weights = torch.ones(len(skeleton))
         weights[self._ends] = end_weight
         self.register_buffer("_joint_weights", weights / weights.mean(), persistent=False)
@@ -91,7 +94,7 @@ class WatchRegression(Training):
         features, true, canonical = self._inputs(batch)
         output = self.net(features)
         last = output.motion.shape[1]
-        motion, true = output.motion.float(), true[:, -last:]
+        motion, true, contact = output.motion.float(), true[:, -last:], batch.foot_contact[:, -last:]
         joints, joints_true = (self._joints(each, batch, canonical) for each in (motion, true))
         error = motion - true
         rotation_error = _norm(rearrange(error[..., 3:], "batch time (joint entry) -> batch time joint entry", entry=6))
@@ -100,9 +103,11 @@ class WatchRegression(Training):
             "root": (_norm(error[..., :3]) + rotation_error[..., 0]).mean(),
             "rotation": rotation_error[..., 1:].mean(),
             "position": (distance * self._joint_weights).mean(),
-            "contact": F.binary_cross_entropy_with_logits(output.contact_logit.float(), batch.foot_contact[:, -last:]),
+            "contact": losses.balanced_cross_entropy(output.contact_logit.float(), contact, self.contact_share),
         }
         if last > 1:
+            feet = joints[:, :, self._feet].unflatten(2, (2, 2))
+            terms["skate"] = losses.foot_skate(feet, contact, torch.ones_like(contact[..., 0]), self.fps)
             velocity = _norm((joints - joints_true).diff(dim=1) * self.fps)
             terms |= {"foot_velocity": velocity[:, :, self._ends[2:]].mean(), "velocity": velocity.mean()}
         if output.ends is not None:
@@ -117,4 +122,4 @@ class WatchRegression(Training):
 
 def _norm(value: Float[Tensor, "*batch axis"]) -> Float[Tensor, "*batch"]:
     """Norm over the last axis, smoothed at zero."""
-    return (value.square().sum(-1) + EPSILON_M2).sqrt()
+    return (value.square().sum(-1) + losses.EPSILON_M2).sqrt()

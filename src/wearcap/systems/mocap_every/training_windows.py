@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from wearcap.data.bodies import Proportions, with_proportions
 from wearcap.data.features import body_size, true_foot_contact
 from wearcap.data.transforms import Cut, Draws, Window, joint_twins
 from wearcap.data.windows import Content
@@ -52,9 +53,11 @@ class WatchContent(Content):
     """
 
     draws = ("shift", "mirror", "yaw", "begins", "begin", "speed", "scale")
+    any_body = True
 
-    def open(self, store: RecordingStore, name: str, every: int) -> _WatchTrack:
+    def open(self, store: RecordingStore, name: str, every: int, body: Proportions | None = None) -> _WatchTrack:
         recording = RecordingFile(store.path_of(name)).load()
+        recording = recording if body is None else with_proportions(recording, body)
         motion, head = recording.motion, recording.head
         assert motion is not None
         assert head is not None
