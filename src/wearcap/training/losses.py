@@ -48,11 +48,15 @@ def joint_velocity(
 
 
 def balanced_cross_entropy(
-    logit: Float[Tensor, "batch time foot"], contact: Float[Tensor, "batch time foot"], share: float
+    logit: Float[Tensor, "batch time foot"],
+    contact: Float[Tensor, "batch time foot"],
+    share: float,
+    weight: Float[Tensor, "batch time"],
 ) -> Float[Tensor, ""]:
     """Cross entropy in which contact, a `share` of the training's labels, and its absence weigh alike (ours)."""
-    weight = torch.where(contact > 0.5, 0.5 / share, 0.5 / (1 - share))
-    return F.binary_cross_entropy_with_logits(logit, contact, weight)
+    balance = torch.where(contact > 0.5, 0.5 / share, 0.5 / (1 - share))
+    error = F.binary_cross_entropy_with_logits(logit, contact, balance, reduction="none")
+    return masked_mean(error.mean(-1), weight)
 
 
 def foot_skate(

@@ -19,6 +19,8 @@ from wearcap.systems.hmd2.training_windows import HeadContent, HeadWindow
 from wearcap.training import losses
 from wearcap.training.base import OptimizerOf, SchedulerOf, Training
 
+CONTACT_LOGIT = 4.0
+"""Logit of a contact whose predicted feature is 1; features of contacts are from -1 to 1."""
 _TAIL_FRAMES = 20
 """Decay length, in frames, of the extra loss weight of a window's last frames."""
 
@@ -26,7 +28,8 @@ _TAIL_FRAMES = 20
 class MotionDiffusion(Training):
     """x0-prediction under one noise level per window; loss terms are weighed by `loss_weights`.
 
-    "motion" is the thesis's plain MSE; "joints", "velocity" and "skate" are ours (0 leaves them out). Levels are drawn
+    "motion" is the thesis's plain MSE; "joints", "velocity", "skate" and "contact" (cross entropy in which both classes
+    weigh alike: `contact_share` of the labels are contact) are ours (0 leaves them out). Levels are drawn
     with a density proportional to the level to the power of `level_tilt`: 0 draws them uniformly, as the thesis does;
     more (ours) favours high noise levels, on which sampling in few steps depends. Points and images are each replaced
     by their null vector with probability `drop` per window, so that one checkpoint runs with any subset of them.
@@ -48,6 +51,7 @@ class MotionDiffusion(Training):
         level_tilt: float = 0.0,
         drop: float = 0.0,
         tail: float = 0.0,
+        contact_share: float = 0.5,
         place_encoder: VoxelAutoencoder | None = None,
         image_encoder: str | None = None,
         image_size: int = 0,
@@ -66,7 +70,7 @@ class MotionDiffusion(Training):
         self.place_encoder = None if place_encoder is None else place_encoder.requires_grad_(False).eval()
         self.image_encoder, self.drop, self.tail = image_encoder, drop, tail
         self.features, self.schedule, self.skeleton, self.fps = features, schedule, skeleton, fps
-        self.level_tilt = level_tilt
+        self.level_tilt, self.contact_share = level_tilt, contact_share
         self._feet = [skeleton.index(f"{side}_{joint}") for side in ("left", "right") for joint in ("ankle", "toe")]
         # Methods, since compiled modules would put every weight into checkpoints a second time.
         self._denoise = torch.compile(self.net.forward) if compile else self.net.forward
@@ -127,7 +131,7 @@ class MotionDiffusion(Training):
         x0 = self.net.motion_normalizer(motion)
         x0_hat = self._predicted(batch, x0)
         terms = {"motion": losses.motion_mse(x0_hat, x0, weight)}
-        if any(self.loss_weights.get(name) for name in ("joints", "velocity", "skate")):
+        if any(self.loss_weights.get(name) for name in ("joints", "velocity", "skate", "contact")):
             motion_hat = self.net.motion_normalizer.inverse(x0_hat.float())
             R_hat, _ = self.features.decode(motion_hat, batch.R_world_head)
             # As anchoring the body to the true head gives them.
@@ -138,6 +142,9 @@ class MotionDiffusion(Training):
             feet = rearrange(feet, "batch time (foot point) axis -> batch time foot point axis", foot=FEET)
             feet = feet + batch.t_world_head[:, :, None, None]
             terms["skate"] = losses.foot_skate(feet, batch.foot_contact, weight, self.fps)
+            if self.features.contacts:
+                logit = CONTACT_LOGIT * motion_hat[..., -FEET:]
+                terms["contact"] = losses.balanced_cross_entropy(logit, batch.foot_contact, self.contact_share, weight)
         return terms
 
 

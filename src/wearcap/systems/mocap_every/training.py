@@ -95,6 +95,7 @@ class WatchRegression(Training):
         output = self.net(features)
         last = output.motion.shape[1]
         motion, true, contact = output.motion.float(), true[:, -last:], batch.foot_contact[:, -last:]
+        every = torch.ones_like(contact[..., 0])
         joints, joints_true = (self._joints(each, batch, canonical) for each in (motion, true))
         error = motion - true
         rotation_error = _norm(rearrange(error[..., 3:], "batch time (joint entry) -> batch time joint entry", entry=6))
@@ -103,11 +104,11 @@ class WatchRegression(Training):
             "root": (_norm(error[..., :3]) + rotation_error[..., 0]).mean(),
             "rotation": rotation_error[..., 1:].mean(),
             "position": (distance * self._joint_weights).mean(),
-            "contact": losses.balanced_cross_entropy(output.contact_logit.float(), contact, self.contact_share),
+            "contact": losses.balanced_cross_entropy(output.contact_logit.float(), contact, self.contact_share, every),
         }
         if last > 1:
             feet = joints[:, :, self._feet].unflatten(2, (2, 2))
-            terms["skate"] = losses.foot_skate(feet, contact, torch.ones_like(contact[..., 0]), self.fps)
+            terms["skate"] = losses.foot_skate(feet, contact, every, self.fps)
             velocity = _norm((joints - joints_true).diff(dim=1) * self.fps)
             terms |= {"foot_velocity": velocity[:, :, self._ends[2:]].mean(), "velocity": velocity.mean()}
         if output.ends is not None:
