@@ -45,6 +45,7 @@ BODY = {
 OBJECTS = {
     **BODY,
     "v2v_cm": "E_v2v (cm)",
+    "symmetric_v2v_cm": "E_v2v modulo symmetry (cm)",
     "add_s_cm": "ADD-S (cm)",
     "center_cm": "E_c (cm)",
     "rotation_deg": "rotation (°)",
@@ -77,9 +78,14 @@ TRAININGS: dict[str, tuple[str, ...]] = {
     "echo_without_people": (*SHORT, "data.sources.cmu=null"),
     "echo_without_auxiliary": (
         *SHORT,
-        "model.loss_weights={object_vertices: 0.0, joints: 0.0, velocity: 0.0, skate: 0.0}",
+        "model.loss_weights={object_vertices: 0.0, joints: 0.0, velocity: 0.0, skate: 0.0, held: 0.0, foot_contact: 0.0}",
     ),
-    "echo_paper_losses": (*SHORT, "model.loss_weights={object_vertices: 0.1, joints: 0.1, velocity: 0.0, skate: 0.05}"),
+    "echo_paper_losses": (
+        *SHORT,
+        "model.loss_weights={object_vertices: 0.1, joints: 0.1, velocity: 0.0, skate: 0.05, held: 0.0, foot_contact: 0.0}",
+    ),
+    "echo_true_orientations": (*SHORT, "data.dataset.content.canonical=false"),
+    "echo_without_lead": (*SHORT, "model.levels.lead=[]", "model.levels.chances=[]"),
     "echo_three_streams": (*SHORT, "model.net.streams=3"),
     "bodiffusion_object": ("experiment=baseline/bodiffusion_object",),
     "bodiffusion_object_window": ("experiment=baseline/bodiffusion_object", "features.frame=window"),
@@ -100,6 +106,8 @@ ABLATIONS: dict[str, tuple[str, ...]] = {
     "no humans alone": ("echo_without_people", *UNGUIDED),
     "no auxiliary losses": ("echo_without_auxiliary", *UNGUIDED),
     "the paper's weights of losses": ("echo_paper_losses", *UNGUIDED),
+    "objects asked for as they are, not modulo symmetry": ("echo_true_orientations", *UNGUIDED),
+    "contacts learned as often as the rest, none in the lead": ("echo_without_lead", *UNGUIDED),
     "three tokens per frame": ("echo_three_streams", *UNGUIDED),
 }
 RIVALS: dict[str, tuple[str, ...]] = {
@@ -341,6 +349,7 @@ LABELS = {
     "foot_contact": ("FC", 2),
     "true_foot_contact": ("FC, truth", 2),
     "v2v_cm": ("E_v2v (cm)", 1),
+    "symmetric_v2v_cm": ("E_v2v modulo symmetry (cm)", 1),
     "center_cm": ("E_c (cm)", 1),
     "add_s_cm": ("ADD-S (cm)", 1),
     "rotation_deg": ("rotation (°)", 1),

@@ -15,10 +15,11 @@ from wearcap.data.transforms import Cut, Draws, EarlyEnd, Mirror, Shift, mirrore
 from wearcap.data.windows import Source, Windows, collate
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.rotation import about_axis, geodesic, yaw_of
 from wearcap.systems.echo.features import POINTS
 from wearcap.systems.echo.observations import ObjectReader, ObjectShape
 from wearcap.systems.echo.scores import body_contact
-from wearcap.systems.echo.training_windows import EchoContent, EchoTrack
+from wearcap.systems.echo.training_windows import ASKEW_DEG, EchoContent, EchoTrack
 from wearcap_testing import small_dataset
 
 SKELETON = xsens23()
@@ -249,3 +250,50 @@ def test_poses_in_a_window_are_rigid(root):
     assert isinstance(window.T_world_object, Rigid)
     turned = window.R_world_object.mT @ window.R_world_object
     torch.testing.assert_close(turned, torch.eye(3).expand_as(turned), atol=1e-5, rtol=0)
+
+
+def test_canonical_poses_look_the_same_whichever_side_was_up(root):
+    """The surface is where it was, and windows of the box turned by half a turn in its own axes ask for the same pose."""
+    recording, shape = carrying(2.0), dataset(root).track(0).objects[0]
+    track = track_of(recording, boxes())
+    for T in track.T_world_canonical:
+        error = shape.symmetry.vertex_error_cm(
+            shape.of_mesh(T), shape.of_mesh(track.T_world_object), shape.cloud + shape.middle
+        )
+        assert error.max() < 0.5
+    half = Rigid(torch.diag(torch.tensor([-1.0, -1.0, 1.0])), torch.zeros(3))
+    about = Rigid(torch.eye(3), shape.middle) @ half @ Rigid(torch.eye(3), -shape.middle)
+    poses = recording.object_motion["box_1"]
+    T = poses.T_world_body @ about
+    turned = replace(recording, object_motion={"box_1": replace(poses, R_world_body=T.R, t_world_body=T.t)})
+    for one, other in zip(track.T_world_canonical, track_of(turned, boxes()).T_world_canonical):
+        torch.testing.assert_close(one.R, other.R, atol=1e-3, rtol=0)
+        torch.testing.assert_close(one.t, other.t, atol=1e-3, rtol=0)
+
+
+def test_in_a_mirror_the_canonical_pose_is_that_of_the_mirrored_recording(root):
+    """What a mirrored window asks for is near the heading turned to the same side as in windows as they are."""
+    plain, images = dataset(root), mirror_images(root)
+    shape = mirrored_shape(plain.track(0).objects[0])
+    touched = int((plain.track(0).contact[:, :BODY_POINTS] > 0).any(1).float().argmax())
+    for k in range(4):
+        window = images[k]
+        first = touched - int(plain.starts[k, 1])
+        if not 0 <= first < WINDOW:
+            continue
+        heading = yaw_of(window.R_world_point[first, 0]) + torch.tensor(ASKEW_DEG).deg2rad()
+        alike = shape.symmetry.alike(
+            Rigid(window.R_world_object[first], window.t_world_object[first]), about_axis("z", heading)
+        )
+        away = geodesic(alike.R, about_axis("z", heading).double().expand_as(alike.R))
+        mine = geodesic(window.R_world_canonical[first], about_axis("z", heading))
+        assert mine.item() == pytest.approx(away.min().item(), abs=0.02)
+        return
+    pytest.fail("no window in which the box is touched first")
+
+
+def test_without_canonical_poses_the_true_ones_are_asked_for(root):
+    content = EchoContent(small_features(), None, canonical=False)
+    window = Windows([Source(root)], "train", content=content, window=WINDOW, stride=4, fps=30.0, every=None)[1]
+    assert torch.equal(window.R_world_canonical, window.R_world_object)
+    assert torch.equal(window.t_world_canonical, window.t_world_object)

@@ -89,8 +89,38 @@ def test_as_many_windows_as_asked_for_are_known_whole(whole):
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"whole": 1.0}, {"ramp": [20, 10]}, {"ramp": [0, 5]}, {"independent": 0.7, "conveyor": 0.6}]
+    "wrong",
+    [
+        {"lead": [0.0, 0.0, 1.0]},
+        {"chances": [1.0, -1.0, 1.0]},
+        {"whole": 1.0},
+        {"ramp": [20, 10]},
+        {"ramp": [0, 5]},
+        {"independent": 0.7, "conveyor": 0.6},
+    ],
 )
 def test_shares_and_ramps_that_cannot_be_are_refused(wrong):
     with pytest.raises(WearcapError, match="Expected shares that add up"):
         LevelMix(**{"independent": 0.25, "conveyor": 0.6, "observed": 0.15} | wrong)
+
+
+def test_a_modality_in_the_lead_is_denoised_first():
+    levels, _ = drawn(independent=0.0, conveyor=1.0, observed=0.0, lead=[0.0, 0.0, 0.5], ramp=[10, 10])
+    human, scene_object, contact = levels.unbind(-1)
+    assert torch.equal(human, scene_object)
+    assert (contact <= human).all()
+    inside = (human > 0) & (human < 1)
+    assert ((contact < human - 0.1) & inside).float().mean() > 0.1
+    first = (human >= 1).float().argmax(1)
+    newest = (human.amax(1) >= 1) & (first > 0)
+    assert (contact[newest, first[newest]] == 1).all(), "all enter as noise"
+    slopes = contact.diff(dim=1)[(contact[:, 1:] < 1) & (contact[:, :-1] > 0)]
+    assert slopes.min() >= 1 / 10 - 1e-5
+    assert slopes.max() <= 1 / 5 + 1e-5
+
+
+def test_the_observed_modality_is_drawn_by_its_chance():
+    levels, _ = drawn(independent=1.0, conveyor=0.0, observed=1.0, whole=0.99, chances=[1.0, 0.0, 3.0])
+    share = (levels == 0).any(1).float().mean(0)
+    assert share[1] == 0
+    assert (share[2] / share[0]).item() == pytest.approx(3.0, rel=0.15)

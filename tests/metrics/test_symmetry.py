@@ -80,6 +80,33 @@ def test_rotations_are_measured_modulo_the_symmetry():
             assert found == pytest.approx(expected, abs=1.0), (name, axis, degrees)
 
 
+def test_vertices_are_measured_from_the_pose_that_looks_the_same():
+    """Turned about its own middle by its symmetry an object is where it was; moved besides, it is as far off as it was moved;
+    a chair has no second side."""
+    random = torch.Generator().manual_seed(0)
+    for name, axis, degrees in (("suitcase", "z", 180.0), ("bottle", "z", 123.0), ("ball", "x", 71.0)):
+        mesh = movable(name)
+        mesh = replace(mesh, vertices=mesh.vertices + np.float32([0.1, -0.2, 0.05]))
+        symmetry, cloud = symmetry_of(mesh), object_cloud(mesh)
+        center = symmetry.center
+        place = Rigid(
+            rotation.exp(torch.randn(4, 3, generator=random).double()), torch.randn(4, 3, generator=random).double()
+        )
+        turn = about(axis, degrees).R[0]
+        turned = place @ Rigid(turn, center - turn @ center)
+        allowed = 2 * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+        assert vertex_error_cm(turned, place, cloud.double()).min() > 5, name
+        assert symmetry.vertex_error_cm(turned, place, cloud).max() < allowed, name
+        moved = Rigid(turned.R, turned.t + torch.tensor([0.3, 0.0, 0.0]))
+        assert symmetry.vertex_error_cm(moved, place, cloud).mean().item() == pytest.approx(30, abs=allowed), name
+        back = symmetry.nearest(turned, place.R)
+        assert rotation.geodesic(back.R, place.R).max() < 0.1 or len(symmetry.axes) > 1, name
+    chair, level = movable("chair"), about("z", 0.0)
+    cloud, turned = object_cloud(chair), about("z", 180.0)
+    found = symmetry_of(chair).vertex_error_cm(turned, level, cloud).item()
+    assert found == pytest.approx(vertex_error_cm(turned, level, cloud.double()).item())
+
+
 def test_the_closest_surface_does_not_know_the_sides_of_a_suitcase():
     mesh = movable("suitcase")
     cloud, surface = object_cloud(mesh), TriangleIndex.of(mesh)

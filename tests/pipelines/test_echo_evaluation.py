@@ -52,7 +52,7 @@ def perfect(truth):
 def test_the_truth_is_perfect(truth):
     scores = score_echo(perfect(truth), truth, "a", 0).scores
     zero = ("mpjpe_mm", "mpjve_mm", "v2v_cm", "center_cm", "rotation_deg", "quaternion", "busy_mpjpe_mm")
-    for name in (*zero, "symmetric_rotation_deg", "add_s_cm"):
+    for name in (*zero, "symmetric_rotation_deg", "symmetric_v2v_cm", "add_s_cm"):
         assert scores[name] == pytest.approx(0.0, abs=0.05), name
     assert scores["touch_f1"] == 1.0
     for name in ("foot_contact", "jitter_m_s3", "foot_skate_cm_s", "physicality", "floor_penetration_cm"):

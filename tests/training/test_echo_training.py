@@ -16,13 +16,14 @@ from wearcap.diffusion.levels import LevelMix
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.models.checkpoint import load_trained
 from wearcap.recording import RecordingStore
 from wearcap.systems.echo.features import OBJECT_SIZE
 from wearcap.systems.echo.model import EchoDenoiser
 from wearcap.systems.echo.scores import score_echo
-from wearcap.systems.echo.training import EchoDiffusion
+from wearcap.systems.echo.training import HANDS, STANDING, EchoDiffusion, balanced_cross_entropy
 from wearcap.systems.echo.training_windows import EchoContent, EchoWindow
 from wearcap_testing import benchmark, experiments, small_dataset
 
@@ -36,7 +37,9 @@ WEIGHTS = {
     "object_vertices": 1.0,
     "joints": 2.0,
     "velocity": 0.1,
-    "skate": 0.05,
+    "skate": 0.2,
+    "held": 0.1,
+    "foot_contact": 0.1,
 }
 
 
@@ -93,8 +96,9 @@ def test_the_truth_costs_nothing(data, people, frame):
     at = system.features.canonical(windows.points)
     system.net.outputs = system.truth(windows, at)
     for name, term in system.terms(windows).items():
-        if name != "skate":
+        if name not in ("skate", "foot_contact"):
             assert term < 0.005, name
+        assert name != "foot_contact" or term < 0.03, "what is left at targets of ±1"
     wrong = system.net.outputs.clone()
     wrong[..., 2] += 0.1
     system.net.outputs = wrong
@@ -115,7 +119,9 @@ def test_the_vertex_term_is_the_mean_over_the_points(data, frame):
     R, t = turn @ windows.R_world_object, windows.t_world_object + 0.2 * torch.randn_like(windows.t_world_object)
     first = system.net.sizes[0]
     outputs[..., first : first + OBJECT_SIZE] = system.features.encode_object(type(at)(R, t), at)
-    value = system.object_vertices(outputs, windows, at)
+    first = system.net.sizes[0]
+    T = system.features.decode_object(outputs[..., first : first + OBJECT_SIZE], at)
+    value = system.object_vertices(T, windows)
     torch.testing.assert_close(value, explicit_vertices(windows, cloud, R, t).mean(), atol=1e-4, rtol=1e-4)
 
 
@@ -129,6 +135,8 @@ def test_objects_that_are_not_there_count_for_nothing(data, people):
     other = mixed._replace(
         R_world_object=torch.where(none[..., None, None], rotation.exp(torch.ones(3)), mixed.R_world_object),
         t_world_object=torch.where(none[..., None], 9.0, mixed.t_world_object),
+        R_world_canonical=torch.where(none[..., None, None], rotation.exp(torch.ones(3)), mixed.R_world_canonical),
+        t_world_canonical=torch.where(none[..., None], 9.0, mixed.t_world_canonical),
         object_code=torch.where(none[..., None], 5.0, mixed.object_code),
     )
     for name, term in system.terms(mixed).items():
@@ -160,10 +168,58 @@ def test_padding_counts_for_nothing(data):
     other = windows._replace(
         t_world_root=torch.where(short[..., None], windows.t_world_root, 7.0),
         t_world_object=torch.where(short[..., None], windows.t_world_object, -7.0),
+        t_world_canonical=torch.where(short[..., None], windows.t_world_canonical, -7.0),
         contact=torch.where(short[..., None], windows.contact, 1.0),
     )
     for name, term in system.terms(windows).items():
         torch.testing.assert_close(system.terms(other)[name], term, msg=name)
+
+
+def test_an_object_that_slips_in_the_hand_costs_what_moves_with_it_does_not(data):
+    system = learner()
+    windows = batch(system.features, data)
+    time = torch.arange(windows.valid.shape[1])[:, None] / system.features.fps
+    true, speed = windows.T_world_object, 0.3
+    held = (windows.contact[..., HANDS["left_wrist"]] > 0).any(-1)
+    assert 0.3 < held.float().mean() <= 1
+    shifted = Rigid(true.R, true.t + speed * time * torch.tensor([0.0, 0.0, 1.0]))
+    share = (held[:, 1:] & held[:, :-1]).float().mean()
+    # The closed form of points that all move as one: the shift's velocity in the hand's own axes.
+    assert system.held(true, windows) < 1e-5
+    assert system.held(shifted, windows).item() > 0.5 * speed**2 * share.item()
+    wrist = Rigid(windows.R_world_point[:, :, 1], windows.t_world_point[:, :, 1])
+    rigid = wrist @ (wrist.inverse() @ true)[:, :1]
+    assert system.held(rigid, windows) < 1e-4, "the box is carried: constant in the hand"
+    none = windows._replace(contact=torch.zeros_like(windows.contact))
+    assert system.held(shifted, none) == 0
+
+
+def test_both_classes_of_foot_contact_count_alike():
+    """Where the share is the data's, saying always one costs as much as saying always the other."""
+    contact = (torch.arange(1000) < 1000 * STANDING).float()[None, :, None]
+    valid = torch.ones(1, 1000, dtype=torch.bool)
+    costs = [balanced_cross_entropy(torch.full_like(contact, value), contact, valid) for value in (-1.0, 1.0)]
+    assert costs[0].item() == pytest.approx(costs[1].item(), rel=0.01)
+    right = balanced_cross_entropy(2 * contact - 1, contact, valid)
+    assert right < 0.05 * costs[0]
+    assert balanced_cross_entropy(2 * contact - 1, contact, ~valid) == 0
+
+
+def test_alike_orientations_are_asked_for_where_no_clean_frame_shows_the_true_one(data):
+    windows = batch(small_features(), data)
+    half = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
+    windows = windows._replace(R_world_canonical=windows.R_world_object @ half)
+    levels = torch.full((*windows.valid.shape, 3), 0.5)
+    asked = EchoDiffusion.knowable(windows, levels)
+    assert torch.equal(asked.R_world_object, windows.R_world_canonical)
+    levels[::2, 3, 1] = 0.0
+    asked = EchoDiffusion.knowable(windows, levels)
+    assert torch.equal(asked.R_world_object[::2], windows.R_world_object[::2])
+    assert torch.equal(asked.R_world_object[1::2], windows.R_world_canonical[1::2])
+    levels[..., 1] = torch.where(windows.has_object, 0.5, 0.0)
+    without = windows._replace(has_object=torch.zeros_like(windows.has_object))
+    asked = EchoDiffusion.knowable(without, torch.zeros_like(levels))
+    assert torch.equal(asked.R_world_object, windows.R_world_canonical), "what is not there shows nothing"
 
 
 @pytest.mark.parametrize("frame", ["own", "window", "world"])

@@ -15,8 +15,9 @@ from torch import Tensor
 
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.rotation import geodesic
+from wearcap.geometry.rotation import exp, geodesic, quat_wxyz_from_matrix
 from wearcap.geometry.triangle_distance import TriangleIndex
+from wearcap.metrics.objects import vertex_error_cm
 
 SAME = 0.02
 """Share of the object's size (the diagonal of its box) within which a turn brings 95 % of its surface back to itself."""
@@ -36,6 +37,8 @@ class Symmetry:
     """The identity among them."""
     axes: Float[Tensor, "axis 3"]
     """Axes about which every turn does so: none of a suitcase, one of a bottle, three of a ball."""
+    center: Float[Tensor, "3"]
+    """Where all turns meet, in the mesh's axes (m)."""
 
     @classmethod
     def of(cls, mesh: Mesh, points: Float[Tensor, "point 3"], surface: TriangleIndex) -> "Symmetry":
@@ -62,7 +65,41 @@ class Symmetry:
             known = any(abs(axis @ other) > 0.97 for other in axes)
             if not known and all(kept(R) for R in Rotation.from_rotvec(steps[:, None] * axis).as_matrix()):
                 axes.append(axis)
-        return cls(torch.from_numpy(np.stack(turns)), torch.from_numpy(np.array(axes).reshape(-1, 3)))
+        found = np.stack(turns), np.array(axes).reshape(-1, 3), center
+        return cls(*(torch.from_numpy(part) for part in found))
+
+    def alike(self, T_world_mesh: Rigid, R_reference: Float[Tensor, "*batch 3 3"]) -> Rigid:
+        """All poses of the mesh that look the same, "*batch turn"; where they are a continuum, those of orientations that
+        are nearest to a reference."""
+        R, reference = T_world_mesh.R.double(), R_reference.double()
+        if len(self.axes) > 1:
+            turned = reference[..., None, :, :]
+        else:
+            turned = R[..., None, :, :] @ self.turns
+            if len(self.axes):
+                turned = turned @ _nearest_about(self.axes[0], turned.mT @ reference[..., None, :, :])
+        center = T_world_mesh.t.double() + (R @ self.center[:, None])[..., 0]
+        return Rigid(turned, center[..., None, :] - (turned @ self.center[:, None])[..., 0])
+
+    def nearest(self, T_world_mesh: Rigid, R_reference: Float[Tensor, "*batch 3 3"]) -> Rigid:
+        """The pose that looks the same as `T_world_mesh` and whose orientation is nearest to the reference."""
+        alike = self.alike(T_world_mesh, R_reference)
+        best = (alike.R * R_reference.double()[..., None, :, :]).sum((-1, -2)).argmax(-1, keepdim=True)
+        R = alike.R.take_along_dim(best[..., None, None], -3)[..., 0, :, :]
+        return Rigid(R, alike.t.take_along_dim(best[..., None], -2)[..., 0, :])
+
+    def vertex_error_cm(
+        self, T_found: Rigid, T_true: Rigid, vertices: Float[Tensor, "vertex 3"]
+    ) -> Float[Tensor, "*batch"]:
+        """E_v2v (cm) from the true pose or one that looks the same, whichever is nearest. Poses are of the mesh."""
+        alike = self.alike(T_true, T_found.R)
+        errors = [
+            vertex_error_cm(
+                T_found.to(torch.float64), Rigid(alike.R[..., k, :, :], alike.t[..., k, :]), vertices.double()
+            )
+            for k in range(alike.t.shape[-2])
+        ]
+        return torch.stack(errors).amin(0)
 
     def rotation_difference_deg(self, T_found: Rigid, T_true: Rigid) -> Float[Tensor, "*batch"]:
         """Smallest angle (degrees) between the captured and the true orientation, modulo the symmetry."""
@@ -74,6 +111,13 @@ class Symmetry:
             away = torch.linalg.cross(*ends).norm(dim=-1)
             return torch.atan2(away, (ends[0] * ends[1]).sum(-1)).amin(-1).rad2deg()
         return geodesic(found, true.expand_as(found)).amin(-1).rad2deg()
+
+
+def _nearest_about(axis: Float[Tensor, "3"], R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """The turn about an axis that is nearest to a rotation: the twist of its quaternion."""
+    quat_wxyz = quat_wxyz_from_matrix(R)
+    angle = 2 * torch.atan2((quat_wxyz[..., 1:] * axis).sum(-1), quat_wxyz[..., 0])
+    return exp(angle[..., None] * axis)
 
 
 def _center_and_axes(mesh: Mesh) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3 3"]]:

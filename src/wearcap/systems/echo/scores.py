@@ -137,6 +137,9 @@ def score_echo(motion: Motion, truth: Truth, name: str, seed: int) -> Row:
             T_found, T_true = shape.centred(_poses_at(track, motion.timestamps[rows])), T_true[rows]
             for key, value in {
                 "v2v_cm": object_metrics.vertex_error_cm(T_found, T_true, shape.cloud),
+                "symmetric_v2v_cm": shape.symmetry.vertex_error_cm(
+                    shape.of_mesh(T_found), shape.of_mesh(T_true), shape.cloud + shape.middle
+                ),
                 "center_cm": object_metrics.center_error_cm(T_found, T_true, shape.cloud),
                 "rotation_deg": object_metrics.rotation_difference_deg(T_found, T_true),
                 "quaternion": object_metrics.quaternion_difference(T_found, T_true),

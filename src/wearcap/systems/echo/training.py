@@ -3,12 +3,13 @@
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional as F
 
-from wearcap.body.contact_points import BODY_POINTS
+from wearcap.body.contact_points import BODY_POINTS, HAND_POINTS
 from wearcap.body.kinematics import forward_kinematics
-from wearcap.body.skeleton import Skeleton
+from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
 from wearcap.data.windows import MIN_SCALE, Windows, drawn_batches, standardize
 from wearcap.diffusion.levels import LevelMix
 from wearcap.diffusion.process import add_noise
@@ -16,13 +17,20 @@ from wearcap.diffusion.schedule import Schedule
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.point_encoder import PointNeXt
-from wearcap.systems.echo.features import CONTACTS, OBJECT_SIZE, Body, EchoFeatures
+from wearcap.systems.echo.features import CONTACTS, OBJECT_SIZE, POINTS, Body, EchoFeatures
 from wearcap.systems.echo.model import MODALITIES, EchoDenoiser
 from wearcap.systems.echo.pipeline import Echo
 from wearcap.systems.echo.queue import EchoModel
 from wearcap.systems.echo.training_windows import EchoContent, EchoWindow
 from wearcap.training import losses
 from wearcap.training.base import OptimizerOf, SchedulerOf, Training
+
+HANDS = {"left_wrist": slice(0, HAND_POINTS), "right_wrist": slice(BODY_POINTS // 2, BODY_POINTS // 2 + HAND_POINTS)}
+"""Points of the body that are each hand's."""
+STANDING = 0.73
+"""Share of the training frames in which a foot's patch is on the floor."""
+SLOPE = 4.0
+"""Logit of a contact per unit of the output: at its target, ±1, the probability is 0.98."""
 
 
 class EchoDiffusion(Training):
@@ -31,8 +39,10 @@ class EchoDiffusion(Training):
     Loss terms, weighted by `loss_weights`: "human", "object" and "contact" are mean squares in normalised space (the
     first three of eq. 12; squares are ours: their minimiser is the posterior mean, which the sampler's step expects
     as x̂0); "object_vertices" (root mean square over the surface, in closed form without vertices), "joints" and
-    "skate" are distances in metres (its last three); "velocity" of the joints is ours. Frames without an active
-    object do not count in the object terms.
+    "skate" are distances in metres (its last three). Ours: "velocity" of the joints; "held", how the object moves in the hand
+    that touches it; "foot_contact", cross entropy of the feet's contact, both classes alike. Frames without an active object do
+    not count in the object terms. An object that looks the same from several sides is asked for in the orientation that can
+    be known (`training_windows.canonical`), unless clean frames show another.
     """
 
     system = Echo
@@ -81,7 +91,8 @@ class EchoDiffusion(Training):
         for batch in drawn_batches(dataset, limit, 100):
             frame = self.features.canonical(batch.points)
             rows["human"].append(self.features.encode_body(batch.body, frame)[batch.valid])
-            scene_object = self.features.encode_object(batch.T_world_object, frame)
+            canonical = Rigid(batch.R_world_canonical, batch.t_world_canonical)
+            scene_object = self.features.encode_object(canonical, frame)
             rows["object"].append(scene_object[batch.valid & batch.has_object])
             rows["condition"].append(self.features.condition(batch.points, batch.floor_height, batch.size)[batch.valid])
         human, scene_object, condition = (torch.cat(part) for part in rows.values())
@@ -120,6 +131,17 @@ class EchoDiffusion(Training):
         blank = torch.cat([human, torch.zeros_like(scene_object), -torch.ones_like(contact)], -1)
         return torch.where(self._counts(batch), x0, blank)
 
+    @staticmethod
+    def knowable(batch: EchoWindow, levels: Float[Tensor, "batch time modality"]) -> EchoWindow:
+        """The batch with canonical poses of all objects that no clean frame shows."""
+        clean = batch.has_object & batch.valid & (levels[..., 1] == 0)
+        same = (batch.object_mean[:, :, None] == batch.object_mean[:, None]).all(-1)
+        shown = (same & clean[:, None]).any(-1)[..., None]
+        return batch._replace(
+            R_world_object=torch.where(shown[..., None], batch.R_world_object, batch.R_world_canonical),
+            t_world_object=torch.where(shown, batch.t_world_object, batch.t_world_canonical),
+        )
+
     def _counts(self, batch: EchoWindow) -> Tensor:
         """Mask of meaningful features: all with an active object, else human and foot contacts."""
         always = torch.ones(sum(self.net.sizes), dtype=torch.bool, device=batch.valid.device)
@@ -130,7 +152,9 @@ class EchoDiffusion(Training):
     def terms(self, batch: EchoWindow) -> dict[str, Tensor]:
         """Every loss term of a batch, unweighted."""
         frame = self.features.canonical(batch.points)
-        x0, levels = self.truth(batch, frame), self.levels(batch)
+        levels = self.levels(batch)
+        batch = self.knowable(batch, levels)
+        x0 = self.truth(batch, frame)
         x_t = add_noise(x0, batch.noise, self.net.per_feature(levels), self.schedule)
         condition = self.features.condition(batch.points, batch.floor_height, batch.size, frame)
         encoded = self.net.encode(condition, self.net.object(batch.object_code), batch.has_object, batch.valid)
@@ -145,8 +169,13 @@ class EchoDiffusion(Training):
             }
             if not self.contacts:
                 terms.pop("contact")
+            else:
+                feet = x0_hat[..., -len(FOOT_PATCHES) :]
+                terms["foot_contact"] = balanced_cross_entropy(feet, batch.contact[..., BODY_POINTS:], batch.valid)
             outputs = self.net.motion_normalizer.inverse(x0_hat)
-            terms["object_vertices"] = self.object_vertices(outputs, batch, frame)
+            first = self.net.sizes[0]
+            T_object = self.features.decode_object(outputs[..., first : first + OBJECT_SIZE], frame)
+            terms["object_vertices"], terms["held"] = self.object_vertices(T_object, batch), self.held(T_object, batch)
             body = self.features.decode_body(outputs[..., : self.net.sizes[0]], frame)
             predicted, true = self._joints(body, batch), self._joints(batch.body, batch)
             terms["joints"] = losses.joint_position(predicted, true, weight)
@@ -159,16 +188,50 @@ class EchoDiffusion(Training):
         """Joint positions in the world (m)."""
         return forward_kinematics(self.skeleton, *body, batch.t_parent_joint[:, None]).t
 
-    def object_vertices(
-        self, outputs: Float[Tensor, "batch time feature"], batch: EchoWindow, frame: Rigid
-    ) -> Float[Tensor, ""]:
-        """Root mean squared distance (m) between the points of the predicted and the true surface:
-        ‖Δt‖² + 2 Δt·ΔR μ + tr ΔR S ΔRᵀ."""
-        first = self.net.sizes[0]
-        T = self.features.decode_object(outputs[..., first : first + OBJECT_SIZE], frame)
-        turn, shift = T.R - batch.R_world_object, T.t - batch.t_world_object
-        mean = (turn @ batch.object_mean[..., None])[..., 0]
-        turned = (turn @ batch.object_spread * turn).sum((-1, -2))
-        square = shift.square().sum(-1) + 2 * (shift * mean).sum(-1) + turned
+    @staticmethod
+    def object_vertices(T_world_object: Rigid, batch: EchoWindow) -> Float[Tensor, ""]:
+        """Root mean squared distance (m) between the points of the predicted and the true surface."""
+        turn, shift = T_world_object.R - batch.R_world_object, T_world_object.t - batch.t_world_object
+        square = _mean_square(turn, shift, batch.object_mean, batch.object_spread)
         distance = (square.clamp_min(0) + losses.EPSILON_M2).sqrt()
         return losses.masked_mean(distance, (batch.valid & batch.has_object).float())
+
+    def held(self, T_world_object: Rigid, batch: EchoWindow) -> Float[Tensor, ""]:
+        """Mean squared error (m²/s²) of the velocity of the object's surface relative to a wrist whose hand touches it, the
+        wrists as they were measured."""
+        term = T_world_object.t.new_zeros(())
+        for wrist, points in HANDS.items():
+            at = POINTS.index(wrist)
+            if at >= len(self.features.points):
+                continue
+            T_wrist_world = Rigid(batch.R_world_point[:, :, at], batch.t_world_point[:, :, at]).inverse()
+            found, true = T_wrist_world @ T_world_object, T_wrist_world @ batch.T_world_object
+            turn, shift = (self.features.fps * (a - b).diff(dim=1) for a, b in ((found.R, true.R), (found.t, true.t)))
+            square = _mean_square(turn, shift, batch.object_mean[:, 1:], batch.object_spread[:, 1:])
+            same = (batch.object_mean[:, 1:] == batch.object_mean[:, :-1]).all(-1)
+            held = (batch.contact[..., points] > 0).any(-1) & batch.valid & batch.has_object
+            term = term + losses.masked_mean(square, (held[:, 1:] & held[:, :-1] & same).float())
+        return term
+
+
+def _mean_square(
+    turn: Float[Tensor, "batch time 3 3"],
+    shift: Float[Tensor, "batch time 3"],
+    mean: Float[Tensor, "batch time 3"],
+    spread: Float[Tensor, "batch time 3 3"],
+) -> Float[Tensor, "batch time"]:
+    """Mean of ‖A p + b‖² over an object's points, from their mean and second moment: ‖b‖² + 2 b·A μ + tr A S Aᵀ."""
+    along = (shift * (turn @ mean[..., None])[..., 0]).sum(-1)
+    return shift.square().sum(-1) + 2 * along + (turn @ spread * turn).sum((-1, -2))
+
+
+def balanced_cross_entropy(
+    output: Float[Tensor, "batch time patch"],
+    contact: Float[Tensor, "batch time patch"],
+    valid: Bool[Tensor, "batch time"],
+) -> Float[Tensor, ""]:
+    """Cross entropy of contacts, from outputs whose targets are ±1, weighted so that both classes count alike."""
+    there = contact > 0.5
+    weight = torch.where(there, 0.5 / STANDING, 0.5 / (1 - STANDING))
+    entropy = F.binary_cross_entropy_with_logits(SLOPE * output, there.to(output), weight, reduction="none")
+    return losses.masked_mean(entropy.mean(-1), valid.float())

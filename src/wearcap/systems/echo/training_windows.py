@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cache, cached_property
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -16,6 +17,7 @@ from wearcap.data.features import body_size
 from wearcap.data.transforms import Cut, Draws, Window, joint_twins
 from wearcap.data.windows import Content, Windows
 from wearcap.diffusion.levels import DRAWS
+from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.environment import read_environment
 from wearcap.models.checkpoint import load_network
@@ -30,6 +32,10 @@ from wearcap.systems.echo.scores import body_contact, foot_patches
 
 MIN_FRAMES = 6
 """Length of the shortest training window (frames)."""
+CANONICAL = "canonical", "canonical_mirrored"
+"""Names of the objects' canonical poses, for windows as they are and for mirrored ones."""
+ASKEW_DEG = 22.5
+"""Angle between the wearer's heading and the orientation to which the canonical ones are nearest."""
 
 
 class EchoWindow(NamedTuple):
@@ -51,6 +57,9 @@ class EchoWindow(NamedTuple):
     """Class, extents and feature of the active object (`ObjectShape.code`)."""
     R_world_object: Float[Tensor, "*batch time 3 3"]
     t_world_object: Float[Tensor, "*batch time 3"]
+    R_world_canonical: Float[Tensor, "*batch time 3 3"]
+    """The object's pose, or another that looks the same (`canonical`)."""
+    t_world_canonical: Float[Tensor, "*batch time 3"]
     object_mean: Float[Tensor, "*batch time 3"]
     object_spread: Float[Tensor, "*batch time 3 3"]
     """Mean (m) of the object's points about its centre, and second moment (m²), which gives their mean squared
@@ -93,6 +102,8 @@ class EchoTrack:
     """Index of the active object in `objects`, -1 without one."""
     T_world_object: Rigid
     """Pose of the active object's centre; the identity without one."""
+    T_world_canonical: tuple[Rigid, Rigid]
+    """The same, or other poses that look the same (`canonical`): for the windows as they are, and for mirrored ones."""
 
     @cached_property
     def twins(self) -> dict[str, list[int]]:
@@ -140,11 +151,45 @@ class EchoTrack:
             R[rows], t[rows] = T.R, T.t
             skin = surface.vertices(body[take[rows]])
             contact[rows, : CONTACTS - len(FOOT_PATCHES)] = body_contact(skin, shape, T, within_m).float()
+        first = points.R_world_point[:, 0], (contact > 0).any(1), active
+        alike = [canonical(Rigid(R, t), objects, *first, side) for side in (1.0, -1.0)]
         contact[:, CONTACTS - len(FOOT_PATCHES) :] = foot_patches(recording)[take].float()
         floor = recording.floor.height[take] if recording.floor is not None else torch.zeros(len(take))
         wearer = floor.float(), motion.skeleton, body_size(motion.skeleton)
         truth = Body(motion.R_parent_joint[take], motion.t_world_root[take])
-        return cls(points, *wearer, truth, contact, objects, active, Rigid(R, t))
+        return cls(points, *wearer, truth, contact, objects, active, Rigid(R, t), (alike[0], alike[1]))
+
+
+def canonical(
+    T_world_object: Rigid,
+    objects: list[ObjectShape],
+    R_world_head: Float[Tensor, "time 3 3"],
+    touched: Bool[Tensor, "time"],
+    active: Int64[Tensor, "time"],
+    side: float = 1.0,
+) -> Rigid:
+    """Poses of the active object's centre that look the same and that a network can know: of all orientations that are alike
+    by the object's symmetry, the one nearest to the wearer's heading when the object is first touched, for as long as it is
+    active.
+
+    The heading is turned by `ASKEW_DEG` to the left (`side` 1) or right (-1, for mirrored windows), as objects are often
+    held along or across it, and the choice must not lie on an edge.
+    """
+    R, t = T_world_object.R.clone(), T_world_object.t.clone()
+    askew = torch.tensor(side * ASKEW_DEG).deg2rad()
+    begins = [0, *(active.diff().nonzero()[:, 0] + 1).tolist(), len(active)]
+    for start, stop in pairwise(begins):
+        if active[start] == NO_OBJECT:
+            continue
+        shape = objects[int(active[start])]
+        first = start + int(touched[start:stop].float().argmax())
+        heading = rotation.about_axis("z", rotation.yaw_of(R_world_head[first]) + askew)
+        before = shape.of_mesh(T_world_object[first])
+        # The turn in the mesh's axes that this moment asks for is the whole act's.
+        turn = before.to(torch.float64).inverse() @ shape.symmetry.nearest(before, heading)
+        act = shape.centred(shape.of_mesh(T_world_object[start:stop]).to(torch.float64) @ turn)
+        R[start:stop], t[start:stop] = act.R.to(R), act.t.to(t)
+    return Rigid(R, t)
 
 
 class EchoContent(Content):
@@ -162,13 +207,14 @@ class EchoContent(Content):
         encoder: PointNeXt | str | None = "object_encoder",
         within_m: float = TOUCH_M,
         objects: bool = True,
+        canonical: bool = True,
     ):
         """`encoder` is a checkpoint of experiment=object_encoder, or another PointNeXt; None: no shape feature.
 
         A body point is in contact within `within_m` of the object's surface. With `objects` False all recordings are of
-        humans alone. Raises WearcapError when the checkpoint is missing, damaged or another network's.
+        humans alone. `canonical`: objects' poses that nobody observed are to be found modulo their symmetry (ours). Raises WearcapError when the checkpoint is missing, damaged or another network's.
         """
-        self.features, self.within_m, self.objects = features, within_m, objects
+        self.features, self.within_m, self.objects, self.canonical = features, within_m, objects, canonical
         if isinstance(encoder, str):
             encoder = load_network(encoder, PointNeXt, "object_encoder", part="net.encoder").requires_grad_(False)
         self.encoder = encoder
@@ -190,15 +236,13 @@ class EchoContent(Content):
         return Cut(start // every, windows.window, length, windows.stride, latest=latest, stretch=windows.stretch)
 
     def read(self, track: EchoTrack, cut: Cut, random: Draws) -> Window:
-        true = track.body._asdict() | {
-            "contact": track.contact,
-            "R_world_object": track.T_world_object.R,
-            "t_world_object": track.T_world_object.t,
-        }
+        poses = {"object": track.T_world_object, **dict(zip(CANONICAL, track.T_world_canonical))}
+        poses = {f"{kind}_world_{name}": getattr(T, kind) for name, T in poses.items() for kind in "Rt"}
+        true = track.body._asdict() | {"contact": track.contact} | poses
         values = {name: cut.take(name, part) for name, part in true.items()}
         low, high, _ = cut.between()
         changes = track.active[low] != track.active[high]
-        for name in ("R_world_object", "t_world_object"):
+        for name in poses:
             # Nothing is between the poses of two objects.
             values[name][changes] = true[name][cut.frames[changes]]
         sensed = track.points._asdict() | {"floor_height": track.floor_height}
@@ -225,8 +269,11 @@ class EchoContent(Content):
             code[:, len(self.features.classes) :][:, :EXTENTS] *= window.scale
             mean, spread = mean * window.scale, spread * window.scale**2
         features = self.features.human_size + OBJECT_SIZE + CONTACTS
+        chosen = CANONICAL[window.mirrored] if self.canonical else "object"
+        values = {name: value for name, value in window.values.items() if not name.endswith(CANONICAL)}
+        values |= {f"{kind}_world_canonical": window.values[f"{kind}_world_{chosen}"] for kind in "Rt"}
         return EchoWindow(
-            **window.values,
+            **values,
             has_object=active != NO_OBJECT,
             object_code=code,
             object_mean=mean,
