@@ -23,8 +23,9 @@ from wearcap.recording import RecordingStore
 from wearcap.systems.echo.features import OBJECT_SIZE
 from wearcap.systems.echo.model import EchoDenoiser
 from wearcap.systems.echo.scores import score_echo
-from wearcap.systems.echo.training import HANDS, STANDING, EchoDiffusion, balanced_cross_entropy
+from wearcap.systems.echo.training import HANDS, SLOPE, STANDING, EchoDiffusion
 from wearcap.systems.echo.training_windows import EchoContent, EchoWindow
+from wearcap.training import losses
 from wearcap_testing import benchmark, experiments, small_dataset
 
 pytestmark = pytest.mark.usefixtures("few_statistics")
@@ -197,12 +198,15 @@ def test_an_object_that_slips_in_the_hand_costs_what_moves_with_it_does_not(data
 def test_both_classes_of_foot_contact_count_alike():
     """Where the share is the data's, saying always one costs as much as saying always the other."""
     contact = (torch.arange(1000) < 1000 * STANDING).float()[None, :, None]
-    valid = torch.ones(1, 1000, dtype=torch.bool)
-    costs = [balanced_cross_entropy(torch.full_like(contact, value), contact, valid) for value in (-1.0, 1.0)]
+    valid = torch.ones(1, 1000)
+    costs = [
+        losses.balanced_cross_entropy(torch.full_like(contact, SLOPE * value), contact, STANDING, valid)
+        for value in (-1.0, 1.0)
+    ]
     assert costs[0].item() == pytest.approx(costs[1].item(), rel=0.01)
-    right = balanced_cross_entropy(2 * contact - 1, contact, valid)
+    right = losses.balanced_cross_entropy(SLOPE * (2 * contact - 1), contact, STANDING, valid)
     assert right < 0.05 * costs[0]
-    assert balanced_cross_entropy(2 * contact - 1, contact, ~valid) == 0
+    assert losses.balanced_cross_entropy(SLOPE * (2 * contact - 1), contact, STANDING, 1 - valid) == 0
 
 
 def test_alike_orientations_are_asked_for_where_no_clean_frame_shows_the_true_one(data):

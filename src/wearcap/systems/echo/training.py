@@ -3,9 +3,8 @@
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional as F
 
 from wearcap.body.contact_points import BODY_POINTS, HAND_POINTS
 from wearcap.body.kinematics import forward_kinematics
@@ -171,7 +170,8 @@ class EchoDiffusion(Training):
                 terms.pop("contact")
             else:
                 feet = x0_hat[..., -len(FOOT_PATCHES) :]
-                terms["foot_contact"] = balanced_cross_entropy(feet, batch.contact[..., BODY_POINTS:], batch.valid)
+                standing = batch.contact[..., BODY_POINTS:]
+                terms["foot_contact"] = losses.balanced_cross_entropy(SLOPE * feet, standing, STANDING, weight)
             outputs = self.net.motion_normalizer.inverse(x0_hat)
             first = self.net.sizes[0]
             T_object = self.features.decode_object(outputs[..., first : first + OBJECT_SIZE], frame)
@@ -223,15 +223,3 @@ def _mean_square(
     """Mean of ‖A p + b‖² over an object's points, from their mean and second moment: ‖b‖² + 2 b·A μ + tr A S Aᵀ."""
     along = (shift * (turn @ mean[..., None])[..., 0]).sum(-1)
     return shift.square().sum(-1) + 2 * along + (turn @ spread * turn).sum((-1, -2))
-
-
-def balanced_cross_entropy(
-    output: Float[Tensor, "batch time patch"],
-    contact: Float[Tensor, "batch time patch"],
-    valid: Bool[Tensor, "batch time"],
-) -> Float[Tensor, ""]:
-    """Cross entropy of contacts, from outputs whose targets are ±1, weighted so that both classes count alike."""
-    there = contact > 0.5
-    weight = torch.where(there, 0.5 / STANDING, 0.5 / (1 - STANDING))
-    entropy = F.binary_cross_entropy_with_logits(SLOPE * output, there.to(output), weight, reduction="none")
-    return losses.masked_mean(entropy.mean(-1), valid.float())
