@@ -32,6 +32,8 @@ class Method:
     """Overrides of conf/evaluate.yaml."""
     sensors: str | None = None
     """Preset of the device's errors (`WEARABLES`), or `GIVEN`; None: the case's."""
+    height_off_m: float | None = None
+    """How far the height that the wearer gives is off (m); None: as the preset knows it."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ class Result:
 def run_method(method: Method, case: Case) -> Result:
     """Capture and score. Raises what the verbs of wearcap raise."""
     torch.set_num_threads(1)
-    store = SensedStore.open(case.dataset, method.sensors or case.sensors)
+    store = SensedStore.open(case.dataset, method.sensors or case.sensors, method.height_off_m)
     if method.checkpoint is None:
         pipeline = BASELINES[method.name].fit([RecordingStore.open(root) for root in case.training])
         seeds = case.seeds[:1]

@@ -12,6 +12,7 @@ import re
 import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from echo_rows import Captured, Method, captured, pipeline_of, scenario_of
@@ -19,7 +20,8 @@ from hydra.utils import instantiate
 from result_pages import Grid, Page, Tree, Trees, figure_of, mean, picked, rows_of, score_grids
 from rich.console import Console
 from rich.progress import Progress
-from tabling import TRAINING, finite, recordings_of, training_of
+from sensed import WRONG_HEIGHTS
+from tabling import TRAINING, add_people, finite, recordings_of, split_of, titled, training_of
 
 from wearcap.cli.conf import compose
 from wearcap.files import write_text
@@ -31,13 +33,18 @@ from wearcap.systems.echo.scores import score_echo
 
 BODY = {
     "mpjpe_mm": "MPJPE (mm)",
+    "upper_pe_mm": "upper body (mm)",
+    "lower_pe_mm": "lower body (mm)",
+    "hand_pe_mm": "hands (mm)",
     "mpjve_mm": "MPJVE (mm per frame at 30 Hz)",
     "mpjve_printed": "MPJVE as the paper prints it, without unit",
     "foot_contact": "FC",
     "foot_skate_cm_s": "skate (cm/s)",
+    "skate_ratio": "skate, of the truth's",
     "floor_penetration_cm": "into the floor (cm)",
     "physicality": "physicality",
     "jitter_m_s3": "jitter (m/s³)",
+    "jitter_ratio": "jitter, of the truth's",
     **TRAINING,
 }
 """Columns of the tables of bodies. Ours of MPJVE is in the unit of ECHO's words, which its figures cannot have
@@ -135,7 +142,7 @@ SETTINGS = {
     "context of 40: latency of 20 frames": ("pipeline=echo", "pipeline.sampling.context=40"),
     "all as in the paper": ("pipeline=paper/echo",),
 }
-TRUTH_GIVEN = "exact wrists and heads, floor, bones, and which object is active, are given to all rows"
+TRUTH_GIVEN = "exact wrists and heads, floor, bones (but in rows of wrong height), and which object is active, are given to all rows"
 SHARES = {"human": (0.01, 0.05, 0.1, 0.25, 1.0), "object": (0.01, 0.05, 0.1, 0.25, 1.0), "contact": (0.01, 0.05, 0.1, 0.25, 1.0)}  # fmt: skip
 PAPER: Scores = {
     name: {key: Summary(value, None, 4) for key, value in zip(keys, values)}
@@ -181,6 +188,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=list(PARTS),
         help="tables to make",
     )
+    add_people(parser)
 
 
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
@@ -188,8 +196,9 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     console, found = Console(width=200), {}
     path = options.output / "echo.json"
     with Progress(transient=True, console=console) as progress:
-        for part in options.parts:
-            title, columns, scores = PARTS[part](options, progress)
+        makers = [PARTS[part] for part in options.parts] + [partial(_strangers, root) for root in options.strangers]
+        for make in makers:
+            title, columns, scores = make(options, progress)
             ours = next((row for row in scores.values() if f"{TRUTH}physicality" in row), {})
             scores = scores | {"truth": truth_row(ours)}
             found[title] = {method: {k: vars(v) for k, v in row.items()} for method, row in scores.items()}
@@ -280,10 +289,26 @@ def _given(row: tuple[str, float] | None) -> str:
 
 def _human(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapping[str, str], Scores]:
     """Table 2: people without objects."""
-    store, names = recordings_of(options, "cmu")
-    methods = [Method("ours", options.checkpoint), *_trained(HUMANS, options, progress)]
-    scores = _scores(methods, options, progress, store, names)
-    return f"Table 2: CMU, {options.split}; {TRUTH_GIVEN}", BODY, scores | PAPER_HUMAN
+    scores = _people(options, progress, *recordings_of(options, "cmu"))
+    title = titled(f"Table 2: CMU, {options.split}; {TRUTH_GIVEN}", options)
+    return title, BODY, scores | ({} if options.keep else PAPER_HUMAN)
+
+
+def _strangers(
+    root: Path, options: argparse.Namespace, progress: Progress
+) -> tuple[str, Mapping[str, str], Scores]:
+    """The same rows on people of another laboratory."""
+    scores = _people(options, progress, *split_of(options, root))
+    return titled(f"Strangers ({root.name}): {options.split}; {TRUTH_GIVEN}", options), BODY, scores
+
+
+def _people(options: argparse.Namespace, progress: Progress, store: RecordingStore, names: list[str]) -> Scores:
+    """Rows of bodies: ours, with the wearer's bones and with a wrong height, then trained rivals."""
+    methods = [Method("ours", options.checkpoint)]
+    for what, off in WRONG_HEIGHTS.items():
+        methods.append(Method(f"ours, {what}", options.checkpoint, height_off_m=off))
+    methods += [] if options.keep else _trained(HUMANS, options, progress)
+    return _scores(methods, options, progress, store, names)
 
 
 def _scores(
@@ -336,6 +361,9 @@ PARTS = {
 
 LABELS = {
     "mpjpe_mm": ("MPJPE (mm)", 1),
+    "upper_pe_mm": ("upper body (mm)", 1),
+    "lower_pe_mm": ("lower body (mm)", 1),
+    "hand_pe_mm": ("hands (mm)", 1),
     "mpjve_mm": ("MPJVE (mm a frame)", 1),
     "mpjve_printed": ("MPJVE as the paper prints it", 1),
     "foot_contact": ("FC", 2),
@@ -349,7 +377,9 @@ LABELS = {
     "touch_f1": ("contact F1", 2),
     "jitter_m_s3": ("jitter (m/s³)", 1),
     "true_jitter_m_s3": ("jitter, truth", 1),
+    "jitter_ratio": ("jitter, of the truth's", 2),
     "foot_skate_cm_s": ("skate (cm/s)", 1),
+    "skate_ratio": ("skate, of the truth's", 2),
     "floor_penetration_cm": ("into the floor (cm)", 2),
     "physicality": ("physicality", 4),
     "training_minutes": ("minutes learned from", 0),

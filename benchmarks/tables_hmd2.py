@@ -18,8 +18,8 @@ from joblib import Parallel, delayed
 from result_pages import NONE, Grid, Page, Tree, Trees, figure_of, grid_of, mean, ranged, score_grids, summaries, text
 from rich.console import Console
 from rich.table import Table
-from sensed import GIVEN, add_sensors
-from tabling import TRAINING, finite, new_table
+from sensed import GIVEN, WRONG_HEIGHTS, add_sensors
+from tabling import TRAINING, add_people, finite, new_table, split_of, titled
 
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
@@ -39,6 +39,7 @@ COLUMNS = {
     "diversity": "divers.",
     "physicality": "phys.",
     "floor_penetration_cm": "floor",
+    "skate_ratio": "skate, of truth's",
     "foot_skate_cm_s": "skate",
     "jitter_m_s3": "m/s³",
     "jitter_ratio": "jitter",
@@ -95,6 +96,8 @@ WINDOW = {
     "avatarposer_hands": 82,
 }
 """Frames of a window that a network sees, where they are not 240: AvatarPoser's two pairs of poses see 41 each."""
+PEOPLE = (*BASELINES, *TRAINED, "head alone")
+"""Rows of the tables of people without surroundings, beside those of other sensors."""
 STRIDES = (230, 180, 120, 60, 30, 10, 1)
 STEPS = (2, 3, 5, 10, 20, 40, 80)
 LOOKAHEAD = 20
@@ -146,10 +149,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--steps", type=int, nargs="*", default=STEPS, help="steps of Table 6.7")
     parser.add_argument("--device", default="cpu", help="device that captures")
     parser.add_argument("--jobs", type=int, default=2, help="rows at a time")
+    add_people(parser)
 
 
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
-    """Print and write the tables; returns the file."""
+    """Print and write the tables; returns the file. With `--strangers` those of people without surroundings alone."""
+    if options.strangers:
+        return _strangers(options, about)
     case = _case(options)
     console = Console(width=WIDTH)
     jobs = [(FIRST, case, _methods(options, console)), *([] if options.quick else _sweeps(options, case))]
@@ -188,6 +194,32 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
         "scenarios": {title: _plain(rows) for title, rows in scenarios.items()},
     }
     write_text(path, json.dumps(finite(tree), indent=1) + "\n")
+    return path
+
+
+def _strangers(options: argparse.Namespace, about: dict[str, str]) -> Path:
+    """People whose head alone is tracked, of data sets without points and pictures, in hmd2_people.json."""
+    console, tables = Console(width=WIDTH), {}
+    methods = [method for method in _methods(options, console) if method.name in PEOPLE]
+    alone = next(method for method in methods if method.name == "head alone")
+    methods += [replace(alone, name=f"head alone, {n} sensors", sensors=n) for n in WEARABLES if n != options.sensors]
+    methods += [replace(alone, name=f"head alone, {what}", height_off_m=off) for what, off in WRONG_HEIGHTS.items()]
+    methods.append(replace(alone, name="head alone, exact sensors, bones given", sensors=GIVEN))
+    if options.keep:
+        methods = [method for method in methods if method.name.startswith("head alone") and method.name != BRIEF]
+    for root in options.strangers:
+        store, names = split_of(options, root)
+        seeds = tuple(range(2 if options.quick else options.seeds))
+        case = Case(store.root, tuple(names), seeds, tuple(options.training), None, options.sensors, options.device)
+        results = Parallel(n_jobs=options.jobs)(delayed(run_method)(method, case) for method in methods)
+        title = titled(f"Strangers ({root.name}): {options.split}, head alone, {options.sensors} sensors", options)
+        found = [result for result in results if result is not None]
+        console.print(_table(title, found))
+        scores = {result.method: result.scores for result in found}
+        tables[title] = _plain(scores | {"truth": truth_row(scores["head alone"])})
+    path = options.output / "hmd2_people.json"
+    facts = {**about, "split": options.split, "sensors": options.sensors, "seeds": len(seeds)}
+    write_text(path, json.dumps(finite({"about": facts, "tables": tables}), indent=1) + "\n")
     return path
 
 

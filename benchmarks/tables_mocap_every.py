@@ -10,6 +10,7 @@ table gives their mean and spread. A row without its checkpoint is left out, and
 import argparse
 import json
 import shlex
+from functools import partial
 from pathlib import Path
 
 from mocap_every_calibration import GOALS, calibration_scores
@@ -17,12 +18,13 @@ from mocap_every_rows import Method, body_row, captures, cue_row, floor_row, pip
 from result_pages import Grid, Page, Tree, Trees, figure_of, mean, picked, ranged, rows_of, score_grids
 from rich.console import Console
 from rich.progress import Progress
-from sensed import GIVEN, add_sensors
-from tabling import TRAINING, finite, recordings_of, training_of
+from sensed import GIVEN, WRONG_HEIGHTS, add_sensors
+from tabling import TRAINING, add_people, finite, recordings_of, split_of, titled, training_of
 
 from wearcap.files import write_text
 from wearcap.metrics.table import Scores, Summary, aggregate, markdown_table, truth_row
 from wearcap.models.checkpoint import checkpoint_file
+from wearcap.recording import RecordingStore
 from wearcap.sensors.wearables import WEARABLES
 from wearcap.systems.mocap_every.energy import LatentSolver
 from wearcap.systems.mocap_every.visual_cues import load_visual_cues
@@ -36,6 +38,7 @@ BODY = (
     "upper_pe_cm",
     "lower_pe_cm",
     "hand_pe_cm",
+    "skate_ratio",
     "foot_skate_cm_s",
     "jitter_m_s3",
     "physicality",
@@ -134,14 +137,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=["body", "floor", "cues", "calibration"],
         help="tables to make; totalcapture, too, for those who have prepared it",
     )
+    add_people(parser)
 
 
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     """Print and write the tables; returns the file."""
     console, found = Console(width=170), {}
     with Progress(transient=True, console=console) as progress:
-        for part in options.parts:
-            title, columns, scores = PARTS[part](options, progress)
+        makers = [PARTS[part] for part in options.parts] + [partial(_strangers, root) for root in options.strangers]
+        for make in makers:
+            title, columns, scores = make(options, progress)
             found[title] = {method: {k: vars(v) for k, v in row.items()} for method, row in scores.items()}
             console.print(f"\n{title}\n\n{markdown_table(scores, columns)}", markup=False, soft_wrap=True)
     path = options.output / f"mocap_every{'' if options.sensors == 'typical' else f'_{options.sensors}'}.json"
@@ -163,6 +168,7 @@ LABELS = {
     "right_arm_cm": ("right arm (cm)", 2),
     "jitter_ratio": ("jitter, of the truth's", 2),
     "jitter_m_s3": ("jitter (m/s³)", 1),
+    "skate_ratio": ("skate, of the truth's", 2),
     "foot_skate_cm_s": ("skate (cm/s)", 2),
     "physicality": ("physicality", 4),
     "floor_penetration_cm": ("into the floor (cm)", 2),
@@ -272,33 +278,23 @@ def _briefly(body: dict[str, Tree]) -> tuple[str, ...]:
 
 def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """Tables 2, 5, 6 and 7: held-out CMU subjects, whose heads and watches are simulated."""
-    level, usual = "pipeline.floor=fixed", options.sensors
-    variants = {
-        "ours": ("pipeline=mocap_every",),
-        "ours, floor fixed at the beginning": ("pipeline=mocap_every", level),
-        "ours, without mirror averaging": ("pipeline=mocap_every", "pipeline.mirror_average=false"),
-        "ours, not anchored to the head": ("pipeline=mocap_every", "pipeline.anchor=false"),
-        "ours, three frames at a time": ("pipeline=mocap_every_online",),
-    }
-    ours = [Method(name, options.checkpoint, usual, pipeline) for name, pipeline in variants.items()]
-    ours += [Method(f"ours, {other} sensors", options.checkpoint, other) for other in WEARABLES if other != usual]
-    given = "ours, exact sensors, floor and bones given"
-    ours.append(Method(given, options.checkpoint, GIVEN, ("pipeline=mocap_every", level)))
-    trained = {}
-    for name, (run, pipeline) in TRAINED.items():
-        paths = [options.runs / seeded / "checkpoints" / "best.ckpt" for seeded in (run, f"{run}_1", f"{run}_2")]
-        sensors = GIVEN if run in HANDS else usual
-        trained[name] = [Method(name, str(path), sensors, (*pipeline, level)) for path in paths if path.is_file()]
-        if not trained[name]:
-            command = shlex.join(
-                ["wearcap", "train", *TRAININGS[run], *STEPS, f"name={run}", f"paths.run={options.runs / run}"]
-            )
-            progress.console.print(
-                f"left out: {name} (no {paths[0]}); train it by: {command}", markup=False, soft_wrap=True
-            )
-    rows = {name: methods for name, methods in trained.items() if methods}
-    rows |= {method.name: [method] for method in ours}
-    store, names = recordings_of(options, "cmu")
+    scores = _people(options, progress, *recordings_of(options, "cmu"))
+    title = f"CMU, {options.split}, {options.sensors} sensors (hands tracked: exact, floor and bones given)"
+    return titled(f"Tables 2, 6, 7: {title}", options), BODY, scores | ({} if options.keep else PAPER)
+
+
+def _strangers(root: Path, options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
+    """The same rows on people of another laboratory."""
+    scores = _people(options, progress, *split_of(options, root))
+    return titled(f"Strangers ({root.name}): {options.split}, {options.sensors} sensors", options), BODY, scores
+
+
+def _people(
+    options: argparse.Namespace, progress: Progress, store: RecordingStore, names: list[str]
+) -> dict[str, dict[str, Summary]]:
+    """Rows of bodies: trained rivals and ablations, then ours, then the truth."""
+    rows = {} if options.keep else _rivals(options, progress.console)
+    rows |= {method.name: [method] for method in _ours(options)}
     scores = {}
     for name, methods in rows.items():
         bar = progress.add_task(name, total=len(methods) * len(names))
@@ -308,9 +304,42 @@ def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
             for recording, _, captured in captures(method, store, names, lambda b=bar: progress.advance(b))
         ]
         scores[name] = aggregate(scored) | training_of(methods[0].checkpoint)
-    scores["truth"] = truth_row(scores["ours"])
-    title = f"Tables 2, 6, 7: CMU, {options.split}, {usual} sensors (hands tracked: exact, floor and bones given)"
-    return title, BODY, scores | PAPER
+    return scores | {"truth": truth_row(scores["ours"])}
+
+
+def _ours(options: argparse.Namespace) -> list[Method]:
+    """Rows of our checkpoint."""
+    level, usual = "pipeline.floor=fixed", options.sensors
+    variants = {
+        "ours": ("pipeline=mocap_every",),
+        "ours, floor fixed at the beginning": ("pipeline=mocap_every", level),
+        "ours, without mirror averaging": ("pipeline=mocap_every", "pipeline.mirror_average=false"),
+        "ours, not anchored to the head": ("pipeline=mocap_every", "pipeline.anchor=false"),
+        "ours, three frames at a time": ("pipeline=mocap_every_online",),
+    }
+    ours = [Method(name, options.checkpoint, usual, pipeline) for name, pipeline in variants.items()]
+    ours += [
+        Method(f"ours, {what}", options.checkpoint, usual, height_off_m=off) for what, off in WRONG_HEIGHTS.items()
+    ]
+    ours += [Method(f"ours, {other} sensors", options.checkpoint, other) for other in WEARABLES if other != usual]
+    given = "ours, exact sensors, floor and bones given"
+    return [*ours, Method(given, options.checkpoint, GIVEN, ("pipeline=mocap_every", level))]
+
+
+def _rivals(options: argparse.Namespace, console: Console) -> dict[str, list[Method]]:
+    """Methods of the rows with trainings of their own, by seed; those without a checkpoint are named and left out."""
+    trained = {}
+    for name, (run, pipeline) in TRAINED.items():
+        paths = [options.runs / seeded / "checkpoints" / "best.ckpt" for seeded in (run, f"{run}_1", f"{run}_2")]
+        sensors, overrides = GIVEN if run in HANDS else options.sensors, (*pipeline, "pipeline.floor=fixed")
+        trained[name] = [Method(name, str(path), sensors, overrides) for path in paths if path.is_file()]
+        if not trained[name]:
+            command = shlex.join(
+                ["wearcap", "train", *TRAININGS[run], *STEPS, f"name={run}", f"paths.run={options.runs / run}"]
+            )
+            how = f"left out: {name} (no {paths[0]}); train it by: {command}"
+            console.print(how, markup=False, soft_wrap=True)
+    return {name: methods for name, methods in trained.items() if methods}
 
 
 def _totalcapture(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:

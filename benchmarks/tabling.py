@@ -2,6 +2,7 @@
 
 import argparse
 import math
+from pathlib import Path
 from typing import Any
 
 from rich.table import Table
@@ -30,12 +31,39 @@ PREPARE = {
 }
 
 
+def add_people(parser: argparse.ArgumentParser) -> None:
+    """Options of tables of people without surroundings."""
+    parser.add_argument(
+        "--strangers",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="DATASET",
+        help="data sets of people of other laboratories, as datasets/hdm05: a table of each, with the rows of CMU's",
+    )
+    parser.add_argument(
+        "--keep",
+        metavar="NAME",
+        help="rows of our checkpoint alone, in tables of this name that later runs leave as they are, such as "
+        "\'before more motion\': the page shows them beside those of now",
+    )
+
+
+def titled(title: str, options: argparse.Namespace) -> str:
+    """A table's title, behind the name of tables that are kept."""
+    return f"{options.keep}, {title}" if options.keep else title
+
+
 def recordings_of(options: argparse.Namespace, data: str) -> tuple[RecordingStore, list[str]]:
     """A prepared data set, and names of its split as `--split`, `--recordings` and `--quick` say. Raises WearcapError
     where it is missing."""
-    root = options.datasets / data
+    return split_of(options, options.datasets / data)
+
+
+def split_of(options: argparse.Namespace, root: Path) -> tuple[RecordingStore, list[str]]:
+    """The same of a data set in a folder."""
     if not (root / "manifest.json").is_file():
-        raise WearcapError("no such data set", where=root, fix=PREPARE[data])
+        raise WearcapError("no such data set", where=root, fix=PREPARE.get(root.name, f"Run: wearcap prepare {root.name}"))
     store = RecordingStore.open(root)
     return store, store.names(options.split)[: 3 if options.quick else options.recordings]
 

@@ -27,6 +27,9 @@ averaged over frames."""
 TRUTH = "truth_"
 """Beginning of the names of scores that belong to the true motion."""
 
+RATIOS = {"skate_ratio": "foot_skate_cm_s", "jitter_ratio": "jitter_m_s3"}
+"""Scores that are shares of the truth's, and what of."""
+
 
 @dataclass(frozen=True)
 class Row:
@@ -91,6 +94,7 @@ def evaluate_motion(
     scores = {
         "mpjpe_cm": error.mean(),
         **{name: value.mean() for name, value in parts.items()},
+        **{f"{part}_pe_cm": value for part, value in position.part_errors_cm(truth.skeleton, error).items()},
         **{f"{P95}{name}": position.error_percentile_cm(value) for name, value in tails.items()},
         "root_cm": position.root_error_cm(joints[:, 0], joints_true[:, 0]),
         "mpjve_cm_s": position.mpjve_cm_s(joints, joints_true, fps),
@@ -138,7 +142,8 @@ def _span(motion: Motion) -> str:
 
 def aggregate(rows: list[Row]) -> dict[str, Summary]:
     """Mean over recordings within each seed, weighted by frames (`P95`: equally), then mean and
-    spread over seeds. Scores that are NaN (no contact, too few frames) are ignored.
+    spread over seeds. Scores that are NaN (no contact, too few frames) are ignored. Where there are both, `RATIOS` of
+    these means to the truth's are added.
 
     Raises WearcapError unless every seed was scored on the same recordings, once each.
     """
@@ -150,16 +155,21 @@ def aggregate(rows: list[Row]) -> dict[str, Summary]:
     seen = {frozenset(recordings) for recordings in by_seed.values()}
     if len(seen) != 1:
         raise WearcapError("the seeds were not scored on the same recordings" if seen else "nothing was scored")
-    summaries = {}
-    for name in rows[0].scores:
+    by_metric: dict[str, list[float]] = {}
+    for name in dict.fromkeys(name for row in rows for name in row.scores):
         means = []
         for recordings in by_seed.values():
-            weighted = [(row.scores[name], 1 if name.startswith(P95) else row.frames) for row in recordings.values()]
-            weighted = [(score, weight) for score, weight in weighted if not math.isnan(score)]
+            scored = [(row.scores.get(name, math.nan), row.frames) for row in recordings.values()]
+            known = [(score, frames) for score, frames in scored if not math.isnan(score)]
+            weighted = [(score, 1 if name.startswith(P95) else frames) for score, frames in known]
             total = sum(weight for _, weight in weighted)
             means.append(sum(score * weight for score, weight in weighted) / total if total else math.nan)
-        summaries[name] = summarize(means)
-    return summaries
+        by_metric[name] = means
+    for name, metric in RATIOS.items():
+        if name not in by_metric and {metric, f"{TRUTH}{metric}"} <= set(by_metric):
+            both = zip(by_metric[metric], by_metric[f"{TRUTH}{metric}"])
+            by_metric[name] = [value / true if true else math.nan for value, true in both]
+    return {name: summarize(means) for name, means in by_metric.items()}
 
 
 def summarize(values: list[float]) -> Summary:
