@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-
 from sensed import GIVEN, sensed
 
 from wearcap.cli.conf import compose, load_pipeline

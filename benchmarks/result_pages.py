@@ -113,6 +113,7 @@ def score_grids(tree: Tree, labels: Mapping[str, tuple[str, int]], spread: str =
     (and digits), then all others but those of the truth, which has a row."""
     grids, labels = [], {**labels, **TRAINING}
     for title, rows in tree["tables"].items():
+        rows = {**rows, **_kept(tree, title)}
         present = list(dict.fromkeys(m for row in rows.values() for m in row if not m.startswith("truth_")))
         metrics = [name for name in labels if name in present] + [name for name in present if name not in labels]
         cells = [[name, *(text(row.get(m), labels.get(m, ("", 2))[1]) for m in metrics)] for name, row in rows.items()]
@@ -129,6 +130,16 @@ def score_grids(tree: Tree, labels: Mapping[str, tuple[str, int]], spread: str =
         heads = ("", *(labels.get(metric, (metric, 2))[0] for metric in metrics))
         grids.append(Grid(title, heads, cells, origin(about, f"{count} {spread}" if count > 1 else "")))
     return grids
+
+
+def _kept(tree: Tree, title: str) -> Tree:
+    """Rows of a table's earlier versions ("before more motion, Table 2: …"), which a new run leaves as they are."""
+    kept = {}
+    for other, rows in tree["tables"].items():
+        if _number(other).endswith(f", {_number(title)}"):
+            name = _number(other).removesuffix(f", {_number(title)}")
+            kept |= {f"{name}: {row}": scores for row, scores in rows.items() if row != "truth"}
+    return kept
 
 
 def rows_of(trees: Trees, title: str) -> dict[str, dict[str, Any]]:

@@ -294,12 +294,10 @@ def _human(options: argparse.Namespace, progress: Progress) -> tuple[str, Mappin
     return title, BODY, scores | ({} if options.keep else PAPER_HUMAN)
 
 
-def _strangers(
-    root: Path, options: argparse.Namespace, progress: Progress
-) -> tuple[str, Mapping[str, str], Scores]:
+def _strangers(root: Path, options: argparse.Namespace, progress: Progress) -> tuple[str, Mapping[str, str], Scores]:
     """The same rows on people of another laboratory."""
     scores = _people(options, progress, *split_of(options, root))
-    return titled(f"Strangers ({root.name}): {options.split}; {TRUTH_GIVEN}", options), BODY, scores
+    return titled(f"People ({root.name}): {options.split}; {TRUTH_GIVEN}", options), BODY, scores
 
 
 def _people(options: argparse.Namespace, progress: Progress, store: RecordingStore, names: list[str]) -> Scores:
@@ -397,7 +395,7 @@ HEADLINE = (
     ("Table 1:", "paper: BoDiffusion+Obj, BEHAVE", "the paper's BoDiffusion + object, on BEHAVE"),
     ("Table 2", "ours", "people alone (CMU): **ours**"),
     ("Table 2", "ours, the same budget", "people alone (CMU): ours, the rivals' budget"),
-    ("Table 2", "BoDiffusion-style", "people alone (CMU): BoDiffusion-style, the same budget"),
+    ("People (hdm05)", "ours", "people alone (another laboratory's, HDM05): **ours**"),
 )
 """Rows of the page's first table: table, row, and what the page calls it."""
 CLOCKS = {

@@ -185,10 +185,10 @@ HEADLINE = (
     ("Tables 2, 6, 7", "ours", "CMU: **ours**"),
     ("Tables 2, 6, 7", "ours, poor sensors", "CMU: **ours**, poor sensors"),
     ("Tables 2, 6, 7", "truth", "CMU: the truth itself"),
+    ("People (hdm05)", "ours", "another laboratory's person (HDM05): **ours**"),
     ("Tables 2, 6, 7", "paper: AMASS", "the paper's, on AMASS"),
     ("Table 3", "floor update", "hillsides: D.2 with our network"),
     ("Table 3", "floor follow", "hillsides: **ours**"),
-    ("Table 4", "cmu: estimated", "CMU, right wrist in the picture: estimated"),
     ("Table 4", "cmu: edited", "CMU, right wrist in the picture: **edited**"),
 )
 """Rows of the page's first table: table, row, and what the page calls it."""
@@ -199,7 +199,9 @@ COLUMNS = (
     ("hands", ("hand_pe_cm", "right_hand_cm"), 2),
     ("MPJVE (cm/s)", ("mpjve_cm_s",), 2),
     ("jitter, of the truth's", ("jitter_ratio",), 2),
+    ("skate, of the truth's", ("skate_ratio",), 1),
     ("skate (cm/s)", ("foot_skate_cm_s",), 1),
+    ("into the floor", ("floor_penetration_cm",), 1),
     ("M frames seen", ("frames_seen_m",), 2),
 )
 """Columns of the page's first table: heading, metrics of which a row has one, digits."""
@@ -286,7 +288,7 @@ def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
 def _strangers(root: Path, options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """The same rows on people of another laboratory."""
     scores = _people(options, progress, *split_of(options, root))
-    return titled(f"Strangers ({root.name}): {options.split}, {options.sensors} sensors", options), BODY, scores
+    return titled(f"People ({root.name}): {options.split}, {options.sensors} sensors", options), BODY, scores
 
 
 def _people(

@@ -45,7 +45,7 @@ def add_people(parser: argparse.ArgumentParser) -> None:
         "--keep",
         metavar="NAME",
         help="rows of our checkpoint alone, in tables of this name that later runs leave as they are, such as "
-        "\'before more motion\': the page shows them beside those of now",
+        "'before more motion': the page shows them beside those of now",
     )
 
 
@@ -63,7 +63,9 @@ def recordings_of(options: argparse.Namespace, data: str) -> tuple[RecordingStor
 def split_of(options: argparse.Namespace, root: Path) -> tuple[RecordingStore, list[str]]:
     """The same of a data set in a folder."""
     if not (root / "manifest.json").is_file():
-        raise WearcapError("no such data set", where=root, fix=PREPARE.get(root.name, f"Run: wearcap prepare {root.name}"))
+        raise WearcapError(
+            "no such data set", where=root, fix=PREPARE.get(root.name, f"Run: wearcap prepare {root.name}")
+        )
     store = RecordingStore.open(root)
     return store, store.names(options.split)[: 3 if options.quick else options.recordings]
 

@@ -38,7 +38,15 @@ def body_parts(skeleton: Skeleton) -> dict[str, list[int]]:
     return {"hand": hand, "lower": lower, "upper": upper}
 
 
-_PAIRED = {"shoulder": "arm", "elbow": "arm", "wrist": "hand", "hip": "leg", "knee": "leg", "ankle": "foot", "toe": "foot"}
+_PAIRED = {
+    "shoulder": "arm",
+    "elbow": "arm",
+    "wrist": "hand",
+    "hip": "leg",
+    "knee": "leg",
+    "ankle": "foot",
+    "toe": "foot",
+}
 PARTS = ("head", "trunk", "arm", "hand", "leg", "foot")
 """Parts of the body that share out all joints, from head to foot; "head" has the neck, "trunk" the collars."""
 

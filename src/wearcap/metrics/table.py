@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool
@@ -224,10 +225,37 @@ def rich_table(title: str, methods: Scores, metrics: Columns | None = None) -> T
     return table
 
 
-def write_scores(path: str | Path, methods: Scores, about: dict[str, str | int | float] | None = None) -> None:
+def rich_lines(title: str, methods: Scores, metrics: Columns | None = None) -> Table:
+    """The same with one line per method, one column per metric."""
+    table = Table(title=title)
+    header, *lines = _cells(methods, metrics)
+    for number, heading in enumerate(["", *header[1:]]):
+        table.add_column(heading, justify="right" if number else "left", no_wrap=not number)
+    for line in lines:
+        table.add_row(*line)
+    return table
+
+
+def write_scores(
+    path: str | Path,
+    methods: Scores,
+    about: dict[str, str | int | float] | None = None,
+    activities: Mapping[str, Scores] | None = None,
+    recordings: Mapping[str, str] | None = None,
+) -> None:
     """Write a table as JSON, atomically: {"about", "methods": {method: {metric: {mean, std, seeds}}}}; values that
-    are not finite become null."""
-    tree = {
+    are not finite become null. `activities`: the same by method and activity; `recordings`: names by place ("worst" …)."""
+    tree: dict[str, Any] = {"about": about or {}, "methods": _plain(methods)}
+    if activities:
+        tree["activities"] = {method: _plain(scores) for method, scores in activities.items()}
+    if recordings:
+        tree["recordings"] = dict(recordings)
+    write_text(path, json.dumps(tree, indent=1, allow_nan=False) + "\n")
+
+
+def _plain(methods: Scores) -> dict[str, Any]:
+    """Summaries as JSON."""
+    return {
         method: {
             metric: {
                 key: value if value is not None and math.isfinite(value) else None
@@ -237,4 +265,3 @@ def write_scores(path: str | Path, methods: Scores, about: dict[str, str | int |
         }
         for method, scores in methods.items()
     }
-    write_text(path, json.dumps({"about": about or {}, "methods": tree}, indent=1, allow_nan=False) + "\n")

@@ -117,7 +117,9 @@ def score_echo(motion: Motion, truth: Truth, name: str, seed: int) -> Row:
     joints, true = motion.T_world_joint.t, truth.motion.T_world_joint.t
     floor, touching = truth.floor_height, foot_contact(truth.foot_contact > 0.5)
     error = joint_error_cm(joints, true)
-    parts = {part: error[:, mine].mean() for part, mine in body_parts(skeleton).items()} | part_errors_cm(skeleton, error)
+    parts = {part: error[:, mine].mean() for part, mine in body_parts(skeleton).items()} | part_errors_cm(
+        skeleton, error
+    )
     scores = {
         "mpjpe_mm": 10 * error.mean().item(),
         **{f"{part}_pe_mm": 10 * value.item() for part, value in parts.items()},
