@@ -104,6 +104,7 @@ TRAINING = {
     "parameters_m": ("parameters (M)", 2),
     "frames_seen_m": ("frames seen (M)", 2),
     "core_minutes": ("core minutes", 0),
+    "rate_swept": ("rate swept", 4),
 }
 """Columns of what a row's training took."""
 

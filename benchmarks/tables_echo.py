@@ -9,7 +9,6 @@ diffusion, as in the paper.
 import argparse
 import json
 import re
-import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
@@ -21,7 +20,7 @@ from result_pages import Grid, Page, Tree, Trees, figure_of, mean, picked, rows_
 from rich.console import Console
 from rich.progress import Progress
 from sensed import WRONG_HEIGHTS
-from tabling import TRAINING, add_people, finite, recordings_of, split_of, titled, training_of
+from tabling import TRAINING, add_people, budget, finite, left_out, recordings_of, split_of, titled, training_of
 
 from wearcap.cli.conf import compose
 from wearcap.files import write_text
@@ -64,18 +63,10 @@ WHOLE = ("mpjpe_mm", "mpjve_printed", "foot_contact", "v2v_cm", "center_cm", "ro
 """The paper's columns of Table 1."""
 UNGUIDED = ("pipeline=echo", "pipeline.contacts.guidance=null")
 SHORT = ("experiment=echo",)
-BUDGET = (
-    "trainer.max_steps=400",
-    "data.loading.steps_per_epoch=80",
-    "optimizer.scheduler.warmup=40",
-    "callbacks.average.decay=0.98",
-    "early_stop=3",
-)
-"""How long all of these are trained: 400 batches of some 960 frames, in windows of 60 or 98, or until the validation
-loss has not fallen for three epochs; captured with is the checkpoint of the lowest."""
-BATCH = "data.loading.batch_size=16"
-LONG = ("data.loading.batch_size=10",)
-"""Windows of a batch, and those of 98 frames."""
+BUDGET = 384_000
+"""Frames that each of these sees, ours among them, unless `rivals.py` is given another budget."""
+BATCH, LONG = (16, 60), (10, 98)
+"""Windows of a batch and their frames, and those of AGRoL."""
 TRAININGS: dict[str, tuple[str, ...]] = {
     "echo_short": SHORT,
     "echo_window": (*SHORT, "features.frame=window"),
@@ -92,8 +83,9 @@ TRAININGS: dict[str, tuple[str, ...]] = {
     "bodiffusion_object_window": ("experiment=baseline/bodiffusion_object", "features.frame=window"),
     "bodiffusion": ("experiment=baseline/bodiffusion",),
     "egoallo_human": ("experiment=baseline/egoallo_human",),
-    "agrol_human": ("experiment=baseline/agrol_human", *LONG),
+    "agrol_human": ("experiment=baseline/agrol_human",),
 }
+RUNS = tuple(TRAININGS)
 """Overrides of `wearcap train` by the run's name: ECHO trained briefly, and each ablation of it trained as long: the
 paper's canonical frame (window) and none (world), the losses of the three modalities alone, the weights of ECHO eq. 13,
 and a token per frame and modality; and the baselines, as long, in the same frames as ours."""
@@ -261,17 +253,14 @@ def _trained(rows: dict[str, tuple[str, ...]], options: argparse.Namespace, prog
         if path.is_file():
             methods.append(Method(name, str(path), tuple(pipeline)))
         else:
-            command = shlex.join(["wearcap", "train", *training(run), f"name={run}", f"paths.run={options.runs / run}"])
-            progress.console.print(
-                f"left out: {name} (no {path}); train it by: {command}", markup=False, soft_wrap=True
-            )
+            progress.console.print(left_out(name, "echo", run, path), markup=False, soft_wrap=True)
     return methods
 
 
-def training(run: str) -> list[str]:
-    """Overrides that train a run within the common budget."""
-    batch = () if LONG[0] in TRAININGS[run] else (BATCH,)
-    return [*TRAININGS[run], *batch, *BUDGET]
+def training(run: str, frames: int = BUDGET) -> list[str]:
+    """Overrides that train one of `RUNS` within a budget."""
+    windows, length = LONG if run == "agrol_human" else BATCH
+    return [*TRAININGS[run], f"data.loading.batch_size={windows}", *budget(frames, windows * length)]
 
 
 def _sparse(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapping[str, str], Scores]:

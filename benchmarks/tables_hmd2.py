@@ -7,7 +7,6 @@ out, which is printed. Checkpoints come by name (checkpoints/) or path.
 
 import argparse
 import json
-import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -19,7 +18,7 @@ from result_pages import NONE, Grid, Page, Tree, Trees, figure_of, grid_of, mean
 from rich.console import Console
 from rich.table import Table
 from sensed import GIVEN, WRONG_HEIGHTS, add_sensors
-from tabling import TRAINING, add_people, finite, split_of, titled
+from tabling import TRAINING, add_people, budget, finite, left_out, split_of, titled
 
 from wearcap.errors import WearcapError
 from wearcap.evaluation.breakdown import extremes
@@ -88,8 +87,9 @@ TRAINED = {
     BRIEF: ("motion_diffusion_head", ("pipeline=hmd2", "pipeline.runtime=auto"), None),
 }
 """Baselines, and our network with as little training: run, overrides that capture, and sensors (None: the table's)."""
+RUNS = tuple(run for run, _, _ in TRAINED.values())
 BUDGET, BATCH = 300_000, 8
-"""Frames that each of these sees, and windows of a batch."""
+"""Frames that each of these sees, unless `rivals.py` is given another budget, and windows of a batch."""
 WINDOW = {
     "egoego_style": 120,
     "egoallo_style": 128,
@@ -305,17 +305,11 @@ def _latencies(options: argparse.Namespace, h: int) -> list[Method]:
     ]
 
 
-def training(run: str, runs: Path) -> list[str]:
-    """The command that trains one of `TRAINED`: all on the motion of the same data, to the same number of frames, or until
-    the validation loss has not fallen for three epochs; captured with is the checkpoint of the lowest."""
-    steps = BUDGET // (BATCH * WINDOW.get(run, 240))
+def training(run: str, frames: int = BUDGET) -> list[str]:
+    """Overrides that train one of `RUNS` within a budget, all on the motion of the same data."""
     experiment = run if run == "motion_diffusion_head" else f"baseline/{run}"
-    return [
-        *("wearcap", "train", f"experiment={experiment}", "data=cmu_simulated", f"data.loading.batch_size={BATCH}"),
-        *(f"trainer.max_steps={steps}", f"data.loading.steps_per_epoch={steps // 6}", "trainer.precision=bf16-mixed"),
-        *("optimizer.optimizer.lr=1.0e-3", f"optimizer.scheduler.warmup={steps // 10}", "early_stop=3"),
-        *("callbacks=averaged", "callbacks.average.decay=0.98", f"name={run}", f"paths.run={runs / run}"),
-    ]
+    data = [f"experiment={experiment}", "data=cmu_simulated", f"data.loading.batch_size={BATCH}", "callbacks=averaged"]
+    return [*data, *budget(frames, BATCH * WINDOW.get(run, 240))]
 
 
 def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
@@ -324,7 +318,6 @@ def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
         Method(name, str(options.runs / run / "checkpoints" / "best.ckpt"), pipeline, sensors)
         for name, (run, pipeline, sensors) in TRAINED.items()
     ]
-    commands = {name: shlex.join(training(run, options.runs)) for name, (run, _, _) in TRAINED.items()}
     full = _ours(options, OURS)
     sensing = [replace(full, name=f"full, {n} sensors", sensors=n) for n in WEARABLES if n != options.sensors]
     sensing.append(replace(full, name="full, the data's own sensors, bones given", sensors=GIVEN))
@@ -345,8 +338,11 @@ def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
     there = [method for method in wanted if method.checkpoint is None or _exists(method.checkpoint)]
     for method in wanted:
         if method not in there:
-            how = f"; train it by: {commands[method.name]}" if method.name in commands else ""
-            console.print(f"left out: {method.name} (no checkpoint {method.checkpoint!r}){how}", soft_wrap=True)
+            run = TRAINED.get(method.name, ("",))[0]
+            missing = f"left out: {method.name} (no checkpoint {method.checkpoint!r})"
+            console.print(
+                left_out(method.name, "hmd2", run, method.checkpoint) if run else missing, markup=False, soft_wrap=True
+            )
     return there
 
 

@@ -9,7 +9,6 @@ table gives their mean and spread. A row without its checkpoint is left out, and
 
 import argparse
 import json
-import shlex
 from functools import partial
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from result_pages import Grid, Page, Tree, Trees, figure_of, mean, picked, range
 from rich.console import Console
 from rich.progress import Progress
 from sensed import GIVEN, WRONG_HEIGHTS, add_sensors
-from tabling import TRAINING, add_people, finite, recordings_of, split_of, titled, training_of
+from tabling import TRAINING, add_people, budget, finite, left_out, recordings_of, split_of, titled, training_of
 
 from wearcap.files import write_text
 from wearcap.metrics.table import Scores, Summary, aggregate, markdown_table, truth_row
@@ -74,16 +73,10 @@ TRAININGS: dict[str, tuple[str, ...]] = {
 """Overrides of `wearcap train` by the run's name: ablations after the paper's Table 7 without its first stage, and
 without its data representation as well (world coordinates); and AvatarPoser's protocol 1, with tracked hands instead of
 accelerations."""
-STEPS = (
-    "trainer.max_steps=300",
-    "data.loading.steps_per_epoch=50",
-    "optimizer.scheduler.warmup=30",
-    "trainer.precision=bf16-mixed",
-    "callbacks.average.decay=0.98",
-    "early_stop=3",
-)
-"""One budget for all of these, ours among them: as many frames of the same data, in batches and precision alike, or
-until the validation loss has not fallen for three epochs. Captured with is each one's checkpoint of the lowest."""
+RUNS = tuple(TRAININGS)
+BUDGET, BATCH, WINDOW = 768_000, 64, 40
+"""Frames that each of these sees, ours among them, unless `rivals.py` is given another budget; windows of a batch, and
+their frames."""
 TRAINED = {
     "AvatarPoser-style, watches": (
         "mocap_every_avatarposer",
@@ -138,6 +131,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="tables to make; totalcapture, too, for those who have prepared it",
     )
     add_people(parser)
+
+
+def training(run: str, frames: int = BUDGET) -> list[str]:
+    """Overrides that train one of `RUNS` within a budget, all on the same data."""
+    return [*TRAININGS[run], f"data.loading.batch_size={BATCH}", *budget(frames, BATCH * WINDOW)]
 
 
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
@@ -336,11 +334,7 @@ def _rivals(options: argparse.Namespace, console: Console) -> dict[str, list[Met
         sensors, overrides = GIVEN if run in HANDS else options.sensors, (*pipeline, "pipeline.floor=fixed")
         trained[name] = [Method(name, str(path), sensors, overrides) for path in paths if path.is_file()]
         if not trained[name]:
-            command = shlex.join(
-                ["wearcap", "train", *TRAININGS[run], *STEPS, f"name={run}", f"paths.run={options.runs / run}"]
-            )
-            how = f"left out: {name} (no {paths[0]}); train it by: {command}"
-            console.print(how, markup=False, soft_wrap=True)
+            console.print(left_out(name, "mocap_every", run, paths[0]), markup=False, soft_wrap=True)
     return {name: methods for name, methods in trained.items() if methods}
 
 
