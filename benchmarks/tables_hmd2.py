@@ -98,7 +98,8 @@ WINDOW = {
     "avatarposer_hands": 82,
 }
 """Frames of a window that a network sees, where they are not 240: AvatarPoser's two pairs of poses see 41 each."""
-PEOPLE = (*BASELINES, *TRAINED, "head alone")
+ALONE = "head alone"
+PEOPLE = (*BASELINES, *TRAINED, ALONE)
 """Rows of the tables of people without surroundings, beside those of other sensors."""
 STRIDES = (230, 180, 120, 60, 30, 10, 1)
 STEPS = (2, 3, 5, 10, 20, 40, 80)
@@ -205,13 +206,16 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
 def _strangers(options: argparse.Namespace, about: dict[str, str]) -> Path:
     """People whose head alone is tracked, of data sets without points and pictures, in hmd2_people.json."""
     console, tables = Console(width=WIDTH), {}
-    methods = [method for method in _methods(options, console) if method.name in PEOPLE]
-    alone = next(method for method in methods if method.name == "head alone")
-    methods += [replace(alone, name=f"head alone, {n} sensors", sensors=n) for n in WEARABLES if n != options.sensors]
-    methods += [replace(alone, name=f"head alone, {what}", height_off_m=off) for what, off in WRONG_HEIGHTS.items()]
-    methods.append(replace(alone, name="head alone, exact sensors, bones given", sensors=GIVEN))
-    if options.keep:
-        methods = [method for method in methods if method.name.startswith("head alone") and method.name != BRIEF]
+    there = {method.name: method for method in _methods(options, console) if method.name in PEOPLE}
+    alone = there.pop(ALONE)
+    ours = [
+        alone,
+        *(replace(alone, name=f"{ALONE}, {n} sensors", sensors=n) for n in WEARABLES if n != options.sensors),
+    ]
+    ours += [replace(alone, name=f"{ALONE}, {what}", height_off_m=off) for what, off in WRONG_HEIGHTS.items()]
+    ours.append(replace(alone, name=f"{ALONE}, exact sensors, bones given", sensors=GIVEN))
+    ours = [method for method in ours if options.rows is None or method.name in options.rows]
+    methods = ours if options.keep else [*there.values(), *ours]
     for root in options.strangers:
         store, names = split_of(options, root)
         seeds = tuple(range(2 if options.quick else options.seeds))
@@ -221,7 +225,7 @@ def _strangers(options: argparse.Namespace, about: dict[str, str]) -> Path:
         found = [result for result in results if result is not None]
         console.print(_table(title, found))
         scores = {result.method: result.scores for result in found}
-        tables[title] = _plain(scores | {"truth": truth_row(scores["head alone"])})
+        tables[title] = _plain(scores | {"truth": truth_row(scores[ours[0].name])})
     path = options.output / "hmd2_people.json"
     facts = {**about, "split": options.split, "sensors": options.sensors, "seeds": len(seeds)}
     write_text(path, json.dumps(finite({"about": facts, "tables": tables}), indent=1) + "\n")
@@ -507,10 +511,10 @@ def _against_hands(scores: dict[str, Tree]) -> tuple[str, ...]:
 
 def _strangers_off(people: Tree) -> tuple[str, ...]:
     """How far it is off people without surroundings, whose head alone is tracked."""
-    found = {
-        _dataset(title): rows["head alone"] for title, rows in people["tables"].items() if title.startswith("People")
-    }
-    errors = [f"{mean(scores['mpjpe_cm'])} cm on {name}" for name, scores in found.items()]
+    errors = []
+    for title, rows in people["tables"].items():
+        name = title.partition("People")[0].rstrip(", ")
+        errors.append(f"{mean(rows[ALONE]['mpjpe_cm'])} cm on {_dataset(title)}" + (f" ({name})" if name else ""))
     return (
         (f"From the head alone, on whole splits of people without surroundings: {', '.join(errors)}.",)
         if errors

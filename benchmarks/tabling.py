@@ -51,6 +51,7 @@ def add_people(parser: argparse.ArgumentParser) -> None:
         metavar="DATASET",
         help="data sets of people of other laboratories, as datasets/hdm05: a table of each, with the rows of CMU's",
     )
+    parser.add_argument("--rows", nargs="+", metavar="ROW", help="of the rows of our checkpoint these alone")
     parser.add_argument(
         "--keep",
         metavar="NAME",

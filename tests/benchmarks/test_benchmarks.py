@@ -216,6 +216,23 @@ def test_sensed_stores_hold_no_truth_and_lend_it_to_scores(tmp_path):
     assert torch.equal(again.head.t_world_device, found["typical"].head.t_world_device)
 
 
+@pytest.mark.parametrize("sensors", ["typical", "given"])
+def test_a_wrong_height_is_off_by_as_much_whatever_is_sensed_and_the_truth_stays(sensors):
+    from sensed import WRONG_HEIGHTS, sensed
+
+    from watched_walk import watched_walk
+
+    recording = watched_walk(1.0)
+    true = recording.motion.skeleton.stature
+    for off in WRONG_HEIGHTS.values():
+        given = sensed(recording, sensors, off)
+        assert given.skeleton.stature == pytest.approx(true + off, abs=1e-4)
+        assert (given.motion is None) == (sensors == "typical")
+        if given.motion is not None:
+            assert given.motion.skeleton.stature == pytest.approx(true)
+    assert sorted(WRONG_HEIGHTS.values()) == [-0.03, 0.03]
+
+
 def test_best_samples_are_chosen_by_recording():
     from hmd2_runs import best_of
 
