@@ -513,6 +513,8 @@ def _strangers_off(people: Tree) -> tuple[str, ...]:
     """How far it is off people without surroundings, whose head alone is tracked."""
     errors = []
     for title, rows in people["tables"].items():
+        if ALONE not in rows:
+            continue
         name = title.partition("People")[0].rstrip(", ")
         errors.append(f"{mean(rows[ALONE]['mpjpe_cm'])} cm on {_dataset(title)}" + (f" ({name})" if name else ""))
     return (
