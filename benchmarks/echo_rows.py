@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from sensed import GIVEN, sensed
 
 from wearcap.cli.conf import compose, load_pipeline
 from wearcap.recording import Motion, RecordingStore
@@ -24,6 +25,8 @@ class Method:
     pipeline: tuple[str, ...] = ("pipeline=echo",)
     observed: tuple[str, float] | None = None
     """A modality, and the share of its frames that are given."""
+    height_off_m: float | None = None
+    """How far the height that the wearer gives is off (m); None: the wearer's own bones are given."""
 
 
 def pipeline_of(method: Method) -> Echo:
@@ -54,7 +57,8 @@ def captured(
     jobs = [(name, seed) for name in ordered for seed in seeds]
     for start in range(0, len(jobs), items):
         batch = jobs[start : start + items]
-        observed_parts = {name: scenario_of(echo, CaptureInput(store.load(name), store.root)) for name, _ in batch}
+        given = {name: sensed(store.load(name), GIVEN, method.height_off_m) for name, _ in batch}
+        observed_parts = {name: scenario_of(echo, CaptureInput(part, store.root)) for name, part in given.items()}
         scenarios = [_observing(method, echo, observed_parts[name], store.root, seed) for name, seed in batch]
         motions = echo.capture_scenarios(scenarios, [seed for _, seed in batch])
         for (name, seed), motion in zip(batch, motions):

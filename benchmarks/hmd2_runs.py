@@ -1,6 +1,5 @@
 """One row of HMD²'s tables: a method captures recordings of a data set with every seed, and is scored."""
 
-from collections import defaultdict
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from tabling import training_of
 
 from wearcap.cli.conf import compose, load_pipeline
 from wearcap.evaluation.baselines import BASELINES
+from wearcap.evaluation.breakdown import by_activity
 from wearcap.evaluation.evaluate import Realism, evaluate
 from wearcap.metrics.scores import score
 from wearcap.metrics.table import Row, Summary, aggregate
@@ -32,6 +32,8 @@ class Method:
     """Overrides of conf/evaluate.yaml."""
     sensors: str | None = None
     """Preset of the device's errors (`WEARABLES`), or `GIVEN`; None: the case's."""
+    height_off_m: float | None = None
+    """How far the height that the wearer gives is off (m); None: as the preset knows it."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ class Result:
 def run_method(method: Method, case: Case) -> Result:
     """Capture and score. Raises what the verbs of wearcap raise."""
     torch.set_num_threads(1)
-    store = SensedStore.open(case.dataset, method.sensors or case.sensors)
+    store = SensedStore.open(case.dataset, method.sensors or case.sensors, method.height_off_m)
     if method.checkpoint is None:
         pipeline = BASELINES[method.name].fit([RecordingStore.open(root) for root in case.training])
         seeds = case.seeds[:1]
@@ -85,7 +87,7 @@ def run_method(method: Method, case: Case) -> Result:
         scores |= realism.scores(method.name)
     if method.checkpoint is not None:
         scores |= training_of(method.checkpoint)
-    return Result(method.name, scores, _by_activity(rows, store))
+    return Result(method.name, scores, by_activity(rows, {name: store.entries[name].activity for name in case.names}))
 
 
 def best_of(rows: list[Row]) -> list[Row]:
@@ -121,11 +123,3 @@ def seam_ratio(motion: Motion) -> float | None:
     if stride < 6 or not (grown & seam).any():
         return None
     return (jerk[grown & seam].mean() / jerk[grown & ~seam].mean()).item()
-
-
-def _by_activity(rows: list[Row], store: RecordingStore) -> dict[str, dict[str, Summary]]:
-    """Scores by what was done longest in a recording (thesis Tables 6.8–6.10)."""
-    groups: defaultdict[str, list[Row]] = defaultdict(list)
-    for row in rows:
-        groups[store.entries[row.recording].activity.partition(",")[0] or "unnamed"].append(row)
-    return {activity: aggregate(group) for activity, group in sorted(groups.items())}

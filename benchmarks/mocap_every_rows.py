@@ -35,6 +35,8 @@ class Method:
     sensors: str
     """Preset of the errors of head and watches (`WEARABLES`), or `GIVEN`."""
     pipeline: tuple[str, ...] = ("pipeline=mocap_every",)
+    height_off_m: float | None = None
+    """How far the height that the wearer gives is off (m); None: as the preset knows it."""
 
 
 def pipeline_of(method: Method) -> MocapEvery:
@@ -50,7 +52,7 @@ def captures(
     pipeline = pipeline_of(method)
     for name in names:
         recording = store.load(name)
-        given = sensed(recording, method.sensors)
+        given = sensed(recording, method.sensors, method.height_off_m)
         yield recording, given, pipeline.run(given)
         step()
 

@@ -32,6 +32,8 @@ MOST_ROWS = 12
 TRANSCRIBED = "transcribed"
 """Key of a JSON's `about` whose figures were taken from an earlier page and not from the command's own output."""
 NONE = "–"
+OURS = "ours"
+"""Row of our checkpoint."""
 
 Tree = dict[str, Any]
 Trees = Mapping[str, Tree]
@@ -104,6 +106,7 @@ TRAINING = {
     "parameters_m": ("parameters (M)", 2),
     "frames_seen_m": ("frames seen (M)", 2),
     "core_minutes": ("core minutes", 0),
+    "rate_swept": ("rate swept", 4),
 }
 """Columns of what a row's training took."""
 
@@ -113,6 +116,9 @@ def score_grids(tree: Tree, labels: Mapping[str, tuple[str, int]], spread: str =
     (and digits), then all others but those of the truth, which has a row."""
     grids, labels = [], {**labels, **TRAINING}
     for title, rows in tree["tables"].items():
+        rows = {**rows}
+        for name, earlier in kept(tree, title).items():
+            rows |= {f"{name}: {row}": scores for row, scores in earlier.items() if row != "truth"}
         present = list(dict.fromkeys(m for row in rows.values() for m in row if not m.startswith("truth_")))
         metrics = [name for name in labels if name in present] + [name for name in present if name not in labels]
         cells = [[name, *(text(row.get(m), labels.get(m, ("", 2))[1]) for m in metrics)] for name, row in rows.items()]
@@ -131,6 +137,17 @@ def score_grids(tree: Tree, labels: Mapping[str, tuple[str, int]], spread: str =
     return grids
 
 
+def kept(tree: Tree, title: str) -> dict[str, Tree]:
+    """Earlier versions of a table that new runs leave as they are ("before more motion, Table 2: …"), by their names; of
+    the title its beginning is enough."""
+    found = {}
+    for other, rows in tree.get("tables", {}).items():
+        name, comma, rest = other.partition(", ")
+        if comma and rest.startswith(title.split(":")[0]):
+            found[name] = rows
+    return found
+
+
 def rows_of(trees: Trees, title: str) -> dict[str, dict[str, Any]]:
     """Rows of the first table whose title begins so; none where no tree has it."""
     for tree in trees.values():
@@ -144,13 +161,20 @@ def picked(
     trees: Trees, rows: Iterable[tuple[str, str, str]], columns: Iterable[tuple[str, tuple[str, ...], int]]
 ) -> list[list[str]]:
     """Lines of a headline table. rows: a table's title, a row of it, what the page calls it; columns: a heading, the
-    metrics of which a row has one, digits. Rows that are not in the tables are left out."""
-    lines = []
+    metrics of which a row has one, digits. Rows that are not in the tables are left out; our row of an earlier version
+    that was kept follows that of now."""
+
+    def line(label: str, found: Mapping[str, Any]) -> list[str]:
+        chosen = ((next((found[m] for m in metrics if m in found), None), digits) for _, metrics, digits in columns)
+        return [label, *(text(summary, digits) for summary, digits in chosen)]
+
+    lines, columns = [], tuple(columns)
     for title, name, label in rows:
         found = rows_of(trees, title).get(name)
-        if found is not None:
-            chosen = ((next((found[m] for m in metrics if m in found), None), digits) for _, metrics, digits in columns)
-            lines.append([label, *(text(summary, digits) for summary, digits in chosen)])
+        lines += [line(label, found)] if found is not None else []
+        for tree in trees.values():
+            earlier = kept(tree, title).items()
+            lines += [line(f"{label}, {of}", kept_rows[name]) for of, kept_rows in earlier if name == OURS in kept_rows]
     return lines
 
 

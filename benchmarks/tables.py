@@ -23,6 +23,7 @@ it has a page, `page(trees, speed)`.
 
 import argparse
 import importlib
+import shlex
 import sys
 from pathlib import Path
 
@@ -55,9 +56,9 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--page", action="store_true", help="make the page of what is in docs/results, nothing else")
     system.add_arguments(parser)
     options = parser.parse_args(arguments[1:])
-    command = ["python benchmarks/tables.py", *(word for word in arguments if word != "--publish")]
+    command = shlex.join(["python", "benchmarks/tables.py", *(word for word in arguments if word != "--publish")])
     try:
-        path = system.tables(options, about(" ".join(command)))
+        path = system.tables(options, about(command))
     except WearcapError as error:
         sys.exit(f"error: {error}")
     print(f"written: {path}")

@@ -9,9 +9,9 @@ diffusion, as in the paper.
 import argparse
 import json
 import re
-import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from echo_rows import Captured, Method, captured, pipeline_of, scenario_of
@@ -19,7 +19,8 @@ from hydra.utils import instantiate
 from result_pages import Grid, Page, Tree, Trees, figure_of, mean, picked, rows_of, score_grids
 from rich.console import Console
 from rich.progress import Progress
-from tabling import TRAINING, finite, recordings_of, training_of
+from sensed import WRONG_HEIGHTS
+from tabling import TRAINING, add_people, budget, finite, left_out, recordings_of, split_of, titled, training_of
 
 from wearcap.cli.conf import compose
 from wearcap.files import write_text
@@ -31,13 +32,18 @@ from wearcap.systems.echo.scores import score_echo
 
 BODY = {
     "mpjpe_mm": "MPJPE (mm)",
+    "upper_pe_mm": "upper body (mm)",
+    "lower_pe_mm": "lower body (mm)",
+    "hand_pe_mm": "hands (mm)",
     "mpjve_mm": "MPJVE (mm per frame at 30 Hz)",
     "mpjve_printed": "MPJVE as the paper prints it, without unit",
     "foot_contact": "FC",
     "foot_skate_cm_s": "skate (cm/s)",
+    "skate_ratio": "skate, of the truth's",
     "floor_penetration_cm": "into the floor (cm)",
     "physicality": "physicality",
     "jitter_m_s3": "jitter (m/s³)",
+    "jitter_ratio": "jitter, of the truth's",
     **TRAINING,
 }
 """Columns of the tables of bodies. Ours of MPJVE is in the unit of ECHO's words, which its figures cannot have
@@ -58,18 +64,10 @@ WHOLE = ("mpjpe_mm", "mpjve_printed", "foot_contact", "v2v_cm", "center_cm", "ro
 """The paper's columns of Table 1."""
 UNGUIDED = ("pipeline=echo", "pipeline.contacts.guidance=null")
 SHORT = ("experiment=echo",)
-BUDGET = (
-    "trainer.max_steps=400",
-    "data.loading.steps_per_epoch=80",
-    "optimizer.scheduler.warmup=40",
-    "callbacks.average.decay=0.98",
-    "early_stop=3",
-)
-"""How long all of these are trained: 400 batches of some 960 frames, in windows of 60 or 98, or until the validation
-loss has not fallen for three epochs; captured with is the checkpoint of the lowest."""
-BATCH = "data.loading.batch_size=16"
-LONG = ("data.loading.batch_size=10",)
-"""Windows of a batch, and those of 98 frames."""
+BUDGET = 384_000
+"""Frames that each of these sees, ours among them, unless `rivals.py` is given another budget."""
+BATCH, LONG = (16, 60), (10, 98)
+"""Windows of a batch and their frames, and those of AGRoL."""
 TRAININGS: dict[str, tuple[str, ...]] = {
     "echo_short": SHORT,
     "echo_window": (*SHORT, "features.frame=window"),
@@ -91,8 +89,9 @@ TRAININGS: dict[str, tuple[str, ...]] = {
     "bodiffusion_object_window": ("experiment=baseline/bodiffusion_object", "features.frame=window"),
     "bodiffusion": ("experiment=baseline/bodiffusion",),
     "egoallo_human": ("experiment=baseline/egoallo_human",),
-    "agrol_human": ("experiment=baseline/agrol_human", *LONG),
+    "agrol_human": ("experiment=baseline/agrol_human",),
 }
+RUNS = tuple(TRAININGS)
 """Overrides of `wearcap train` by the run's name: ECHO trained briefly, and each ablation of it trained as long: the
 paper's canonical frame (window) and none (world), the losses of the three modalities alone, the weights of ECHO eq. 13,
 and a token per frame and modality; and the baselines, as long, in the same frames as ours."""
@@ -143,7 +142,7 @@ SETTINGS = {
     "context of 40: latency of 20 frames": ("pipeline=echo", "pipeline.sampling.context=40"),
     "all as in the paper": ("pipeline=paper/echo",),
 }
-TRUTH_GIVEN = "exact wrists and heads, floor, bones, and which object is active, are given to all rows"
+TRUTH_GIVEN = "exact wrists and heads, floor, bones (but in rows of wrong height), and which object is active, are given to all rows"
 SHARES = {"human": (0.01, 0.05, 0.1, 0.25, 1.0), "object": (0.01, 0.05, 0.1, 0.25, 1.0), "contact": (0.01, 0.05, 0.1, 0.25, 1.0)}  # fmt: skip
 PAPER: Scores = {
     name: {key: Summary(value, None, 4) for key, value in zip(keys, values)}
@@ -189,6 +188,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=list(PARTS),
         help="tables to make",
     )
+    add_people(parser)
 
 
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
@@ -196,8 +196,9 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     console, found = Console(width=200), {}
     path = options.output / "echo.json"
     with Progress(transient=True, console=console) as progress:
-        for part in options.parts:
-            title, columns, scores = PARTS[part](options, progress)
+        makers = [PARTS[part] for part in options.parts] + [partial(_strangers, root) for root in options.strangers]
+        for make in makers:
+            title, columns, scores = make(options, progress)
             ours = next((row for row in scores.values() if f"{TRUTH}physicality" in row), {})
             scores = scores | {"truth": truth_row(ours)}
             found[title] = {method: {k: vars(v) for k, v in row.items()} for method, row in scores.items()}
@@ -260,17 +261,14 @@ def _trained(rows: dict[str, tuple[str, ...]], options: argparse.Namespace, prog
         if path.is_file():
             methods.append(Method(name, str(path), tuple(pipeline)))
         else:
-            command = shlex.join(["wearcap", "train", *training(run), f"name={run}", f"paths.run={options.runs / run}"])
-            progress.console.print(
-                f"left out: {name} (no {path}); train it by: {command}", markup=False, soft_wrap=True
-            )
+            progress.console.print(left_out(name, "echo", run, path), markup=False, soft_wrap=True)
     return methods
 
 
-def training(run: str) -> list[str]:
-    """Overrides that train a run within the common budget."""
-    batch = () if LONG[0] in TRAININGS[run] else (BATCH,)
-    return [*TRAININGS[run], *batch, *BUDGET]
+def training(run: str, frames: int = BUDGET) -> list[str]:
+    """Overrides that train one of `RUNS` within a budget."""
+    windows, length = LONG if run == "agrol_human" else BATCH
+    return [*TRAININGS[run], f"data.loading.batch_size={windows}", *budget(frames, windows * length)]
 
 
 def _sparse(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapping[str, str], Scores]:
@@ -288,10 +286,25 @@ def _given(row: tuple[str, float] | None) -> str:
 
 def _human(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapping[str, str], Scores]:
     """Table 2: people without objects."""
-    store, names = recordings_of(options, "cmu")
-    methods = [Method("ours", options.checkpoint), *_trained(HUMANS, options, progress)]
-    scores = _scores(methods, options, progress, store, names)
-    return f"Table 2: CMU, {options.split}; {TRUTH_GIVEN}", BODY, scores | PAPER_HUMAN
+    scores = _people(options, progress, *recordings_of(options, "cmu"))
+    title = titled(f"Table 2: CMU, {options.split}; {TRUTH_GIVEN}", options)
+    return title, BODY, scores | ({} if options.keep else PAPER_HUMAN)
+
+
+def _strangers(root: Path, options: argparse.Namespace, progress: Progress) -> tuple[str, Mapping[str, str], Scores]:
+    """The same rows on people of another laboratory."""
+    scores = _people(options, progress, *split_of(options, root))
+    return titled(f"People ({root.name}): {options.split}; {TRUTH_GIVEN}", options), BODY, scores
+
+
+def _people(options: argparse.Namespace, progress: Progress, store: RecordingStore, names: list[str]) -> Scores:
+    """Rows of bodies: ours, with the wearer's bones and with a wrong height, then trained rivals."""
+    methods = [Method("ours", options.checkpoint)]
+    for what, off in WRONG_HEIGHTS.items():
+        methods.append(Method(f"ours, {what}", options.checkpoint, height_off_m=off))
+    methods = [method for method in methods if options.rows is None or method.name in options.rows]
+    methods += [] if options.keep else _trained(HUMANS, options, progress)
+    return _scores(methods, options, progress, store, names)
 
 
 def _scores(
@@ -344,6 +357,9 @@ PARTS = {
 
 LABELS = {
     "mpjpe_mm": ("MPJPE (mm)", 1),
+    "upper_pe_mm": ("upper body (mm)", 1),
+    "lower_pe_mm": ("lower body (mm)", 1),
+    "hand_pe_mm": ("hands (mm)", 1),
     "mpjve_mm": ("MPJVE (mm a frame)", 1),
     "mpjve_printed": ("MPJVE as the paper prints it", 1),
     "foot_contact": ("FC", 2),
@@ -358,7 +374,9 @@ LABELS = {
     "touch_f1": ("contact F1", 2),
     "jitter_m_s3": ("jitter (m/s³)", 1),
     "true_jitter_m_s3": ("jitter, truth", 1),
+    "jitter_ratio": ("jitter, of the truth's", 2),
     "foot_skate_cm_s": ("skate (cm/s)", 1),
+    "skate_ratio": ("skate, of the truth's", 2),
     "floor_penetration_cm": ("into the floor (cm)", 2),
     "physicality": ("physicality", 4),
     "training_minutes": ("minutes learned from", 0),
@@ -366,17 +384,15 @@ LABELS = {
 """Columns of the page's tables with their digits."""
 HEADLINE = (
     ("Table 1:", "ours", "objects: **ours**"),
-    ("Table 1:", "ours, object stuck to the nearer wrist", "objects: ours, the object stuck to the nearer wrist"),
     ("Table 1:", "nearest training window", "objects: nearest training window"),
     ("Table 1, equal", "ours, the same budget", "objects: ours, the rivals' budget"),
     ("Table 1, equal", "BoDiffusion-style + object", "objects: BoDiffusion-style + object, the same frame and budget"),
     ("Table 1, equal", "BoDiffusion-style", "objects: BoDiffusion-style, the same frame and budget"),
     ("Table 1:", "truth", "objects: the truth itself"),
     ("Table 1:", "paper: BEHAVE", "the paper's, on BEHAVE"),
-    ("Table 1:", "paper: BoDiffusion+Obj, BEHAVE", "the paper's BoDiffusion + object, on BEHAVE"),
     ("Table 2", "ours", "people alone (CMU): **ours**"),
     ("Table 2", "ours, the same budget", "people alone (CMU): ours, the rivals' budget"),
-    ("Table 2", "BoDiffusion-style", "people alone (CMU): BoDiffusion-style, the same budget"),
+    ("People (hdm05)", "ours", "people alone (another laboratory's, HDM05): **ours**"),
 )
 """Rows of the page's first table: table, row, and what the page calls it."""
 CLOCKS = {

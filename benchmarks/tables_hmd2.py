@@ -7,7 +7,6 @@ out, which is printed. Checkpoints come by name (checkpoints/) or path.
 
 import argparse
 import json
-import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -18,12 +17,13 @@ from joblib import Parallel, delayed
 from result_pages import NONE, Grid, Page, Tree, Trees, figure_of, grid_of, mean, ranged, score_grids, summaries, text
 from rich.console import Console
 from rich.table import Table
-from sensed import GIVEN, add_sensors
-from tabling import TRAINING, finite, new_table
+from sensed import GIVEN, WRONG_HEIGHTS, add_sensors
+from tabling import TRAINING, add_people, budget, finite, left_out, split_of, titled
 
 from wearcap.errors import WearcapError
+from wearcap.evaluation.breakdown import extremes
 from wearcap.files import write_text
-from wearcap.metrics.table import P95, Scores, Summary, truth_row
+from wearcap.metrics.table import P95, Scores, Summary, rich_lines, truth_row
 from wearcap.models.checkpoint import checkpoint_file
 from wearcap.recording import RecordingStore
 from wearcap.sensors.wearables import WEARABLES
@@ -39,6 +39,7 @@ COLUMNS = {
     "diversity": "divers.",
     "physicality": "phys.",
     "floor_penetration_cm": "floor",
+    "skate_ratio": "sk. ratio",
     "foot_skate_cm_s": "skate",
     "jitter_m_s3": "m/s³",
     "jitter_ratio": "jitter",
@@ -70,6 +71,7 @@ PAPER = {
     "HMD² (h = 10)": (9.19, 17.67, 5.00, 15.23, 1.30, 1.19),
 }
 """Thesis Table 6.1, on Nymeria: MPJPE, hand, FID, Diversity (truth 16.13), Physicality (truth 0.56), floor penetration."""
+PAPER_METRICS = ("mpjpe_cm", "hand_pe_cm", "fid", "diversity", "physicality", "floor_penetration_cm")
 FIRST = "Tables 6.1 and 6.3"
 OURS = "full"
 TRUTH_GIVEN = "hands of the AvatarPoser-style row that sees them (with exact sensors and bones), and the bones of rows that say so"
@@ -85,8 +87,9 @@ TRAINED = {
     BRIEF: ("motion_diffusion_head", ("pipeline=hmd2", "pipeline.runtime=auto"), None),
 }
 """Baselines, and our network with as little training: run, overrides that capture, and sensors (None: the table's)."""
+RUNS = tuple(run for run, _, _ in TRAINED.values())
 BUDGET, BATCH = 300_000, 8
-"""Frames that each of these sees, and windows of a batch."""
+"""Frames that each of these sees, unless `rivals.py` is given another budget, and windows of a batch."""
 WINDOW = {
     "egoego_style": 120,
     "egoallo_style": 128,
@@ -95,6 +98,9 @@ WINDOW = {
     "avatarposer_hands": 82,
 }
 """Frames of a window that a network sees, where they are not 240: AvatarPoser's two pairs of poses see 41 each."""
+ALONE = "head alone"
+PEOPLE = (*BASELINES, *TRAINED, ALONE)
+"""Rows of the tables of people without surroundings, beside those of other sensors."""
 STRIDES = (230, 180, 120, 60, 30, 10, 1)
 STEPS = (2, 3, 5, 10, 20, 40, 80)
 LOOKAHEAD = 20
@@ -146,10 +152,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--steps", type=int, nargs="*", default=STEPS, help="steps of Table 6.7")
     parser.add_argument("--device", default="cpu", help="device that captures")
     parser.add_argument("--jobs", type=int, default=2, help="rows at a time")
+    add_people(parser)
 
 
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
-    """Print and write the tables; returns the file."""
+    """Print and write the tables; returns the file. With `--strangers` those of people without surroundings alone."""
+    if options.strangers:
+        return _strangers(options, about)
     case = _case(options)
     console = Console(width=WIDTH)
     jobs = [(FIRST, case, _methods(options, console)), *([] if options.quick else _sweeps(options, case))]
@@ -162,12 +171,15 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
         results = results[len(methods) :]
         split = options.split if where is case else options.sweep_split
         console.print(_table(f"{title} ({case.dataset.name}, {split}, {case.sensors} sensors)", found[title]))
-    console.print(f"The truth's are, beside the sensors', {TRUTH_GIVEN}.", _paper())
+    heads = {name: COLUMNS[name] for name in PAPER_METRICS}
+    paper = rich_lines("the paper", _papers(heads, PAPER), heads)
+    console.print(f"The truth's are, beside the sensors', {TRUTH_GIVEN}.", paper)
     tail = {row.method: {name: row.scores[name] for name in TAIL} for row in found[FIRST]}
-    console.print(_parts("Table 6.6: 95th percentiles of each recording", TAIL, tail, PAPER_TAIL))
+    title = "Table 6.6: 95th percentiles of each recording (cm)"
+    console.print(rich_lines(title, tail | _papers(TAIL, PAPER_TAIL), TAIL))
     scenarios = _scenarios(found[FIRST])
     for title, rows in scenarios.items():
-        console.print(_parts(title, PARTS, rows, {}))
+        console.print(rich_lines(f"{title} (cm)", rows, PARTS))
     for metric, title in PARTS.items():
         console.print(_activities(f"{title} (cm) by what was mostly done", found[FIRST], metric))
     usual = "" if options.sensors == "typical" else f"_{options.sensors}"
@@ -188,6 +200,35 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
         "scenarios": {title: _plain(rows) for title, rows in scenarios.items()},
     }
     write_text(path, json.dumps(finite(tree), indent=1) + "\n")
+    return path
+
+
+def _strangers(options: argparse.Namespace, about: dict[str, str]) -> Path:
+    """People whose head alone is tracked, of data sets without points and pictures, in hmd2_people.json."""
+    console, tables = Console(width=WIDTH), {}
+    there = {method.name: method for method in _methods(options, console) if method.name in PEOPLE}
+    alone = there.pop(ALONE)
+    ours = [
+        alone,
+        *(replace(alone, name=f"{ALONE}, {n} sensors", sensors=n) for n in WEARABLES if n != options.sensors),
+    ]
+    ours += [replace(alone, name=f"{ALONE}, {what}", height_off_m=off) for what, off in WRONG_HEIGHTS.items()]
+    ours.append(replace(alone, name=f"{ALONE}, exact sensors, bones given", sensors=GIVEN))
+    ours = [method for method in ours if options.rows is None or method.name in options.rows]
+    methods = ours if options.keep else [*there.values(), *ours]
+    for root in options.strangers:
+        store, names = split_of(options, root)
+        seeds = tuple(range(2 if options.quick else options.seeds))
+        case = Case(store.root, tuple(names), seeds, tuple(options.training), None, options.sensors, options.device)
+        results = Parallel(n_jobs=options.jobs)(delayed(run_method)(method, case) for method in methods)
+        title = titled(f"People ({root.name}): {options.split}, head alone, {options.sensors} sensors", options)
+        found = [result for result in results if result is not None]
+        console.print(_table(title, found))
+        scores = {result.method: result.scores for result in found}
+        tables[title] = _plain(scores | {"truth": truth_row(scores[ours[0].name])})
+    path = options.output / "hmd2_people.json"
+    facts = {**about, "split": options.split, "sensors": options.sensors, "seeds": len(seeds)}
+    write_text(path, json.dumps(finite({"about": facts, "tables": tables}), indent=1) + "\n")
     return path
 
 
@@ -219,15 +260,13 @@ def _sweeps(options: argparse.Namespace, case: Case) -> list[tuple[str, Case, li
 def _scenarios(results: list[Result]) -> dict[str, Scores]:
     """Tables 6.8 to 6.10: the activities in which ours is best, in the middle, and worst, by title."""
     ours = next((result.activities for result in results if result.method == OURS), {})
-    ranked = sorted(ours, key=lambda name: ours[name]["mpjpe_cm"].mean)
-    if not ranked:
-        return {}
-    places = {"6.8: best": 0, "6.9: median": (len(ranked) - 1) // 2, "6.10: worst": -1}
+    ranks = extremes({name: scores["mpjpe_cm"].mean for name, scores in ours.items()})
     return {
-        f"Table {number} of {len(ranked)} activities, {ranked[place]}": {
-            row.method: {metric: row.activities[ranked[place]][metric] for metric in PARTS} for row in results
+        f"Table {number}: {place} of {len(ours)} activities, {ranks[place]}": {
+            row.method: {metric: row.activities[ranks[place]][metric] for metric in PARTS} for row in results
         }
-        for number, place in places.items()
+        for number, place in (("6.8", "best"), ("6.9", "median"), ("6.10", "worst"))
+        if place in ranks
     }
 
 
@@ -270,17 +309,11 @@ def _latencies(options: argparse.Namespace, h: int) -> list[Method]:
     ]
 
 
-def training(run: str, runs: Path) -> list[str]:
-    """The command that trains one of `TRAINED`: all on the motion of the same data, to the same number of frames, or until
-    the validation loss has not fallen for three epochs; captured with is the checkpoint of the lowest."""
-    steps = BUDGET // (BATCH * WINDOW.get(run, 240))
+def training(run: str, frames: int = BUDGET) -> list[str]:
+    """Overrides that train one of `RUNS` within a budget, all on the motion of the same data."""
     experiment = run if run == "motion_diffusion_head" else f"baseline/{run}"
-    return [
-        *("wearcap", "train", f"experiment={experiment}", "data=cmu_simulated", f"data.loading.batch_size={BATCH}"),
-        *(f"trainer.max_steps={steps}", f"data.loading.steps_per_epoch={steps // 6}", "trainer.precision=bf16-mixed"),
-        *("optimizer.optimizer.lr=1.0e-3", f"optimizer.scheduler.warmup={steps // 10}", "early_stop=3"),
-        *("callbacks=averaged", "callbacks.average.decay=0.98", f"name={run}", f"paths.run={runs / run}"),
-    ]
+    data = [f"experiment={experiment}", "data=cmu_simulated", f"data.loading.batch_size={BATCH}", "callbacks=averaged"]
+    return [*data, *budget(frames, BATCH * WINDOW.get(run, 240))]
 
 
 def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
@@ -289,7 +322,6 @@ def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
         Method(name, str(options.runs / run / "checkpoints" / "best.ckpt"), pipeline, sensors)
         for name, (run, pipeline, sensors) in TRAINED.items()
     ]
-    commands = {name: shlex.join(training(run, options.runs)) for name, (run, _, _) in TRAINED.items()}
     full = _ours(options, OURS)
     sensing = [replace(full, name=f"full, {n} sensors", sensors=n) for n in WEARABLES if n != options.sensors]
     sensing.append(replace(full, name="full, the data's own sensors, bones given", sensors=GIVEN))
@@ -310,49 +342,39 @@ def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
     there = [method for method in wanted if method.checkpoint is None or _exists(method.checkpoint)]
     for method in wanted:
         if method not in there:
-            how = f"; train it by: {commands[method.name]}" if method.name in commands else ""
-            console.print(f"left out: {method.name} (no checkpoint {method.checkpoint!r}){how}", soft_wrap=True)
+            run = TRAINED.get(method.name, ("",))[0]
+            missing = f"left out: {method.name} (no checkpoint {method.checkpoint!r})"
+            console.print(
+                left_out(method.name, "hmd2", run, method.checkpoint) if run else missing, markup=False, soft_wrap=True
+            )
     return there
 
 
 def _table(title: str, results: list[Result]) -> Table:
-    table = new_table(title, ["", *COLUMNS.values()])
-    for result in results:
-        table.add_row(result.method, *_cells(result.scores, COLUMNS))
-    if results:
-        table.add_row("truth", *_cells(truth_row(results[0].scores), COLUMNS))
-    return table
+    rows = {result.method: result.scores for result in results}
+    columns = {name: head for name, head in COLUMNS.items() if any(name in scores for scores in rows.values())}
+    return rich_lines(title, rows | ({"truth": truth_row(results[0].scores)} if results else {}), columns)
 
 
-def _cells(scores: Mapping[str, Summary], columns: Iterable[str]) -> list[str]:
-    """Means ± deviations with as many digits as they need; a dash for what there is not."""
-    return [str(scores[name]) if name in scores else "–" for name in columns]
-
-
-def _parts(title: str, columns: Mapping[str, str], rows: Scores, paper: Mapping[str, tuple[float, ...]]) -> Table:
-    """A table of parts of the body."""
-    table = new_table(f"{title} (cm)", ["", *columns.values()])
-    for name, scores in rows.items():
-        table.add_row(name, *_cells(scores, columns))
-    for name, values in paper.items():
-        table.add_row(f"the paper's {name}, on Nymeria", *(f"{value:.2f}" for value in values))
-    return table
-
-
-def _paper() -> Table:
-    table = new_table("the paper, on Nymeria", ["", "MPJPE", "hand", "FID", "divers.", "phys.", "floor"])
-    for name, values in PAPER.items():
-        table.add_row(name, *(f"{value:.2f}" for value in values))
-    return table
+def _papers(columns: Iterable[str], paper: Mapping[str, tuple[float, ...]]) -> Scores:
+    """Rows of the paper."""
+    return {
+        f"the paper's {name}, on Nymeria": {metric: Summary(value, None, 1) for metric, value in zip(columns, values)}
+        for name, values in paper.items()
+    }
 
 
 def _activities(title: str, results: list[Result], metric: str) -> Table:
-    names = sorted({activity for result in results for activity in result.activities})
-    table = new_table(title, ["", *(name[:14] for name in names)])
-    for result in results:
-        row = [result.activities[name][metric].mean if name in result.activities else None for name in names]
-        table.add_row(result.method, *("–" if value is None else f"{value:.1f}" for value in row))
-    return table
+    """Means of one metric by activity."""
+    rows = {
+        result.method: {
+            activity: Summary(scores[metric].mean, None, 1) for activity, scores in result.activities.items()
+        }
+        for result in results
+    }
+    return rich_lines(
+        title, rows, {name: name[:14] for name in sorted({each for row in rows.values() for each in row})}
+    )
 
 
 HEADLINE = {
@@ -384,6 +406,8 @@ MAIN = "Tables 6.1 and 6.3"
 
 def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     """What docs/results/hmd2.md says."""
+    people = trees.get("hmd2_people", {"tables": {}})
+    trees = {name: tree for name, tree in trees.items() if name != "hmd2_people"}
     simulated, real = (
         {row["method"]: row["scores"] for row in _rows(trees, name)} for name in ("simulated_camera", "cmu_surrounded")
     )
@@ -415,6 +439,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         "[simulation](simulation.md). The paper's rows are from real recordings (Nymeria): no comparison.",
         limits=(
             *_against_hands(simulated),
+            *_strangers_off(people),
             f"Jitter is {mean(ours['jitter_ratio'])} times the truth's.",
             "Bad are arms out of the camera's sight, and CMU's dances and jumps.",
             *_briefly(simulated, real),
@@ -423,7 +448,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
             "FID needs more windows than CMU's held-out subjects have.",
             "No recording of a real head-mounted device has been scored.",
         ),
-        full=_grids(trees),
+        full=[*score_grids(people, _labels(), "repetitions"), *_grids(trees)],
         measured=f"joints {errors[0]} cm off{ours_real}",
         speed=f"{online['ratio']:.0f} × online, head's path and points given" if online else "",
         clocks=CLOCKS,
@@ -484,6 +509,26 @@ def _against_hands(scores: dict[str, Tree]) -> tuple[str, ...]:
     return (f"The regressor that also sees both hands is {errors[0]} off, and {errors[1]} in the lower body.",)
 
 
+def _strangers_off(people: Tree) -> tuple[str, ...]:
+    """How far it is off people without surroundings, whose head alone is tracked."""
+    errors = []
+    for title, rows in people["tables"].items():
+        if ALONE not in rows:
+            continue
+        name = title.partition("People")[0].rstrip(", ")
+        errors.append(f"{mean(rows[ALONE]['mpjpe_cm'])} cm on {_dataset(title)}" + (f" ({name})" if name else ""))
+    return (
+        (f"From the head alone, on whole splits of people without surroundings: {', '.join(errors)}.",)
+        if errors
+        else ()
+    )
+
+
+def _dataset(title: str) -> str:
+    """Name of the data set in a title "People (cmu): …"."""
+    return title.partition("(")[2].partition(")")[0]
+
+
 def _first_lines(simulated: dict[str, Tree], real: dict[str, Tree]) -> list[list[str]]:
     """Lines of the page's first table, from scores by row of both data sets."""
     metrics = (("mpjpe_cm", 2), ("hand_pe_cm", 2), ("lower_pe_cm", 2), ("fid", 2), ("jitter_ratio", 2))
@@ -519,11 +564,10 @@ def _grids(trees: Trees) -> list[Grid]:
         for title, rows in tree["tables"].items()
         if rows
     ]
-    labels = {name: (title, 2) for name, title in COLUMNS.items()}
     for tree in trees.values():
         parts = {"Table 6.6: 95th percentiles": tree.get("percentiles"), **tree.get("scenarios", {})}
         found = {title: rows for title, rows in parts.items() if rows}
-        grids += score_grids({"about": tree["about"], "tables": found}, labels)
+        grids += score_grids({"about": tree["about"], "tables": found}, _labels())
     first = {name: _results(tree["tables"].get(MAIN, [])) for name, tree in trees.items()}
     for name, rows in first.items():
         if any(row.activities for row in rows):
@@ -532,6 +576,11 @@ def _grids(trees: Trees) -> list[Grid]:
             )
             grids.append(grid_of(table, trees[name]["about"]))
     return grids
+
+
+def _labels() -> dict[str, tuple[str, int]]:
+    """Columns of the page's tables with their digits."""
+    return {name: (title, 2) for name, title in COLUMNS.items()}
 
 
 def _rows(trees: Trees, name: str) -> list[Tree]:

@@ -9,7 +9,7 @@ table gives their mean and spread. A row without its checkpoint is left out, and
 
 import argparse
 import json
-import shlex
+from functools import partial
 from pathlib import Path
 
 from mocap_every_calibration import GOALS, calibration_scores
@@ -17,12 +17,13 @@ from mocap_every_rows import Method, body_row, captures, cue_row, floor_row, pip
 from result_pages import Grid, Page, Tree, Trees, figure_of, mean, picked, ranged, rows_of, score_grids
 from rich.console import Console
 from rich.progress import Progress
-from sensed import GIVEN, add_sensors
-from tabling import TRAINING, finite, recordings_of, training_of
+from sensed import GIVEN, WRONG_HEIGHTS, add_sensors
+from tabling import TRAINING, add_people, budget, finite, left_out, recordings_of, split_of, titled, training_of
 
 from wearcap.files import write_text
 from wearcap.metrics.table import Scores, Summary, aggregate, markdown_table, truth_row
 from wearcap.models.checkpoint import checkpoint_file
+from wearcap.recording import RecordingStore
 from wearcap.sensors.wearables import WEARABLES
 from wearcap.systems.mocap_every.energy import LatentSolver
 from wearcap.systems.mocap_every.visual_cues import load_visual_cues
@@ -36,6 +37,7 @@ BODY = (
     "upper_pe_cm",
     "lower_pe_cm",
     "hand_pe_cm",
+    "skate_ratio",
     "foot_skate_cm_s",
     "jitter_m_s3",
     "physicality",
@@ -71,16 +73,10 @@ TRAININGS: dict[str, tuple[str, ...]] = {
 """Overrides of `wearcap train` by the run's name: ablations after the paper's Table 7 without its first stage, and
 without its data representation as well (world coordinates); and AvatarPoser's protocol 1, with tracked hands instead of
 accelerations."""
-STEPS = (
-    "trainer.max_steps=300",
-    "data.loading.steps_per_epoch=50",
-    "optimizer.scheduler.warmup=30",
-    "trainer.precision=bf16-mixed",
-    "callbacks.average.decay=0.98",
-    "early_stop=3",
-)
-"""One budget for all of these, ours among them: as many frames of the same data, in batches and precision alike, or
-until the validation loss has not fallen for three epochs. Captured with is each one's checkpoint of the lowest."""
+RUNS = tuple(TRAININGS)
+BUDGET, BATCH, WINDOW = 768_000, 64, 40
+"""Frames that each of these sees, ours among them, unless `rivals.py` is given another budget; windows of a batch, and
+their frames."""
 TRAINED = {
     "AvatarPoser-style, watches": (
         "mocap_every_avatarposer",
@@ -134,14 +130,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=["body", "floor", "cues", "calibration"],
         help="tables to make; totalcapture, too, for those who have prepared it",
     )
+    add_people(parser)
+
+
+def training(run: str, frames: int = BUDGET) -> list[str]:
+    """Overrides that train one of `RUNS` within a budget, all on the same data."""
+    return [*TRAININGS[run], f"data.loading.batch_size={BATCH}", *budget(frames, BATCH * WINDOW)]
 
 
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     """Print and write the tables; returns the file."""
     console, found = Console(width=170), {}
     with Progress(transient=True, console=console) as progress:
-        for part in options.parts:
-            title, columns, scores = PARTS[part](options, progress)
+        makers = [PARTS[part] for part in options.parts] + [partial(_strangers, root) for root in options.strangers]
+        for make in makers:
+            title, columns, scores = make(options, progress)
             found[title] = {method: {k: vars(v) for k, v in row.items()} for method, row in scores.items()}
             console.print(f"\n{title}\n\n{markdown_table(scores, columns)}", markup=False, soft_wrap=True)
     path = options.output / f"mocap_every{'' if options.sensors == 'typical' else f'_{options.sensors}'}.json"
@@ -163,6 +166,7 @@ LABELS = {
     "right_arm_cm": ("right arm (cm)", 2),
     "jitter_ratio": ("jitter, of the truth's", 2),
     "jitter_m_s3": ("jitter (m/s³)", 1),
+    "skate_ratio": ("skate, of the truth's", 2),
     "foot_skate_cm_s": ("skate (cm/s)", 2),
     "physicality": ("physicality", 4),
     "floor_penetration_cm": ("into the floor (cm)", 2),
@@ -174,15 +178,13 @@ LABELS = {
 HEADLINE = (
     ("Tables 2, 6, 7", "AvatarPoser-style, watches", "CMU: AvatarPoser-style, on watches"),
     ("Tables 2, 6, 7", "AGRoL's MLP, watches (AGRoL*)", "CMU: AGRoL's MLP, on watches"),
-    ("Tables 2, 6, 7", "as in the paper", "CMU: our network as in the paper"),
-    ("Tables 2, 6, 7", "ours, the same budget (+ multi-stage)", "CMU: ours, trained as briefly as these three"),
+    ("Tables 2, 6, 7", "ours, the same budget (+ multi-stage)", "CMU: ours, trained as briefly as these"),
     ("Tables 2, 6, 7", "ours", "CMU: **ours**"),
     ("Tables 2, 6, 7", "ours, poor sensors", "CMU: **ours**, poor sensors"),
     ("Tables 2, 6, 7", "truth", "CMU: the truth itself"),
+    ("People (hdm05)", "ours", "another laboratory's person (HDM05): **ours**"),
     ("Tables 2, 6, 7", "paper: AMASS", "the paper's, on AMASS"),
-    ("Table 3", "floor update", "hillsides: D.2 with our network"),
     ("Table 3", "floor follow", "hillsides: **ours**"),
-    ("Table 4", "cmu: estimated", "CMU, right wrist in the picture: estimated"),
     ("Table 4", "cmu: edited", "CMU, right wrist in the picture: **edited**"),
 )
 """Rows of the page's first table: table, row, and what the page calls it."""
@@ -193,7 +195,9 @@ COLUMNS = (
     ("hands", ("hand_pe_cm", "right_hand_cm"), 2),
     ("MPJVE (cm/s)", ("mpjve_cm_s",), 2),
     ("jitter, of the truth's", ("jitter_ratio",), 2),
+    ("skate, of the truth's", ("skate_ratio",), 1),
     ("skate (cm/s)", ("foot_skate_cm_s",), 1),
+    ("into the floor", ("floor_penetration_cm",), 1),
     ("M frames seen", ("frames_seen_m",), 2),
 )
 """Columns of the page's first table: heading, metrics of which a row has one, digits."""
@@ -272,33 +276,23 @@ def _briefly(body: dict[str, Tree]) -> tuple[str, ...]:
 
 def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """Tables 2, 5, 6 and 7: held-out CMU subjects, whose heads and watches are simulated."""
-    level, usual = "pipeline.floor=fixed", options.sensors
-    variants = {
-        "ours": ("pipeline=mocap_every",),
-        "ours, floor fixed at the beginning": ("pipeline=mocap_every", level),
-        "ours, without mirror averaging": ("pipeline=mocap_every", "pipeline.mirror_average=false"),
-        "ours, not anchored to the head": ("pipeline=mocap_every", "pipeline.anchor=false"),
-        "ours, three frames at a time": ("pipeline=mocap_every_online",),
-    }
-    ours = [Method(name, options.checkpoint, usual, pipeline) for name, pipeline in variants.items()]
-    ours += [Method(f"ours, {other} sensors", options.checkpoint, other) for other in WEARABLES if other != usual]
-    given = "ours, exact sensors, floor and bones given"
-    ours.append(Method(given, options.checkpoint, GIVEN, ("pipeline=mocap_every", level)))
-    trained = {}
-    for name, (run, pipeline) in TRAINED.items():
-        paths = [options.runs / seeded / "checkpoints" / "best.ckpt" for seeded in (run, f"{run}_1", f"{run}_2")]
-        sensors = GIVEN if run in HANDS else usual
-        trained[name] = [Method(name, str(path), sensors, (*pipeline, level)) for path in paths if path.is_file()]
-        if not trained[name]:
-            command = shlex.join(
-                ["wearcap", "train", *TRAININGS[run], *STEPS, f"name={run}", f"paths.run={options.runs / run}"]
-            )
-            progress.console.print(
-                f"left out: {name} (no {paths[0]}); train it by: {command}", markup=False, soft_wrap=True
-            )
-    rows = {name: methods for name, methods in trained.items() if methods}
-    rows |= {method.name: [method] for method in ours}
-    store, names = recordings_of(options, "cmu")
+    scores = _people(options, progress, *recordings_of(options, "cmu"))
+    title = f"CMU, {options.split}, {options.sensors} sensors (hands tracked: exact, floor and bones given)"
+    return titled(f"Tables 2, 6, 7: {title}", options), BODY, scores | ({} if options.keep else PAPER)
+
+
+def _strangers(root: Path, options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
+    """The same rows on people of another laboratory."""
+    scores = _people(options, progress, *split_of(options, root))
+    return titled(f"People ({root.name}): {options.split}, {options.sensors} sensors", options), BODY, scores
+
+
+def _people(
+    options: argparse.Namespace, progress: Progress, store: RecordingStore, names: list[str]
+) -> dict[str, dict[str, Summary]]:
+    """Rows of bodies: trained rivals and ablations, then ours, then the truth."""
+    rows = {} if options.keep else _rivals(options, progress.console)
+    rows |= {method.name: [method] for method in _ours(options) if options.rows is None or method.name in options.rows}
     scores = {}
     for name, methods in rows.items():
         bar = progress.add_task(name, total=len(methods) * len(names))
@@ -308,9 +302,38 @@ def _body(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
             for recording, _, captured in captures(method, store, names, lambda b=bar: progress.advance(b))
         ]
         scores[name] = aggregate(scored) | training_of(methods[0].checkpoint)
-    scores["truth"] = truth_row(scores["ours"])
-    title = f"Tables 2, 6, 7: CMU, {options.split}, {usual} sensors (hands tracked: exact, floor and bones given)"
-    return title, BODY, scores | PAPER
+    return scores | {"truth": truth_row(next(reversed(scores.values())))}
+
+
+def _ours(options: argparse.Namespace) -> list[Method]:
+    """Rows of our checkpoint."""
+    level, usual = "pipeline.floor=fixed", options.sensors
+    variants = {
+        "ours": ("pipeline=mocap_every",),
+        "ours, floor fixed at the beginning": ("pipeline=mocap_every", level),
+        "ours, without mirror averaging": ("pipeline=mocap_every", "pipeline.mirror_average=false"),
+        "ours, not anchored to the head": ("pipeline=mocap_every", "pipeline.anchor=false"),
+        "ours, three frames at a time": ("pipeline=mocap_every_online",),
+    }
+    ours = [Method(name, options.checkpoint, usual, pipeline) for name, pipeline in variants.items()]
+    ours += [
+        Method(f"ours, {what}", options.checkpoint, usual, height_off_m=off) for what, off in WRONG_HEIGHTS.items()
+    ]
+    ours += [Method(f"ours, {other} sensors", options.checkpoint, other) for other in WEARABLES if other != usual]
+    given = "ours, exact sensors, floor and bones given"
+    return [*ours, Method(given, options.checkpoint, GIVEN, ("pipeline=mocap_every", level))]
+
+
+def _rivals(options: argparse.Namespace, console: Console) -> dict[str, list[Method]]:
+    """Methods of the rows with trainings of their own, by seed; those without a checkpoint are named and left out."""
+    trained = {}
+    for name, (run, pipeline) in TRAINED.items():
+        paths = [options.runs / seeded / "checkpoints" / "best.ckpt" for seeded in (run, f"{run}_1", f"{run}_2")]
+        sensors, overrides = GIVEN if run in HANDS else options.sensors, (*pipeline, "pipeline.floor=fixed")
+        trained[name] = [Method(name, str(path), sensors, overrides) for path in paths if path.is_file()]
+        if not trained[name]:
+            console.print(left_out(name, "mocap_every", run, paths[0]), markup=False, soft_wrap=True)
+    return {name: methods for name, methods in trained.items() if methods}
 
 
 def _totalcapture(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:

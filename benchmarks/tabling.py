@@ -1,7 +1,9 @@
 """What tables of several systems share: their recordings, summaries over seeds, their cells, JSON without NaN."""
 
 import argparse
+import json
 import math
+from pathlib import Path
 from typing import Any
 
 from rich.table import Table
@@ -11,9 +13,18 @@ from wearcap.metrics.table import Summary
 from wearcap.models.checkpoint import read_checkpoint
 from wearcap.recording import RecordingStore
 
-TRAINING = {"parameters_m": "M param.", "frames_seen_m": "M frames", "core_minutes": "core min"}
+TRAINING = {
+    "parameters_m": "M param.",
+    "frames_seen_m": "M frames",
+    "core_minutes": "core min",
+    "rate_swept": "rate swept",
+}
 """Columns of what a row's training took: trained parameters and frames of drawn windows, both in millions, and minutes of a
-core; and their headings."""
+core; the learning rate, where `rivals.py` chose it of several; and their headings."""
+RATE_FILE = "rate.json"
+"""In the folder of a run of `rivals.py`: the rate that was chosen, and by what."""
+EPOCHS = 12
+"""Validations of a training by budget."""
 _RECORDED = {
     "parameters_m": ("parameters", 1e6),
     "frames_seen_m": ("frames", 1e6),
@@ -30,12 +41,42 @@ PREPARE = {
 }
 
 
+def add_people(parser: argparse.ArgumentParser) -> None:
+    """Options of tables of people without surroundings."""
+    parser.add_argument(
+        "--strangers",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="DATASET",
+        help="data sets of people of other laboratories, as datasets/hdm05: a table of each, with the rows of CMU's",
+    )
+    parser.add_argument("--rows", nargs="+", metavar="ROW", help="of the rows of our checkpoint these alone")
+    parser.add_argument(
+        "--keep",
+        metavar="NAME",
+        help="rows of our checkpoint alone, in tables of this name that later runs leave as they are, such as "
+        "'before more motion': the page shows them beside those of now",
+    )
+
+
+def titled(title: str, options: argparse.Namespace) -> str:
+    """A table's title, behind the name of tables that are kept."""
+    return f"{options.keep}, {title}" if options.keep else title
+
+
 def recordings_of(options: argparse.Namespace, data: str) -> tuple[RecordingStore, list[str]]:
     """A prepared data set, and names of its split as `--split`, `--recordings` and `--quick` say. Raises WearcapError
     where it is missing."""
-    root = options.datasets / data
+    return split_of(options, options.datasets / data)
+
+
+def split_of(options: argparse.Namespace, root: Path) -> tuple[RecordingStore, list[str]]:
+    """The same of a data set in a folder."""
     if not (root / "manifest.json").is_file():
-        raise WearcapError("no such data set", where=root, fix=PREPARE[data])
+        raise WearcapError(
+            "no such data set", where=root, fix=PREPARE.get(root.name, f"Run: wearcap prepare {root.name}")
+        )
     store = RecordingStore.open(root)
     return store, store.names(options.split)[: 3 if options.quick else options.recordings]
 
@@ -71,10 +112,33 @@ def training_of(checkpoint: str) -> dict[str, Summary]:
     config, state = read_checkpoint(checkpoint)
     weights = sum(value.numel() for name, value in state.items() if name.startswith("net."))
     taken: dict[str, Any] = {"parameters": weights, **config.get("training", {})}
-    return {
+    found = {
         name: Summary(taken[key] / unit, None, 1) if key in taken else NotRecorded(math.nan, None, 0)
         for name, (key, unit) in _RECORDED.items()
     }
+    rate = Path(checkpoint).parent.parent / RATE_FILE
+    if Path(checkpoint).is_file() and rate.is_file():
+        note = json.loads(rate.read_text(encoding="utf-8"))
+        found |= {"rate_swept": Summary(note["rate"], None, 1)} if note["losses"] else {}
+    return found
+
+
+def budget(frames: int, per_step: int) -> list[str]:
+    """Overrides of a training that sees so many frames, `per_step` in a batch, or stops when the validation loss has not
+    fallen for three epochs; captured with is its checkpoint of the least."""
+    steps = max(1, frames // per_step)
+    average = min(0.995, max(0.98, 1 - 20 / steps))
+    return [
+        *(f"trainer.max_steps={steps}", f"data.loading.steps_per_epoch={max(1, steps // EPOCHS)}"),
+        *(f"optimizer.scheduler.warmup={steps // 10}", f"callbacks.average.decay={average:.4g}"),
+        *("trainer.precision=bf16-mixed", "early_stop=3"),
+    ]
+
+
+def left_out(row: str, system: str, run: str, checkpoint: str | Path | None) -> str:
+    """A line on a row whose training is not there."""
+    command = f"python benchmarks/rivals.py {system} --only {run}"
+    return f"left out: {row} (no checkpoint {checkpoint}); train it by: {command}"
 
 
 def new_table(title: str, columns: list[str]) -> Table:

@@ -55,7 +55,7 @@ def test_a_row_prints_what_its_training_took(tmp_path):
     from wearcap.models.checkpoint import read_checkpoint
 
     took = tabling.training_of("hmd2")
-    assert list(took) == list(tabling.TRAINING)
+    assert [*took, "rate_swept"] == list(tabling.TRAINING), "no rate of it was chosen by a sweep"
     assert 5 < took["parameters_m"].mean < 7
     assert "training" in read_checkpoint("hmd2")[0] or str(took["frames_seen_m"]) == "not recorded"
     record = {"parameters": 2_500_000, "frames": 13_824_000, "core_seconds": 1815.0}
@@ -216,6 +216,23 @@ def test_sensed_stores_hold_no_truth_and_lend_it_to_scores(tmp_path):
     assert torch.equal(again.head.t_world_device, found["typical"].head.t_world_device)
 
 
+@pytest.mark.parametrize("sensors", ["typical", "given"])
+def test_a_wrong_height_is_off_by_as_much_whatever_is_sensed_and_the_truth_stays(sensors):
+    from sensed import WRONG_HEIGHTS, sensed
+
+    from watched_walk import watched_walk
+
+    recording = watched_walk(1.0)
+    true = recording.motion.skeleton.stature
+    for off in WRONG_HEIGHTS.values():
+        given = sensed(recording, sensors, off)
+        assert given.skeleton.stature == pytest.approx(true + off, abs=1e-4)
+        assert (given.motion is None) == (sensors == "typical")
+        if given.motion is not None:
+            assert given.motion.skeleton.stature == pytest.approx(true)
+    assert sorted(WRONG_HEIGHTS.values()) == [-0.03, 0.03]
+
+
 def test_best_samples_are_chosen_by_recording():
     from hmd2_runs import best_of
 
@@ -300,7 +317,7 @@ def test_learned_rivals_of_hmd2_see_as_many_frames_as_ours():
     import tables_hmd2
 
     for run, _, _ in tables_hmd2.TRAINED.values():
-        name, frames = frames_of(tables_hmd2.training(run, Path("runs"))[2:])
+        name, frames = frames_of(tables_hmd2.training(run))
         assert name == run
         if run.startswith("avatarposer"):  # of 240 frames drawn, its two pairs of poses see 41 each
             frames = frames * tables_hmd2.WINDOW[run] // 240
@@ -318,4 +335,4 @@ def test_learned_rivals_of_echo_see_as_many_frames_as_ours():
 def test_learned_rivals_of_mocap_every_see_as_many_frames_as_ours():
     import tables_mocap_every as tables
 
-    assert len({frames_of([*overrides, *tables.STEPS])[1] for overrides in tables.TRAININGS.values()}) == 1
+    assert len({frames_of(tables.training(run))[1] for run in tables.RUNS}) == 1

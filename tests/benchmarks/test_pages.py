@@ -91,6 +91,29 @@ def test_cells_of_what_is_not_known_and_ranges():
     assert [number(value) for value in (0.59, 4976.4, 0.0, 12.34, None)] == ["0.590", "4976", "0", "12.3", "–"]
 
 
+def test_what_is_kept_stays_and_is_shown_beside_what_is_new(tmp_path):
+    from result_pages import picked, publish, score_grids
+
+    def scores(error: float) -> dict:
+        return {"ours": {"a_cm": summary(error)}, "ours, 3 cm too tall": {"a_cm": summary(9.0)}, "truth": {}}
+
+    folder, made = tmp_path / "results", tmp_path / "echo.json"
+    folder.mkdir()
+    for title, error in (("before it, Table 2: CMU", 8.0), ("Table 2: CMU", 6.0), ("Table 2: CMU, longer", 5.0)):
+        made.write_text(json.dumps({"about": ABOUT, "tables": {title: scores(error)}}))
+        tree = json.loads(publish(made, folder).read_text())
+    assert list(tree["tables"]) == ["before it, Table 2: CMU", "Table 2: CMU, longer"]
+    grid = next(grid for grid in score_grids(tree, {}) if grid.title == "Table 2: CMU, longer")
+    named = {row[0]: row[1] for row in grid.rows}
+    assert (named["ours"], named["before it: ours"], named["before it: ours, 3 cm too tall"]) == (
+        "5.00",
+        "8.00",
+        "9.00",
+    )
+    lines = picked({"echo": tree}, [("Table 2", "ours", "CMU"), ("Table 9", "ours", "none")], [("error", ("a_cm",), 1)])
+    assert lines == [["CMU", "5.0"], ["CMU, before it", "8.0"]]
+
+
 def test_published_tables_are_merged_by_number(tmp_path):
     from result_pages import publish
 

@@ -117,6 +117,19 @@ def test_aggregate_weighs_frames_then_spreads_over_seeds():
     assert table.aggregate(rows[:2])["mpjpe_cm"] == Summary(4.0, None, 1)
 
 
+def test_shares_of_the_truths_are_ratios_of_means_and_missing_scores_are_ignored():
+    scores = [(10.0, 1.0), (30.0, 9.0), (math.nan, math.nan)]
+    rows = [
+        Row(str(k), 0, 10, {"foot_skate_cm_s": mine, "truth_foot_skate_cm_s": true})
+        for k, (mine, true) in enumerate(scores)
+    ]
+    found = table.aggregate([*rows, Row("late", 0, 10, {"seam_ratio": 2.0})])
+    assert found["skate_ratio"] == Summary(4.0, None, 1)
+    assert found["seam_ratio"].mean == 2.0
+    still = [Row("a", 0, 10, {"foot_skate_cm_s": 1.0, "truth_foot_skate_cm_s": 0.0})]
+    assert math.isnan(table.aggregate(still)["skate_ratio"].mean)
+
+
 def test_aggregate_refuses_uneven_seeds():
     row = Row("a", 0, 10, {"x": 1.0})
     with pytest.raises(WearcapError, match="same recordings"):

@@ -79,6 +79,14 @@ def test_every_score_of_a_motion_is_what_numpy_makes_of_it():
     lower = [f"{side}_{name}" for side in SIDES for name in ("hip", "knee", "ankle", "toe")]
     upper = [name for name in names if name not in (*lower, "pelvis")]
     hands = ["left_wrist", "right_wrist"]
+    parts = {
+        "head": ["neck", "head"],
+        "trunk": ["pelvis", "l5", "l3", "t12", "t8", "left_collar", "right_collar"],
+        "arm": [f"{side}_{name}" for side in SIDES for name in ("shoulder", "elbow")],
+        "leg": [f"{side}_{name}" for side in SIDES for name in ("hip", "knee")],
+        "foot": [f"{side}_{name}" for side in SIDES for name in ("ankle", "toe")],
+    }
+    assert sorted([*hands, *(name for part in parts.values() for name in part)]) == sorted(names)
     errors = {
         key: 100 * np.mean([np.linalg.norm(t[n] - t_true[n], axis=1) for n in part], axis=0)
         for key, part in {"cm": names, "hand_pe_cm": hands, "lower_pe_cm": lower, "upper_pe_cm": upper}.items()
@@ -97,6 +105,7 @@ def test_every_score_of_a_motion_is_what_numpy_makes_of_it():
         "hand_pe_cm": error(t, t_true, ("left_wrist", "right_wrist")),
         "lower_pe_cm": error(t, t_true, lower),
         "upper_pe_cm": error(t, t_true, upper),
+        **{f"{part}_pe_cm": error(t, t_true, joints) for part, joints in parts.items()},
         **{f"p95_{key}": np.percentile(value, 95) for key, value in errors.items()},
         "p95_floor_penetration_cm": 100 * np.percentile(np.maximum(floor - lowest, 0), 95),
         "root_cm": error(t, t_true, ["pelvis"]),

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 from wearcap.cli import capture, evaluate, export, train
 from wearcap.cli.conf import compose, conf_dir, load_pipeline, with_pipeline
@@ -167,6 +168,25 @@ def test_an_evaluation_goes_on_and_lists_what_failed(checkpoint, data, tmp_path,
 
 
 _evaluate = whole.evaluate
+
+
+def test_an_evaluation_says_where_it_errs_and_draws_the_worst(checkpoint, data, tmp_path, capsys):
+    evaluating(checkpoint, data, tmp_path / "t.json", "jobs=1", "sheets=true")
+    tree = json.loads((tmp_path / "t.json").read_text())
+    errors = {name: float(row["mpjpe_cm"]) for name, row in table(tmp_path / "t.csv").items()}
+    assert tree["recordings"]["worst"] == max(errors, key=lambda name: errors[name])
+    assert tree["recordings"]["best"] == min(errors, key=lambda name: errors[name])
+    assert set(tree["activities"]) == {"wearcap", "mean pose", "nearest window"}
+    activities = tree["activities"]["wearcap"]
+    assert {row["activity"] or "unnamed" for row in table(tmp_path / "t.csv").values()} == set(activities)
+    for scores in activities.values():
+        assert scores["foot_pe_cm"]["mean"] > scores["head_pe_cm"]["mean"] > 0
+    out = capsys.readouterr().out
+    assert "by part of the body" in out
+    assert f"worst: {tree['recordings']['worst']}" in out
+    for place in ("worst", "median", "best"):
+        picture = Image.open(tmp_path / f"t_{place}.png")
+        assert picture.height == 2 * 240
 
 
 def test_an_evaluation_without_the_training_data_runs_and_says_what_is_missing(checkpoint, data, tmp_path, capsys):

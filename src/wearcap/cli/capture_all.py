@@ -91,5 +91,6 @@ def _captured(names: Sequence[str], plain: dict[str, Any], key: str, capture: Ca
         except WearcapError as refused:
             error = f"captured, but not scored: {reason_of(refused)}"
     files = [(str(path), path.stat().st_size) for path in sorted(folder.iterdir()) if path.is_file()]
-    frames = store.entries[name].frames if motion is None else len(motion)
-    return [Outcome(name, seconds, frames, tuple(rows), tuple(files), error)]
+    entry = store.entries[name]
+    frames = entry.frames if motion is None else len(motion)
+    return [Outcome(name, seconds, frames, tuple(rows), tuple(files), error, entry.activity)]

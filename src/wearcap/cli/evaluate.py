@@ -1,6 +1,7 @@
 """`wearcap evaluate`: whole recordings of a split, over seeds, beside the trivial baselines."""
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,16 @@ from rich import print as show
 from wearcap.cli.conf import hydra_main, load_systems, spread_of, trained_on, with_pipeline
 from wearcap.errors import WearcapError
 from wearcap.evaluation.baselines import BASELINES
+from wearcap.evaluation.breakdown import (
+    activity_table,
+    by_activity,
+    error_columns,
+    extremes,
+    main_errors,
+    mostly_done,
+    part_table,
+    recording_table,
+)
 from wearcap.evaluation.evaluate import Realism
 from wearcap.evaluation.whole import (
     Outcome,
@@ -29,8 +40,10 @@ from wearcap.metrics.table import Row, Scores, Summary, aggregate, rich_table, w
 from wearcap.reading import read
 from wearcap.recording import RecordingStore
 from wearcap.recording.store import MANIFEST, dataset_folder
-from wearcap.runtime.system import System
+from wearcap.runtime.system import CaptureInput, System
 from wearcap.spread import Spread
+from wearcap.viewer.page_layers import with_objects
+from wearcap.viewer.picture import contact_sheet, save_png
 
 OURS = "wearcap"
 """Name of the evaluated checkpoint's method in the table."""
@@ -66,18 +79,58 @@ def run(config: DictConfig) -> Scores:
     if not rows:
         require_all(outcomes, store.root)
         raise WearcapError(f"no recordings of split {config.split}", store.root, fix="Choose another split.")
-    scores = {name: _summaries(rows, realism, name)}
+    of_method = {name: rows}
     if config.baselines and systems[0].baselines:
-        scores |= _baselines(scoring, systems[0].baselines, checkpoints[0], {row.recording for row in rows})
+        of_method |= _baselines(scoring, systems[0].baselines, checkpoints[0], {row.recording for row in rows})
+    scores = {method: _summaries(found, realism, method) for method, found in of_method.items()}
+    activities = {method: by_activity(found, scoring.activity_of) for method, found in of_method.items()}
     about = {"dataset": str(store.root), "split": config.split, "checkpoint": ", ".join(checkpoints) or "None"}
     if len(outcomes) <= LISTED or failed:
         show(outcome_table(f"{name}, {len(outcomes)} recordings", outcomes))
     show(rich_table(f"{store.root.name}, {config.split} split", scores))
-    write_scores(config.output, scores, about)
+    _show_where(name, rows, scores, activities[name], scoring.activity_of)
+    places = extremes(main_errors(rows))
+    write_scores(config.output, scores, about, _errors(activities), places)
     write_outcomes(Path(config.output).with_suffix(".csv"), outcomes)
     show(f"table: {config.output}")
+    if config.sheets:
+        for place, recording in places.items():
+            show(f"{place}: {_sheet(systems[0], store, recording, place, config)}")
     require_all(outcomes, store.root)
     return scores
+
+
+def _show_where(name: str, rows: list[Row], scores: Scores, activities: Scores, activity_of: Mapping[str, str]) -> None:
+    """Tables of errors by part of the body, and, of several recordings, by activity and of the worst to the best."""
+    show(part_table("by part of the body", scores))
+    recordings = {row.recording for row in rows}
+    if len(recordings) > 1 and extremes(main_errors(rows)):
+        counts = Counter(mostly_done(activity_of[recording]) for recording in recordings)
+        show(activity_table(f"{name} by what was mostly done", activities, counts))
+        show(recording_table(f"{name}: recordings", rows, activity_of))
+
+
+def _errors(activities: Mapping[str, Scores]) -> dict[str, Scores]:
+    """What is written by activity: the errors that are shown."""
+    return {
+        method: {
+            activity: {metric: each[metric] for metric in error_columns(each)} for activity, each in scores.items()
+        }
+        for method, scores in activities.items()
+    }
+
+
+def _sheet(system: System, store: RecordingStore, name: str, place: str, config: DictConfig) -> Path:
+    """Draw a recording's truth and its capture with the first seed beside each other, with their objects; returns the file."""
+    recording, path = store.load(name), Path(config.output).with_name(f"{Path(config.output).stem}_{place}.png")
+    source = CaptureInput.in_dataset(recording, store.root, config.scene, config.metres_per_unit)
+    motion, environment = system.capture([source], [config.seeds[0]])[0].motion, system.objects(source)
+    truth = with_objects(recording, environment)
+    assert motion is not None
+    assert truth is not None
+    shown = {f"{name}, truth": truth, "captured": motion}
+    save_png(path, contact_sheet(shown, environment=environment))
+    return path
 
 
 def _chosen(config: DictConfig, checkpoints: Sequence[str], system: System) -> tuple[RecordingStore, list[str]]:
@@ -109,6 +162,7 @@ class _Scoring:
     def __init__(self, config: DictConfig, store: RecordingStore, names: Sequence[str], realism: Realism | None):
         self.config, self.store, self.realism = config, store, realism
         self.names = sorted(names, key=lambda name: store.entries[name].frames)
+        self.activity_of = {name: store.entries[name].activity for name in names}
 
     def of(
         self, system: System, checkpoints: Sequence[str], seeds: Sequence[int], title: str, method: str
@@ -170,16 +224,16 @@ def _load(checkpoints: list[str], pipeline: dict[str, Any], device: str) -> Syst
     return load_systems(checkpoints, OmegaConf.create(pipeline), device)[0]
 
 
-def _baselines(scoring: _Scoring, labels: Sequence[str], checkpoint: str, names: set[str]) -> Scores:
-    """Scores of the baselines, on the recordings that were scored; a line says why one is left out."""
-    scores: Scores = {}
+def _baselines(scoring: _Scoring, labels: Sequence[str], checkpoint: str, names: set[str]) -> dict[str, list[Row]]:
+    """Rows of the baselines, on the recordings that were scored; a line says why one is left out."""
+    found: dict[str, list[Row]] = {}
     turned_off = "baselines=false turns them off."
     try:
         stores = [RecordingStore.open(source) for source in trained_on(checkpoint)[0]]
     except WearcapError as error:
         what = f"left out: {', '.join(labels)}, which need the data that the checkpoint was trained on. {error}"
         _notice(f"{what} {turned_off}")
-        return scores
+        return found
     for label in labels:
         try:
             baseline = BASELINES[label].fit(stores)
@@ -190,10 +244,10 @@ def _baselines(scoring: _Scoring, labels: Sequence[str], checkpoint: str, names:
                 chosen, baseline, lambda made=baseline: made, key, [0], label, label, Spread(jobs=1)
             )
             require_all(outcomes, scoring.store.root)
-            scores[label] = _summaries(rows_of(outcomes), scoring.realism, label)
+            found[label] = rows_of(outcomes)
         except WearcapError as error:
             _notice(f"left out: {label}. {error} {turned_off}")
-    return scores
+    return found
 
 
 def _notice(text: str) -> None:

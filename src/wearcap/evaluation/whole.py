@@ -51,6 +51,8 @@ class Outcome:
     """Files that were written, with their sizes (bytes)."""
     error: str = ""
     """Why it failed; "" if it did not."""
+    activity: str = ""
+    """What was done in it."""
 
     def scores(self) -> dict[str, float]:
         """Means over seeds by metric."""
@@ -232,13 +234,18 @@ def scored(
     rows: dict[str, list[Row]] = {name: [] for name in names}
     for row in found:
         rows[row.recording].append(row)
-    frames = {name: store.entries[name].frames for name in names}
-    per_frame = (time.perf_counter() - begin) / max(1, sum(frames.values()))
+    entries = [(name, store.entries[name]) for name in names]
+    per_frame = (time.perf_counter() - begin) / max(1, sum(entry.frames for _, entry in entries))
     return [
         Outcome(
-            name, per_frame * frames[name], frames[name], tuple(rows[name]), error="" if rows[name] else "no motion"
+            name,
+            per_frame * entry.frames,
+            entry.frames,
+            tuple(rows[name]),
+            error="" if rows[name] else "no motion",
+            activity=entry.activity,
         )
-        for name in names
+        for name, entry in entries
     ]
 
 
@@ -280,11 +287,11 @@ def write_outcomes(path: str | Path, outcomes: Iterable[Outcome]) -> None:
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     metrics = _metrics(rows)
-    writer.writerow(["recording", "seconds", "frames", *metrics, "error"])
+    writer.writerow(["recording", "activity", "seconds", "frames", *metrics, "error"])
     for row in rows:
         scores = row.scores()
         cells = [scores.get(name, "") for name in metrics]
-        writer.writerow([row.recording, f"{row.seconds:.3f}", row.frames, *cells, row.error])
+        writer.writerow([row.recording, row.activity, f"{row.seconds:.3f}", row.frames, *cells, row.error])
     write_text(path, text.getvalue())
 
 

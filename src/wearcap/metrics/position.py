@@ -38,6 +38,29 @@ def body_parts(skeleton: Skeleton) -> dict[str, list[int]]:
     return {"hand": hand, "lower": lower, "upper": upper}
 
 
+_PAIRED = {
+    "shoulder": "arm",
+    "elbow": "arm",
+    "wrist": "hand",
+    "hip": "leg",
+    "knee": "leg",
+    "ankle": "foot",
+    "toe": "foot",
+}
+PARTS = ("head", "trunk", "arm", "hand", "leg", "foot")
+"""Parts of the body that share out all joints, from head to foot; "head" has the neck, "trunk" the collars."""
+
+
+def part_errors_cm(skeleton: Skeleton, error_cm: Float[Tensor, "time joint"]) -> dict[str, Float[Tensor, ""]]:
+    """Mean error (cm) over frames and joints of each of `PARTS`; NaN for a part without joints."""
+    part_of = []
+    for name in skeleton.joint_names:
+        plain = name.removeprefix("left_").removeprefix("right_")
+        part_of.append("head" if plain in ("neck", "head") else _PAIRED.get(plain, "trunk"))
+    joints = {part: [k for k, mine in enumerate(part_of) if mine == part] for part in PARTS}
+    return {part: error_cm[:, chosen].mean() for part, chosen in joints.items()}
+
+
 def mpjve_cm_s(
     joints: Float[Tensor, "time joint 3"], joints_true: Float[Tensor, "time joint 3"], fps: float
 ) -> Float[Tensor, ""]:

@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool
@@ -26,6 +27,9 @@ averaged over frames."""
 
 TRUTH = "truth_"
 """Beginning of the names of scores that belong to the true motion."""
+
+RATIOS = {"skate_ratio": "foot_skate_cm_s", "jitter_ratio": "jitter_m_s3"}
+"""Scores that are shares of the truth's, and what of."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +95,7 @@ def evaluate_motion(
     scores = {
         "mpjpe_cm": error.mean(),
         **{name: value.mean() for name, value in parts.items()},
+        **{f"{part}_pe_cm": value for part, value in position.part_errors_cm(truth.skeleton, error).items()},
         **{f"{P95}{name}": position.error_percentile_cm(value) for name, value in tails.items()},
         "root_cm": position.root_error_cm(joints[:, 0], joints_true[:, 0]),
         "mpjve_cm_s": position.mpjve_cm_s(joints, joints_true, fps),
@@ -138,7 +143,8 @@ def _span(motion: Motion) -> str:
 
 def aggregate(rows: list[Row]) -> dict[str, Summary]:
     """Mean over recordings within each seed, weighted by frames (`P95`: equally), then mean and
-    spread over seeds. Scores that are NaN (no contact, too few frames) are ignored.
+    spread over seeds. Scores that are NaN (no contact, too few frames) are ignored. Where there are both, `RATIOS` of
+    these means to the truth's are added.
 
     Raises WearcapError unless every seed was scored on the same recordings, once each.
     """
@@ -150,16 +156,21 @@ def aggregate(rows: list[Row]) -> dict[str, Summary]:
     seen = {frozenset(recordings) for recordings in by_seed.values()}
     if len(seen) != 1:
         raise WearcapError("the seeds were not scored on the same recordings" if seen else "nothing was scored")
-    summaries = {}
-    for name in rows[0].scores:
+    by_metric: dict[str, list[float]] = {}
+    for name in dict.fromkeys(name for row in rows for name in row.scores):
         means = []
         for recordings in by_seed.values():
-            weighted = [(row.scores[name], 1 if name.startswith(P95) else row.frames) for row in recordings.values()]
-            weighted = [(score, weight) for score, weight in weighted if not math.isnan(score)]
+            scored = [(row.scores.get(name, math.nan), row.frames) for row in recordings.values()]
+            known = [(score, frames) for score, frames in scored if not math.isnan(score)]
+            weighted = [(score, 1 if name.startswith(P95) else frames) for score, frames in known]
             total = sum(weight for _, weight in weighted)
             means.append(sum(score * weight for score, weight in weighted) / total if total else math.nan)
-        summaries[name] = summarize(means)
-    return summaries
+        by_metric[name] = means
+    for name, metric in RATIOS.items():
+        if name not in by_metric and {metric, f"{TRUTH}{metric}"} <= set(by_metric):
+            both = zip(by_metric[metric], by_metric[f"{TRUTH}{metric}"])
+            by_metric[name] = [value / true if true else math.nan for value, true in both]
+    return {name: summarize(means) for name, means in by_metric.items()}
 
 
 def summarize(values: list[float]) -> Summary:
@@ -214,10 +225,37 @@ def rich_table(title: str, methods: Scores, metrics: Columns | None = None) -> T
     return table
 
 
-def write_scores(path: str | Path, methods: Scores, about: dict[str, str | int | float] | None = None) -> None:
+def rich_lines(title: str, methods: Scores, metrics: Columns | None = None) -> Table:
+    """The same with one line per method, one column per metric."""
+    table = Table(title=title)
+    header, *lines = _cells(methods, metrics)
+    for number, heading in enumerate(["", *header[1:]]):
+        table.add_column(heading, justify="right" if number else "left", no_wrap=not number)
+    for line in lines:
+        table.add_row(*line)
+    return table
+
+
+def write_scores(
+    path: str | Path,
+    methods: Scores,
+    about: dict[str, str | int | float] | None = None,
+    activities: Mapping[str, Scores] | None = None,
+    recordings: Mapping[str, str] | None = None,
+) -> None:
     """Write a table as JSON, atomically: {"about", "methods": {method: {metric: {mean, std, seeds}}}}; values that
-    are not finite become null."""
-    tree = {
+    are not finite become null. `activities`: the same by method and activity; `recordings`: names by place ("worst" …)."""
+    tree: dict[str, Any] = {"about": about or {}, "methods": _plain(methods)}
+    if activities:
+        tree["activities"] = {method: _plain(scores) for method, scores in activities.items()}
+    if recordings:
+        tree["recordings"] = dict(recordings)
+    write_text(path, json.dumps(tree, indent=1, allow_nan=False) + "\n")
+
+
+def _plain(methods: Scores) -> dict[str, Any]:
+    """Summaries as JSON."""
+    return {
         method: {
             metric: {
                 key: value if value is not None and math.isfinite(value) else None
@@ -227,4 +265,3 @@ def write_scores(path: str | Path, methods: Scores, about: dict[str, str | int |
         }
         for method, scores in methods.items()
     }
-    write_text(path, json.dumps({"about": about or {}, "methods": tree}, indent=1, allow_nan=False) + "\n")

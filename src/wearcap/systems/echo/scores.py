@@ -16,7 +16,7 @@ from wearcap.geometry.trajectory import Trajectory, interpolate_clamped, nearest
 from wearcap.metrics import objects as object_metrics
 from wearcap.metrics.detection import detection_scores
 from wearcap.metrics.physics import foot_contact, plausibility
-from wearcap.metrics.position import mpjpe_cm
+from wearcap.metrics.position import body_parts, joint_error_cm, mpjpe_cm, part_errors_cm
 from wearcap.metrics.symmetry import closest_surface_error_cm
 from wearcap.metrics.table import TRUTH, Row
 from wearcap.recording import Motion, Recording
@@ -116,8 +116,13 @@ def score_echo(motion: Motion, truth: Truth, name: str, seed: int) -> Row:
     pose, pose_true = motion.T_world_joint.to(torch.float64), truth.motion.T_world_joint.to(torch.float64)
     joints, true = motion.T_world_joint.t, truth.motion.T_world_joint.t
     floor, touching = truth.floor_height, foot_contact(truth.foot_contact > 0.5)
+    error = joint_error_cm(joints, true)
+    parts = {part: error[:, mine].mean() for part, mine in body_parts(skeleton).items()} | part_errors_cm(
+        skeleton, error
+    )
     scores = {
-        "mpjpe_mm": 10 * mpjpe_cm(joints, true).item(),
+        "mpjpe_mm": 10 * error.mean().item(),
+        **{f"{part}_pe_mm": 10 * value.item() for part, value in parts.items()},
         "mpjve_mm": object_metrics.joint_step_error_mm(joints, true).item(),
         "foot_contact": object_metrics.foot_contact_share(skeleton, joints, floor).item(),
         f"{TRUTH}foot_contact": object_metrics.foot_contact_share(skeleton, true, floor).item(),

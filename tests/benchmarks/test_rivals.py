@@ -1,0 +1,129 @@
+"""Rivals are trained at the best of a few rates, go on after a kill, and their tables say so."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from wearcap.cli.conf import compose
+from wearcap.errors import WearcapError
+from wearcap.models.checkpoint import read_checkpoint
+from wearcap_testing import benchmark, small_dataset
+
+rivals, tabling = map(benchmark, ("rivals", "tabling"))
+NAME, STEP = "motion_diffusion_head", 8 * 240
+SMALL = [f"model.net.{name}" for name in ("width=32", "layers=1", "heads=4", "feedforward=32")]
+QUIET = [
+    "data.dataset.window=60",
+    "trainer.accelerator=cpu",
+    "trainer.enable_progress_bar=false",
+    "callbacks.progress=null",
+]
+
+
+@pytest.fixture(autouse=True)
+def importable(monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(rivals.__file__).parent))
+
+
+@pytest.fixture(scope="module")
+def datasets(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("datasets")
+    for name in ("cmu", "simulated"):
+        small_dataset(folder / name)
+    return folder
+
+
+def given(datasets: Path, runs: Path, *more: str) -> list[str]:
+    overrides = [f"paths.datasets={datasets}", "trainer.precision=32-true", *SMALL, *QUIET]
+    return ["hmd2", "--only", NAME, "--runs", str(runs), "--budget", str(24 * STEP), *more, "--overrides", *overrides]
+
+
+def finish(arguments: list[str]) -> int:
+    with pytest.raises(SystemExit) as ended:
+        rivals.main(arguments)
+    return ended.value.code
+
+
+def test_rates_are_swept_the_best_trained_and_what_is_finished_left_alone(datasets, tmp_path, monkeypatch, capsys):
+    fitted = []
+    fit = rivals.Rival.fit
+
+    def remembered(rival, rate, share, run, seed=0):
+        fitted.append((rate, share, seed))
+        if len(fitted) == 3:
+            raise KeyboardInterrupt  # killed after the sweep
+        return fit(rival, rate, share, run, seed)
+
+    monkeypatch.setattr(rivals.Rival, "fit", remembered)
+    arguments = given(datasets, tmp_path, "--rates", "1e-9", "3e-3", "--seeds", "0", "1")
+    with pytest.raises(KeyboardInterrupt):
+        rivals.main(arguments)
+    assert fitted == [(1e-9, 0.1, 0), (3e-3, 0.1, 0), (3e-3, 1.0, 0)]
+    note = json.loads((tmp_path / NAME / "rate.json").read_text())
+    assert note["losses"]["0.003"] < note["losses"]["1e-09"]
+    assert not note["finished"]
+    assert finish(arguments) == 0
+    assert fitted[3:] == [(3e-3, 1.0, 0), (3e-3, 1.0, 1)], "the sweep is not made again"
+    assert finish(arguments) == 0
+    assert len(fitted) == 5
+    assert f"{NAME}: rate 0.003" in capsys.readouterr().out
+    for run in (NAME, f"{NAME}_1"):
+        best = tmp_path / run / "checkpoints" / "best.ckpt"
+        config, _ = read_checkpoint(best)
+        assert config["optimizer"]["optimizer"]["lr"] == 0.003
+        assert config["seed"] == int(run != NAME)
+        took = tabling.training_of(str(best))
+        assert took["rate_swept"].mean == 0.003
+        assert str(took["rate_swept"]) == "0.0030"
+        assert 0 < took["frames_seen_m"].mean <= 24 * 8 * 60 / 1e6
+    assert not (tmp_path / NAME / "sweep").exists()
+
+
+def test_a_killed_training_goes_on_where_it_was(datasets, tmp_path, monkeypatch):
+    import lightning
+
+    arguments = given(datasets, tmp_path, "--rates", "1e-3")
+    fit = lightning.Trainer.fit
+
+    def killed(trainer, module, *rest, **named):
+        class Kill(lightning.Callback):
+            def on_train_batch_end(self, trainer, *_):
+                if trainer.global_step == 3:
+                    raise KeyboardInterrupt("killed")
+
+        trainer.callbacks.append(Kill())
+        return fit(trainer, module, *rest, **named)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(lightning.Trainer, "fit", killed)
+        with pytest.raises((KeyboardInterrupt, SystemExit)):
+            rivals.main(arguments)
+    assert (tmp_path / NAME / "checkpoints" / "last.ckpt").is_file()
+    assert not json.loads((tmp_path / NAME / "rate.json").read_text())["finished"]
+    assert finish(arguments) == 0
+    config, _ = read_checkpoint(tmp_path / NAME / "checkpoints" / "last.ckpt")
+    assert config["training"]["steps"] == 24
+    note = json.loads((tmp_path / NAME / "rate.json").read_text())
+    assert note["losses"] == {}, "one rate needs no sweep"
+    assert "rate_swept" not in tabling.training_of(str(tmp_path / NAME / "checkpoints" / "best.ckpt"))
+
+
+def test_another_budget_and_no_finite_loss_are_refused(datasets, tmp_path, monkeypatch, capsys):
+    rival = rivals.Rival("hmd2", NAME, 100, (1e-3, 1.0), (0,), tmp_path)
+    monkeypatch.setattr(rivals.Rival, "fit", lambda *_: float("nan"))
+    with pytest.raises(WearcapError, match=r"no rate of 0.001, 1 gives a finite loss. Give lower --rates"):
+        rivals.train_rival(rival, 1)
+    assert finish(given(datasets, tmp_path)) == 1
+    assert f"{NAME} has been trained on 100 frames" in capsys.readouterr().out
+    assert finish(["hmd2", "--only", "motion_diffusion"]) == 2
+
+
+@pytest.mark.parametrize("system", rivals.SYSTEMS)
+def test_budgets_scale_with_what_is_asked_for(system):
+    table = benchmark(f"tables_{system}")
+    for run in table.RUNS:
+        small, large = (compose("train", table.training(run, frames)) for frames in (table.BUDGET, 10 * table.BUDGET))
+        assert large.trainer.max_steps == pytest.approx(10 * small.trainer.max_steps, rel=0.05), run
+        assert small.trainer.max_steps >= tabling.EPOCHS * small.data.loading.steps_per_epoch
+        assert 0.98 <= small.callbacks.average.decay <= large.callbacks.average.decay == 0.995
