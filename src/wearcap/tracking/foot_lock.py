@@ -37,8 +37,10 @@ class FootLock:
     leak_s: float
     """Time constant (s) with which a standing foot's displacement decays, so that errors do not add up."""
     floor_within_m: float
-    """Largest distance of a standing foot from the floor that is closed, and largest depth from which a foot is raised;
-    at twice as much nothing is changed, as the floor is then somewhere else."""
+    """Largest distance of a standing foot from the floor that is closed; at twice as much nothing is changed, as the foot
+    then stands on something else."""
+    raise_m: float
+    """Largest depth from which a foot is raised to the floor; at twice as much nothing is changed."""
 
     @property
     def lookahead(self) -> int:
@@ -58,8 +60,10 @@ class FootState:
     """Whether contact was believed in the last frame."""
     stands: bool = False
     """Whether the foot was held in the last frame."""
+    kept: Float[Tensor, "3"] = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
+    """Displacement (m) that keeps its lowest point where it was, in the last frame of contact."""
     offset: Float[Tensor, "3"] = field(default_factory=lambda: torch.zeros(3, dtype=torch.float64))
-    """Displacement (m) in the last frame of contact, before it is limited to `FootLock.farthest_m`."""
+    """The same, limited and with the floor considered."""
     since: int = NEVER
     """Number of frames from that one to the next frame."""
     points: Float[Tensor, "point 3"] | None = None
@@ -97,15 +101,15 @@ class _Foot:
         first = points[:1] if before.points is None else before.points.numpy()[None]
         self.low = points[..., 2].argmin(1)
         frames = np.arange(len(points))
-        step = np.diff(points, axis=0, prepend=first)[frames, self.low]
+        self.step = np.diff(points, axis=0, prepend=first)[frames, self.low]
         """Movement (m) of the lowest point since the frame before."""
-        self.step = step[:, :2]
         speed = np.linalg.norm(self.step, axis=1) * fps
         self.believed = _hysteresis(np.where(speed > how.fastest_m_s, 0.0, prob), how, before.believed)
         edges = np.flatnonzero(np.diff(self.believed.astype(int), prepend=0, append=0))
         self.height = points[frames, self.low, 2]
         self.held = np.zeros(len(points), bool)
-        self.offset = np.zeros((len(points), 3))
+        self.kept = np.zeros((len(points), 3))
+        """Displacements (m) that keep the lowest point of a standing foot where it was."""
         for start, stop in zip(edges[::2].tolist(), edges[1::2].tolist()):
             self._hold(start, stop)
 
@@ -116,43 +120,44 @@ class _Foot:
             return
         step = -self.step[start:stop]
         if goes_on:
-            begin = self.leak * self.before.offset.numpy()[:2]
-            offset = lfilter([1.0], [1.0, -self.leak], step, axis=0, zi=begin[None])[0]
+            begin = self.leak * self.before.kept.numpy()
+            kept = lfilter([1.0], [1.0, -self.leak], step, axis=0, zi=begin[None])[0]
         else:
             step[0] = 0
-            offset = lfilter([1.0], [1.0, -self.leak], step, axis=0)
-            decay = self.leak ** np.arange(len(step))
-            offset = offset - np.median(offset[: self.how.settle], axis=0) * decay[:, None]
-        self.offset[start:stop, :2] = offset
+            kept = lfilter([1.0], [1.0, -self.leak], step, axis=0)
+            kept -= np.median(kept[: self.how.settle], axis=0) * self.leak ** np.arange(len(step))[:, None]
+        self.kept[start:stop] = kept
         self.held[start:stop] = True
 
     def offsets(self, floor: np.ndarray) -> np.ndarray:
         """Displacements (m) of all frames."""
         how, frames, held = self.how, np.arange(len(self.points)), np.flatnonzero(self.held)
-        # A standing foot is put on the floor, where that is near.
-        self.offset[held, 2] = _near(floor - self.height, how.floor_within_m)[held]
-        # The last frame of contact before each frame, and the first one after it; `before` holds the one before all.
-        offset = np.concatenate([self.before.offset.numpy()[None], self.offset[held], np.zeros((1, 3))])
-        offset[:, :2] *= how.farthest_m / np.maximum(np.linalg.norm(offset[:, :2], axis=1, keepdims=True), how.farthest_m)
+        # A standing foot is put on the floor, where that is near; `before` holds the last frame of contact before all.
+        offset = self.kept[held]
+        distance = np.linalg.norm(offset[:, :2], axis=1, keepdims=True)
+        offset[:, :2] *= how.farthest_m / np.maximum(distance, how.farthest_m)
+        offset[:, 2] += _near((floor - self.height)[held] - offset[:, 2], how.floor_within_m)
+        offset = np.concatenate([self.before.offset.numpy()[None], offset, np.zeros((1, 3))])
         when = np.concatenate([[-self.before.since], held, [NEVER]])
         place = np.searchsorted(held, frames, side="right")
         after = np.minimum(place + 1 - self.held, len(when) - 1)
         out = _fading((frames - when[place]) / (how.fade + 1))[:, None]
         into = np.where(self.held, 0, _fading((when[after] - frames) / (how.fade + 1)))[:, None]
-        offset = (offset[place] * out + offset[after] * into) / np.maximum(out + into, 1)
-        offset[:, 2] += np.maximum(_near(floor - self.height - offset[:, 2], how.floor_within_m), 0)
-        return offset
+        self.offset = (offset[place] * out + offset[after] * into) / np.maximum(out + into, 1)
+        self.offset[:, 2] += np.maximum(_near(floor - self.height - self.offset[:, 2], how.raise_m), 0)
+        return self.offset
 
     def state(self, final: int) -> FootState:
         """The state after `final` frames."""
         if not final:
             return self.before
         held = np.flatnonzero(self.held[:final])
-        offset, since = self.before.offset, self.before.since + final
+        kept, offset, since = self.before.kept, self.before.offset, self.before.since + final
         if len(held):
-            offset, since = torch.from_numpy(self.offset[held[-1]].copy()), final - int(held[-1])
+            kept, offset = (torch.from_numpy(part[held[-1]].copy()) for part in (self.kept, self.offset))
+            since = final - int(held[-1])
         points = torch.from_numpy(self.points[final - 1].copy())
-        return FootState(bool(self.believed[final - 1]), bool(self.held[final - 1]), offset, since, points)
+        return FootState(bool(self.believed[final - 1]), bool(self.held[final - 1]), kept, offset, since, points)
 
 
 def _hysteresis(prob: np.ndarray, how: FootLock, believed: bool) -> np.ndarray:
