@@ -4,10 +4,10 @@ tracked wrists.
 Whole recordings and streams run the same `Refiner`, which returns a frame once the `lookahead` frames after it are known.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import ceil
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -23,6 +23,7 @@ from wearcap.recording import Motion
 from wearcap.recording.timing import joined
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.foot_lock import FootLock, FootState, displacements
+from wearcap.tracking.head_path import HeadPath
 
 SIDES = ("left", "right")
 _REACH = 2.5
@@ -78,6 +79,14 @@ class Refinement:
         """Frames after a frame that must be known: a stream's poses come so much later."""
         return self.half_width + (0 if self.feet is None else self.feet.lookahead)
 
+    @classmethod
+    def of(cls, values: Mapping[str, Any] | None) -> "Refinement | None":
+        """The refinement of plain values, as `dataclasses.asdict` gives them; None of None."""
+        if values is None:
+            return None
+        feet = values["feet"]
+        return cls(**{**values, "feet": None if feet is None else FootLock(**feet)})
+
     def whole(
         self, motion: Motion, measured: Measured, stretches: Sequence[tuple[int, int]], fps: float, anchored: bool
     ) -> Motion:
@@ -89,8 +98,8 @@ class Refinement:
         R, t = motion.R_parent_joint.clone(), motion.t_world_root.clone()
         for start, stop in stretches:
             refiner = Refiner(self, motion.skeleton, fps, anchored)
-            parts = refiner.push(motion.sliced(start, stop), measured.part(slice(start, stop))), refiner.finish()
-            if (found := joined([part for part in parts if part is not None])) is not None:
+            parts = refiner.push(motion.sliced(start, stop), measured.part(slice(start, stop))) + refiner.finish()
+            if (found := joined(parts)) is not None:
                 R[start:stop], t[start:stop] = found.R_parent_joint, found.t_world_root
         return replace(motion, R_parent_joint=R, t_world_root=t)
 
@@ -111,8 +120,8 @@ class Refiner:
         """Frames that are smooth, but not final."""
         self._states = tuple(FootState() for _ in range(FEET))
 
-    def push(self, motion: Motion, measured: Measured) -> Motion | None:
-        """Take in the next frames; returns those that are final now, if any.
+    def push(self, motion: Motion, measured: Measured) -> list[Motion]:
+        """Take in the next frames; returns those that are final now, as a list of at most one motion.
 
         Raises WearcapError for contact probabilities that are not finite.
         """
@@ -124,20 +133,20 @@ class Refiner:
         self._raw = _joined(self._raw, (motion, measured))
         return self._advance(ended=False)
 
-    def finish(self) -> Motion | None:
-        """The remaining frames, after which no others follow."""
+    def finish(self) -> list[Motion]:
+        """The remaining frames, after which no others follow, as a list of at most one motion."""
         return self._advance(ended=True)
 
-    def _advance(self, ended: bool) -> Motion | None:
+    def _advance(self, ended: bool) -> list[Motion]:
         if self._raw is not None:
             fresh, self._raw = _split(self._raw, len(self._raw[0]) - (0 if ended else self.refinement.half_width))
             self._smooth = _joined(self._smooth, self._smoothed(fresh)) if fresh else self._smooth
         if self._smooth is None:
-            return None
+            return []
         known = len(self._smooth[0])
         count = known if ended or self._feet is None else known - self._feet.lookahead
         if count <= 0:
-            return None
+            return []
         offsets = self._offsets(*self._smooth, count)
         final, self._smooth = _split(self._smooth, count)
         assert final is not None
@@ -147,7 +156,7 @@ class Refiner:
             moved = with_feet_moved(moved, offsets)
         if self.refinement.wrists and measured.t_world_wrist.shape[1]:
             moved = with_wrists_at(moved, Rigid(measured.R_world_wrist, measured.t_world_wrist))
-        return _except_given(moved, motion, measured.given)
+        return [_except_given(moved, motion, measured.given)]
 
     def _smoothed(self, piece: tuple[Motion, Measured]) -> tuple[Motion, Measured]:
         """The next frames with the average of their neighbours, anchored to the head."""
@@ -180,6 +189,13 @@ class Refiner:
             self._feet, points, prob, measured.floor_height, self.fps, self._states, count
         )
         return offsets
+
+
+def held_in_gaps(motion: Motion, path: HeadPath, anchored: bool) -> Motion:
+    """The motion whose frames between stretches keep the pose before them, `anchored` at the interpolated head."""
+    frames = torch.cat([torch.arange(start, stop) for start, stop in path.stretches])[path.held_frames]
+    held = replace(motion, R_parent_joint=motion.R_parent_joint[frames], t_world_root=motion.t_world_root[frames])
+    return anchored_to_head(held, path.T_world_head) if anchored else held
 
 
 def with_feet_moved(motion: Motion, offset: Float[Tensor, "time foot 3"]) -> Motion:
@@ -254,4 +270,6 @@ def _except_given(changed: Motion, motion: Motion, given: Bool[Tensor, "time"]) 
     if not given.any():
         return changed
     R = torch.where(given[:, None, None, None], motion.R_parent_joint, changed.R_parent_joint)
-    return replace(changed, R_parent_joint=R, t_world_root=torch.where(given[:, None], motion.t_world_root, changed.t_world_root))
+    return replace(
+        changed, R_parent_joint=R, t_world_root=torch.where(given[:, None], motion.t_world_root, changed.t_world_root)
+    )
