@@ -20,9 +20,9 @@ from wearcap.body.skeleton import FEET
 class FootLock:
     """When a foot counts as standing, and how it is held. Durations are in frames."""
 
-    on: float
+    begin_prob: float
     """Contact probability above which a foot begins to stand."""
-    off: float
+    end_prob: float
     """Contact probability below which it ends to stand; between the two nothing changes."""
     shortest: int
     """Fewest frames of a contact; shorter ones are ignored."""
@@ -161,10 +161,10 @@ class _Foot:
 
 
 def _hysteresis(prob: np.ndarray, how: FootLock, believed: bool) -> np.ndarray:
-    """Whether contact is believed: since the probability was above `on`, until it is below `off`."""
-    decides = (prob > how.on) | (prob < how.off)
+    """Whether contact is believed: since the probability was above `begin_prob`, until it is below `end_prob`."""
+    decides = (prob > how.begin_prob) | (prob < how.end_prob)
     last = np.maximum.accumulate(np.where(decides, np.arange(len(prob)), -1))
-    return np.where(last >= 0, prob[np.maximum(last, 0)] > how.on, believed)
+    return np.where(last >= 0, prob[np.maximum(last, 0)] > how.begin_prob, believed)
 
 
 def _near(gap: np.ndarray, within_m: float) -> np.ndarray:
