@@ -28,7 +28,7 @@ from wearcap.tracking.head_path import HeadPath
 SIDES = ("left", "right")
 _REACH = 2.5
 """Half width of the filter in standard deviations."""
-_STRAIGHT, _SOFT = 0.95, 0.04
+_STRAIGHT, _SOFT = 0.97, 0.025
 """Share of a leg's length from which a farther goal is approached ever more slowly, and the share within which."""
 
 
