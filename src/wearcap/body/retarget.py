@@ -107,10 +107,12 @@ def reach(
     middle: Float[Tensor, "*batch 3"],
     end: Float[Tensor, "*batch 3"],
     goal: Float[Tensor, "*batch 3"],
+    bias: Float[Tensor, "*batch 3"] | None = None,
 ) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3 3"]]:
     """World rotations to left-multiply onto those of the upper and the lower bone so that `end` reaches `goal`.
 
-    Bone lengths and the plane of the bend are kept; a goal out of reach is approached along its direction.
+    Bone lengths and the plane of the bend are kept; a goal out of reach is approached along its direction. `bias` (m)
+    is added to the offset of `middle` from the line between the ends, whose direction it decides for a straight limb.
     """
     upper, lower = (middle - start).norm(dim=-1), (end - middle).norm(dim=-1)
     aim = goal - start
@@ -120,7 +122,7 @@ def reach(
     aim = torch.nn.functional.normalize(aim, dim=-1)
     # Turn the bend's plane with the limb before bending, so that a straight arm keeps its elbow's direction.
     turn = swing_between(end - start, aim)
-    bend = (turn @ (middle - start)[..., None])[..., 0]
+    bend = (turn @ (middle - start if bias is None else middle - start + bias)[..., None])[..., 0]
     bend = torch.nn.functional.normalize(bend - (bend * aim).sum(-1, keepdim=True) * aim, dim=-1)
     along = (distance**2 + upper**2 - lower**2) / (2 * distance)
     beside = (upper**2 - along**2).clamp_min(0).sqrt()

@@ -29,6 +29,7 @@ from wearcap.systems.echo.features import POINTS, EchoFeatures
 from wearcap.systems.echo.model import MODALITIES, EchoDenoiser
 from wearcap.systems.echo.pipeline import Echo, Sampling
 from wearcap.systems.echo.queue import EchoModel
+from wearcap.tracking.refinement import Refinement
 
 
 def exports(pipeline: Echo) -> Exports:
@@ -63,6 +64,7 @@ def exports(pipeline: Echo) -> Exports:
             "static_threshold": pipeline.contacts.static_threshold,
         },
         "guidance": None if guidance is None else asdict(guidance),
+        "refinement": None if pipeline.refinement is None else asdict(pipeline.refinement),
         "skeleton": skeleton_to_json(model.skeleton),
         "encoder": None if encoder is None else encoder.settings,
     }
@@ -147,4 +149,4 @@ def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], abo
         settings.pop("contacts"),
     )
     use, anchor = ContactUse(guidance, settings.pop("static_threshold")), settings.pop("anchor")
-    return Echo(model, Sampling(**settings), use, anchor)
+    return Echo(model, Sampling(**settings), use, anchor, Refinement.of(about.get("refinement")))

@@ -30,6 +30,7 @@ from wearcap.systems.echo.queue import Conditioning, EchoModel, EchoQueue, Outpu
 from wearcap.systems.echo.scores import Truth, score_echo, truth_of
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.head_path import head_path
+from wearcap.tracking.refinement import Measured, Refinement, held_in_gaps
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,8 @@ class Echo(LearnedSystem):
     contacts: ContactUse = field(default_factory=ContactUse)
     anchor: bool = True
     """Whether the body is anchored to the measured head (ours) or keeps its sampled position (ECHO)."""
+    refinement: Refinement | None = None
+    """How sampled motion is refined (ours); None: it stays as sampled."""
     acts: str | Sequence[Mapping[str, Any]] | Callable[[Motion, Environment], tuple[Act, ...]] = "truth"
     """Which object is active when: "truth", the recording's interactions; "none": the human alone; a list of
     {object, start_s, stop_s}; or a search."""
@@ -116,7 +119,7 @@ class Echo(LearnedSystem):
     @property
     def latency_s(self) -> float:
         """Time between a frame and its final pose (s)."""
-        return (self.rolling.ramp - 1) / self.fps
+        return (self.rolling.ramp - 1 + (0 if self.refinement is None else self.refinement.lookahead)) / self.fps
 
     @property
     def contact_use(self) -> ContactUse:
@@ -230,7 +233,17 @@ class Echo(LearnedSystem):
         if (threshold := self.contact_use.static_threshold) is not None:
             outputs = [with_static_objects(item.conditioning, part, threshold) for item, part in zip(items, outputs)]
         settings, contacts = self.settings(), self.model.contacts
-        return [motion_of(item, part, self.anchor, settings, contacts) for item, part in zip(items, outputs)]
+        motions = [motion_of(item, part, self.anchor, settings, contacts) for item, part in zip(items, outputs)]
+        # 4. It is smoothed, its feet are held, and its arms reach the tracked wrists.
+        return [self._refined(motion, item) for motion, item in zip(motions, items)]
+
+    def _refined(self, motion: Motion, item: BatchItem) -> Motion:
+        """Step 4; the frames between stretches keep the refined pose before them."""
+        if self.refinement is None:
+            return motion
+        path = item.path
+        motion = self.refinement.whole(motion, measured_of(item), path.stretches, self.fps, self.anchor)
+        return motion if len(path.stretches) == 1 else held_in_gaps(motion, path, self.anchor)
 
     def queue(
         self,
@@ -267,7 +280,12 @@ class Echo(LearnedSystem):
     def settings(self) -> dict[str, str]:
         """Settings that a capture depends on, for its provenance."""
         acts, use = "search" if callable(self.acts) else self.acts, self.contact_use
-        own = {"anchor": self.anchor, "static_threshold": use.static_threshold, "placed": self.placed}
+        own = {
+            "anchor": self.anchor,
+            "refinement": self.refinement,
+            "static_threshold": use.static_threshold,
+            "placed": self.placed,
+        }
         settings = {**vars(self.sampling), **own, "guidance": use.guidance, "acts": acts}
         return {"pipeline": "echo"} | {name: str(value) for name, value in settings.items()}
 
@@ -295,6 +313,14 @@ def motion_of(
     R = torch.where(is_observed[:, None, None, None], motion.R_parent_joint, anchored.R_parent_joint)
     t = torch.where(is_observed[:, None], motion.t_world_root, anchored.t_world_root)
     return replace(motion, R_parent_joint=R, t_world_root=t)
+
+
+def measured_of(item: BatchItem) -> Measured:
+    """What one batch item's refinement knows: head, floor, tracked wrists, and frames whose body is observed."""
+    conditioning = item.conditioning
+    wrists = Rigid(conditioning.R_world_point[0, :, 1:], conditioning.t_world_point[0, :, 1:])
+    measured = Measured.of(item.path.T_world_head, conditioning.floor_height[0], wrists)
+    return measured._replace(given=conditioning.is_observed[0, :, 0])
 
 
 def pulled_by(

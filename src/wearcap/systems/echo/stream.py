@@ -38,13 +38,17 @@ from wearcap.systems.echo.contacts import StaticObjects
 from wearcap.systems.echo.features import CONTACTS
 from wearcap.systems.echo.model import MODALITIES
 from wearcap.systems.echo.observations import MAX_GAP_S, BatchItem, ObjectShape, wrist_poses
-from wearcap.systems.echo.pipeline import Echo, motion_of, pulled_by, stretch_seed
+from wearcap.systems.echo.pipeline import Echo, measured_of, motion_of, pulled_by, stretch_seed
 from wearcap.systems.echo.queue import Conditioning, EchoQueue, Outputs
-from wearcap.tracking import floor, head_path
+from wearcap.tracking import floor, foot_lock, head_path, refinement
 from wearcap.tracking.floor import FloorTracker
 from wearcap.tracking.head_path import Chunk, HeadPath
+from wearcap.tracking.refinement import Refiner
 
-_STATE = skeleton, motion_types, trajectory, rigid, head_path, packets, samples, floor, conveyor, queue, contacts
+_STATE = (
+    *(skeleton, motion_types, trajectory, rigid, head_path, packets, samples, floor, conveyor, queue, contacts),
+    *(refinement, foot_lock),
+)
 """Modules with the classes that a session's state consists of."""
 MAX_SEEN = 1000
 """Most object observations that are buffered; the oldest are dropped."""
@@ -105,6 +109,7 @@ class EchoStream(HeadAndWristsStream):
             self._seen = []
         super()._restart(again)
         self._queue = None
+        self._refiner: Refiner | None = None
         self._pending: list[tuple[float, Conditioning, Rigid]] = []
         """Time, conditioning and head pose of frames that were consumed but not output yet."""
         self._floor = FloorTracker(self.wearer.skeleton.height_of("head"), self.pipeline.fps)
@@ -235,7 +240,9 @@ class EchoStream(HeadAndWristsStream):
         motions: list[Motion] = []
         while self._queue is not None and self._pending:
             motions += self._emit(self._queue.push(self._queue.padding()))
-        self._queue = None
+        if self._refiner is not None:
+            motions += self._refiner.finish()
+        self._queue, self._refiner = None, None
         return motions
 
     def _frame(self, time: float, T_world_head: Rigid) -> Conditioning:
@@ -318,8 +325,13 @@ class EchoStream(HeadAndWristsStream):
         batch_item = BatchItem(path, conditioning, list(self._shapes.values()))
         if self._static is not None:
             outputs = self._static(conditioning, outputs)
-        settings, contacts = self.pipeline.settings(), self.pipeline.model.contacts
-        return [motion_of(batch_item, outputs, self.pipeline.anchor, settings, contacts)]
+        pipeline = self.pipeline
+        motion = motion_of(batch_item, outputs, pipeline.anchor, pipeline.settings(), pipeline.model.contacts)
+        if pipeline.refinement is None:
+            return [motion]
+        if self._refiner is None:
+            self._refiner = Refiner(pipeline.refinement, motion.skeleton, pipeline.fps, pipeline.anchor)
+        return self._refiner.push(motion, measured_of(batch_item))
 
 
 class EchoSession(Session):

@@ -18,6 +18,7 @@ from wearcap.scene.voxels import VoxelGrid
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import Conditions, MotionDenoiser
 from wearcap.systems.hmd2.pipeline import HMD2, DiffusionModel, Overlap, Sampling
+from wearcap.tracking.refinement import Refinement
 
 SETTINGS = ("steps", "stride", "eta", "spacing", "guidance", "inpaint", "fade", "lookahead", "live", "use")
 
@@ -79,6 +80,7 @@ def exports(pipeline: HMD2) -> Exports:
         "window": net.window,
         "fps": model.fps,
         "settings": {name: settings[name] for name in SETTINGS},
+        "refinement": None if pipeline.refinement is None else asdict(pipeline.refinement),
         "schedule": graphs.schedule_to_json(model.schedule),
         "features": asdict(features),
         "condition_channels": condition_channels(features),
@@ -157,4 +159,4 @@ def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], abo
         kind(**{field.name: settings.pop(field.name) for field in fields(kind) if field.name in settings})
         for kind in (Sampling, Overlap)
     )
-    return HMD2(model, sampling, overlap, **settings)
+    return HMD2(model, sampling, overlap, refinement=Refinement.of(about.get("refinement")), **settings)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import torch
@@ -28,6 +28,7 @@ from wearcap.systems.hmd2.windows import Frames, Poses, WindowSampler, advance, 
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.floor import floor_from_points, tracked_floor
 from wearcap.tracking.head_path import HeadPath, head_path
+from wearcap.tracking.refinement import Measured, Refinement
 
 MODALITIES = ("points", "images")
 
@@ -85,6 +86,8 @@ class HMD2(LearnedSystem):
     overlap: Overlap = Overlap()
     use: Sequence[str] = MODALITIES
     """Modalities that condition the model, of those that it was trained on and the recording contains."""
+    refinement: Refinement | None = None
+    """How predicted motion is refined (ours); None: it stays as predicted."""
     live: bool = False
     """Whether the floor at a frame is estimated from earlier data only, as it must be in a stream."""
     runtime: str = "eager"
@@ -152,8 +155,8 @@ class HMD2(LearnedSystem):
         paths, frames = zip(*((path_of[id(recording)], sensed[id(recording)]) for recording in recordings))
         # 4. windows of the diffusion model, every stretch of a path separately
         poses = self._windows(paths, frames, seeds)
-        # 5. anchor the body to the measured head
-        return [self.motion(p.timestamps, p.skeleton, p.T_world_head, predicted) for p, predicted in zip(paths, poses)]
+        # 5. anchor the body to the measured head; 6. smooth it and hold its feet
+        return [self._refined(*parts) for parts in zip(paths, frames, poses)]
 
     def sense(self, recording: Recording, path: HeadPath) -> Frames:
         """Steps 2 and 3: the conditioning of a whole recording, as a batch of one.
@@ -235,11 +238,21 @@ class HMD2(LearnedSystem):
                 for target, part in zip(whole[i], final):
                     target[0, end - part.shape[1] : end] = part[0]
             items = [item for item in items if item[1] + passed < item[2]]
-        return [_bridged(Poses(*(part[0] for part in poses)), path.stretches) for poses, path in zip(whole, paths)]
+        return [Poses(*(part[0] for part in poses)) for poses in whole]
 
     def sampler(self, skeleton: Skeleton, seed: int, start: int) -> WindowSampler:
         """A sampler for the stretch that begins at frame `start`; every stretch of a recording has its own noise."""
         return WindowSampler(self, body_size(skeleton), seed + 1_000_003 * start)
+
+    def _refined(self, path: HeadPath, frames: Frames, poses: Poses) -> Motion:
+        """Steps 5 and 6 of a whole recording."""
+        motion = self.motion(path.timestamps, path.skeleton, path.T_world_head, poses)
+        if self.refinement is not None:
+            measured = Measured.of(path.T_world_head, frames.floor_height[0])
+            motion = self.refinement.whole(motion, measured, path.stretches, self.model.fps, anchored=True)
+        if len(path.stretches) == 1:
+            return motion
+        return anchored_to_head(_bridged(motion, path.stretches), path.T_world_head)
 
     def motion(
         self, timestamps: Float64[Tensor, "time"], skeleton: Skeleton, T_world_head: Rigid, poses: Poses
@@ -251,6 +264,7 @@ class HMD2(LearnedSystem):
             "stride": str(self.advance),
             "eta": str(self.sampling.eta),
             "lookahead": str(self.lookahead_frames),
+            "refinement": str(self.refinement),
         }
         contact = poses.foot_contact.repeat_interleave(2, -1) if self.model.features.contacts else None
         root = torch.zeros(len(timestamps), 3)
@@ -258,11 +272,12 @@ class HMD2(LearnedSystem):
         return anchored_to_head(motion, T_world_head)
 
 
-def _bridged(poses: Poses, stretches: tuple[tuple[int, int], ...]) -> Poses:
-    """Poses with the frames between stretches interpolated (slerp) from the last pose before to the first one after."""
+def _bridged(motion: Motion, stretches: tuple[tuple[int, int], ...]) -> Motion:
+    """The motion with the frames between stretches interpolated (slerp) from the last pose before to the first one
+    after."""
+    R = motion.R_parent_joint.clone()
     for (_, before), (after, _) in pairwise(stretches):
         if after > before:
-            R = poses.R_parent_joint
             share = torch.linspace(0, 1, after - before + 2)[1:-1]
             R[before:after] = rotation.between(R[before - 1], R[after], share[:, None])
-    return poses
+    return replace(motion, R_parent_joint=R)

@@ -27,15 +27,15 @@ from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.places import Memory
 from wearcap.systems.hmd2.wearer import Wearer, WearerState
 from wearcap.systems.hmd2.windows import advance
-from wearcap.tracking import floor, head_path
+from wearcap.tracking import floor, foot_lock, head_path, refinement
 from wearcap.tracking.head_path import Chunk
 
 
 class HMD2Session(Session):
     """A streaming capture of one or several wearers with one pipeline, whose windows share batches.
 
-    Poses are final once `stride` frames, and `lookahead_frames` after them, have arrived; poses pending at a gap are
-    returned with the next ones. Samples may be late or out of order within those frames; poses that are later still
+    Poses are final once `stride` frames, and `lookahead_frames` and those of the refinement after them, have arrived;
+    poses pending at a gap are returned with the next ones. Samples may be late or out of order within those frames; poses that are later still
     count as `dropped` (their points and embeddings are used). A missing or refused head pose is interpolated; at a
     chunk's end, before a newer one has arrived, the last pose is repeated, and corrected for the windows that follow.
     After a gap or jump (`tracking.head_path.MAX_GAP_S`, `MAX_SPEED_M_S`) the capture restarts; gaps get no poses.
@@ -44,7 +44,8 @@ class HMD2Session(Session):
 
     stream_class = WearerState
     classes = classes_of(
-        skeleton, motion_types, rigid, head_path, packets, samples, floor, voxels, places, windows, wearer
+        *(skeleton, motion_types, rigid, head_path, packets, samples, floor, voxels, places, windows, wearer),
+        *(refinement, foot_lock),
     )
 
     def __init__(self, pipeline: HMD2, wearers: Sequence[Wearer], seeds: Sequence[int], memory: Memory | None = None):
@@ -108,13 +109,13 @@ class HMD2Session(Session):
         while chunks := {i: chunk for i in wearers if (chunk := self.streams[i].track.next(ended))}:
             for i, chunk in chunks.items():
                 if chunk.begins:
-                    predicted[i] += self.streams[i].finalize(0)
+                    predicted[i] += self.streams[i].end()
             with self.system.undisturbed():
                 self._advance(chunks)
             for i in chunks:
                 predicted[i] += self.streams[i].finalize(self.system.lookahead_frames)
         for i in wearers if ended else ():
-            predicted[i] += self.streams[i].finalize(0)
+            predicted[i] += self.streams[i].end()
         return [joined(parts) for parts in predicted]
 
     @torch.inference_mode()
@@ -148,6 +149,7 @@ class HMD2Session(Session):
             "spacing": sampling.spacing,
             **{name: getattr(net, name) for name in ("motion_size", "points_size", "image_size")},
             "features": str(system.model.features),
+            "refinement": str(system.refinement),
         }
 
     def state(self) -> dict[str, Any]:

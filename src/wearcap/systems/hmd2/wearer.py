@@ -21,6 +21,7 @@ from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.places import Memory, Places
 from wearcap.systems.hmd2.windows import Frames, Poses, WindowSampler
 from wearcap.tracking.head_path import Chunk, HeadTrack
+from wearcap.tracking.refinement import Refiner
 
 MAX_WAITING = 1000
 """Most image embeddings, and most floor heights, that are buffered for coming head poses; the oldest are dropped."""
@@ -55,6 +56,7 @@ class WearerState:
         stature = self.wearer.skeleton.height_of("head")
         self.places = Places(grid, stature, pipeline.model.fps, self.memory)
         self.sampler: WindowSampler | None = None
+        self.refiner: Refiner | None = None
         self.times = torch.zeros(0, dtype=torch.float64)
         """Timestamps of the frames that were sampled but not output yet."""
         self.pictures: list[tuple[float, Tensor]] = []
@@ -147,13 +149,27 @@ class WearerState:
         return frames._replace(valid=frames.valid & (number < count))
 
     def finalize(self, lookahead_frames: int) -> list[Motion]:
-        """Newly final poses, all but the last `lookahead_frames`, as a list of at most one motion."""
+        """Newly final poses, all but the last `lookahead_frames` and those that wait for refinement, as a list of at
+        most one motion."""
         if self.sampler is None or len(self.times) <= lookahead_frames:
             return []
-        poses, T_world_head = self.sampler.finalize(lookahead_frames)
-        times, self.times = self.times.tensor_split([len(T_world_head.t)])
-        poses = Poses(*(part[0] for part in poses))
-        return [self.pipeline.motion(times, self.wearer.skeleton, T_world_head, poses)]
+        poses, measured = self.sampler.finalize(lookahead_frames)
+        times, self.times = self.times.tensor_split([len(measured.floor_height)])
+        poses, T_world_head = Poses(*(part[0] for part in poses)), Rigid(measured.R_world_head, measured.t_world_head)
+        motion = self.pipeline.motion(times, self.wearer.skeleton, T_world_head, poses)
+        if self.pipeline.refinement is None:
+            return [motion]
+        if self.refiner is None:
+            self.refiner = Refiner(self.pipeline.refinement, motion.skeleton, self.pipeline.model.fps, anchored=True)
+        return self.refiner.push(motion, measured)
+
+    def end(self) -> list[Motion]:
+        """All remaining poses of a stretch, as a list of at most two motions."""
+        motions = self.finalize(0)
+        if self.refiner is not None:
+            motions += self.refiner.finish()
+        self.refiner = None
+        return motions
 
 
 def _newest(times: Float64[Tensor, "sample"], time: float) -> int:

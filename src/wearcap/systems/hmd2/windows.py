@@ -18,6 +18,7 @@ from wearcap.body.skeleton import FEET
 from wearcap.diffusion.process import sample
 from wearcap.geometry.rigid import Rigid
 from wearcap.systems.hmd2.model import Conditions
+from wearcap.tracking.refinement import Measured
 
 if TYPE_CHECKING:
     from wearcap.systems.hmd2.pipeline import HMD2
@@ -97,15 +98,17 @@ class WindowSampler:
         self.predicted = Poses(*_appended(self.predicted, first, no_poses(self.pipeline, new)))
         self.frames = fresh if self.frames is None else Frames(*_appended(self.frames, first, fresh))
 
-    def finalize(self, lookahead_frames: int) -> tuple[Poses, Rigid]:
-        """Mark all predictions but the last `lookahead_frames` as final; returns the newly final ones with their head poses."""
+    def finalize(self, lookahead_frames: int) -> tuple[Poses, Measured]:
+        """Mark all predictions but the last `lookahead_frames` as final; returns the newly final ones with their head
+        poses and floor."""
         assert self.frames is not None
         # Frames after a recording's end are not valid and never output.
         until = max(self.final, int(self.frames.valid.sum()) - lookahead_frames)
         part = slice(self.final, until)
         self.final = until
         head = Rigid(self.frames.R_world_head[0, part], self.frames.t_world_head[0, part])
-        return Poses(*(poses[:, part] for poses in self.predicted)), head
+        measured = Measured.of(head, self.frames.floor_height[0, part])
+        return Poses(*(poses[:, part] for poses in self.predicted)), measured
 
 
 @torch.inference_mode()

@@ -12,6 +12,7 @@ from wearcap.runtime.graphs import Exports, Run, skeleton_from_json, skeleton_to
 from wearcap.systems.mocap_every.features import WatchFeatures
 from wearcap.systems.mocap_every.model import Estimate, WatchEstimator
 from wearcap.systems.mocap_every.pipeline import SETTINGS, MocapEvery, WatchModel
+from wearcap.tracking.refinement import Refinement
 
 
 def exports(pipeline: MocapEvery) -> Exports:
@@ -30,6 +31,7 @@ def exports(pipeline: MocapEvery) -> Exports:
         "fps": pipeline.model.fps,
         "skeleton": skeleton_to_json(pipeline.model.skeleton),
         "settings": {name: getattr(pipeline, name) for name in SETTINGS},
+        "refinement": None if pipeline.refinement is None else asdict(pipeline.refinement),
     }
     return Exports("mocap_every", {"network": net.graph(features.size)}, about)
 
@@ -50,4 +52,4 @@ def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], abo
     """The pipeline of an exported model."""
     net, features = _ExportedEstimator(runs["model"], about["window"]), WatchFeatures(**about["features"])
     model = WatchModel(net, features, skeleton_from_json(about["skeleton"]), about["fps"])
-    return MocapEvery(model, **about["settings"])
+    return MocapEvery(model, refinement=Refinement.of(about.get("refinement")), **about["settings"])

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from wearcap.body.skeleton import FEET, Skeleton
 from wearcap.errors import WearcapError, require_choice
+from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.metrics.scores import score_in_world
 from wearcap.metrics.table import Row
@@ -29,6 +30,7 @@ from wearcap.systems.mocap_every.windows import EstimatorWindows, FinalPoses
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.floor import floor_from_points
 from wearcap.tracking.head_path import HeadPath, head_path
+from wearcap.tracking.refinement import Measured, Refinement, held_in_gaps
 
 FLOORS = ("follow", "update", "points", "fixed")
 SETTINGS = ("stride", "lookahead", "floor", "anchor", "mirror_average")
@@ -73,6 +75,8 @@ class MocapEvery(LearnedSystem):
     """Whether the body is anchored to the measured head (ours) or keeps the estimator's translation (the paper)."""
     mirror_average: bool = True
     """Mirror test-time augmentation: the prediction for the mirrored window is averaged in (ours)."""
+    refinement: Refinement | None = None
+    """How estimated motion is refined (ours); None: it stays as estimated."""
     cues: VisualCues | None = None
     """Motion editing by the recording's keypoints (§3.4); None: no editing."""
     runtime: str = "eager"
@@ -131,11 +135,29 @@ class MocapEvery(LearnedSystem):
         # 4. anchor the body to the measured head
         if self.anchor:
             motion = anchored_to_head(motion, path.T_world_head)
-        # 5. edit the motion within the manifold to fit the visual cues
+        # 5. smooth it, hold its feet, and bend its arms to tracked hands
+        if self.refinement is not None:
+            motion = self._refined(motion, self.refinement, path, sensed, whole.floor_height)
+        # 6. edit the motion within the manifold to fit the visual cues
         edits: list[LatentSolution] = []
         if self.cues is not None:
             motion, edits = self.cues.edit(motion, recording, path.T_world_head)
         return CapturedWithFloor(motion, FloorTrack(path.timestamps, whole.floor_height), edits)
+
+    def _refined(
+        self,
+        motion: Motion,
+        refinement: Refinement,
+        path: HeadPath,
+        sensed: Sensed,
+        floor_height: Float[Tensor, "time"],
+    ) -> Motion:
+        """Step 5; the frames between stretches keep the refined pose before them."""
+        tracked = self.model.features.wrists == "positions"
+        hands = Rigid(sensed.R_world_wrist, sensed.t_world_wrist) if tracked else None
+        measured = Measured.of(path.T_world_head, floor_height, hands)
+        motion = refinement.whole(motion, measured, path.stretches, self.model.fps, self.anchor)
+        return motion if len(path.stretches) == 1 else held_in_gaps(motion, path, self.anchor)
 
     def score(self, motion: Motion, source: CaptureInput, seed: int) -> Row:
         """All metrics in the world, without anchoring or alignment (MocapEvery §4.1)."""
@@ -204,4 +226,4 @@ class MocapEvery(LearnedSystem):
 
     def settings(self) -> dict[str, str]:
         """Settings that the motion depends on, for its provenance."""
-        return {"pipeline": "mocap_every"} | {name: str(getattr(self, name)) for name in SETTINGS}
+        return {"pipeline": "mocap_every"} | {name: str(getattr(self, name)) for name in (*SETTINGS, "refinement")}

@@ -1,7 +1,8 @@
 """Streaming MocapEvery: head poses and watch samples go in as they arrive, final poses come out.
 
 Windows, floor and anchoring are those of `MocapEvery.run`: with equal stride, lookahead and initial floor the motion is
-the same. Beyond the lookahead, a stream's latency includes the three future frames of the mean filter.
+the same. Beyond the lookahead, a stream's latency includes the three future frames of the mean filter, and those of the
+refinement.
 """
 
 import math
@@ -33,11 +34,15 @@ from wearcap.systems.mocap_every import features, windows
 from wearcap.systems.mocap_every.features import Sensed
 from wearcap.systems.mocap_every.pipeline import MocapEvery
 from wearcap.systems.mocap_every.windows import EstimatorWindows, FinalPoses
-from wearcap.tracking import head_path
+from wearcap.tracking import foot_lock, head_path, refinement
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.head_path import Chunk
+from wearcap.tracking.refinement import Measured, Refiner
 
-_STATE = skeleton, motion_types, rigid, head_path, packets, sample_types, floor_types, features, windows
+_STATE = (
+    *(skeleton, motion_types, rigid, head_path, packets, sample_types, floor_types, features, windows),
+    *(refinement, foot_lock),
+)
 """Modules with the classes that a session's state consists of."""
 MAX_POINTS = 1_000_000
 """Capacity of the buffer of points that wait for a head pose; the oldest are dropped."""
@@ -76,6 +81,7 @@ class MocapEveryStream(HeadAndWristsStream):
         self._times = torch.zeros(0, dtype=torch.float64)
         self._heads = Rigid(torch.zeros(0, 3, 3), torch.zeros(0, 3))
         """Head poses of frames that were consumed but not returned yet."""
+        self._refiner: Refiner | None = None
 
     def _take(self, admitted: Admitted) -> None:
         super()._take(admitted)
@@ -119,7 +125,7 @@ class MocapEveryStream(HeadAndWristsStream):
         while self._chunks and (ended or self._complete(self._chunks[0])):
             motions += self._advance(self._chunks.pop(0), end_s)
         if ended and self._windows is not None:
-            motions += self._to_motion(self._windows.finish())
+            motions += self._end(self._windows)
             self._windows = None
         return joined(motions)
 
@@ -137,7 +143,7 @@ class MocapEveryStream(HeadAndWristsStream):
         T_world_head = chunk.T_world_device @ mount
         if chunk.begins or self._windows is None:
             if self._windows is not None:
-                motions += self._to_motion(self._windows.finish())
+                motions += self._end(self._windows)
             self._begin_s = chunk.timestamps[0].item()
             floor_m = self.wearing.floor_m if self._windows is None else self._windows.floor_m
             if floor_m is None:
@@ -196,8 +202,22 @@ class MocapEveryStream(HeadAndWristsStream):
         self._times, self._heads = self._times[count:], self._heads[count:]
         poses = times, self.wearing.skeleton, output.R_parent_joint, output.t_world_root
         contact_prob = output.contact_prob.repeat_interleave(2, -1)
-        motion = Motion(*poses, contact_prob, provenance=self.pipeline.settings())
-        return [anchored_to_head(motion, heads) if self.pipeline.anchor else motion]
+        pipeline = self.pipeline
+        motion = Motion(*poses, contact_prob, provenance=pipeline.settings())
+        motion = anchored_to_head(motion, heads) if pipeline.anchor else motion
+        if pipeline.refinement is None:
+            return [motion]
+        if self._refiner is None:
+            self._refiner = Refiner(pipeline.refinement, motion.skeleton, pipeline.model.fps, pipeline.anchor)
+        return self._refiner.push(motion, Measured.of(heads, output.floor_height))
+
+    def _end(self, windows: EstimatorWindows) -> list[Motion]:
+        """The remaining frames of a stretch that has ended."""
+        motions = self._to_motion(windows.finish())
+        if self._refiner is not None:
+            motions += self._refiner.finish()
+        self._refiner = None
+        return motions
 
 
 class MocapEverySession(Session):

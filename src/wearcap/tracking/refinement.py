@@ -1,0 +1,275 @@
+"""Refinement of what a network predicts: rotations are smoothed without delay, feet that stand are held, and arms reach
+tracked wrists.
+
+Whole recordings and streams run the same `Refiner`, which returns a frame once the `lookahead` frames after it are known.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import ceil
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from wearcap.body.kinematics import local_rotations, site_positions
+from wearcap.body.retarget import reach
+from wearcap.body.skeleton import FEET, FOOT_PATCHES, WRISTS, Skeleton
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
+from wearcap.recording import Motion
+from wearcap.recording.timing import joined
+from wearcap.tracking.anchor import anchored_to_head
+from wearcap.tracking.foot_lock import FootLock, FootState, displacements
+from wearcap.tracking.head_path import HeadPath
+
+SIDES = ("left", "right")
+_REACH = 2.5
+"""Half width of the filter in standard deviations."""
+_STRAIGHT, _SOFT = 0.97, 0.025
+"""Share of a leg's length from which a farther goal is approached ever more slowly, and the share within which."""
+
+
+class Measured(NamedTuple):
+    """What is measured in the frames of a motion."""
+
+    R_world_head: Float[Tensor, "time 3 3"]
+    t_world_head: Float[Tensor, "time 3"]
+    floor_height: Float[Tensor, "time"]
+    """World z (m) of the floor, as far as the system knows it."""
+    R_world_wrist: Float[Tensor, "time wrist 3 3"]
+    """Orientations of the tracked wrists; none of systems that do not track them."""
+    t_world_wrist: Float[Tensor, "time wrist 3"]
+    given: Bool[Tensor, "time"]
+    """Frames whose whole body is given, which stay as they are."""
+
+    @classmethod
+    def of(cls, T_world_head: Rigid, floor_height: Float[Tensor, "time"], T_world_wrist: Rigid | None = None):
+        """Measurements of head, floor and, where they are tracked, wrists (R "time wrist 3 3"); no body is given."""
+        count = len(floor_height)
+        wrists = T_world_wrist or Rigid(torch.zeros(count, 0, 3, 3), torch.zeros(count, 0, 3))
+        given = torch.zeros(count, dtype=torch.bool)
+        return cls(T_world_head.R, T_world_head.t, floor_height, wrists.R, wrists.t, given)
+
+    def part(self, frames: slice) -> "Measured":
+        """A range of frames."""
+        return Measured(*(field[frames] for field in self))
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """How predicted motion is refined."""
+
+    smooth: float
+    """Standard deviation (frames) of the Gaussian that rotations are averaged with; 0: they stay."""
+    feet: FootLock | None
+    """How standing feet are held; None: they stay."""
+    wrists: bool
+    """Whether arms are bent to tracked wrists, where a system has them."""
+
+    @property
+    def half_width(self) -> int:
+        """Frames to either side that are averaged."""
+        return ceil(_REACH * self.smooth)
+
+    @property
+    def lookahead(self) -> int:
+        """Frames after a frame that must be known: a stream's poses come so much later."""
+        return self.half_width + (0 if self.feet is None else self.feet.lookahead)
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any] | None) -> "Refinement | None":
+        """The refinement of plain values, as `dataclasses.asdict` gives them; None of None."""
+        if values is None:
+            return None
+        feet = values["feet"]
+        return cls(**{**values, "feet": None if feet is None else FootLock(**feet)})
+
+    def whole(
+        self, motion: Motion, measured: Measured, stretches: Sequence[tuple[int, int]], fps: float, anchored: bool
+    ) -> Motion:
+        """A whole motion, each stretch (frames from, to) by itself; frames between stretches stay.
+
+        `anchored`: whether the head joint is put where it was measured. Raises WearcapError for contact probabilities
+        that are not finite.
+        """
+        R, t = motion.R_parent_joint.clone(), motion.t_world_root.clone()
+        for start, stop in stretches:
+            refiner = Refiner(self, motion.skeleton, fps, anchored)
+            parts = refiner.push(motion.sliced(start, stop), measured.part(slice(start, stop))) + refiner.finish()
+            if (found := joined(parts)) is not None:
+                R[start:stop], t[start:stop] = found.R_parent_joint, found.t_world_root
+        return replace(motion, R_parent_joint=R, t_world_root=t)
+
+
+class Refiner:
+    """Refines one stretch of motion, piece by piece."""
+
+    def __init__(self, refinement: Refinement, skeleton: Skeleton, fps: float, anchored: bool):
+        """`anchored`: whether the head joint is put where it was measured."""
+        self.refinement, self.fps, self.anchored = refinement, fps, anchored
+        has_soles = all(patch in skeleton.sites for patch in FOOT_PATCHES)
+        self._feet = refinement.feet if has_soles else None
+        self._values = torch.zeros(0, 0)
+        """Values to be averaged: of frames that are smooth already, as far as later ones need them, and of the others."""
+        self._raw: tuple[Motion, Measured] | None = None
+        """Frames that are not smooth yet."""
+        self._smooth: tuple[Motion, Measured] | None = None
+        """Frames that are smooth, but not final."""
+        self._states = tuple(FootState() for _ in range(FEET))
+
+    def push(self, motion: Motion, measured: Measured) -> list[Motion]:
+        """Take in the next frames; returns those that are final now, as a list of at most one motion.
+
+        Raises WearcapError for contact probabilities that are not finite.
+        """
+        if self._feet is not None and motion.contact_prob is not None and not motion.contact_prob.isfinite().all():
+            raise WearcapError("contact probabilities that are NaN or infinite", expected="values from 0 to 1")
+        values = rotation.rot6d_from_matrix(motion.R_parent_joint).flatten(-2)
+        values = torch.cat([values, motion.t_world_root - measured.t_world_head], -1)
+        self._values = torch.cat([self._values.reshape(-1, values.shape[1]), values])
+        self._raw = _joined(self._raw, (motion, measured))
+        return self._advance(ended=False)
+
+    def finish(self) -> list[Motion]:
+        """The remaining frames, after which no others follow, as a list of at most one motion."""
+        return self._advance(ended=True)
+
+    def _advance(self, ended: bool) -> list[Motion]:
+        if self._raw is not None:
+            fresh, self._raw = _split(self._raw, len(self._raw[0]) - (0 if ended else self.refinement.half_width))
+            self._smooth = _joined(self._smooth, self._smoothed(fresh)) if fresh else self._smooth
+        if self._smooth is None:
+            return []
+        known = len(self._smooth[0])
+        count = known if ended or self._feet is None else known - self._feet.lookahead
+        if count <= 0:
+            return []
+        offsets = self._offsets(*self._smooth, count)
+        final, self._smooth = _split(self._smooth, count)
+        assert final is not None
+        motion, measured = final
+        moved = motion
+        if offsets is not None:
+            moved = with_feet_moved(moved, offsets)
+        if self.refinement.wrists and measured.t_world_wrist.shape[1]:
+            moved = with_wrists_at(moved, Rigid(measured.R_world_wrist, measured.t_world_wrist))
+        return [_except_given(moved, motion, measured.given)]
+
+    def _smoothed(self, piece: tuple[Motion, Measured]) -> tuple[Motion, Measured]:
+        """The next frames with the average of their neighbours, anchored to the head."""
+        motion, measured = piece
+        half, count = self.refinement.half_width, len(motion)
+        before = len(self._values) - count - (0 if self._raw is None else len(self._raw[0]))
+        smooth = motion
+        if half:
+            shift = torch.arange(-half, half + 1)
+            weight = torch.exp(-0.5 * (shift / self.refinement.smooth) ** 2)
+            frames = torch.arange(before, before + count)[:, None] + shift
+            inside = (frames >= 0) & (frames < len(self._values))
+            weights = weight * inside
+            weights = weights / weights.sum(1, keepdim=True)
+            near = self._values[frames.clamp(0, len(self._values) - 1)]
+            mean = torch.einsum("tk,tkv->tv", weights, near)
+            R = rotation.matrix_from_rot6d(mean[:, :-3].unflatten(-1, (-1, 6)))
+            smooth = replace(motion, R_parent_joint=R, t_world_root=mean[:, -3:] + measured.t_world_head)
+        self._values = self._values[max(before + count - half, 0) :]
+        if self.anchored:
+            smooth = anchored_to_head(smooth, Rigid(measured.R_world_head, measured.t_world_head))
+        return _except_given(smooth, motion, measured.given), measured
+
+    def _offsets(self, motion: Motion, measured: Measured, count: int) -> Float[Tensor, "time foot 3"] | None:
+        if self._feet is None or motion.contact_prob is None:
+            return None
+        points = site_positions(motion.skeleton, motion.T_world_joint, FOOT_PATCHES).unflatten(1, (FEET, -1))
+        prob = motion.contact_prob.unflatten(1, (FEET, -1)).amax(-1)
+        offsets, self._states = displacements(
+            self._feet, points, prob, measured.floor_height, self.fps, self._states, count
+        )
+        return offsets
+
+
+def held_in_gaps(motion: Motion, path: HeadPath, anchored: bool) -> Motion:
+    """The motion whose frames between stretches keep the pose before them, `anchored` at the interpolated head."""
+    frames = torch.cat([torch.arange(start, stop) for start, stop in path.stretches])[path.held_frames]
+    held = replace(motion, R_parent_joint=motion.R_parent_joint[frames], t_world_root=motion.t_world_root[frames])
+    return anchored_to_head(held, path.T_world_head) if anchored else held
+
+
+def with_feet_moved(motion: Motion, offset: Float[Tensor, "time foot 3"]) -> Motion:
+    """The motion with its ankles moved by an offset in the world (m), hips and knees following, feet turned as before.
+
+    Knees bend forward, and a leg never becomes straighter than it can.
+    """
+    skeleton, T = motion.skeleton, motion.T_world_joint
+    R = T.R.clone()
+    for foot, side in enumerate(SIDES):
+        hip, knee, ankle = skeleton.indices(*(f"{side}_{joint}" for joint in ("hip", "knee", "ankle")))
+        start, middle, end = (T.t[:, joint].double() for joint in (hip, knee, ankle))
+        goal = _within_reach(start, middle, end, end + offset[:, foot].double())
+        # The thigh's x axis points forward: the farther a foot is moved, the more surely its knee bends that way.
+        forward = T.R[:, hip, :, 0].double() * offset[:, foot].norm(dim=-1, keepdim=True)
+        upper, lower = (turn.to(R) for turn in reach(start, middle, end, goal, forward))
+        moved = (offset[:, foot] != 0).any(-1)[:, None, None]
+        R[:, hip] = torch.where(moved, upper @ R[:, hip], R[:, hip])
+        R[:, knee] = torch.where(moved, lower @ R[:, knee], R[:, knee])
+    return replace(motion, R_parent_joint=local_rotations(skeleton, R))
+
+
+def _within_reach(
+    start: Float[Tensor, "time 3"],
+    middle: Float[Tensor, "time 3"],
+    end: Float[Tensor, "time 3"],
+    goal: Float[Tensor, "time 3"],
+) -> Float[Tensor, "time 3"]:
+    """The goal, nearer to the hip where the leg would have to be stretched more than it is and more than softly."""
+    length = (middle - start).norm(dim=-1) + (end - middle).norm(dim=-1)
+    now, wanted = ((point - start).norm(dim=-1) / length for point in (end, goal))
+    soft = _STRAIGHT + _SOFT * (1 - torch.exp(-(wanted - _STRAIGHT) / _SOFT))
+    share = torch.where(wanted > _STRAIGHT, torch.maximum(torch.minimum(now, wanted), soft), wanted)
+    return start + (goal - start) * (share / wanted.clamp_min(1e-9))[:, None]
+
+
+def with_wrists_at(motion: Motion, T_world_wrist: Rigid) -> Motion:
+    """The motion with both wrists turned as measured, and where they were measured or as near as the arms reach."""
+    skeleton, T = motion.skeleton, motion.T_world_joint
+    R = T.R.clone()
+    for number, wrist_name in enumerate(WRISTS):
+        side = wrist_name.partition("_")[0]
+        shoulder, elbow, wrist = skeleton.indices(f"{side}_shoulder", f"{side}_elbow", wrist_name)
+        points = (T.t[:, joint].double() for joint in (shoulder, elbow, wrist))
+        upper, lower = (turn.to(R) for turn in reach(*points, T_world_wrist.t[:, number].double()))
+        R[:, shoulder], R[:, elbow] = upper @ R[:, shoulder], lower @ R[:, elbow]
+        R[:, wrist] = T_world_wrist.R[:, number]
+    return replace(motion, R_parent_joint=local_rotations(skeleton, R))
+
+
+def _joined(before: tuple[Motion, Measured] | None, new: tuple[Motion, Measured]) -> tuple[Motion, Measured]:
+    if before is None:
+        return new
+    motion = joined([before[0], new[0]])
+    assert motion is not None
+    return motion, Measured(*(torch.cat(both) for both in zip(before[1], new[1])))
+
+
+def _split(
+    piece: tuple[Motion, Measured], count: int
+) -> tuple[tuple[Motion, Measured] | None, tuple[Motion, Measured] | None]:
+    """The first `count` frames, and the others; None for no frames."""
+    motion, measured = piece
+    if count <= 0 or count >= len(motion):
+        return (None, piece) if count <= 0 else (piece, None)
+    parts = ((0, count), (count, len(motion)))
+    return tuple((motion.sliced(*part), measured.part(slice(*part))) for part in parts)  # pyright: ignore[reportReturnType]
+
+
+def _except_given(changed: Motion, motion: Motion, given: Bool[Tensor, "time"]) -> Motion:
+    """The changed motion, with the given frames as they were."""
+    if not given.any():
+        return changed
+    R = torch.where(given[:, None, None, None], motion.R_parent_joint, changed.R_parent_joint)
+    return replace(
+        changed, R_parent_joint=R, t_world_root=torch.where(given[:, None], motion.t_world_root, changed.t_world_root)
+    )
