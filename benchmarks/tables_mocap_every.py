@@ -314,6 +314,8 @@ def _ours(options: argparse.Namespace) -> list[Method]:
         "ours, without mirror averaging": ("pipeline=mocap_every", "pipeline.mirror_average=false"),
         "ours, not anchored to the head": ("pipeline=mocap_every", "pipeline.anchor=false"),
         "ours, three frames at a time": ("pipeline=mocap_every_online",),
+        "ours, as predicted": ("pipeline=mocap_every", "pipeline.refinement=null"),
+        "ours, smoothed alone": ("pipeline=mocap_every", "pipeline.refinement.feet=null"),
     }
     ours = [Method(name, options.checkpoint, usual, pipeline) for name, pipeline in variants.items()]
     ours += [

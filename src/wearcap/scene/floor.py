@@ -260,8 +260,12 @@ class FloorFollow:
     """Number of nearest points that are used, and fewest of them within both distances (else the sole is used)."""
     GAIN, GAIN_POINTS = 0.05, 0.1
     """Share of the floor's error that a frame of full contact corrects, measured by the sole's height or by points."""
-    WALKING_M_S = (0.1, 0.3)
-    """Head speeds between which the head's rise starts to move the floor, and moves it fully."""
+    WALKING_M_S = (0.3, 0.5)
+    """Speeds of the head, over `STEP_S`, between which its rise starts to move the floor, and moves it fully."""
+    STEP_S = 2.0
+    """Time (s) over which the head's way counts: who squats or bends comes back, who climbs does not."""
+    STEEPEST = 1.0
+    """Largest rise of the floor per horizontal distance: stairs have 0.8."""
     LEVEL, TREND = 0.15, 0.01
     """Smoothing factors of the head's height (Holt's method; against steps and nods) and of its rate of rise."""
 
@@ -270,26 +274,31 @@ class FloorFollow:
         self._sole, self._fps, self._cloud = sole_m, fps, _Cloud()
         self._floors = np.array([initial_m])
         """Floor heights (m) of the latest block of frames."""
-        self._head: np.ndarray | None = None
-        self._velocity, self._level, self._trend = np.zeros(2), 0.0, 0.0
+        self._heads = np.zeros((0, 3))
+        """Head positions (m) of the latest frames, over `STEP_S`."""
+        self._level, self._trend = 0.0, 0.0
 
     def see(self, points_world: Float[Tensor, "point 3"]) -> None:
         self._cloud.add(points_world)
 
     def ahead(self, t_world_head: Float[Tensor, "time 3"]) -> Float[Tensor, "time"]:
         # The rise of the floor (m) within a frame follows from the head's smoothed height (Holt's linear trend).
-        rise, (low, high) = [], self.WALKING_M_S
-        for head in t_world_head.detach().cpu().double().numpy():
-            if (last := self._head) is None:
-                last, self._level = head, float(head[2])
-            velocity = (head[:2] - last[:2]) * self._fps
-            self._velocity += self.LEVEL * (velocity - self._velocity)
-            self._head = head
-            before, innovation = self._level, float(head[2]) - self._level - self._trend
+        heads, (low, high) = t_world_head.detach().cpu().double().numpy(), self.WALKING_M_S
+        if not len(self._heads):
+            self._heads, self._level = heads[:1], float(heads[0, 2])
+        rise = []
+        for height in heads[:, 2].tolist():
+            before, innovation = self._level, height - self._level - self._trend
             self._level += self._trend + self.LEVEL * innovation
             self._trend += self.TREND * innovation
-            walking = float(np.clip((np.hypot(*self._velocity) - low) / (high - low), 0, 1))
-            rise.append(walking * (self._level - before))
+            rise.append(self._level - before)
+        known, span = len(self._heads), round(self.STEP_S * self._fps)
+        path = np.concatenate([self._heads, heads])
+        start = np.maximum(np.arange(known, len(path)) - span, 0)
+        speed = np.linalg.norm(path[known:, :2] - path[start, :2], axis=1) / self.STEP_S
+        self._heads = path[-span:]
+        steepest = self.STEEPEST * speed / self._fps
+        rise = np.clip((speed - low) / (high - low), 0, 1) * np.clip(rise, -steepest, steepest)
         self._floors = self._floors[-1] + np.cumsum(rise)
         return torch.from_numpy(self._floors).float()
 
