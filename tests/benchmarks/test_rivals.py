@@ -15,6 +15,7 @@ NAME, STEP = "motion_diffusion_head", 8 * 240
 SMALL = [f"model.net.{name}" for name in ("width=32", "layers=1", "heads=4", "feedforward=32")]
 QUIET = [
     "data.dataset.window=60",
+    "data.loading.val_windows=8",
     "trainer.accelerator=cpu",
     "trainer.enable_progress_bar=false",
     "callbacks.progress=null",
