@@ -511,22 +511,9 @@ def _against_hands(scores: dict[str, Tree]) -> tuple[str, ...]:
 
 def _strangers_off(people: Tree) -> tuple[str, ...]:
     """How far it is off people without surroundings, whose head alone is tracked."""
-    errors = []
-    for title, rows in people["tables"].items():
-        if ALONE not in rows:
-            continue
-        name = title.partition("People")[0].rstrip(", ")
-        errors.append(f"{mean(rows[ALONE]['mpjpe_cm'])} cm on {_dataset(title)}" + (f" ({name})" if name else ""))
-    return (
-        (f"From the head alone, on whole splits of people without surroundings: {', '.join(errors)}.",)
-        if errors
-        else ()
-    )
-
-
-def _dataset(title: str) -> str:
-    """Name of the data set in a title "People (cmu): …"."""
-    return title.partition("(")[2].partition(")")[0]
+    rows = {title.split(":")[0]: rows for title, rows in people["tables"].items() if ALONE in rows}
+    errors = ", ".join(f"{mean(row[ALONE]['mpjpe_cm'])} cm ({title})" for title, row in rows.items())
+    return (f"From the head alone, on whole splits of people without surroundings: {errors}.",) if errors else ()
 
 
 def _first_lines(simulated: dict[str, Tree], real: dict[str, Tree]) -> list[list[str]]:
