@@ -40,7 +40,7 @@ def given(datasets: Path, runs: Path, *more: str) -> list[str]:
     return ["hmd2", "--only", NAME, "--runs", str(runs), "--budget", str(24 * STEP), *more, "--overrides", *overrides]
 
 
-def finish(arguments: list[str]) -> int:
+def finish(arguments: list[str]) -> object:
     with pytest.raises(SystemExit) as ended:
         rivals.main(arguments)
     return ended.value.code
