@@ -223,6 +223,7 @@ def test_a_wrong_height_is_off_by_as_much_whatever_is_sensed_and_the_truth_stays
     from watched_walk import watched_walk
 
     recording = watched_walk(1.0)
+    assert recording.motion is not None
     true = recording.motion.skeleton.stature
     for off in WRONG_HEIGHTS.values():
         given = sensed(recording, sensors, off)
