@@ -205,7 +205,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
 
 def _strangers(options: argparse.Namespace, about: dict[str, str]) -> Path:
     """People whose head alone is tracked, of data sets without points and pictures, in hmd2_people.json."""
-    console, tables = Console(width=WIDTH), {}
+    console, tables, path = Console(width=WIDTH), {}, options.output / "hmd2_people.json"
     there = {method.name: method for method in _methods(options, console) if method.name in PEOPLE}
     alone = there.pop(ALONE)
     ours = [
@@ -226,9 +226,8 @@ def _strangers(options: argparse.Namespace, about: dict[str, str]) -> Path:
         console.print(_table(title, found))
         scores = {result.method: result.scores for result in found}
         tables[title] = _plain(scores | {"truth": truth_row(scores[ours[0].name])})
-    path = options.output / "hmd2_people.json"
-    facts = {**about, "split": options.split, "sensors": options.sensors, "seeds": len(seeds)}
-    write_text(path, json.dumps(finite({"about": facts, "tables": tables}), indent=1) + "\n")
+        facts = {**about, "split": options.split, "sensors": options.sensors, "seeds": len(seeds)}
+        write_text(path, json.dumps(finite({"about": facts, "tables": tables}), indent=1) + "\n")
     return path
 
 
