@@ -409,7 +409,11 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     objects, people = rows_of(trees, "Table 1:"), rows_of(trees, "Table 2")
     ours, online = objects["ours"], figure_of(speed, "echo_online_small_fps")
     shown = {metric for title, row, _ in HEADLINE for metric in rows_of(trees, title).get(row, {})}
-    columns = [(LABELS[name][0], (name,), LABELS[name][1]) for name in LABELS if name in shown and name in OBJECTS]
+    columns = [
+        (LABELS[name][0], (name,), LABELS[name][1])
+        for name in LABELS
+        if name in shown and name in OBJECTS and "_pe_" not in name
+    ]
     real = f"; real motion (CMU) {people['ours']['mpjpe_mm']['mean'] / 10:.1f}" if "ours" in people else ""
     return Page(
         title="[ECHO](../echo.md): figures",

@@ -205,7 +205,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
 
 def _strangers(options: argparse.Namespace, about: dict[str, str]) -> Path:
     """People whose head alone is tracked, of data sets without points and pictures, in hmd2_people.json."""
-    console, tables = Console(width=WIDTH), {}
+    console, tables, path = Console(width=WIDTH), {}, options.output / "hmd2_people.json"
     there = {method.name: method for method in _methods(options, console) if method.name in PEOPLE}
     alone = there.pop(ALONE)
     ours = [
@@ -226,9 +226,8 @@ def _strangers(options: argparse.Namespace, about: dict[str, str]) -> Path:
         console.print(_table(title, found))
         scores = {result.method: result.scores for result in found}
         tables[title] = _plain(scores | {"truth": truth_row(scores[ours[0].name])})
-    path = options.output / "hmd2_people.json"
-    facts = {**about, "split": options.split, "sensors": options.sensors, "seeds": len(seeds)}
-    write_text(path, json.dumps(finite({"about": facts, "tables": tables}), indent=1) + "\n")
+        facts = {**about, "split": options.split, "sensors": options.sensors, "seeds": len(seeds)}
+        write_text(path, json.dumps(finite({"about": facts, "tables": tables}), indent=1) + "\n")
     return path
 
 
@@ -511,22 +510,9 @@ def _against_hands(scores: dict[str, Tree]) -> tuple[str, ...]:
 
 def _strangers_off(people: Tree) -> tuple[str, ...]:
     """How far it is off people without surroundings, whose head alone is tracked."""
-    errors = []
-    for title, rows in people["tables"].items():
-        if ALONE not in rows:
-            continue
-        name = title.partition("People")[0].rstrip(", ")
-        errors.append(f"{mean(rows[ALONE]['mpjpe_cm'])} cm on {_dataset(title)}" + (f" ({name})" if name else ""))
-    return (
-        (f"From the head alone, on whole splits of people without surroundings: {', '.join(errors)}.",)
-        if errors
-        else ()
-    )
-
-
-def _dataset(title: str) -> str:
-    """Name of the data set in a title "People (cmu): …"."""
-    return title.partition("(")[2].partition(")")[0]
+    rows = {title.split(":")[0]: rows for title, rows in people["tables"].items() if ALONE in rows}
+    errors = ", ".join(f"{mean(row[ALONE]['mpjpe_cm'])} cm ({title})" for title, row in rows.items())
+    return (f"From the head alone, on whole splits of people without surroundings: {errors}.",) if errors else ()
 
 
 def _first_lines(simulated: dict[str, Tree], real: dict[str, Tree]) -> list[list[str]]:

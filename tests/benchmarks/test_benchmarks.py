@@ -223,6 +223,7 @@ def test_a_wrong_height_is_off_by_as_much_whatever_is_sensed_and_the_truth_stays
     from watched_walk import watched_walk
 
     recording = watched_walk(1.0)
+    assert recording.motion is not None
     true = recording.motion.skeleton.stature
     for off in WRONG_HEIGHTS.values():
         given = sensed(recording, sensors, off)
@@ -302,6 +303,47 @@ def test_hmd2_tables_write_tails_scenarios_and_sweeps_on_validation(tmp_path, mo
     assert "0.0012" in shown
     assert "truth" in shown
     assert "Table 6.10" in shown
+
+
+@pytest.mark.parametrize("keep", [None, "before it"])
+def test_hmd2_strangers_are_captured_from_the_head_alone(keep, tmp_path, monkeypatch):
+    import tables_hmd2
+    from hmd2_runs import Result
+    from sensed import GIVEN
+
+    from watched_walk import watched_walk
+    from wearcap.metrics.table import Summary
+    from wearcap.recording import RecordingStore
+
+    RecordingStore(tmp_path / "walks").add(watched_walk(1.0), split="test", config_hash="")
+    seen = {}
+
+    def run_method(method, case):
+        seen[method.name] = method.sensors or case.sensors, method.height_off_m, case.dataset.name
+        assert (
+            method.checkpoint is None
+            or "pipeline.use=[]" in method.pipeline
+            or not method.name.startswith("head alone,")
+        )
+        return Result(method.name, {"mpjpe_cm": Summary(9.0, None, 1), "truth_physicality": Summary(0.5, None, 1)}, {})
+
+    monkeypatch.setattr(tables_hmd2, "run_method", run_method)
+    monkeypatch.setattr(tables_hmd2, "_exists", lambda checkpoint: True)
+    parser = argparse.ArgumentParser()
+    tables_hmd2.add_arguments(parser)
+    arguments = ["--strangers", str(tmp_path / "walks"), "--jobs", "1", *(["--keep", keep] if keep else [])]
+    options = parser.parse_args(arguments, argparse.Namespace(quick=False, output=tmp_path))
+    path = tables_hmd2.tables(options, {})
+    assert path.name == "hmd2_people.json"
+    (title, rows), *others = json.loads(path.read_text())["tables"].items()
+    assert not others
+    assert title.startswith("before it, People (walks):" if keep else "People (walks):")
+    assert rows["truth"] == {"physicality": {"mean": 0.5, "std": None, "seeds": 1}}
+    assert set(rows) == {*seen, "truth"}
+    assert ("mean pose" in rows) == ("EgoAllo-style" in rows) == (tables_hmd2.BRIEF in rows) == (keep is None)
+    assert seen["head alone"] == ("typical", None, "walks")
+    assert seen["head alone, 3 cm too short"] == ("typical", -0.03, "walks")
+    assert seen["head alone, exact sensors, bones given"] == (GIVEN, None, "walks")
 
 
 def frames_of(overrides: list[str]) -> tuple[str, int]:

@@ -15,6 +15,7 @@ NAME, STEP = "motion_diffusion_head", 8 * 240
 SMALL = [f"model.net.{name}" for name in ("width=32", "layers=1", "heads=4", "feedforward=32")]
 QUIET = [
     "data.dataset.window=60",
+    "data.loading.val_windows=8",
     "trainer.accelerator=cpu",
     "trainer.enable_progress_bar=false",
     "callbacks.progress=null",
@@ -39,7 +40,7 @@ def given(datasets: Path, runs: Path, *more: str) -> list[str]:
     return ["hmd2", "--only", NAME, "--runs", str(runs), "--budget", str(24 * STEP), *more, "--overrides", *overrides]
 
 
-def finish(arguments: list[str]) -> int:
+def finish(arguments: list[str]) -> object:
     with pytest.raises(SystemExit) as ended:
         rivals.main(arguments)
     return ended.value.code
