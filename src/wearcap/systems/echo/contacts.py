@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int64
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from wearcap.body.contact_points import BODY_POINTS, TOUCH_M
+from wearcap.body.contact_points import BODY_POINTS
 from wearcap.body.kinematics import forward_kinematics, site_positions
 from wearcap.body.model import BodyModel
 from wearcap.body.skeleton import FOOT_PATCHES
@@ -41,11 +41,11 @@ class Guidance:
     """Step size of the body towards the object."""
     feet: float = 1.0
     """Step size of the body that brings feet in contact to the floor."""
-    held: float = 0.3
+    held: float = 0.0
     """Step size of an object that stays where it is relative to the wrists whose hands touch it."""
     threshold: float = 0.5
     """Contact probability from which a point counts as in contact."""
-    within_m: float = TOUCH_M
+    within_m: float = 0.0
     """Distance to the surface (m) at which a point in contact is near enough."""
 
     def corrected(
