@@ -34,7 +34,9 @@ def run(conveyor: Conveyor, count: int, denoise, observation=None, random=None):
         yield first, conveyor
 
 
-@pytest.mark.parametrize("change", [{"context": 6}, {"context": -1}, {"per_frame": 0}, {"step": "jump"}])
+@pytest.mark.parametrize(
+    "change", [{"context": 6}, {"context": -1}, {"per_frame": 0}, {"step": "jump"}, {"lead": (0.0, 1.0)}]
+)
 def test_a_belt_that_cannot_run_is_refused(change):
     with pytest.raises(WearcapError, match=r"Expected"):
         replace(BELT, **change)
@@ -43,11 +45,26 @@ def test_a_belt_that_cannot_run_is_refused(change):
 def test_a_belt_counts_what_is_on_it():
     assert BELT.ramp == 4
     assert BELT.steps == 12
-    levels = BELT.levels(torch.arange(14))
+    levels = BELT.levels(torch.arange(14))[:, 0]
     assert levels[0] == 1
     assert (levels[12:] == 0).all()
     assert (levels[:13].diff() < 0).all()
-    assert (replace(BELT, spacing=2.0).levels(torch.arange(1, 12)) < levels[1:12]).all()
+    assert (replace(BELT, spacing=2.0).levels(torch.arange(1, 12))[:, 0] < levels[1:12]).all()
+
+
+def test_a_modality_in_the_lead_is_clean_first():
+    """A half as long ramp: both enter as noise, and the leading one is final when the other is half way."""
+    belt = replace(BELT, lead=(0.0, 0.5))
+    levels = belt.levels(torch.arange(13))
+    assert torch.equal(levels[:, 0], BELT.levels(torch.arange(13))[:, 0])
+    assert torch.equal(levels[:7, 1], BELT.levels(torch.arange(0, 13, 2))[:, 0])
+    assert (levels[6:, 1] == 0).all()
+    seen = []
+    conveyor = Conveyor(belt, SCHEDULE, SIZES, 2)
+    for _, now in run(conveyor, 9, lambda x, level, first: seen.append(level) or torch.full_like(x, 1.5)):
+        assert torch.equal(now.level, belt.levels(now.age).expand_as(now.level))
+    assert (seen[-1][..., 1] <= seen[-1][..., 0]).all()
+    assert torch.equal(now.x[:, : now.clean], torch.full_like(now.x[:, : now.clean], 1.5))
 
 
 @pytest.mark.parametrize("levels_of", ["modality", "one"])
@@ -83,7 +100,7 @@ def test_frames_on_their_way_have_their_levels_marginals(step):
     """With the true x0 a frame at level l is N(√ᾱ x0, 1 - ᾱ), in both ways to step."""
     conveyor = Conveyor(replace(BELT, step=step), SCHEDULE, (1,), 20_000)
     *_, (_, now) = run(conveyor, 9, lambda x, level, first: torch.full_like(x, 1.5))
-    alpha_bar = SCHEDULE(now.rolling.levels(now.age))
+    alpha_bar = SCHEDULE(now.rolling.levels(now.age)[:, 0])
     torch.testing.assert_close(now.x.mean(0)[:, 0], 1.5 * alpha_bar.sqrt(), atol=0.03, rtol=0)
     torch.testing.assert_close(now.x.var(0)[:, 0], 1 - alpha_bar, atol=0.03, rtol=0)
 
@@ -112,7 +129,7 @@ def test_a_gaussian_process_comes_out_as_it_is_with_neighbours_at_other_levels()
     assert pair.std(1).mean().item() == pytest.approx(std, rel=0.05)
     assert pair.corrcoef()[0, 1].item() == pytest.approx(rho, abs=0.04)
     noisy = now.x[:, -2, 0]
-    a = SCHEDULE(now.rolling.levels(now.age))[-2].item()
+    a = SCHEDULE(now.rolling.levels(now.age)[:, 0])[-2].item()
     assert noisy.mean().item() == pytest.approx(mean * a**0.5, abs=0.04)
     assert noisy.var().item() == pytest.approx(a * std**2 + 1 - a, rel=0.08)
 

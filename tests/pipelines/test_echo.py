@@ -80,13 +80,13 @@ def test_observed_frames_of_one_modality_enter_at_level_0(modality):
     denoiser = echo.denoiser
 
     def watched(queue, conditioning, frame):
-        denoise, correct = denoiser(queue, conditioning, frame)
+        denoise, corrections = denoiser(queue, conditioning, frame)
 
         def look(x, level):
             given.append((level, conditioning.is_observed))
             return denoise(x, level)
 
-        return look, correct
+        return look, corrections
 
     echo.denoiser = watched
     found = echo.capture_scenarios([scenario_of(recording, margin_s=3.0, observed=seen)], [0])[0]
@@ -130,7 +130,7 @@ class Knowing(Echo):
             observed_parts.append(torch.where(queue.conveyor.wide(level) == 0, (x - truth).abs(), 0.0))
             return truth
 
-        return denoise, None
+        return denoise, []
 
 
 def knowing(frame: str, **settings) -> Echo:
@@ -224,8 +224,8 @@ def test_windows_take_as_many_steps_as_asked_for(monkeypatch):
     assert torch.equal(conveyor.capture([recording], [0])[0].motion.R_parent_joint, whole.R_parent_joint)
 
     def counted(self, queue, conditioning, frame):
-        denoise, correct = denoiser(self, queue, conditioning, frame)
-        return lambda x, level: taken.append(1) or denoise(x, level), correct
+        denoise, corrections = denoiser(self, queue, conditioning, frame)
+        return lambda x, level: taken.append(1) or denoise(x, level), corrections
 
     denoiser = Echo.denoiser
     monkeypatch.setattr(Echo, "denoiser", counted)

@@ -48,7 +48,7 @@ def scene_of(frame: str = "own", shift=(0.0, 0.0, 0.0), lift: float = 0.0, conta
 @pytest.mark.parametrize("frame", ["own", "window", "world"])
 def test_an_object_comes_to_the_hand_that_touches_it(frame):
     scene, x = scene_of(frame, shift=(0.1, 0.05, -0.1))
-    corrected = Guidance(object=1.0, human=0.0, feet=0.0).corrected(x, scene)
+    corrected = Guidance(object=1.0, human=0.0, feet=0.0, held=0.0, within_m=0.0).corrected(x, scene)
     assert scene.costs(corrected, 0.5)[0] < 0.9 * scene.costs(x, 0.5)[0]
     first = scene.net.sizes[0]
     changed = (corrected != x).any(0).any(0)
@@ -58,7 +58,7 @@ def test_an_object_comes_to_the_hand_that_touches_it(frame):
 
 def test_a_body_comes_to_its_object():
     scene, x = scene_of(shift=(0.1, 0.05, -0.1))
-    corrected = Guidance(object=0.0, human=0.3, feet=0.0).corrected(x, scene)
+    corrected = Guidance(object=0.0, human=0.3, feet=0.0, held=0.0).corrected(x, scene)
     assert scene.costs(corrected, 0.5)[0] < scene.costs(x, 0.5)[0]
     assert torch.equal(corrected[..., scene.net.sizes[0] :], x[..., scene.net.sizes[0] :])
 
@@ -106,6 +106,47 @@ def test_what_is_not_there_is_not_pulled(part):
     assert moved.tolist() == [True] * 4 + [False] * 4
 
 
+@pytest.mark.parametrize("given", [0.0, 1.0])
+def test_observed_contacts_count_whatever_the_network_says(given):
+    contact = torch.full((1, FRAMES, BODY_POINTS + 4), 0.9 - 1.8 * given)
+    scene, x = scene_of(shift=(0.1, 0.05, -0.1), lift=0.1, contact=contact)
+    told = torch.zeros(1, FRAMES, BODY_POINTS + 4)
+    told[..., LEFT_HAND] = told[..., BODY_POINTS:] = given
+    is_observed = scene.conditioning.is_observed.clone()
+    is_observed[..., 2] = True
+    is_observed[:, 4:, 2] = False
+    scene = replace(scene, conditioning=scene.conditioning._replace(contact=told, is_observed=is_observed))
+    moved = (Guidance(held=0.0).corrected(x, scene) != x).any(-1)[0]
+    assert moved.tolist() == [given > 0] * 4 + [given == 0] * 4
+
+
+def test_near_enough_is_touching():
+    """Points in contact within the threshold of contact do not pull; others pull as far as to it."""
+    scene, x = scene_of(shift=(0.1, 0.05, -0.1))
+    costs = [scene.costs(x, 0.5, within)[0] for within in (0.0, 0.05, 0.5)]
+    assert costs[0] > costs[1] > costs[2]
+    assert costs[2] == 0
+    moved = Guidance(object=3.0, human=0.0, feet=0.0, held=0.0, within_m=0.5).corrected(x, scene)
+    assert torch.equal(moved, x)
+
+
+def test_what_is_held_moves_with_the_hand():
+    """A box that is carried does not slip; one that trembles in the hand is calmed, and only while the hand touches it."""
+    scene, x = scene_of()
+    assert scene.costs(x, 0.5)[2] < 1e-5
+    first = scene.net.sizes[0]
+    trembling = x.clone()
+    trembling[:, ::2, first] += 0.1
+    before, calm = scene.costs(trembling, 0.5)[2], trembling
+    for _ in range(20):
+        calm = Guidance(object=0.0, human=0.0, feet=0.0, held=0.3).corrected(calm, scene)
+    assert scene.costs(calm, 0.5)[2] < 0.2 * before
+    assert torch.equal(calm[..., :first], x[..., :first])
+    far = trembling.clone()
+    far[..., first + OBJECT_SIZE :] = -0.9
+    assert scene.costs(far, 0.5)[2] == 0
+
+
 @pytest.mark.parametrize("frame", ["own", "window"])
 def test_gradients_are_those_of_finite_differences(frame):
     """In float64, along random directions of the body's and the object's pose."""
@@ -118,7 +159,7 @@ def test_gradients_are_those_of_finite_differences(frame):
     )
     x, step = x.double(), 1e-6
     x.requires_grad_(True)
-    for cost in (0, 1):
+    for cost in (0, 1, 2):
         (gradient,) = torch.autograd.grad(scene.costs(x, 0.5)[cost], x)
         random = torch.Generator().manual_seed(cost)
         for _ in range(4):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from boxes import box_mesh
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
@@ -94,3 +95,48 @@ def test_hands_that_begin_together_turn_nothing_until_they_part():
     palms[:, 0, 1], palms[:, 1, 1] = apart / 2, -apart / 2  # along y: not the direction of any default
     found, _ = follow_hands(sofa, ObjectState(sofa.T_world_object), palms, BOTH)
     torch.testing.assert_close(found.R, torch.eye(3).double().expand(60, 3, 3))
+
+
+def test_a_pose_is_brought_to_what_the_objects_freedom_allows():
+    """Poses that are allowed stay; others come back to them: the hinge's angle, the axis, the floor, up to the limits."""
+    random = torch.Generator().manual_seed(0)
+    middle, start = (
+        torch.tensor([0.4, 0.0, 1.0]),
+        Rigid(rotation.about_axis("z", torch.tensor(0.3)), torch.tensor([1.0, 2.0, 0.1])),
+    )
+    tilt = rotation.exp(0.2 * torch.randn(5, 3, generator=random))
+    for freedom in (
+        Freedom("hinge", pivot=(1.0, 2.0, 0.0), limits=(0.0, 1.2)),
+        Freedom("axis", axis=(0.6, 0.8, 0.0), limits=(0.0, 0.5)),
+        Freedom("plane"),
+        Freedom("free"),
+    ):
+        item = SceneObject("thing", "box", box_mesh((0.0, -0.1, 0.0), (0.8, 0.1, 2.0)), start.R, start.t, freedom)
+        value = torch.tensor([0.0, 0.1, 0.3, 0.4, 0.5])
+        if freedom.kind in ("hinge", "axis"):
+            allowed = freedom.moved(start, value)
+        else:
+            R = rotation.about_axis("z", 3 * value) @ start.R
+            allowed = Rigid(R, start.t + value[:, None] * torch.tensor([1.0, -2.0, 0.0]))
+        same = item.reachable(allowed, middle)
+        torch.testing.assert_close(same.R, allowed.R, atol=1e-5, rtol=0)
+        torch.testing.assert_close(same.t, allowed.t, atol=1e-5, rtol=0)
+        # Tilted about its middle, and lifted: neither is to be seen in what the object can do.
+        at = allowed @ middle
+        away = Rigid(
+            tilt @ allowed.R, at - (tilt @ allowed.R @ middle[:, None])[..., 0] + torch.tensor([0.0, 0.0, 0.2])
+        )
+        back = item.reachable(away, middle)
+        if freedom.kind == "free":
+            assert torch.equal(back.R, away.R)
+            continue
+        assert (back.R @ start.R.mT)[:, 2, 2].min() > 1 - 1e-5, "upright"
+        error = (back @ middle - at).norm(dim=-1)
+        assert error.max() < 0.02, freedom.kind
+        if freedom.limits is not None:
+            beyond = item.reachable(
+                freedom.moved(start, torch.tensor([-0.7, 2.0 if freedom.kind == "hinge" else 9.0])), middle
+            )
+            ends = freedom.moved(start, torch.tensor(freedom.limits))
+            torch.testing.assert_close(beyond.R, ends.R, atol=1e-5, rtol=0)
+            torch.testing.assert_close(beyond.t, ends.t, atol=1e-5, rtol=0)

@@ -20,10 +20,10 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.models.checkpoint import load_trained
 from wearcap.recording import RecordingStore
-from wearcap.systems.echo.features import OBJECT_SIZE
+from wearcap.systems.echo.features import HANDS, OBJECT_SIZE
 from wearcap.systems.echo.model import EchoDenoiser
 from wearcap.systems.echo.scores import score_echo
-from wearcap.systems.echo.training import HANDS, SLOPE, STANDING, EchoDiffusion
+from wearcap.systems.echo.training import SLOPE, STANDING, EchoDiffusion
 from wearcap.systems.echo.training_windows import EchoContent, EchoWindow
 from wearcap.training import losses
 from wearcap_testing import benchmark, experiments, small_dataset

@@ -38,7 +38,12 @@ class RollingSchedule:
     step: str = "posterior"
     """Update rule, one of `STEPS`; "redraw" adds fresh noise to x̂0 in every step, as ECHO eq. 11 is printed."""
 
+    lead: tuple[float, ...] = ()
+    """Share by which each modality's ramp is shorter than the frame's: it is denoised before the others; none: by nothing."""
+
     def __post_init__(self):
+        if not all(0 <= lead < 1 for lead in self.lead):
+            raise WearcapError(f"leads of {self.lead}", expected="from 0 to less than 1 each")
         if not 0 <= self.context < self.window:
             what = f"a context of {self.context} frames in a window of {self.window}"
             raise WearcapError(what, expected=f"from 0 to {self.window - 1}")
@@ -57,9 +62,10 @@ class RollingSchedule:
         """Total number of denoising steps of a frame (ECHO: 100)."""
         return self.ramp * self.per_frame
 
-    def levels(self, age: Int64[Tensor, "frame"]) -> Float[Tensor, "frame"]:
+    def levels(self, age: Int64[Tensor, "frame"]) -> Float[Tensor, "frame #modality"]:
         """Noise levels of frames that have been denoised `age` times: 1 for new frames, 0 for clean ones."""
-        return (1 - age / self.steps).clamp(0, 1) ** self.spacing
+        ramps = 1 - torch.tensor(self.lead or (0.0,))
+        return (1 - age[:, None] / self.steps / ramps).clamp(0, 1) ** self.spacing
 
 
 @dataclass(frozen=True)
@@ -114,7 +120,7 @@ class Conveyor:
         self.x = torch.where(self.wide(gone), noise[0], self.x)
         self.level = torch.where(observation.is_observed, 0.0, torch.where(gone, 1.0, self.level))
         for fresh in noise:
-            due = self.rolling.levels(self.age + 1)[:, None].expand_as(self.level)
+            due = self.rolling.levels(self.age + 1).expand_as(self.level)
             level, then = (self.level, torch.where(observation.is_absent, self.level, torch.minimum(due, self.level)))
             self.x = torch.where(observed, observation.observed, self.x)
             x0_hat = denoise(self.x, level)

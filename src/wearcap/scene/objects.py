@@ -103,6 +103,31 @@ class SceneObject:
     def T_world_object(self) -> Rigid:
         return Rigid(self.R_world_object, self.t_world_object)
 
+    def reachable(self, T_world_object: Rigid, middle: Float[Tensor, "3"]) -> Rigid:
+        """The nearest pose that the object's freedom allows, by its `middle` (m, in the mesh's axes): on its hinge or axis
+        within the limits, or upright at its height on the floor. A free object may be anywhere."""
+        kind, start = self.freedom.kind, self.T_world_object.to(torch.float64)
+        if kind == "free":
+            return T_world_object
+        found = T_world_object.to(torch.float64)
+        here, there = start.t + start.R @ middle.double(), found.t + (found.R @ middle.double()[:, None])[..., 0]
+        if kind == "plane":
+            turn = (found.R @ start.R.mT)[..., :2, :2]
+            yaw = torch.atan2(turn[..., 1, 0] - turn[..., 0, 1], turn[..., 0, 0] + turn[..., 1, 1])
+            R = rotation.about_axis("z", yaw) @ start.R
+            t = there - (R @ middle.double()[:, None])[..., 0]
+            place = Rigid(R, torch.cat([t[..., :2], start.t[2].expand_as(t[..., :1])], -1))
+        elif kind == "axis":
+            value = ((there - here) * torch.tensor(self.freedom.axis, dtype=torch.float64)).sum(-1)
+            place = self.freedom.moved(start, self.freedom.clamped(value))
+        else:
+            pivot = torch.tensor(self.freedom.pivot, dtype=torch.float64)[:2]
+            arm, found_arm = (here[:2] - pivot).expand_as(there[..., :2]), there[..., :2] - pivot
+            cross = arm[..., 0] * found_arm[..., 1] - arm[..., 1] * found_arm[..., 0]
+            angle = torch.atan2(cross, (arm * found_arm).sum(-1))
+            place = self.freedom.moved(start, self.freedom.clamped(angle))
+        return Rigid(place.R.to(T_world_object.R), place.t.to(T_world_object.t))
+
     @property
     def points_world(self) -> Float64[np.ndarray, "vertex 3"]:
         """Vertices in the world (m) at the initial pose."""

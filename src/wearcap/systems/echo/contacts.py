@@ -17,7 +17,7 @@ from wearcap.body.model import BodyModel
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.systems.echo.features import OBJECT_SIZE, EchoFeatures
+from wearcap.systems.echo.features import HANDS, OBJECT_SIZE, POINTS, EchoFeatures
 from wearcap.systems.echo.model import EchoDenoiser
 from wearcap.systems.echo.queue import Conditioning, Outputs
 
@@ -41,8 +41,12 @@ class Guidance:
     """Step size of the body towards the object."""
     feet: float = 1.0
     """Step size of the body that brings feet in contact to the floor."""
+    held: float = 0.0
+    """Step size of an object that stays where it is relative to the wrists whose hands touch it."""
     threshold: float = 0.5
     """Contact probability from which a point counts as in contact."""
+    within_m: float = 0.0
+    """Distance to the surface (m) at which a point in contact is near enough."""
 
     def corrected(
         self, x0_hat: Float[Tensor, "batch frame feature"], scene: "GuidedScene"
@@ -50,14 +54,15 @@ class Guidance:
         """x̂0 after one gradient step (classifier guidance, Dhariwal and Nichol 2021)."""
         with torch.enable_grad():
             x = x0_hat.detach().clone().requires_grad_(True)
-            grad_touch, grad_stand = (
+            grad_touch, grad_stand, grad_held = (
                 torch.autograd.grad(cost, x, retain_graph=True)[0] if cost.requires_grad else torch.zeros_like(x)
-                for cost in scene.costs(x, self.threshold)
+                for cost in scene.costs(x, self.threshold, self.within_m)
             )
         human = scene.net.sizes[0]
         step = torch.zeros_like(x0_hat)
         step[..., :human] = self.human * grad_touch[..., :human] + self.feet * grad_stand[..., :human]
-        step[..., human : human + OBJECT_SIZE] = self.object * grad_touch[..., human : human + OBJECT_SIZE]
+        scene_object = slice(human, human + OBJECT_SIZE)
+        step[..., scene_object] = self.object * grad_touch[..., scene_object] + self.held * grad_held[..., scene_object]
         return x0_hat - step
 
 
@@ -86,15 +91,18 @@ class GuidedScene:
     """Surface points of the objects of each batch item, relative to the objects' centres (m)."""
 
     def costs(
-        self, x0_hat: Float[Tensor, "batch frame feature"], threshold: float
-    ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-        """Squared distances (m²) of body points in contact to the object, and of feet in contact to the floor: means
-        over each frame's points, summed over frames."""
+        self, x0_hat: Float[Tensor, "batch frame feature"], threshold: float, within_m: float = 0.0
+    ) -> tuple[Float[Tensor, ""], Float[Tensor, ""], Float[Tensor, ""]]:
+        """Squared distances (m²) of body points in contact to the object, from `within_m` on, and of feet in contact to the
+        floor, means over each frame's points; and of the displacement of the touching wrists from frame to frame in the
+        object's axes. Sums over frames. Observed contacts are what they were observed to be, others the network's.
+        """
         mean, scale = self.net.motion_normalizer.mean.to(x0_hat), self.net.motion_normalizer.scale.to(x0_hat)
         human, scene_object, contact = (x0_hat * scale + mean).split(self.net.sizes, -1)
         body = self.features.decode_body(human, self.frame)
         T_object = self.features.decode_object(scene_object, self.frame)
         in_contact = (contact.detach() + 1) / 2 > threshold
+        in_contact = torch.where(self.conditioning.is_observed[..., 2:], self.conditioning.contact > 0.5, in_contact)
         has_object = self.conditioning.valid & self.conditioning.has_object
         touch, stand = x0_hat.new_zeros(()), x0_hat.new_zeros(())
         for item, surface in enumerate(self.surfaces):
@@ -112,13 +120,26 @@ class GuidedScene:
                     mine = local[number == index]
                     _, nearest = tree.query(mine.detach().double().numpy())
                     target = torch.from_numpy(np.asarray(tree.data, np.float32)[nearest])
-                    total = total + ((mine - target).square().sum(1) * share[number == index]).sum()
+                    away = F.relu((mine - target).norm(dim=1) - within_m)
+                    total = total + (away.square() * share[number == index]).sum()
                 touch = touch + total
             stands = in_contact[item, :, BODY_POINTS:] & self.conditioning.valid[item, :, None]
             soles = site_positions(surface.skeleton, pose, FOOT_PATCHES)
             height = soles[..., 2] - self.conditioning.floor_height[item, :, None]
             stand = stand + (height.square() * stands / stands.sum(1, keepdim=True).clamp_min(1)).sum()
-        return touch, stand
+        return touch, stand, self._slip(T_object, in_contact)
+
+    def _slip(self, T_object: Rigid, in_contact: Bool[Tensor, "batch frame contact"]) -> Float[Tensor, ""]:
+        """Squared displacements (m²) from frame to frame of the tracked wrists in the axes of the object that they hold."""
+        there, number = self.conditioning.valid & self.conditioning.has_object, self.conditioning.object_number
+        same = there[:, 1:] & there[:, :-1] & (number[:, 1:] == number[:, :-1])
+        slip = T_object.t.new_zeros(())
+        for wrist, points in HANDS.items():
+            at = self.conditioning.t_world_point[:, :, POINTS.index(wrist)]
+            local = (T_object.R.mT @ (at - T_object.t)[..., None])[..., 0]
+            holds = in_contact[..., points].any(-1)
+            slip = slip + (local.diff(dim=1).square().sum(-1) * (same & holds[:, 1:] & holds[:, :-1])).sum()
+        return slip
 
 
 def _is_touched(conditioning: Conditioning, outputs: Outputs, threshold: float) -> Bool[Tensor, "batch frame"]:

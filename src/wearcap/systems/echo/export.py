@@ -61,6 +61,7 @@ def exports(pipeline: Echo) -> Exports:
             "contacts": model.contacts,
             **vars(pipeline.sampling),
             "anchor": pipeline.anchor,
+            "freedoms": pipeline.freedoms,
             "static_threshold": pipeline.contacts.static_threshold,
         },
         "guidance": None if guidance is None else asdict(guidance),
@@ -134,8 +135,9 @@ class _ExportedEchoDenoiser(EchoDenoiser):
 
 def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], about: dict[str, Any]) -> Echo:
     """The pipeline of an exported model."""
-    encoder, settings = None, dict(about["settings"])
-    guidance = None if about["guidance"] is None else Guidance(**about["guidance"])
+    # Files of before these settings captured without them.
+    encoder, settings = None, {"freedoms": False, "spread": None, "wrists": None, **about["settings"]}
+    guidance = None if about["guidance"] is None else Guidance(**{"held": 0.0, "within_m": 0.0, **about["guidance"]})
     if about["encoder"] is not None:
         encoder = PointNeXt(**about["encoder"])
         encoder.load_state_dict(weights["encoder"])
@@ -148,5 +150,7 @@ def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], abo
         encoder,
         settings.pop("contacts"),
     )
-    use, anchor = ContactUse(guidance, settings.pop("static_threshold")), settings.pop("anchor")
-    return Echo(model, Sampling(**settings), use, anchor, Refinement.of(about.get("refinement")))
+    use = ContactUse(guidance, settings.pop("static_threshold"))
+    anchor, freedoms = settings.pop("anchor"), settings.pop("freedoms")
+    refinement = Refinement.of(about.get("refinement"))
+    return Echo(model, Sampling(**settings), use, anchor, refinement, freedoms=freedoms)

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body.contact_points import BODY_POINTS
+from wearcap.body.contact_points import BODY_POINTS, HAND_POINTS
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.data.features import LIMBS
 from wearcap.errors import WearcapError, require_choice
@@ -20,6 +20,8 @@ FRAMES = ("own", "window", "world")
 """Coordinate frames that features can be expressed in (`EchoFeatures.frame`)."""
 CONTACTS = BODY_POINTS + len(FOOT_PATCHES)
 """Number of contact labels per frame."""
+HANDS = {"left_wrist": slice(0, HAND_POINTS), "right_wrist": slice(BODY_POINTS // 2, BODY_POINTS // 2 + HAND_POINTS)}
+"""Points of the body that are each hand's."""
 OBJECT_SIZE = 9
 """Features of an object's pose: translation and 6D rotation."""
 EXTENTS = 6

@@ -54,6 +54,8 @@ class ObjectShape:
     """Condition for the object mirrored along its own y axis."""
     surface: TriangleIndex
     """Spatial index of the mesh's triangles."""
+    item: SceneObject | None = None
+    """The object in its environment, whose freedom captures keep to; None: it may be anywhere."""
 
     @cached_property
     def symmetry(self) -> Symmetry:
@@ -64,6 +66,12 @@ class ObjectShape:
         """Pose of the bounding box's centre, given the mesh's pose."""
         return Rigid(T_world_object.R, T_world_object @ self.middle.to(T_world_object.t))
 
+    def reachable(self, T_world_middle: Rigid) -> Rigid:
+        """The nearest pose of the centre that the object's freedom allows."""
+        if self.item is None:
+            return T_world_middle
+        return self.centred(self.item.reachable(self.of_mesh(T_world_middle), self.middle))
+
     def of_mesh(self, T_world_middle: Rigid) -> Rigid:
         """The inverse of `centred`."""
         return Rigid(T_world_middle.R, T_world_middle @ -self.middle.to(T_world_middle.t))
@@ -73,11 +81,15 @@ class ObjectReader:
     """Turns objects into conditions for the network; each mesh is processed once."""
 
     def __init__(
-        self, features: EchoFeatures, encoder: PointNeXt | None, embed: Callable[[Tensor], Tensor] | None = None
+        self,
+        features: EchoFeatures,
+        encoder: PointNeXt | None,
+        embed: Callable[[Tensor], Tensor] | None = None,
+        freedoms: bool = False,
     ):
-        """`encoder` None: codes are class and extents alone, for features without shape. `embed`: the network's layer
+        """`freedoms`: whether shapes know how their objects can move. `encoder` None: codes are class and extents alone, for features without shape. `embed`: the network's layer
         on codes (`EchoDenoiser.object`), which is the same in every window; None leaves them raw."""
-        self.features, self.encoder, self._embed = features, encoder, embed
+        self.features, self.encoder, self._embed, self._freedoms = features, encoder, embed, freedoms
         empty = torch.zeros(1, features.object_condition_size)
         self.nothing: Float[Tensor, "code"] = self._embedded(empty)[0]
         """Placeholder code for frames without an active object."""
@@ -88,7 +100,7 @@ class ObjectReader:
         """Shape and codes of an object. Raises WearcapError for a class that the model was not built for."""
         key = (id(item.mesh), item.category)
         if key in self._shapes:
-            return replace(self._shapes[key], name=item.name)
+            return replace(self._shapes[key], name=item.name, item=item if self._freedoms else None)
         one_hot = self.features.class_code(item.category)
         cloud = object_cloud(item.mesh)
         middle = (cloud.max(0).values + cloud.min(0).values) / 2
@@ -98,7 +110,7 @@ class ObjectReader:
             parts.append(self.encoder(both))
         code, code_mirrored = self._embedded(torch.cat(parts, -1)).unbind(0)
         made = item.name, item.category, item.mesh, middle, both[0].clone(), code, code_mirrored
-        self._shapes[key] = ObjectShape(*made, TriangleIndex.of(item.mesh))
+        self._shapes[key] = ObjectShape(*made, TriangleIndex.of(item.mesh), item if self._freedoms else None)
         return self._shapes[key]
 
     @torch.no_grad()

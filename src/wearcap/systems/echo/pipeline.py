@@ -28,6 +28,7 @@ from wearcap.systems.echo.model import EchoRunner
 from wearcap.systems.echo.observations import BatchItem, ObjectReader, ObjectShape, Scenario, batch_item_of
 from wearcap.systems.echo.queue import Conditioning, EchoModel, EchoQueue, Outputs, Rewindow
 from wearcap.systems.echo.scores import Truth, score_echo, truth_of
+from wearcap.systems.echo.wrists import Reaching, reaches
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.head_path import head_path
 from wearcap.tracking.refinement import Measured, Refinement, held_in_gaps
@@ -44,6 +45,13 @@ class Sampling:
     spacing: float = 2.0
     eta: float = 0.0
     step: str = "posterior"
+    lead: float = 0.0
+    """Share by which the contacts' ramp of levels is shorter: they are denoised before body and object (ours)."""
+    spread: float | None = 8.0
+    """Frames over which the residual of x̂0 in an observed frame is taken over by its neighbours (ours); None: not at all."""
+    wrists: float | None = 0.3
+    """Share of its distance from the tracked wrists by which x̂0 approaches them in every step (ours); None: not at all
+    (ECHO)."""
     rewindow: int | None = None
     """Frames by which overlapping windows advance that are each denoised from scratch; None: a conveyor."""
     rewindow_steps: int | None = None
@@ -72,6 +80,8 @@ class Echo(LearnedSystem):
     """File of the objects; None: the recording's own."""
     placed: bool = False
     """Whether the objects' initial poses in the environment count as observed (ours; ECHO has no initial poses)."""
+    freedoms: bool = False
+    """Whether objects keep to the freedom that the environment gives them: hinges, axes, the floor (ours)."""
     runtime: str = "eager"
     """Backend of the denoising steps (`runtime.graphs.RUNTIMES`)."""
     precision: str = "float32"
@@ -109,7 +119,8 @@ class Echo(LearnedSystem):
     def rolling(self) -> RollingSchedule:
         """The conveyor's rolling schedule."""
         how = self.sampling
-        return RollingSchedule(self.model.net.window, how.context, how.per_frame, how.spacing, how.eta, how.step)
+        lead = (0.0, 0.0, how.lead) if how.lead else ()
+        return RollingSchedule(self.model.net.window, how.context, how.per_frame, how.spacing, how.eta, how.step, lead)
 
     @property
     def fps(self) -> float:
@@ -136,7 +147,8 @@ class Echo(LearnedSystem):
         """A reader that turns objects into embedded conditions for the network, each once."""
         self.prepare()
         model = self.model
-        return ObjectReader(model.features, model.encoder, lambda codes: model.net.object(codes.to(self.device)).cpu())
+        embed = lambda codes: model.net.object(codes.to(self.device)).cpu()  # noqa: E731
+        return ObjectReader(model.features, model.encoder, embed, self.freedoms)
 
     def motions(self, sources: Sequence[CaptureInput], seeds: Sequence[int]) -> list[Motion]:
         """One motion per recording and seed, with the objects of the recordings' environments.
@@ -260,8 +272,8 @@ class Echo(LearnedSystem):
             queue.guided = pulled_by(skeletons, shapes, objects)
         return queue
 
-    def denoiser(self, queue: EchoQueue, conditioning: Conditioning, frame: Rigid) -> tuple[Denoise, Correct | None]:
-        """x̂0 of the conveyor's frames as a function of x_t and levels, and the guidance that corrects it, if any.
+    def denoiser(self, queue: EchoQueue, conditioning: Conditioning, frame: Rigid) -> tuple[Denoise, list[Correct]]:
+        """x̂0 of the conveyor's frames as a function of x_t and levels, and what corrects it: tracked wrists, guidance.
 
         The condition is encoded once per call; the level-dependent part is cached between calls.
         """
@@ -270,12 +282,16 @@ class Echo(LearnedSystem):
             self.prepare()
         assert self._runner is not None
         denoise = self._runner.begin(condition, conditioning.object_code, conditioning.has_object, conditioning.valid)
-        guidance = self.contact_use.guidance
-        if guidance is None or queue.guided is None:
-            return denoise, None
-        surfaces, objects = queue.guided
-        scene = GuidedScene(self.model.net, self.model.features, conditioning, frame, surfaces, objects)
-        return denoise, lambda x0_hat: guidance.corrected(x0_hat, scene)
+        guidance, model = self.contact_use.guidance, self.model
+        corrections: list[Correct] = []
+        if (share := self.sampling.wrists) is not None and reaches(model.features):
+            reaching = Reaching(model.net, model.features, model.skeleton, queue.t_parent_joint, conditioning, frame)
+            corrections.append(lambda x0_hat: reaching.corrected(x0_hat, share))
+        if guidance is not None and queue.guided is not None:
+            surfaces, objects = queue.guided
+            scene = GuidedScene(model.net, model.features, conditioning, frame, surfaces, objects)
+            corrections.append(lambda x0_hat: guidance.corrected(x0_hat, scene))
+        return denoise, corrections
 
     def settings(self) -> dict[str, str]:
         """Settings that a capture depends on, for its provenance."""
@@ -285,6 +301,7 @@ class Echo(LearnedSystem):
             "refinement": self.refinement,
             "static_threshold": use.static_threshold,
             "placed": self.placed,
+            "freedoms": self.freedoms,
         }
         settings = {**vars(self.sampling), **own, "guidance": use.guidance, "acts": acts}
         return {"pipeline": "echo"} | {name: str(value) for name, value in settings.items()}
@@ -342,7 +359,9 @@ def object_tracks(item: BatchItem, outputs: Outputs) -> dict[str, Trajectory]:
         if not len(rows):
             continue
         last = torch.searchsorted(rows, torch.arange(len(active)), right=True).sub(1).clamp_min(0)
-        pose = shape.of_mesh(T[rows[last]])
+        pose, found = shape.reachable(T), item.conditioning.is_observed[0, :, 1]
+        pose = Rigid(torch.where(found[:, None, None], T.R, pose.R), torch.where(found[:, None], T.t, pose.t))
+        pose = shape.of_mesh(pose[rows[last]])
         tracks[shape.name] = Trajectory(item.path.timestamps, pose.R, pose.t)
     return tracks
 

@@ -3,6 +3,7 @@ overlapping windows in place of the conveyor, denoised from scratch with inpaint
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from itertools import pairwise
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -13,6 +14,7 @@ from torch import Tensor
 from wearcap.body.skeleton import Skeleton
 from wearcap.data.features import body_size
 from wearcap.diffusion.conveyor import Conveyor, Correct, Denoise, Observation, RollingSchedule
+from wearcap.diffusion.observed import spreading, with_residuals
 from wearcap.diffusion.process import posterior_step, step_levels
 from wearcap.diffusion.schedule import Schedule
 from wearcap.geometry.rigid import Rigid
@@ -83,11 +85,19 @@ class EchoModel:
     """Whether the network was trained on contacts."""
 
 
+class _Sampling(Protocol):
+    """The part of a pipeline's sampling that the queue uses."""
+
+    @property
+    def spread(self) -> float | None: ...
+
+
 @runtime_checkable
 class _Pipeline(Protocol):
     """The part of a pipeline that the queue uses."""
 
     model: EchoModel
+    sampling: "_Sampling"
     device: str
 
     @property
@@ -95,7 +105,7 @@ class _Pipeline(Protocol):
 
     def denoiser(
         self, queue: "EchoQueue", conditioning: Conditioning, frame: Rigid
-    ) -> tuple[Denoise, Correct | None]: ...
+    ) -> tuple[Denoise, list[Correct]]: ...
 
 
 class EchoQueue:
@@ -104,6 +114,7 @@ class EchoQueue:
     def __init__(self, pipeline: _Pipeline, skeletons: Sequence[Skeleton], seeds: Sequence[int]):
         self.pipeline = pipeline
         self.size = torch.stack([body_size(skeleton) for skeleton in skeletons])
+        self.t_parent_joint = torch.stack([skeleton.t_parent_joint for skeleton in skeletons])[:, None]
         model, self.rolling = pipeline.model, pipeline.rolling
         self.conveyor = Conveyor(self.rolling, model.schedule, model.net.sizes, len(seeds))
         self.conditioning: Conditioning | None = None
@@ -137,7 +148,8 @@ class EchoQueue:
         count = len(self.conveyor.age)
         noise = self._noise(self.rolling.per_frame * count).unflatten(1, (self.rolling.per_frame, count))
         observation = self._observation(self.conditioning, frame)
-        denoise, correct = self.pipeline.denoiser(self, self.conditioning, frame)
+        denoise, corrections = self.pipeline.denoiser(self, self.conditioning, frame)
+        correct = self._corrected(corrections, self.conditioning, observation)
         self.conveyor.run(denoise, observation, noise.transpose(0, 1), correct)
         clean = self.conveyor.clean
         return self._decoded(self.conveyor.x, slice(clean - 1, clean), frame) if clean else None
@@ -181,6 +193,21 @@ class EchoQueue:
         is_observed = conditioning.is_observed.clone()
         is_observed[..., 1] &= conditioning.has_object
         return Observation(observed, is_observed, torch.stack(absent, -1) & ~is_observed)
+
+    def _corrected(
+        self, corrections: Sequence[Correct], conditioning: Conditioning, observation: Observation
+    ) -> Correct:
+        """Spreads the residuals of observed frames, then applies the pipeline's corrections in turn."""
+        frames, corrections = self.pipeline.sampling.spread, list(corrections)
+        if frames is not None and observation.is_observed.any():
+            valid, number = conditioning.valid, torch.where(conditioning.has_object, conditioning.object_number, -1.0)
+            together = valid[:, :, None] & valid[:, None]
+            touching = together & (number[:, :, None] == number[:, None])
+            alike = torch.stack([together, touching, touching], 1)
+            weights = spreading(observation.is_observed.mT, alike, frames)
+            sizes = self.pipeline.model.net.sizes
+            corrections.insert(0, lambda x0_hat: with_residuals(x0_hat, observation.observed, weights, sizes))
+        return lambda x0_hat: reduce(lambda value, correct: correct(value), corrections, x0_hat)
 
     def _reexpressed(
         self,
@@ -237,7 +264,8 @@ class Rewindow(EchoQueue):
         frame = self.pipeline.model.features.canonical(conditioning.points)
         count, observed_frames = conditioning.valid.shape[1], before.shape[1]
         observation = self._observation(conditioning, frame)
-        denoise, correct = self.pipeline.denoiser(self, conditioning, frame)
+        denoise, corrections = self.pipeline.denoiser(self, conditioning, frame)
+        correct = self._corrected(corrections, conditioning, observation)
         levels = step_levels(self.steps, self.rolling.spacing)
         # Always a full window's noise: a batch item's noise must not depend on the length of the others.
         x = self._noise(self.rolling.window)[:, :count]
@@ -251,8 +279,7 @@ class Rewindow(EchoQueue):
                 torch.where(is_observed, 0.0, torch.where(observation.is_absent, 1.0, value)) for value in (now, after)
             )
             x = torch.where(wide(is_observed), observed, x)
-            x0_hat = denoise(x, level)
-            x0_hat = x0_hat if correct is None else correct(x0_hat)
+            x0_hat = correct(denoise(x, level))
             noise = self._noise(self.rolling.window)[:, :count]
             x = posterior_step(
                 x, x0_hat, wide(level), wide(then), noise, self.pipeline.model.schedule, self.rolling.eta

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body.contact_points import BODY_POINTS, HAND_POINTS
+from wearcap.body.contact_points import BODY_POINTS
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
 from wearcap.data.windows import MIN_SCALE, Windows, drawn_batches, standardize
@@ -16,7 +16,7 @@ from wearcap.diffusion.schedule import Schedule
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.point_encoder import PointNeXt
-from wearcap.systems.echo.features import CONTACTS, OBJECT_SIZE, POINTS, Body, EchoFeatures
+from wearcap.systems.echo.features import CONTACTS, HANDS, OBJECT_SIZE, POINTS, Body, EchoFeatures
 from wearcap.systems.echo.model import MODALITIES, EchoDenoiser
 from wearcap.systems.echo.pipeline import Echo
 from wearcap.systems.echo.queue import EchoModel
@@ -24,8 +24,6 @@ from wearcap.systems.echo.training_windows import EchoContent, EchoWindow
 from wearcap.training import losses
 from wearcap.training.base import OptimizerOf, SchedulerOf, Training
 
-HANDS = {"left_wrist": slice(0, HAND_POINTS), "right_wrist": slice(BODY_POINTS // 2, BODY_POINTS // 2 + HAND_POINTS)}
-"""Points of the body that are each hand's."""
 STANDING = 0.73
 """Share of the training frames in which a foot's patch is on the floor."""
 SLOPE = 4.0
