@@ -1,1 +1,2 @@
-"""Tracked points of a body: the path of a head, the floor below it, and bodies that are anchored to what is tracked."""
+"""Tracked points of a body: the path of a head, the floor below it, bodies that are anchored to what is tracked, and their
+refinement."""

@@ -31,6 +31,9 @@ _REACH = 2.5
 _STRAIGHT, _SOFT = 0.97, 0.025
 """Share of a leg's length from which a farther goal is approached ever more slowly, and the share within which."""
 
+_SURELY_M = 0.02
+"""Displacement (m) of a foot from which a knee that was predicted to bend backwards bends forward."""
+
 
 class Measured(NamedTuple):
     """What is measured in the frames of a motion."""
@@ -210,8 +213,10 @@ def with_feet_moved(motion: Motion, offset: Float[Tensor, "time foot 3"]) -> Mot
         start, middle, end = (T.t[:, joint].double() for joint in (hip, knee, ankle))
         goal = _within_reach(start, middle, end, end + offset[:, foot].double())
         # The thigh's x axis points forward: the farther a foot is moved, the more surely its knee bends that way.
-        forward = T.R[:, hip, :, 0].double() * offset[:, foot].norm(dim=-1, keepdim=True)
-        upper, lower = (turn.to(R) for turn in reach(start, middle, end, goal, forward))
+        forward, distance = T.R[:, hip, :, 0].double(), offset[:, foot].norm(dim=-1, keepdim=True)
+        backward = ((torch.lerp(start, end, 0.5) - middle) * forward).sum(-1, keepdim=True).clamp_min(0)
+        bias = forward * (distance + backward * (distance / _SURELY_M).clamp_max(1))
+        upper, lower = (turn.to(R) for turn in reach(start, middle, end, goal, bias))
         moved = (offset[:, foot] != 0).any(-1)[:, None, None]
         R[:, hip] = torch.where(moved, upper @ R[:, hip], R[:, hip])
         R[:, knee] = torch.where(moved, lower @ R[:, knee], R[:, knee])
