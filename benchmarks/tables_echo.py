@@ -300,6 +300,7 @@ def _strangers(root: Path, options: argparse.Namespace, progress: Progress) -> t
 def _people(options: argparse.Namespace, progress: Progress, store: RecordingStore, names: list[str]) -> Scores:
     """Rows of bodies: ours, with the wearer's bones and with a wrong height, then trained rivals."""
     methods = [Method("ours", options.checkpoint)]
+    methods.append(Method("ours, as sampled", options.checkpoint, ("pipeline=echo", "pipeline.refinement=null")))
     for what, off in WRONG_HEIGHTS.items():
         methods.append(Method(f"ours, {what}", options.checkpoint, height_off_m=off))
     methods = [method for method in methods if options.rows is None or method.name in options.rows]

@@ -212,6 +212,7 @@ def _strangers(options: argparse.Namespace, about: dict[str, str]) -> Path:
         alone,
         *(replace(alone, name=f"{ALONE}, {n} sensors", sensors=n) for n in WEARABLES if n != options.sensors),
     ]
+    ours.append(replace(alone, name=f"{ALONE}, as predicted", pipeline=(*alone.pipeline, "pipeline.refinement=null")))
     ours += [replace(alone, name=f"{ALONE}, {what}", height_off_m=off) for what, off in WRONG_HEIGHTS.items()]
     ours.append(replace(alone, name=f"{ALONE}, exact sensors, bones given", sensors=GIVEN))
     ours = [method for method in ours if options.rows is None or method.name in options.rows]

@@ -93,8 +93,8 @@ TRAINED = {
     "ours, the same budget (+ multi-stage)": ("mocap_every_short", ("pipeline=mocap_every",)),
     "+ multi-stage, hands tracked": ("mocap_every_hands", ("pipeline=mocap_every",)),
 }
-"""Rows: run, and pipeline. All are on a floor that stays as at the beginning."""
-HANDS = ("mocap_every_hands",)
+"""Rows: run, and pipeline. All are on a floor that stays as at the beginning, and as predicted, without refinement."""
+HANDS = ("mocap_every_hands", "mocap_every_agrol_hands")
 """Runs whose hands are tracked: those of the truth, with exact sensors, floor and bones given."""
 PAPER: Scores = {
     name: {key: Summary(value, None, 1) for key, value in zip(BODY, values)}
@@ -331,7 +331,8 @@ def _rivals(options: argparse.Namespace, console: Console) -> dict[str, list[Met
     trained = {}
     for name, (run, pipeline) in TRAINED.items():
         paths = [options.runs / seeded / "checkpoints" / "best.ckpt" for seeded in (run, f"{run}_1", f"{run}_2")]
-        sensors, overrides = GIVEN if run in HANDS else options.sensors, (*pipeline, "pipeline.floor=fixed")
+        sensors = GIVEN if run in HANDS else options.sensors
+        overrides = (*pipeline, "pipeline.floor=fixed", "pipeline.refinement=null")
         trained[name] = [Method(name, str(path), sensors, overrides) for path in paths if path.is_file()]
         if not trained[name]:
             console.print(left_out(name, "mocap_every", run, paths[0]), markup=False, soft_wrap=True)

@@ -117,12 +117,11 @@ def score_echo(motion: Motion, truth: Truth, name: str, seed: int) -> Row:
     joints, true = motion.T_world_joint.t, truth.motion.T_world_joint.t
     floor, touching = truth.floor_height, foot_contact(truth.foot_contact > 0.5)
     error = joint_error_cm(joints, true)
-    parts = {part: error[:, mine].mean() for part, mine in body_parts(skeleton).items()} | part_errors_cm(
-        skeleton, error
-    )
+    by_part = {part: error[:, mine].mean() for part, mine in body_parts(skeleton).items()}
+    by_part |= part_errors_cm(skeleton, error)
     scores = {
         "mpjpe_mm": 10 * error.mean().item(),
-        **{f"{part}_pe_mm": 10 * value.item() for part, value in parts.items()},
+        **{f"{part}_pe_mm": 10 * value.item() for part, value in by_part.items()},
         "mpjve_mm": object_metrics.joint_step_error_mm(joints, true).item(),
         "foot_contact": object_metrics.foot_contact_share(skeleton, joints, floor).item(),
         f"{TRUTH}foot_contact": object_metrics.foot_contact_share(skeleton, true, floor).item(),
