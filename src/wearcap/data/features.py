@@ -7,6 +7,7 @@ from torch import Tensor
 from wearcap.body.skeleton import Skeleton
 from wearcap.metrics import physics
 from wearcap.recording.recording import Recording
+from wearcap.recording.store import RecordingFile
 
 LIMBS = {
     "stature": (),
@@ -23,6 +24,13 @@ def body_size(skeleton: Skeleton) -> Float[Tensor, "limb"]:
         sum(float(skeleton.t_parent_joint[skeleton.index(name)].norm()) for name in names) for names in LIMBS.values()
     ]
     return torch.tensor([skeleton.height_of("head"), *lengths[1:]])
+
+
+def on_level_ground(file: RecordingFile) -> bool:
+    """Whether a recording's floor may be taken to be where it says, or at z = 0; not where people climb on what was not
+    captured, so that their height over the floor says nothing (`prepare.mocap`)."""
+    motion = file.part("motion")
+    return file.part("floor") is not None or motion is None or motion.provenance.get("floor") != "uneven"
 
 
 def first_repeated(step: Float[Tensor, "batch step *rest"]) -> Float[Tensor, "batch time *rest"]:

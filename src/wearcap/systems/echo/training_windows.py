@@ -13,9 +13,9 @@ from wearcap.body.anny_body import anny_body
 from wearcap.body.contact_points import TOUCH_M, contact_points, mirrored_points
 from wearcap.body.skeleton import FOOT_PATCHES, MIRROR, Skeleton
 from wearcap.data.bodies import Proportions, with_proportions
-from wearcap.data.features import body_size
+from wearcap.data.features import body_size, on_level_ground
 from wearcap.data.transforms import Cut, Draws, Window, joint_twins
-from wearcap.data.windows import Content, Windows
+from wearcap.data.windows import Content, Windows, open_recording
 from wearcap.diffusion.levels import DRAWS
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
@@ -222,6 +222,9 @@ class EchoContent(Content):
 
     def min_frames(self, window: int, stretch: float) -> int:
         return 2 * MIN_FRAMES
+
+    def usable(self, store: RecordingStore, name: str) -> bool:
+        return on_level_ground(open_recording(store.path_of(name)))
 
     def open(self, store: RecordingStore, name: str, every: int, body: Proportions | None = None) -> EchoTrack:
         recording = RecordingFile(store.path_of(name)).load()

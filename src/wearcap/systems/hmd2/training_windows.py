@@ -11,7 +11,7 @@ from torch import Tensor
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import FEET, Skeleton
 from wearcap.data.bodies import Proportions, with_proportions
-from wearcap.data.features import body_size, true_foot_contact
+from wearcap.data.features import body_size, on_level_ground, true_foot_contact
 from wearcap.data.surroundings import NOTHING, Surroundings, embeddings_of
 from wearcap.data.transforms import Cut, Draws, Window, joint_twins
 from wearcap.data.windows import Content, open_recording
@@ -92,6 +92,10 @@ class HeadContent(Content):
 
     def min_frames(self, window: int, stretch: float) -> int:
         return MIN_FRAMES
+
+    def usable(self, store: RecordingStore, name: str) -> bool:
+        file = open_recording(store.path_of(name))
+        return "points.points_world" in file.keys or on_level_ground(file)
 
     def open(self, store: RecordingStore, name: str, every: int, body: Proportions | None = None) -> _HeadTrack:
         file = open_recording(store.path_of(name))

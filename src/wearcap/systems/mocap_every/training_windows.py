@@ -8,9 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.data.bodies import Proportions, with_proportions
-from wearcap.data.features import body_size, true_foot_contact
+from wearcap.data.features import body_size, on_level_ground, true_foot_contact
 from wearcap.data.transforms import Cut, Draws, Window, joint_twins
-from wearcap.data.windows import Content
+from wearcap.data.windows import Content, open_recording
 from wearcap.recording.store import RecordingFile, RecordingStore
 from wearcap.systems.mocap_every.features import Sensed, synthetic_wrists
 
@@ -54,6 +54,9 @@ class WatchContent(Content):
 
     draws = ("shift", "mirror", "yaw", "begins", "begin", "speed", "scale")
     any_body = True
+
+    def usable(self, store: RecordingStore, name: str) -> bool:
+        return on_level_ground(open_recording(store.path_of(name)))
 
     def open(self, store: RecordingStore, name: str, every: int, body: Proportions | None = None) -> _WatchTrack:
         recording = RecordingFile(store.path_of(name)).load()
