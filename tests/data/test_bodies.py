@@ -12,6 +12,7 @@ from wearcap.data.features import body_size
 from wearcap.data.windows import Content, Source, Windows
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory
+from wearcap.recording import RecordingStore
 from wearcap.systems.echo.features import EchoFeatures
 from wearcap.systems.echo.training_windows import EchoContent
 from wearcap.systems.hmd2.training_windows import HeadContent
@@ -118,3 +119,14 @@ def test_validation_and_sources_that_say_so_are_as_recorded(store):
     ):
         sizes = [windows[0, seed].size for seed in range(4)]
         assert all(torch.equal(size, sizes[0]) for size in sizes)
+
+
+def test_climbing_on_what_was_not_captured_is_not_trained_on(store, recording, tmp_path):
+    """Without the floor, and with a provenance that says the ground is uneven, heights over it say nothing."""
+    uneven = replace(recording.motion, provenance={**recording.motion.provenance, "floor": "uneven"})
+    for name, motion in (("level", recording.motion), ("climbed", uneven)):
+        made = RecordingStore(tmp_path)
+        made.add(replace(recording, name=name, motion=motion, floor=None), split="train", config_hash="test")
+    for content, settings in CONTENTS.values():
+        windows = Windows([Source(str(tmp_path))], "train", content=content, **settings)
+        assert {windows.recordings[number][1] for number in windows.starts[:, 0].tolist()} == {"level"}

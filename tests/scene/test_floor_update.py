@@ -127,6 +127,19 @@ def test_sitting_down_is_no_way_down():
     assert follower.ahead(head).abs().max() < 0.01
 
 
+@pytest.mark.parametrize("sway", [0.0, 0.3, 0.5])
+def test_a_squat_does_not_take_the_floor_down(sway):
+    """The head goes down by 60 cm and forward, and comes back, in two seconds: too fast a sway to be told from walking."""
+    time = torch.arange(60) / 30
+    bent = (1 - torch.cos(torch.pi * time)) / 2
+    heads = torch.stack([sway * bent, torch.zeros(60), 1.6 - 0.6 * bent], 1)
+    follower = FloorFollow(0.0, SOLE, 30.0)
+    follower.ahead(torch.tensor([[0.0, 0.0, 1.6]]).expand(60, 3))
+    floors = torch.cat([follower.ahead(part) for part in heads.split(20)])
+    assert floors.abs().max() < 0.08
+    assert floors[-1].abs() < 0.04
+
+
 def test_points_below_a_sole_that_is_off_draw_the_floor_to_themselves():
     follower = FloorFollow(0.0, SOLE, 30.0)
     follower.see(torch.cat([points_at(0.0), points_at(0.0) - torch.tensor([0.0, 0.2, 0.0])]))
