@@ -324,6 +324,7 @@ def test_hmd2_strangers_are_captured_from_the_head_alone(keep, tmp_path, monkeyp
             method.checkpoint is None
             or "pipeline.use=[]" in method.pipeline
             or not method.name.startswith("head alone,")
+            or method.name == tables_hmd2.BRIEF
         )
         return Result(method.name, {"mpjpe_cm": Summary(9.0, None, 1), "truth_physicality": Summary(0.5, None, 1)}, {})
 

@@ -127,4 +127,4 @@ def test_budgets_scale_with_what_is_asked_for(system):
         small, large = (compose("train", table.training(run, frames)) for frames in (table.BUDGET, 10 * table.BUDGET))
         assert large.trainer.max_steps == pytest.approx(10 * small.trainer.max_steps, rel=0.05), run
         assert small.trainer.max_steps >= tabling.EPOCHS * small.data.loading.steps_per_epoch
-        assert 0.98 <= small.callbacks.average.decay <= large.callbacks.average.decay == 0.995
+        assert 0.98 <= small.callbacks.average.decay <= large.callbacks.average.decay <= 0.995

@@ -349,9 +349,9 @@ def test_a_killed_capture_goes_on_with_what_is_left(checkpoint, tmp_path):
         time.sleep(0.02)
     process.kill()
     process.wait()
-    finished = {path.stem: path.stat().st_mtime_ns for path in output.glob("finished/*.json")}
+    finished = {path.stem: path.stat().st_mtime_ns for path in output.glob("finished/[!.]*.json")}
     capturing(checkpoint, store.root, output, "jobs=1")
-    after = {path.stem: path.stat().st_mtime_ns for path in output.glob("finished/*.json")}
+    after = {path.stem: path.stat().st_mtime_ns for path in output.glob("finished/[!.]*.json")}
     assert set(after) == set(store.names())
     assert finished.items() <= after.items()
     assert len(table(output / "recordings.csv")) == 8

@@ -30,6 +30,7 @@ pytestmark = pytest.mark.usefixtures("few_statistics")
 TRAININGS = benchmark("tables_mocap_every").TRAININGS
 SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
 WEIGHTS = {
+    "skate": 0.5,
     "root": 1.0,
     "rotation": 1.0,
     "position": 10.0,
@@ -51,6 +52,7 @@ def arguments(experiment: str, data: Path, run: Path, *more: str) -> list[str]:
         f"experiment={experiment}",
         f"data.sources.cmu.root={data}",
         "data.sources.simulated=null",
+        "data.sources.hdm05=null",
         f"data.val_sources.cmu.root={data}",
         "debug=fast",
         f"hydra.run.dir={run}",

@@ -84,7 +84,9 @@ def _callbacks(config: DictConfig) -> list[Callback]:
     callbacks += [instantiate(callback, _convert_="all") for callback in chosen]
     if config.early_stop:
         best = config.callbacks.checkpoint
-        callbacks.append(EarlyStopping(best.monitor, mode=best.get("mode", "min"), patience=config.early_stop))
+        callbacks.append(
+            EarlyStopping(best.monitor, mode=best.get("mode", "min"), patience=config.early_stop, strict=False)
+        )
     return callbacks
 
 

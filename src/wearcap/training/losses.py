@@ -50,10 +50,12 @@ def joint_velocity(
 def balanced_cross_entropy(
     logit: Float[Tensor, "batch time foot"],
     contact: Float[Tensor, "batch time foot"],
-    share: float,
+    share: float | None,
     weight: Float[Tensor, "batch time"],
 ) -> Float[Tensor, ""]:
-    """Cross entropy in which contact, a `share` of the training's labels, and its absence weigh alike (ours)."""
+    """Cross entropy in which contact, a `share` of the training's labels, and its absence weigh alike (ours); without a
+    share plain cross entropy."""
+    share = 0.5 if share is None else share
     balance = torch.where(contact > 0.5, 0.5 / share, 0.5 / (1 - share))
     error = F.binary_cross_entropy_with_logits(logit, contact, balance, reduction="none")
     return masked_mean(error.mean(-1), weight)

@@ -29,7 +29,7 @@ class MotionDiffusion(Training):
     """x0-prediction under one noise level per window; loss terms are weighed by `loss_weights`.
 
     "motion" is the thesis's plain MSE; "joints", "velocity", "skate" and "contact" (cross entropy in which both classes
-    weigh alike: `contact_share` of the labels are contact) are ours (0 leaves them out). Levels are drawn
+    weigh alike, if `contact_share` says what share of the labels is contact) are ours (0 leaves them out). Levels are drawn
     with a density proportional to the level to the power of `level_tilt`: 0 draws them uniformly, as the thesis does;
     more (ours) favours high noise levels, on which sampling in few steps depends. Points and images are each replaced
     by their null vector with probability `drop` per window, so that one checkpoint runs with any subset of them.
@@ -51,7 +51,7 @@ class MotionDiffusion(Training):
         level_tilt: float = 0.0,
         drop: float = 0.0,
         tail: float = 0.0,
-        contact_share: float = 0.5,
+        contact_share: float | None = None,
         place_encoder: VoxelAutoencoder | None = None,
         image_encoder: str | None = None,
         image_size: int = 0,

@@ -41,11 +41,11 @@ class WatchRegression(Training):
         optimizer: OptimizerOf,
         scheduler: SchedulerOf = None,
         end_weight: float = 1.0,
-        contact_share: float = 0.5,
+        contact_share: float | None = None,
         seed: int = 0,
     ):
         """`end_weight`: weight of hands and feet relative to the other joints in "position". `contact_share`: share of
-        the labels with contact, by which both classes weigh alike in "contact"; 0.5: plain cross entropy."""
+        the labels with contact, by which both classes weigh alike in "contact"; None: plain cross entropy."""
         super().__init__(optimizer, scheduler, loss_weights, seed)
         self.net = net(feature_size=features.size, motion_size=features.motion_size)
         self.features, self.skeleton, self.fps = features, skeleton, fps
