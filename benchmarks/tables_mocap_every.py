@@ -260,8 +260,14 @@ def _briefly(body: dict[str, Tree]) -> tuple[str, ...]:
     """How the learned baselines were trained, and what that tells."""
     name = "ours, the same budget (+ multi-stage)"
     rivals = [row for row, (run, _) in TRAINED.items() if row in body and row != name and run not in HANDS]
-    if name not in body or not rivals:
+    if not rivals:
         return ()
+    if name not in body:
+        seen = [mean(body[row]["frames_seen_m"], 2) for row in (rivals[0], "ours")]
+        return (
+            f"Learned baselines saw {seen[0]} million frames each, at the best of the learning rates that were tried, ours "
+            f"{seen[1]}: their rows are no comparison at equal budget.",
+        )
     errors = [f"{row}: {mean(body[row]['mpjpe_cm'])} cm" for row in (*rivals, name)]
     best = min(rivals, key=lambda row: body[row]["mpjpe_cm"]["mean"])
     jitters = " against ".join(mean(body[row]["jitter_ratio"], 2) for row in (name, best))

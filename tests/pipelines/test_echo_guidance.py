@@ -110,12 +110,12 @@ def test_what_is_not_there_is_not_pulled(part):
 def test_observed_contacts_count_whatever_the_network_says(given):
     contact = torch.full((1, FRAMES, BODY_POINTS + 4), 0.9 - 1.8 * given)
     scene, x = scene_of(shift=(0.1, 0.05, -0.1), lift=0.1, contact=contact)
-    told = torch.zeros(1, FRAMES, BODY_POINTS + 4)
-    told[..., LEFT_HAND] = told[..., BODY_POINTS:] = given
+    labels = torch.zeros(1, FRAMES, BODY_POINTS + 4)
+    labels[..., LEFT_HAND] = told[..., BODY_POINTS:] = given
     is_observed = scene.conditioning.is_observed.clone()
     is_observed[..., 2] = True
     is_observed[:, 4:, 2] = False
-    scene = replace(scene, conditioning=scene.conditioning._replace(contact=told, is_observed=is_observed))
+    scene = replace(scene, conditioning=scene.conditioning._replace(contact=labels, is_observed=is_observed))
     moved = (Guidance(held=0.0).corrected(x, scene) != x).any(-1)[0]
     assert moved.tolist() == [given > 0] * 4 + [given == 0] * 4
 

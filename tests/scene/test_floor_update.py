@@ -129,7 +129,7 @@ def test_sitting_down_is_no_way_down():
 
 @pytest.mark.parametrize("sway", [0.0, 0.3, 0.5])
 def test_a_squat_does_not_take_the_floor_down(sway):
-    """The head goes down by 60 cm and forward, and comes back, in two seconds: too fast a sway to be told from walking."""
+    """The head goes down by 60 cm and forward, and comes back, in two seconds: too fast a sway to look unlike walking."""
     time = torch.arange(60) / 30
     bent = (1 - torch.cos(torch.pi * time)) / 2
     heads = torch.stack([sway * bent, torch.zeros(60), 1.6 - 0.6 * bent], 1)

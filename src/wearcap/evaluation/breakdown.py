@@ -46,7 +46,7 @@ def error_columns(scores: Mapping[str, Summary]) -> dict[str, str]:
 
 
 def part_table(title: str, scores: Scores) -> Table:
-    """Mean errors of methods, or of activities, by part of the body; the unit is said in the title."""
+    """Mean errors of methods, or of activities, by part of the body; the title gives the unit."""
     columns = error_columns(next(iter(scores.values())))
     unit = next((metric.rpartition("_")[2] for metric in columns if "_pe_" in metric), "")
     shares = [heading for metric, heading in columns.items() if metric in RATIOS]
