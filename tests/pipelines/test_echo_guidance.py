@@ -111,7 +111,7 @@ def test_observed_contacts_count_whatever_the_network_says(given):
     contact = torch.full((1, FRAMES, BODY_POINTS + 4), 0.9 - 1.8 * given)
     scene, x = scene_of(shift=(0.1, 0.05, -0.1), lift=0.1, contact=contact)
     labels = torch.zeros(1, FRAMES, BODY_POINTS + 4)
-    labels[..., LEFT_HAND] = told[..., BODY_POINTS:] = given
+    labels[..., LEFT_HAND] = labels[..., BODY_POINTS:] = given
     is_observed = scene.conditioning.is_observed.clone()
     is_observed[..., 2] = True
     is_observed[:, 4:, 2] = False
