@@ -18,6 +18,7 @@ FLOORS = (
     ("systems", "simulation"),
     ("evaluation", "export", "viewer", "doctor", "prepare"),
     ("reading",),
+    ("live",),
     ("cli",),
 )
 MAY_SIMULATE = ("simulation", "prepare", "cli")

@@ -63,3 +63,11 @@ class SuitPiece(NamedTuple):
 
     suit: Motion
     localization: Localization | None = None
+
+
+class LocalizationSample(NamedTuple):
+    """Pose of the head camera in the scanned scene, as a localiser found it."""
+
+    timestamp: float
+    T_world_cam: Rigid
+    confidence: float = 1.0

@@ -1,0 +1,75 @@
+"""Packets of live devices, and the box in which they wait for the capture."""
+
+import threading
+from collections import Counter, deque
+from typing import Any, NamedTuple
+
+from wearcap.sensors.samples import HeadSample, LocalizationSample, SuitPiece, WatchSample, WristSample
+
+MAX_PACKETS = 20_000
+"""Capacity of an `Inbox`: some 20 s of five devices at 200 Hz. The oldest packets are dropped."""
+HEAD, SUIT, CAMERA = "head", "suit", "camera"
+"""Names of devices that say by themselves what they are; wrists are named by their joint, others by their serial."""
+
+
+class Packet(NamedTuple):
+    """What one device measured at one time."""
+
+    wearer: str
+    """Name of who wears it; "" where the source serves one person."""
+    device: str
+    """`HEAD`, a joint of `body.skeleton.WRISTS`, `SUIT`, `CAMERA`, or the serial of a tracker of unknown place."""
+    clock: str
+    """Name of the clock that `sent_s` counts on; devices of one clock share it."""
+    sent_s: float | None
+    """The device's own time (s); None where the protocol has none: the time of arrival stands for it."""
+    arrived_s: float
+    """Our time (s, `time.monotonic`) at which the packet arrived."""
+    sample: HeadSample | WatchSample | WristSample | SuitPiece | LocalizationSample
+    """In wearcap's axes. Its timestamp is `sent_s`, or `arrived_s`. A tracker of unknown place is a `WristSample` whose
+    joint is its serial; a watch of unknown place is a `WatchSample` whose joint is its serial."""
+
+
+class Inbox:
+    """Packets that wait for the capture, bounded: whoever delivers never blocks and never fails."""
+
+    def __init__(self, capacity: int = MAX_PACKETS):
+        self.overflowed = 0
+        """Number of packets dropped because the capture was slow."""
+        self.refused: Counter[str] = Counter()
+        """Number of datagrams, or parts of them, that no source understood, by source and reason."""
+        self._packets: deque[Packet] = deque(maxlen=capacity)
+        self._ready = threading.Condition()
+
+    def deliver(self, packets: list[Packet]) -> None:
+        """Take packets in, from any thread."""
+        if not packets:
+            return
+        with self._ready:
+            capacity = self._packets.maxlen or 0
+            self.overflowed += max(0, len(self._packets) + len(packets) - capacity)
+            self._packets.extend(packets)
+            self._ready.notify()
+
+    def refuse(self, source: str, reason: str) -> None:
+        """Count something that a source could not use; an endless variety of reasons is kept out by the sources."""
+        self.refused[f"{source}: {reason}"] += 1
+
+    def wait(self, seconds: float) -> list[Packet]:
+        """All packets that are there, after at most so many seconds of waiting for the first."""
+        with self._ready:
+            if not self._packets:
+                self._ready.wait(seconds)
+            found = list(self._packets)
+            self._packets.clear()
+            return found
+
+    def wake(self) -> None:
+        """End a `wait`."""
+        with self._ready:
+            self._ready.notify()
+
+
+def same(packet: Packet, **changed: Any) -> Packet:
+    """The packet with other values of its sample."""
+    return packet._replace(sample=packet.sample._replace(**changed))

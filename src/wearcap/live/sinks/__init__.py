@@ -1,0 +1,1 @@
+"""Sinks: where live motion goes, one protocol or kind of file a module."""

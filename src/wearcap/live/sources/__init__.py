@@ -1,0 +1,1 @@
+"""Sources: what devices and their applications send, one protocol a module."""
