@@ -11,12 +11,13 @@ from planted import swinging
 from wearcap.body.skeleton import xsens23
 from wearcap.cli.conf import compose, load_pipeline
 from wearcap.models.checkpoint import shared_checkpoints
+from wearcap.runtime.wearer import Wearer
 from wearcap.scene.objects import Environment
 from wearcap.simulation.places.movables import make_movable
 from wearcap.systems.echo.observations import Scenario, batch_item_of
 from wearcap.systems.echo.pipeline import Echo
 from wearcap.systems.echo.queue import Conditioning
-from wearcap.systems.echo.stream import EchoStream, EchoWearer
+from wearcap.systems.echo.stream import EchoStream
 from wearcap.tracking.head_path import head_path
 
 NAME = "echo"
@@ -57,7 +58,7 @@ class Streamed:
 
     def __init__(self, pipeline: Echo):
         box = make_movable("box", "box", np.random.default_rng(0)).object
-        self.session = EchoStream(pipeline, EchoWearer(xsens23(), floor_m=0.0), Environment((box,)))
+        self.session = EchoStream(pipeline, Wearer(xsens23(), floor_m=0.0), Environment((box,)))
         self.number, self.outputs = 0, 0
         motion = swinging("walk", LAP_S / 2, 0, fps=FPS).motion
         assert motion is not None

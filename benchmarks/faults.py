@@ -36,10 +36,11 @@ from wearcap.io.formats.motion_npz import read_motion
 from wearcap.models.checkpoint import read_checkpoint, read_run_file
 from wearcap.prepare.engine import Task, prepare
 from wearcap.recording import RecordingStore
+from wearcap.runtime.wearer import Wearer
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.pipeline import HMD2, DiffusionModel, Overlap, Sampling
-from wearcap.systems.hmd2.stream import HeadSample, HMD2Session, Wearer
+from wearcap.systems.hmd2.stream import HeadSample, HMD2Session
 from wearcap.training.loggers import read_metrics
 from wearcap.training.run import RunCheckpointIO
 from wearcap.viewer.annotate import AnnotationFile

@@ -35,10 +35,11 @@ from wearcap.recording.serialize import flatten
 from wearcap.recording.store import dataset_folder, load_recording
 from wearcap.recording.timing import joined
 from wearcap.runtime.system import CaptureInput
-from wearcap.systems.echo.stream import EchoStream, EchoWearer
-from wearcap.systems.hmd2.stream import HeadSample, HMD2Session, Wearer
+from wearcap.runtime.wearer import Wearer
+from wearcap.systems.echo.stream import EchoStream
+from wearcap.systems.hmd2.stream import HeadSample, HMD2Session
 from wearcap.systems.hps.stream import follow
-from wearcap.systems.mocap_every.stream import MocapEveryStream, WatchSample, Wearing
+from wearcap.systems.mocap_every.stream import MocapEveryStream, WatchSample
 from wearcap.training.loggers import read_metrics
 
 FOLDER = Path(__file__).resolve().parent
@@ -309,7 +310,7 @@ def mocap_every_streamed() -> Motion | None:
     head = recording.head
     assert head is not None
     mounts = {joint: stream.R_joint_imu for joint, stream in recording.imu.items() if "wrist" in joint}
-    session = MocapEveryStream(pipeline, Wearing(recording.skeleton, head.R_head_device, head.t_head_device, mounts))
+    session = MocapEveryStream(pipeline, Wearer(recording.skeleton, head.R_head_device, head.t_head_device, mounts))
     parts, before = [], -np.inf
     for number, now in enumerate(head.timestamps.tolist()):
         session.head(now, head.T_world_device[number])
@@ -329,7 +330,7 @@ def echo_streamed() -> Motion | None:
     assert head is not None
     assert motion is not None
     environment = CaptureInput(recording, dataset_folder(place)).objects()
-    wearer = EchoWearer(recording.skeleton, recording.shape, head.R_head_device, head.t_head_device)
+    wearer = Wearer(recording.skeleton, head.R_head_device, head.t_head_device, shape=recording.shape)
     session = EchoStream(pipeline, wearer, environment, seed=3)
     for act in true_acts(recording):
         session.activate(act.object, act.start_s)

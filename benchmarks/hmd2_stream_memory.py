@@ -13,11 +13,12 @@ from online import Walk
 from wearcap.body.skeleton import xsens23
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
+from wearcap.runtime.wearer import Wearer
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.pipeline import HMD2, DiffusionModel, Overlap, Sampling
 from wearcap.systems.hmd2.places import Memory
-from wearcap.systems.hmd2.stream import HMD2Session, Wearer
+from wearcap.systems.hmd2.stream import HMD2Session
 
 
 def measure(minutes: int = 60, settle: int = 10, max_points: int = 100_000) -> list[dict]:

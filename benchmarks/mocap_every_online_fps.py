@@ -16,8 +16,9 @@ from mocap_every_runs import figure, pipeline_of, watched
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Recording
 from wearcap.runtime.graphs import undisturbed
+from wearcap.runtime.wearer import Wearer
 from wearcap.systems.mocap_every.pipeline import MocapEvery
-from wearcap.systems.mocap_every.stream import MocapEveryStream, WatchSample, Wearing
+from wearcap.systems.mocap_every.stream import MocapEveryStream, WatchSample
 
 NEW_POINTS = 150
 """Points per pose: Aria's semi-dense map has some 5,000 a second."""
@@ -52,7 +53,7 @@ def _rate(pipeline: MocapEvery, recording: Recording, points: bool) -> float:
     assert recording.motion is not None
     floor_m = None if points else 0.0
     session = MocapEveryStream(
-        pipeline, Wearing(recording.motion.skeleton, head.R_head_device, head.t_head_device, floor_m=floor_m)
+        pipeline, Wearer(recording.motion.skeleton, head.R_head_device, head.t_head_device, floor_m=floor_m)
     )
     seen = [_around(t, rng) if points else None for t in head.t_world_device]
     full, begin = 2 * pipeline.model.net.window, 0.0

@@ -14,10 +14,11 @@ from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.checkpoint import shared_checkpoints
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
+from wearcap.runtime.wearer import Wearer
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.pipeline import HMD2, DiffusionModel
-from wearcap.systems.hmd2.stream import HeadSample, HMD2Session, Wearer
+from wearcap.systems.hmd2.stream import HeadSample, HMD2Session
 
 EXPERIMENTS = {"small": "hmd2", "full": "full/hmd2"}
 """Experiments of both sizes; where there is a checkpoint, it has the same name."""

@@ -8,10 +8,11 @@ from carried_box import boxes, carrying, drawn_echo
 from wearcap.body.skeleton import WRISTS
 from wearcap.recording import Motion
 from wearcap.recording.timing import joined
+from wearcap.runtime.wearer import Wearer
 from wearcap.sensors import packets
 from wearcap.sensors.packets import AGREEING
 from wearcap.systems.echo import stream as echo_stream
-from wearcap.systems.echo.stream import EchoStream, EchoWearer
+from wearcap.systems.echo.stream import EchoStream
 
 FRAMES, FAULT = 45, 21
 
@@ -28,7 +29,7 @@ def echo():
 
 def opened(echo, recording) -> EchoStream:
     head = recording.head
-    wearer = EchoWearer(recording.skeleton, {}, head.R_head_device, head.t_head_device, floor_m=0.0)
+    wearer = Wearer(recording.skeleton, head.R_head_device, head.t_head_device, floor_m=0.0)
     return EchoStream(echo, wearer, boxes(), seed=3)
 
 

@@ -12,17 +12,18 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
 from wearcap.recording.acts import active_at
 from wearcap.recording.timing import joined
+from wearcap.runtime.wearer import Wearer
 from wearcap.scene.objects import Environment
-from wearcap.systems.echo.stream import EchoStream, EchoWearer
+from wearcap.systems.echo.stream import EchoStream
 
 TWO = (("box_1", "left", 0.1, 0.4), ("box_2", "right", 0.7, 0.9))
 WRISTS = ("left_wrist", "right_wrist")
 NAN = Rigid(torch.full((3, 3), torch.nan), torch.zeros(3))
 
 
-def wearer(recording, **changes) -> EchoWearer:
+def wearer(recording, **changes) -> Wearer:
     head = recording.head
-    return EchoWearer(recording.skeleton, {}, head.R_head_device, head.t_head_device, **{"floor_m": 0.0} | changes)
+    return Wearer(recording.skeleton, head.R_head_device, head.t_head_device, **{"floor_m": 0.0} | changes)
 
 
 def feed(session: EchoStream, recording, frame: int, wrists=WRISTS) -> None:
@@ -354,7 +355,7 @@ def test_the_floor_is_found_after_sitting_and_standing_up():
 
 
 def test_unknown_names_are_refused():
-    session = EchoStream(drawn_echo(), EchoWearer(carrying(0.6).skeleton), boxes())
+    session = EchoStream(drawn_echo(), Wearer(carrying(0.6).skeleton), boxes())
     for call in (lambda: session.activate("ghost", 0.0), lambda: session.see_object("ghost", 0.0, Rigid.identity())):
         with pytest.raises(WearcapError, match="no object 'ghost'. Expected one of box_1"):
             call()
@@ -366,7 +367,7 @@ def test_objects_that_cannot_be_used_are_refused_when_they_are_named():
     mesh = boxes(CARRIED).by_name("box_1").mesh
     huge = Mesh(mesh.vertices * 1000, mesh.faces, mesh.color)
     surroundings = Environment((scene_object("a", mesh=huge), scene_object("b", "piano")))
-    session = EchoStream(drawn_echo(), EchoWearer(carrying(0.6).skeleton), surroundings)
+    session = EchoStream(drawn_echo(), Wearer(carrying(0.6).skeleton), surroundings)
     with pytest.raises(WearcapError, match="object 'a': .*looks like millimetres"):
         session.activate("a", 0.0)
     with pytest.raises(WearcapError, match="has no object class 'piano'"):
@@ -377,4 +378,4 @@ def test_objects_that_cannot_be_used_are_refused_when_they_are_named():
 
 def test_windows_from_scratch_are_no_stream():
     with pytest.raises(WearcapError, match="rewindow=3. Expected a conveyor"):
-        EchoStream(drawn_echo(rewindow=3), EchoWearer(carrying(0.6).skeleton))
+        EchoStream(drawn_echo(rewindow=3), Wearer(carrying(0.6).skeleton))

@@ -13,11 +13,12 @@ from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import CameraStream, Motion, PointCloud, Recording
+from wearcap.runtime.wearer import Wearer
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.places import Memory
-from wearcap.systems.hmd2.stream import HeadSample, HMD2Session, Wearer
+from wearcap.systems.hmd2.stream import HeadSample, HMD2Session
 from wearcap_testing import pushed, recording_of, swaying_motion
 
 WINDOW, IMAGE = 60, 8

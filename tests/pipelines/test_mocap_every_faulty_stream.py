@@ -13,10 +13,11 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
 from wearcap.recording.timing import joined
+from wearcap.runtime.wearer import Wearer
 from wearcap.sensors import packets
 from wearcap.sensors.packets import AGREEING
 from wearcap.systems.mocap_every import stream as mocap_every_stream
-from wearcap.systems.mocap_every.stream import MocapEveryStream, WatchSample, Wearing
+from wearcap.systems.mocap_every.stream import MocapEveryStream, WatchSample
 
 FRAMES, FAULT = 60, 33
 
@@ -33,7 +34,7 @@ def pipeline():
 
 def opened(pipeline, recording) -> MocapEveryStream:
     head, mounts = recording.head, {joint: stream.R_joint_imu for joint, stream in recording.imu.items()}
-    return MocapEveryStream(pipeline, Wearing(recording.skeleton, head.R_head_device, head.t_head_device, mounts, 0.0))
+    return MocapEveryStream(pipeline, Wearer(recording.skeleton, head.R_head_device, head.t_head_device, mounts, 0.0))
 
 
 def feed(session, recording, frame: int, shift: float = 0.0, watched: bool = True) -> list[Motion]:

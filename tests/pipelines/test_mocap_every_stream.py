@@ -6,7 +6,8 @@ import torch
 from watched_walk import drawn_pipeline, watched_walk
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
-from wearcap.systems.mocap_every.stream import MocapEveryStream, WatchSample, Wearing
+from wearcap.runtime.wearer import Wearer
+from wearcap.systems.mocap_every.stream import MocapEveryStream, WatchSample
 
 
 @pytest.fixture(scope="module")
@@ -14,9 +15,9 @@ def recording():
     return watched_walk()
 
 
-def wearing(recording) -> Wearing:
+def wearing(recording) -> Wearer:
     head, mounts = recording.head, {joint: stream.R_joint_imu for joint, stream in recording.imu.items()}
-    return Wearing(recording.skeleton, head.R_head_device, head.t_head_device, mounts, floor_m=0.0)
+    return Wearer(recording.skeleton, head.R_head_device, head.t_head_device, mounts, floor_m=0.0)
 
 
 def samples(stream):

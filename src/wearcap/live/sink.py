@@ -1,7 +1,6 @@
 """What a sink of live motion is, and the thread that keeps a slow or broken one from delaying the others."""
 
 import threading
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 
@@ -12,7 +11,7 @@ MAX_PIECES = 300
 """Pieces of motion that may wait for a sink: some seconds to minutes, by the system's stride."""
 
 
-class Sink(ABC):
+class Sink:
     """Somewhere that motion goes. All methods are called from one thread of the sink's own."""
 
     name: str
@@ -23,13 +22,12 @@ class Sink(ABC):
     def open(self) -> None:
         """Get ready. Raises WearcapError when that is impossible."""
 
-    @abstractmethod
     def begin(self, wearer: str, skeleton: Skeleton, fps: float) -> None:
         """A wearer's motion begins, or begins anew, with a skeleton."""
 
-    @abstractmethod
     def take(self, wearer: str, motion: Motion) -> None:
         """The next frames of a wearer."""
+        raise NotImplementedError
 
     def end(self, wearer: str) -> None:
         """A wearer has left."""

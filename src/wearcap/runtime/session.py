@@ -27,6 +27,8 @@ from wearcap.files import atomic_path, parse_json
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
 from wearcap.runtime.stages import digest
+from wearcap.runtime.system import CaptureInput
+from wearcap.runtime.wearer import Wearer
 from wearcap.sensors.packets import Admitted, HeadInput, WristInput
 from wearcap.tracking.head_path import Chunk, HeadTrack
 
@@ -46,6 +48,10 @@ class Session(ABC):
     """Classes of a saved session's state."""
     stream_class: ClassVar[type]
     """Class of the streams of single wearers."""
+    devices: ClassVar[tuple[str, ...]] = ("head",)
+    """Devices of a wearer without which there is no motion: "head", joints of wrists, "suit", "camera"."""
+    tracks_wrists: ClassVar[bool] = False
+    """Whether wrists come as tracked poses; otherwise as orientation and acceleration of watches."""
 
     def __init__(self, system: Any, streams: Sequence[Any]):
         """`streams`: one for each wearer, with the properties `dropped` and `refused`, `take(sample)` for one sample, and
@@ -54,6 +60,14 @@ class Session(ABC):
         if not streams:
             raise WearcapError("a session without wearers", expected="one wearer or more")
         self.system, self.streams = system, list(streams)
+
+    @classmethod
+    def of_wearers(
+        cls, system: Any, wearers: Sequence[Wearer], seed: int = 0, source: CaptureInput | None = None
+    ) -> "Session":
+        """The session of some wearers, each with a seed from `seed` on; `source`: recording, scan and objects that belong
+        to the place, for systems that use them. Raises WearcapError as the system's own constructor does."""
+        return cls(system, wearers)
 
     @property
     def dropped(self) -> list[int]:

@@ -172,6 +172,14 @@ class System(ABC):
         """A streaming capture of one or several wearers: the `runtime.session.Session` of the system's `stream.py`."""
         return self._room("stream", "captures streams").SESSION(self, *args, **kwargs)
 
+    @property
+    def latency_s(self) -> float:
+        """Longest time (s) from a frame to its final pose in a stream, without computation.
+
+        Raises WearcapError for a system that does not stream.
+        """
+        raise WearcapError(f"pipeline {self.name!r} is none that captures streams", fix="Choose another pipeline=….")
+
     def follow(self, folder: Path, scan: Scan | None, refused: Counter[str]) -> Iterator[Motion]:
         """Final pieces of motion of a recording that still grows in a folder; `refused` counts unusable pieces."""
         raise WearcapError("this pipeline cannot follow a growing recording", expected="pipeline=hps")

@@ -7,17 +7,15 @@ latency of a pose is `Echo.latency_s`. Memory use is bounded.
 import math
 import sys
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body import skeleton
-from wearcap.body.skeleton import WRISTS, Skeleton
+from wearcap.body.skeleton import WRISTS
 from wearcap.diffusion import conveyor
 from wearcap.errors import WearcapError
 from wearcap.geometry import rigid, rotation, trajectory
@@ -27,8 +25,11 @@ from wearcap.recording import Motion
 from wearcap.recording import motion as motion_types
 from wearcap.recording.acts import SAME_S
 from wearcap.recording.timing import joined
+from wearcap.runtime import wearer as wearer_types
 from wearcap.runtime.graphs import undisturbed
 from wearcap.runtime.session import HeadAndWristsStream, Session, classes_of
+from wearcap.runtime.system import CaptureInput
+from wearcap.runtime.wearer import Wearer
 from wearcap.scene.objects import Environment
 from wearcap.sensors import packets, samples
 from wearcap.sensors.packets import MAX_WAITING
@@ -47,7 +48,7 @@ from wearcap.tracking.refinement import Refiner
 
 _STATE = (
     *(skeleton, motion_types, trajectory, rigid, head_path, packets, samples, floor, conveyor, queue, contacts),
-    *(refinement, foot_lock),
+    *(refinement, foot_lock, wearer_types),
 )
 """Modules with the classes that a session's state consists of."""
 MAX_SEEN = 1000
@@ -56,23 +57,10 @@ ASIDE_M, BELOW = 0.25, 0.47
 """Position of a wrist with the arm down: beside the head (m), and below it as a share of the head's height."""
 
 
-@dataclass(frozen=True, eq=False)
-class EchoWearer:
-    """The wearer's body, and how the head device is mounted."""
-
-    skeleton: Skeleton
-    shape: Mapping[str, float] = field(default_factory=dict)
-    R_head_device: Float[Tensor, "3 3"] = field(default_factory=lambda: torch.eye(3))
-    t_head_device: Float[Tensor, "3"] = field(default_factory=lambda: torch.zeros(3))
-    floor_m: float | None = None
-    """World z of the floor; None: estimated from the head's usual height in the last half minute and the height of a
-    standing head. A capture of the whole recording uses later frames, too."""
-
-
 class EchoStream(HeadAndWristsStream):
     """A streaming capture of one wearer and some objects; the active object is kept when the clock is set back."""
 
-    def __init__(self, pipeline: Echo, wearer: EchoWearer, environment: Environment | None = None, seed: int = 0):
+    def __init__(self, pipeline: Echo, wearer: Wearer, environment: Environment | None = None, seed: int = 0):
         """Raises WearcapError for a pipeline without a conveyor."""
         if (rewindow := pipeline.sampling.rewindow) is not None:
             raise WearcapError(f"a stream with rewindow={rewindow}", expected="a conveyor: rewindow=null")
@@ -339,11 +327,13 @@ class EchoSession(Session):
 
     stream_class = EchoStream
     classes = classes_of(*_STATE, sys.modules[__name__])
+    devices = ("head", *WRISTS)
+    tracks_wrists = True
 
     def __init__(
         self,
         pipeline: Echo,
-        wearers: Sequence[EchoWearer],
+        wearers: Sequence[Wearer],
         seeds: Sequence[int] | None = None,
         environment: Environment | None = None,
     ):
@@ -351,6 +341,13 @@ class EchoSession(Session):
         seeds = [0] * len(wearers) if seeds is None else seeds
         pairs = zip(wearers, seeds, strict=True)
         super().__init__(pipeline, [EchoStream(pipeline, wearer, environment, seed) for wearer, seed in pairs])
+
+    @classmethod
+    def of_wearers(
+        cls, system: Echo, wearers: Sequence[Wearer], seed: int = 0, source: CaptureInput | None = None
+    ) -> "EchoSession":
+        environment = None if source is None else system.objects(source)
+        return cls(system, wearers, range(seed, seed + len(wearers)), environment)
 
     @classmethod
     def settings(cls, system: Echo) -> dict[str, Any]:

@@ -128,6 +128,12 @@ class HMD2(LearnedSystem):
             raise WearcapError(what, expected=f"a lookahead from 0 to {shared}")
         return lookahead_frames
 
+    @property
+    def latency_s(self) -> float:
+        """Longest time between a frame and its final pose (s): a stride's first frame waits for its last."""
+        refinement = 0 if self.refinement is None else self.refinement.lookahead
+        return (self.advance - 1 + self.lookahead_frames + refinement) / self.model.fps
+
     def prepare(self) -> None:
         """Move the network to its device and set up its runtime, as every capture does first.
 

@@ -17,7 +17,10 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
 from wearcap.recording import motion as motion_types
 from wearcap.recording.timing import joined
+from wearcap.runtime import wearer as wearer_types
 from wearcap.runtime.session import Session, classes_of
+from wearcap.runtime.system import CaptureInput
+from wearcap.runtime.wearer import Wearer
 from wearcap.scene import voxels
 from wearcap.sensors import packets, samples
 from wearcap.sensors.packets import Admitted, time_fault
@@ -25,7 +28,7 @@ from wearcap.sensors.samples import HeadSample
 from wearcap.systems.hmd2 import places, wearer, windows
 from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.places import Memory
-from wearcap.systems.hmd2.wearer import Wearer, WearerState
+from wearcap.systems.hmd2.wearer import WearerState
 from wearcap.systems.hmd2.windows import advance
 from wearcap.tracking import floor, foot_lock, head_path, refinement
 from wearcap.tracking.head_path import Chunk
@@ -45,7 +48,7 @@ class HMD2Session(Session):
     stream_class = WearerState
     classes = classes_of(
         *(skeleton, motion_types, rigid, head_path, packets, samples, floor, voxels, places, windows, wearer),
-        *(refinement, foot_lock),
+        *(refinement, foot_lock, wearer_types),
     )
 
     def __init__(self, pipeline: HMD2, wearers: Sequence[Wearer], seeds: Sequence[int], memory: Memory | None = None):
@@ -57,6 +60,12 @@ class HMD2Session(Session):
         super().__init__(pipeline, [WearerState(pipeline, who, seed, memory) for who, seed in zip(wearers, seeds)])
         self.embedded = False
         """Whether an embedding of the right length has arrived."""
+
+    @classmethod
+    def of_wearers(
+        cls, system: HMD2, wearers: Sequence[Wearer], seed: int = 0, source: CaptureInput | None = None
+    ) -> "HMD2Session":
+        return cls(system, wearers, range(seed, seed + len(wearers)))
 
     def push(self, samples: Sequence[Sequence[HeadSample]]) -> None:
         """Take in each wearer's new samples, any number of them.

@@ -1,18 +1,17 @@
 """One wearer of an HMD² stream: its input buffers and its window sampler."""
 
 from bisect import insort
-from dataclasses import dataclass, field
 from typing import SupportsFloat
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float64
 from torch import Tensor
 
-from wearcap.body.skeleton import Skeleton
 from wearcap.data.surroundings import latest_before
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.recording import Motion
+from wearcap.runtime.wearer import Wearer
 from wearcap.scene.voxels import VoxelGrid
 from wearcap.sensors import packets
 from wearcap.sensors.packets import Admitted, HeadInput
@@ -25,15 +24,6 @@ from wearcap.tracking.refinement import Refiner
 
 MAX_WAITING = 1000
 """Most image embeddings, and most floor heights, that are buffered for coming head poses; the oldest are dropped."""
-
-
-@dataclass(frozen=True)
-class Wearer:
-    """The wearer's skeleton, and the device's pose on the head joint."""
-
-    skeleton: Skeleton
-    R_head_device: Float[Tensor, "3 3"] = field(default_factory=lambda: torch.eye(3))
-    t_head_device: Float[Tensor, "3"] = field(default_factory=lambda: torch.zeros(3))
 
 
 class WearerState:

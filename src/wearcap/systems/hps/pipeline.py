@@ -94,6 +94,12 @@ class HPS(StagedSystem):
         found = (replace(need, has=localizable) if need is LOCALIZATION else need for need in self.required)
         return tuple(need for need in found if need is not SCAN or self.energy.reading("on_ground"))
 
+    @property
+    def latency_s(self) -> float:
+        """Longest time between a frame and its final pose (s), with the default settings of a stream."""
+        settings = self._room("stream", "captures streams").StreamSettings()
+        return settings.lag_s + settings.advance_s
+
     def stages(self, source: CaptureInput) -> list[Stage]:
         """The steps from a recording to the solution. Raises WearcapError without suit, head camera, localisation or
         map, or a scan where the energy asks for one."""

@@ -28,10 +28,13 @@ from wearcap.recording.recording import Localization
 from wearcap.recording.timing import at_times, joined
 from wearcap.runtime.session import Session, classes_of
 from wearcap.runtime.stages import digest
+from wearcap.runtime.system import CaptureInput
+from wearcap.runtime.wearer import Wearer
 from wearcap.scene.scan import Scan
+from wearcap.sensors import packets, samples
 from wearcap.sensors.initialization import Initialization, align_suit, estimate_head_camera, initialize, inliers
 from wearcap.sensors.packets import MAX_POSITION_M, MAX_TIME_S, OFF_THE_CLOCK, WRONG_TYPE, rotation_fault, values_fault
-from wearcap.sensors.samples import SuitPiece
+from wearcap.sensors.samples import LocalizationSample, SuitPiece
 from wearcap.systems.hps.pipeline import HPS, mount
 
 MAX_UNALIGNED_S = 600.0
@@ -137,6 +140,9 @@ class HpsStream:
         """The last piece, if it did not follow those before."""
         self._finished: list[Motion] = []
         """Motions that `take` finished and `poses` did not return yet."""
+        self._collected: list[Motion] = []
+        """Single frames of the suit, and below poses of the camera, that `push` did not get yet."""
+        self._cameras: list[LocalizationSample] = []
         self._any_returned = False
         """Whether any motion was returned."""
         self._like: Motion | None = None
@@ -151,14 +157,59 @@ class HpsStream:
         return sum(count for reason, count in self.refused.items() if reason.startswith("localization"))
 
     def take(self, sample: Any) -> None:
-        """Take in a `SuitPiece`; anything else is refused."""
-        if not isinstance(sample, SuitPiece):
-            self.refused[f"sample: {WRONG_TYPE}"] += 1
-        elif (motion := self.push(*sample)) is not None:
+        """Take in a `SuitPiece` with its localisation; or, as live devices send them, pieces of single frames and
+        `LocalizationSample`s, which are collected for `advance_s`. Anything else is refused."""
+        match sample:
+            case SuitPiece() if sample.localization is not None:
+                self._push_collected()
+                self._push_piece(*sample)
+            case SuitPiece():
+                if fault := _suit_fault(sample.suit, self._like):
+                    self.refused[f"suit: {fault}"] += 1
+                elif len(sample.suit):
+                    self._collected.append(sample.suit)
+                    first, last = (self._collected[end].timestamps[end].item() for end in (0, -1))
+                    if not 0 <= last - first < self.settings.advance_s:
+                        self._push_collected()
+            case LocalizationSample():
+                if fault := packets.time_fault(sample.timestamp) or packets.pose_fault(sample.T_world_cam):
+                    self.refused[f"localization: {fault}"] += 1
+                else:
+                    self._cameras.append(sample)
+                    del self._cameras[: -packets.MAX_WAITING]
+            case _:
+                self.refused[f"sample: {WRONG_TYPE}"] += 1
+
+    def _push_piece(self, suit: Motion, localization: Localization | None) -> None:
+        if (motion := self.push(suit, localization)) is not None:
             self._finished.append(motion)
+
+    def _push_collected(self) -> None:
+        """Push the frames that were collected, in order of time, with the camera poses up to the last of them."""
+        if not self._collected:
+            return
+        frames = {each.timestamps[0].item(): each for each in self._collected}
+        self._collected = []
+        suit = joined([frames[time] for time in sorted(frames)])
+        assert suit is not None
+        last_s = suit.timestamps[-1].item()
+        seen = {each.timestamp: each for each in self._cameras if each.timestamp <= last_s}
+        self._cameras = [each for each in self._cameras if each.timestamp > last_s]
+        ordered = [seen[time] for time in sorted(seen)]
+        localization = None
+        if ordered:
+            localization = Localization(
+                torch.tensor([each.timestamp for each in ordered], dtype=torch.float64),
+                torch.stack([each.T_world_cam.R for each in ordered]),
+                torch.stack([each.T_world_cam.t for each in ordered]),
+                torch.tensor([each.confidence for each in ordered]),
+            )
+        self._push_piece(suit, localization)
 
     def poses(self, ended: bool = False) -> Motion | None:
         """Frames that became final since the last call, or None; `ended`: no more pieces come. Raises as `finish`."""
+        if ended:
+            self._push_collected()
         if ended and not self._finished:
             return self.finish()
         return self._finished.pop(0) if self._finished else None
@@ -359,13 +410,24 @@ class HpsSession(Session):
     """A streaming capture of one or several wearers in one scene, each by an `HpsStream`."""
 
     stream_class = HpsStream
-    classes = classes_of(skeleton, motion_types, trajectory, rigid, recording_types, sys.modules[__name__])
+    classes = classes_of(skeleton, motion_types, trajectory, rigid, recording_types, samples, sys.modules[__name__])
+    devices = ("suit", "camera")
 
     def __init__(
         self, hps: HPS, wearers: Sequence[Recording], scan: Scan | None, settings: StreamSettings | None = None
     ):
         """`wearers`: each one's shape and camera (`HpsStream`). Raises WearcapError as `HpsStream` does."""
         super().__init__(hps, [HpsStream(hps, about, scan, settings) for about in wearers])
+
+    @classmethod
+    def of_wearers(
+        cls, system: HPS, wearers: Sequence[Wearer], seed: int = 0, source: CaptureInput | None = None
+    ) -> "HpsSession":
+        """Each wearer's camera and its mount are those of the source's recording. Raises WearcapError without one."""
+        if source is None:
+            what = "a live suit without its head camera's description"
+            raise WearcapError(what, expected="recording=FILE with the camera and its mount, and the scene's scan")
+        return cls(system, [source.recording] * len(wearers), source.read_scan())
 
     @classmethod
     def settings(cls, system: HPS) -> dict[str, Any]:

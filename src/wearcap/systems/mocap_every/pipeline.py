@@ -21,7 +21,7 @@ from wearcap.runtime.graphs import Run, chosen, run_of
 from wearcap.runtime.needs import HEAD, HEIGHT, POINTS, WATCHES
 from wearcap.runtime.system import CaptureInput, LearnedSystem
 from wearcap.scene.floor import FloorFixed, FloorFollow, FloorFollower, FloorUpdate
-from wearcap.sensors.watches import watch_gaps, watches_at
+from wearcap.sensors.watches import FILTER, watch_gaps, watches_at
 from wearcap.systems.mocap_every.energy import LatentSolution
 from wearcap.systems.mocap_every.features import Sensed, WatchFeatures, synthetic_wrists
 from wearcap.systems.mocap_every.model import Estimate, WatchEstimator
@@ -100,6 +100,12 @@ class MocapEvery(LearnedSystem):
             what = f"windows of {window} frames with stride {self.stride} and lookahead {self.lookahead}"
             expected = "a stride from 1 to the window, and a lookahead of at most the overlap of two windows"
             raise WearcapError(what, expected=expected)
+
+    @property
+    def latency_s(self) -> float:
+        """Longest time between a frame and its final pose (s), with the future frames of the watches' mean filter."""
+        refinement = 0 if self.refinement is None else self.refinement.lookahead
+        return (self.stride - 1 + self.lookahead + refinement + FILTER / 2) / self.model.fps
 
     def prepare(self) -> None:
         """Move the network to its device and set up its runtime, compiled or exported once."""

@@ -7,8 +7,7 @@ refinement.
 
 import math
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -16,14 +15,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body import skeleton
-from wearcap.body.skeleton import WRISTS, Skeleton
+from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.geometry import rigid
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import ImuStream, Motion
 from wearcap.recording import motion as motion_types
 from wearcap.recording.timing import joined
+from wearcap.runtime import wearer as wearer_types
 from wearcap.runtime.session import HeadAndWristsStream, Session, classes_of
+from wearcap.runtime.wearer import Wearer
 from wearcap.scene import floor as floor_types
 from wearcap.sensors import packets
 from wearcap.sensors import samples as sample_types
@@ -41,24 +42,11 @@ from wearcap.tracking.refinement import Measured, Refiner
 
 _STATE = (
     *(skeleton, motion_types, rigid, head_path, packets, sample_types, floor_types, features, windows),
-    *(refinement, foot_lock),
+    *(refinement, foot_lock, wearer_types),
 )
 """Modules with the classes that a session's state consists of."""
 MAX_POINTS = 1_000_000
 """Capacity of the buffer of points that wait for a head pose; the oldest are dropped."""
-
-
-@dataclass(frozen=True)
-class Wearing:
-    """The wearer's skeleton and the mounting of the devices."""
-
-    skeleton: Skeleton
-    R_head_device: Float[Tensor, "3 3"] = field(default_factory=lambda: torch.eye(3))
-    t_head_device: Float[Tensor, "3"] = field(default_factory=lambda: torch.zeros(3))
-    R_wrist_imu: Mapping[str, Float[Tensor, "3 3"]] = field(default_factory=dict)
-    """Mounting of each watch on its wrist joint; identity where missing."""
-    floor_m: float | None = None
-    """Initial floor height (the paper's h_0); None: the first head height minus the standing head height."""
 
 
 class MocapEveryStream(HeadAndWristsStream):
@@ -68,9 +56,9 @@ class MocapEveryStream(HeadAndWristsStream):
     than `watches.MAX_GAP_S` is assumed static (last orientation, no acceleration) and counted in `silent`.
     """
 
-    def __init__(self, pipeline: MocapEvery, wearing: Wearing):
+    def __init__(self, pipeline: MocapEvery, wearer: Wearer):
         super().__init__(pipeline, pipeline.model.fps, pipeline.stride)
-        self.wearing = wearing
+        self.wearer = wearer
         self._restart()
 
     def _restart(self, again: bool = False) -> None:
@@ -139,17 +127,17 @@ class MocapEveryStream(HeadAndWristsStream):
     def _advance(self, chunk: Chunk, end_s: float) -> list[Motion]:
         """Run the windows over one chunk of frames; `end_s`: time of the last frame (s), once known."""
         motions: list[Motion] = []
-        mount = Rigid(self.wearing.R_head_device, self.wearing.t_head_device).inverse()
+        mount = Rigid(self.wearer.R_head_device, self.wearer.t_head_device).inverse()
         T_world_head = chunk.T_world_device @ mount
         if chunk.begins or self._windows is None:
             if self._windows is not None:
                 motions += self._end(self._windows)
             self._begin_s = chunk.timestamps[0].item()
-            floor_m = self.wearing.floor_m if self._windows is None else self._windows.floor_m
+            floor_m = self.wearer.floor_m if self._windows is None else self._windows.floor_m
             if floor_m is None:
-                floor_m = T_world_head.t[0, 2].item() - self.wearing.skeleton.height_of("head")
-            follower = self.pipeline.follower(self.wearing.skeleton, floor_m)
-            self._windows = EstimatorWindows(self.pipeline, self.wearing.skeleton, follower)
+                floor_m = T_world_head.t[0, 2].item() - self.wearer.skeleton.height_of("head")
+            follower = self.pipeline.follower(self.wearer.skeleton, floor_m)
+            self._windows = EstimatorWindows(self.pipeline, self.wearer.skeleton, follower)
         elif len(chunk.corrected.t):
             self._windows.correct(chunk.corrected @ mount)
         for points in self._points:
@@ -185,7 +173,7 @@ class MocapEveryStream(HeadAndWristsStream):
                     joint,
                     torch.stack([s.R_world_imu for s in samples]),
                     torch.stack([s.acc_world for s in samples]),
-                    R_joint_imu=self.wearing.R_wrist_imu.get(joint),
+                    R_joint_imu=self.wearer.R_wrist_imu.get(joint),
                 )
             )
             oldest_s = around[-FILTER].item() - 2 * step
@@ -200,7 +188,7 @@ class MocapEveryStream(HeadAndWristsStream):
             return []
         times, heads = self._times[:count], self._heads[:count]
         self._times, self._heads = self._times[count:], self._heads[count:]
-        poses = times, self.wearing.skeleton, output.R_parent_joint, output.t_world_root
+        poses = times, self.wearer.skeleton, output.R_parent_joint, output.t_world_root
         contact_prob = output.contact_prob.repeat_interleave(2, -1)
         pipeline = self.pipeline
         motion = Motion(*poses, contact_prob, provenance=pipeline.settings())
@@ -225,10 +213,11 @@ class MocapEverySession(Session):
 
     stream_class = MocapEveryStream
     classes = classes_of(*_STATE, sys.modules[__name__])
+    devices = ("head", *WRISTS)
 
-    def __init__(self, pipeline: MocapEvery, wearers: Sequence[Wearing]):
+    def __init__(self, pipeline: MocapEvery, wearers: Sequence[Wearer]):
         """Raises WearcapError without wearers."""
-        super().__init__(pipeline, [MocapEveryStream(pipeline, wearing) for wearing in wearers])
+        super().__init__(pipeline, [MocapEveryStream(pipeline, wearer) for wearer in wearers])
 
     @classmethod
     def settings(cls, system: MocapEvery) -> dict[str, Any]:

@@ -1,0 +1,132 @@
+"""Clocks of live devices: from a device's own time to ours, and from one device's to another's.
+
+A packet takes at least as long as the quickest one did: the smallest differences between arrival and the device's time show
+how the two clocks stand, and how they drift, however much single packets are delayed.
+"""
+
+import statistics
+from collections import deque
+
+BUCKET_S = 2.0
+"""Time over which the quickest packet is kept."""
+BUCKETS = 60
+"""Number of quickest packets from which the drift follows: two minutes."""
+MAX_DRIFT = 5e-4
+"""Largest drift that is believed (s/s); crystals of watches and phones are within 1e-4."""
+DRIFT_AFTER_S = 20.0
+"""Time after which drift is estimated; before, it is smaller than the network's jitter."""
+RESTART_S = 1.0
+"""Deviation from the estimate that means another clock, if `AGREEING` packets in a row have it."""
+AGREEING = 5
+
+
+class DeviceClock:
+    """One device's clock against ours, from packets as they arrive; memory is bounded."""
+
+    def __init__(self) -> None:
+        self.restarts = 0
+        """How often the device's clock was set anew."""
+        self._far = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        self._quickest: deque[tuple[float, float]] = deque(maxlen=BUCKETS)
+        """Device time and delay (arrival minus device time, s) of the quickest packet of each `BUCKET_S`."""
+        self._drift = 0.0
+        self._delay_s = 0.0
+        """Smallest delay at device time `_at_s`."""
+        self._at_s = 0.0
+
+    def see(self, sent_s: float, arrived_s: float) -> None:
+        """A packet with the device's time arrived."""
+        delay_s = arrived_s - sent_s
+        if not self._quickest:
+            self._quickest.append((sent_s, delay_s))
+            self._delay_s, self._at_s = delay_s, sent_s
+            return
+        expected_s = self._delay_at(sent_s)
+        # Early packets are impossible with one clock; late ones by a second, and all of them, mean another one, too.
+        self._far = self._far + 1 if abs(delay_s - expected_s) > RESTART_S else 0
+        if self._far:
+            if self._far >= AGREEING:
+                self.restarts += 1
+                self._far = 0
+                self._begin()
+                self.see(sent_s, arrived_s)
+            return
+        if sent_s >= self._quickest[-1][0] + BUCKET_S:
+            self._quickest.append((sent_s, delay_s))
+            self._estimate()
+        elif delay_s < self._quickest[-1][1]:
+            self._quickest[-1] = (self._quickest[-1][0], delay_s)
+        if delay_s < self._delay_at(sent_s):
+            self._delay_s, self._at_s = delay_s, sent_s
+
+    def _delay_at(self, sent_s: float) -> float:
+        return self._delay_s + self._drift * (sent_s - self._at_s)
+
+    def _estimate(self) -> None:
+        """Drift and smallest delay from the quickest packets that are complete: a line below all of them."""
+        done = list(self._quickest)[:-1] or list(self._quickest)
+        first_s, last_s = done[0][0], done[-1][0]
+        if last_s - first_s >= DRIFT_AFTER_S:
+            apart = len(done) // 2
+            slopes = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in zip(done, done[apart:])]
+            self._drift = min(max(statistics.median(slopes), -MAX_DRIFT), MAX_DRIFT)
+        self._at_s = last_s
+        self._delay_s = min(delay_s - self._drift * (sent_s - last_s) for sent_s, delay_s in done)
+
+    @property
+    def known(self) -> bool:
+        """Whether a packet has arrived."""
+        return bool(self._quickest)
+
+    def ours(self, device_s: float) -> float:
+        """Our time (s) at a time of the device, as if its packets took no time."""
+        return device_s + self._delay_at(device_s)
+
+    def theirs(self, our_s: float) -> float:
+        """The device's time (s) at ours."""
+        return self._at_s + (our_s - self._at_s - self._delay_s) / (1 + self._drift)
+
+
+class Clocks:
+    """The clocks of one wearer's devices; the head's is the one that motion is timed by."""
+
+    def __init__(self) -> None:
+        self.leader: str | None = None
+        """Name of the clock that motion counts on; None: the first one seen decides."""
+        self._clocks: dict[str, DeviceClock] = {}
+        self._shifts_s: dict[str, float] = {}
+
+    def see(self, clock: str, sent_s: float, arrived_s: float) -> None:
+        """A packet that counts on a clock arrived."""
+        if clock not in self._clocks:
+            if len(self._clocks) >= MAX_CLOCKS:
+                return
+            self._clocks[clock] = DeviceClock()
+        self._clocks[clock].see(sent_s, arrived_s)
+
+    def shift(self, clock: str, seconds: float) -> None:
+        """What is to be added to a clock's time beyond what its delays show, found by a clap or by motion."""
+        self._shifts_s[clock] = seconds
+
+    def on_leader(self, clock: str, time_s: float) -> float:
+        """A time of one clock on the leading one; unchanged on the same clock, and while one of them is unknown."""
+        if clock == self.leader or self.leader not in self._clocks or clock not in self._clocks:
+            return time_s
+        return self._clocks[self.leader].theirs(self._clocks[clock].ours(time_s)) + self._shifts_s.get(clock, 0.0)
+
+    def ours(self, time_s: float) -> float:
+        """Our time at a time of the leading clock."""
+        clock = self._clocks.get(self.leader or "")
+        return time_s if clock is None else clock.ours(time_s)
+
+    @property
+    def restarts(self) -> int:
+        """How often clocks were set anew."""
+        return sum(clock.restarts for clock in self._clocks.values())
+
+
+MAX_CLOCKS = 32
+"""Most clocks of one wearer; a sender that invents names gets no more."""

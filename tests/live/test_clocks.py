@@ -1,0 +1,72 @@
+"""Clocks of live devices: offset, drift and restarts are recovered from delayed packets."""
+
+import random
+
+import pytest
+
+from wearcap.live.clocks import AGREEING, Clocks, DeviceClock
+
+
+def packets(seconds: float, hz: float, offset_s: float, drift: float, jitter_s: float, seed: int = 0):
+    """(device time, arrival) of packets whose device clock is `offset_s` behind ours and drifts."""
+    draw = random.Random(seed)
+    for k in range(round(seconds * hz)):
+        ours = 1000.0 + k / hz
+        yield (ours - offset_s) * (1 + drift) - 1000.0 * drift, ours + 0.004 + jitter_s * draw.random() ** 2
+
+
+@pytest.mark.parametrize("drift", [0.0, 1e-4, -1e-4])
+@pytest.mark.parametrize("jitter_s", [0.0, 0.02])
+def test_time_follows_the_smallest_delay_and_the_drift(drift: float, jitter_s: float):
+    clock = DeviceClock()
+    for sent_s, arrived_s in packets(300, 60, 777.0, drift, jitter_s):
+        clock.see(sent_s, arrived_s)
+        last = sent_s
+    truly = (last + 1000.0 * drift) / (1 + drift) + 777.0
+    assert clock.ours(last) == pytest.approx(truly + 0.004, abs=0.002)
+    assert clock.theirs(clock.ours(last)) == pytest.approx(last, abs=1e-6)
+
+
+def test_a_late_packet_changes_nothing_and_an_earlier_one_counts_at_once():
+    clock = DeviceClock()
+    clock.see(10.0, 20.05)
+    clock.see(10.1, 20.9)
+    assert clock.ours(10.1) == pytest.approx(20.15)
+    clock.see(10.2, 20.21)
+    assert clock.ours(10.2) == pytest.approx(20.21)
+
+
+def test_a_clock_set_anew_is_followed_after_some_packets():
+    clock = DeviceClock()
+    for k in range(100):
+        clock.see(50.0 + k / 60, 500.0 + k / 60)
+    for k in range(AGREEING):
+        assert clock.restarts == 0
+        clock.see(3.0 + k / 60, 502.0 + k / 60)
+    assert clock.restarts == 1
+    assert clock.ours(3.0) == pytest.approx(502.0)
+
+
+def test_three_clocks_meet_on_the_heads():
+    """Two watches and a head with unrelated times: one moment has one time."""
+    clocks = Clocks()
+    clocks.leader = "head"
+    offsets = {"head": 3.0, "left": -50.0, "right": 1.7e9}
+    for number, (name, offset) in enumerate(offsets.items()):
+        for sent_s, arrived_s in packets(60, 50, offset, 0.0, 0.02, number):
+            clocks.see(name, sent_s, arrived_s)
+    moment = 1055.0
+    for name, offset in offsets.items():
+        assert clocks.on_leader(name, moment - offset) == pytest.approx(moment - 3.0, abs=0.002)
+    clocks.shift("left", 0.25)
+    assert clocks.on_leader("left", moment + 50.0) == pytest.approx(moment - 3.0 + 0.25, abs=0.002)
+    assert clocks.on_leader("head", 12.345) == 12.345
+
+
+def test_a_sender_that_invents_clocks_gets_no_memory():
+    clocks = Clocks()
+    clocks.leader = "head"
+    clocks.see("head", 1.0, 2.0)
+    for k in range(1000):
+        clocks.see(f"clock {k}", 1.0, 2.0)
+    assert clocks.on_leader("clock 999", 5.0) == 5.0
