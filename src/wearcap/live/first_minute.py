@@ -29,9 +29,9 @@ WALKED_S = 2.5
 """Time (s) of walking that is enough."""
 AGREE_M = 0.15
 """Distance (m) between the head's height and that of a standing wearer for which a floor is believed."""
-RAISED_M, RAISED_UP = 0.45, -0.1
+RAISED_M, RAISED_UP = 0.35, -0.5
 """Rise (m) of a raised tracker, and component of a raised hand's direction along the vertical."""
-NO_CONTROLLER_DEG = 70.0
+NO_CONTROLLER_DEG = 50.0
 """Angle between a hanging hand and a controller's nominal seat above which it is no controller that is held."""
 MAX_DEVICES = 32
 """Most devices that are looked at."""
@@ -143,24 +143,30 @@ class FirstMinute:
             case HeadSample(T_world_device=pose):
                 if packets.number_fault(sample.floor_height, packets.MAX_POSITION_M) is None:
                     self._own_floor_m = float(sample.floor_height)  # pyright: ignore[reportArgumentType]
-                self._add(HEAD, sample.timestamp, pose, False)
+                if isinstance(pose, Rigid):
+                    self._add(HEAD, sample.timestamp, pose.R, pose.t, False)
             case WristSample(T_world_joint=pose) if self.tracked:
-                self._add(device, sample.timestamp, pose, False)
+                if isinstance(pose, Rigid):
+                    self._add(device, sample.timestamp, pose.R, pose.t, False)
             case WatchSample() if not self.tracked:
-                self._add(device, sample.timestamp, Rigid(sample.R_world_imu, sample.acc_world), True)
+                self._add(device, sample.timestamp, sample.R_world_imu, sample.acc_world, True)
             case _:
                 pass
         self.look(now_s)
 
-    def _add(self, device: str, time_s: object, pose: object, watch: bool) -> None:
-        if packets.time_fault(time_s) or packets.pose_fault(pose) or not isinstance(pose, Rigid):
+    def _add(self, device: str, time_s: Any, R: Any, v: Any, watch: bool) -> None:
+        """Keep a device's sample if it is valid."""
+        if (
+            packets.time_fault(time_s)
+            or packets.rotation_fault(R)
+            or packets.values_fault(v, (3,), packets.MAX_POSITION_M)
+        ):
             return
         if device not in self._seen:
             if len(self._seen) >= MAX_DEVICES:
                 return
             self._seen[device] = Seen(watch)
-        owned = packets.owned_pose(pose)
-        self._seen[device].add(float(time_s), owned.R, owned.t)  # pyright: ignore[reportArgumentType]
+        self._seen[device].add(float(time_s), packets.owned(R), packets.owned(v))
 
     def look(self, now_s: float) -> None:
         """Go on with what has been seen; to be called now and then also when no samples come."""
@@ -236,7 +242,8 @@ class FirstMinute:
             self._measured = early is not None and self._measure(early.v[:, 2].median().item())
         elif not self._measured and head is not None and self._is_standing(head):
             self._measured = self._measure(head.v[:, 2].median().item())
-        arms = not self._wrists or (head is not None and self._see_arms(head, waited))
+        placed = not self._missing and (self.tracked or not self._wrists)
+        arms = placed or (head is not None and self._see_arms(head, waited))
         late = waited > (DEVICES_S if self._missing or not arms else SOON_S)
         if (self._measured and arms) or late:
             if not self._measured:
