@@ -1,0 +1,114 @@
+"""State of a running capture, as its page and its report show it, and what a page may ask of the capture."""
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.geometry.rigid import Rigid
+
+Stage = Literal["waiting", "first minute", "live", "away"]
+"""Of a wearer: nothing has come yet; the set-up is being found; poses come; packets have stopped."""
+STAGES: tuple[Stage, ...] = ("waiting", "first minute", "live", "away")
+MAX_POINTS = 50_000
+"""Most points of the surroundings in a status: the newest."""
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Quantiles (ms) of the time from a packet's device time to the pose that leaves; NaN before the first pose."""
+
+    median_ms: float = float("nan")
+    p95_ms: float = float("nan")
+    p99_ms: float = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceStatus:
+    """One device of a wearer."""
+
+    name: str
+    """Joint, "head", or serial, as packets name it."""
+    hz: float
+    """Rate of its packets over the last seconds."""
+    T_world_device: Rigid | None = None
+    """Newest pose in the head's world, R "3 3", t "3" (m); None where there is none. Of a watch, t may be NaN."""
+    last_s_ago: float = float("inf")
+    """Time (s) since its newest packet."""
+
+
+@dataclass(frozen=True, eq=False)
+class WearerStatus:
+    """One wearer."""
+
+    name: str
+    """As packets name the wearer; "" where a source serves one person."""
+    stage: Stage
+    step: str | None = None
+    """What to do now, as a sentence, while the first minute is guided."""
+    progress: float = 0.0
+    """Of the step, 0…1."""
+    devices: tuple[DeviceStatus, ...] = ()
+    latency: Latency = Latency()
+    frames: int = 0
+    """Number of poses so far."""
+    dropped: int = 0
+    """Number of packets dropped because the capture was slow."""
+    late: int = 0
+    """Number of packets that came too late to be used."""
+    gaps: int = 0
+    """Number of gaps in the head's path."""
+    floor_m: float | None = None
+    """Floor height (m) in the head's world."""
+    points_world: Float[Tensor, "point 3"] | None = None
+    """Newest points of the surroundings (m), at most `MAX_POINTS`; the same tensor while nothing new has come."""
+    notes: tuple[str, ...] = ()
+    """How the set-up was found, and what is wrong with it."""
+
+
+@dataclass(frozen=True)
+class SinkStatus:
+    """One sink."""
+
+    name: str
+    sent: int = 0
+    """Number of frames that it took."""
+    dropped: int = 0
+    """Number of pieces dropped because it was slow."""
+    failed: int = 0
+    """Number of pieces that it could not take."""
+    last_error: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class LiveStatus:
+    """A running capture at one moment."""
+
+    wearers: tuple[WearerStatus, ...] = ()
+    sinks: tuple[SinkStatus, ...] = ()
+    recording: str | None = None
+    """Where it is being recorded; None: it is not."""
+    seconds: float = 0.0
+    """Time since it started."""
+
+
+class LiveControls(Protocol):
+    """What a page asks of the capture; every method returns at once and may be called from any thread."""
+
+    def status(self) -> LiveStatus: ...
+
+    def record(self, on: bool) -> None:
+        """Start or stop recording."""
+
+    def guide(self, wearer: str) -> None:
+        """Begin the guided first minute of a wearer, anew where there was one."""
+
+    def skip(self, wearer: str) -> None:
+        """Go on to the next step, with defaults for this one."""
+
+    def redo(self, wearer: str) -> None:
+        """Begin the step again."""
+
+    def stop(self) -> None:
+        """End the capture."""
