@@ -2,9 +2,10 @@
 
 from wearcap.errors import WearcapError, nearest
 from wearcap.live.source import Address, Source
+from wearcap.live.sources.mvn import MvnSource
 from wearcap.live.sources.osc import OscTrackerSource, VmcSource
 
-SOURCES: dict[str, type[Source]] = {source.scheme: source for source in (VmcSource, OscTrackerSource)}
+SOURCES: dict[str, type[Source]] = {source.scheme: source for source in (VmcSource, OscTrackerSource, MvnSource)}
 """Sources by the scheme of their addresses."""
 
 
