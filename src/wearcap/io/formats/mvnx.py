@@ -42,13 +42,13 @@ _SIDED = {
     "foot": "ankle",
     "toe": "toe",
 }
-_JOINT_OF = {name: name for name in ("pelvis", "l5", "l3", "t12", "t8", "neck", "head")} | {
+JOINT_OF = {name: name for name in ("pelvis", "l5", "l3", "t12", "t8", "neck", "head")} | {
     side + segment: f"{side}_{joint}" for side in ("left", "right") for segment, joint in _SIDED.items()
 }
 """Segment or sensor label (lower case, no spaces) to joint."""
-_LABEL_OF = {joint: label for label, joint in _JOINT_OF.items()}
+_LABEL_OF = {joint: label for label, joint in JOINT_OF.items()}
 
-_SITE_OF = {"ptopofhead": "crown"} | {
+SITE_OF = {"ptopofhead": "crown"} | {
     f"p{side}{point}": f"{side}_{site}"
     for side in ("left", "right")
     for point, site in (("heelfoot", "heel"), ("toe", "toe_tip"), ("topofhand", "fingertip"))
@@ -93,11 +93,11 @@ class _File:
             if not 0 < self.fps < 1e5:
                 raise ValueError(f"a frame rate of {self.fps} Hz")
         elif name == "segment":
-            label = _plain(element.attrib["label"])
+            label = plain_label(element.attrib["label"])
             self.segments.append(label)
             for point in (child for child in element.iter() if tag_of(child) == "point"):
                 text = next((child.text or "" for child in point if tag_of(child) == "pos_b"), "")
-                self.points[_plain(point.attrib["label"])] = (label, finite_floats(text.split()).tolist())
+                self.points[plain_label(point.attrib["label"])] = (label, finite_floats(text.split()).tolist())
         elif name == "frame":
             try:
                 self.take_frame(element)
@@ -106,7 +106,7 @@ class _File:
                 raise ValueError(f"{label}: {error}") from error
         else:
             items = self.sensors if name == "sensor" else self.contacts
-            items.append(_plain(element.attrib["label"]))
+            items.append(plain_label(element.attrib["label"]))
 
     def take_frame(self, element: Element) -> None:
         kind = element.get("type", "normal")
@@ -128,7 +128,7 @@ class _File:
             self.frames[name].append(found.astype(np.float32) if name != "position" else found)
 
     def require_segments(self) -> None:
-        if missing := sorted(set(_JOINT_OF) - set(self.segments)):
+        if missing := sorted(set(JOINT_OF) - set(self.segments)):
             raise WearcapError(f"segments {missing[:5]} are missing", self.path, "the 23 segments of a full-body suit")
 
     def numbers(self, name: str, text: str) -> np.ndarray:
@@ -196,7 +196,8 @@ class _Chunks:
         self._size = _CHUNK
 
 
-def _plain(label: str) -> str:
+def plain_label(label: str) -> str:
+    """A label as `JOINT_OF` and `SITE_OF` have it."""
     return label.replace(" ", "").replace("_", "").lower()
 
 
@@ -235,7 +236,7 @@ def _recording(file: _File) -> Recording:
         parts["acc_world"] = file.column("sensorFreeAcceleration", 3)
     if file.frames["sensorOrientation"]:
         parts["R_world_imu"] = matrix_from_quat_wxyz(_quaternions(file, "sensorOrientation"))
-    known = [(k, _JOINT_OF[label]) for k, label in enumerate(file.sensors if parts else []) if label in _JOINT_OF]
+    known = [(k, JOINT_OF[label]) for k, label in enumerate(file.sensors if parts else []) if label in JOINT_OF]
     imu = {
         joint: ImuStream(timestamps, joint, **{name: part[:, k].contiguous() for name, part in parts.items()})
         for k, joint in known
@@ -269,6 +270,14 @@ def _quaternions(file: _File, name: str) -> Float[Tensor, "time segment 4"]:
     return quat_wxyz
 
 
+def bone_offsets(
+    skeleton: Skeleton, R_world: Float[Tensor, "*batch joint 3 3"], t_world: Float[Tensor, "*batch joint 3"]
+) -> Float[Tensor, "*batch joint 3"]:
+    """Each joint's position in its parent's frame (m); the root's is zero."""
+    parents = [max(parent, 0) for parent in skeleton.parents]
+    return (R_world[..., parents, :, :].mT @ (t_world - t_world[..., parents, :])[..., None])[..., 0]
+
+
 def _fitted(
     file: _File,
     skeleton: Skeleton,
@@ -277,17 +286,14 @@ def _fitted(
     t_world: Float[Tensor, "time joint 3"],
 ) -> Skeleton:
     """The wearer's bones: from the identity or T-pose frame, else from the median over the motion."""
-    parents = [max(parent, 0) for parent in skeleton.parents]
-
-    def bones(R: Tensor, t: Tensor) -> Tensor:
-        return (R[..., parents, :, :].mT @ (t - t[..., parents, :])[..., None])[..., 0]
-
-    moving = bones(R_world, t_world)
+    moving = bone_offsets(skeleton, R_world, t_world)
     offsets = moving.median(0).values
     for kind in reversed(_REST_TYPES):
         if {"orientation", "position"} <= set(file.rest.get(kind, {})):
             R = matrix_from_quat_wxyz(torch.from_numpy(file.rest[kind]["orientation"]).unflatten(0, (-1, 4)))[rows]
-            offsets = bones(R, torch.from_numpy(file.rest[kind]["position"]).unflatten(0, (-1, 3))[rows])
+            offsets = bone_offsets(
+                skeleton, R, torch.from_numpy(file.rest[kind]["position"]).unflatten(0, (-1, 3))[rows]
+            )
     change = (moving - offsets).norm(dim=-1).amax(0)
     if change.max() > BONE_CHANGE_M:
         worst = skeleton.joint_names[int(change.argmax())]
@@ -297,8 +303,8 @@ def _fitted(
         )
     fitted = skeleton.with_offsets(offsets.float())
     points = {
-        _SITE_OF[label]: Site(_JOINT_OF[segment], tuple(at))
+        SITE_OF[label]: Site(JOINT_OF[segment], tuple(at))
         for label, (segment, at) in file.points.items()
-        if label in _SITE_OF and segment in _JOINT_OF and len(at) == 3
+        if label in SITE_OF and segment in JOINT_OF and len(at) == 3
     }
     return replace(fitted, sites=fitted.sites | points)
