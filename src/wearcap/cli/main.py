@@ -11,7 +11,7 @@ from wearcap import __version__
 from wearcap.errors import WearcapError, nearest
 from wearcap.io.formats.bounded import VARIABLE, gib_bytes
 
-VERBS = "train evaluate capture export prepare view render annotate scene calibrate track doctor demo".split()  # noqa: SIM905
+VERBS = "train evaluate capture live export prepare view render annotate scene calibrate track doctor demo".split()  # noqa: SIM905
 """Verbs in the order of the help, each a module."""
 USER_ERROR, INTERRUPTED = 2, 130
 

@@ -2,7 +2,7 @@
 
 import threading
 from collections import Counter, deque
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from wearcap.sensors.samples import HeadSample, LocalizationSample, SuitPiece, WatchSample, WristSample
 
@@ -64,12 +64,12 @@ class Inbox:
             self._packets.clear()
             return found
 
+    @property
+    def waiting(self) -> int:
+        """Number of packets that wait."""
+        return len(self._packets)
+
     def wake(self) -> None:
         """End a `wait`."""
         with self._ready:
             self._ready.notify()
-
-
-def same(packet: Packet, **changed: Any) -> Packet:
-    """The packet with other values of its sample."""
-    return packet._replace(sample=packet.sample._replace(**changed))

@@ -16,6 +16,8 @@ class Sink:
 
     name: str
     """Name in messages and counters."""
+    waiting: int = 0
+    """Pieces that wait for the sink, kept by its thread."""
     convention: str
     """Axes and units of what is sent, as text for people."""
 
@@ -43,6 +45,8 @@ class SinkThread:
         self.sink, self.capacity = sink, capacity
         self.dropped = 0
         """Number of pieces dropped because the sink was slow."""
+        self.sent = 0
+        """Number of frames that the sink took."""
         self.failed = 0
         """Number of pieces that the sink could not take."""
         self.last_error = ""
@@ -60,7 +64,11 @@ class SinkThread:
         self._put(False, lambda: self.sink.begin(wearer, skeleton, fps))
 
     def take(self, wearer: str, motion: Motion) -> None:
-        self._put(True, lambda: self.sink.take(wearer, motion))
+        def take() -> None:
+            self.sink.take(wearer, motion)
+            self.sent += len(motion)
+
+        self._put(True, take)
 
     def end(self, wearer: str) -> None:
         self._put(False, lambda: self.sink.end(wearer))
@@ -88,6 +96,7 @@ class SinkThread:
                 while not (self._calls or self._closing):
                     self._ready.wait()
                 call = self._calls.popleft()[1] if self._calls else None
+                self.sink.waiting = len(self._calls)
             if call is None:
                 break
             self._try(call)

@@ -170,7 +170,16 @@ class System(ABC):
 
     def stream(self, *args: Any, **kwargs: Any) -> Any:
         """A streaming capture of one or several wearers: the `runtime.session.Session` of the system's `stream.py`."""
-        return self._room("stream", "captures streams").SESSION(self, *args, **kwargs)
+        return self.session_class()(self, *args, **kwargs)
+
+    def session_class(self) -> Any:
+        """Class of `stream`'s session, a `runtime.session.Session`. Raises WearcapError for a system without streams."""
+        return self._room("stream", "captures streams").SESSION
+
+    @property
+    def fps(self) -> float:
+        """Frame rate of captures (Hz). Raises WearcapError for a system that does not stream."""
+        raise WearcapError(f"pipeline {self.name!r} is none that captures streams", fix="Choose another pipeline=….")
 
     @property
     def latency_s(self) -> float:

@@ -1,1 +1,24 @@
 """Sinks: where live motion goes, one protocol or kind of file a module."""
+
+from wearcap.errors import WearcapError, nearest
+from wearcap.live.sink import Sink
+from wearcap.live.sinks.vmc import VmcSink
+from wearcap.live.sinks.websocket import WebSocketSink
+from wearcap.live.source import Address
+
+SINKS: dict[str, tuple[type, int]] = {"vmc": (VmcSink, 39539), "ws": (WebSocketSink, 9102)}
+"""Sinks by the scheme of their addresses, with their default ports."""
+
+
+def sink_of(text: str, host: str, pace: bool) -> Sink:
+    """The sink of an address ("vmc://127.0.0.1:39539"); `pace`: whether frames are sent at their own rate.
+
+    Raises WearcapError for an unknown scheme and for anything that is no address.
+    """
+    scheme, separator, _ = text.partition("://")
+    if scheme not in SINKS:
+        raise WearcapError(
+            f"no sink is called {scheme[:40]!r}", f"to={text[:80]}", "SCHEME://HOST:PORT", nearest(scheme, SINKS)
+        )
+    kind, port = SINKS[scheme]
+    return kind(Address.of(text if separator else f"{scheme}://", port, host), pace)

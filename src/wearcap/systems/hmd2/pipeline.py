@@ -129,6 +129,11 @@ class HMD2(LearnedSystem):
         return lookahead_frames
 
     @property
+    def fps(self) -> float:
+        """Frame rate of captures (Hz)."""
+        return self.model.fps
+
+    @property
     def latency_s(self) -> float:
         """Longest time between a frame and its final pose (s): a stride's first frame waits for its last."""
         refinement = 0 if self.refinement is None else self.refinement.lookahead

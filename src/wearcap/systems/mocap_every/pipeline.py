@@ -102,6 +102,11 @@ class MocapEvery(LearnedSystem):
             raise WearcapError(what, expected=expected)
 
     @property
+    def fps(self) -> float:
+        """Frame rate of captures (Hz)."""
+        return self.model.fps
+
+    @property
     def latency_s(self) -> float:
         """Longest time between a frame and its final pose (s), with the future frames of the watches' mean filter."""
         refinement = 0 if self.refinement is None else self.refinement.lookahead

@@ -1,0 +1,132 @@
+"""`wearcap live`: devices in, motion out, while people move."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, ListConfig
+from rich import print as show
+
+from wearcap.cli.conf import compose, hydra_main, load_pipeline
+from wearcap.errors import WearcapError, nearest
+from wearcap.live.capture import LiveCapture, write_report
+from wearcap.live.page import LivePage
+from wearcap.live.setup import Setup, read_setup
+from wearcap.live.sink import Sink
+from wearcap.live.sinks import sink_of
+from wearcap.live.sinks.files import FilesSink
+from wearcap.live.source import Source
+from wearcap.live.sources import source_of
+from wearcap.live.sources.replay import ReplaySource
+from wearcap.reading import read
+from wearcap.recording.store import dataset_folder
+from wearcap.runtime.system import CaptureInput, System
+from wearcap.viewer.guard import LOOPBACK
+
+HELP = "capture while people move: wearcap live system=hmd2 source=vmc://:39540 to=vmc://127.0.0.1:39539 view=true"
+
+
+def run(config: DictConfig) -> dict[str, Any]:
+    """Capture until interrupted, or until a replay has ended; returns the report."""
+    system = load_pipeline(config.checkpoint, config.pipeline, config.device, shared=True)
+    place = None
+    if config.recording is not None:
+        recording, folder = read(config.recording), dataset_folder(config.recording)
+        place = CaptureInput.in_dataset(recording, folder, config.scene, config.metres_per_unit)
+    sources, setup = _sources(config, system, place)
+    speed = float(config.speed)
+    sinks: list[Sink] = [sink_of(each, config.host, pace=speed <= 1) for each in _listed(config.to)]
+    page = LivePage(host=config.host, port=config.port) if config.view else None
+    setup_file = None if config.setup is None else Path(config.setup)
+    capture = LiveCapture(
+        system,
+        sources,
+        sinks if page is None else [*sinks, page],
+        source=place,
+        setup=setup,
+        height_m=config.height,
+        guided=config.guided,
+        setup_file=setup_file,
+        seed=config.seed,
+        recorder=FilesSink,
+        record=None if config.record is None else Path(config.record),
+    )
+    _tell(config, sources, sinks, page)
+    if page is not None:
+        page.attach(capture)
+    report = capture.run(float("inf") if config.seconds is None else float(config.seconds))
+    write_report(report, Path(config.report))
+    _summarize(report)
+    show(f"report: {config.report}")
+    return report
+
+
+def _sources(config: DictConfig, system: System, place: CaptureInput | None) -> tuple[list[Source], Setup | None]:
+    """The sources, and the set-up as far as it is known. Raises WearcapError for a replay without a recording."""
+    setup = read_setup(config.setup) if config.setup is not None and Path(config.setup).is_file() else None
+    sources: list[Source] = []
+    for text in _listed(config.source):
+        if text != "replay":
+            sources.append(source_of(text, config.host))
+            continue
+        if place is None:
+            raise WearcapError("source=replay without a recording", expected="recording=DATASET/NAME, or any file with one")
+        kind = system.session_class()
+        replay = ReplaySource(place.recording, kind.devices, kind.tracks_wrists, float(config.speed))
+        sources.append(replay)
+        if config.height is None and not config.guided:
+            setup = setup or replay.setup
+    if not sources:
+        raise WearcapError("no source", expected="source=replay, or source=vmc://:39540 …")
+    return sources, setup
+
+
+def _tell(config: DictConfig, sources: list[Source], sinks: list[Sink], page: LivePage | None) -> None:
+    """Say what listens where, loudly where other machines can reach it."""
+    for source in sources:
+        show(f"from {source.name}: {source.convention}", file=sys.stderr)
+    for sink in sinks:
+        show(f"to {getattr(sink, 'url', sink.name)}: {sink.convention}", file=sys.stderr)
+    open_sources = [source.name for source in sources if not source.loopback]
+    if config.host not in LOOPBACK or open_sources:
+        where = ", ".join(open_sources) or config.host
+        show(f"[bold red]OPEN TO OTHER MACHINES: {where} takes packets from anyone who reaches this address.", file=sys.stderr)
+    if page is not None:
+        show(f"open {page.url} (Ctrl+C ends)", file=sys.stderr)
+
+
+def _summarize(report: dict[str, Any]) -> None:
+    for name, wearer in report["wearers"].items():
+        latency = wearer["latency_ms"]
+        text = ", ".join(f"{key} {latency[key]:.0f}" for key in ("median", "p95", "p99"))
+        show(
+            f"{name}: {wearer['frames']} frames, latency {text} ms (the system's own: {latency['of_the_system']:.0f}), "
+            f"dropped {wearer['dropped']}, late {wearer['late']}, gaps {wearer['gaps']}"
+        )
+        for note in wearer["notes"]:
+            show(f"  {note}")
+    for reason, count in report["refused"].items():
+        show(f"refused {count} × {reason}")
+
+
+def _listed(value: Any) -> list[str]:
+    return [str(each) for each in value] if isinstance(value, list | ListConfig) else [str(value)]
+
+
+def with_system(arguments: list[str]) -> list[str]:
+    """Arguments with `system=NAME` as the choice of its pipeline. Raises WearcapError for an unknown system."""
+    systems = dict(compose("live").systems)
+    chosen = []
+    for argument in arguments:
+        key, _, name = argument.partition("=")
+        if key != "system":
+            chosen.append(argument)
+        elif name in systems:
+            chosen.append(f"pipeline={systems[name]}")
+        else:
+            raise WearcapError(f"no live system {name!r}", expected=", ".join(systems), fix=nearest(name, systems))
+    return chosen
+
+
+def main(arguments: list[str]) -> None:
+    hydra_main("live", run, with_system(arguments))

@@ -1,0 +1,297 @@
+"""A live capture: sources deliver packets, every wearer's session makes poses of them, sinks take them."""
+
+import asyncio
+import json
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from wearcap.errors import WearcapError
+from wearcap.files import write_text
+from wearcap.live.first_minute import FirstMinute
+from wearcap.live.packets import Inbox
+from wearcap.live.setup import Setup, write_setup
+from wearcap.live.sink import Sink, SinkThread
+from wearcap.live.source import Source
+from wearcap.live.status import LiveStatus, SinkStatus
+from wearcap.live.wearer import LiveWearer, Opener
+from wearcap.recording import Motion
+from wearcap.runtime.system import CaptureInput, System
+
+MAX_WEARERS = 8
+"""Most wearers; packets of further ones are counted as refused."""
+WAIT_S = 0.02
+"""Longest time without a look at who has left and what the page wishes."""
+RESTART_S = 2.0
+"""Time after which a source that failed is started again."""
+
+
+class LiveCapture:
+    """Runs until its sources end, `seconds` are over or `stop` is called. Its public methods may be called by any thread."""
+
+    def __init__(
+        self,
+        system: System,
+        sources: Sequence[Source],
+        sinks: Sequence[Sink],
+        *,
+        source: CaptureInput | None = None,
+        setup: Setup | None = None,
+        height_m: float | None = None,
+        guided: bool = False,
+        setup_file: Path | None = None,
+        seed: int = 0,
+        recorder: Callable[[Path], Sink] | None = None,
+        record: Path | None = None,
+    ):
+        """`source`: recording, scan and objects of the place, for systems that use them; `setup`: of every wearer, from the
+        beginning; `setup_file`: where what the first minute finds is kept; `recorder` makes the sink that writes to a
+        folder, from the start where `record` names one. Raises WearcapError for a system that does not stream.
+        """
+        self.system, self.sources = system, list(sources)
+        self.latency_s = system.latency_s
+        kind = system.session_class()
+        minute = lambda before, guide: FirstMinute(  # noqa: E731
+            kind.devices, tracked=kind.tracks_wrists, height_m=height_m, setup=before, guided=guide or guided
+        )
+        open_session = lambda wearer: kind.of_wearers(system, [wearer], seed, source)  # noqa: E731
+        self.opener = Opener(open_session, kind.devices, kind.tracks_wrists, system.fps, minute)
+        self.inbox = Inbox()
+        self.wearers: dict[str, LiveWearer] = {}
+        self.sinks = [SinkThread(sink) for sink in sinks]
+        self._setup, self._setup_file, self._guided = setup, setup_file, guided
+        self._recorder, self._recording = recorder, None
+        self._record_from_start = record
+        self._recorded: SinkThread | None = None
+        self._wishes: list[Callable[[], None]] = []
+        self._stopping = threading.Event()
+        self._began_s = time.monotonic()
+        self._failure: WearcapError | None = None
+        self._sources_done = threading.Event()
+
+    # --- running ----------------------------------------------------------------------------------------------------
+
+    def run(self, seconds: float = float("inf")) -> dict[str, Any]:
+        """Capture, and return the report. Raises WearcapError when a source or sink cannot be opened."""
+        getattr(self.system, "prepare", lambda: None)()
+        opened: list[SinkThread] = []
+        try:
+            for sink in self.sinks:
+                sink.start()
+                opened.append(sink)
+            if self._record_from_start is not None:
+                self._start_recording(self._record_from_start)
+            loop = asyncio.new_event_loop()
+            thread = threading.Thread(target=self._run_sources, args=(loop,), name="sources", daemon=True)
+            self._began_s = time.monotonic()
+            thread.start()
+            with suppress(KeyboardInterrupt):  # the user's way to end a capture: what has come is kept, and reported
+                self._loop(seconds)
+            loop.call_soon_threadsafe(lambda: [task.cancel() for task in asyncio.all_tasks(loop)])
+            thread.join(5.0)
+        finally:
+            for wearer in self.wearers.values():
+                self._send(wearer, wearer.leave())
+            self.record(False)
+            self._fulfil()
+            for sink in opened:
+                sink.close()
+        if self._failure is not None:
+            raise self._failure
+        return self.report()
+
+    def _loop(self, seconds: float) -> None:
+        while not self._stopping.is_set() and time.monotonic() - self._began_s < seconds:
+            done = self._sources_done.is_set()
+            self._step()
+            if done and not self.inbox.waiting:
+                return
+
+    def _step(self) -> None:
+        """One turn: wishes, packets, poses."""
+        self._fulfil()
+        for packet in self.inbox.wait(WAIT_S):
+            wearer = self.wearers.get(packet.wearer)
+            if wearer is None:
+                if len(self.wearers) >= MAX_WEARERS:
+                    self.inbox.refuse("capture", f"more than {MAX_WEARERS} wearers")
+                    continue
+                wearer = self.wearers[packet.wearer] = LiveWearer(packet.wearer, self.opener, self._setup)
+                if self._guided:
+                    wearer.guide()
+            before = wearer.stage
+            wearer.take(packet)
+            if before != "live" and wearer.stage == "live":
+                self._begin(wearer)
+        now_s = time.monotonic()
+        for wearer in self.wearers.values():
+            live = wearer.stage == "live"
+            self._send(wearer, wearer.poses(now_s))
+            if live and wearer.stage == "away":
+                self._each_sink(lambda sink, name=wearer.name: sink.end(name))
+
+    def _begin(self, wearer: LiveWearer) -> None:
+        assert wearer.skeleton is not None
+        for sink in self._all_sinks():
+            sink.begin(wearer.name, wearer.skeleton, self.system.fps)
+        if self._setup_file is not None and wearer.setup is not None and wearer.setup is not self._setup:
+            name = self._setup_file
+            write_setup(wearer.setup, name.with_stem(f"{name.stem}_{wearer.name}") if wearer.name else name)
+
+    def _send(self, wearer: LiveWearer, motions: list[Motion]) -> None:
+        for motion in motions:
+            self._each_sink(lambda sink, motion=motion: sink.take(wearer.name, motion))
+
+    def _all_sinks(self) -> list[SinkThread]:
+        return [*self.sinks, *([] if self._recorded is None else [self._recorded])]
+
+    def _each_sink(self, call: Callable[[SinkThread], None]) -> None:
+        for sink in self._all_sinks():
+            call(sink)
+
+    def _run_sources(self, loop: asyncio.AbstractEventLoop) -> None:
+        asyncio.set_event_loop(loop)
+
+        async def keep(source: Source) -> None:
+            while True:
+                try:
+                    return await source.run(self.inbox)
+                except WearcapError as error:
+                    if time.monotonic() - self._began_s < RESTART_S:  # it never ran: the user should know
+                        self._failure = error
+                        self._stopping.set()
+                        return None
+                    self.inbox.refuse(source.name, "failed, and is started again")
+                except OSError:
+                    self.inbox.refuse(source.name, "failed, and is started again")
+                await asyncio.sleep(RESTART_S)
+
+        async def every() -> None:
+            await asyncio.gather(*(keep(source) for source in self.sources))
+
+        try:
+            loop.run_until_complete(every())
+        except asyncio.CancelledError:
+            pass
+        finally:
+            self._sources_done.set()
+            self.inbox.wake()
+            loop.close()
+
+    # --- what a page may ask (`status.LiveControls`) ----------------------------------------------------------------
+
+    def status(self) -> LiveStatus:
+        sinks = tuple(
+            SinkStatus(each.sink.name, each.sent, each.dropped, each.failed, each.last_error)
+            for each in self._all_sinks()
+        )
+        wearers = tuple(wearer.status() for wearer in list(self.wearers.values()))
+        recording = None if self._recording is None else str(self._recording)
+        return LiveStatus(wearers, sinks, recording, time.monotonic() - self._began_s)
+
+    def record(self, on: bool) -> None:
+        """Start or stop recording."""
+        self._wish(lambda: self._start_recording(None) if on else self._stop_recording())
+
+    def guide(self, wearer: str) -> None:
+        """Begin the guided first minute of a wearer, anew where there was one."""
+        self._wish(lambda: self._guide(wearer))
+
+    def skip(self, wearer: str) -> None:
+        """Go on to the next step of the first minute, with defaults for this one."""
+        self._first(wearer, "skip")
+
+    def redo(self, wearer: str) -> None:
+        """Begin the step of the first minute again."""
+        self._first(wearer, "redo")
+
+    def stop(self) -> None:
+        """End the capture."""
+        self._stopping.set()
+        self.inbox.wake()
+
+    def _first(self, wearer: str, action: str) -> None:
+        def fulfil() -> None:
+            first = self.wearers[wearer].first if wearer in self.wearers else None
+            if first is not None:
+                getattr(first, action)()
+
+        self._wish(fulfil)
+
+    def _guide(self, name: str) -> None:
+        wearer = self.wearers.get(name)
+        if wearer is not None:
+            self._send(wearer, wearer.leave())
+            self._each_sink(lambda sink: sink.end(name))
+            wearer.guide()
+
+    def _wish(self, wish: Callable[[], None]) -> None:
+        self._wishes.append(wish)
+        self.inbox.wake()
+
+    def _fulfil(self) -> None:
+        while self._wishes:
+            self._wishes.pop(0)()
+
+    # --- recording --------------------------------------------------------------------------------------------------
+
+    def _start_recording(self, folder: Path | None) -> None:
+        if self._recorder is None or self._recorded is not None:
+            return
+        folder = folder or Path(f"live_{datetime.now():%Y-%m-%d_%H-%M-%S}")
+        sink = SinkThread(self._recorder(folder), capacity=100_000)
+        sink.start()
+        self._recorded, self._recording = sink, folder
+        for wearer in self.wearers.values():
+            if wearer.stage == "live" and wearer.skeleton is not None:
+                sink.begin(wearer.name, wearer.skeleton, self.system.fps)
+
+    def _stop_recording(self) -> None:
+        if self._recorded is not None:
+            self._recorded.close(60.0)
+        self._recorded = self._recording = None
+
+    # --- report -----------------------------------------------------------------------------------------------------
+
+    def report(self) -> dict[str, Any]:
+        """Latencies, rates and counts as plain data."""
+        status = self.status()
+        wearers = {}
+        for each in status.wearers:
+            live = self.wearers[each.name]
+            wearers[each.name or "wearer"] = {
+                "frames": each.frames,
+                "latency_ms": {
+                    "median": each.latency.median_ms,
+                    "p95": each.latency.p95_ms,
+                    "p99": each.latency.p99_ms,
+                    "of_the_system": 1000 * self.latency_s,
+                },
+                "dropped": each.dropped,
+                "late": each.late,
+                "gaps": each.gaps,
+                "unknown": live.unknown,
+                "clock_restarts": live.clocks.restarts,
+                "refused": live.refused,
+                "notes": list(each.notes),
+            }
+        sinks = {
+            each.name: {"sent": each.sent, "dropped": each.dropped, "failed": each.failed} for each in status.sinks
+        }
+        return {
+            "seconds": round(status.seconds, 3),
+            "wearers": wearers,
+            "sinks": sinks,
+            "refused": dict(self.inbox.refused),
+            "overflowed": self.inbox.overflowed,
+        }
+
+
+def write_report(report: dict[str, Any], path: Path) -> None:
+    """Write a report as JSON; a quantile without poses is null."""
+    text = json.dumps(json.loads(json.dumps(report), parse_constant=lambda _: None), indent=1)
+    write_text(path, text + "\n")

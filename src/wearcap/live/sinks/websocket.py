@@ -1,0 +1,160 @@
+"""The body as JSON over WebSocket, to any number of clients.
+
+The first message of a client describes each wearer: {"skeleton": {"wearer", "joints", "parents", "offsets"}, "fps"}; every
+frame follows as {"wearer", "time", "root": [x, y, z], "rotations_wxyz": [[w, x, y, z], …], "contact": [0…1 of left heel,
+left toe tip, right heel, right toe tip] or null}: rotations relative to the parent joint, in wearcap's axes (z up, metres).
+"""
+
+import asyncio
+import json
+import threading
+from http import HTTPStatus
+from typing import Any
+
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.http11 import Request, Response
+
+from wearcap.body.skeleton import Skeleton
+from wearcap.errors import WearcapError
+from wearcap.geometry.rotation import quat_wxyz_from_matrix
+from wearcap.live.pacing import Pacing
+from wearcap.live.sink import Sink
+from wearcap.live.source import Address
+from wearcap.recording import Motion
+from wearcap.viewer.guard import LOOPBACK, Guard, Refused
+
+MAX_CLIENTS = 16
+MAX_WAITING_BYTES = 1 << 20
+"""Bytes that may wait for one client; a client that reads more slowly is disconnected."""
+
+
+class WebSocketSink(Sink):
+    """Serves frames on an address; beyond loopback a client gives the token of the printed address."""
+
+    convention = "JSON; wearcap's axes (x forward, y left, z up), metres, quaternions wxyz"
+
+    def __init__(self, address: Address, pace: bool = True):
+        self.address, self.guard = address, Guard(address.host)
+        self.name = f"ws://{address.host}:{address.port}"
+        self._pacing, self._step_s = Pacing(pace), 1 / 60
+        self._loop = asyncio.new_event_loop()
+        self._server: Server | None = None
+        self._clients: set[ServerConnection] = set()
+        self._about: dict[str, str] = {}
+        self.slow = 0
+        """Number of clients disconnected because they read too slowly."""
+
+    @property
+    def url(self) -> str:
+        """Address for clients, with the token where one is needed."""
+        if self.address.host in LOOPBACK:
+            return self.name
+        return self.guard.url(self.address.port).replace("http://", "ws://", 1)
+
+    def open(self) -> None:
+        ready: list[Any] = []
+        done = threading.Event()
+
+        async def begin() -> None:
+            try:
+                ready.append(
+                    await serve(
+                        self._client,
+                        self.address.host,
+                        self.address.port,
+                        process_request=self._admit,
+                        max_size=1024,
+                        compression=None,
+                    )
+                )
+            except OSError as error:
+                ready.append(error)
+            done.set()
+
+        def run() -> None:
+            asyncio.set_event_loop(self._loop)
+            self._loop.create_task(begin())
+            self._loop.run_forever()
+
+        threading.Thread(target=run, name=self.name, daemon=True).start()
+        done.wait()
+        if isinstance(ready[0], OSError):
+            what = f"cannot serve here ({ready[0].strerror or ready[0]})"
+            raise WearcapError(what, self.name, fix="Choose another port.") from ready[0]
+        self._server = ready[0]
+
+    def begin(self, wearer: str, skeleton: Skeleton, fps: float) -> None:
+        self._step_s = 1 / fps
+        offsets = [[round(each, 6) for each in row] for row in skeleton.t_parent_joint.tolist()]
+        names, parents = list(skeleton.joint_names), list(skeleton.parents)
+        about = {"wearer": wearer, "joints": names, "parents": parents, "offsets": offsets}
+        text = json.dumps({"skeleton": about, "fps": fps})
+        self._loop.call_soon_threadsafe(self._describe, wearer, text)
+
+    def take(self, wearer: str, motion: Motion) -> None:
+        wxyz = quat_wxyz_from_matrix(motion.R_parent_joint.double())
+        contacts = motion.contact_prob
+        for k, time_s in enumerate(motion.timestamps.tolist()):
+            frame = {
+                "wearer": wearer,
+                "time": time_s,
+                "root": [round(each, 5) for each in motion.t_world_root[k].tolist()],
+                "rotations_wxyz": [[round(each, 6) for each in row] for row in wxyz[k].tolist()],
+                "contact": None if contacts is None else [round(each, 3) for each in contacts[k].tolist()],
+            }
+            self._pacing.wait(self._step_s, self.waiting > 1)
+            self._loop.call_soon_threadsafe(self._broadcast, json.dumps(frame))
+
+    def end(self, wearer: str) -> None:
+        self._loop.call_soon_threadsafe(self._leave, wearer)
+
+    def close(self) -> None:
+        if self._server is not None:
+            self._loop.call_soon_threadsafe(self._server.close)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+
+    def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Refuses other sites' pages, clients without the token beyond loopback, and too many of them."""
+        if len(self._clients) >= MAX_CLIENTS:
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "too many clients\n")
+        if self.address.host in LOOPBACK and request.headers.get("Origin") is None:
+            return None  # programs of this machine; a browser always names its page's origin
+        try:
+            self.guard.admit(request.path, request.headers)
+        except Refused as refused:
+            return connection.respond(HTTPStatus.FORBIDDEN, f"{refused}\n")
+        return None
+
+    async def _client(self, connection: ServerConnection) -> None:
+        self._clients.add(connection)
+        try:
+            for about in list(self._about.values()):
+                await connection.send(about)
+            async for _ in connection:  # whatever a client says is ignored
+                pass
+        finally:
+            self._clients.discard(connection)
+
+    def _describe(self, wearer: str, text: str) -> None:
+        self._about[wearer] = text
+        self._broadcast(text)
+
+    def _leave(self, wearer: str) -> None:
+        self._about.pop(wearer, None)
+        self._broadcast(json.dumps({"left": wearer}))
+
+    def _broadcast(self, text: str) -> None:
+        for client in list(self._clients):
+            if client.transport.get_write_buffer_size() > MAX_WAITING_BYTES:
+                self.slow += 1
+                self._clients.discard(client)
+                client.transport.abort()
+                continue
+            self._loop.create_task(_sent(client, text))
+
+
+async def _sent(client: ServerConnection, text: str) -> None:
+    try:
+        await asyncio.wait_for(client.send(text), 5.0)
+    except Exception:  # the client has left
+        client.transport.abort()
