@@ -92,9 +92,9 @@ class Show:
             while not self.stopped.is_set() and (now := time.monotonic() - begin) < seconds:
                 until = int(now * FPS)
                 while self._frame + PIECE <= min(until, min(len(motion) for motion in self.persons.values())):
-                    piece = slice(self._frame, self._frame + PIECE)
+                    piece = (self._frame, self._frame + PIECE)
                     for name, motion in self.persons.items():
-                        sink.take(name, motion[piece])
+                        sink.take(name, motion.sliced(*piece))
                     self._frame += PIECE
                 time.sleep(0.02)
 

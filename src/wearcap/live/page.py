@@ -15,6 +15,7 @@ from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
 from wearcap.geometry.rotation import quat_wxyz_from_matrix
+from wearcap.live.packets import HEAD
 from wearcap.live.page_panel import Panel, fitting
 from wearcap.live.playout import Playout
 from wearcap.live.sink import Sink
@@ -28,10 +29,10 @@ MAX_WEARERS, MAX_DEVICES = 16, 16
 """Most wearers, and most devices of each, that are drawn."""
 PANEL_S, POINTS_S = 0.25, 1.0
 """Times (s) between updates of the panel, and of the points."""
-SOON_S = 0.1
-"""Time (s) for which the camera takes to follow."""
-CAMERA_M = np.array([2.3, 1.9, 0.55])
-"""Where the camera stands at first, from the person."""
+SOON_S = 0.3
+"""Time (s) that the camera takes to follow."""
+LOOK_AT_M, CAMERA_M = (0.0, -0.3, 0.9), (2.2, 1.5, 1.35)
+"""Where the camera looks and stands at first, from the floor below the person; the panel covers the right side."""
 AXES_M = 0.13
 _NOTHING = LiveStatus()
 
@@ -89,7 +90,7 @@ class _Person:
 
     def _build(self, server: viser.ViserServer, name: str, motion: Motion) -> None:
         """Nodes for a skeleton; those of an earlier one are replaced. Pieces of one motion have one skeleton."""
-        node = f"person_{self.number}"
+        node = f"world/person_{self.number}"
         if self.body is None or self.skeleton != motion.skeleton:
             self.remove_body()
             self.body = BodyLayer(server, node, motion, surface_or_sticks(motion.skeleton, {}), self.color)
@@ -117,7 +118,7 @@ class _Person:
             if device.name not in self.devices:
                 if place is None or len(self.devices) >= MAX_DEVICES:
                     continue
-                node = f"/person_{self.number}_devices/{number}_{len(self.devices)}"
+                node = f"/world/person_{self.number}_devices/{number}_{len(self.devices)}"
                 frame = server.scene.add_frame(node, axes_length=AXES_M, axes_radius=0.006, origin_radius=0.012)
                 label = server.scene.add_label(
                     f"{node}/name", fitting(device.name).replace("_", " "), anchor="bottom-left", font_screen_scale=0.8
@@ -165,11 +166,15 @@ class LivePage(ServedPage, Sink):
         self._lock = threading.Lock()
         self._status, self._panel_s, self._points_s = _NOTHING, -math.inf, -math.inf
         self._points: list[Tensor] = []
+        # The capture's world moves below a camera that stays: cameras report where they are too late to be moved along.
+        self._worlds = [self.server.scene.add_frame(node, show_axes=False) for node in ("/world", "/surroundings")]
         self._floor = self.server.scene.add_grid(
-            "/floor", infinite_grid=True, fade_distance=25.0, section_color=(170, 170, 170)
+            "/world/floor", infinite_grid=True, fade_distance=25.0, section_color=(170, 170, 170)
         )
         self._panel = Panel(self.server, controls)
         self._focus: np.ndarray | None = None
+        """Place on the floor (m, the capture's world) that the camera follows."""
+        self.server.initial_camera.look_at, self.server.initial_camera.position = LOOK_AT_M, CAMERA_M
         self._drawn_s = 0.0
         self._thread = threading.Thread(target=self.run, name="page", daemon=True)
 
@@ -280,33 +285,24 @@ class LivePage(ServedPage, Sink):
         if len(every):
             add_points(self.server, PointCloud(every))
         else:
-            self.server.scene.remove_by_name("/surroundings")
+            self.server.scene.remove_by_name("/surroundings/points")
 
     def _has_points(self, wearer: WearerStatus) -> bool:
         person = self._persons.get(wearer.name)
         return wearer.points_world is not None and len(wearer.points_world) > 0 and (person is None or person.shown)
 
     def _follow(self, persons: dict[str, _Person], now_s: float) -> None:
-        """Move the cameras along with the persons that are shown; to the first one at once."""
-        roots = [
-            np.asarray(one.body.handle.position) for one in persons.values() if one.body is not None and one.visible
-        ]
-        if not roots:
+        """Keep the middle of the persons that are shown, or of their heads, where the camera looks; the first one at once."""
+        bodies = [one.body.handle for one in persons.values() if one.body is not None and one.visible]
+        heads = [one.devices[HEAD][0] for one in persons.values() if HEAD in one.devices and one.shown]
+        roots = [np.asarray(handle.position) for handle in bodies or heads]
+        if not roots or (self._focus is not None and not self._panel.follow.value):
             return
         middle = np.mean(roots, axis=0)
-        if self._focus is None:
-            self._focus = middle
-            self.server.initial_camera.look_at = tuple(middle)
-            self.server.initial_camera.position = tuple(middle + CAMERA_M)
-            for client in self.server.get_clients().values():
-                client.camera.position, client.camera.look_at = middle + CAMERA_M, middle
-            return
-        share = 1 - math.exp(-max(now_s - self._drawn_s, 0.0) / SOON_S)
-        moved = share * (middle - self._focus)
-        moved[2] *= 0.2  # the head's bobbing need not shake the picture
-        self._focus = self._focus + moved
-        self.server.initial_camera.look_at = tuple(self._focus)
-        self.server.initial_camera.position = tuple(self._focus + CAMERA_M)
-        if self._panel.follow.value and np.linalg.norm(moved) > 1e-4:
-            for client in self.server.get_clients().values():
-                client.camera.position = client.camera.position + moved  # its look-at point is carried along
+        middle[2] = self._floor.position[2]
+        share = 1.0 if self._focus is None else 1 - math.exp(-max(now_s - self._drawn_s, 0.0) / SOON_S)
+        focus = middle if self._focus is None else self._focus + share * (middle - self._focus)
+        if self._focus is None or np.linalg.norm(focus - self._focus) > 1e-4:
+            self._focus = focus
+            for frame in self._worlds:
+                frame.position = -focus
