@@ -1,7 +1,7 @@
 """State of a running capture, as its page and its report show it, and what a page may ask of the capture."""
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -93,6 +93,7 @@ class LiveStatus:
     """Time since it started."""
 
 
+@runtime_checkable
 class LiveControls(Protocol):
     """What a page asks of the capture; every method returns at once and may be called from any thread."""
 

@@ -1,0 +1,266 @@
+"""The live page: even playing, what it draws and shows, and its buttons in a real browser."""
+
+import time
+import urllib.error
+import urllib.request
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from live_show import FPS, PIECE, Show, walking
+from wearcap.body.skeleton import skeleton_of_height
+from wearcap.geometry import rotation
+from wearcap.live.page import MAX_WEARERS, LivePage
+from wearcap.live.page_panel import sinks_html, wearer_html
+from wearcap.live.playout import BEHIND_S, Playout
+from wearcap.live.status import Latency, LiveStatus, SinkStatus, WearerStatus
+from wearcap.viewer.page import COLORS
+from wearcap_browser import Chromium, chromium
+
+NASTY = "<img src=x onerror=\"document.title='broken'\">"
+
+
+def pieces(motion, size=PIECE):
+    return [motion.sliced(start, start + size) for start in range(0, len(motion) - size + 1, size)]
+
+
+@pytest.fixture
+def show():
+    return Show({"anna": walking(60.0), "ben": walking(60.0, 1.3)})
+
+
+@pytest.fixture
+def page(show):
+    page = LivePage(show, port=18180)
+    yield page
+    show.stopped.set()
+    page.stop()
+
+
+# --- playing -------------------------------------------------------------------------------------------------------
+
+
+def test_pieces_are_played_evenly():
+    """Ten frames at once, 33 ms late or early: what is shown moves on by about the screen's step every time."""
+    playout, parts, shown, random = Playout(), pieces(walking(8.0)), [], np.random.default_rng(2)
+    due = [part.timestamps[-1].item() + 0.033 * random.uniform(-1, 1) for part in parts]
+    for now_s in np.arange(0.5, 7.5, 1 / 30):
+        while parts and due[0] <= now_s:
+            playout.put(parts.pop(0))
+            due.pop(0)
+        if (found := playout.step(now_s)) is not None:
+            motion, shown_s = found
+            assert motion.timestamps[0] - 1.01 / FPS <= shown_s <= motion.timestamps[-1]
+            shown.append(shown_s)
+    steps = np.diff(shown)[30:]
+    assert steps.min() > 0.6 / 30
+    assert steps.max() < 1.4 / 30
+    assert playout.behind_s < 0.35
+    assert playout.dropped_s == 0
+
+
+def test_what_a_slow_screen_misses_is_dropped():
+    playout = Playout()
+    for part in pieces(walking(4.0)):
+        playout.put(part)
+    playout.step(0.0)
+    for part in pieces(replace(walking(9.0), timestamps=walking(9.0).timestamps + 4.0)):
+        playout.put(part)
+    _, shown_s = playout.step(0.1)
+    assert shown_s > 12.0
+    assert playout.dropped_s > 5.0
+    assert playout.behind_s < BEHIND_S
+
+
+def test_a_clock_that_is_set_anew_and_no_frames():
+    playout, parts = Playout(), pieces(walking(2.0))
+    assert playout.step(1.0) is None
+    playout.put(parts[8])
+    playout.step(1.0)
+    playout.put(parts[0])
+    assert playout.step(1.1)[1] <= parts[0].timestamps[-1]
+    playout.put(parts[0].sliced(0, 0))
+    playout.clear()
+    assert playout.step(1.2) is None
+
+
+# --- drawing -------------------------------------------------------------------------------------------------------
+
+
+def test_bones_are_the_joints_of_the_frame_that_is_shown(page, show):
+    motion = show.persons["anna"]
+    page.begin("anna", motion.skeleton, FPS)
+    page.take("anna", motion.sliced(0, 40))
+    page.draw(1.0)
+    person = page._persons["anna"]
+    shown_s = person.playout.step(1.0)[1]
+    truth = motion.T_world_joint[round(shown_s * FPS)]
+    handle = person.body.handle
+    placed = np.stack([bone.position for bone in handle.bones]) + handle.position
+    np.testing.assert_allclose(placed, truth.t.numpy(), atol=1e-5)
+    turned = torch.tensor(np.stack([bone.wxyz for bone in handle.bones]))
+    torch.testing.assert_close(rotation.matrix_from_quat_wxyz(turned).float(), truth.R, atol=1e-5, rtol=0)
+    assert person.feet is not None
+
+
+def test_devices_are_where_they_are_and_watches_at_their_wrists(page, show):
+    page.take("anna", show.persons["anna"].sliced(0, 1))
+    page.draw(1.0)
+    page.draw(1.1)
+    person = page._persons["anna"]
+    head, watch = (person.devices[name][0] for name in ("head", "left_wrist"))
+    motion, status = show.persons["anna"], show.status().wearers[0]
+    np.testing.assert_allclose(head.position, status.devices[0].T_world_device.t.numpy(), atol=1e-5)
+    np.testing.assert_allclose(watch.position, motion.joint("left_wrist").t[0].numpy(), atol=1e-5)
+    page._panel.devices.value = False
+    page.draw(1.2)
+    assert not head.visible
+
+
+def test_persons_have_their_own_colours_leave_and_come_back(page, show):
+    for name, motion in show.persons.items():
+        page.begin(name, motion.skeleton, FPS)
+        page.take(name, motion.sliced(0, 10))
+    page.draw(1.0)
+    anna, ben = page._persons["anna"], page._persons["ben"]
+    assert tuple(anna.body.handle.color) == COLORS[0]
+    assert tuple(ben.body.handle.color) == COLORS[1]
+    assert ben.body.handle.position[0] - anna.body.handle.position[0] == pytest.approx(1.3, abs=1e-5)
+    page.end("anna")
+    page.draw(1.1)
+    assert not anna.body.handle.visible
+    assert ben.body.handle.visible
+    taller = replace(show.persons["anna"].sliced(0, 10), skeleton=skeleton_of_height(1.95))
+    page.begin("anna", taller.skeleton, FPS)
+    page.take("anna", taller)
+    page.draw(1.2)
+    assert anna.body.handle.visible
+    assert anna.skeleton is taller.skeleton
+    page._panel.wearers["ben"].shown.value = False
+    page.draw(1.3)
+    assert not ben.body.handle.visible
+
+
+def test_take_only_stores_and_keeps_a_bounded_number(page, show):
+    """Without a thread that draws, as when the page stalls."""
+    parts = pieces(show.persons["anna"])
+    begin = time.perf_counter()
+    for number in range(2000):
+        page.take(f"wearer {number % 40}", parts[number % len(parts)])
+    assert time.perf_counter() - begin < 2.0
+    assert len(page._persons) == MAX_WEARERS
+    assert all(len(person.playout._pieces) <= 200 for person in page._persons.values())
+
+
+def test_what_goes_wrong_does_not_end_the_page(page, show):
+    original, calls = show.status, []
+
+    def status():
+        calls.append(1)
+        if len(calls) < 3:
+            raise RuntimeError("no status")
+        return original()
+
+    show.status = status
+    page.run(1.2)
+    assert page.errors == 2
+    assert page.last_error == "RuntimeError: no status"
+    assert page._panel.wearers.keys() == {"anna", "ben"}
+
+
+def test_the_floor_and_the_points_follow_the_status(page, show):
+    page._status = show.status()
+    page._show_points()
+    sent = page._points
+    page._show_points()
+    assert page._points is sent
+    show.points = show.points[:100].clone()
+    page._status = show.status()
+    page._show_points()
+    assert page._points is not sent
+    lower = replace(show.status().wearers[0], floor_m=-0.4)
+    page._status = LiveStatus((lower,))
+    page._show_status()
+    assert page._floor.position[2] == pytest.approx(-0.4)
+
+
+def test_names_and_errors_from_the_network_are_text():
+    wearer = WearerStatus(NASTY, "live", latency=Latency(1.0), notes=(NASTY,))
+    sink = SinkStatus(NASTY, last_error=NASTY, failed=1)
+    for shown in (wearer_html(wearer, 0.1), sinks_html([sink])):
+        assert "<img" not in shown
+    assert "–" in wearer_html(WearerStatus("", "waiting"), 0.0)
+
+
+def test_the_page_answers_only_with_its_token(page):
+    bare = page.url.partition("?")[0]
+    with pytest.raises(urllib.error.HTTPError, match="403"):
+        urllib.request.urlopen(bare, timeout=10)
+    assert urllib.request.urlopen(page.url, timeout=10).status == 200
+
+
+# --- in a browser --------------------------------------------------------------------------------------------------
+
+
+def like(picture: np.ndarray, color: tuple[int, int, int]) -> int:
+    """Pixels whose hue is the colour's, in whatever light, left of the panel."""
+    picture = picture[:, :760].astype(float)
+    total = picture.sum(-1, keepdims=True)
+    share = picture / total.clip(1)
+    return int(((np.abs(share - np.array(color) / sum(color)) < 0.035).all(-1) & (total[..., 0] > 90)).sum())
+
+
+def until(browser: Chromium, label: str, wanted) -> None:
+    """Click a button until the capture has been asked for what is wanted."""
+    for _ in range(5):
+        browser.click(*browser.labelled(label))
+        end = time.monotonic() + 6
+        while time.monotonic() < end:
+            if wanted():
+                return
+            time.sleep(0.1)
+    pytest.fail(f"{label} did nothing")
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+def test_chromium_shows_a_walking_person_and_its_buttons_work(tmp_path: Path):
+    show = Show({"anna": walking(240.0), NASTY: walking(240.0, 40.0)})
+    page = LivePage(show, port=18181)
+    page.open()
+    show.play(page)
+    try:
+        with chromium(tmp_path / "profile", page.url) as browser:
+            browser.poll(lambda: "Not recording" in browser.text())
+            browser.click(
+                *browser.element("[...document.querySelectorAll('input[type=checkbox]')][4]")
+            )  # hides the second
+            browser.poll(lambda: like(browser.screenshot(), COLORS[0]) > 1500)
+            text = browser.text()
+            for shown in ("anna", NASTY[:30], "● live", "72 Hz", "4.2 s ago", "41", "63", "88", "the disk is full"):
+                assert shown in text, shown
+            before = browser.screenshot()
+            browser.poll(
+                lambda: (np.abs(browser.screenshot()[:, :760].astype(int) - before[:, :760]) > 40).sum() > 3000
+            )
+            assert like(browser.screenshot(), COLORS[0]) > 1500  # followed by the camera
+
+            until(browser, "Record", lambda: ("record", True) in show.asked)
+            browser.poll(lambda: "Recording to walk" in browser.text())
+            until(browser, "Stop recording", lambda: ("record", False) in show.asked)
+            until(browser, "Guide me", lambda: ("guide", "anna") in show.asked)
+            browser.poll(lambda: "Stand still and look straight ahead." in browser.text())
+            until(browser, "Skip", lambda: ("skip", "anna") in show.asked)
+            browser.poll(lambda: "The left watch still moves." in browser.text())
+            until(browser, "Redo", lambda: ("redo", "anna") in show.asked)
+            until(browser, "Stop the capture", lambda: ("stop",) in show.asked)
+            assert browser.evaluate("document.title") != "broken"
+            assert browser.evaluate("document.querySelectorAll('img[src=x]').length") == 0
+            assert not browser.exceptions
+    finally:
+        show.stopped.set()
+        page.stop()
+    assert page.errors == 0, page.last_error
