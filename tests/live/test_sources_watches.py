@@ -1,23 +1,21 @@
 """Watches and phones: SensorLog and Sensor Logger in every convention, whole samples and sensors apart."""
 
-import asyncio
 import csv
 import http.client
 import json
 import math
-import threading
-import time
 from collections import Counter
 from datetime import UTC, datetime
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from serving import Served, free_port
 
 from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.io.devices.watch_log import read_watch_log
-from wearcap.live.packets import Inbox, Packet
+from wearcap.live.packets import Packet
 from wearcap.live.sources import source_of
 
 G = 9.80665
@@ -125,7 +123,9 @@ def test_sensor_logger_of_a_phone_sends_its_sensors_apart(down):
 def sensor_log(row, text: bool) -> dict[str, str | float]:
     t, turn, acc = row
     gravity, free, (w, x, y, z) = core_motion(turn, acc)
-    values: dict[str, str | float] = {"loggingTime": datetime.fromtimestamp(t, UTC).strftime("%Y-%m-%d %H:%M:%S.%f +0000")}
+    values: dict[str, str | float] = {
+        "loggingTime": datetime.fromtimestamp(t, UTC).strftime("%Y-%m-%d %H:%M:%S.%f +0000")
+    }
     values |= dict(zip((f"accelerometerAcceleration{axis}" for axis in "XYZ"), (gravity + free).tolist()))
     values |= dict(zip((f"motionUserAcceleration{axis}" for axis in "XYZ"), free.tolist()))
     values |= dict(zip((f"motionQuaternion{axis}" for axis in "XYZW"), (x, y, z, w)))
@@ -236,47 +236,11 @@ def test_a_real_watch_streams_as_its_file_is_read(real_data, name):
         assert np.allclose(packet.sample.acc_world, stream.acc_world[k], atol=1e-3)
 
 
-class Served:
-    """A source that runs in a thread of its own."""
-
-    def __init__(self, url: str):
-        self.source, self.inbox = source_of(url), Inbox()
-        self.loop = asyncio.new_event_loop()
-        self.thread = threading.Thread(target=self._run)
-        self.error: Exception | None = None
-
-    def _run(self) -> None:
-        asyncio.set_event_loop(self.loop)
-        self.task = self.loop.create_task(self.source.run(self.inbox))
-        try:
-            self.loop.run_until_complete(self.task)
-        except asyncio.CancelledError:
-            pass
-        except Exception as error:
-            self.error = error
-
-    def __enter__(self) -> "Served":
-        self.thread.start()
-        time.sleep(0.3)
-        return self
-
-    def __exit__(self, *_) -> None:
-        self.loop.call_soon_threadsafe(self.task.cancel)
-        self.thread.join(10)
-        assert not self.thread.is_alive()
-
-
-def free_port() -> int:
-    import socket
-
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 def test_posts_are_taken_answered_and_guarded():
     port = free_port()
-    message = posted([{"name": "wristmotion", "time": round(r[0] * 1e9)} | wrist_motion(r, True, False) for r in moving()])
+    message = posted(
+        [{"name": "wristmotion", "time": round(r[0] * 1e9)} | wrist_motion(r, True, False) for r in moving()]
+    )
     with Served(f"watch+http://127.0.0.1:{port}?joint=left_wrist&token=secret") as served:
 
         def answer(method: str, target: str, body: bytes | None = None, **headers: str) -> int:

@@ -6,6 +6,7 @@ import io
 import time
 from collections.abc import Callable
 from http import HTTPStatus
+from typing import Any
 
 from wearcap.errors import WearcapError
 from wearcap.live.packets import Inbox
@@ -35,11 +36,11 @@ class Budget:
         return self._spent[0] <= self.messages and self._spent[1] <= self.size
 
 
-def admitting(host: str, token: str | None) -> Callable[[str, http.client.HTTPMessage], None]:
+def admitting(host: str, token: str | None) -> Callable[[str, Any], None]:
     """What raises Refused for a request of a foreign page or name, and for one without the token, where there is one."""
     guard = Guard(host) if token is None else Guard(host, token)
 
-    def admit(target: str, headers: http.client.HTTPMessage) -> None:
+    def admit(target: str, headers: Any) -> None:
         # The guard always checks a token: where none is needed, it is put in.
         guard.admit(target if token is not None else f"?token={guard.token}", headers)
 
@@ -79,9 +80,9 @@ class _Connections:
                     again = await self._next(reader, writer)
                 except _Answer as answer:
                     self._refuse(answer.status.phrase.lower())
-                    await _write(writer, answer.status, answer.why, close=True)
+                    await asyncio.wait_for(_write(writer, answer.status, answer.why, close=True), REQUEST_S)
                     again = False
-        except (asyncio.IncompleteReadError, OSError):
+        except (TimeoutError, asyncio.IncompleteReadError, OSError):
             self._refuse("broken connection")
         finally:
             self.open -= 1
@@ -167,9 +168,9 @@ async def serve_posts(source: DatagramSource, token: str | None, inbox: Inbox) -
             f"cannot listen ({error.strerror or error})", f"{where.host}:{where.port}", fix=fix
         ) from error
     try:
-        async with server:
-            await server.serve_forever()
+        await asyncio.Event().wait()
     finally:
+        server.close()
         for task in connections.tasks:
             task.cancel()
         await asyncio.gather(*connections.tasks, return_exceptions=True)
