@@ -8,6 +8,7 @@ conventions of a file are inferred from its values: the unit from the length of 
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
@@ -45,6 +46,16 @@ _X_IMU = [f"{name} {axis} ({unit})" for name, unit in (("Gyroscope", "deg/s"), (
 _X_QUATERNION = {"W", "X", "Y", "Z"}
 
 
+@dataclass(frozen=True)
+class WatchConvention:
+    """What a watch's numbers mean."""
+
+    m_s2: float
+    """Acceleration (m/s²) per unit of its accelerations, negative where their sign is reversed."""
+    back: bool
+    """Whether its attitude turns the world to the watch, and not the watch to the world."""
+
+
 def read_watch_log(path: str | Path, joint: str) -> ImuStream:
     """A watch's stream: attitude in a world with z up, free acceleration there (m/s²), specific force, turn rate.
 
@@ -68,26 +79,11 @@ def read_watch_log(path: str | Path, joint: str) -> ImuStream:
             row = int(np.flatnonzero(~np.isfinite(values).all(1))[0])
             raise WearcapError(f"{name} of row {row} is not finite", path, "numbers")
     gravity = parts["gravity"] if "gravity" in parts else parts["whole"] - parts["free"]
-    length = float(np.median(np.linalg.norm(gravity, axis=1)))
-    unit = next((unit for unit in (G_M_S2, 1.0) if abs(length * unit / G_M_S2 - 1) < 0.1), None)  # m/s² per unit
-    if unit is None:
-        raise WearcapError(f"gravity of length {length:.3g}", path, "1 (g) or 9.8 (m/s²)")
-    # R_world_imu, and the component of gravity along the world's z: about 1 or -1
-    quaternion = parts["quaternion"]
-    norm = np.linalg.norm(quaternion, axis=1)
-    if (np.abs(norm - 1) > 0.01).any():
-        row = int(np.argmax(np.abs(norm - 1)))
-        raise WearcapError(f"attitude of length {norm[row]:.3g} in row {row}", path, "1")
-    R = matrix_from_quat_wxyz(torch.from_numpy(quaternion)).numpy()
-    down = gravity / np.linalg.norm(gravity, axis=1, keepdims=True).clip(1e-9)
-    there, back = (float((turned @ down[..., None])[:, 2, 0].mean()) for turned in (R, R.swapaxes(1, 2)))
-    best = max(abs(there), abs(back))
-    if best < UPRIGHT:
-        fix = "Check the order of the quaternion's columns (W, X, Y, Z), and that z is up in its reference frame."
-        raise WearcapError(f"the attitude turns gravity {best:.2f} upright", path, f"at least {UPRIGHT}", fix)
-    R, upright = (R, there) if abs(there) >= abs(back) else (np.ascontiguousarray(R.swapaxes(1, 2)), back)
-    # Core Motion's gravity points down, and its accelerations have the opposite sign.
-    free, felt = np.sign(upright) * unit * parts["free"], np.sign(upright) * unit * (parts["free"] + gravity)
+    sense = watch_convention(gravity, parts["quaternion"], path)
+    R = matrix_from_quat_wxyz(torch.from_numpy(parts["quaternion"])).numpy()
+    if sense.back:
+        R = np.ascontiguousarray(R.swapaxes(1, 2))
+    free, felt = sense.m_s2 * parts["free"], sense.m_s2 * (parts["free"] + gravity)
     turn = torch.from_numpy(parts["turn"]).float() if "turn" in parts else None
     return ImuStream(
         torch.from_numpy(seconds),
@@ -97,6 +93,33 @@ def read_watch_log(path: str | Path, joint: str) -> ImuStream:
         acc_imu=torch.from_numpy(felt).float(),
         gyro_imu=turn,
     )
+
+
+def watch_convention(gravity: np.ndarray, quat_wxyz: np.ndarray, where: str | Path) -> WatchConvention:
+    """The convention that directions of gravity and attitudes, a row each, show.
+
+    Raises WearcapError for gravity that is neither 1 g nor 9.8 m/s² long, attitudes that are no unit quaternions, and
+    where neither direction of the attitude turns gravity upright.
+    """
+    length = float(np.median(np.linalg.norm(gravity, axis=1)))
+    unit = next((unit for unit in (G_M_S2, 1.0) if abs(length * unit / G_M_S2 - 1) < 0.1), None)  # m/s² per unit
+    if unit is None:
+        raise WearcapError(f"gravity of length {length:.3g}", where, "1 (g) or 9.8 (m/s²)")
+    norm = np.linalg.norm(quat_wxyz, axis=1)
+    if (np.abs(norm - 1) > 0.01).any():
+        row = int(np.argmax(np.abs(norm - 1)))
+        raise WearcapError(f"attitude of length {norm[row]:.3g} in row {row}", where, "1")
+    # R_world_imu, and the component of gravity along the world's z: about 1 or -1
+    R = matrix_from_quat_wxyz(torch.from_numpy(quat_wxyz)).numpy()
+    down = gravity / np.linalg.norm(gravity, axis=1, keepdims=True).clip(1e-9)
+    there, back = (float((turned @ down[..., None])[:, 2, 0].mean()) for turned in (R, R.swapaxes(1, 2)))
+    best = max(abs(there), abs(back))
+    if best < UPRIGHT:
+        fix = "Check the order of the quaternion's columns (W, X, Y, Z), and that z is up in its reference frame."
+        raise WearcapError(f"the attitude turns gravity {best:.2f} upright", where, f"at least {UPRIGHT}", fix)
+    is_back = abs(there) < abs(back)
+    # Core Motion's gravity points down, and its accelerations have the opposite sign.
+    return WatchConvention(float(np.sign(back if is_back else there)) * unit, is_back)
 
 
 def is_watch_log(path: str | Path) -> bool:
@@ -174,12 +197,16 @@ def _columns(path: str | Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         seconds = np.empty(len(table[time]))
         for row, text in enumerate(table[time]):
             with understood(f"time {text.decode()!r} in row {row}", path, "such as 2024-05-01T12:00:00.123+02:00"):
-                iso = text.decode().strip().replace(" +", "+").replace(" -", "-")
-                seconds[row] = datetime.fromisoformat(iso).timestamp()
+                seconds[row] = logging_time(text.decode())
     else:
         expected = "SensorLog's CSV (motionQuaternionW(R), …) or WristMotion.csv (quaternionW, …)"
         raise WearcapError("not a watch's motion log", path, expected, "Switch on device motion when you record.")
     return seconds, {name: np.stack([table[column] for column in group], 1) for name, group in groups.items()}
+
+
+def logging_time(text: str) -> float:
+    """Seconds since 1970 of SensorLog's `loggingTime`. Raises ValueError for what is no time."""
+    return datetime.fromisoformat(text.strip().replace(" +", "+").replace(" -", "-")).timestamp()
 
 
 def _require_times(seconds: np.ndarray, path: str | Path) -> None:

@@ -2,10 +2,24 @@
 
 from wearcap.errors import WearcapError, nearest
 from wearcap.live.source import Address, Source
+from wearcap.live.sources.json_lines import JsonSource, WebSocketSource
 from wearcap.live.sources.mvn import MvnSource
 from wearcap.live.sources.osc import OscTrackerSource, VmcSource
+from wearcap.live.sources.watches import WatchHttpSource, WatchSource
 
-SOURCES: dict[str, type[Source]] = {source.scheme: source for source in (VmcSource, OscTrackerSource, MvnSource)}
+SOURCES: dict[str, type[Source]] = {
+    source.scheme: source
+    for source in (
+        VmcSource,
+        OscTrackerSource,
+        MvnSource,
+        WatchSource,
+        WatchHttpSource,
+        JsonSource,
+        WebSocketSource,
+        # the replay of recordings goes here
+    )
+}
 """Sources by the scheme of their addresses."""
 
 

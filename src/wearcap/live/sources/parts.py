@@ -40,6 +40,9 @@ class Names:
         self.limit = limit
         self._last_s: dict[str, float] = {}
 
+    def __contains__(self, name: str) -> bool:
+        return name in self._last_s
+
     def fault(self, name: object, now_s: float) -> str | None:
         """Why a name cannot be used, or None."""
         if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME or not name.isprintable():

@@ -1,0 +1,176 @@
+"""A small HTTP server for sensor apps: it takes POSTs of bounded size, answers each, and does nothing else."""
+
+import asyncio
+import http.client
+import io
+import time
+from collections.abc import Callable
+from http import HTTPStatus
+from typing import Any
+
+from wearcap.errors import WearcapError
+from wearcap.live.packets import Inbox
+from wearcap.live.source import MAX_DATAGRAMS_PER_S, DatagramSource
+from wearcap.viewer.guard import Guard, Refused
+
+MAX_HEADER, MAX_BODY = 1 << 14, 1 << 20
+MAX_CONNECTIONS = 16
+MAX_BYTES_PER_S = 1 << 24
+REQUEST_S, IDLE_S = 10.0, 60.0
+"""Time for a request once it has begun, and until the next one of a connection (s)."""
+
+
+class Budget:
+    """Limit of the messages and bytes of a second."""
+
+    def __init__(self, messages: int = MAX_DATAGRAMS_PER_S, size: int = MAX_BYTES_PER_S):
+        self.messages, self.size = messages, size
+        self._second, self._spent = 0, (0, 0)
+
+    def allows(self, size: int) -> bool:
+        """Whether one more message, of so many bytes, is within the limit."""
+        now = int(time.monotonic())
+        if now != self._second:
+            self._second, self._spent = now, (0, 0)
+        self._spent = (self._spent[0] + 1, self._spent[1] + size)
+        return self._spent[0] <= self.messages and self._spent[1] <= self.size
+
+
+def admitting(host: str, token: str | None) -> Callable[[str, Any], None]:
+    """What raises Refused for a request of a foreign page or name, and for one without the token, where there is one."""
+    guard = Guard(host) if token is None else Guard(host, token)
+
+    def admit(target: str, headers: Any) -> None:
+        # The guard always checks a token: where none is needed, it is put in.
+        guard.admit(target if token is not None else f"?token={guard.token}", headers)
+
+    return admit
+
+
+class _Answer(Exception):
+    """Ends a request with a status."""
+
+    def __init__(self, status: HTTPStatus, why: str = ""):
+        super().__init__(why)
+        self.status, self.why = status, why
+
+
+class _Connections:
+    """The connections of one server."""
+
+    def __init__(self, source: DatagramSource, token: str | None, inbox: Inbox):
+        self.source, self.inbox = source, inbox
+        self.admit = admitting(source.address.host, token)
+        self.budget = Budget()
+        self.open = 0
+        self.tasks: set[asyncio.Task] = set()
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer the requests of one connection."""
+        self.open += 1
+        if task := asyncio.current_task():
+            self.tasks.add(task)
+            task.add_done_callback(self.tasks.discard)
+        try:
+            again = True
+            while again:
+                try:
+                    if self.open > MAX_CONNECTIONS:
+                        raise _Answer(HTTPStatus.SERVICE_UNAVAILABLE, "too many connections")
+                    again = await self._next(reader, writer)
+                except _Answer as answer:
+                    self._refuse(answer.status.phrase.lower())
+                    await asyncio.wait_for(_write(writer, answer.status, answer.why, close=True), REQUEST_S)
+                    again = False
+        except (TimeoutError, asyncio.IncompleteReadError, OSError):
+            self._refuse("broken connection")
+        finally:
+            self.open -= 1
+            writer.close()
+
+    async def _next(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
+        """Wait for a request and answer it; whether the connection stays open."""
+        try:
+            try:
+                begin = await asyncio.wait_for(reader.readuntil(b"\r\n"), IDLE_S)
+            except (TimeoutError, asyncio.IncompleteReadError) as nothing:
+                if getattr(nothing, "partial", b""):
+                    raise
+                return False
+            return await asyncio.wait_for(self._request(begin, reader, writer), REQUEST_S)
+        except asyncio.LimitOverrunError as error:
+            raise _Answer(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE) from error
+        except TimeoutError as error:
+            raise _Answer(HTTPStatus.REQUEST_TIMEOUT) from error
+
+    async def _request(self, begin: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
+        """Answer one request; whether the connection stays open."""
+        method, target, headers = await self._head(begin, reader)
+        try:
+            self.admit(target, headers)
+        except Refused as refused:
+            raise _Answer(HTTPStatus.FORBIDDEN, str(refused)) from refused
+        if method != "POST":
+            raise _Answer(HTTPStatus.METHOD_NOT_ALLOWED, "a sensor app's messages are POSTed here")
+        length = headers.get("Content-Length", "")
+        if not (length.isascii() and length.isdigit() and len(length) < 12) or "Transfer-Encoding" in headers:
+            raise _Answer(HTTPStatus.LENGTH_REQUIRED)
+        if int(length) > MAX_BODY:
+            raise _Answer(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
+        if not self.budget.allows(int(length)):
+            raise _Answer(HTTPStatus.TOO_MANY_REQUESTS)
+        if headers.get("Expect", "").lower() == "100-continue":
+            writer.write(b"HTTP/1.1 100 Continue\r\n\r\n")
+        body = await reader.readexactly(int(length))
+        self.inbox.deliver(self.source.parse(body, time.monotonic(), self._refuse))
+        close = headers.get("Connection", "").lower() == "close"
+        await _write(writer, HTTPStatus.OK, "", close)
+        return not close
+
+    async def _head(self, begin: bytes, reader: asyncio.StreamReader) -> tuple[str, str, http.client.HTTPMessage]:
+        """Method, target and headers of a request."""
+        try:
+            method, target, version = begin.decode("ascii").split()
+            lines = b""
+            while not lines.endswith(b"\r\n\r\n") and lines != b"\r\n":
+                lines += await reader.readuntil(b"\r\n")
+                if len(begin) + len(lines) > MAX_HEADER:
+                    raise _Answer(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE)
+            headers = http.client.parse_headers(io.BytesIO(lines))
+        except (ValueError, http.client.HTTPException) as error:
+            raise _Answer(HTTPStatus.BAD_REQUEST) from error
+        if version not in ("HTTP/1.1", "HTTP/1.0"):
+            raise _Answer(HTTPStatus.HTTP_VERSION_NOT_SUPPORTED)
+        return method, target, headers
+
+    def _refuse(self, why: str) -> None:
+        self.inbox.refuse(self.source.name, why)
+
+
+async def _write(writer: asyncio.StreamWriter, status: HTTPStatus, text: str, close: bool) -> None:
+    """Send an answer."""
+    body = f"{text}\n".encode() if text else b""
+    head = f"HTTP/1.1 {status.value} {status.phrase}\r\nContent-Type: text/plain; charset=utf-8\r\n"
+    head += f"Content-Length: {len(body)}\r\nConnection: {'close' if close else 'keep-alive'}\r\n\r\n"
+    writer.write(head.encode() + body)
+    await writer.drain()
+
+
+async def serve_posts(source: DatagramSource, token: str | None, inbox: Inbox) -> None:
+    """Deliver what the source's `parse` finds in the POSTs at its address. Raises WearcapError where it cannot listen."""
+    connections = _Connections(source, token, inbox)
+    where = source.address
+    try:
+        server = await asyncio.start_server(connections.serve, where.host, where.port, limit=MAX_HEADER)
+    except OSError as error:
+        fix = "Is another program listening there? Choose another port, or end it."
+        raise WearcapError(
+            f"cannot listen ({error.strerror or error})", f"{where.host}:{where.port}", fix=fix
+        ) from error
+    try:
+        await asyncio.Event().wait()
+    finally:
+        server.close()
+        for task in connections.tasks:
+            task.cancel()
+        await asyncio.gather(*connections.tasks, return_exceptions=True)
