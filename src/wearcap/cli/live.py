@@ -36,12 +36,11 @@ def run(config: DictConfig) -> dict[str, Any]:
     sources, setup = _sources(config, system, place)
     speed = float(config.speed)
     sinks: list[Sink] = [sink_of(each, config.host, pace=speed <= 1) for each in _listed(config.to)]
-    page = LivePage(host=config.host, port=config.port) if config.view else None
     setup_file = None if config.setup is None else Path(config.setup)
     capture = LiveCapture(
         system,
         sources,
-        sinks if page is None else [*sinks, page],
+        sinks,
         source=place,
         setup=setup,
         height_m=config.height,
@@ -51,9 +50,11 @@ def run(config: DictConfig) -> dict[str, Any]:
         recorder=FilesSink,
         record=None if config.record is None else Path(config.record),
     )
+    page = None
+    if config.view:
+        page = LivePage(capture, config.host, config.port)
+        capture.add_sink(page)
     _tell(config, sources, sinks, page)
-    if page is not None:
-        page.attach(capture)
     report = capture.run(float("inf") if config.seconds is None else float(config.seconds))
     write_report(report, Path(config.report))
     _summarize(report)
@@ -70,7 +71,9 @@ def _sources(config: DictConfig, system: System, place: CaptureInput | None) -> 
             sources.append(source_of(text, config.host))
             continue
         if place is None:
-            raise WearcapError("source=replay without a recording", expected="recording=DATASET/NAME, or any file with one")
+            raise WearcapError(
+                "source=replay without a recording", expected="recording=DATASET/NAME, or any file with one"
+            )
         kind = system.session_class()
         replay = ReplaySource(place.recording, kind.devices, kind.tracks_wrists, float(config.speed))
         sources.append(replay)
@@ -90,7 +93,10 @@ def _tell(config: DictConfig, sources: list[Source], sinks: list[Sink], page: Li
     open_sources = [source.name for source in sources if not source.loopback]
     if config.host not in LOOPBACK or open_sources:
         where = ", ".join(open_sources) or config.host
-        show(f"[bold red]OPEN TO OTHER MACHINES: {where} takes packets from anyone who reaches this address.", file=sys.stderr)
+        show(
+            f"[bold red]OPEN TO OTHER MACHINES: {where} takes packets from anyone who reaches this address.",
+            file=sys.stderr,
+        )
     if page is not None:
         show(f"open {page.url} (Ctrl+C ends)", file=sys.stderr)
 

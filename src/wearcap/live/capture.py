@@ -10,10 +10,14 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
+from wearcap.geometry.rigid import Rigid
 from wearcap.live.first_minute import FirstMinute
-from wearcap.live.packets import Inbox
+from wearcap.live.packets import HEAD, Inbox
 from wearcap.live.setup import Setup, write_setup
 from wearcap.live.sink import Sink, SinkThread
 from wearcap.live.source import Source
@@ -21,11 +25,15 @@ from wearcap.live.status import LiveStatus, SinkStatus
 from wearcap.live.wearer import LiveWearer, Opener
 from wearcap.recording import Motion
 from wearcap.runtime.system import CaptureInput, System
+from wearcap.runtime.wearer import Wearer
+from wearcap.sensors.samples import HeadSample, WatchSample, WristSample
 
 MAX_WEARERS = 8
 """Most wearers; packets of further ones are counted as refused."""
 WAIT_S = 0.02
 """Longest time without a look at who has left and what the page wishes."""
+WARM_UP_S = 2.0
+"""Length of what the network is run on before the first packet."""
 RESTART_S = 2.0
 """Time after which a source that failed is started again."""
 
@@ -77,7 +85,7 @@ class LiveCapture:
 
     def run(self, seconds: float = float("inf")) -> dict[str, Any]:
         """Capture, and return the report. Raises WearcapError when a source or sink cannot be opened."""
-        getattr(self.system, "prepare", lambda: None)()
+        self._warm_up()
         opened: list[SinkThread] = []
         try:
             for sink in self.sinks:
@@ -91,7 +99,8 @@ class LiveCapture:
             thread.start()
             with suppress(KeyboardInterrupt):  # the user's way to end a capture: what has come is kept, and reported
                 self._loop(seconds)
-            loop.call_soon_threadsafe(lambda: [task.cancel() for task in asyncio.all_tasks(loop)])
+            with suppress(RuntimeError):  # the sources have ended by themselves
+                loop.call_soon_threadsafe(lambda: [task.cancel() for task in asyncio.all_tasks(loop)])
             thread.join(5.0)
         finally:
             for wearer in self.wearers.values():
@@ -103,6 +112,25 @@ class LiveCapture:
         if self._failure is not None:
             raise self._failure
         return self.report()
+
+    def _warm_up(self) -> None:
+        """Load and run the network once, on a wearer who stands still, so that the first poses are not late."""
+        getattr(self.system, "prepare", lambda: None)()
+        devices, skeleton, pose = self.opener.devices, xsens23(), Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 1.6]))
+        if HEAD not in devices:
+            return
+        session = self.opener.session(Wearer(skeleton, floor_m=0.0))
+        for k in range(int(WARM_UP_S * self.system.fps)):
+            at_s, samples = k / self.system.fps, []
+            for joint in devices[1:]:
+                watch = WatchSample(at_s, torch.eye(3), torch.zeros(3), joint)
+                samples.append(WristSample(joint, at_s, pose) if self.opener.tracks_wrists else watch)
+            session.push([[*samples, HeadSample(at_s, pose)]])
+            session.poses()
+
+    def add_sink(self, sink: Sink) -> None:
+        """Add a sink before the capture runs: one that needs the capture itself, as the page does."""
+        self.sinks.append(SinkThread(sink))
 
     def _loop(self, seconds: float) -> None:
         while not self._stopping.is_set() and time.monotonic() - self._began_s < seconds:

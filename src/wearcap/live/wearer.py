@@ -128,9 +128,10 @@ class LiveWearer:
             self._head_s = time_s
         if isinstance(sample, HeadSample) and sample.points_world is not None and len(sample.points_world):
             self._keep_points(sample.points_world)
-        if self.session is None:
-            self._prepare(packet.device, sample, packet.arrived_s)
-        elif (seated := self._seated(packet.device, sample)) is None:
+        if self.session is None and not self._is_prepared(packet.device, sample, packet.arrived_s):
+            return
+        assert self.session is not None
+        if (seated := self._seated(packet.device, sample)) is None:
             self.unknown += 1
         else:
             try:
@@ -138,19 +139,20 @@ class LiveWearer:
             except WearcapError as error:
                 self._note(str(error))
 
-    def _prepare(self, device: str, sample: Any, now_s: float) -> None:
-        """Look for the set-up, and begin once it is known."""
+    def _is_prepared(self, device: str, sample: Any, now_s: float) -> bool:
+        """Look for the set-up, and open the session once it is known."""
         if self.setup is None or (self.first is not None and self.first.found is None):
             if self.first is None:
                 self.first = self.opener.first_minute(None, False)
             self.stage = "first minute"
             self.first.see(device, sample, now_s)
             if self.first.found is None:
-                return
+                return False
             self.setup = self.first.found
             for note in self.setup.notes:
                 self._note(note)
         self._open(self.setup)
+        return True
 
     def _open(self, setup: Setup) -> None:
         head = next((seat for seat in setup.seats.values() if seat.joint == HEAD), None)

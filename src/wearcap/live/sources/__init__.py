@@ -23,8 +23,9 @@ SOURCES: dict[str, type[Source]] = {
 """Sources by the scheme of their addresses."""
 
 
-def source_of(text: str) -> Source:
-    """The source that an address names ("vmc://127.0.0.1:39540?wearer=anna"; "vmc" alone: the defaults).
+def source_of(text: str, host: str = "127.0.0.1") -> Source:
+    """The source that an address names ("vmc://127.0.0.1:39540?wearer=anna"; "vmc" alone: the defaults), on `host` unless it
+    names another.
 
     Raises WearcapError for an unknown scheme, another text, and options that the source does not have.
     """
@@ -33,4 +34,4 @@ def source_of(text: str) -> Source:
         what = f"no source is called {scheme[:40]!r}"
         raise WearcapError(what, f"source={text[:80]}", "SCHEME://HOST:PORT", nearest(scheme, SOURCES))
     source = SOURCES[scheme]
-    return source(Address.of(text if separator else f"{scheme}://", source.port))
+    return source(Address.of(text if separator else f"{scheme}://", source.port, host))
