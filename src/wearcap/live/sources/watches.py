@@ -16,11 +16,10 @@ import torch
 
 from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError, require_choice
-from wearcap.files import parse_json
 from wearcap.io.devices.watch_log import G_M_S2, WatchConvention, logging_time, watch_convention
 from wearcap.live.packets import Inbox, Packet
 from wearcap.live.source import Address, DatagramSource
-from wearcap.live.sources.parts import Names, device_of, matrix_of, require_options
+from wearcap.live.sources.parts import Names, bounded_json, device_of, matrix_of, require_options
 from wearcap.live.sources.posts import serve_posts
 from wearcap.sensors.packets import MAX_ACC_M_S2, NOT_FINITE, time_fault, values_fault
 from wearcap.sensors.samples import WatchSample
@@ -112,7 +111,9 @@ class _Watch:
             if self.changed < CHANGED_ROWS:
                 return self.convention if self.changed == 0 else refuse(NO_CONVENTION)
             self.convention, self.changed, self.rows = None, 0, []
-        if (self.rows and row.time_s <= self.rows[-1].time_s) or len(self.rows) >= MAX_ROWS:
+        if self.rows and -FIRST_S <= row.time_s - self.rows[-1].time_s <= 0:
+            return None  # late or repeated
+        if self.rows and (abs(row.time_s - self.rows[-1].time_s) > FIRST_S or len(self.rows) >= MAX_ROWS):
             self.rows = []
         self.rows.append(row)
         if row.time_s - self.rows[0].time_s < FIRST_S or len(self.rows) < FIRST_ROWS:
@@ -169,7 +170,7 @@ class WatchSource(DatagramSource):
     def _json_rows(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> Iterator[tuple[str, _Row]]:
         """Samples by device: of Sensor Logger's message, or of SensorLog's objects, one or a list, or one a line."""
         for text in data.splitlines()[:MAX_ENTRIES] if b"}\n{" in data else [data]:
-            content = parse_json(text, "datagram")
+            content = bounded_json(text)
             if isinstance(content, dict) and isinstance(content.get("payload"), list):
                 yield from self._sensor_logger(content, arrived_s, refuse)
                 continue
