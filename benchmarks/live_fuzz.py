@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from fuzz_mutate import mutated
+from fuzz_mutate import FLOATS, NUMBER, VALUES, WHOLE, mutated
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from scipy.spatial.transform import Rotation
@@ -52,7 +52,7 @@ LONGEST_S = {"ws": 0.5, "watch+http": 0.5}
 """Limits of a packet's time, where messages may have 1 MiB; else 0.1 s."""
 GROWTH_MIB, OWN_KIB = 16.0, 256.0
 ADVANCE = 500
-SOUND_EVERY = 4
+SOUND_EVERY = 8
 """One of so many packets is sound, so that the sources' state is one of use."""
 
 
@@ -125,8 +125,14 @@ SOUND = {
     "watch": watch,
     "watch+http": requests,
     "json": messages(5),
-    "ws": messages(300),
+    "ws": messages(60),
 }
+
+
+EXTREMES = [struct.pack(">f", value) for value in FLOATS if not abs(value) > 1e38]
+EXTREMES += [bytes.fromhex(text) for text in ("7f800000", "ff800000", "7f800001", "7f7fffff", "00000001")]
+EXTREMES += [(value % (1 << 32)).to_bytes(4, "big") for value in WHOLE]
+"""Extreme numbers as big-endian bytes: infinite, signalling, largest and smallest floats, and whole numbers."""
 
 
 # --- damage ---------------------------------------------------------------------------------------------------------
@@ -140,12 +146,32 @@ def nested(data: bytes, depth: int) -> bytes:
 
 def damaged(name: str, pool: list[bytes], seed: random.Random) -> bytes:
     """A packet of the pool with damage, cut to what a packet may have."""
-    packet = seed.choice(pool)
-    if name in ("vmc", "osctrackers") and seed.random() < 0.05:
-        packet = nested(packet, seed.choice((1, 3, 4, 5, 60, 2000)))
-    else:
-        packet = mutated(packet, seed.choice(pool), seed)
-    return packet[: 1 << 20 if name in LONGEST_S else MAX_DATAGRAM]
+    packet, dice = seed.choice(pool), seed.random()
+    if dice < 0.05 and name in ("vmc", "osctrackers"):
+        return nested(packet, seed.choice((1, 3, 4, 5, 60, 2000)))[:MAX_DATAGRAM]
+    if dice < 0.1:  # all that is done to files, long runs of brackets among it
+        return mutated(packet, seed.choice(pool), seed)[: 1 << 20 if name in LONGEST_S else MAX_DATAGRAM]
+    damage = bytearray(packet)
+    for _ in range(seed.choice((1, 1, 1, 2, 3))):
+        place = int(seed.random() * max(len(damage), 1))
+        match int(seed.random() * 6):
+            case 0:  # bits
+                for at in (place, int(seed.random() * len(damage))) if damage else ():
+                    damage[at] ^= 1 << int(seed.random() * 8)
+            case 1:
+                del damage[place:]
+            case 2:  # twice
+                damage += damage[place:]
+            case 3:  # a splice
+                other = seed.choice(pool)
+                damage[place:] = other[int(seed.random() * len(other)) :]
+            case 4:  # an extreme number, binary
+                damage[place & ~3 : (place & ~3) + 4] = seed.choice(EXTREMES)
+            case _:  # and in a text
+                found = NUMBER.search(damage, place)
+                if found:
+                    damage[found.start() : found.end()] = seed.choice(VALUES)
+    return bytes(damage[:MAX_DATAGRAM])
 
 
 # --- one source -----------------------------------------------------------------------------------------------------
