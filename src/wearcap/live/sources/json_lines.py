@@ -22,11 +22,10 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from wearcap.errors import WearcapError
-from wearcap.files import parse_json
 from wearcap.geometry.rigid import Rigid
 from wearcap.live.packets import CAMERA, HEAD, SUIT, Inbox, Packet
 from wearcap.live.source import Address, DatagramSource
-from wearcap.live.sources.parts import AXES, Names, checked_pose, matrix_of, require_options
+from wearcap.live.sources.parts import AXES, MAX_LISTS, Names, bounded_json, checked_pose, matrix_of, require_options
 from wearcap.live.sources.posts import Budget, admitting
 from wearcap.sensors.packets import MAX_ACC_M_S2, MAX_POSITION_M, WRONG_TYPE, number_fault, time_fault, values_fault
 from wearcap.sensors.samples import HeadSample, LocalizationSample, WatchSample, WristSample
@@ -36,6 +35,7 @@ MAX_LINES = 64
 """Objects of a message."""
 MAX_MESSAGE, MAX_POINTS_MESSAGE = 1 << 16, 1 << 20
 """Bytes of a message over WebSocket; the larger one for messages with points."""
+MAX_BYTES_PER_S = 1 << 22
 MAX_CONNECTIONS = 16
 _KEYS = {
     *("device", "wearer", "time", "clock", "position", "rotation_wxyz", "matrix", "axes", "lost"),
@@ -84,7 +84,7 @@ class JsonSource(DatagramSource):
         return packets
 
     def _packet(self, line: bytes, arrived_s: float, refuse: Callable[[str], None]) -> Packet:
-        content = parse_json(line, "message")
+        content = bounded_json(line)
         if not isinstance(content, dict):
             raise _Fault(NO_JSON)
         if not content.keys() <= _KEYS:
@@ -173,7 +173,7 @@ def _pose(content: dict[str, Any], axes: str) -> Rigid:
 
 def _points(rows: object, axes: str) -> torch.Tensor:
     """Points of the surroundings, "point 3" (m)."""
-    if not isinstance(rows, list):
+    if not isinstance(rows, list) or len(rows) > MAX_LISTS:
         raise _Fault(WRONG_TYPE)
     try:
         values = np.asarray(rows if rows else np.zeros((0, 3)))
@@ -197,7 +197,7 @@ class WebSocketSource(JsonSource):
         super().__init__(address)
         given = address.options.get("token")
         self.token = given if given or self.loopback else secrets.token_urlsafe(18)
-        self._budget = Budget()
+        self._budget = Budget(size=MAX_BYTES_PER_S)
         self._open = 0
 
     @property

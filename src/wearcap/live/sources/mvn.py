@@ -84,9 +84,6 @@ class _Character:
     """Metres per unit of type 13."""
     skeleton: Skeleton | None = None
     """What the poses are given on, once the first is."""
-    metres: float = 1.0
-    """Metres per unit of the poses' positions."""
-    has_metres: bool = False
 
 
 class MvnSource(DatagramSource):
@@ -153,27 +150,25 @@ class MvnSource(DatagramSource):
     def _motion(
         self, character: _Character, poses: np.ndarray, time_s: float, arrived_s: float, refuse: Callable[[str], None]
     ) -> Motion | None:
-        """One frame of motion; the first one of a character finds its unit of length."""
-        quat_wxyz = torch.from_numpy(poses["quat_wxyz"].astype(np.float64))[self._order]
-        t_world = torch.from_numpy(poses["position"].astype(np.float64))[self._order]
+        """One frame of motion."""
+        quat_wxyz = torch.from_numpy(poses["quat_wxyz"].astype(np.float32)).double()[self._order]
+        t_world = torch.from_numpy(poses["position"].astype(np.float32)).double()[self._order]
         if not (quat_wxyz.isfinite().all() and t_world.isfinite().all()):
             return refuse(NOT_FINITE)
         if not ((quat_wxyz.norm(dim=-1) - 1).abs() <= UNIT_TOLERANCE).all():
             return refuse(NOT_A_ROTATION)
         R_world = matrix_from_quat_wxyz(quat_wxyz)
         offsets = bone_offsets(self._xsens23, R_world, t_world)
-        if not character.has_metres:
-            metres = _metres(offsets)
-            if metres is None:
-                return refuse(OUT_OF_RANGE)
-            character.metres, character.has_metres = metres, True
-        t_root = t_world[0] * character.metres
+        metres = _metres(offsets)
+        if metres is None:
+            return refuse(OUT_OF_RANGE)
+        t_root = t_world[0] * metres
         if not (t_root.abs() <= MAX_POSITION_M).all():
             return refuse(OUT_OF_RANGE)
         if character.skeleton is None:
             if arrived_s - character.first_s < SCALE_WAIT_S:
                 return refuse(NO_SIZE_YET)
-            bones = offsets * character.metres if character.offsets_m is None else character.offsets_m
+            bones = offsets * metres if character.offsets_m is None else character.offsets_m
             skeleton = self._xsens23.with_offsets(bones.float())
             character.skeleton = replace(skeleton, sites=skeleton.sites | character.sites)
         return Motion(

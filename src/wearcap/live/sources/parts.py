@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError, nearest
+from wearcap.files import parse_json
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.devices.axes import CONVENTIONS
 from wearcap.live.packets import CAMERA, HEAD, SUIT
@@ -22,6 +24,8 @@ MAX_NAMES = 64
 """Names that a source knows at once."""
 FORGOTTEN_S = 60.0
 """A name that was silent for so long makes room for another."""
+MAX_LISTS = 20_100
+"""Lists and objects of a JSON message: 20,000 points and what goes with them. They take far longer than their bytes."""
 UNIT_TOLERANCE = 0.02
 """Tolerance of a quaternion's length."""
 AXES = {"wearcap": torch.eye(3), **CONVENTIONS}
@@ -62,6 +66,13 @@ def require_options(address: Address, *allowed: str) -> None:
         if name not in ("wearer", *allowed):
             what = f"no option {name!r}"
             raise WearcapError(what, f"source {address.scheme}://", fix=nearest(name, ("wearer", *allowed)))
+
+
+def bounded_json(data: bytes) -> Any:
+    """Content of a message. Raises WearcapError as `parse_json` does, and for more than `MAX_LISTS` lists and objects."""
+    if data.count(b"[") + data.count(b"{") > MAX_LISTS:
+        raise WearcapError("too many lists and objects", "message", f"at most {MAX_LISTS}")
+    return parse_json(data, "message")
 
 
 def device_of(serial: str) -> str:

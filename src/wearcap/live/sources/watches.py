@@ -16,13 +16,12 @@ import torch
 
 from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError, require_choice
-from wearcap.files import parse_json
 from wearcap.io.devices.watch_log import G_M_S2, WatchConvention, logging_time, watch_convention
 from wearcap.live.packets import Inbox, Packet
 from wearcap.live.source import Address, DatagramSource
-from wearcap.live.sources.parts import Names, device_of, matrix_of, require_options
+from wearcap.live.sources.parts import Names, bounded_json, device_of, matrix_of, require_options
 from wearcap.live.sources.posts import serve_posts
-from wearcap.sensors.packets import MAX_ACC_M_S2, NOT_FINITE, time_fault, values_fault
+from wearcap.sensors.packets import MAX_ACC_M_S2, NOT_FINITE, OUT_OF_RANGE, time_fault, values_fault
 from wearcap.sensors.samples import WatchSample
 
 MAX_ENTRIES = 4096
@@ -99,7 +98,8 @@ class _Watch:
     rows: list[_Row] = field(default_factory=list)
     """Samples that the convention will be found in."""
     changed: int = 0
-    """Samples in a row whose gravity has another length than the convention says."""
+    """Samples in a row whose gravity has another length than the convention says; before it is found, those whose time
+    is far from the others'."""
     entries: _Entries = field(default_factory=_Entries)
     whole: bool = False
     """Whether it sends whole samples, so that entries of single sensors are another device's, the phone's."""
@@ -112,12 +112,17 @@ class _Watch:
             if self.changed < CHANGED_ROWS:
                 return self.convention if self.changed == 0 else refuse(NO_CONVENTION)
             self.convention, self.changed, self.rows = None, 0, []
-        if (self.rows and row.time_s <= self.rows[-1].time_s) or len(self.rows) >= MAX_ROWS:
-            self.rows = []
+        step_s = row.time_s - self.rows[-1].time_s if self.rows else 0.01
+        if not 0 < step_s <= FIRST_S:  # late, repeated, or of another time
+            self.changed += abs(step_s) > FIRST_S
+            if self.changed < CHANGED_ROWS:
+                return None
+        if self.changed >= CHANGED_ROWS or len(self.rows) >= MAX_ROWS:
+            self.rows, self.changed = [], 0
         self.rows.append(row)
         if row.time_s - self.rows[0].time_s < FIRST_S or len(self.rows) < FIRST_ROWS:
             return None
-        rows, self.rows = self.rows, []
+        rows, self.rows, self.changed = self.rows, [], 0
         try:
             gravity, quat_wxyz = (np.array([getattr(each, name) for each in rows]) for name in ("gravity", "quat_wxyz"))
             self.convention = watch_convention(gravity, quat_wxyz, "watch")
@@ -169,7 +174,7 @@ class WatchSource(DatagramSource):
     def _json_rows(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> Iterator[tuple[str, _Row]]:
         """Samples by device: of Sensor Logger's message, or of SensorLog's objects, one or a list, or one a line."""
         for text in data.splitlines()[:MAX_ENTRIES] if b"}\n{" in data else [data]:
-            content = parse_json(text, "datagram")
+            content = bounded_json(text)
             if isinstance(content, dict) and isinstance(content.get("payload"), list):
                 yield from self._sensor_logger(content, arrived_s, refuse)
                 continue
@@ -222,8 +227,9 @@ class WatchSource(DatagramSource):
         R = matrix_of(row.quat_wxyz)
         if isinstance(R, str):
             return refuse(R)
-        if not all(map(math.isfinite, (*row.gravity, *row.free))):
-            return refuse(NOT_FINITE)
+        felt = (*row.gravity, *row.free)
+        if not all(abs(value) <= MAX_ACC_M_S2 for value in felt):
+            return refuse(OUT_OF_RANGE if all(map(math.isfinite, felt)) else NOT_FINITE)
         convention = watch.understood(row, refuse)
         if convention is None:
             return None
