@@ -74,8 +74,7 @@ def _sources(config: DictConfig, system: System, place: CaptureInput | None) -> 
             raise WearcapError(
                 "source=replay without a recording", expected="recording=DATASET/NAME, or any file with one"
             )
-        kind = system.session_class()
-        replay = ReplaySource(place.recording, kind.devices, kind.tracks_wrists, float(config.speed))
+        replay = ReplaySource(place.recording, system.session_class(), float(config.speed))
         sources.append(replay)
         if config.height is None and not config.guided:
             setup = setup or replay.setup

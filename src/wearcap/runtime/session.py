@@ -52,6 +52,8 @@ class Session(ABC):
     """Devices of a wearer without which there is no motion: "head", joints of wrists, "suit", "camera"."""
     tracks_wrists: ClassVar[bool] = False
     """Whether wrists come as tracked poses; otherwise as orientation and acceleration of watches."""
+    given_floor: ClassVar[bool] = False
+    """Whether a capture of a whole recording takes the floor that it has, as a stream then takes its wearer's `floor_m`."""
 
     def __init__(self, system: Any, streams: Sequence[Any]):
         """`streams`: one for each wearer, with the properties `dropped` and `refused`, `take(sample)` for one sample, and

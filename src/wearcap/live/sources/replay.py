@@ -12,11 +12,12 @@ from torch import Tensor
 from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.trajectory import Trajectory, interpolate_clamped
+from wearcap.geometry.trajectory import Trajectory
 from wearcap.live.packets import CAMERA, HEAD, SUIT, Inbox, Packet
 from wearcap.live.setup import Seat, Setup
 from wearcap.live.source import Address, Source
 from wearcap.recording import ImuStream, Motion, Recording
+from wearcap.runtime.session import Session
 from wearcap.sensors.imu import acceleration
 from wearcap.sensors.samples import HeadSample, LocalizationSample, SuitPiece, WatchSample, WristSample
 from wearcap.tracking.stature import skeleton_of
@@ -33,18 +34,16 @@ class ReplaySource(Source):
     scheme, port, hz = "replay", 0, 60.0
     convention = "the recording's own"
 
-    def __init__(
-        self, recording: Recording, devices: tuple[str, ...], tracks_wrists: bool, speed: float = 1.0, wearer: str = ""
-    ):
-        """`devices` and `tracks_wrists`: what a session needs; `speed` times real time, inf: as fast as it goes.
+    def __init__(self, recording: Recording, kind: type[Session], speed: float = 1.0, wearer: str = ""):
+        """`kind`: class of the session, which says what it needs; `speed` times real time, inf: as fast as it goes.
 
         Raises WearcapError for a recording that has not all of these devices, and for a speed that is not positive.
         """
         super().__init__(Address("replay", "127.0.0.1", 0))
         if not speed > 0:
             raise WearcapError(f"speed={speed}", expected="a positive number, or inf: as fast as it goes")
-        self.recording, self.devices, self.speed, self.wearer = recording, devices, speed, wearer
-        self.streams = {device: self._stream(device, tracks_wrists) for device in devices}
+        self.recording, self.kind, self.speed, self.wearer = recording, kind, speed, wearer
+        self.streams = {device: self._stream(device, kind.tracks_wrists) for device in kind.devices}
 
     @property
     def name(self) -> str:
@@ -63,7 +62,8 @@ class ReplaySource(Source):
         if recording.head is not None:
             seats[HEAD] = Seat(HEAD, recording.head.R_head_device, recording.head.t_head_device)
         floor = recording.floor
-        floor_m = floor.height[0].item() if floor is not None and len(floor.height) else None
+        given = self.kind.given_floor and floor is not None and len(floor.height)
+        floor_m = floor.height[0].item() if given else None
         return Setup(skeleton, seats, floor_m, ("As the recording has it.",))
 
     async def run(self, inbox: Inbox) -> None:
@@ -104,14 +104,11 @@ class ReplaySource(Source):
                 return WristSample(device, stream.timestamps[k].item(), stream.T_world_body[k])
             case Motion():
                 return SuitPiece(stream.sliced(k, k + 1))
-        time_s, recording = stream.timestamps[k].item(), self.recording
+        time_s = stream.timestamps[k].item()
         if device == CAMERA:
             pose = Rigid(stream.R_world_cam[k], stream.t_world_cam[k])
             return LocalizationSample(time_s, pose, stream.confidence[k].item())
-        floor_m, at = None, torch.tensor([time_s], dtype=torch.float64)
-        if recording.floor is not None:
-            floor_m = interpolate_clamped(recording.floor.timestamps, recording.floor.height, at).item()
-        return HeadSample(time_s, stream.T_world_device[k], points[k], self._embedding(time_s), floor_m)
+        return HeadSample(time_s, stream.T_world_device[k], points[k], self._embedding(time_s))
 
     def _embedding(self, time_s: float) -> Tensor | None:
         camera = self.recording.camera
@@ -153,7 +150,7 @@ class ReplaySource(Source):
         else:
             found = {HEAD: recording.head, SUIT: recording.suit, CAMERA: recording.localization}[device]
         if found is None or not len(_times(found)):
-            expected = f"{', '.join(self.devices)}, as this system needs"
+            expected = f"{', '.join(self.kind.devices)}, as this system needs"
             raise WearcapError(f"a recording without {device.replace('_', ' ')}", recording.name, expected)
         return found
 

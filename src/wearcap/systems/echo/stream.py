@@ -328,6 +328,7 @@ class EchoSession(Session):
     stream_class = EchoStream
     classes = classes_of(*_STATE, sys.modules[__name__])
     devices = ("head", *WRISTS)
+    given_floor = True
     tracks_wrists = True
 
     def __init__(

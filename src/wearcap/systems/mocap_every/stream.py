@@ -214,6 +214,7 @@ class MocapEverySession(Session):
     stream_class = MocapEveryStream
     classes = classes_of(*_STATE, sys.modules[__name__])
     devices = ("head", *WRISTS)
+    given_floor = True
 
     def __init__(self, pipeline: MocapEvery, wearers: Sequence[Wearer]):
         """Raises WearcapError without wearers."""
