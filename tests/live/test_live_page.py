@@ -14,10 +14,12 @@ import torch
 from live_show import FPS, PIECE, Show, walking
 from wearcap.body.skeleton import skeleton_of_height
 from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
 from wearcap.live.page import MAX_WEARERS, LivePage
+from wearcap.live.page_devices import Devices
 from wearcap.live.page_panel import sinks_html, wearer_html
 from wearcap.live.playout import BEHIND_S, Playout
-from wearcap.live.status import Latency, LiveStatus, SinkStatus, WearerStatus
+from wearcap.live.status import DeviceStatus, Latency, LiveStatus, SinkStatus, WearerStatus
 from wearcap.viewer.page import COLORS
 from wearcap_browser import Chromium, chromium
 
@@ -112,13 +114,30 @@ def test_devices_are_where_they_are_and_watches_at_their_wrists(page, show):
     page.draw(1.0)
     page.draw(1.1)
     person = page._persons["anna"]
-    head, watch = (person.devices[name][0] for name in ("head", "left_wrist"))
+    head, watch = (person.devices.known[name].frame for name in ("head", "left_wrist"))
     motion, status = show.persons["anna"], show.status().wearers[0]
     np.testing.assert_allclose(head.position, status.devices[0].T_world_device.t.numpy(), atol=1e-5)
     np.testing.assert_allclose(watch.position, motion.joint("left_wrist").t[0].numpy(), atol=1e-5)
     page._panel.devices.value = False
     page.draw(1.2)
     assert not head.visible
+
+
+def test_devices_are_as_late_as_the_body(page):
+    devices = Devices("/world/devices_of_test")
+    for step in range(11):
+        pose = Rigid(rotation.about_axis("z", torch.tensor(0.2 * step)), torch.tensor([0.1 * step, 0.0, 1.0]))
+        devices.see(page.server, (DeviceStatus("head", 72.0, pose),), 50.0 + 0.1 * step)
+    devices.show(51.0, 0.25, True, None)
+    frame = devices.known["head"].frame
+    np.testing.assert_allclose(frame.position, [0.75, 0.0, 1.0], atol=1e-5)
+    assert 2 * np.arctan2(frame.wxyz[3], frame.wxyz[0]) == pytest.approx(1.5, abs=0.01)
+    devices.see(page.server, (), 51.1)
+    devices.show(51.1, 0.0, True, None)
+    assert not frame.visible
+    for number in range(100):
+        devices.see(page.server, (DeviceStatus(f"serial {number}", 1.0, pose),), 52.0)
+    assert len(devices.known) == 16
 
 
 def test_persons_have_their_own_colours_leave_and_come_back(page, show):
@@ -166,7 +185,7 @@ def test_what_goes_wrong_does_not_end_the_page(page, show):
         return original()
 
     show.status = status
-    page.run(1.2)
+    page.run(1.8)
     assert page.errors == 2
     assert page.last_error == "RuntimeError: no status"
     assert page._panel.wearers.keys() == {"anna", "ben"}
