@@ -98,9 +98,9 @@ class FirstMinute:
         self._head, self._floor_m, self._own_floor_m = head_seat(), None, None
         self._measured = False
         """Whether the height is known better than by the default."""
-        self._hung: dict[str, Tensor] = {}
+        self._hanging: dict[str, Tensor] = {}
         """Orientation of hanging devices, "time 3 3"."""
-        self._hung_m: dict[str, float] = {}
+        self._hanging_m: dict[str, float] = {}
         self._heading = 0.0
         """Heading (rad) of the wearer whose arms hang."""
         self._looked_s = self._begun_s = self._step_s = -math.inf
@@ -283,7 +283,7 @@ class FirstMinute:
             return False
         self._heading = rotation.yaw_of(rotation.mean_rotation(head.R)).item()
         for device in worn:
-            self._hung[device] = seen[device].R
+            self._hanging[device] = seen[device].R
             self._seat_watch(device, rough=True)
         return True
 
@@ -345,7 +345,7 @@ class FirstMinute:
 
     def _seat_watch(self, device: str, rough: bool) -> None:
         """Seat and heading of a watch on a hanging arm."""
-        seat, R = self._seats[device], self._hung[device]
+        seat, R = self._seats[device], self._hanging[device]
         known = self.before is not None and device in self.before.seats
         mount = None if known else wearing.watch_mount(R, seat.joint)
         if mount is not None:
@@ -384,7 +384,7 @@ class FirstMinute:
         if step == STAND:
             return True
         if step == RAISE:
-            candidates = [device for device in self._hung if device not in self._seats]
+            candidates = [device for device in self._hanging if device not in self._seats]
             return bool(self._missing and candidates)
         return bool(self._wrists) if step == ARMS else bool(self._wrists) and not self.tracked
 
@@ -467,10 +467,10 @@ class FirstMinute:
                 self._reason, self._hold_s, self._progress = f"{name} is not down yet.", self._now_s, 0.0
                 return False
             self._place_trackers(head, seen)
-        self._hung = {device: window.R for device, window in seen.items()}
-        self._hung_m = {device: window.v[:, 2].median().item() for device, window in seen.items()}
+        self._hanging = {device: window.R for device, window in seen.items()}
+        self._hanging_m = {device: window.v[:, 2].median().item() for device, window in seen.items()}
         for device, seat in list(self._seats.items()):
-            if seat.joint in WRISTS and device in self._hung:
+            if seat.joint in WRISTS and device in self._hanging:
                 self._seat_hanging(device)
         return True
 
@@ -479,7 +479,7 @@ class FirstMinute:
         if not self.tracked:
             self._seat_watch(device, rough=False)
             return
-        seat, R = self._seats[device], rotation.mean_rotation(self._hung[device])
+        seat, R = self._seats[device], rotation.mean_rotation(self._hanging[device])
         R_world_joint = wearing.hanging(seat.joint, self._heading)
         off = math.degrees(rotation.geodesic(R @ seat.R_joint_device.mT, R_world_joint).item())
         if off > NO_CONTROLLER_DEG and self.before is None:
@@ -491,7 +491,7 @@ class FirstMinute:
             )
 
     def _raise(self) -> bool:
-        candidates = [device for device in self._hung if device not in self._seats]
+        candidates = [device for device in self._hanging if device not in self._seats]
         risen = {device: self._rise(device) for device in candidates}
         self._progress = max(0.0, *risen.values()) if risen else 0.0
         raised = [device for device, share in risen.items() if share >= 1.0]
@@ -512,8 +512,8 @@ class FirstMinute:
         if window is None:
             return 0.0
         if self.tracked:
-            return (window.v[:, 2].median().item() - self._hung_m[device]) / RAISED_M
-        hand = -rotation.mean_rotation(self._hung[device])[2]  # downwards while it hung, in the watch's axes
+            return (window.v[:, 2].median().item() - self._hanging_m[device]) / RAISED_M
+        hand = -rotation.mean_rotation(self._hanging[device])[2]  # downwards while it was down, in the watch's axes
         up = (rotation.mean_rotation(window.R) @ hand)[2].item()
         return (up + 1) / (RAISED_UP + 1)
 

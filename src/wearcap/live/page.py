@@ -14,26 +14,27 @@ import viser
 from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
-from wearcap.geometry.rotation import quat_wxyz_from_matrix
 from wearcap.live.packets import HEAD
+from wearcap.live.page_devices import Devices
 from wearcap.live.page_panel import Panel, fitting
 from wearcap.live.playout import Playout
 from wearcap.live.sink import Sink
-from wearcap.live.status import MAX_POINTS, DeviceStatus, LiveControls, LiveStatus, WearerStatus
+from wearcap.live.status import MAX_POINTS, LiveControls, LiveStatus, WearerStatus
 from wearcap.recording import Motion, PointCloud
 from wearcap.viewer.page import COLORS, UPDATES_PER_S
 from wearcap.viewer.page_layers import BodyLayer, FeetLayer, LabelLayer, add_points, surface_or_sticks
 from wearcap.viewer.page_server import ServedPage
 
-MAX_WEARERS, MAX_DEVICES = 16, 16
-"""Most wearers, and most devices of each, that are drawn."""
-PANEL_S, POINTS_S = 0.25, 1.0
-"""Times (s) between updates of the panel, and of the points."""
+MAX_WEARERS = 16
+"""Most wearers that are drawn."""
+STATUS_S, PANEL_S, POINTS_S = 0.1, 0.3, 1.0
+"""Times (s) between questions for the state, updates of the panel, and of the points."""
+UNSEEN_S = 0.5
+"""Time (s) between frames that no browser sees."""
 SOON_S = 0.3
 """Time (s) that the camera takes to follow."""
 LOOK_AT_M, CAMERA_M = (0.0, -0.3, 0.9), (2.2, 1.5, 1.35)
 """Where the camera looks and stands at first, from the floor below the person; the panel covers the right side."""
-AXES_M = 0.13
 _NOTHING = LiveStatus()
 
 
@@ -51,8 +52,10 @@ class _Person:
     body: BodyLayer | None = None
     feet: FeetLayer | None = None
     label: LabelLayer | None = None
-    devices: dict[str, tuple[viser.FrameHandle, viser.LabelHandle]] = field(default_factory=dict)
     shown: bool = True
+
+    def __post_init__(self):
+        self.devices = Devices(f"/world/devices_{self.number}")
 
     @property
     def color(self) -> tuple[int, int, int]:
@@ -111,42 +114,6 @@ class _Person:
                 handle.remove()
         self.body = self.feet = self.label = self.skeleton = None
 
-    def place_devices(self, server: viser.ViserServer, devices: tuple[DeviceStatus, ...], visible: bool) -> None:
-        """Axes and names of the devices, where they are; those without a place are not shown."""
-        for number, device in enumerate(devices[:MAX_DEVICES]):
-            pose, place = device.T_world_device, self._place(device)
-            if device.name not in self.devices:
-                if place is None or len(self.devices) >= MAX_DEVICES:
-                    continue
-                node = f"/world/person_{self.number}_devices/{number}_{len(self.devices)}"
-                frame = server.scene.add_frame(node, axes_length=AXES_M, axes_radius=0.006, origin_radius=0.012)
-                label = server.scene.add_label(
-                    f"{node}/name", fitting(device.name).replace("_", " "), anchor="bottom-left", font_screen_scale=0.8
-                )
-                self.devices[device.name] = frame, label
-            frame, _ = self.devices[device.name]
-            shown = visible and self.shown and place is not None
-            if frame.visible != shown:
-                frame.visible = shown
-            if place is not None and pose is not None:
-                frame.position = place
-                frame.wxyz = quat_wxyz_from_matrix(pose.R.double()).numpy()
-        gone = self.devices.keys() - {device.name for device in devices}
-        for name in gone:
-            self.devices[name][0].visible = False
-
-    def _place(self, device: DeviceStatus) -> np.ndarray | None:
-        """Where a device is: its own place, else that of the joint that wears it."""
-        pose = device.T_world_device
-        if pose is None or not bool(pose.R.isfinite().all()):
-            return None
-        if bool(pose.t.isfinite().all()):
-            return pose.t.double().numpy()
-        if self.body is None or self.skeleton is None or device.name not in self.skeleton or not self.visible:
-            return None
-        bone = self.body.handle.bones[self.skeleton.index(device.name)]
-        return np.asarray(self.body.handle.position) + np.asarray(bone.position)
-
 
 class LivePage(ServedPage, Sink):
     """The page of a running capture. `take` stores and returns; `open` starts the thread that draws."""
@@ -164,7 +131,7 @@ class LivePage(ServedPage, Sink):
         """Number of frames drawn so far."""
         self._persons: dict[str, _Person] = {}
         self._lock = threading.Lock()
-        self._status, self._panel_s, self._points_s = _NOTHING, -math.inf, -math.inf
+        self._status, self._status_s, self._panel_s, self._points_s = _NOTHING, -math.inf, -math.inf, -math.inf
         self._points: list[Tensor] = []
         # The capture's world moves below a camera that stays: cameras report where they are too late to be moved along.
         self._worlds = [self.server.scene.add_frame(node, show_axes=False) for node in ("/world", "/surroundings")]
@@ -233,16 +200,17 @@ class LivePage(ServedPage, Sink):
             except Exception as error:  # a frame that cannot be drawn must not end the page
                 self.errors += 1
                 self.last_error = f"{type(error).__name__}: {error}"[:200]
-            time.sleep(max(0.002, 1 / UPDATES_PER_S - (time.monotonic() - now)))
+            step_s = 1 / UPDATES_PER_S if self.server.get_clients() else UNSEEN_S
+            time.sleep(max(0.002, step_s - (time.monotonic() - now)))
 
     def draw(self, now_s: float) -> None:
         """Send one frame."""
         with self._lock:
             persons = dict(self._persons)
         self.frames += 1
-        fresh = now_s - self._panel_s >= PANEL_S
+        fresh = now_s - self._status_s >= STATUS_S
         if fresh:
-            self._panel_s = now_s
+            self._status_s = now_s
             self._status = self.controls.status()
         of = {wearer.name: wearer for wearer in self._status.wearers}
         with self.server.atomic():
@@ -250,10 +218,16 @@ class LivePage(ServedPage, Sink):
                 folder = self._panel.wearers.get(name)
                 person.shown = folder is None or bool(folder.shown.value)
                 person.draw(self.server, name, now_s, len(persons) > 1)
-                if name in of:
-                    person.place_devices(self.server, of[name].devices, bool(self._panel.devices.value))
+                if fresh:
+                    person.devices.see(self.server, of[name].devices if name in of else (), now_s)
+                # The body is late by the capture's latency and by its play-out.
+                latency_ms = of[name].latency.median_ms if name in of and person.visible else 0.0
+                delay_s = latency_ms / 1000 + person.playout.behind_s
+                visible = person.shown and bool(self._panel.devices.value)
+                person.devices.show(now_s, delay_s, visible, person.body)
             self._follow(persons, now_s)
-            if fresh:
+            if now_s - self._panel_s >= PANEL_S:
+                self._panel_s = now_s
                 self._show_status()
         if now_s - self._points_s >= POINTS_S:
             self._points_s = now_s
@@ -294,7 +268,7 @@ class LivePage(ServedPage, Sink):
     def _follow(self, persons: dict[str, _Person], now_s: float) -> None:
         """Keep the middle of the persons that are shown, or of their heads, where the camera looks; the first one at once."""
         bodies = [one.body.handle for one in persons.values() if one.body is not None and one.visible]
-        heads = [one.devices[HEAD][0] for one in persons.values() if HEAD in one.devices and one.shown]
+        heads = [one.devices.known[HEAD].frame for one in persons.values() if HEAD in one.devices.known and one.shown]
         roots = [np.asarray(handle.position) for handle in bodies or heads]
         if not roots or (self._focus is not None and not self._panel.follow.value):
             return
