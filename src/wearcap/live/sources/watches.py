@@ -33,8 +33,9 @@ PAIR_S = 0.02
 """Largest distance in time between entries of one sample."""
 LATE_S = 0.2
 """An entry waits so long for those of other sensors."""
-CHANGED_ROWS = 100
-"""So many samples in a row whose gravity has another length show that the convention has changed."""
+OTHER_UNIT, CHANGED_ROWS = 4.0, 100
+"""Gravity that is longer or shorter by this factor, in so many samples in a row, shows that the unit has changed. What
+SensorLog's two accelerations leave of gravity may be wrong by a part of this in a fast movement."""
 _XYZ, _WXYZ = ("X", "Y", "Z"), ("W", "X", "Y", "Z")
 
 NO_SAMPLE = "no sample of a watch"
@@ -108,7 +109,7 @@ class _Watch:
         """The convention, once it is found; until then the sample is kept for that."""
         if self.convention is not None:
             length = math.hypot(*row.gravity) * abs(self.convention.m_s2)
-            self.changed = 0 if abs(length / G_M_S2 - 1) < 0.2 else self.changed + 1
+            self.changed = 0 if G_M_S2 / OTHER_UNIT < length < G_M_S2 * OTHER_UNIT else self.changed + 1
             if self.changed < CHANGED_ROWS:
                 return self.convention if self.changed == 0 else refuse(NO_CONVENTION)
             self.convention, self.changed, self.rows = None, 0, []
