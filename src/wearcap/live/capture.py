@@ -293,6 +293,7 @@ class LiveCapture:
             live = self.wearers[each.name]
             wearers[each.name or "wearer"] = {
                 "frames": each.frames,
+                "sessions": live.sessions,
                 "latency_ms": {
                     "median": each.latency.median_ms,
                     "p95": each.latency.p95_ms,

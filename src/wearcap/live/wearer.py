@@ -85,6 +85,8 @@ class LiveWearer:
     stage: Stage = "waiting"
     frames: int = 0
     gaps: int = 0
+    sessions: int = 0
+    """How often the capture of this wearer began."""
     unknown: int = 0
     """Number of packets of devices that nobody wears."""
     latencies: Latencies = field(default_factory=Latencies)
@@ -160,6 +162,7 @@ class LiveWearer:
         placed = {} if head is None else {"R_head_device": head.R_joint_device, "t_head_device": head.t_joint_device}
         wearer = Wearer(setup.skeleton, R_wrist_imu=mounts, floor_m=setup.floor_m, **placed)
         self.session, self.skeleton, self.stage = self.opener.session(wearer), setup.skeleton, "live"
+        self.sessions += 1
 
     def _seated(self, device: str, sample: Any) -> Any:
         """A device's sample as the session takes it, on the joint that wears it; None for a device that nobody wears."""
