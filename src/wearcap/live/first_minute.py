@@ -237,9 +237,6 @@ class FirstMinute:
     def _nominal(self, joint: str) -> Seat:
         return hand_seat(joint, self.hands if self.tracked else "joint")
 
-    def _seat_of(self, joint: str) -> str | None:
-        return next((device for device, seat in self._seats.items() if seat.joint == joint), None)
-
     # --- by itself ------------------------------------------------------------------------------------------------
 
     def _start_soon(self, now_s: float) -> None:
