@@ -59,6 +59,8 @@ class Devices:
     watches: bool = False
     noise_m: float = 0.001
     noise_deg: float = 0.3
+    batch_s: float = 0.0
+    """Time (s) of hands' samples that come at once."""
     now_s: float = 5.0
     """Our time; it goes on from one play to the next."""
 
@@ -68,6 +70,7 @@ class Devices:
         shift = Rigid(torch.eye(3), torch.tensor([0.4, -1.0, self.floor_m]))
         head = shift @ motion.joint("head") @ self.T_head_device
         hands = [self._hand(motion, shift, side) for side in (0, 1)]
+        waiting: list[tuple[str, WristSample | WatchSample]] = []
         for frame, time_s in enumerate(motion.timestamps.tolist()):
             if first.found is not None or time_s > until_s:
                 return time_s
@@ -78,11 +81,14 @@ class Devices:
                 if not name:
                     continue
                 noisy = self._noisy(pose[frame], random)
+                sample = WristSample(name, at_s, noisy)
                 if self.watches:
-                    acc_world = acc[frame] + 0.05 * torch.randn(3, generator=random)
-                    first.see(name, WatchSample(at_s, noisy.R, acc_world, name), self.now_s)
-                else:
-                    first.see(name, WristSample(name, at_s, noisy), self.now_s)
+                    sample = WatchSample(at_s, noisy.R, acc[frame] + 0.05 * torch.randn(3, generator=random), name)
+                waiting.append((name, sample))
+            if not waiting or at_s - waiting[0][1].timestamp >= self.batch_s:
+                for name, sample in waiting:
+                    first.see(name, sample, self.now_s)
+                waiting.clear()
         return math.inf
 
     def _hand(self, motion: Motion, shift: Rigid, side: int) -> tuple[Rigid, torch.Tensor]:

@@ -19,10 +19,12 @@ from wearcap.sensors.samples import HeadSample, SuitPiece, WatchSample, WristSam
 
 LOOK_EVERY_S = 0.1
 SHORT_S = 0.5
-HOLD_S = 2.0
+HOLD_S = 2.2
 """Time (s) for which a wearer stands still, and hands are looked at."""
 SOON_S, DEVICES_S = 8.0, 15.0
 """Time (s) after which the capture starts with defaults: of someone who does not stand still, without a device."""
+LAG_S = 1.5
+"""Time (s) by which samples of a device may be later than the head's: some applications send a second at once."""
 STEP_S = 25.0
 """Time (s) after which a guided step is left with its default."""
 WALKED_S = 2.5
@@ -194,8 +196,15 @@ class FirstMinute:
         return self._seen[HEAD].newest_s if HEAD in self._seen else -math.inf
 
     def _window(self, device: str, start_s: float) -> Window | None:
-        """Samples of a device since a time (s, head's clock), in the head's case of the head joint."""
-        found = self._seen[device].between(start_s, self._now_s) if device in self._seen else None
+        """Samples of a device since a time (s, head's clock), in the head's case of the head joint.
+
+        Of a device whose samples come late, up to `LAG_S`, as many from before.
+        """
+        if device not in self._seen:
+            return None
+        now_s = self._now_s
+        lag_s = min(max(now_s - self._seen[device].newest_s, 0.0), LAG_S)
+        found = self._seen[device].between(start_s - lag_s, now_s - lag_s)
         if found is None or device != HEAD:
             return found
         return wearing.head_of(found, Rigid(self._head.R_joint_device, self._head.t_joint_device))
@@ -227,9 +236,6 @@ class FirstMinute:
 
     def _nominal(self, joint: str) -> Seat:
         return hand_seat(joint, self.hands if self.tracked else "joint")
-
-    def _seat_of(self, joint: str) -> str | None:
-        return next((device for device, seat in self._seats.items() if seat.joint == joint), None)
 
     # --- by itself ------------------------------------------------------------------------------------------------
 

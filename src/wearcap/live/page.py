@@ -35,6 +35,8 @@ SOON_S = 0.3
 """Time (s) that the camera takes to follow."""
 LOOK_AT_M, CAMERA_M = (0.0, -0.3, 0.9), (2.2, 1.5, 1.35)
 """Where the camera looks and stands at first, from the floor below the person; the panel covers the right side."""
+LABEL_M = 0.09
+"""Height (m) of persons' names."""
 _NOTHING = LiveStatus()
 
 
@@ -100,6 +102,7 @@ class _Person:
             self.feet = FeetLayer.of(server, f"{node}_feet", motion, None)
             self.label = LabelLayer(server, node, motion)
             self.label.handle.text = fitting(name)
+            self.label.handle.font_size_mode, self.label.handle.font_scene_height = "scene", LABEL_M
         self.skeleton = motion.skeleton
 
     def _hide(self) -> None:

@@ -14,7 +14,8 @@ from wearcap.viewer.page_layers import BodyLayer
 
 MAX_DEVICES = 16
 """Most devices of one wearer that are shown."""
-AXES_M = 0.13
+AXES_M, LABEL_M = 0.13, 0.05
+"""Length of the axes, and height of the names (m)."""
 KEPT = 40
 """Number of newest places that are kept of a device."""
 MAX_DELAY_S = 2.0
@@ -29,7 +30,9 @@ class Device:
             node, axes_length=AXES_M, axes_radius=0.006, origin_radius=0.012, visible=False
         )
         label = fitting(name).replace("_", " ")
-        server.scene.add_label(f"{node}/name", label, anchor="bottom-left", font_screen_scale=0.8)
+        server.scene.add_label(
+            f"{node}/name", label, anchor="bottom-left", font_size_mode="scene", font_scene_height=LABEL_M
+        )
         self._path: deque[tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "4"]]] = deque(maxlen=KEPT)
 
     def see(self, device: DeviceStatus, now_s: float) -> None:

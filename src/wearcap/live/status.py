@@ -10,7 +10,6 @@ from wearcap.geometry.rigid import Rigid
 
 Stage = Literal["waiting", "first minute", "live", "away"]
 """Of a wearer: nothing has come yet; the set-up is being found; poses come; packets have stopped."""
-STAGES: tuple[Stage, ...] = ("waiting", "first minute", "live", "away")
 MAX_POINTS = 50_000
 """Most points of the surroundings in a status: the newest."""
 

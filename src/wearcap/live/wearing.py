@@ -22,6 +22,7 @@ from wearcap.tracking.stature import HEIGHTS_M
 KEEP_S = 20.0
 """Time (s) of samples that are kept of a device."""
 MAX_KEPT = 6000
+EDGE_S = 0.25
 MIN_STEP_S = 0.004
 """Samples nearer in time (s) than this to the last one are left out."""
 CLOCK_BACK_S = 1.0
@@ -75,9 +76,9 @@ class Seen:
             self._samples.popleft()
 
     def between(self, start_s: float, stop_s: float) -> Window | None:
-        """Samples of a span of time; None unless they fill it, but for 0.4 s at each end."""
+        """Samples of a span of time; None unless they fill it, but for `EDGE_S` at each end."""
         found = [sample for sample in self._samples if start_s <= sample[0] <= stop_s]
-        if len(found) < 4 or found[0][0] > start_s + 0.4 or found[-1][0] < stop_s - 0.4:
+        if len(found) < 4 or found[0][0] > start_s + EDGE_S or found[-1][0] < stop_s - EDGE_S:
             return None
         times = torch.tensor([sample[0] for sample in found], dtype=torch.float64)
         return Window(times, torch.stack([sample[1] for sample in found]), torch.stack([sample[2] for sample in found]))
