@@ -427,3 +427,25 @@ def test_a_port_that_is_taken_ends_the_capture_with_its_reason():
         source = source_of(f"vmc://127.0.0.1:{taken.getsockname()[1]}")
         with pytest.raises(WearcapError, match="cannot listen"):
             LiveCapture(small_hmd2(), [source], []).run(10.0)
+
+
+@pytest.mark.slow
+def test_an_exported_model_captures_live_without_lightning_and_hydra(tmp_path: Path):
+    """The command of an export, on a replay as fast as it goes, against the same export on the whole recording."""
+    from wearcap.export import files
+    from wearcap.recording.store import save_recording
+
+    sensed = swaying(120)
+    files.write_exports(small_hmd2().exports(), tmp_path / "model.onnx", "onnx")
+    save_recording(sensed, tmp_path / "in.safetensors")
+    program = (
+        "import sys; from wearcap.live.__main__ import main; main(sys.argv[1:]); "
+        "assert not {'lightning', 'hydra', 'omegaconf'} & set(sys.modules)"
+    )
+    arguments = [tmp_path / "model.onnx", "--recording", tmp_path / "in.safetensors", "--speed", "inf"]
+    command = [sys.executable, "-c", program, *arguments, "--record", tmp_path / "live"]
+    report = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    assert report["wearers"]["wearer"]["frames"] == 120
+    whole = files.load_exported(tmp_path / "model.onnx")(sensed, 0)
+    found = read_motion(tmp_path / "live" / "wearer" / "motion.npz")
+    torch.testing.assert_close(found.T_world_joint.t, whole.T_world_joint.t, atol=1e-3, rtol=0)

@@ -62,8 +62,9 @@ class ReplaySource(Source):
         if recording.head is not None:
             seats[HEAD] = Seat(HEAD, recording.head.R_head_device, recording.head.t_head_device)
         floor = recording.floor
-        given = self.kind.given_floor and floor is not None and len(floor.height)
-        floor_m = floor.height[0].item() if given else None
+        floor_m = None
+        if self.kind.given_floor and floor is not None and len(floor.height):
+            floor_m = floor.height[0].item()
         return Setup(skeleton, seats, floor_m, ("As the recording has it.",))
 
     async def run(self, inbox: Inbox) -> None:

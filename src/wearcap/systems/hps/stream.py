@@ -33,12 +33,22 @@ from wearcap.runtime.wearer import Wearer
 from wearcap.scene.scan import Scan
 from wearcap.sensors import packets, samples
 from wearcap.sensors.initialization import Initialization, align_suit, estimate_head_camera, initialize, inliers
-from wearcap.sensors.packets import MAX_POSITION_M, MAX_TIME_S, OFF_THE_CLOCK, WRONG_TYPE, rotation_fault, values_fault
+from wearcap.sensors.packets import (
+    BEHIND_S,
+    MAX_POSITION_M,
+    MAX_TIME_S,
+    OFF_THE_CLOCK,
+    WRONG_TYPE,
+    rotation_fault,
+    values_fault,
+)
 from wearcap.sensors.samples import LocalizationSample, SuitPiece
 from wearcap.systems.hps.pipeline import HPS, mount
 
 MAX_UNALIGNED_S = 600.0
 """Length (s) of suit motion that is kept until the first alignment."""
+OVERTAKEN_S = 0.05
+"""Time (s) for which single frames wait for others that they overtook on their way."""
 MAX_PAUSE_S = 10.0
 """Longest gap (s) within a stretch. A piece after a longer one is kept aside until the next piece continues it; then a
 new stretch begins."""
@@ -140,8 +150,8 @@ class HpsStream:
         """The last piece, if it did not follow those before."""
         self._finished: list[Motion] = []
         """Motions that `take` finished and `poses` did not return yet."""
-        self._collected: list[Motion] = []
-        """Single frames of the suit, and below poses of the camera, that `push` did not get yet."""
+        self._collected: dict[float, Motion] = {}
+        """Single frames of the suit by time, and below poses of the camera, that `push` did not get yet."""
         self._cameras: list[LocalizationSample] = []
         self._any_returned = False
         """Whether any motion was returned."""
@@ -167,10 +177,7 @@ class HpsStream:
                 if fault := _suit_fault(sample.suit, self._like):
                     self.refused[f"suit: {fault}"] += 1
                 elif len(sample.suit):
-                    self._collected.append(sample.suit)
-                    first, last = (self._collected[end].timestamps[end].item() for end in (0, -1))
-                    if not 0 <= last - first < self.settings.advance_s:
-                        self._push_collected()
+                    self._collect(sample.suit)
             case LocalizationSample():
                 if fault := packets.time_fault(sample.timestamp) or packets.pose_fault(sample.T_world_cam):
                     self.refused[f"localization: {fault}"] += 1
@@ -184,14 +191,24 @@ class HpsStream:
         if (motion := self.push(suit, localization)) is not None:
             self._finished.append(motion)
 
-    def _push_collected(self) -> None:
-        """Push the frames that were collected, in order of time, with the camera poses up to the last of them."""
-        if not self._collected:
+    def _collect(self, suit: Motion) -> None:
+        """Keep frames until they span `advance_s`; the newest wait for others that they overtook."""
+        time = suit.timestamps[0].item()
+        pushed = -math.inf if self.suit is None else self.suit.timestamps[-1].item()
+        if 0 <= pushed - time < BEHIND_S:
+            self.refused["suit: late"] += 1
             return
-        frames = {each.timestamps[0].item(): each for each in self._collected}
-        self._collected = []
-        suit = joined([frames[time] for time in sorted(frames)])
-        assert suit is not None
+        self._collected[time] = suit
+        newest, oldest = max(self._collected), min(self._collected)
+        if newest - oldest >= self.settings.advance_s + OVERTAKEN_S:
+            self._push_collected(newest - OVERTAKEN_S)
+
+    def _push_collected(self, until: float = math.inf) -> None:
+        """Push collected frames up to a time (s), in order of time, with the camera poses up to the last of them."""
+        times = sorted(time for time in self._collected if time <= until)
+        suit = joined([self._collected.pop(time) for time in times])
+        if suit is None:
+            return
         last_s = suit.timestamps[-1].item()
         seen = {each.timestamp: each for each in self._cameras if each.timestamp <= last_s}
         self._cameras = [each for each in self._cameras if each.timestamp > last_s]

@@ -1,0 +1,78 @@
+"""HPS live: single frames of a suit and of a localised camera become registered poses, every second."""
+
+import math
+import sys
+from pathlib import Path
+
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "pipelines"))
+
+from hps_walk import floor_points, hps_recording
+from hydra.utils import instantiate
+
+from wearcap.cli.conf import compose
+from wearcap.geometry.rigid import Rigid
+from wearcap.live.capture import LiveCapture
+from wearcap.live.sink import Sink
+from wearcap.live.sources.replay import ReplaySource
+from wearcap.recording import Motion
+from wearcap.recording.timing import joined
+from wearcap.runtime.system import CaptureInput
+from wearcap.scene.scan import Scan
+from wearcap.sensors.samples import LocalizationSample, SuitPiece
+from wearcap.systems.hps.stream import HpsSession
+
+
+class Kept(Sink):
+    name = convention = "kept"
+
+    def __init__(self):
+        self.pieces: list[Motion] = []
+
+    def take(self, wearer: str, motion: Motion) -> None:
+        self.pieces.append(motion)
+
+
+def test_a_suit_and_a_localised_camera_become_registered_poses():
+    recording = hps_recording()
+    system = instantiate(compose("capture", ["pipeline=hps", "recording=none"]).pipeline, _convert_="all")
+    source, kept = ReplaySource(recording, HpsSession, math.inf), Kept()
+    place = CaptureInput(recording, scan=Scan(floor_points()))
+    report = LiveCapture(system, [source], [kept], source=place, setup=source.setup).run(120.0)
+    motion = joined(kept.pieces)
+    assert motion is not None and recording.motion is not None  # noqa: PT018
+    frame = torch.searchsorted(recording.motion.timestamps, motion.timestamps - 1e-6)
+    off = (motion.t_world_root - recording.motion.t_world_root[frame]).norm(dim=-1)
+    assert 100 * off.mean() < 6.0
+    assert len(motion) > 28 * 30
+    assert report["wearers"]["wearer"]["refused"] == {}
+
+
+def test_frames_out_of_order_and_doubled_are_sorted_and_bad_ones_counted():
+    recording = hps_recording(seconds=8.0)
+    system = instantiate(compose("capture", ["pipeline=hps", "recording=none"]).pipeline, _convert_="all")
+    session = HpsSession(system, [recording], Scan(floor_points()))
+    suit, seen = recording.suit, recording.localization
+    assert suit is not None and seen is not None  # noqa: PT018
+    order, parts = list(range(len(suit))), []
+    for k in range(0, len(order) - 1, 7):
+        order[k], order[k + 1] = order[k + 1], order[k]
+    for k in order:
+        samples = [SuitPiece(suit.sliced(k, k + 1))] * (2 if k % 50 == 3 else 1)
+        if k % 2 == 0 and k // 2 < len(seen.timestamps):
+            pose = Rigid(seen.R_world_cam[k // 2], seen.t_world_cam[k // 2])
+            samples.append(LocalizationSample(seen.timestamps[k // 2].item(), pose))
+            if k == 100:
+                samples.append(LocalizationSample(float("nan"), pose))
+        session.push([samples])
+        if (motion := session.poses()[0]) is not None:
+            parts.append(motion)
+    # After the first five localised seconds poses come twice a second, a second late.
+    assert len(parts) >= 4
+    ends = torch.tensor([part.timestamps[-1].item() for part in parts])
+    assert ends[0] >= 3.5
+    assert ends.diff().max() <= 0.6
+    assert set(session.refused[0]) <= {"localization: not finite", "suit: late"}
+    assert session.refused[0]["localization: not finite"] == 1
+    assert sum(len(part) for part in parts) == len(torch.cat([part.timestamps for part in parts]).unique())
