@@ -170,6 +170,16 @@ def test_serials_do_not_fill_the_memory():
     assert parsed(source, device("Tra/Pos", "later"), 200.0)[0]
 
 
+def test_trackers_that_come_and_go_are_forgotten():
+    """Ever other serials in the tracking space, far more of them than are remembered."""
+    source = source_of("vmc")
+    for number in range(300):
+        data = device("Tra/Pos/Local", f"serial {number}")
+        packets = [packet for late in (0, 1, 2) for packet in parsed(source, data, 100.0 * number + late)[0]]
+        assert packets
+        assert all(near(packet) for packet in packets)
+
+
 def unity_euler(turn: Rotation, place: np.ndarray) -> tuple[list[float], list[float]]:
     """Position and Euler degrees (x, y, z) as Unity's Transform has them: turned about z, then x, then y."""
     p, q = to_unity(turn, place)

@@ -174,14 +174,14 @@ class VmcSource(DatagramSource):
 
     def _wanted(self, device: str, local: bool, now_s: float) -> bool:
         """Whether to use a pose: one in the tracking space only where the device has none in the world."""
+        if len(self._global_s) > 2 * self._names.limit:  # of devices that are long forgotten, too
+            self._global_s.clear()
+            self._sent_s.clear()
         if not local:
             self._global_s[device] = now_s
         elif device not in self._global_s:
             self._global_s[device] = now_s
             return False
-        if len(self._global_s) > 2 * self._names.limit:
-            self._global_s.clear()
-            self._sent_s.clear()
         return not local or now_s - self._global_s[device] > _WITHOUT_GLOBAL_S
 
 
