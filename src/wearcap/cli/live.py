@@ -1,9 +1,11 @@
 """`wearcap live`: devices in, motion out, while people move."""
 
+import os
 import sys
 from pathlib import Path
 from typing import Any
 
+import torch
 from omegaconf import DictConfig, ListConfig
 from rich import print as show
 
@@ -28,6 +30,10 @@ HELP = "capture while people move: wearcap live system=hmd2 source=vmc://:39540 
 
 def run(config: DictConfig) -> dict[str, Any]:
     """Capture until interrupted, or until a replay has ended; returns the report."""
+    threads = config.threads or max(1, (os.cpu_count() or 2) // 2)
+    if threads < 1:
+        raise WearcapError(f"threads={threads}", expected="1 or more")
+    torch.set_num_threads(threads)
     system = load_pipeline(config.checkpoint, config.pipeline, config.device, shared=True)
     place = None
     if config.recording is not None:

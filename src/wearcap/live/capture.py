@@ -1,6 +1,7 @@
 """A live capture: sources deliver packets, every wearer's session makes poses of them, sinks take them."""
 
 import asyncio
+import gc
 import json
 import threading
 import time
@@ -86,6 +87,8 @@ class LiveCapture:
     def run(self, seconds: float = float("inf")) -> dict[str, Any]:
         """Capture, and return the report. Raises WearcapError when a source or sink cannot be opened."""
         self._warm_up()
+        gc.collect()
+        gc.freeze()  # what is loaded stays: a full collection of it takes a tenth of a second
         opened: list[SinkThread] = []
         try:
             for sink in self.sinks:

@@ -9,16 +9,7 @@ from wearcap.live.sources.watches import WatchHttpSource, WatchSource
 
 SOURCES: dict[str, type[Source]] = {
     source.scheme: source
-    for source in (
-        VmcSource,
-        OscTrackerSource,
-        MvnSource,
-        WatchSource,
-        WatchHttpSource,
-        JsonSource,
-        WebSocketSource,
-        # the replay of recordings goes here
-    )
+    for source in (VmcSource, OscTrackerSource, MvnSource, WatchSource, WatchHttpSource, JsonSource, WebSocketSource)
 }
 """Sources by the scheme of their addresses."""
 
