@@ -68,7 +68,7 @@ class LiveCapture:
             kind.devices, tracked=kind.tracks_wrists, height_m=height_m, setup=before, guided=guide or guided
         )
         open_session = lambda wearer: kind.of_wearers(system, [wearer], seed, source)  # noqa: E731
-        self.opener = Opener(open_session, kind.devices, kind.tracks_wrists, system.fps, minute)
+        self.opener = Opener(open_session, kind.devices, kind.tracks_wrists, minute)
         self.inbox = Inbox()
         self.wearers: dict[str, LiveWearer] = {}
         self.sinks = [SinkThread(sink) for sink in sinks]
@@ -123,8 +123,8 @@ class LiveCapture:
         if HEAD not in devices:
             return
         session = self.opener.session(Wearer(skeleton, floor_m=0.0))
-        for k in range(int(WARM_UP_S * self.system.fps)):
-            at_s, samples = k / self.system.fps, []
+        for k in range(int(WARM_UP_S * session.fps)):
+            at_s, samples = k / session.fps, []
             for joint in devices[1:]:
                 watch = WatchSample(at_s, torch.eye(3), torch.zeros(3), joint)
                 samples.append(WristSample(joint, at_s, pose) if self.opener.tracks_wrists else watch)
@@ -168,7 +168,7 @@ class LiveCapture:
     def _begin(self, wearer: LiveWearer) -> None:
         assert wearer.skeleton is not None
         for sink in self._all_sinks():
-            sink.begin(wearer.name, wearer.skeleton, self.system.fps)
+            sink.begin(wearer.name, wearer.skeleton, wearer.fps)
         if self._setup_file is not None and wearer.setup is not None and wearer.setup is not self._setup:
             name = self._setup_file
             write_setup(wearer.setup, name.with_stem(f"{name.stem}_{wearer.name}") if wearer.name else name)
@@ -279,7 +279,7 @@ class LiveCapture:
         self._recorded, self._recording = sink, folder
         for wearer in self.wearers.values():
             if wearer.stage == "live" and wearer.skeleton is not None:
-                sink.begin(wearer.name, wearer.skeleton, self.system.fps)
+                sink.begin(wearer.name, wearer.skeleton, wearer.fps)
 
     def _stop_recording(self) -> None:
         if self._recorded is not None:

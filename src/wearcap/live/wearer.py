@@ -43,7 +43,6 @@ class Opener:
     devices: tuple[str, ...]
     """Devices that the session needs; the first one's clock times the motion."""
     tracks_wrists: bool
-    fps: float
     first_minute: Callable[[Setup | None, bool], FirstMinute]
     """(set-up of last time, whether guided) → a new first minute."""
 
@@ -97,6 +96,7 @@ class LiveWearer:
         self.first: FirstMinute | None = None
         self.session: Session | None = None
         self.skeleton: Skeleton | None = None
+        self.fps = 0.0
         self._devices: dict[str, _Device] = {}
         self._arrived_s = -np.inf
         self._head_s = -np.inf
@@ -162,7 +162,7 @@ class LiveWearer:
         placed = {} if head is None else {"R_head_device": head.R_joint_device, "t_head_device": head.t_joint_device}
         wearer = Wearer(setup.skeleton, R_wrist_imu=mounts, floor_m=setup.floor_m, **placed)
         self.session, self.skeleton, self.stage = self.opener.session(wearer), setup.skeleton, "live"
-        self.sessions += 1
+        self.sessions, self.fps = self.sessions + 1, self.session.fps
 
     def _seated(self, device: str, sample: Any) -> Any:
         """A device's sample as the session takes it, on the joint that wears it; None for a device that nobody wears."""

@@ -72,6 +72,11 @@ class Session(ABC):
         return cls(system, wearers)
 
     @property
+    def fps(self) -> float:
+        """Frame rate of the poses (Hz)."""
+        return self.system.fps
+
+    @property
     def dropped(self) -> list[int]:
         """Number of each wearer's head poses that were late, duplicated or refused."""
         return [stream.dropped for stream in self.streams]

@@ -177,11 +177,6 @@ class System(ABC):
         return self._room("stream", "captures streams").SESSION
 
     @property
-    def fps(self) -> float:
-        """Frame rate of captures (Hz). Raises WearcapError for a system that does not stream."""
-        raise WearcapError(f"pipeline {self.name!r} is none that captures streams", fix="Choose another pipeline=….")
-
-    @property
     def latency_s(self) -> float:
         """Longest time (s) from a frame to its final pose in a stream, without computation.
 
