@@ -8,6 +8,7 @@ import pytest
 
 from wearcap.cli import main as cli
 from wearcap.cli.conf import compose, conf_dir
+from wearcap.cli.live import with_system
 from wearcap.errors import WearcapError
 
 ROOT = Path(__file__).parents[1]
@@ -48,6 +49,8 @@ def test_a_command_of_the_pages_is_understood(page, line, tmp_path, monkeypatch)
     assert verb in cli.VERBS
     if verb in HYDRA_VERBS:
         composes(verb, arguments)
+    elif verb == "live":
+        composes("live", with_system(arguments))
     elif verb == "prepare":
         composes("prepare", [f"prepare={arguments[0]}", *arguments[1:]])
     elif verb != "demo":

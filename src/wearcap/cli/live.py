@@ -1,5 +1,6 @@
 """`wearcap live`: devices in, motion out, while people move."""
 
+import json
 import os
 import sys
 from pathlib import Path
@@ -125,12 +126,18 @@ def _listed(value: Any) -> list[str]:
 
 
 def with_system(arguments: list[str]) -> list[str]:
-    """Arguments with `system=NAME` as the choice of its pipeline. Raises WearcapError for an unknown system."""
+    """Arguments with `system=NAME` as the choice of its pipeline, and with addresses quoted, which Hydra cannot read plain.
+
+    Raises WearcapError for an unknown system.
+    """
     systems = dict(compose("live").systems)
     chosen = []
     for argument in arguments:
         key, _, name = argument.partition("=")
-        if key != "system":
+        if key in ("source", "to"):
+            addresses = (each.strip().strip("'\"") for each in name.strip("[]").split(","))
+            chosen.append(f"{key}=[{','.join(json.dumps(each) for each in addresses if each)}]")
+        elif key != "system":
             chosen.append(argument)
         elif name in systems:
             chosen.append(f"pipeline={systems[name]}")

@@ -1,0 +1,55 @@
+"""`wearcap live` on the command line."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from wearcap.cli.conf import compose
+from wearcap.cli.live import main, with_system
+from wearcap.errors import WearcapError
+from wearcap.io.formats.motion_npz import read_motion
+from wearcap.recording.store import save_recording
+from wearcap_testing import recording_of, swaying_motion
+
+
+@pytest.mark.parametrize(
+    ("given", "source"),
+    [
+        ("source=vmc://:39540", ["vmc://:39540"]),
+        ("source=vmc://127.0.0.1:39540?wearer=anna", ["vmc://127.0.0.1:39540?wearer=anna"]),
+        ("source=[json://:9100,watch://:5555?joint=left_wrist]", ["json://:9100", "watch://:5555?joint=left_wrist"]),
+        ("source=replay", ["replay"]),
+    ],
+)
+def test_addresses_need_no_quotes(given: str, source: list[str]):
+    config = compose("live", with_system(["system=echo", given, "to=[]"]))
+    assert list(config.source) == source
+    assert not config.to
+    assert config.pipeline._target_.endswith("Echo")
+
+
+def test_an_unknown_system_and_a_replay_of_nothing_are_named():
+    with pytest.raises(WearcapError, match="hmd2"):
+        with_system(["system=hmd3"])
+    with pytest.raises(WearcapError, match="recording="):
+        main(["system=hmd2", "source=replay"])
+
+
+@pytest.mark.slow
+def test_a_replay_with_the_shared_checkpoint_is_recorded_and_reported(tmp_path: Path):
+    save_recording(recording_of(swaying_motion(200, 0), "sway"), tmp_path / "in.safetensors")
+    main(
+        [
+            "system=hmd2",
+            "source=replay",
+            f"recording={tmp_path / 'in.safetensors'}",
+            "speed=inf",
+            f"record={tmp_path / 'out'}",
+            f"report={tmp_path / 'report.json'}",
+            f"hydra.run.dir={tmp_path}",
+        ]
+    )
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["wearers"]["wearer"]["frames"] == 200
+    assert len(read_motion(tmp_path / "out" / "wearer" / "motion.npz")) == 200
