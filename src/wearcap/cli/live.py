@@ -1,6 +1,7 @@
 """`wearcap live`: devices in, motion out, while people move."""
 
 import json
+import logging
 import os
 import sys
 from pathlib import Path
@@ -11,7 +12,7 @@ from omegaconf import DictConfig, ListConfig
 from rich import print as show
 
 from wearcap.cli.conf import compose, hydra_main, load_pipeline
-from wearcap.errors import WearcapError, nearest
+from wearcap.errors import WearcapError, nearest, require_choice
 from wearcap.live.capture import LiveCapture, write_report
 from wearcap.live.page import LivePage
 from wearcap.live.setup import Setup, read_setup
@@ -26,6 +27,7 @@ from wearcap.recording.store import dataset_folder
 from wearcap.runtime.system import CaptureInput, System
 from wearcap.viewer.guard import LOOPBACK
 
+HANDS = ("grip", "wrist", "joint")
 HELP = "capture while people move: wearcap live system=hmd2 source=vmc://:39540 to=vmc://127.0.0.1:39539 view=true"
 
 
@@ -40,6 +42,7 @@ def run(config: DictConfig) -> dict[str, Any]:
     if config.recording is not None:
         recording, folder = read(config.recording), dataset_folder(config.recording)
         place = CaptureInput.in_dataset(recording, folder, config.scene, config.metres_per_unit)
+    require_choice(config.hands, HANDS, f"hands={config.hands}")
     sources, setup = _sources(config, system, place)
     speed = float(config.speed)
     sinks: list[Sink] = [sink_of(each, config.host, pace=speed <= 1) for each in _listed(config.to)]
@@ -51,6 +54,7 @@ def run(config: DictConfig) -> dict[str, Any]:
         source=place,
         setup=setup,
         height_m=config.height,
+        hands="joint" if "replay" in _listed(config.source) else config.hands,  # a recording has the wrists themselves
         guided=config.guided,
         setup_file=setup_file,
         seed=config.seed,
@@ -61,6 +65,8 @@ def run(config: DictConfig) -> dict[str, Any]:
     if config.view:
         page = LivePage(capture, config.host, config.port)
         capture.add_sink(page)
+    for name in ("", "websockets"):  # a quantisation's and a server's messages are no news to a wearer
+        logging.getLogger(name).setLevel(logging.WARNING)
     _tell(config, sources, sinks, page)
     report = capture.run(float("inf") if config.seconds is None else float(config.seconds))
     write_report(report, Path(config.report))

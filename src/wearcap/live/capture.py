@@ -51,6 +51,7 @@ class LiveCapture:
         source: CaptureInput | None = None,
         setup: Setup | None = None,
         height_m: float | None = None,
+        hands: str = "grip",
         guided: bool = False,
         setup_file: Path | None = None,
         seed: int = 0,
@@ -58,14 +59,19 @@ class LiveCapture:
         record: Path | None = None,
     ):
         """`source`: recording, scan and objects of the place, for systems that use them; `setup`: of every wearer, from the
-        beginning; `setup_file`: where what the first minute finds is kept; `recorder` makes the sink that writes to a
+        beginning; `hands`: what hand poses are (`setup.hand_seat`); `setup_file`: where what the first minute finds is kept; `recorder` makes the sink that writes to a
         folder, from the start where `record` names one. Raises WearcapError for a system that does not stream.
         """
         self.system, self.sources = system, list(sources)
         self.latency_s = system.latency_s
         kind = system.session_class()
         minute = lambda before, guide: FirstMinute(  # noqa: E731
-            kind.devices, tracked=kind.tracks_wrists, height_m=height_m, setup=before, guided=guide or guided
+            kind.devices,
+            tracked=kind.tracks_wrists,
+            hands=hands,
+            height_m=height_m,
+            setup=before,
+            guided=guide or guided,
         )
         open_session = lambda wearer: kind.of_wearers(system, [wearer], seed, source)  # noqa: E731
         self.opener = Opener(open_session, kind.devices, kind.tracks_wrists, minute)
