@@ -42,7 +42,8 @@ BONES = {
     **{f"{side}{bone}": f"{side.lower()}_{joint}" for side in ("Left", "Right") for bone, joint in _SIDES.items()},
 }
 """Unity's names of bones, parents first, with our joints; the lowest of the spine's joints has no bone of its own."""
-_PARENTS = {
+PARENTS = {
+    "Hips": None,
     "Spine": "Hips", "Chest": "Spine", "UpperChest": "Chest", "Neck": "UpperChest", "Head": "Neck",
     **{f"{side}{bone}": f"{side}{parent}" for side in ("Left", "Right") for bone, parent in (
         ("UpperArm", "Shoulder"), ("LowerArm", "UpperArm"), ("Hand", "LowerArm"),
@@ -50,6 +51,7 @@ _PARENTS = {
     **{f"{side}Shoulder": "UpperChest" for side in ("Left", "Right")},
     **{f"{side}UpperLeg": "Hips" for side in ("Left", "Right")},
 }  # fmt: skip
+"""Parent of each bone; None of the hips."""
 _CALIBRATED = 3
 """Of `/VMC/Ext/OK`: the performer is calibrated."""
 
@@ -107,7 +109,7 @@ def bones_of(motion: Motion) -> tuple[Float[Tensor, "time bone 3"], Float[Tensor
     names = list(BONES)
     pose = motion.T_world_joint[:, motion.skeleton.indices(*BONES.values())]
     R, t = UNITY.mT @ pose.R @ UNITY, pose.t @ UNITY
-    parents = [names.index(_PARENTS[name]) for name in names[1:]]
+    parents = [names.index(PARENTS[name]) for name in names[1:]]
     t_local, R_local = t.clone(), R.clone()
     t_local[:, 1:] = (R[:, parents].mT @ (t[:, 1:] - t[:, parents])[..., None])[..., 0]
     R_local[:, 1:] = R[:, parents].mT @ R[:, 1:]
