@@ -12,7 +12,7 @@ from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import Motion, Recording, RecordingStore
-from wearcap.systems.mocap_every.training_windows import WatchContent
+from wearcap.systems.mocap_every.training_windows import WatchContent, WatchWindow
 from wearcap_testing import small_dataset
 
 FPS = 60.0
@@ -129,9 +129,13 @@ def test_windows_take_other_arms_for_a_share_of_the_others(tmp_path):
         for arms in (0.0, 1.0)
     )
     own, own_too = none[0, 2], all_mixed[0, 2]
+    assert isinstance(own, WatchWindow)
+    assert isinstance(own_too, WatchWindow)
     assert torch.equal(own.R_parent_joint, own_too.R_parent_joint)
     legs = [joint for joint in range(23) if joint not in JOINTS]
     before, after = none[0, 3], all_mixed[0, 3]
+    assert isinstance(before, WatchWindow)
+    assert isinstance(after, WatchWindow)
     assert torch.equal(before.R_parent_joint[:, legs], after.R_parent_joint[:, legs])
     assert torch.equal(before.t_world_head, after.t_world_head)
     assert rotation.geodesic(before.R_parent_joint, after.R_parent_joint)[:, JOINTS].max() > 0.3
