@@ -113,6 +113,10 @@ PAPER_TOTALCAPTURE: Scores = {
 }
 """TotalCapture, real sensors, all five subjects."""
 FLOORS = ("fixed", "update", "points", "follow")
+GIVEN_ALL, ALL_TRAININGS = "ours, exact sensors, floor and bones given", "ours, all trainings"
+UPSIDE_DOWN = ("127_32",)
+"""Recordings of CMU whose file has the head upside down on an upright neck (158° about one axis), as no head can be: rows
+are given with and without them."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -299,6 +303,10 @@ def _people(
     """Rows of bodies: trained rivals and ablations, then ours, then the truth."""
     rows = {} if options.keep else _rivals(options, progress.console)
     rows |= {method.name: [method] for method in _ours(options) if options.rows is None or method.name in options.rows}
+    others = [path for path in _seeded(options.runs, "mocap_every")[1:] if path.is_file()]
+    if others and not options.keep:
+        checkpoints = [options.checkpoint, *map(str, others)]
+        rows[ALL_TRAININGS] = [Method(ALL_TRAININGS, each, options.sensors) for each in checkpoints]
     scores = {}
     for name, methods in rows.items():
         bar = progress.add_task(name, total=len(methods) * len(names))
@@ -308,7 +316,10 @@ def _people(
             for recording, _, captured in captures(method, store, names, lambda b=bar: progress.advance(b))
         ]
         scores[name] = aggregate(scored) | training_of(methods[0].checkpoint)
-    return scores | {"truth": truth_row(next(reversed(scores.values())))}
+        upright = [row for row in scored if row.recording not in UPSIDE_DOWN]
+        if name in ("ours", GIVEN_ALL, ALL_TRAININGS) and len(upright) < len(scored):
+            scores[f"{name}, without {', '.join(UPSIDE_DOWN)}"] = aggregate(upright)
+    return scores | {"truth": truth_row(scores[next(reversed(rows))])}
 
 
 def _ours(options: argparse.Namespace) -> list[Method]:
@@ -328,21 +339,25 @@ def _ours(options: argparse.Namespace) -> list[Method]:
         Method(f"ours, {what}", options.checkpoint, usual, height_off_m=off) for what, off in WRONG_HEIGHTS.items()
     ]
     ours += [Method(f"ours, {other} sensors", options.checkpoint, other) for other in WEARABLES if other != usual]
-    given = "ours, exact sensors, floor and bones given"
-    return [*ours, Method(given, options.checkpoint, GIVEN, ("pipeline=mocap_every", level))]
+    return [*ours, Method(GIVEN_ALL, options.checkpoint, GIVEN, ("pipeline=mocap_every", level))]
 
 
 def _rivals(options: argparse.Namespace, console: Console) -> dict[str, list[Method]]:
     """Methods of the rows with trainings of their own, by seed; those without a checkpoint are named and left out."""
     trained = {}
     for name, (run, pipeline) in TRAINED.items():
-        paths = [options.runs / seeded / "checkpoints" / "best.ckpt" for seeded in (run, f"{run}_1", f"{run}_2")]
+        paths = _seeded(options.runs, run)
         sensors = GIVEN if run in HANDS else options.sensors
         overrides = (*pipeline, "pipeline.floor=fixed", "pipeline.refinement=null")
         trained[name] = [Method(name, str(path), sensors, overrides) for path in paths if path.is_file()]
         if not trained[name]:
             console.print(left_out(name, "mocap_every", run, paths[0]), markup=False, soft_wrap=True)
     return {name: methods for name, methods in trained.items() if methods}
+
+
+def _seeded(runs: Path, run: str) -> list[Path]:
+    """Checkpoints of a training with three seeds."""
+    return [runs / seeded / "checkpoints" / "best.ckpt" for seeded in (run, f"{run}_1", f"{run}_2")]
 
 
 def _totalcapture(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
