@@ -10,6 +10,7 @@ table gives their mean and spread. A row without its checkpoint is left out, and
 import argparse
 import json
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 from mocap_every_calibration import GOALS, calibration_scores
@@ -324,18 +325,20 @@ def _upright(name: str, scored: list[Row]) -> Scores:
 
 
 def _trainings(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
-    """Our checkpoint and two other trainings of the same: mean and spread."""
-    checkpoints = [options.checkpoint, *map(str, _seeded(options.runs, "mocap_every")[1:])]
+    """Our checkpoint beside the mean and spread of three trainings, RUNS/mocap_every, …_1 and …_2."""
+    trained = {"ours": [options.checkpoint], "three trainings": [*map(str, _seeded(options.runs, "mocap_every"))]}
+    sensing = {"": (options.sensors, ()), ", exact sensors, floor and bones given": (GIVEN, ("pipeline.floor=fixed",))}
     scores: Scores = {}
     for root in (options.datasets / "cmu", *options.strangers):
         store, names = split_of(options, root)
-        for name, sensors, pipeline in (("ours", options.sensors, ()), (GIVEN_ALL, GIVEN, ("pipeline.floor=fixed",))):
-            bar, scored = progress.add_task(f"{root.name}: {name}", total=3 * len(names)), []
+        for (label, checkpoints), (given, (sensors, pipeline)) in product(trained.items(), sensing.items()):
+            name, scored = f"{root.name}, {label}{given}", []
+            bar = progress.add_task(name, total=len(checkpoints) * len(names))
             for seed, checkpoint in enumerate(checkpoints):
                 method = Method(name, checkpoint, sensors, ("pipeline=mocap_every", *pipeline))
                 found = captures(method, store, names, lambda b=bar: progress.advance(b))
                 scored += [body_row(recording, captured, seed) for recording, _, captured in found]
-            scores |= {f"{root.name}: {name}": aggregate(scored)} | _upright(f"{root.name}: {name}", scored)
+            scores |= {name: aggregate(scored) | training_of(checkpoints[0])} | _upright(name, scored)
     return f"Three trainings: {options.split}, {options.sensors} sensors", BODY, scores
 
 
