@@ -9,8 +9,10 @@ from dataclasses import dataclass, replace
 import torch
 
 from wearcap.body.skeleton import Skeleton
+from wearcap.data.arm_mixing import ArmDonors
 from wearcap.errors import WearcapError
 from wearcap.recording.recording import FloorTrack, HeadStream, Recording
+from wearcap.recording.store import RecordingFile
 
 _TRUNK = ("l5", "l3", "t12", "t8", "neck", "head")
 _SHOULDERS = ("collar", "shoulder")
@@ -43,10 +45,18 @@ class OtherBodies:
     limb: float = 0.03
     shoulders: float = 0.05
     elbow: float = 0.02
+    arms: float = 0.0
+    """Share of these people whose arms move as somebody else's, where the trunks agree (`arm_mixing`)."""
 
     def __post_init__(self):
         if self.count < 1:
             raise WearcapError(f"count={self.count} of other bodies", expected="1 or more, or no other bodies: null")
+        if not 0 <= self.arms <= 1:
+            raise WearcapError(f"arms={self.arms} of other bodies", expected="a share of the people, from 0 to 1")
+
+    def moves_other_arms(self, seed: int) -> bool:
+        """Whether the person of a seed moves the arms as somebody else."""
+        return torch.rand((), generator=torch.Generator().manual_seed(seed + 1)).item() < self.arms
 
     def proportions(self, seed: int) -> Proportions:
         """Proportions of one person, a function of the seed."""
@@ -55,6 +65,23 @@ class OtherBodies:
         stature, legs, trunk, arms, shoulders, elbow = (spread * value for spread, value in zip(spreads, normal))
         logs = (legs, trunk, shoulders, arms + elbow, arms - elbow)
         return Proportions(*(torch.tensor(stature + each).exp().item() for each in logs))
+
+
+@dataclass(frozen=True)
+class OtherPerson:
+    """Somebody else who does a recorded motion."""
+
+    body: Proportions
+    seed: int = 0
+    donors: ArmDonors | None = None
+    """Whose arms the person moves; None: the recorded ones."""
+
+    def recording(self, file: RecordingFile) -> Recording:
+        """The file's recording, done by this person."""
+        recording = file.load()
+        if self.donors is not None and recording.motion is not None:
+            recording = replace(recording, motion=self.donors.mixed(recording.motion, file, self.seed))
+        return with_proportions(recording, self.body)
 
 
 def with_proportions(recording: Recording, body: Proportions) -> Recording:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
-from wearcap.data.bodies import Proportions
+from wearcap.data.bodies import OtherPerson
 from wearcap.data.features import first_repeated
 from wearcap.data.transforms import Cut, Draws, Window, joint_twins
 from wearcap.data.windows import Content, Windows
@@ -121,7 +121,7 @@ class MovementContent(Content):
         stride = windows.stride // every
         return Cut(start // every, windows.window // every, length, stride, stretch=windows.stretch)
 
-    def open(self, store: RecordingStore, name: str, every: int, body: Proportions | None = None) -> Movement:
+    def open(self, store: RecordingStore, name: str, every: int, person: OtherPerson | None = None) -> Movement:
         return self.features.movement(RecordingFile(store.path_of(name)).part("motion"))
 
     def read(self, track: Movement, cut: Cut, random: Draws) -> Window:

@@ -16,7 +16,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
-from wearcap.data.bodies import OtherBodies, Proportions
+from wearcap.data.arm_mixing import ArmDonors
+from wearcap.data.bodies import OtherBodies, OtherPerson
 from wearcap.data.transforms import Cut, Draws, TimeStretch, TimeTransform, Transform, Window
 from wearcap.errors import WearcapError
 from wearcap.models.layers import Normalizer
@@ -71,10 +72,10 @@ class Content:
         keys = open_recording(store.path_of(name)).keys
         return self.any_body and not any(key.startswith("object_motion.") for key in keys)
 
-    def open(self, store: RecordingStore, name: str, every: int, body: Proportions | None = None) -> Any:
+    def open(self, store: RecordingStore, name: str, every: int, person: OtherPerson | None = None) -> Any:
         """The track of a recording: what is kept of it in memory, for `read` to cut windows out of.
 
-        `body`: proportions of another person who does the same, for recordings that are `varied`; None: as recorded.
+        `person`: somebody else who does the same, for recordings that are `varied`; None: as recorded.
         """
         raise NotImplementedError
 
@@ -126,6 +127,7 @@ class Windows(Dataset):
         self._varied: list[bool] = []
         self.bodies = bodies if augmented else None
         self._tracks: dict[tuple[int, int], Any] = {}
+        self._donors: dict[Path, ArmDonors] = {}
         stores = [RecordingStore.open(source.root) for source in sources]
         content.prepare(stores, split)
         least, starts, weights = content.min_frames(window, self.stretch), [], []
@@ -151,16 +153,35 @@ class Windows(Dataset):
         return len(self.starts)
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_tracks": {}}
+        return self.__dict__ | {"_tracks": {}, "_donors": {}}
 
     def track(self, number: int, person: int = 0) -> Any:
         """A whole recording, by its index in `recordings`, of its wearer (0) or of one of the other `bodies`."""
         if (number, person) not in self._tracks:
             if len(self._tracks) == self.content.tracks_at_once:
                 self._tracks.pop(next(iter(self._tracks)))
-            body = self.bodies.proportions(1_000_003 * number + person) if self.bodies and person else None
-            self._tracks[number, person] = self.content.open(*self.recordings[number], body)
+            self._tracks[number, person] = self.content.open(*self.recordings[number], self._other(number, person))
         return self._tracks[number, person]
+
+    def _other(self, number: int, person: int) -> OtherPerson | None:
+        """One of the other `bodies` who does a recording's motion; None for its wearer."""
+        if self.bodies is None or not person:
+            return None
+        seed = 1_000_003 * number + person
+        donors = self._arm_donors(self.recordings[number][0]) if self.bodies.moves_other_arms(seed) else None
+        return OtherPerson(self.bodies.proportions(seed), seed, donors)
+
+    def _arm_donors(self, store: RecordingStore) -> ArmDonors:
+        """The recordings of a store that windows are cut out of and in which no objects are handled."""
+        if store.root not in self._donors:
+            cut = {
+                self.recordings[number][1]
+                for number in self.starts[:, 0].unique().tolist()
+                if self.recordings[number][0].root == store.root
+            }
+            names = [name for name in sorted(cut) if self.content.varied(store, name)]
+            self._donors[store.root] = ArmDonors([open_recording(store.path_of(name)) for name in names])
+        return self._donors[store.root]
 
     def _person(self, number: int, seed: int) -> int:
         """Who does the motion of a sample."""

@@ -12,7 +12,7 @@ from torch import Tensor
 from wearcap.body.anny_body import anny_body
 from wearcap.body.contact_points import TOUCH_M, contact_points, mirrored_points
 from wearcap.body.skeleton import FOOT_PATCHES, MIRROR, Skeleton
-from wearcap.data.bodies import Proportions, with_proportions
+from wearcap.data.bodies import OtherPerson
 from wearcap.data.features import body_size, on_level_ground
 from wearcap.data.transforms import Cut, Draws, Window, joint_twins
 from wearcap.data.windows import Content, Windows, open_recording
@@ -226,9 +226,9 @@ class EchoContent(Content):
     def usable(self, store: RecordingStore, name: str) -> bool:
         return on_level_ground(open_recording(store.path_of(name)))
 
-    def open(self, store: RecordingStore, name: str, every: int, body: Proportions | None = None) -> EchoTrack:
-        recording = RecordingFile(store.path_of(name)).load()
-        recording = recording if body is None else with_proportions(recording, body)
+    def open(self, store: RecordingStore, name: str, every: int, person: OtherPerson | None = None) -> EchoTrack:
+        opened = RecordingFile(store.path_of(name))
+        recording = opened.load() if person is None else person.recording(opened)
         file = recording.environment if self.objects else None
         environment = None if file is None else _environment(store.root / file)
         return EchoTrack.read(recording, environment, self._reader, every, self.within_m)

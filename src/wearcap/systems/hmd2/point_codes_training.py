@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.data.bodies import Proportions
+from wearcap.data.bodies import OtherPerson
 from wearcap.data.transforms import Cut, Draws, Window
 from wearcap.data.windows import Content, Windows, drawn_batches
 from wearcap.metrics.detection import distance_mae_cm, occupancy_iou, occupied_distance_mae_cm
@@ -43,7 +43,7 @@ class PlaceContent(Content):
         return 1
 
     def open(
-        self, store: RecordingStore, name: str, every: int, body: Proportions | None = None
+        self, store: RecordingStore, name: str, every: int, person: OtherPerson | None = None
     ) -> tuple[VoxelMap, HeadStream]:
         file = RecordingFile(store.path_of(name))
         cloud, head, surroundings = file.part("points"), file.part("head"), VoxelMap(self.grid)

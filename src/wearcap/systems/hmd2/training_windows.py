@@ -10,7 +10,7 @@ from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import FEET, Skeleton
-from wearcap.data.bodies import Proportions, with_proportions
+from wearcap.data.bodies import OtherPerson
 from wearcap.data.features import body_size, on_level_ground, true_foot_contact
 from wearcap.data.surroundings import NOTHING, Surroundings, embeddings_of
 from wearcap.data.transforms import Cut, Draws, Window, joint_twins
@@ -97,12 +97,12 @@ class HeadContent(Content):
         file = open_recording(store.path_of(name))
         return "points.points_world" in file.keys or on_level_ground(file)
 
-    def open(self, store: RecordingStore, name: str, every: int, body: Proportions | None = None) -> _HeadTrack:
+    def open(self, store: RecordingStore, name: str, every: int, person: OtherPerson | None = None) -> _HeadTrack:
         file = open_recording(store.path_of(name))
         if file.length("head.timestamps") != file.length("motion.timestamps"):
             what, fix = "head and motion have different lengths", "Prepare the recording again."
             raise WearcapError(what, where=file.path, expected="both on one clock", fix=fix)
-        recording = file.load() if body is None else with_proportions(file.load(), body)
+        recording = file.load() if person is None else person.recording(file)
         head, motion = recording.head, recording.motion
         assert head is not None
         assert motion is not None
@@ -118,7 +118,7 @@ class HeadContent(Content):
         constants = {"t_parent_joint": motion.skeleton.t_parent_joint, "size": body_size(motion.skeleton)}
         twins = dict.fromkeys(("R_parent_joint", "t_parent_joint"), joint_twins(motion.skeleton))
         twins |= {"foot_contact": [1, 0]}
-        return _HeadTrack(store, name, file, head.R_head_device, values, constants, twins, surrounded=body is None)
+        return _HeadTrack(store, name, file, head.R_head_device, values, constants, twins, surrounded=person is None)
 
     def read(self, track: _HeadTrack, cut: Cut, random: Draws) -> Window:
         start, stop = cut.bounds

@@ -9,7 +9,7 @@ from einops import rearrange
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from wearcap.data.bodies import Proportions
+from wearcap.data.bodies import OtherPerson
 from wearcap.data.transforms import Cut, Draws, Window, joint_twins
 from wearcap.data.windows import Content, Windows, open_recording
 from wearcap.errors import WearcapError
@@ -85,7 +85,7 @@ class ContactContent(Content):
         length, longest = len(track.timestamps), self.min_frames(windows.window, windows.stretch)
         return Cut(start, windows.window, length, windows.stride, latest=length - longest, stretch=windows.stretch)
 
-    def open(self, store: RecordingStore, name: str, every: int, body: Proportions | None = None) -> _PoseTrack:
+    def open(self, store: RecordingStore, name: str, every: int, person: OtherPerson | None = None) -> _PoseTrack:
         file = open_recording(store.path_of(name))
         interactions = file.part("interactions")
         if f"{self.stream}.timestamps" not in file.keys or interactions is None:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.data.bodies import Proportions, with_proportions
+from wearcap.data.bodies import OtherPerson
 from wearcap.data.features import body_size, on_level_ground, true_foot_contact
 from wearcap.data.transforms import Cut, Draws, Window, joint_twins
 from wearcap.data.windows import Content, open_recording
@@ -58,9 +58,9 @@ class WatchContent(Content):
     def usable(self, store: RecordingStore, name: str) -> bool:
         return on_level_ground(open_recording(store.path_of(name)))
 
-    def open(self, store: RecordingStore, name: str, every: int, body: Proportions | None = None) -> _WatchTrack:
-        recording = RecordingFile(store.path_of(name)).load()
-        recording = recording if body is None else with_proportions(recording, body)
+    def open(self, store: RecordingStore, name: str, every: int, person: OtherPerson | None = None) -> _WatchTrack:
+        file = RecordingFile(store.path_of(name))
+        recording = file.load() if person is None else person.recording(file)
         motion, head = recording.motion, recording.head
         assert motion is not None
         assert head is not None
