@@ -398,6 +398,25 @@ def test_a_client_that_does_not_read_is_disconnected_and_the_others_get_all():
     thread.close()
 
 
+def test_the_page_starts_and_stops_recordings_while_the_capture_runs(tmp_path: Path):
+    sensed, kept = swaying(400), Kept()
+    source = ReplaySource(sensed, HMD2Session, 2.0)
+    capture = LiveCapture(
+        small_hmd2(), [source], [kept], setup=source.setup, recorder=FilesSink, recordings=tmp_path / "all"
+    )
+    for at_s, on in ((1.0, True), (2.0, False), (2.2, True)):
+        threading.Timer(at_s, capture.record, [on]).start()
+    report = capture.run(60.0)
+    assert report["wearers"]["wearer"]["frames"] == 400
+    recorded = [read_motion(path) for path in sorted((tmp_path / "all").glob("*/wearer/motion.npz"))]
+    assert len(recorded) == 2
+    whole = kept.motion()
+    for motion in recorded:
+        first = int((whole.timestamps - motion.timestamps[0]).abs().argmin())
+        part = whole.sliced(first, first + len(motion))
+        torch.testing.assert_close(motion.t_world_root, part.t_world_root)
+
+
 def test_reports_are_json_also_without_poses(tmp_path: Path):
     report = LiveCapture(small_hmd2(), [Scripted([])], []).run(5.0)
     write_report(report, tmp_path / "report.json")

@@ -60,6 +60,7 @@ def run(config: DictConfig) -> dict[str, Any]:
         seed=config.seed,
         recorder=FilesSink,
         record=None if config.record is None else Path(config.record),
+        recordings=Path(config.paths.run),
     )
     page = None
     if config.view:

@@ -35,6 +35,8 @@ WAIT_S = 0.02
 """Longest time without a look at who has left and what the page wishes."""
 WARM_UP_S = 2.0
 """Length of what the network is run on before the first packet."""
+JOIN_S = 600.0
+"""Longest time for the files of a recording to be joined at its end."""
 RESTART_S = 2.0
 """Time after which a source that failed is started again."""
 
@@ -57,10 +59,12 @@ class LiveCapture:
         seed: int = 0,
         recorder: Callable[[Path], Sink] | None = None,
         record: Path | None = None,
+        recordings: Path = Path(),
     ):
         """`source`: recording, scan and objects of the place, for systems that use them; `setup`: of every wearer, from the
         beginning; `hands`: what hand poses are (`setup.hand_seat`); `setup_file`: where what the first minute finds is kept; `recorder` makes the sink that writes to a
-        folder, from the start where `record` names one. Raises WearcapError for a system that does not stream.
+        folder, from the start where `record` names one, else in `recordings` when the
+        page asks for it. Raises WearcapError for a system that does not stream.
         """
         self.system, self.sources = system, list(sources)
         self.latency_s = system.latency_s
@@ -82,6 +86,8 @@ class LiveCapture:
         self._recorder, self._recording = recorder, None
         self._record_from_start = record
         self._recorded: SinkThread | None = None
+        self._closing: list[threading.Thread] = []
+        self._recordings = recordings
         self._wishes: list[Callable[[], None]] = []
         self._stopping = threading.Event()
         self._began_s = time.monotonic()
@@ -118,6 +124,8 @@ class LiveCapture:
             self._fulfil()
             for sink in opened:
                 sink.close()
+            for closing in self._closing:
+                closing.join()
         if self._failure is not None:
             raise self._failure
         return self.report()
@@ -279,7 +287,7 @@ class LiveCapture:
     def _start_recording(self, folder: Path | None) -> None:
         if self._recorder is None or self._recorded is not None:
             return
-        folder = folder or Path(f"live_{datetime.now():%Y-%m-%d_%H-%M-%S}")
+        folder = folder or self._recordings / f"recording_{datetime.now():%Y-%m-%d_%H-%M-%S}"
         sink = SinkThread(self._recorder(folder), capacity=100_000)
         sink.start()
         self._recorded, self._recording = sink, folder
@@ -288,8 +296,11 @@ class LiveCapture:
                 sink.begin(wearer.name, wearer.skeleton, wearer.fps)
 
     def _stop_recording(self) -> None:
+        """Close the files in a thread of its own: joining a long recording takes seconds."""
         if self._recorded is not None:
-            self._recorded.close(60.0)
+            closing = threading.Thread(target=self._recorded.close, args=(JOIN_S,), name="closing a recording")
+            closing.start()
+            self._closing.append(closing)
         self._recorded = self._recording = None
 
     # --- report -----------------------------------------------------------------------------------------------------
