@@ -1,7 +1,7 @@
 """Files that grow while they are recorded: whatever moment a capture is killed at, they open and lack at most a second.
 
-A folder for each wearer holds `motion-000000.npz`, `motion-000001.npz`, …, ten seconds each, and the same as .bvh; the newest
-are written anew twice a second, atomically. At the end, and by `join_sections` after a kill, they become motion.npz and
+A folder for each wearer holds `motion-000000.npz`, `motion-000001.npz`, …, four seconds each, and the same as .bvh; the newest
+are written anew four times a second, atomically. At the end, and by `join_sections` after a kill, they become motion.npz and
 motion.bvh.
 """
 
@@ -17,9 +17,9 @@ from wearcap.live.sink import Sink
 from wearcap.recording import Motion
 from wearcap.recording.timing import joined
 
-SYNC_S = 0.5
+SYNC_S = 0.25
 """Time between writes of what has come."""
-SECTION_S = 10.0
+SECTION_S = 4.0
 """Length of the motion in one file."""
 _SECTION = re.compile(r"motion-([0-9]{6})\.npz")
 
