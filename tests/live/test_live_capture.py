@@ -21,6 +21,7 @@ from serving import free_port
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+import wearcap
 from carried_box import carrying, drawn_echo
 from small_hmd2 import hmd2_of
 from watched_walk import drawn_pipeline, watched_walk
@@ -336,7 +337,10 @@ for k in range(1000):
         assert files
         for path in files:
             assert len(read_bvh(path.with_suffix(".bvh"))) == len(read_motion(path))
+        left = wearcap.read(folder / "wearer").motion
         whole = join_sections(folder / "wearer")
+        assert left is not None
+        assert len(left) == len(whole) == len(wearcap.read(folder / "wearer").motion)
         assert (sent - 1) * 0.1 - whole.timestamps[-1].item() <= 1.0
         assert sorted(path.name for path in (folder / "wearer").iterdir()) == ["motion.bvh", "motion.npz"]
 
@@ -431,7 +435,7 @@ def test_reports_are_json_also_without_poses(tmp_path: Path):
         (lambda: source_of("telepathy://:1"), ("telepathy",)),
         (lambda: ReplaySource(Recording("bare"), HMD2Session), ("head", "bare")),
         (lambda: ReplaySource(swaying(10), HMD2Session, speed=0.0), ("speed",)),
-        (lambda: join_sections(Path("nowhere")), ("nowhere",)),
+        (lambda: join_sections(Path("nowhere")), ("no recorded motion",)),
     ],
 )
 def test_what_is_wrong_is_named(call, names):

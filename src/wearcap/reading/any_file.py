@@ -11,7 +11,7 @@ from wearcap.io.datasets.amass import read_amass
 from wearcap.io.datasets.nymeria import is_nymeria, read_nymeria, read_xdata
 from wearcap.io.datasets.totalcapture import is_totalcapture, read_totalcapture, totalcapture_files
 from wearcap.io.devices.aria_mps import head_stream, is_mps_folder, read_closed_loop, read_mps
-from wearcap.io.formats.motion_npz import read_motion
+from wearcap.io.formats.motion_npz import motion_files, read_motion, read_sections
 from wearcap.io.formats.npz import read_npz
 from wearcap.io.formats.trajectory import trajectory_format
 from wearcap.prepare.foreign import read_foreign_motion
@@ -84,6 +84,12 @@ def _read_npz(path: Path) -> Recording | Motion:
     return read_motion(path) if read_npz(path, ("wearcap",)) else read_amass(path)
 
 
+def _read_motion_folder(folder: Path) -> Recording:
+    """What `wearcap live record=DIR` left of a wearer, also where it was killed."""
+    motion = read_sections(motion_files(folder))
+    return Recording(folder.name, motion=motion, skeleton=motion.skeleton)
+
+
 def _totalcapture(folder: Path) -> Recording:
     """A sequence in Vicon's skeleton; where the sensors are mounted is not known."""
     found = read_totalcapture(totalcapture_files(folder)[0])
@@ -95,6 +101,7 @@ _FOLDERS: tuple[tuple[Callable[[Path], bool], Callable[[Path], Recording]], ...]
     (is_mps_folder, read_mps),
     (is_adt, read_adt),
     (is_totalcapture, _totalcapture),
+    (lambda folder: bool(motion_files(folder)), _read_motion_folder),
     (is_kit, lambda folder: read_kit(folder)[0]),
 )
 READERS: dict[str, Callable[[Path], Recording | Motion]] = {

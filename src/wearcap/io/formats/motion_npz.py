@@ -5,6 +5,8 @@ everything that is no array), and for tools that know AMASS' keys `trans`, `pose
 parent, in this skeleton's joints and axes), `mocap_framerate` and `joint_names`.
 """
 
+import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +21,11 @@ from wearcap.geometry.trajectory import nearest_frames
 from wearcap.io.formats.npz import read_npz, require
 from wearcap.recording.motion import HANDS, Motion
 from wearcap.recording.serialize import dumps, flatten, unflatten
+from wearcap.recording.timing import joined
 
 SCHEMA = 1
+SECTION = re.compile(r"motion-[0-9]{6}\.npz")
+"""Names of consecutive parts of one motion."""
 
 
 def write_motion(motion: Motion, path: str | Path) -> None:
@@ -62,6 +67,27 @@ def read_motion(path: str | Path) -> Motion:
     except (KeyError, TypeError, ValueError, AttributeError, IndexError, RecursionError) as error:
         raise _damaged(error, path) from error
     return motion
+
+
+def motion_files(folder: str | Path) -> list[Path]:
+    """Files of a motion in a folder, in order of time: motion.npz, else the sections of a live capture that did not end."""
+    folder = Path(folder)
+    whole = folder / "motion.npz"
+    return (
+        [whole]
+        if whole.is_file()
+        else sorted(path for path in folder.glob("motion-*.npz") if SECTION.fullmatch(path.name))
+    )
+
+
+def read_sections(paths: Sequence[Path]) -> Motion:
+    """The motion of consecutive files. Raises WearcapError as `read_motion` does, for no file, and for other skeletons."""
+    motions = [read_motion(path) for path in paths]
+    if any(each.skeleton != motions[0].skeleton for each in motions):
+        raise WearcapError("sections of several skeletons", paths[0].parent, "the files of one wearer")
+    if (whole := joined(motions)) is None:
+        raise WearcapError("no recorded motion", expected="motion.npz, or motion-000000.npz, …")
+    return whole
 
 
 def _damaged(error: Exception, path: str | Path) -> WearcapError:

@@ -12,7 +12,7 @@ from pathlib import Path
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.io.formats.bvh import write_bvh
-from wearcap.io.formats.motion_npz import read_motion, write_motion
+from wearcap.io.formats.motion_npz import SECTION, read_sections, write_motion
 from wearcap.live.sink import Sink
 from wearcap.recording import Motion
 from wearcap.recording.timing import joined
@@ -21,7 +21,6 @@ SYNC_S = 0.25
 """Time between writes of what has come."""
 SECTION_S = 4.0
 """Length of the motion in one file."""
-_SECTION = re.compile(r"motion-([0-9]{6})\.npz")
 
 
 class FilesSink(Sink):
@@ -91,16 +90,9 @@ class _Track:
 
 
 def join_sections(folder: Path) -> Motion:
-    """Write motion.npz and motion.bvh of a folder's sections and remove these. Raises WearcapError for a folder without any,
-    and for files that are not of one wearer's skeleton."""
-    found = sorted(path for path in folder.glob("motion-*.npz") if _SECTION.fullmatch(path.name))
-    if not found:
-        raise WearcapError("no recorded motion", folder, "motion-000000.npz, … of wearcap live record=DIR")
-    motions = [read_motion(path) for path in found]
-    if any(each.skeleton != motions[0].skeleton for each in motions):
-        raise WearcapError("sections of several skeletons", folder, "the files of one wearer")
-    whole = joined(motions)
-    assert whole is not None
+    """Write motion.npz and motion.bvh of a folder's sections and remove these. Raises WearcapError as `read_sections` does."""
+    found = sorted(path for path in folder.glob("motion-*.npz") if SECTION.fullmatch(path.name))
+    whole = read_sections(found)
     write_motion(whole, folder / "motion.npz")
     if len(whole) > 1:
         write_bvh(whole, folder / "motion.bvh")
