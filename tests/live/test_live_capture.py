@@ -404,12 +404,18 @@ def test_a_client_that_does_not_read_is_disconnected_and_the_others_get_all():
 
 def test_the_page_starts_and_stops_recordings_while_the_capture_runs(tmp_path: Path):
     sensed, kept = swaying(400), Kept()
-    source = ReplaySource(sensed, HMD2Session, 2.0)
+    source = ReplaySource(sensed, HMD2Session, 1.5)
     capture = LiveCapture(
         small_hmd2(), [source], [kept], setup=source.setup, recorder=FilesSink, recordings=tmp_path / "all"
     )
-    for at_s, on in ((1.0, True), (2.0, False), (2.2, True)):
-        threading.Timer(at_s, capture.record, [on]).start()
+
+    def press() -> None:
+        for frames, on in ((20, True), (120, False), (150, True)):
+            while sum(len(piece) for piece in kept.pieces.get("", [])) < frames:
+                time.sleep(0.02)
+            capture.record(on)
+
+    threading.Thread(target=press, daemon=True).start()
     report = capture.run(60.0)
     assert report["wearers"]["wearer"]["frames"] == 400
     recorded = [read_motion(path) for path in sorted((tmp_path / "all").glob("*/wearer/motion.npz"))]
