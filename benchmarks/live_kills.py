@@ -28,10 +28,12 @@ import sys, time
 sys.path[:0] = [sys.argv[2]]
 from dataclasses import replace
 from pathlib import Path
+import torch
 from wearcap.live.sink import SinkThread
 from wearcap.live.sinks.files import FilesSink
 from wearcap_testing import swaying_motion
 thread, motion = SinkThread(FilesSink(Path(sys.argv[1]))), swaying_motion(6, 0)
+torch.set_num_threads(1)
 thread.start()
 thread.begin("", motion.skeleton, 60.0)
 begin = time.monotonic()

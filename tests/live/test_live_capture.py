@@ -324,7 +324,7 @@ for k in range(1000):
     print(k, flush=True)
     time.sleep(max(0, begin + (k + 1) / 10 - time.monotonic()))
 """
-    for number, after_s in enumerate((0.35, 1.6, 2.4)):
+    for number, after_s in enumerate((0.9, 1.6, 2.4)):
         folder = tmp_path / str(number)
         process = subprocess.Popen([sys.executable, "-c", script, str(folder)], stdout=subprocess.PIPE, text=True)
         assert process.stdout is not None

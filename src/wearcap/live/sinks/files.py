@@ -1,26 +1,23 @@
 """Files that grow while they are recorded: whatever moment a capture is killed at, they open and lack at most a second.
 
-A folder for each wearer holds `motion-000000.npz`, `motion-000001.npz`, …, four seconds each, and the same as .bvh; the newest
-are written anew four times a second, atomically. At the end, and by `join_sections` after a kill, they become motion.npz and
-motion.bvh.
+A folder for each wearer holds `motion-000000.npz`, `motion-000001.npz`, … of half a second each, and the same as .bvh, each
+written once and atomically. At the end, and by `join_sections` after a kill, they become motion.npz and motion.bvh.
 """
 
+import math
 import re
-import time
 from pathlib import Path
 
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.io.formats.bvh import write_bvh
-from wearcap.io.formats.motion_npz import SECTION, read_sections, write_motion
+from wearcap.io.formats.motion_npz import SECTION, motion_files, read_sections, write_motion
 from wearcap.live.sink import Sink
 from wearcap.recording import Motion
 from wearcap.recording.timing import joined
 
-SYNC_S = 0.25
-"""Time between writes of what has come."""
-SECTION_S = 4.0
-"""Length of the motion in one file."""
+SECTION_S = 0.5
+"""Length of the motion in one file; a file is written once."""
 
 
 class FilesSink(Sink):
@@ -40,20 +37,20 @@ class FilesSink(Sink):
             raise WearcapError(what, self.folder, "record=DIR") from error
 
     def begin(self, wearer: str, skeleton: Skeleton, fps: float) -> None:
-        if wearer in self._tracks:
-            self._tracks[wearer].flush()
+        self.end(wearer)
         self._tracks[wearer] = _Track(_free_folder(self.folder / _plain(wearer)))
 
     def take(self, wearer: str, motion: Motion) -> None:
-        if wearer not in self._tracks:
-            self.begin(wearer, motion.skeleton, motion.fps)
+        if wearer not in self._tracks or motion.timestamps[0].item() <= self._tracks[wearer].last_s:
+            self.begin(wearer, motion.skeleton, 0.0)  # also where the wearer's clock was set back
         self._tracks[wearer].take(motion)
 
     def end(self, wearer: str) -> None:
         if wearer in self._tracks:
             track = self._tracks.pop(wearer)
             track.flush()
-            join_sections(track.folder)
+            if motion_files(track.folder):
+                join_sections(track.folder)
 
     def close(self) -> None:
         for wearer in list(self._tracks):
@@ -65,28 +62,25 @@ class _Track:
 
     def __init__(self, folder: Path):
         self.folder = folder
-        self._section, self._parts, self._synced_s = 0, [], -1e9
-        self._begin_s: float | None = None
+        self.last_s = -math.inf
+        """Time (s) of the last frame."""
+        self._number, self._parts = 0, []
 
     def take(self, motion: Motion) -> None:
-        first_s = motion.timestamps[0].item()
-        if self._begin_s is not None and not 0 <= first_s - self._begin_s < SECTION_S:
-            self.flush()
-            self._section, self._parts, self._begin_s = self._section + 1, [], None
-        self._begin_s = first_s if self._begin_s is None else self._begin_s
         self._parts.append(motion)
-        if time.monotonic() - self._synced_s > SYNC_S:
+        self.last_s = motion.timestamps[-1].item()
+        if self.last_s - self._parts[0].timestamps[0].item() >= SECTION_S:
             self.flush()
 
     def flush(self) -> None:
-        """Write what has come of this section."""
-        whole = joined(self._parts)
-        if whole is None:
+        """Write what has come since the last section."""
+        if (section := joined(self._parts)) is None:
             return
-        self._parts, self._synced_s = [whole], time.monotonic()
-        write_motion(whole, self.folder / f"motion-{self._section:06d}.npz")
-        if len(whole) > 1:
-            write_bvh(whole, self.folder / f"motion-{self._section:06d}.bvh")
+        path = self.folder / f"motion-{self._number:06d}.npz"
+        write_motion(section, path)
+        if len(section) > 1:
+            write_bvh(section, path.with_suffix(".bvh"))
+        self._number, self._parts = self._number + 1, []
 
 
 def join_sections(folder: Path) -> Motion:
