@@ -147,7 +147,8 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     """Print and write the tables; returns the file."""
     console, found = Console(width=170), {}
     with Progress(transient=True, console=console) as progress:
-        makers = [PARTS[part] for part in options.parts] + [partial(_strangers, root) for root in options.strangers]
+        strangers = options.strangers if "body" in options.parts else []
+        makers = [PARTS[part] for part in options.parts] + [partial(_strangers, root) for root in strangers]
         for make in makers:
             title, columns, scores = make(options, progress)
             found[title] = {method: {k: vars(v) for k, v in row.items()} for method, row in scores.items()}
