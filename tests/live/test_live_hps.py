@@ -47,6 +47,7 @@ def test_a_suit_and_a_localised_camera_become_registered_poses():
     assert 100 * off.mean() < 6.0
     assert len(motion) > 28 * 30
     assert report["wearers"]["wearer"]["refused"] == {}
+    assert report["wearers"]["wearer"]["sessions"] == 1
 
 
 def test_frames_out_of_order_and_doubled_are_sorted_and_bad_ones_counted():

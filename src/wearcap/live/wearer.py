@@ -101,7 +101,7 @@ class LiveWearer:
         self.skeleton: Skeleton | None = None
         self.fps = 0.0
         self._devices: dict[str, _Device] = {}
-        self._arrived_s = -np.inf
+        self._heard_s = -np.inf
         self._head_s = -np.inf
         self._points: Tensor | None = None
         self._dropped = 0
@@ -125,7 +125,7 @@ class LiveWearer:
         time_s = self.clocks.on_leader(clock, sent_s)
         device = self._devices[packet.device]
         device.see(packet, time_s)
-        self._arrived_s = packet.arrived_s
+        self._heard_s = max(packet.arrived_s, time.monotonic())  # of a capture that is behind, packets wait
         sample = _timed(packet.sample, time_s)
         device.pose = _shown(sample) or device.pose
         if not self.opener.tracks_wrists and len(self.opener.devices) > 1 and HEAD in self.opener.devices:
@@ -206,7 +206,7 @@ class LiveWearer:
             if self.first is not None and self.first.found is None:
                 self.first.look(now_s)
             return []
-        if now_s - self._arrived_s > AWAY_S:
+        if now_s - self._heard_s > AWAY_S:
             return self.leave()
         found = self._final(ended=False)
         if found is None:
