@@ -177,7 +177,7 @@ def soak(system: str, minutes: float, rough: bool, where: str) -> dict[str, Any]
                 memory.append((time.monotonic() - sender.begun_s, watched.memory_info().rss / 2**20))
         time.sleep(1.0)
         cpu_s = sum(watched.cpu_times()[:2]) if process.poll() is None else float("nan")
-        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGTERM)
         process.wait(60)
         if not report.is_file():
             raise SystemExit("".join(errors[-20:]))

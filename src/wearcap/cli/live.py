@@ -3,6 +3,7 @@
 import json
 import logging
 import os
+import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -69,6 +70,11 @@ def run(config: DictConfig) -> dict[str, Any]:
     for name in ("", "websockets"):  # a quantisation's and a server's messages are no news to a wearer
         logging.getLogger(name).setLevel(logging.WARNING)
     _tell(config, sources, sinks, page)
+    for number in (
+        signal.SIGINT,
+        signal.SIGTERM,
+    ):  # also where a shell started it in the background, which ignores the first
+        signal.signal(number, lambda *_: capture.stop())
     report = capture.run(float("inf") if config.seconds is None else float(config.seconds))
     write_report(report, Path(config.report))
     _summarize(report)

@@ -8,6 +8,7 @@ left toe tip, right heel, right toe tip] or null}: rotations relative to the par
 import asyncio
 import json
 import threading
+from contextlib import suppress
 from http import HTTPStatus
 from typing import Any
 
@@ -24,6 +25,8 @@ from wearcap.recording import Motion
 from wearcap.viewer.guard import LOOPBACK, Guard, Refused
 
 MAX_CLIENTS = 16
+CLOSE_S = 2.0
+"""Time in which clients may close their connections at the end."""
 MAX_WAITING_BYTES = 1 << 20
 """Bytes that may wait for one client; a client that reads more slowly is disconnected."""
 
@@ -109,9 +112,14 @@ class WebSocketSink(Sink):
         self._loop.call_soon_threadsafe(self._leave, wearer)
 
     def close(self) -> None:
+        async def end(server: Server) -> None:
+            server.close()
+            with suppress(TimeoutError):
+                await asyncio.wait_for(server.wait_closed(), CLOSE_S)
+            self._loop.stop()
+
         if self._server is not None:
-            self._loop.call_soon_threadsafe(self._server.close)
-        self._loop.call_soon_threadsafe(self._loop.stop)
+            asyncio.run_coroutine_threadsafe(end(self._server), self._loop)
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
         """Refuses other sites' pages, clients without the token beyond loopback, and too many of them."""
