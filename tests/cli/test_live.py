@@ -1,6 +1,9 @@
 """`wearcap live` on the command line."""
 
 import json
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -53,3 +56,19 @@ def test_a_replay_with_the_shared_checkpoint_is_recorded_and_reported(tmp_path: 
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["wearers"]["wearer"]["frames"] == 200
     assert len(read_motion(tmp_path / "out" / "wearer" / "motion.npz")) == 200
+
+
+@pytest.mark.slow
+def test_a_capture_ends_with_its_report_on_sigterm(tmp_path: Path):
+    """Also where SIGINT is ignored, as in the background of a shell."""
+    command = [sys.executable, "-m", "wearcap.cli.main", "live", "system=hmd2", "source=json://127.0.0.1:0"]
+    command += [f"report={tmp_path / 'report.json'}", f"hydra.run.dir={tmp_path}"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    for line in process.stderr:
+        if line.startswith("from json"):
+            break
+    time.sleep(5.0)
+    process.terminate()
+    assert process.wait(60) == 0
+    assert json.loads((tmp_path / "report.json").read_text())["wearers"] == {}

@@ -5,6 +5,8 @@ import logging
 import os
 import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -70,16 +72,24 @@ def run(config: DictConfig) -> dict[str, Any]:
     for name in ("", "websockets"):  # a quantisation's and a server's messages are no news to a wearer
         logging.getLogger(name).setLevel(logging.WARNING)
     _tell(config, sources, sinks, page)
-    for number in (
-        signal.SIGINT,
-        signal.SIGTERM,
-    ):  # also where a shell started it in the background, which ignores the first
-        signal.signal(number, lambda *_: capture.stop())
-    report = capture.run(float("inf") if config.seconds is None else float(config.seconds))
+    with _stopped_by_signals(capture):
+        report = capture.run(float("inf") if config.seconds is None else float(config.seconds))
     write_report(report, Path(config.report))
     _summarize(report)
     show(f"report: {config.report}")
     return report
+
+
+@contextmanager
+def _stopped_by_signals(capture: LiveCapture) -> Iterator[None]:
+    """SIGINT and SIGTERM end the capture, also where a shell that started it in the background lets the first be ignored."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda *_: capture.stop()) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, before):
+            signal.signal(number, handler)
 
 
 def _sources(config: DictConfig, system: System, place: CaptureInput | None) -> tuple[list[Source], Setup | None]:
