@@ -28,6 +28,8 @@ from wearcap.tracking.head_path import MAX_GAP_S
 
 AWAY_S = 5.0
 """Time without packets after which a wearer has left: the last poses are returned, and the next packet begins anew."""
+BEHIND_S = 2.0
+"""Time for which packets may wait before the page says that the machine is too slow."""
 MAX_DEVICES = 32
 """Most devices of a wearer; packets of further ones are counted as unknown."""
 RATE_S = 2.0
@@ -125,7 +127,12 @@ class LiveWearer:
         time_s = self.clocks.on_leader(clock, sent_s)
         device = self._devices[packet.device]
         device.see(packet, time_s)
-        self._heard_s = max(packet.arrived_s, time.monotonic())  # of a capture that is behind, packets wait
+        now_s = time.monotonic()
+        self._heard_s = max(packet.arrived_s, now_s)  # of a capture that is behind, packets wait
+        if now_s - packet.arrived_s > BEHIND_S:
+            self._note(
+                "The capture is slower than the packets come: end other programs, or give it more cores (threads=N)."
+            )
         sample = _timed(packet.sample, time_s)
         device.pose = _shown(sample) or device.pose
         if not self.opener.tracks_wrists and len(self.opener.devices) > 1 and HEAD in self.opener.devices:
