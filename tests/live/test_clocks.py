@@ -1,17 +1,10 @@
 """Clocks of live devices: offset, drift and restarts are recovered from delayed packets."""
 
-import math
 import random
-import time
 
 import pytest
-import torch
 
-from wearcap.geometry import rotation
-from wearcap.geometry.rigid import Rigid
-from wearcap.live.alignment import WatchAlignment
 from wearcap.live.clocks import AGREEING, Clocks, DeviceClock
-from wearcap.sensors.samples import HeadSample, WatchSample
 
 
 def packets(seconds: float, hz: float, offset_s: float, drift: float, jitter_s: float, seed: int = 0):
@@ -77,29 +70,3 @@ def test_a_sender_that_invents_clocks_gets_no_memory():
     for k in range(1000):
         clocks.see(f"clock {k}", 1.0, 2.0)
     assert clocks.on_leader("clock 999", 5.0) == 5.0
-
-
-def test_a_watch_that_arrives_late_is_aligned_by_turns_of_the_body():
-    """0.3 s of delay on a clock of its own; the wearer turns to and fro."""
-    found: dict[str, float] = {}
-    alignment = WatchAlignment(found.__setitem__)
-    for k in range(1600):
-        time_s = k / 60
-        yaw = 1.2 * math.sin(1.1 * time_s) + 0.5 * math.sin(2.7 * time_s)
-        late = 1.2 * math.sin(1.1 * (time_s - 0.3)) + 0.5 * math.sin(2.7 * (time_s - 0.3))
-        head, wrist = (rotation.about_axis("z", torch.tensor(angle)) for angle in (yaw, late))
-        alignment.see("left_wrist", time_s, WatchSample(time_s, wrist, torch.zeros(3), "left_wrist"))
-        alignment.see("head", time_s, HeadSample(time_s, Rigid(head, torch.zeros(3))))
-        if k % 600 == 599:
-            time.sleep(1.0)  # the comparison has a thread of its own
-    assert found["left_wrist"] == pytest.approx(-0.3, abs=0.02)
-
-
-def test_who_does_not_turn_is_left_as_the_clocks_say():
-    found: dict[str, float] = {}
-    alignment = WatchAlignment(found.__setitem__)
-    for k in range(1500):
-        alignment.see("left_wrist", k / 60, WatchSample(k / 60, torch.eye(3), torch.zeros(3), "left_wrist"))
-        alignment.see("head", k / 60, HeadSample(k / 60, Rigid(torch.eye(3), torch.zeros(3))))
-    time.sleep(1.0)
-    assert found == {}

@@ -13,7 +13,6 @@ from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.live.alignment import WatchAlignment
 from wearcap.live.clocks import Clocks
 from wearcap.live.first_minute import FirstMinute
 from wearcap.live.latency import Latencies
@@ -96,8 +95,6 @@ class LiveWearer:
 
     def __post_init__(self) -> None:
         self.clocks = Clocks()
-        self._alignment = WatchAlignment(self._align)
-        self._clock_of: dict[str, str] = {}
         self.first: FirstMinute | None = None
         self.session: Session | None = None
         self.skeleton: Skeleton | None = None
@@ -135,9 +132,6 @@ class LiveWearer:
             )
         sample = _timed(packet.sample, time_s)
         device.pose = _shown(sample) or device.pose
-        if not self.opener.tracks_wrists and len(self.opener.devices) > 1 and HEAD in self.opener.devices:
-            self._clock_of[packet.device] = clock
-            self._alignment.see(packet.device, time_s, sample)
         if leads:
             self.gaps += MAX_GAP_S < time_s - self._head_s < AWAY_S
             self._head_s = time_s
@@ -197,13 +191,6 @@ class LiveWearer:
             case SuitPiece() | LocalizationSample() if SUIT in self.opener.devices:
                 return sample
         return None
-
-    def _align(self, device: str, seconds: float) -> None:
-        """Make up for a watch that reaches us later than the head does."""
-        clock = self._clock_of[device]
-        if clock != self.clocks.leader:
-            self.clocks.shift(clock, seconds)
-            self._note(f"{device}: its samples count {seconds:+.2f} s, by turns of the whole body.")
 
     # --- poses ------------------------------------------------------------------------------------------------------
 
