@@ -143,7 +143,7 @@ def stalled_client(port: int) -> None:
 
 
 def soak(system: str, minutes: float, rough: bool, where: str) -> dict[str, Any]:
-    """Run one system; what is printed."""
+    """Run one system; the row that is printed."""
     port, ws_port = _free(socket.SOCK_DGRAM), _free(socket.SOCK_STREAM)
     sender = Sender(system, where, port, 60 * minutes, rough)
     receiver = Receiver(sender, rough)
@@ -182,6 +182,20 @@ def soak(system: str, minutes: float, rough: bool, where: str) -> dict[str, Any]
         if not report.is_file():
             raise SystemExit("".join(errors[-20:]))
         found = json.loads(report.read_text())
+    return row_of(system, minutes, rough, sender, receiver, found, memory, cpu_s)
+
+
+def row_of(
+    system: str,
+    minutes: float,
+    rough: bool,
+    sender: Sender,
+    receiver: Receiver,
+    found: dict[str, Any],
+    memory: list[tuple[float, float]],
+    cpu_s: float,
+) -> dict[str, Any]:
+    """What is printed of a run: of its report, of its memory over time (s, MiB), and of its processor time."""
     about = found["wearers"]["wearer"]
     early = next((mib for at_s, mib in memory if at_s > min(60.0, 30.0 * minutes)), memory[0][1])
     latency, arrived = about["latency_ms"], np.array(receiver.late_ms)

@@ -209,7 +209,7 @@ def test_a_step_that_takes_too_long_is_left():
 
 
 def test_all_steps_in_their_order():
-    """Watches whose x axis tells no side are told by the raised left hand."""
+    """Watches whose x axis shows no side: the raised left hand decides."""
     across = Rigid(exp(torch.tensor([0.0, 0.0, 0.1])), torch.zeros(3))
     first = FirstMinute(HANDS, tracked=False, guided=True)
     devices = Devices(watches=True, names=("a", "b"), T_wrist_device=(across, across))
