@@ -24,7 +24,7 @@ core; the learning rate, where `rivals.py` chose it of several; and their headin
 RATE_FILE = "rate.json"
 """In the folder of a run of `rivals.py`: the rate that was chosen, and by what."""
 EPOCHS = 12
-"""Validations of a training by budget."""
+"""Validations of a training by budget, at most; one of few steps has fewer, which would take longer than it."""
 _RECORDED = {
     "parameters_m": ("parameters", 1e6),
     "frames_seen_m": ("frames", 1e6),
@@ -127,9 +127,10 @@ def budget(frames: int, per_step: int) -> list[str]:
     """Overrides of a training that sees so many frames, `per_step` in a batch, or stops when the validation loss has not
     fallen for three epochs; captured with is its checkpoint of the least."""
     steps = max(1, frames // per_step)
+    epochs = min(EPOCHS, max(3, steps // 50))
     average = min(0.995, max(0.98, 1 - 20 / steps))
     return [
-        *(f"trainer.max_steps={steps}", f"data.loading.steps_per_epoch={max(1, steps // EPOCHS)}"),
+        *(f"trainer.max_steps={steps}", f"data.loading.steps_per_epoch={max(1, steps // epochs)}"),
         *(f"optimizer.scheduler.warmup={steps // 10}", f"callbacks.average.decay={average:.4g}"),
         *("trainer.precision=bf16-mixed", "early_stop=3"),
     ]

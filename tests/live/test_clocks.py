@@ -47,6 +47,27 @@ def test_a_clock_set_anew_is_followed_after_some_packets():
     assert clock.ours(3.0) == pytest.approx(502.0)
 
 
+@pytest.mark.parametrize("batch_s", [1.2, 3.0])
+def test_packets_that_are_sent_some_seconds_at_once_are_of_one_clock(batch_s: float):
+    clock = DeviceClock()
+    for k in range(6000):
+        sent_s = k / 100
+        arrived_s = 1000.0 + batch_s * (sent_s // batch_s + 1)
+        clock.see(sent_s, arrived_s)
+    assert clock.restarts == 0
+    assert clock.ours(60.0) == pytest.approx(1060.0, abs=0.02)
+
+
+def test_a_clock_set_back_by_a_little_is_followed_after_some_seconds():
+    clock = DeviceClock()
+    for k in range(600):
+        clock.see(50.0 + k / 60, 500.0 + k / 60)
+    for k in range(600):
+        clock.see(57.0 + k / 60, 510.0 + k / 60)
+    assert clock.restarts == 1
+    assert clock.ours(57.0) == pytest.approx(510.0, abs=0.02)
+
+
 def test_three_clocks_meet_on_the_heads():
     """Two watches and a head with unrelated times: one moment has one time."""
     clocks = Clocks()

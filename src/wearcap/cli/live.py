@@ -8,11 +8,12 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import torch
 from omegaconf import DictConfig, ListConfig
 from rich import print as show
+from rich.markup import escape
 
 from wearcap.cli.conf import compose, hydra_main, load_pipeline
 from wearcap.errors import WearcapError, nearest, require_choice
@@ -76,7 +77,7 @@ def run(config: DictConfig) -> dict[str, Any]:
         report = capture.run(float("inf") if config.seconds is None else float(config.seconds))
     write_report(report, Path(config.report))
     _summarize(report)
-    show(f"report: {config.report}")
+    _show(f"report: {config.report}", sys.stdout)
     return report
 
 
@@ -116,32 +117,40 @@ def _sources(config: DictConfig, system: System, place: CaptureInput | None) -> 
 def _tell(config: DictConfig, sources: list[Source], sinks: list[Sink], page: LivePage | None) -> None:
     """Say what listens where, loudly where other machines can reach it."""
     for source in sources:
-        show(f"from {source.name}: {source.convention}", file=sys.stderr)
+        _show(f"from {source.url}: {source.convention}")
     for sink in sinks:
-        show(f"to {getattr(sink, 'url', sink.name)}: {sink.convention}", file=sys.stderr)
-    open_sources = [source.name for source in sources if not source.loopback]
-    if config.host not in LOOPBACK or open_sources:
-        where = ", ".join(open_sources) or config.host
-        show(
-            f"[bold red]OPEN TO OTHER MACHINES: {where} takes packets from anyone who reaches this address.",
-            file=sys.stderr,
-        )
+        _show(f"to {getattr(sink, 'url', sink.name)}: {sink.convention}")
+    taking = [source.name for source in sources if not source.loopback]
+    giving = [sink.name for sink in sinks if sink.open_to_others]
+    giving += ["the page"] if page is not None and config.host not in LOOPBACK else []
+    parts = [f"{', '.join(taking)} takes packets from anyone who reaches this address"] if taking else []
+    parts += [f"{', '.join(giving)} shows the body to whoever has its token"] if giving else []
+    if parts:
+        show(f"[bold red]OPEN TO OTHER MACHINES: {escape('; '.join(parts))}.", file=sys.stderr)
     if page is not None:
-        show(f"open {page.url} (Ctrl+C ends)", file=sys.stderr)
+        _show(f"open {page.url} (Ctrl+C ends)")
+
+
+def _show(line: str, file: TextIO | None = None) -> None:
+    """Print a line as it is: names from the network are no markup."""
+    show(escape(line), file=file or sys.stderr)
 
 
 def _summarize(report: dict[str, Any]) -> None:
     for name, wearer in report["wearers"].items():
         latency = wearer["latency_ms"]
         text = ", ".join(f"{key} {latency[key]:.0f}" for key in ("median", "p95", "p99"))
-        show(
-            f"{name}: {wearer['frames']} frames, latency {text} ms (the system's own: {latency['of_the_system']:.0f}), "
-            f"dropped {wearer['dropped']}, late {wearer['late']}, gaps {wearer['gaps']}"
-        )
+        counts = ", ".join(f"{key} {wearer[key]}" for key in ("dropped", "late", "gaps"))
+        own = f"(the system's own: {latency['of_the_system']:.0f})"
+        _show(f"{name}: {wearer['frames']} frames, latency {text} ms {own}, {counts}", sys.stdout)
         for note in wearer["notes"]:
-            show(f"  {note}")
+            _show(f"  {note}", sys.stdout)
+    for name, sink in report["sinks"].items():
+        if sink["dropped"] or sink["failed"]:
+            why = f": {sink['last_error']}" if sink["last_error"] else ""
+            _show(f"{name}: {sink['dropped']} pieces dropped, {sink['failed']} lost{why}", sys.stdout)
     for reason, count in report["refused"].items():
-        show(f"refused {count} × {reason}")
+        _show(f"refused {count} × {reason}", sys.stdout)
 
 
 def _listed(value: Any) -> list[str]:

@@ -5,8 +5,8 @@ import gc
 import json
 import threading
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from wearcap.files import write_text
 from wearcap.geometry.rigid import Rigid
 from wearcap.live.first_minute import FirstMinute
 from wearcap.live.packets import HEAD, Inbox
-from wearcap.live.setup import Setup, write_setup
+from wearcap.live.setup import Setup, plain_name, read_setup, write_setup
 from wearcap.live.sink import Sink, SinkThread
 from wearcap.live.source import Source
 from wearcap.live.status import LiveStatus, SinkStatus
@@ -31,6 +31,8 @@ from wearcap.sensors.samples import HeadSample, WatchSample, WristSample
 
 MAX_WEARERS = 8
 """Most wearers; packets of further ones are counted as refused."""
+FORGOTTEN_S = 60.0
+"""Time without packets after which a wearer who is not captured makes room for another."""
 WAIT_S = 0.02
 """Longest time without a look at who has left and what the page wishes."""
 WARM_UP_S = 2.0
@@ -82,10 +84,12 @@ class LiveCapture:
         self.inbox = Inbox()
         self.wearers: dict[str, LiveWearer] = {}
         self.sinks = [SinkThread(sink) for sink in sinks]
-        self._setup, self._setup_file, self._guided = setup, setup_file, guided
+        self._setup, self._setup_file, self._guided, self._height_m = setup, setup_file, guided, height_m
         self._recorder, self._recording = recorder, None
         self._record_from_start = record
         self._recorded: SinkThread | None = None
+        self._recorders: list[SinkThread] = []
+        """All recorders of this capture, those that are closed among them: the report has them."""
         self._closing: list[threading.Thread] = []
         self._recordings = recordings
         self._wishes: list[Callable[[], None]] = []
@@ -134,9 +138,9 @@ class LiveCapture:
         """Load and run the network once, on a wearer who stands still, so that the first poses are not late."""
         getattr(self.system, "prepare", lambda: None)()
         devices, skeleton, pose = self.opener.devices, xsens23(), Rigid(torch.eye(3), torch.tensor([0.0, 0.0, 1.6]))
+        session = self.opener.session(Wearer(skeleton, floor_m=0.0))  # which says now what it lacks
         if HEAD not in devices:
             return
-        session = self.opener.session(Wearer(skeleton, floor_m=0.0))
         for k in range(int(WARM_UP_S * session.fps)):
             at_s, samples = k / session.fps, []
             for joint in devices[1:]:
@@ -160,14 +164,10 @@ class LiveCapture:
         """One turn: wishes, packets, poses."""
         self._fulfil()
         for packet in self.inbox.wait(WAIT_S):
-            wearer = self.wearers.get(packet.wearer)
+            wearer = self.wearers.get(packet.wearer) or self._welcome(packet.wearer)
             if wearer is None:
-                if len(self.wearers) >= MAX_WEARERS:
-                    self.inbox.refuse("capture", f"more than {MAX_WEARERS} wearers")
-                    continue
-                wearer = self.wearers[packet.wearer] = LiveWearer(packet.wearer, self.opener, self._setup)
-                if self._guided:
-                    wearer.guide()
+                self.inbox.refuse("capture", f"more than {MAX_WEARERS} wearers")
+                continue
             before = wearer.stage
             wearer.take(packet)
             if before != "live" and wearer.stage == "live":
@@ -179,13 +179,46 @@ class LiveCapture:
             if live and wearer.stage == "away":
                 self._each_sink(lambda sink, name=wearer.name: sink.end(name))
 
+    def _welcome(self, name: str) -> LiveWearer | None:
+        """A new wearer, in the place of one who has been silent where there are too many; None where there is none."""
+        if len(self.wearers) >= MAX_WEARERS:
+            silent = max(self.wearers.values(), key=lambda one: one.silent_s)
+            if silent.session is not None or silent.silent_s < FORGOTTEN_S:
+                return None
+            del self.wearers[silent.name]
+        setup, path = self._setup, self._setup_path(name)
+        wearer = self.wearers[name] = LiveWearer(name, self.opener, setup)
+        if name and path is not None and path.is_file():
+            with self._noted(wearer):
+                wearer.setup = read_setup(path)
+        if self._height_m is not None and wearer.setup is not None:
+            wearer.setup = wearer.setup.with_height(self._height_m)
+        if self._guided:
+            wearer.guide()
+        return wearer
+
+    def _setup_path(self, wearer: str) -> Path | None:
+        """Where a wearer's set-up is kept."""
+        path = self._setup_file
+        return path.with_stem(f"{path.stem}_{plain_name(wearer)}") if path is not None and wearer else path
+
     def _begin(self, wearer: LiveWearer) -> None:
         assert wearer.skeleton is not None
         for sink in self._all_sinks():
             sink.begin(wearer.name, wearer.skeleton, wearer.fps)
-        if self._setup_file is not None and wearer.setup is not None and wearer.setup is not self._setup:
-            name = self._setup_file
-            write_setup(wearer.setup, name.with_stem(f"{name.stem}_{wearer.name}") if wearer.name else name)
+        path = self._setup_path(wearer.name)
+        if path is not None and wearer.setup is not None and wearer.first is not None:
+            with self._noted(wearer):
+                write_setup(wearer.setup, path)
+
+    @contextmanager
+    def _noted(self, *wearers: LiveWearer) -> Iterator[None]:
+        """What cannot be read or written is noted, and ends no capture."""
+        try:
+            yield
+        except WearcapError as error:
+            for wearer in wearers:
+                wearer.note(str(error))
 
     def _send(self, wearer: LiveWearer, motions: list[Motion]) -> None:
         for motion in motions:
@@ -205,14 +238,12 @@ class LiveCapture:
             while True:
                 try:
                     return await source.run(self.inbox)
-                except WearcapError as error:
-                    if time.monotonic() - self._began_s < RESTART_S:  # it never ran: the user should know
-                        self._failure = error
+                except Exception as error:  # a source must never end the others
+                    if not source.listens:  # it never ran: the user should know
+                        self._failure = _failure_of(source, error)
                         self._stopping.set()
                         return None
-                    self.inbox.refuse(source.name, "failed, and is started again")
-                except OSError:
-                    self.inbox.refuse(source.name, "failed, and is started again")
+                    self.inbox.refuse(source.name, f"failed ({type(error).__name__}), and is started again")
                 await asyncio.sleep(RESTART_S)
 
         async def every() -> None:
@@ -280,7 +311,8 @@ class LiveCapture:
 
     def _fulfil(self) -> None:
         while self._wishes:
-            self._wishes.pop(0)()
+            with self._noted(*self.wearers.values()):
+                self._wishes.pop(0)()
 
     # --- recording --------------------------------------------------------------------------------------------------
 
@@ -290,6 +322,7 @@ class LiveCapture:
         folder = folder or self._recordings / f"recording_{datetime.now():%Y-%m-%d_%H-%M-%S}"
         sink = SinkThread(self._recorder(folder), capacity=100_000)
         sink.start()
+        self._recorders.append(sink)
         self._recorded, self._recording = sink, folder
         for wearer in self.wearers.values():
             if wearer.stage == "live" and wearer.skeleton is not None:
@@ -329,7 +362,13 @@ class LiveCapture:
                 "notes": list(each.notes),
             }
         sinks = {
-            each.name: {"sent": each.sent, "dropped": each.dropped, "failed": each.failed} for each in status.sinks
+            each.sink.name: {
+                "sent": each.sent,
+                "dropped": each.dropped,
+                "failed": each.failed,
+                "last_error": each.last_error,
+            }
+            for each in (*self.sinks, *self._recorders)
         }
         return {
             "seconds": round(status.seconds, 3),
@@ -338,6 +377,13 @@ class LiveCapture:
             "refused": dict(self.inbox.refused),
             "overflowed": self.inbox.overflowed,
         }
+
+
+def _failure_of(source: Source, error: Exception) -> WearcapError:
+    """Why a source never ran, in words for the user."""
+    if isinstance(error, WearcapError):
+        return error
+    return WearcapError(f"cannot start ({error})", f"source {source.name}", fix="Check its address.")
 
 
 def write_report(report: dict[str, Any], path: Path) -> None:

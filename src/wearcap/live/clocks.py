@@ -18,6 +18,8 @@ DRIFT_AFTER_S = 20.0
 RESTART_S = 1.0
 """Deviation from the estimate that means another clock, if `AGREEING` packets in a row have it."""
 AGREEING = 5
+LATE_FOR_S, HELD_BACK_S = 5.0, 10.0
+"""Time for which all packets must be late for that; and lateness (s) that means it at once."""
 
 
 class DeviceClock:
@@ -27,6 +29,8 @@ class DeviceClock:
         self.restarts = 0
         """How often the device's clock was set anew."""
         self._far = 0
+        """Packets in a row that are off by more than `RESTART_S`."""
+        self._far_since_s = 0.0
         self._begin()
 
     def _begin(self) -> None:
@@ -45,10 +49,14 @@ class DeviceClock:
             self._delay_s, self._at_s = delay_s, sent_s
             return
         expected_s = self._delay_at(sent_s)
-        # Early packets are impossible with one clock; late ones by a second, and all of them, mean another one, too.
-        self._far = self._far + 1 if abs(delay_s - expected_s) > RESTART_S else 0
+        # Early packets are impossible with one clock. Late ones mean another one, too, if they are later than an application
+        # would hold them back, or all of some seconds are late: of those that are sent at once the newest is not.
+        off_s = delay_s - expected_s
+        self._far = self._far + 1 if abs(off_s) > RESTART_S else 0
+        if self._far == 1:
+            self._far_since_s = arrived_s
         if self._far:
-            if self._far >= AGREEING:
+            if self._far >= AGREEING and (not 0 < off_s < HELD_BACK_S or arrived_s - self._far_since_s >= LATE_FOR_S):
                 self.restarts += 1
                 self._far = 0
                 self._begin()

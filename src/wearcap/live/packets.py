@@ -8,6 +8,8 @@ from wearcap.sensors.samples import HeadSample, LocalizationSample, SuitPiece, W
 
 MAX_PACKETS = 20_000
 """Capacity of an `Inbox`: some 20 s of five devices at 200 Hz. The oldest packets are dropped."""
+MAX_POINTS_WAITING = 1_000_000
+"""Points of the surroundings that may wait with them: 12 MB. The oldest packets are dropped."""
 HEAD, SUIT, CAMERA = "head", "suit", "camera"
 """Names of devices that say by themselves what they are; wrists are named by their joint, others by their serial."""
 
@@ -38,7 +40,10 @@ class Inbox:
         """Number of packets dropped because the capture was slow."""
         self.refused: Counter[str] = Counter()
         """Number of datagrams, or parts of them, that no source understood, by source and reason."""
-        self._packets: deque[Packet] = deque(maxlen=capacity)
+        self.capacity = capacity
+        self._packets: deque[Packet] = deque()
+        self._points = 0
+        """Points that wait."""
         self._ready = threading.Condition()
 
     def deliver(self, packets: list[Packet]) -> None:
@@ -46,9 +51,11 @@ class Inbox:
         if not packets:
             return
         with self._ready:
-            capacity = self._packets.maxlen or 0
-            self.overflowed += max(0, len(self._packets) + len(packets) - capacity)
             self._packets.extend(packets)
+            self._points += sum(map(_points_of, packets))
+            while len(self._packets) > self.capacity or self._points > MAX_POINTS_WAITING:
+                self._points -= _points_of(self._packets.popleft())
+                self.overflowed += 1
             self._ready.notify()
 
     def refuse(self, source: str, reason: str) -> None:
@@ -62,6 +69,7 @@ class Inbox:
                 self._ready.wait(seconds)
             found = list(self._packets)
             self._packets.clear()
+            self._points = 0
             return found
 
     @property
@@ -73,3 +81,9 @@ class Inbox:
         """End a `wait`."""
         with self._ready:
             self._ready.notify()
+
+
+def _points_of(packet: Packet) -> int:
+    """Number of a packet's points of the surroundings."""
+    points = getattr(packet.sample, "points_world", None)
+    return 0 if points is None else len(points)

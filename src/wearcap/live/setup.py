@@ -7,8 +7,9 @@ first.
 
 import json
 import math
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body.skeleton import WRISTS, Site, Skeleton
+from wearcap.body.skeleton import WRISTS, Site, Skeleton, skeleton_of_height
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
@@ -56,6 +57,18 @@ class Setup:
     """Floor height (m) in the head's world; None: the session estimates it."""
     notes: tuple[str, ...] = ()
     """How each value was found, as sentences for the page and the report."""
+
+    def with_height(self, height_m: float) -> "Setup":
+        """The same of somebody of another height (m). Raises WearcapError for a height that is no person's."""
+        if abs(height_m - self.skeleton.stature) < 5e-4:
+            return self
+        note = f"Height: {height_m:.2f} m, as given, instead of {self.skeleton.stature:.2f} m."
+        return replace(self, skeleton=skeleton_of_height(height_m, self.skeleton), notes=(*self.notes, note))
+
+
+def plain_name(wearer: str) -> str:
+    """A wearer's name as part of a file's or folder's name: names from the network are no paths."""
+    return re.sub(r"[^A-Za-z0-9_-]", "_", wearer)[:40] or "wearer"
 
 
 def head_seat() -> Seat:

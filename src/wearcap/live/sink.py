@@ -3,6 +3,7 @@
 import threading
 from collections import deque
 from collections.abc import Callable
+from typing import ClassVar
 
 from wearcap.body.skeleton import Skeleton
 from wearcap.recording import Motion
@@ -20,6 +21,10 @@ class Sink:
     """Pieces that wait for the sink, kept by its thread."""
     convention: str
     """Axes and units of what is sent, as text for people."""
+    serves: ClassVar[bool] = False
+    """Whether others connect to it, at an address of this machine."""
+    open_to_others: bool = False
+    """Whether other machines can."""
 
     def open(self) -> None:
         """Get ready. Raises WearcapError when that is impossible."""

@@ -4,17 +4,50 @@ import asyncio
 import socket
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 from urllib.parse import parse_qs, urlsplit
 
 from wearcap.errors import WearcapError
 from wearcap.live.packets import Inbox, Packet
+from wearcap.viewer.guard import LOOPBACK
 
 MAX_DATAGRAM = 65_536
-MAX_DATAGRAMS_PER_S = 5_000
-"""Rate limit of a socket; what comes beyond it within a second is dropped and counted."""
+MAX_MESSAGES_PER_S, MAX_BYTES_PER_S, MAX_PARSE_S_PER_S = 5_000, 1 << 24, 0.2
+"""Limits of one source in a second: messages, their bytes, and the time that understanding them takes; what comes beyond
+them is dropped and counted, so that no sender takes the time of the others."""
+TOO_MANY = "too many messages"
+
+
+class Budget:
+    """What one source may take in within a second."""
+
+    def __init__(
+        self, messages: int = MAX_MESSAGES_PER_S, size: int = MAX_BYTES_PER_S, parse_s: float = MAX_PARSE_S_PER_S
+    ):
+        self.messages, self.size, self.parse_s = messages, size, parse_s
+        self._second, self._messages, self._bytes, self._spent_s = 0, 0, 0, 0.0
+
+    def allows(self, size: int) -> bool:
+        """Whether one more message, of so many bytes, is within the limits."""
+        now = int(time.monotonic())
+        if now != self._second:
+            # A message that took longer than its second is paid for in the next ones.
+            self._spent_s = max(0.0, self._spent_s - (now - self._second) * self.parse_s)
+            self._second, self._messages, self._bytes = now, 0, 0
+        self._messages, self._bytes = self._messages + 1, self._bytes + size
+        return self._messages <= self.messages and self._bytes <= self.size and self._spent_s < self.parse_s
+
+    @contextmanager
+    def spending(self) -> Iterator[None]:
+        """Time in here counts as spent."""
+        begin_s = time.thread_time()
+        try:
+            yield
+        finally:
+            self._spent_s += time.thread_time() - begin_s
 
 
 @dataclass(frozen=True)
@@ -56,6 +89,9 @@ class Source(ABC):
         """Listen at an address. Raises WearcapError for options that the source does not have."""
         self.address = address
         self.wearer = address.options.get("wearer", "")
+        self.listens = False
+        """Whether the address has been in use: a source that fails later is started again."""
+        self.budget = Budget()
 
     @property
     def name(self) -> str:
@@ -65,7 +101,18 @@ class Source(ABC):
     @property
     def loopback(self) -> bool:
         """Whether only programs of this machine can reach the source."""
-        return self.address.host in ("127.0.0.1", "::1", "localhost")
+        return self.address.host in LOOPBACK
+
+    @property
+    def url(self) -> str:
+        """Where a sender connects, with the token where one is needed."""
+        host = f"[{self.address.host}]" if ":" in self.address.host else self.address.host
+        return f"{self.scheme}://{host}:{self.address.port}"
+
+    def cannot_listen(self, error: OSError) -> WearcapError:
+        """What to raise when the address cannot be used."""
+        fix = "Is another program listening there? Choose another port, or end it."
+        return WearcapError(f"cannot listen ({error.strerror or error})", self.url, fix=fix)
 
     @abstractmethod
     async def run(self, inbox: Inbox) -> None:
@@ -86,6 +133,19 @@ class DatagramSource(Source):
         of their number; what cannot be used is counted by `refuse(reason)`, whose reasons are few and fixed.
         """
 
+    def take(self, data: bytes, inbox: Inbox) -> None:
+        """Deliver what is in a message, within the limits."""
+
+        def refuse(why: str) -> None:
+            inbox.refuse(self.name, why)
+
+        if not self.budget.allows(len(data)):
+            refuse(TOO_MANY)
+            return
+        with self.budget.spending():
+            packets = self.parse(data, time.monotonic(), refuse)
+        inbox.deliver(packets)
+
     async def run(self, inbox: Inbox) -> None:
         loop = asyncio.get_running_loop()
         try:
@@ -93,9 +153,8 @@ class DatagramSource(Source):
                 lambda: _Receiver(self, inbox), local_addr=(self.address.host, self.address.port)
             )
         except OSError as error:
-            where = f"{self.address.host}:{self.address.port}"
-            fix = "Is another program listening there? Choose another port, or end it."
-            raise WearcapError(f"cannot listen ({error.strerror or error})", where, fix=fix) from error
+            raise self.cannot_listen(error) from error
+        self.listens = True
         endpoint: socket.socket = transport.get_extra_info("socket")
         endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         try:
@@ -105,21 +164,13 @@ class DatagramSource(Source):
 
 
 class _Receiver(asyncio.DatagramProtocol):
-    """Passes datagrams to a source's `parse`, within the rate limit."""
+    """Passes datagrams to a source."""
 
     def __init__(self, source: DatagramSource, inbox: Inbox):
         self.source, self.inbox = source, inbox
-        self._second, self._count = 0, 0
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
-        now = time.monotonic()
-        if int(now) != self._second:
-            self._second, self._count = int(now), 0
-        self._count += 1
-        if self._count > MAX_DATAGRAMS_PER_S:
-            self.inbox.refuse(self.source.name, "too many datagrams")
-            return
-        self.inbox.deliver(self.source.parse(data, now, lambda why: self.inbox.refuse(self.source.name, why)))
+        self.source.take(data, self.inbox)
 
     def error_received(self, exc: Exception) -> None:
         self.inbox.refuse(self.source.name, "socket error")

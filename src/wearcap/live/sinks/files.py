@@ -1,23 +1,27 @@
 """Files that grow while they are recorded: whatever moment a capture is killed at, they open and lack at most a second.
 
 A folder for each wearer holds `motion-000000.npz`, `motion-000001.npz`, … of half a second each, and the same as .bvh, each
-written once and atomically. At the end, and by `join_sections` after a kill, they become motion.npz and motion.bvh.
+written once and atomically. At the end, and by `join_sections` after a kill, they become motion.npz and motion.bvh. A piece
+that cannot be written is lost with its half second, and nothing else.
 """
 
-import math
-import re
+from contextlib import suppress
+from itertools import count
 from pathlib import Path
 
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.io.formats.bvh import write_bvh
-from wearcap.io.formats.motion_npz import SECTION, motion_files, read_sections, write_motion
+from wearcap.io.formats.motion_npz import SECTION, motion_files, read_motion, read_sections, write_motion
+from wearcap.live.setup import plain_name
 from wearcap.live.sink import Sink
 from wearcap.recording import Motion
 from wearcap.recording.timing import joined
 
 SECTION_S = 0.5
 """Length of the motion in one file; a file is written once."""
+MAX_GAP_S = 60.0
+"""Longest time without frames inside a motion; after a longer one, as of a clock that was set, another motion begins."""
 
 
 class FilesSink(Sink):
@@ -38,11 +42,11 @@ class FilesSink(Sink):
 
     def begin(self, wearer: str, skeleton: Skeleton, fps: float) -> None:
         self.end(wearer)
-        self._tracks[wearer] = _Track(_free_folder(self.folder / _plain(wearer)))
+        self._tracks[wearer] = _Track(_own_folder(self.folder / plain_name(wearer)))
 
     def take(self, wearer: str, motion: Motion) -> None:
-        if wearer not in self._tracks or motion.timestamps[0].item() <= self._tracks[wearer].last_s:
-            self.begin(wearer, motion.skeleton, 0.0)  # also where the wearer's clock was set back
+        if wearer not in self._tracks or not self._tracks[wearer].continues(motion):
+            self.begin(wearer, motion.skeleton, 0.0)
         self._tracks[wearer].take(motion)
 
     def end(self, wearer: str) -> None:
@@ -62,9 +66,13 @@ class _Track:
 
     def __init__(self, folder: Path):
         self.folder = folder
-        self.last_s = -math.inf
+        self.last_s: float | None = None
         """Time (s) of the last frame."""
         self._number, self._parts = 0, []
+
+    def continues(self, motion: Motion) -> bool:
+        """Whether a piece goes on from the last one: later, and by no more than `MAX_GAP_S`."""
+        return self.last_s is None or 0.0 < motion.timestamps[0].item() - self.last_s <= MAX_GAP_S
 
     def take(self, motion: Motion) -> None:
         self._parts.append(motion)
@@ -73,39 +81,39 @@ class _Track:
             self.flush()
 
     def flush(self) -> None:
-        """Write what has come since the last section."""
-        if (section := joined(self._parts)) is None:
+        """Write what has come since the last section; it is tried once. Raises what the writers raise."""
+        parts, self._parts = self._parts, []
+        if (section := joined(parts)) is None:
             return
-        path = self.folder / f"motion-{self._number:06d}.npz"
+        path, self._number = self.folder / f"motion-{self._number:06d}.npz", self._number + 1
         write_motion(section, path)
         if len(section) > 1:
             write_bvh(section, path.with_suffix(".bvh"))
-        self._number, self._parts = self._number + 1, []
 
 
 def join_sections(folder: Path) -> Motion:
-    """Write motion.npz and motion.bvh of a folder's sections and remove these. Raises WearcapError as `read_sections` does."""
+    """Write motion.npz and motion.bvh of a folder's sections and remove these; goes on where it was stopped.
+
+    Raises WearcapError as `read_sections` does.
+    """
     found = sorted(path for path in folder.glob("motion-*.npz") if SECTION.fullmatch(path.name))
-    whole = read_sections(found)
-    write_motion(whole, folder / "motion.npz")
-    if len(whole) > 1:
-        write_bvh(whole, folder / "motion.bvh")
+    whole = folder / "motion.npz"
+    motion = read_motion(whole) if whole.is_file() else read_sections(found)
+    if not whole.is_file():
+        write_motion(motion, whole)
+    if len(motion) > 1 and not whole.with_suffix(".bvh").is_file():
+        write_bvh(motion, whole.with_suffix(".bvh"))
     for path in found:
         path.unlink(missing_ok=True)
         path.with_suffix(".bvh").unlink(missing_ok=True)
-    return whole
+    return motion
 
 
-def _plain(wearer: str) -> str:
-    """A folder's name: names from the network are no paths."""
-    return re.sub(r"[^A-Za-z0-9_-]", "_", wearer)[:40] or "wearer"
-
-
-def _free_folder(folder: Path) -> Path:
-    """The folder, or one beside it with a number, that holds no recording yet."""
-    number, free = 1, folder
-    while free.exists() and any(free.iterdir()):
-        number += 1
-        free = folder.with_name(f"{folder.name}_{number}")
-    free.mkdir(parents=True, exist_ok=True)
-    return free
+def _own_folder(folder: Path) -> Path:
+    """A new folder of this name, or beside it with a number: two wearers' names may look alike."""
+    for number in count(1):
+        own = folder if number == 1 else folder.with_name(f"{folder.name}_{number}")
+        with suppress(FileExistsError):
+            own.mkdir(parents=True)
+            return own
+    raise AssertionError

@@ -34,11 +34,13 @@ MAX_WAITING_BYTES = 1 << 20
 class WebSocketSink(Sink):
     """Serves frames on an address; beyond loopback a client gives the token of the printed address."""
 
+    serves = True
     convention = "JSON; wearcap's axes (x forward, y left, z up), metres, quaternions wxyz"
 
     def __init__(self, address: Address, pace: bool = True):
         self.address, self.guard = address, Guard(address.host)
         self.name = f"ws://{address.host}:{address.port}"
+        self.open_to_others = address.host not in LOOPBACK
         self._pacing, self._step_s = Pacing(pace), 1 / 60
         self._loop = asyncio.new_event_loop()
         self._server: Server | None = None

@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import logging
 import secrets
-import time
 from collections.abc import Callable
 from http import HTTPStatus
 from typing import Any
@@ -24,9 +23,9 @@ from websockets.http11 import Request, Response
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.live.packets import CAMERA, HEAD, SUIT, Inbox, Packet
-from wearcap.live.source import Address, DatagramSource
+from wearcap.live.source import Address, Budget, DatagramSource
 from wearcap.live.sources.parts import AXES, MAX_LISTS, Names, bounded_json, checked_pose, matrix_of, require_options
-from wearcap.live.sources.posts import Budget, admitting
+from wearcap.live.sources.posts import admitting
 from wearcap.sensors.packets import MAX_ACC_M_S2, MAX_POSITION_M, WRONG_TYPE, number_fault, time_fault, values_fault
 from wearcap.sensors.samples import HeadSample, LocalizationSample, WatchSample, WristSample
 from wearcap.viewer.guard import Refused
@@ -197,14 +196,12 @@ class WebSocketSource(JsonSource):
         super().__init__(address)
         given = address.options.get("token")
         self.token = given if given or self.loopback else secrets.token_urlsafe(18)
-        self._budget = Budget(size=MAX_BYTES_PER_S)
+        self.budget = Budget(size=MAX_BYTES_PER_S)
         self._open = 0
 
     @property
     def url(self) -> str:
-        """Where an adapter connects."""
-        host = f"[{self.address.host}]" if ":" in self.address.host else self.address.host
-        return f"ws://{host}:{self.address.port}/" + (f"?token={self.token}" if self.token else "")
+        return f"{super().url}/" + (f"?token={self.token}" if self.token else "")
 
     async def run(self, inbox: Inbox) -> None:
         admit = admitting(self.address.host, self.token or None)
@@ -224,9 +221,8 @@ class WebSocketSource(JsonSource):
         try:
             server = await self._server(lambda connection: self._listen(connection, inbox), admitted)
         except OSError as error:
-            where = f"{self.address.host}:{self.address.port}"
-            fix = "Is another program listening there? Choose another port, or end it."
-            raise WearcapError(f"cannot listen ({error.strerror or error})", where, fix=fix) from error
+            raise self.cannot_listen(error) from error
+        self.listens = True
         try:
             await asyncio.Event().wait()
         finally:
@@ -259,12 +255,10 @@ class WebSocketSource(JsonSource):
             with contextlib.suppress(ConnectionClosed):
                 async for message in connection:
                     data = message.encode() if isinstance(message, str) else message
-                    if not self._budget.allows(len(data)):
-                        refuse("too many messages")
-                    elif len(data) > MAX_MESSAGE and b'"points"' not in data:
+                    if len(data) > MAX_MESSAGE and b'"points"' not in data:
                         refuse(TOO_LARGE)
                     else:
-                        inbox.deliver(self.parse(data, time.monotonic(), refuse))
+                        self.take(data, inbox)
                     await asyncio.sleep(0)
         finally:
             self._open -= 1

@@ -8,32 +8,14 @@ from collections.abc import Callable
 from http import HTTPStatus
 from typing import Any
 
-from wearcap.errors import WearcapError
 from wearcap.live.packets import Inbox
-from wearcap.live.source import MAX_DATAGRAMS_PER_S, DatagramSource
+from wearcap.live.source import DatagramSource
 from wearcap.viewer.guard import Guard, Refused
 
 MAX_HEADER, MAX_BODY = 1 << 14, 1 << 20
 MAX_CONNECTIONS = 16
-MAX_BYTES_PER_S = 1 << 24
 REQUEST_S, IDLE_S = 10.0, 60.0
 """Time for a request once it has begun, and until the next one of a connection (s)."""
-
-
-class Budget:
-    """Limit of the messages and bytes of a second."""
-
-    def __init__(self, messages: int = MAX_DATAGRAMS_PER_S, size: int = MAX_BYTES_PER_S):
-        self.messages, self.size = messages, size
-        self._second, self._spent = 0, (0, 0)
-
-    def allows(self, size: int) -> bool:
-        """Whether one more message, of so many bytes, is within the limit."""
-        now = int(time.monotonic())
-        if now != self._second:
-            self._second, self._spent = now, (0, 0)
-        self._spent = (self._spent[0] + 1, self._spent[1] + size)
-        return self._spent[0] <= self.messages and self._spent[1] <= self.size
 
 
 def admitting(host: str, token: str | None) -> Callable[[str, Any], None]:
@@ -61,7 +43,6 @@ class _Connections:
     def __init__(self, source: DatagramSource, token: str | None, inbox: Inbox):
         self.source, self.inbox = source, inbox
         self.admit = admitting(source.address.host, token)
-        self.budget = Budget()
         self.open = 0
         self.tasks: set[asyncio.Task] = set()
 
@@ -117,12 +98,14 @@ class _Connections:
             raise _Answer(HTTPStatus.LENGTH_REQUIRED)
         if int(length) > MAX_BODY:
             raise _Answer(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
-        if not self.budget.allows(int(length)):
+        if not self.source.budget.allows(int(length)):
             raise _Answer(HTTPStatus.TOO_MANY_REQUESTS)
         if headers.get("Expect", "").lower() == "100-continue":
             writer.write(b"HTTP/1.1 100 Continue\r\n\r\n")
         body = await reader.readexactly(int(length))
-        self.inbox.deliver(self.source.parse(body, time.monotonic(), self._refuse))
+        with self.source.budget.spending():
+            packets = self.source.parse(body, time.monotonic(), self._refuse)
+        self.inbox.deliver(packets)
         close = headers.get("Connection", "").lower() == "close"
         await _write(writer, HTTPStatus.OK, "", close)
         return not close
@@ -163,10 +146,8 @@ async def serve_posts(source: DatagramSource, token: str | None, inbox: Inbox) -
     try:
         server = await asyncio.start_server(connections.serve, where.host, where.port, limit=MAX_HEADER)
     except OSError as error:
-        fix = "Is another program listening there? Choose another port, or end it."
-        raise WearcapError(
-            f"cannot listen ({error.strerror or error})", f"{where.host}:{where.port}", fix=fix
-        ) from error
+        raise source.cannot_listen(error) from error
+    source.listens = True
     try:
         await asyncio.Event().wait()
     finally:

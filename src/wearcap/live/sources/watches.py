@@ -8,6 +8,7 @@ Sensor Logger sends a phone's sensors as entries of their own, which are paired 
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -152,16 +153,14 @@ class WatchSource(DatagramSource):
 
     def parse(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> list[Packet]:
         packets: list[Packet] = []
-        try:
-            if data.lstrip()[:1] in (b"{", b"["):
-                found = self._json_rows(data, arrived_s, refuse)
-            else:
-                found = self._csv_rows(data, refuse)
-            for name, row in found:
+        if data.lstrip()[:1] in (b"{", b"["):
+            found = self._json_rows(data, arrived_s, refuse)
+        else:
+            found = self._csv_rows(data, refuse)
+        for name, row in found:
+            with _refusing(refuse):
                 if packet := self._packet(name, row, arrived_s, refuse):
                     packets.append(packet)
-        except (WearcapError, ValueError, TypeError, LookupError, OverflowError, AttributeError):
-            refuse(NO_SAMPLE)
         return packets
 
     def _watch(self, name: object, arrived_s: float, refuse: Callable[[str], None]) -> _Watch | None:
@@ -175,13 +174,18 @@ class WatchSource(DatagramSource):
     def _json_rows(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> Iterator[tuple[str, _Row]]:
         """Samples by device: of Sensor Logger's message, or of SensorLog's objects, one or a list, or one a line."""
         for text in data.splitlines()[:MAX_ENTRIES] if b"}\n{" in data else [data]:
-            content = bounded_json(text)
+            try:
+                content = bounded_json(text)
+            except (WearcapError, ValueError):
+                refuse(NO_SAMPLE)
+                continue
             if isinstance(content, dict) and isinstance(content.get("payload"), list):
                 yield from self._sensor_logger(content, arrived_s, refuse)
                 continue
             for entry in content[:MAX_ENTRIES] if isinstance(content, list) else [content]:
-                name = next((entry[key] for key in ("deviceID", "deviceId", "deviceName") if key in entry), "watch")
-                yield name, _sensor_log({key.partition("(")[0]: value for key, value in entry.items()}.get)
+                with _refusing(refuse):
+                    name = next((entry[key] for key in ("deviceID", "deviceId", "deviceName") if key in entry), "watch")
+                    yield name, _sensor_log({key.partition("(")[0]: value for key, value in entry.items()}.get)
 
     def _sensor_logger(
         self, content: dict[str, Any], arrived_s: float, refuse: Callable[[str], None]
@@ -192,12 +196,14 @@ class WatchSource(DatagramSource):
             return
         entries = []
         for entry in content["payload"][:MAX_ENTRIES]:
-            sensor = entry["name"].lower().replace(" ", "").replace("_", "") if isinstance(entry, dict) else ""
-            if sensor in _VALUES:
-                values = entry.get("values")
-                entries.append((_number(entry["time"]) / 1e9, sensor, values if isinstance(values, dict) else entry))
-        for time_s, sensor, values in sorted(entries, key=lambda entry: entry[0]):
-            numbers = tuple(_number(values[key]) for key in _VALUES[sensor])
+            with _refusing(refuse):
+                sensor = entry["name"].lower().replace(" ", "").replace("_", "")
+                if sensor in _VALUES:
+                    given = entry.get("values")
+                    values = given if isinstance(given, dict) else entry
+                    numbers = tuple(_number(values[key]) for key in _VALUES[sensor])
+                    entries.append((_number(entry["time"]) / 1e9, sensor, numbers))
+        for time_s, sensor, numbers in sorted(entries, key=lambda entry: entry[0]):
             if sensor == "wristmotion":
                 watch.whole = True
                 yield name, _Row(time_s, numbers[:4], numbers[4:7], numbers[7:])
@@ -207,15 +213,19 @@ class WatchSource(DatagramSource):
                     yield name, row
 
     def _csv_rows(self, data: bytes, refuse: Callable[[str], None]) -> Iterator[tuple[str, _Row]]:
-        for line in data.decode("utf-8").splitlines()[:MAX_ENTRIES]:
+        text = ""
+        with _refusing(refuse):
+            text = data.decode("utf-8")
+        for line in text.splitlines()[:MAX_ENTRIES]:
             cells = [cell.strip() for cell in line.split(";" if line.count(";") > line.count(",") else ",")]
             if any(cell.startswith("motionQuaternionW") for cell in cells):
                 self._columns = [cell.partition("(")[0] for cell in cells[:MAX_COLUMNS] if len(cell) <= 64]
             elif not self._columns:
                 return refuse(NO_HEADER)
             elif line.strip():
-                values = dict(zip(self._columns, cells, strict=True))
-                yield values.get("deviceID") or values.get("deviceName") or "watch", _sensor_log(values.get)
+                with _refusing(refuse):
+                    values = dict(zip(self._columns, cells, strict=True))
+                    yield values.get("deviceID") or values.get("deviceName") or "watch", _sensor_log(values.get)
         return None
 
     def _packet(self, name: str, row: _Row, arrived_s: float, refuse: Callable[[str], None]) -> Packet | None:
@@ -264,6 +274,15 @@ _VALUES: Mapping[str, tuple[str, ...]] = {
     "totalacceleration": ("x", "y", "z"),
 }
 """Sensor Logger's sensors, and the values of each."""
+
+
+@contextmanager
+def _refusing(refuse: Callable[[str], None]) -> Iterator[None]:
+    """What is no sample is counted, and the next one looked at."""
+    try:
+        yield
+    except (WearcapError, ValueError, TypeError, LookupError, OverflowError, AttributeError):
+        refuse(NO_SAMPLE)
 
 
 def _number(value: object) -> float:

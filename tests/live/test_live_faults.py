@@ -1,0 +1,196 @@
+"""A live capture outlives what names, files, sources and clocks may bring; what is lost is counted and said."""
+
+import asyncio
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from test_live_capture import Broken, Kept, Scripted, heads, small_hmd2, swaying
+from wearcap.errors import WearcapError
+from wearcap.io.formats.motion_npz import read_motion
+from wearcap.live.capture import LiveCapture
+from wearcap.live.packets import MAX_POINTS_WAITING, Inbox, Packet
+from wearcap.live.setup import read_setup, write_setup
+from wearcap.live.sink import SinkThread
+from wearcap.live.sinks.files import FilesSink, join_sections
+from wearcap.live.source import Address, Budget, Source
+from wearcap.live.sources.replay import ReplaySource
+from wearcap.recording import Motion
+from wearcap.sensors.samples import HeadSample
+from wearcap.systems.hmd2.stream import HMD2Session
+from wearcap_testing import swaying_motion
+
+
+def later(motion: Motion, seconds: float) -> Motion:
+    return replace(motion, timestamps=motion.timestamps + seconds)
+
+
+def test_two_wearers_whose_names_look_alike_have_a_folder_each(tmp_path: Path):
+    sink, motion = FilesSink(tmp_path), swaying_motion(60, 0)
+    sink.open()
+    for name in ("太郎", "花子"):
+        sink.begin(name, motion.skeleton, 60.0)
+    for k in range(3):
+        for name in ("太郎", "花子"):
+            sink.take(name, later(motion, k))
+    sink.close()
+    assert [len(read_motion(tmp_path / folder / "motion.npz")) for folder in ("__", "___2")] == [180, 180]
+
+
+def test_a_piece_that_cannot_be_written_costs_its_half_second(tmp_path: Path):
+    thread, motion = SinkThread(FilesSink(tmp_path)), swaying_motion(30, 0)
+    thread.start()
+    for k in range(10):
+        bad = replace(motion, t_world_root=motion.t_world_root * torch.nan) if k == 4 else motion
+        thread.take("", later(bad, k / 2))
+    thread.close()
+    assert thread.failed >= 1
+    assert "finite" in thread.last_error or thread.last_error
+    assert len(read_motion(tmp_path / "wearer" / "motion.npz")) >= 240
+
+
+def test_a_clock_that_jumps_begins_another_motion(tmp_path: Path):
+    sink, motion = FilesSink(tmp_path), swaying_motion(60, 0)
+    sink.open()
+    for start_s in (0.0, 1.0, 101.0, 102.0, 3.0):
+        sink.take("", later(motion, start_s))
+    sink.close()
+    found = {path.parent.name: len(read_motion(path)) for path in tmp_path.glob("*/motion.npz")}
+    assert found == {"wearer": 120, "wearer_2": 120, "wearer_3": 60}
+    assert all(path.with_suffix(".bvh").is_file() for path in tmp_path.glob("*/motion.npz"))
+
+
+def test_joining_goes_on_where_it_was_killed(tmp_path: Path):
+    sink, motion = FilesSink(tmp_path), swaying_motion(60, 0)
+    sink.open()
+    for k in range(3):
+        sink.take("", later(motion, k))
+    sections = {path.name: path.read_bytes() for path in (tmp_path / "wearer").glob("motion-*")}
+    assert len(sections) == 6
+    sink.close()
+    for name in sorted(sections)[-2:]:  # as if killed before the last section was removed
+        (tmp_path / "wearer" / name).write_bytes(sections[name])
+    (tmp_path / "wearer" / "motion.bvh").unlink()
+    assert len(join_sections(tmp_path / "wearer")) == 180
+    assert sorted(path.name for path in (tmp_path / "wearer").iterdir()) == ["motion.bvh", "motion.npz"]
+
+
+def test_a_name_from_the_network_is_no_path_and_a_named_wearer_keeps_their_set_up(tmp_path: Path):
+    sensed, kept = swaying(60), Kept()
+    known = ReplaySource(sensed, HMD2Session).setup
+    assert known is not None
+    write_setup(known.with_height(1.61), tmp_path / "setup_a_b.json")
+    script = list(heads(sensed, "a/b"))
+    LiveCapture(small_hmd2(), [Scripted(script)], [kept], setup_file=tmp_path / "setup.json").run(30.0)
+    assert kept.motion("a/b").skeleton.stature == pytest.approx(1.61, abs=1e-3)
+    assert [path.name for path in tmp_path.iterdir()] == ["setup_a_b.json"]
+
+
+def test_a_height_that_is_given_is_that_of_a_known_set_up_too():
+    sensed, kept = swaying(60), Kept()
+    setup = ReplaySource(sensed, HMD2Session).setup
+    capture = LiveCapture(small_hmd2(), [Scripted(list(heads(sensed)))], [kept], setup=setup, height_m=1.85)
+    capture.run(30.0)
+    assert kept.motion().skeleton.stature == pytest.approx(1.85, abs=1e-3)
+
+
+def standing(seconds: float = 4.0):
+    """Head packets of one who stands still, each as if it had come at once."""
+    pose = swaying(2).head.T_world_device[0]
+    for k in range(int(60 * seconds)):
+        yield Packet("", "head", "device", k / 60, k / 60, HeadSample(k / 60, pose)), 0.0
+
+
+def test_a_set_up_that_cannot_be_written_is_noted(tmp_path: Path):
+    (tmp_path / "file").write_text("")
+    capture = LiveCapture(
+        small_hmd2(), [Scripted(list(standing()))], [Kept()], height_m=1.7, setup_file=tmp_path / "file" / "setup.json"
+    )
+    about = capture.run(30.0)["wearers"]["wearer"]
+    assert about["frames"] > 0
+    assert any("setup.json" in note for note in about["notes"])
+    capture = LiveCapture(small_hmd2(), [Scripted(list(standing()))], [], height_m=1.7, setup_file=tmp_path / "s.json")
+    capture.run(30.0)
+    assert read_setup(tmp_path / "s.json").skeleton.stature == pytest.approx(1.7, abs=1e-3)
+
+
+def test_a_recorder_that_fails_is_in_the_report(tmp_path: Path):
+    sensed = swaying(120)
+    setup = ReplaySource(sensed, HMD2Session).setup
+    capture = LiveCapture(
+        small_hmd2(), [Scripted(list(heads(sensed)))], [], setup=setup, recorder=lambda _: Broken(), record=tmp_path
+    )
+    sinks = capture.run(30.0)["sinks"]
+    assert sinks["broken"]["failed"] > 0
+    assert sinks["broken"]["last_error"] == "the cable was pulled"
+
+
+class Failing(Source):
+    """Fails in its second run, or before its first."""
+
+    scheme, port, hz, convention = "failing", 1, 60.0, "ours"
+
+    def __init__(self, listens: bool):
+        super().__init__(Address("failing", "127.0.0.1", 1))
+        self.ready, self.runs = listens, 0
+
+    async def run(self, inbox: Inbox) -> None:
+        self.listens, self.runs = self.ready, self.runs + 1
+        if self.runs < 3:
+            raise ValueError("label too long")
+        await asyncio.sleep(0)
+
+
+def test_a_source_that_fails_is_started_again_and_ends_no_other(monkeypatch):
+    monkeypatch.setattr("wearcap.live.capture.RESTART_S", 0.01)
+    sensed, kept, failing = swaying(60), Kept(), Failing(listens=True)
+    setup = ReplaySource(sensed, HMD2Session).setup
+    report = LiveCapture(small_hmd2(), [failing, Scripted(list(heads(sensed)))], [kept], setup=setup).run(30.0)
+    assert failing.runs == 3
+    assert len(kept.motion()) == 60
+    assert report["refused"] == {"failing:1: failed (ValueError), and is started again": 2}
+
+
+def test_a_source_that_never_runs_ends_the_capture_with_its_reason():
+    with pytest.raises(WearcapError, match=r"cannot start \(label too long\).*failing:1"):
+        LiveCapture(small_hmd2(), [Failing(listens=False)], []).run(10.0)
+
+
+def test_silent_strangers_make_room(monkeypatch):
+    monkeypatch.setattr("wearcap.live.capture.FORGOTTEN_S", 0.0)
+    sensed, kept = swaying(60), Kept()
+    strangers = [next(heads(sensed, f"stranger {k}")) for k in range(20)]
+    lone = [(packet._replace(device=f"tracker {k}", wearer="anna"), 0.0) for k, (packet, _) in enumerate(strangers * 3)]
+    script = [*strangers, *lone, *heads(sensed, "anna")]
+    setup = ReplaySource(sensed, HMD2Session).setup
+    LiveCapture(small_hmd2(), [Scripted(script)], [kept], setup=setup).run(30.0)
+    assert len(kept.motion("anna")) == 60
+
+
+def test_points_that_wait_are_bounded():
+    inbox, pose = Inbox(), swaying(2).head.T_world_device[0]
+    points = torch.zeros(MAX_POINTS_WAITING // 4, 3)
+    for k in range(10):
+        inbox.deliver([Packet("", "head", "", k / 60, 0.0, HeadSample(k / 60, pose, points))])
+    assert inbox.waiting == 4
+    assert inbox.overflowed == 6
+    assert [packet.sent_s for packet in inbox.wait(0.0)] == [k / 60 for k in range(6, 10)]
+
+
+def test_a_source_has_messages_bytes_and_time(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("wearcap.live.source.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("wearcap.live.source.time.thread_time", lambda: now[0])
+    budget = Budget(messages=3, size=100, parse_s=0.2)
+    assert [budget.allows(10) for _ in range(4)] == [True, True, True, False]
+    now[0] = 101.0
+    assert [budget.allows(60), budget.allows(60)] == [True, False]
+    now[0] = 102.0
+    with budget.spending():
+        now[0] = 102.7
+    assert not budget.allows(1)
+    for second, allowed in ((103.0, False), (104.0, False), (105.0, True)):
+        now[0] = second
+        assert budget.allows(1) == allowed, second
