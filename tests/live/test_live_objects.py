@@ -18,6 +18,8 @@ from test_live_capture import UNITY, Kept
 from websockets.sync.client import connect
 
 from carried_box import boxes, carrying, drawn_echo
+from wearcap.body.skeleton import xsens23
+from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
 from wearcap.io.formats.environment import write_environment
@@ -36,6 +38,7 @@ from wearcap.live.wearer import LiveWearer, Opener
 from wearcap.recording import Motion, Recording
 from wearcap.recording.acts import active_at
 from wearcap.runtime.system import CaptureInput
+from wearcap.runtime.wearer import Wearer
 from wearcap.sensors.samples import ActiveObject, HeadSample, ObjectSample
 from wearcap.systems.echo.stream import EchoSession
 from wearcap_testing import swaying_motion
@@ -60,7 +63,7 @@ def placed(folder: Path, seconds: float = 1.2) -> CaptureInput:
 def test_a_replay_gives_the_offline_capture_with_its_objects(settings, tmp_path: Path):
     system, place, kept = drawn_echo(**settings), placed(tmp_path), Kept()
     source = ReplaySource(place.recording, EchoSession, math.inf, objects=EchoSession.of_objects(system, place))
-    report = LiveCapture(system, [source], [kept], source=place, setup=source.setup).run(60.0)
+    report = LiveCapture(system, [source], [kept], source=place, setup=source.setup).run(120.0)
     motion, whole = kept.motion(), system(place, 0)
     torch.testing.assert_close(motion.timestamps, whole.timestamps, atol=1e-6, rtol=0)
     torch.testing.assert_close(motion.T_world_joint.t, whole.T_world_joint.t, atol=1e-3, rtol=0)
@@ -85,6 +88,16 @@ def test_a_replay_of_a_walk_without_interactions_names_no_object(tmp_path: Path)
     bare = replace(place, recording=replace(place.recording, interactions=None, object_motion={}))
     assert EchoSession.of_objects(drawn_echo(), bare) == []
     assert EchoSession.of_objects(drawn_echo(acts="none"), place) == []
+
+
+def test_a_users_own_environment_needs_no_recording(tmp_path: Path):
+    write_environment(boxes(TWO), tmp_path / "flat")
+    capture = LiveCapture(drawn_echo(environment=str(tmp_path / "flat")), [], [])
+    assert [item.name for item in capture.objects] == ["box_1", "box_2"]
+    capture.opener.session(Wearer(xsens23())).streams[0].activate("box_2", 0.0)
+    assert LiveCapture(drawn_echo(), [], []).objects == ()
+    with pytest.raises(WearcapError, match="nowhere"):
+        LiveCapture(drawn_echo(environment=str(tmp_path / "nowhere")), [], [])
 
 
 # --- over sockets ---------------------------------------------------------------------------------------------------
@@ -119,7 +132,7 @@ def sent_over_udp(place: CaptureInput, *sinks: Sink) -> tuple[Motion, dict]:
     source = source_of(f"json://127.0.0.1:{port}")
     capture = LiveCapture(drawn_echo(anchor=False), [source], [kept, *sinks], source=place, setup=setup)
     reports: list[dict] = []
-    thread = threading.Thread(target=lambda: reports.append(capture.run(60.0)))
+    thread = threading.Thread(target=lambda: reports.append(capture.run(240.0)))
     thread.start()
     sound = [each for each in messages(place.recording) if "device" in each]
     with socket.socket(type=socket.SOCK_DGRAM) as sender:
@@ -129,7 +142,7 @@ def sent_over_udp(place: CaptureInput, *sinks: Sink) -> tuple[Motion, dict]:
         head = [each for each in sound if each["device"] == "head"]
         wait_for(lambda: sum(map(len, kept.pieces.get("", []))) >= len(head) - 8)  # all but the lookahead's
     capture.stop()
-    thread.join(60.0)
+    thread.join(120.0)
     return kept.motion(), reports[0]
 
 
@@ -142,7 +155,7 @@ def listens(port: int) -> bool:
     return False
 
 
-def wait_for(wanted: Callable[[], bool], seconds: float = 30.0) -> None:
+def wait_for(wanted: Callable[[], bool], seconds: float = 120.0) -> None:
     end = time.monotonic() + seconds
     while not wanted():
         assert time.monotonic() < end

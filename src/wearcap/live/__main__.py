@@ -40,10 +40,8 @@ def main(arguments: list[str]) -> None:
         raise WearcapError("a model that captures no motion", options.model, "one of hmd2, mocap_every or echo")
     sources, setup, place = [source_of(text) for text in options.source], None, None
     if options.recording is not None:
-        place, kind = (
-            CaptureInput.in_dataset(read(options.recording), dataset_folder(options.recording)),
-            system.session_class(),
-        )
+        place = CaptureInput.in_dataset(read(options.recording), dataset_folder(options.recording))
+        kind = system.session_class()
         replay = ReplaySource(place.recording, kind, options.speed, objects=kind.of_objects(system, place))
         sources.append(replay)
         setup = replay.setup if options.height is None else None

@@ -69,6 +69,11 @@ class LiveCapture:
         self.system, self.sources = system, list(sources)
         self.latency_s = system.latency_s
         kind = system.session_class()
+        if kind.takes_objects and source is None:
+            source = CaptureInput(Recording("live"))  # the system itself may name a file of objects
+        environment = system.objects(source) if kind.takes_objects and source is not None else None
+        self.objects = () if environment is None else environment.objects
+        """Those of the place, where the system takes objects."""
         minute = lambda before, guide: FirstMinute(  # noqa: E731
             kind.devices,
             tracked=kind.tracks_wrists,
@@ -78,11 +83,6 @@ class LiveCapture:
             guided=guide or guided,
         )
         open_session = lambda wearer: kind.of_wearers(system, [wearer], seed, source)  # noqa: E731
-        if kind.takes_objects and source is None:
-            source = CaptureInput(Recording("live"))  # the system itself may name a file of objects
-        environment = system.objects(source) if kind.takes_objects and source is not None else None
-        self.objects = () if environment is None else environment.objects
-        """Those of the place, where the system takes objects."""
         self.opener = Opener(open_session, kind.devices, kind.tracks_wrists, kind.takes_objects, minute)
         self.inbox = Inbox()
         self.wearers: dict[str, LiveWearer] = {}
