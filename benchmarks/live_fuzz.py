@@ -45,7 +45,15 @@ from wearcap.live.sources import SOURCES, source_of  # noqa: E402
 from wearcap.live.sources.parts import MAX_NAME  # noqa: E402
 from wearcap.live.sources.posts import MAX_HEADER, _Connections  # noqa: E402
 from wearcap.sensors.packets import MAX_ACC_M_S2, MAX_POSITION_M, pose_fault, time_fault, values_fault  # noqa: E402
-from wearcap.sensors.samples import HeadSample, LocalizationSample, SuitPiece, WatchSample, WristSample  # noqa: E402
+from wearcap.sensors.samples import (  # noqa: E402
+    ActiveObject,
+    HeadSample,
+    LocalizationSample,
+    ObjectSample,
+    SuitPiece,
+    WatchSample,
+    WristSample,
+)
 
 MAX_DATAGRAM = 65_507
 LONGEST_S = {"ws": 0.5, "watch+http": 0.5}
@@ -102,6 +110,8 @@ def messages(points: int) -> Callable[[int], list[bytes]]:
             {"device": "left_wrist", "axes": "unity", "wearer": "anna", "clock": "c", **pose},
             {"device": "w", "acceleration": [1, 2, 3], "matrix": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "time": frame / 60},
             {"device": "camera", "confidence": 0.5, **pose},
+            {"object": "box_1", "axes": "openxr", **pose},
+            {"active_object": "box_1" if frame % 2 else None, "time": frame / 60},
         ]
         return [json.dumps(each).encode() for each in found]
 
@@ -196,6 +206,10 @@ def fault_of(packet: Packet) -> str | None:
             return pose_fault(sample.T_world_joint)
         case LocalizationSample():
             return pose_fault(sample.T_world_cam)
+        case ObjectSample():
+            return "names" if len(sample.name) > MAX_NAME else pose_fault(sample.T_world_object)
+        case ActiveObject():
+            return "names" if len(sample.name or "") > MAX_NAME else time_fault(sample.timestamp)
         case WatchSample():
             return values_fault(sample.acc_world, (3,), MAX_ACC_M_S2)
         case SuitPiece():

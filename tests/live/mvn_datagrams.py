@@ -42,11 +42,18 @@ def header(kind: str, counter: int, part: int, items: int, time_ms: int, charact
     return head + struct.pack(">BBBBHH", character, 23, 0, 0, 0, len(payload) % 65536) + payload
 
 
+def y_up(quat: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses of a z-up world (x forward, y left) in one with y up (z forward, x left), world and segments alike."""
+    M = Rotation.from_matrix([[0, 1, 0], [0, 0, 1], [1, 0, 0]])
+    turned = M * Rotation.from_quat(quat[:, [1, 2, 3, 0]]) * M.inv()
+    return turned.as_quat()[:, [3, 0, 1, 2]], M.apply(position)
+
+
 def pose(
-    counter: int, seed: int = 0, time_ms: int = 0, character: int = 0, parts: int = 1, unit: float = 1.0
+    counter: int, seed: int = 0, time_ms: int = 0, character: int = 0, parts: int = 1, unit: float = 1.0, up: str = "z"
 ) -> list[bytes]:
     """A sample of type 02 in so many datagrams, with a prop behind the body."""
-    quat, position = posed(seed)
+    quat, position = posed(seed) if up == "z" else y_up(*posed(seed))
     items = [struct.pack(">i3f4f", k + 1, *position[k] / unit, *quat[k]) for k in range(23)]
     items.append(struct.pack(">i3f4f", 25, 1, 2, 3, 1, 0, 0, 0))
     cut = [list(chunk) for chunk in np.array_split(np.arange(24), parts)]

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 import torch
 
+from carried_box import boxes
 from live_show import FPS, PIECE, Show, walking
 from wearcap.body.skeleton import skeleton_of_height
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory
 from wearcap.live.page import MAX_WEARERS, LivePage
 from wearcap.live.page_devices import Devices
 from wearcap.live.page_panel import sinks_html, wearer_html
@@ -107,6 +109,37 @@ def test_bones_are_the_joints_of_the_frame_that_is_shown(page, show):
     turned = torch.tensor(np.stack([bone.wxyz for bone in handle.bones]))
     torch.testing.assert_close(rotation.matrix_from_quat_wxyz(turned).float(), truth.R, atol=1e-5, rtol=0)
     assert person.feet is not None
+
+
+def test_objects_are_where_the_motion_has_them_and_stay_there(show):
+    page = LivePage(show, port=18180, objects=boxes().objects)
+    try:
+        motion = show.persons["anna"].sliced(0, 40)
+        track = Trajectory(motion.timestamps, *(getattr(motion.joint("left_wrist"), name) for name in ("R", "t")))
+        page.take("anna", motion)
+        page.draw(1.0)
+        person = page._persons["anna"]
+        assert not person.objects
+        page.take("anna", replace(motion, timestamps=track.timestamps + 1, object_motion={"box_1": later(track)}))
+        page.draw(1.1)
+        motion, shown_s = person.playout.step(1.1)
+        assert motion.object_motion
+        (handle,) = person.objects["box_1"].handles
+        truth = track.t_world_body[round((shown_s - 1) * FPS)]
+        np.testing.assert_allclose(handle.position, truth, atol=1e-5)
+        page.take("anna", replace(motion, timestamps=motion.timestamps + 1, object_motion={"box_7": later(track)}))
+        page.draw(3.0)
+        np.testing.assert_allclose(handle.position, track.t_world_body[-1], atol=1e-5)
+        assert list(person.objects) == ["box_1"]
+        page.end("anna")
+        page.draw(3.1)
+        assert not handle.visible
+    finally:
+        page.stop()
+
+
+def later(track: Trajectory) -> Trajectory:
+    return replace(track, timestamps=track.timestamps + 1)
 
 
 def test_devices_are_where_they_are_and_watches_at_their_wrists(page, show):

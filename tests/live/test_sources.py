@@ -43,14 +43,14 @@ SEEDS = {
     "osctrackers": [osc("/tracking/trackers/1/position", "fff", 1, 2, 3), osc("/tracking/trackers/1/rotation", "fff", 9, 9, 9)],
     "mvn": [*mvn_datagrams.pose(1), *mvn_datagrams.size()],
     "watch": [json.dumps({"deviceId": "a", "payload": [{"name": "gravity", "time": 1, "values": {"x": 0, "y": 0, "z": 1}}]}).encode()],
-    "json": [json.dumps({"device": "head", "position": [1, 2, 3], "rotation_wxyz": [1, 0, 0, 0]}).encode()],
+    "json": [json.dumps(each | {"position": [1, 2, 3], "rotation_wxyz": [1, 0, 0, 0]}).encode() for each in ({"device": "head"}, {"object": "box"}, {"active_object": "box"})],
 }  # fmt: skip
 SEEDS |= {"watch+http": SEEDS["watch"], "ws": SEEDS["json"]}
 
 
 def assert_valid(packet: Packet) -> None:
     assert np.isfinite(packet.sample.timestamp if hasattr(packet.sample, "timestamp") else 0.0)
-    for name in ("T_world_device", "T_world_joint", "T_world_cam"):
+    for name in ("T_world_device", "T_world_joint", "T_world_cam", "T_world_object"):
         pose = getattr(packet.sample, name, None)
         if pose is not None:
             assert float(pose.t.abs().max()) <= MAX_POSITION_M

@@ -16,7 +16,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from wearcap.errors import WearcapError
 from wearcap.live.packets import Packet
 from wearcap.live.sources import SOURCES, source_of
-from wearcap.sensors.samples import HeadSample, LocalizationSample, WatchSample, WristSample
+from wearcap.sensors.samples import ActiveObject, HeadSample, LocalizationSample, ObjectSample, WatchSample, WristSample
 
 TURN = Rotation.from_rotvec([0.4, -0.7, 1.1])
 PLACE = [0.3, -1.2, 1.65]
@@ -78,6 +78,57 @@ def test_other_axes(axes, columns, sign):
     assert np.allclose(head.sample.points_world, [PLACE], atol=1e-5)
     assert np.allclose(felt.sample.R_world_imu, TURN.as_matrix(), atol=1e-5)
     assert np.allclose(felt.sample.acc_world, [1, 2, 3], atol=1e-5)
+
+
+def test_objects_and_which_is_active():
+    packets, refused = parsed(
+        {"object": "box_1", "time": 5, "wearer": "anna", "clock": "c", **POSE},
+        {"active_object": "box_1", "time": 4},
+        {"active_object": None, "device": None},
+        {"active_object": ""},
+    )
+    assert not refused
+    seen, chosen, none, nothing = packets
+    assert isinstance(seen.sample, ObjectSample)
+    assert (seen.device, seen.wearer, seen.clock, seen.sent_s) == ("object box_1", "anna", "json:9100/c", 5.0)
+    assert (seen.sample.name, seen.sample.timestamp) == ("box_1", 5.0)
+    assert np.allclose(seen.sample.T_world_object.R, TURN.as_matrix(), atol=1e-6)
+    assert np.allclose(seen.sample.T_world_object.t, PLACE)
+    assert (chosen.device, chosen.sent_s, chosen.sample) == ("object", 4.0, ActiveObject("box_1", 4.0))
+    assert (none.sent_s, none.sample) == (None, ActiveObject(None, 100.0))
+    assert nothing.sample == ActiveObject(None, 100.0)
+
+
+@pytest.mark.parametrize(
+    ("message", "why"),
+    [
+        ({"object": "box_1"}, "no pose"),
+        ({"object": "box_1", "position": PLACE}, "no pose"),
+        ({"object": "box_1", "position": [1e5, 2, 3], "rotation_wxyz": WXYZ}, "out of range"),
+        ({"object": "box_1", "position": PLACE, "rotation_wxyz": [1, 1, 0, 0]}, "not a rotation"),
+        ({"object": "box_1", "axes": "opengl", **POSE}, "unknown axes"),
+        ({"object": "x" * 65, **POSE}, "no name"),
+        ({"object": 7, **POSE}, "no name"),
+        ({"object": None, **POSE}, "no device"),
+        ({"active_object": ["box_1"]}, "no name"),
+        ({"active_object": "box\n1"}, "no name"),
+        ({"active_object": "box_1", "time": math.nan}, "not finite"),
+        ({"active_object": "box_1", "object": "box_1", **POSE}, "more than one of device, object and active_object"),
+        ({"active_object": None, "device": "head", **POSE}, "more than one of device, object and active_object"),
+        ({"object": "box_1", "device": "head", **POSE}, "more than one of device, object and active_object"),
+    ],
+)
+def test_bad_objects_are_counted(message, why):
+    assert parsed(message) == ([], {why: 1})
+
+
+def test_names_of_objects_are_bounded_in_number():
+    packets, refused = parsed(
+        *({"object": f"box_{number}", **POSE} for number in range(60)),
+        *({"active_object": f"box_{number}"} for number in range(58, 70)),
+    )
+    assert len(packets) == 60 + 6
+    assert refused == {"too many devices": 6}
 
 
 def test_lines_of_one_message():

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wearcap.body.skeleton import xsens23
+from wearcap.errors import WearcapError
 from wearcap.live.packets import Packet
 from wearcap.live.sources import source_of
 
@@ -60,6 +61,43 @@ def test_without_a_size_the_bones_are_those_of_a_pose():
     assert {name: site.joint for name, site in skeleton.sites.items()} == {
         name: site.joint for name, site in xsens23().sites.items()
     }
+
+
+@pytest.mark.parametrize("sized", [True, False])
+def test_y_up_and_z_up_give_the_same_sample(sized):
+    """The size is z up either way. Without it the bones follow from the poses alone."""
+    suits = []
+    for up in ("z", "y"):
+        source = source_of(f"mvn://127.0.0.1:0?up={up}")
+        feed(source, mvn.size() if sized else mvn.pose(1, up=up), 0.0)
+        (packet,), refused = feed(source, mvn.pose(2, 5, 1000, up=up), 2.0)
+        assert not refused
+        assert_posed(packet, 5)
+        suits.append(packet.sample.suit)
+    z_up, y_up = suits
+    assert y_up.timestamps.tolist() == z_up.timestamps.tolist()
+    for name in ("R_parent_joint", "t_world_root"):
+        assert np.allclose(getattr(y_up, name), getattr(z_up, name), atol=1e-6), name
+    assert np.allclose(y_up.skeleton.t_parent_joint, z_up.skeleton.t_parent_joint, atol=1e-6)
+    assert y_up.skeleton.sites == z_up.skeleton.sites
+
+
+def test_y_up_is_where_xsens_own_reader_has_it():
+    """One metre ahead and two up is (0, 2, 1), and a turn to the left is one about y."""
+    quat, position = mvn.y_up(np.array([[0.8, 0.0, 0.0, 0.6]]), np.array([[1.0, 0.0, 2.0]]))
+    assert np.allclose(position, [[0.0, 2.0, 1.0]])
+    assert np.allclose(quat, [[0.8, 0.0, 0.6, 0.0]])
+
+
+def test_what_is_wrong_with_the_axes_is_named():
+    with pytest.raises(WearcapError, match=r"up=x.*one of z, y"):
+        source_of("mvn://127.0.0.1?up=x")
+    lying = mvn.size()[0]
+    for segment, name in enumerate(mvn.BODY):
+        at = lying.index(mvn.text(name)) + len(mvn.text(name))
+        lying = bent(lying, at, ">3f", *mvn.T_POSE[segment][[1, 2, 0]])
+    assert feed(source_of("mvn"), [lying], 0.0) == ([], {"size that is not z up": 1})
+    assert feed(source_of("mvn"), [b"MXTP05" + mvn.pose(1)[0][6:]], 0.0) == ([], {"datagrams of other types": 1})
 
 
 def test_a_skeleton_stays_until_another_person_comes():

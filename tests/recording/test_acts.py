@@ -8,7 +8,7 @@ import torch
 
 from carried_box import carrying
 from wearcap.errors import WearcapError
-from wearcap.recording.acts import NO_OBJECT, Act, active_at, spread_acts, true_acts
+from wearcap.recording.acts import NO_OBJECT, Act, active_at, changes, spread_acts, true_acts
 from wearcap.recording.motion import Interactions
 
 TIMES = torch.arange(0, 20, 0.5, dtype=torch.float64)
@@ -20,6 +20,21 @@ def spans(acts) -> list[tuple[str, float, float]]:
 
 def test_an_act_reaches_beyond_what_is_held():
     assert spans(spread_acts([Act("a", 5.0, 6.0)], 2.0)) == [("a", 3.0, 8.0)]
+
+
+def test_changes_are_of_what_is_active():
+    """Of acts that overlap, touch and enclose each other."""
+    draw = torch.Generator().manual_seed(0)
+    for _ in range(50):
+        edges = torch.randint(0, 16, (4, 2), generator=draw).sort(1).values.tolist()
+        acts = [Act(name, float(start), float(stop)) for name, (start, stop) in zip("abab", edges)]
+        found = changes(acts)
+        assert [time for time, _ in found] == sorted({time for time, _ in found})
+        assert all(before[1] != after[1] for before, after in pairwise(found))
+        given = active_at(acts, "ab", TIMES)
+        for time, active in zip(TIMES.tolist(), given.tolist()):
+            name = next((name for start, name in reversed(found) if start <= time), None)
+            assert name == (None if active == NO_OBJECT else "ab"[active])
 
 
 def test_neighbours_meet_half_way():

@@ -68,7 +68,7 @@ def run(config: DictConfig) -> dict[str, Any]:
     )
     page = None
     if config.view:
-        page = LivePage(capture, config.host, config.port)
+        page = LivePage(capture, config.host, config.port, capture.objects)
         capture.add_sink(page)
     for name in ("", "websockets"):  # a quantisation's and a server's messages are no news to a wearer
         logging.getLogger(name).setLevel(logging.WARNING)
@@ -105,7 +105,9 @@ def _sources(config: DictConfig, system: System, place: CaptureInput | None) -> 
             raise WearcapError(
                 "source=replay without a recording", expected="recording=DATASET/NAME, or any file with one"
             )
-        replay = ReplaySource(place.recording, system.session_class(), float(config.speed))
+        kind = system.session_class()
+        objects = kind.of_objects(system, place)
+        replay = ReplaySource(place.recording, kind, float(config.speed), objects=objects)
         sources.append(replay)
         if config.height is None and not config.guided:
             setup = setup or replay.setup

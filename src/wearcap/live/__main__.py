@@ -17,7 +17,8 @@ from wearcap.live.sinks.files import FilesSink
 from wearcap.live.sources import source_of
 from wearcap.live.sources.replay import ReplaySource
 from wearcap.reading import read
-from wearcap.runtime.system import System
+from wearcap.recording.store import dataset_folder
+from wearcap.runtime.system import CaptureInput, System
 
 
 def main(arguments: list[str]) -> None:
@@ -25,7 +26,7 @@ def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="python -m wearcap.live", description=main.__doc__)
     parser.add_argument("model", type=Path, help="exported .onnx or .pt2 file, with the files written beside it")
     parser.add_argument("--source", nargs="+", default=[], metavar="URL", help="such as vmc://:39540")
-    parser.add_argument("--recording", help="a recording to replay instead")
+    parser.add_argument("--recording", help="a recording to replay instead, with its objects")
     parser.add_argument("--to", nargs="+", default=[], metavar="URL", help="such as vmc://127.0.0.1:39539")
     parser.add_argument("--record", type=Path, help="folder in which motion.npz and motion.bvh grow")
     parser.add_argument("--height", type=float, help="of the wearer (m)")
@@ -37,14 +38,23 @@ def main(arguments: list[str]) -> None:
     system = load_exported(options.model)
     if not isinstance(system, System):
         raise WearcapError("a model that captures no motion", options.model, "one of hmd2, mocap_every or echo")
-    sources, setup = [source_of(text) for text in options.source], None
+    sources, setup, place = [source_of(text) for text in options.source], None, None
     if options.recording is not None:
-        replay = ReplaySource(read(options.recording), system.session_class(), options.speed)
+        place = CaptureInput.in_dataset(read(options.recording), dataset_folder(options.recording))
+        kind = system.session_class()
+        replay = ReplaySource(place.recording, kind, options.speed, objects=kind.of_objects(system, place))
         sources.append(replay)
         setup = replay.setup if options.height is None else None
     sinks = [sink_of(text, "127.0.0.1", options.speed <= 1) for text in options.to]
     capture = LiveCapture(
-        system, sources, sinks, setup=setup, height_m=options.height, recorder=FilesSink, record=options.record
+        system,
+        sources,
+        sinks,
+        source=place,
+        setup=setup,
+        height_m=options.height,
+        recorder=FilesSink,
+        record=options.record,
     )
     print(json.dumps(capture.run(options.seconds), indent=1))
 

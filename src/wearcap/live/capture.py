@@ -24,7 +24,7 @@ from wearcap.live.sink import Sink, SinkThread
 from wearcap.live.source import Source
 from wearcap.live.status import LiveStatus, SinkStatus
 from wearcap.live.wearer import LiveWearer, Opener
-from wearcap.recording import Motion
+from wearcap.recording import Motion, Recording
 from wearcap.runtime.system import CaptureInput, System
 from wearcap.runtime.wearer import Wearer
 from wearcap.sensors.samples import HeadSample, WatchSample, WristSample
@@ -71,6 +71,11 @@ class LiveCapture:
         self.system, self.sources = system, list(sources)
         self.latency_s = system.latency_s
         kind = system.session_class()
+        if kind.takes_objects and source is None:
+            source = CaptureInput(Recording("live"))  # the system itself may name a file of objects
+        environment = system.objects(source) if kind.takes_objects and source is not None else None
+        self.objects = () if environment is None else environment.objects
+        """Those of the place, where the system takes objects."""
         minute = lambda before, guide: FirstMinute(  # noqa: E731
             kind.devices,
             tracked=kind.tracks_wrists,
@@ -80,7 +85,7 @@ class LiveCapture:
             guided=guide or guided,
         )
         open_session = lambda wearer: kind.of_wearers(system, [wearer], seed, source)  # noqa: E731
-        self.opener = Opener(open_session, kind.devices, kind.tracks_wrists, minute)
+        self.opener = Opener(open_session, kind.devices, kind.tracks_wrists, kind.takes_objects, minute)
         self.inbox = Inbox()
         self.wearers: dict[str, LiveWearer] = {}
         self.sinks = [SinkThread(sink) for sink in sinks]

@@ -107,6 +107,9 @@ class Clocks:
         self._clocks: dict[str, DeviceClock] = {}
         self._shifts_s: dict[str, float] = {}
 
+    def __contains__(self, clock: str) -> bool:
+        return clock in self._clocks
+
     def see(self, clock: str, sent_s: float, arrived_s: float) -> None:
         """A packet that counts on a clock arrived."""
         if clock not in self._clocks:

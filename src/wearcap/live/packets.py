@@ -4,7 +4,15 @@ import threading
 from collections import Counter, deque
 from typing import NamedTuple
 
-from wearcap.sensors.samples import HeadSample, LocalizationSample, SuitPiece, WatchSample, WristSample
+from wearcap.sensors.samples import (
+    ActiveObject,
+    HeadSample,
+    LocalizationSample,
+    ObjectSample,
+    SuitPiece,
+    WatchSample,
+    WristSample,
+)
 
 MAX_PACKETS = 20_000
 """Capacity of an `Inbox`: some 20 s of five devices at 200 Hz. The oldest packets are dropped."""
@@ -12,6 +20,9 @@ MAX_POINTS_WAITING = 1_000_000
 """Points of the surroundings that may wait with them: 12 MB. The oldest packets are dropped."""
 HEAD, SUIT, CAMERA = "head", "suit", "camera"
 """Names of devices that say by themselves what they are; wrists are named by their joint, others by their serial."""
+OBJECT = "object"
+"""Device of samples of objects, with the object's name behind it where there is one."""
+Sample = HeadSample | WatchSample | WristSample | SuitPiece | LocalizationSample | ActiveObject | ObjectSample
 
 
 class Packet(NamedTuple):
@@ -20,14 +31,14 @@ class Packet(NamedTuple):
     wearer: str
     """Name of who wears it; "" where the source serves one person."""
     device: str
-    """`HEAD`, a joint of `body.skeleton.WRISTS`, `SUIT`, `CAMERA`, or the serial of a tracker of unknown place."""
+    """`HEAD`, a joint of `body.skeleton.WRISTS`, `SUIT`, `CAMERA`, `OBJECT`, or the serial of a tracker of unknown place."""
     clock: str
     """Name of the clock that `sent_s` counts on; devices of one clock share it."""
     sent_s: float | None
     """The device's own time (s); None where the protocol has none: the time of arrival stands for it."""
     arrived_s: float
     """Our time (s, `time.monotonic`) at which the packet arrived."""
-    sample: HeadSample | WatchSample | WristSample | SuitPiece | LocalizationSample
+    sample: Sample
     """In wearcap's axes. Its timestamp is `sent_s`, or `arrived_s`. A tracker of unknown place is a `WristSample` whose
     joint is its serial; a watch of unknown place is a `WatchSample` whose joint is its serial."""
 

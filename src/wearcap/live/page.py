@@ -6,6 +6,7 @@ It is a sink like any other: `take` only stores, a thread of the page's own draw
 import math
 import threading
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,8 +22,9 @@ from wearcap.live.playout import Playout
 from wearcap.live.sink import Sink
 from wearcap.live.status import MAX_POINTS, LiveControls, LiveStatus, WearerStatus
 from wearcap.recording import Motion, PointCloud
+from wearcap.scene.objects import SceneObject
 from wearcap.viewer.page import COLORS, UPDATES_PER_S
-from wearcap.viewer.page_layers import BodyLayer, FeetLayer, LabelLayer, add_points, surface_or_sticks
+from wearcap.viewer.page_layers import BodyLayer, FeetLayer, LabelLayer, ObjectsLayer, add_points, surface_or_sticks
 from wearcap.viewer.page_server import ServedPage
 
 MAX_WEARERS = 16
@@ -46,6 +48,8 @@ class _Person:
 
     number: int
     """Names the wearer's nodes: names from the network do not."""
+    known: Mapping[str, SceneObject]
+    """Objects of the place, by name."""
     playout: Playout = field(default_factory=Playout)
     wanted: Skeleton | None = None
     """Of the motion that comes; None once the wearer has left."""
@@ -54,6 +58,8 @@ class _Person:
     body: BodyLayer | None = None
     feet: FeetLayer | None = None
     label: LabelLayer | None = None
+    objects: dict[str, ObjectsLayer] = field(default_factory=dict)
+    """By name, those that had a pose; without a new one they stay where they were."""
     shown: bool = True
 
     def __post_init__(self):
@@ -68,7 +74,7 @@ class _Person:
         return self.body is not None and bool(self.body.handle.visible)
 
     def draw(self, server: viser.ViserServer, name: str, now_s: float, several: bool) -> None:
-        """Show the body at its play-out's time."""
+        """Show the body, and the objects that it moves, at its play-out's time."""
         if self.wanted is None:
             self._hide()
             return
@@ -84,7 +90,9 @@ class _Person:
                 layer.motion = motion
         if self.feet is not None and motion.contact_prob is not None:
             self.feet.contact, self.feet.clock = motion.contact_prob > 0.5, motion.timestamps
-        for layer, visible in ((self.body, self.shown), (self.feet, self.shown), (self.label, self.shown and several)):
+        self._take_objects(server, motion)
+        mine = [(layer, self.shown) for layer in (self.body, self.feet, *self.objects.values())]
+        for layer, visible in (*mine, (self.label, self.shown and several)):
             if layer is None:
                 continue
             for handle in layer.handles:
@@ -105,8 +113,17 @@ class _Person:
             self.label.handle.font_size_mode, self.label.handle.font_scene_height = "scene", LABEL_M
         self.skeleton = motion.skeleton
 
+    def _take_objects(self, server: viser.ViserServer, motion: Motion) -> None:
+        """Nodes of objects that a motion moves for the first time, and their newest poses."""
+        for name, track in (motion.object_motion or {}).items():
+            if name not in self.objects and name in self.known:
+                node = f"world/person_{self.number}_objects"
+                self.objects[name] = ObjectsLayer(server, node, [self.known[name]], {})
+            if name in self.objects and len(track):
+                self.objects[name].tracks[name] = track
+
     def _hide(self) -> None:
-        for layer in (self.body, self.feet, self.label):
+        for layer in (self.body, self.feet, self.label, *self.objects.values()):
             for handle in () if layer is None else layer.handles:
                 if handle.visible:
                     handle.visible = False
@@ -124,9 +141,13 @@ class LivePage(ServedPage, Sink):
     name = "page"
     convention = "metres, z up, as the capture"
 
-    def __init__(self, controls: LiveControls, host: str = "127.0.0.1", port: int = 8080):
+    def __init__(
+        self, controls: LiveControls, host: str = "127.0.0.1", port: int = 8080, objects: Sequence[SceneObject] = ()
+    ):
+        """`objects`: of the place; each is shown once a motion moves it."""
         super().__init__("wearcap live", host, port, "medium")
         self.controls = controls
+        self.objects = {item.name: item for item in objects}
         self.errors = 0
         """Number of frames that could not be drawn."""
         self.last_error = ""
@@ -189,7 +210,7 @@ class LivePage(ServedPage, Sink):
     def _person(self, name: str) -> _Person | None:
         with self._lock:
             if name not in self._persons and len(self._persons) < MAX_WEARERS:
-                self._persons[name] = _Person(len(self._persons))
+                self._persons[name] = _Person(len(self._persons), self.objects)
             return self._persons.get(name)
 
     # --- drawing ---------------------------------------------------------------------------------------------------

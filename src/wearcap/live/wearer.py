@@ -22,7 +22,15 @@ from wearcap.live.status import MAX_POINTS, DeviceStatus, Stage, WearerStatus
 from wearcap.recording import Motion
 from wearcap.runtime.session import Session
 from wearcap.runtime.wearer import Wearer
-from wearcap.sensors.samples import HeadSample, LocalizationSample, SuitPiece, WatchSample, WristSample
+from wearcap.sensors.samples import (
+    ActiveObject,
+    HeadSample,
+    LocalizationSample,
+    ObjectSample,
+    SuitPiece,
+    WatchSample,
+    WristSample,
+)
 from wearcap.tracking.head_path import MAX_GAP_S
 
 AWAY_S = 5.0
@@ -45,6 +53,7 @@ class Opener:
     devices: tuple[str, ...]
     """Devices that the session needs; the first one's clock times the motion."""
     tracks_wrists: bool
+    takes_objects: bool
     first_minute: Callable[[Setup | None, bool], FirstMinute]
     """(set-up of last time, whether guided) → a new first minute."""
 
@@ -106,11 +115,24 @@ class LiveWearer:
         self._dropped = 0
         """Packets that earlier sessions refused or dropped."""
         self._last: Motion | None = None
+        self._active: Packet | None = None
+        """The newest choice of the active object."""
+        self._taken = self._taken_before = False
+        """Whether the session, and an earlier one, took that choice."""
 
     # --- packets ----------------------------------------------------------------------------------------------------
 
     def take(self, packet: Packet) -> None:
         """Take in one packet."""
+        of_object = isinstance(packet.sample, ActiveObject | ObjectSample)
+        if of_object and not self.opener.takes_objects:
+            self.unknown += 1
+            return
+        if isinstance(packet.sample, ActiveObject):
+            self._active, self._taken, self._taken_before = packet, False, False
+            if self.session is not None and self.clocks.leader is not None:
+                self._activate(np.inf)
+            return
         clock, sent_s = (ARRIVAL, packet.arrived_s) if packet.sent_s is None else (packet.clock, packet.sent_s)
         if packet.device not in self._devices:
             if len(self._devices) >= MAX_DEVICES:
@@ -125,7 +147,8 @@ class LiveWearer:
         device = self._devices[packet.device]
         device.see(packet, time_s)
         now_s = time.monotonic()
-        self._heard_s = max(packet.arrived_s, now_s)  # of a capture that is behind, packets wait
+        if not of_object:  # objects stay when their wearer leaves
+            self._heard_s = max(packet.arrived_s, now_s)  # of a capture that is behind, packets wait
         if now_s - packet.arrived_s > BEHIND_S:
             self._note(
                 "The capture is slower than the packets come: end other programs, or give it more cores (threads=N)."
@@ -137,16 +160,41 @@ class LiveWearer:
             self._head_s = time_s
         if isinstance(sample, HeadSample) and sample.points_world is not None and len(sample.points_world):
             self._keep_points(sample.points_world)
+        if of_object and (self.session is None or self.clocks.leader is None):
+            return
         if self.session is None and not self._is_prepared(packet.device, sample, packet.arrived_s):
             return
-        assert self.session is not None
+        if leads and not self._taken:
+            self._activate(time_s)
         if (seated := self._seated(packet.device, sample)) is None:
             self.unknown += 1
         else:
-            try:
-                self.session.push([[seated]])
-            except WearcapError as error:
-                self._note(str(error))
+            self._push(seated)
+
+    def _push(self, sample: Any) -> None:
+        assert self.session is not None
+        try:
+            self.session.push([[sample]])
+        except WearcapError as error:
+            self._note(str(error))
+
+    def _activate(self, now_s: float) -> None:
+        """Pass on which object is active; `now_s` is the time of the leading device.
+
+        The choice's time may be any, so it says nothing about its sender's clock; on a clock that nothing else counts on,
+        its arrival counts. What an earlier session took is active from the beginning of this one.
+        """
+        self._taken, packet = True, self._active
+        if packet is None:
+            return
+        clock, time_s = packet.clock, packet.sent_s
+        if time_s is None or clock not in self.clocks:
+            clock, time_s = ARRIVAL, packet.arrived_s
+            self.clocks.see(ARRIVAL, time_s, time_s)
+        time_s = self.clocks.on_leader(clock, time_s)
+        sample = packet.sample
+        assert isinstance(sample, ActiveObject)
+        self._push(sample._replace(timestamp=min(time_s, now_s) if self._taken_before else time_s))
 
     def _is_prepared(self, device: str, sample: Any, now_s: float) -> bool:
         """Look for the set-up, and open the session once it is known."""
@@ -169,6 +217,7 @@ class LiveWearer:
         placed = {} if head is None else {"R_head_device": head.R_joint_device, "t_head_device": head.t_joint_device}
         wearer = Wearer(setup.skeleton, R_wrist_imu=mounts, floor_m=setup.floor_m, **placed)
         self.session, self.skeleton, self.stage = self.opener.session(wearer), setup.skeleton, "live"
+        self._taken, self._taken_before = False, self._taken
         self.sessions, self.fps = self.sessions + 1, self.session.fps
 
     def _seated(self, device: str, sample: Any) -> Any:
@@ -188,6 +237,8 @@ class LiveWearer:
                 turn = rotation.about_axis("z", torch.tensor(seat.yaw_rad))
                 R, acc = turn @ sample.R_world_imu, turn @ sample.acc_world
                 return sample._replace(joint=seat.joint, R_world_imu=R, acc_world=acc)
+            case ObjectSample():
+                return sample
             case SuitPiece() | LocalizationSample() if SUIT in self.opener.devices:
                 return sample
         return None
@@ -297,4 +348,6 @@ def _shown(sample: Any) -> Rigid | None:
             return Rigid(sample.R_world_imu, torch.full((3,), torch.nan))
         case LocalizationSample():
             return sample.T_world_cam
+        case ObjectSample():
+            return sample.T_world_object
     return None

@@ -67,6 +67,21 @@ def spread_acts(held: Sequence[Act], margin_s: float = MARGIN_S) -> list[Act]:
     ]
 
 
+def changes(acts: Iterable[Act]) -> list[tuple[float, str | None]]:
+    """Times (s), rising, from which on another object is active, with its name; None: no object is.
+
+    Where acts overlap the last one counts, as for `active_at`.
+    """
+    acts, found = list(acts), []
+    active: str | None = None
+    for time_s in sorted({edge for act in acts for edge in (act.start_s, act.stop_s)}):
+        name = next((act.object for act in reversed(acts) if act.start_s <= time_s < act.stop_s), None)
+        if name != active:
+            found.append((time_s, name))
+        active = name
+    return found
+
+
 def _side_by_side(held: Sequence[Act]) -> list[Act]:
     """Time spans of which none is within another: longer ones are split."""
     left, done = list(held), []

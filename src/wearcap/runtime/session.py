@@ -30,6 +30,7 @@ from wearcap.runtime.stages import digest
 from wearcap.runtime.system import CaptureInput
 from wearcap.runtime.wearer import Wearer
 from wearcap.sensors.packets import Admitted, HeadInput, WristInput
+from wearcap.sensors.samples import ActiveObject, ObjectSample
 from wearcap.tracking.head_path import Chunk, HeadTrack
 
 _KEY, _SETTINGS, _DIGEST = "wearcap_state", "settings", "sha256"
@@ -54,6 +55,8 @@ class Session(ABC):
     """Whether wrists come as tracked poses; otherwise as orientation and acceleration of watches."""
     given_floor: ClassVar[bool] = False
     """Whether a capture of a whole recording takes the floor that it has, as a stream then takes its wearer's `floor_m`."""
+    takes_objects: ClassVar[bool] = False
+    """Whether samples of objects, and of which one is active, are taken."""
 
     def __init__(self, system: Any, streams: Sequence[Any]):
         """`streams`: one for each wearer, with the properties `dropped` and `refused`, `take(sample)` for one sample, and
@@ -70,6 +73,14 @@ class Session(ABC):
         """The session of some wearers, each with a seed from `seed` on; `source`: recording, scan and objects that belong
         to the place, for systems that use them. Raises WearcapError as the system's own constructor does."""
         return cls(system, wearers)
+
+    @classmethod
+    def of_objects(cls, system: Any, source: CaptureInput) -> list[ActiveObject | ObjectSample]:
+        """The samples of objects, in order of time, that a capture of a whole recording corresponds to.
+
+        Raises WearcapError as that capture does.
+        """
+        return []
 
     @property
     def fps(self) -> float:

@@ -1,10 +1,13 @@
-"""The body to Unity, Unreal, Blender, VSeeFace and others by the VMC protocol (OSC over UDP, port 39539).
+"""The body, and objects, to Unity, Unreal, Blender, VSeeFace and others by the VMC protocol (OSC over UDP, port 39539).
 
 A receiver gets `/VMC/Ext/Root/Pos` and a `/VMC/Ext/Bone/Pos` for each of Unity's humanoid bones: position and rotation
 relative to the parent bone, in Unity's axes (left-handed, x right, y up, z forward, metres), of a T-pose without rotations.
+Objects are trackers: a `/VMC/Ext/Tra/Pos` with the object's name, position and rotation (x y z w) in the world, for each
+that has a pose in the frame. Their own axes are turned like the world's: a mesh's x forward, y left, z up are Unity's z, -x, y.
 """
 
 import socket
+from collections.abc import Mapping
 from contextlib import suppress
 
 import numpy as np
@@ -15,10 +18,12 @@ from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
+from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import quat_wxyz_from_matrix
 from wearcap.io.devices.axes import UNITY
 from wearcap.live.pacing import Pacing
 from wearcap.live.sink import Sink
+from wearcap.live.sinks.objects import objects_of
 from wearcap.live.source import Address
 from wearcap.recording import Motion
 
@@ -59,7 +64,7 @@ _CALIBRATED = 3
 class VmcSink(Sink):
     """Sends one wearer's body: the one that the address names (`?wearer=NAME`), else the first that comes."""
 
-    convention = "Unity's humanoid bones; left-handed, y up, z forward, metres"
+    convention = "Unity's humanoid bones, objects as trackers; left-handed, y up, z forward, metres"
 
     def __init__(self, address: Address, pace: bool = True):
         self.address, self.name = address, f"vmc://{address.host}:{address.port}"
@@ -89,10 +94,11 @@ class VmcSink(Sink):
     def take(self, wearer: str, motion: Motion) -> None:
         if wearer != self.wearer:
             return
-        positions, rotations = bones_of(motion)
+        (positions, rotations), objects = bones_of(motion), objects_of(motion)
         for k, time_s in enumerate(motion.timestamps.tolist()):
             self._pacing.wait(self._step_s, self.waiting > 1)
-            self._send(bundle(positions[k], rotations[k], time_s))
+            trackers = {name: seen.T_world_object for name, seen in objects[k].items()}
+            self._send(bundle(positions[k], rotations[k], time_s, trackers))
 
     def close(self) -> None:
         if self._socket is not None:
@@ -116,14 +122,19 @@ def bones_of(motion: Motion) -> tuple[Float[Tensor, "time bone 3"], Float[Tensor
     return t_local, quat_wxyz_from_matrix(R_local.double()).float().roll(-1, -1)
 
 
-def bundle(t: Float[Tensor, "bone 3"], xyzw: Float[Tensor, "bone 4"], time_s: float) -> bytes:
-    """One frame as an OSC bundle."""
+def bundle(
+    t: Float[Tensor, "bone 3"], xyzw: Float[Tensor, "bone 4"], time_s: float, trackers: Mapping[str, Rigid]
+) -> bytes:
+    """One frame as an OSC bundle; `trackers`: poses by name in wearcap's world."""
     built = OscBundleBuilder(IMMEDIATELY)  # pyright: ignore[reportArgumentType]
     _add(built, "/VMC/Ext/OK", 1, _CALIBRATED, 0)
     _add(built, "/VMC/Ext/T", float(np.float32(time_s)))
     _add(built, "/VMC/Ext/Root/Pos", "root", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     for name, place, turn in zip(BONES, t.tolist(), xyzw.tolist()):
         _add(built, "/VMC/Ext/Bone/Pos", name, *place, *turn)
+    for name, pose in trackers.items():
+        turn = quat_wxyz_from_matrix((UNITY.mT @ pose.R @ UNITY).double()).roll(-1)
+        _add(built, "/VMC/Ext/Tra/Pos", name, *(pose.t @ UNITY).tolist(), *turn.tolist())
     return built.build().dgram
 
 

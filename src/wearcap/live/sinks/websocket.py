@@ -3,6 +3,8 @@
 The first message of a client describes each wearer: {"skeleton": {"wearer", "joints", "parents", "offsets"}, "fps"}; every
 frame follows as {"wearer", "time", "root": [x, y, z], "rotations_wxyz": [[w, x, y, z], …], "contact": [0…1 of left heel,
 left toe tip, right heel, right toe tip] or null}: rotations relative to the parent joint, in wearcap's axes (z up, metres).
+Frames with objects also have "objects": {NAME: {"position": [x, y, z], "rotation_wxyz": [w, x, y, z], "contact": 0…1 or
+null}}: the pose of the object's mesh in the world, and the largest probability that a point of the body touches it.
 """
 
 import asyncio
@@ -20,6 +22,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import quat_wxyz_from_matrix
 from wearcap.live.pacing import Pacing
 from wearcap.live.sink import Sink
+from wearcap.live.sinks.objects import SeenObject, objects_of
 from wearcap.live.source import Address
 from wearcap.recording import Motion
 from wearcap.viewer.guard import LOOPBACK, Guard, Refused
@@ -98,7 +101,7 @@ class WebSocketSink(Sink):
 
     def take(self, wearer: str, motion: Motion) -> None:
         wxyz = quat_wxyz_from_matrix(motion.R_parent_joint.double())
-        contacts = motion.contact_prob
+        contacts, objects = motion.contact_prob, objects_of(motion)
         for k, time_s in enumerate(motion.timestamps.tolist()):
             frame = {
                 "wearer": wearer,
@@ -107,6 +110,8 @@ class WebSocketSink(Sink):
                 "rotations_wxyz": [[round(each, 6) for each in row] for row in wxyz[k].tolist()],
                 "contact": None if contacts is None else [round(each, 3) for each in contacts[k].tolist()],
             }
+            if objects[k]:
+                frame["objects"] = {name: _row(seen) for name, seen in objects[k].items()}
             self._pacing.wait(self._step_s, self.waiting > 1)
             self._loop.call_soon_threadsafe(self._broadcast, json.dumps(frame))
 
@@ -161,6 +166,15 @@ class WebSocketSink(Sink):
                 client.transport.abort()
                 continue
             self._loop.create_task(_sent(client, text))
+
+
+def _row(seen: SeenObject) -> dict[str, Any]:
+    pose, wxyz = seen.T_world_object, quat_wxyz_from_matrix(seen.T_world_object.R.double())
+    return {
+        "position": [round(each, 5) for each in pose.t.tolist()],
+        "rotation_wxyz": [round(each, 6) for each in wxyz.tolist()],
+        "contact": None if seen.contact is None else round(seen.contact, 3),
+    }
 
 
 async def _sent(client: ServerConnection, text: str) -> None:

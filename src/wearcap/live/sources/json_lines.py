@@ -4,6 +4,8 @@
  "position": [x, y, z], "rotation_wxyz": [w, x, y, z] or "matrix": [[…], […], […]], "axes": "wearcap" | "unity" | …,
  "lost": true, "points": [[x, y, z], …], "floor" (the head's), "acceleration": [x, y, z] (a watch's, which has no
  position), "confidence" (a camera's)}
+{"object": NAME, "wearer", "time", "clock", "position", "rotation_wxyz" or "matrix", "axes"}: an observed pose of an object
+{"active_object": NAME or null, "wearer", "time", "clock"}: which object is the active one from that time on
 """
 
 import asyncio
@@ -22,12 +24,12 @@ from websockets.http11 import Request, Response
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
-from wearcap.live.packets import CAMERA, HEAD, SUIT, Inbox, Packet
+from wearcap.live.packets import CAMERA, HEAD, OBJECT, SUIT, Inbox, Packet, Sample
 from wearcap.live.source import Address, Budget, DatagramSource
 from wearcap.live.sources.parts import AXES, MAX_LISTS, Names, bounded_json, checked_pose, matrix_of, require_options
 from wearcap.live.sources.posts import admitting
 from wearcap.sensors.packets import MAX_ACC_M_S2, MAX_POSITION_M, WRONG_TYPE, number_fault, time_fault, values_fault
-from wearcap.sensors.samples import HeadSample, LocalizationSample, WatchSample, WristSample
+from wearcap.sensors.samples import ActiveObject, HeadSample, LocalizationSample, ObjectSample, WatchSample, WristSample
 from wearcap.viewer.guard import Refused
 
 MAX_LINES = 64
@@ -38,7 +40,7 @@ MAX_BYTES_PER_S = 1 << 22
 MAX_CONNECTIONS = 16
 _KEYS = {
     *("device", "wearer", "time", "clock", "position", "rotation_wxyz", "matrix", "axes", "lost"),
-    *("points", "floor", "acceleration", "confidence"),
+    *("points", "floor", "acceleration", "confidence", "object", "active_object"),
 }
 
 _QUIET = logging.Logger("wearcap.live", logging.CRITICAL + 1)
@@ -50,6 +52,7 @@ UNKNOWN_AXES = "unknown axes"
 NO_POSE = "no pose"
 TOO_LARGE = "too large"
 NO_DEVICE = "no device"
+SEVERAL = "more than one of device, object and active_object"
 
 
 class _Fault(Exception):
@@ -66,7 +69,7 @@ class JsonSource(DatagramSource):
     def __init__(self, address: Address):
         super().__init__(address)
         require_options(address, *self.own_options)
-        self._names = {kind: Names() for kind in ("device", "wearer", "clock")}
+        self._names = {kind: Names() for kind in ("device", "object", "wearer", "clock")}
 
     def parse(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> list[Packet]:
         packets = []
@@ -88,31 +91,38 @@ class JsonSource(DatagramSource):
             raise _Fault(NO_JSON)
         if not content.keys() <= _KEYS:
             refuse(UNKNOWN_KEY)  # and used without it
-        device = self._name(content, "device", arrived_s)
-        if device == SUIT or device is None:
-            raise _Fault(NO_DEVICE)
         sent_s = content.get("time")
         if sent_s is not None:
             _require(WRONG_TYPE if isinstance(sent_s, bool) else time_fault(sent_s))
+        device, sample = self._about(content, float(arrived_s if sent_s is None else sent_s), arrived_s)
         wearer = self._name(content, "wearer", arrived_s) or self.wearer
         clock = self._name(content, "clock", arrived_s)
-        sample = self._sample(device, float(arrived_s if sent_s is None else sent_s), content)
         own_clock = f"{self.name}/{clock}" if clock else self.name
         return Packet(wearer, device, own_clock, None if sent_s is None else float(sent_s), arrived_s, sample)
 
-    def _name(self, content: dict[str, Any], kind: str, arrived_s: float) -> str | None:
-        name = content.get(kind)
+    def _about(self, content: dict[str, Any], timestamp: float, arrived_s: float) -> tuple[str, Sample]:
+        """Device and sample of a message."""
+        device, name = (self._name(content, key, arrived_s) for key in ("device", "object"))
+        if ("active_object" in content) + (device is not None) + (name is not None) > 1:
+            raise _Fault(SEVERAL)
+        if "active_object" in content:
+            return OBJECT, ActiveObject(self._name(content, "active_object", arrived_s, "object"), timestamp)
+        if name is not None:
+            return f"{OBJECT} {name}", ObjectSample(name, timestamp, _pose(content, _axes(content)))
+        if device == SUIT or device is None:
+            raise _Fault(NO_DEVICE)
+        return device, self._sample(device, timestamp, content)
+
+    def _name(self, content: dict[str, Any], key: str, arrived_s: float, kind: str = "") -> str | None:
+        """The name that a key holds; `kind`: of which it is one, if not the key itself."""
+        name = content.get(key)
         if name is None or name == "":
             return None
-        _require(self._names[kind].fault(name, arrived_s))
+        _require(self._names[kind or key].fault(name, arrived_s))
         return name
 
-    def _sample(
-        self, device: str, timestamp: float, content: dict[str, Any]
-    ) -> HeadSample | WatchSample | WristSample | LocalizationSample:
-        axes = content.get("axes", "wearcap")
-        if not isinstance(axes, str) or axes not in AXES:
-            raise _Fault(UNKNOWN_AXES)
+    def _sample(self, device: str, timestamp: float, content: dict[str, Any]) -> Sample:
+        axes = _axes(content)
         if device == HEAD:
             pose = None if content.get("lost") is True else _pose(content, axes)
             floor = content.get("floor")
@@ -147,6 +157,13 @@ def _numbers(values: object, count: int) -> list[float]:
     if not all(type(value) is float or type(value) is int for value in values):
         raise _Fault(WRONG_TYPE)
     return [float(value) for value in values]
+
+
+def _axes(content: dict[str, Any]) -> str:
+    axes = content.get("axes", "wearcap")
+    if not isinstance(axes, str) or axes not in AXES:
+        raise _Fault(UNKNOWN_AXES)
+    return axes
 
 
 def _rotation(content: dict[str, Any]) -> torch.Tensor:

@@ -3,6 +3,13 @@
 Datagrams begin with 24 bytes: "MXTP" and the type, sample counter, datagram counter (its highest bit: the sample's last),
 number of items, time code (ms), character, numbers of body segments, props and finger segments, reserved, size. MVN's
 segments are the joints of `xsens23` (see `io.formats.mvnx`). The stream holds no foot contacts.
+
+Axes, by the "MVN real-time network streaming Protocol Specification" (MV0305P): type 02 is z up and right-handed by default,
+"or Y-Up" by a setting of the network streamer (`?up=y`); nothing in a datagram says which. Type 13 is always z up. The
+specification names no other axis of type 02 with y up. MVN's right-handed y up of types 01 and 03 is x left, y up, z forward:
+Xsens' own reader of these (`Datagram::convertFromYupToZup` and `EulerDatagram` of its network streaming SDK) takes positions
+(x, y, z) to (z, x, y), and quaternions (w, x, y, z) to (w, z, x, y). The same is done here. Type 05, "Unity 3D", is
+left-handed, has another order of segments, and poses relative to their parents: it is not read.
 """
 
 import struct
@@ -16,6 +23,7 @@ from torch import Tensor
 
 from wearcap.body.kinematics import local_rotations
 from wearcap.body.skeleton import Site, Skeleton, xsens23
+from wearcap.errors import require_choice
 from wearcap.geometry.rotation import matrix_from_quat_wxyz
 from wearcap.io.formats.mvnx import BONE_CHANGE_M, JOINT_OF, SITE_OF, bone_offsets, plain_label
 from wearcap.live.packets import SUIT, Packet
@@ -43,6 +51,8 @@ MAX_JOINED = 4
 MAX_POINTS = 256
 _HEADER = struct.Struct(">6sIBBIBBBBHH")
 _POSE = np.dtype([("id", ">i4"), ("position", ">f4", 3), ("quat_wxyz", ">f4", 4)])
+_Y_UP = [2, 0, 1]
+"""Which coordinates of a world with y up (x left, z forward) are x, y, z of one with z up."""
 _BONES_M = (1.5, 15.0)
 """Sum of all bones' lengths of a small child and of a giant; an adult's is 4.4 m."""
 
@@ -52,6 +62,7 @@ TRUNCATED = "truncated"
 INCOMPLETE = "incomplete sample"
 REPEATED = "repeated"
 NO_SIZE_YET = "waiting for the size"
+NOT_UPRIGHT = "size that is not z up"
 
 
 @dataclass
@@ -90,11 +101,15 @@ class MvnSource(DatagramSource):
     """Suits that Xsens MVN Analyze or Animate streams; each character is a wearer of their own."""
 
     scheme, port, hz = "mvn", 9763, 60.0
-    convention = "Xsens MVN, types 02 and 13: metres (or centimetres), quaternion w x y z; z up, x forward, y left"
+    convention = (
+        "Xsens MVN, types 02 and 13: metres (or centimetres), quaternion w x y z; z up, x forward, y left (up=y: y up)"
+    )
 
     def __init__(self, address: Address):
         super().__init__(address)
-        require_options(address)
+        require_options(address, "up")
+        self.up = address.options.get("up", "z")
+        require_choice(self.up, ("z", "y"), f"up={self.up[:20]}")
         self._characters: dict[int, _Character] = {}
         self._xsens23 = xsens23()
         self._order = [SEGMENTS.index(name) for name in self._xsens23.joint_names]
@@ -157,6 +172,9 @@ class MvnSource(DatagramSource):
             return refuse(NOT_FINITE)
         if not ((quat_wxyz.norm(dim=-1) - 1).abs() <= UNIT_TOLERANCE).all():
             return refuse(NOT_A_ROTATION)
+        if self.up == "y":  # the segments' own axes are turned like the world's
+            quat_wxyz = torch.cat([quat_wxyz[:, :1], quat_wxyz[:, 1:][:, _Y_UP]], -1)
+            t_world = t_world[:, _Y_UP]
         R_world = matrix_from_quat_wxyz(quat_wxyz)
         offsets = bone_offsets(self._xsens23, R_world, t_world)
         metres = _metres(offsets)
@@ -191,6 +209,9 @@ class MvnSource(DatagramSource):
             if set(SEGMENTS) - set(origins):
                 return refuse(INCOMPLETE)
             t = torch.tensor([origins[name] for name in self._xsens23.joint_names], dtype=torch.float64)
+            spine = t[self._xsens23.index("head")] - t[0]
+            if not spine[2] > spine[:2].norm():
+                return refuse(NOT_UPRIGHT)
             offsets = bone_offsets(self._xsens23, torch.eye(3, dtype=torch.float64).expand(len(t), 3, 3), t)
             metres = _metres(offsets)
             if metres is None:
@@ -200,7 +221,7 @@ class MvnSource(DatagramSource):
             if known is not None and (known - offsets[1:]).norm(dim=-1).max() > BONE_CHANGE_M:
                 character.skeleton, character.first_s, character.sites = None, arrived_s, {}
             character.offsets_m, character.size_metres = offsets, metres
-        for segment, label, at in points:
+        for segment, label, at in points if character.offsets_m is not None else ():
             if label in SITE_OF and 1 <= segment <= len(SEGMENTS) and max(map(abs, at)) * character.size_metres < 1.0:
                 place = tuple(character.size_metres * value for value in at)
                 character.sites[SITE_OF[label]] = Site(SEGMENTS[segment - 1], place)

@@ -3,7 +3,7 @@
 import asyncio
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
 import torch
@@ -13,13 +13,22 @@ from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.live.packets import CAMERA, HEAD, SUIT, Inbox, Packet
+from wearcap.live.packets import CAMERA, HEAD, OBJECT, SUIT, Inbox, Packet
 from wearcap.live.setup import Seat, Setup
 from wearcap.live.source import Address, Source
 from wearcap.recording import ImuStream, Motion, Recording
+from wearcap.recording.acts import SAME_S
 from wearcap.runtime.session import Session
 from wearcap.sensors.imu import acceleration
-from wearcap.sensors.samples import HeadSample, LocalizationSample, SuitPiece, WatchSample, WristSample
+from wearcap.sensors.samples import (
+    ActiveObject,
+    HeadSample,
+    LocalizationSample,
+    ObjectSample,
+    SuitPiece,
+    WatchSample,
+    WristSample,
+)
 from wearcap.tracking.stature import skeleton_of
 
 AHEAD = 256
@@ -34,8 +43,16 @@ class ReplaySource(Source):
     scheme, port, hz = "replay", 0, 60.0
     convention = "the recording's own"
 
-    def __init__(self, recording: Recording, kind: type[Session], speed: float = 1.0, wearer: str = ""):
-        """`kind`: class of the session, which says what it needs; `speed` times real time, inf: as fast as it goes.
+    def __init__(
+        self,
+        recording: Recording,
+        kind: type[Session],
+        speed: float = 1.0,
+        wearer: str = "",
+        objects: Sequence[ActiveObject | ObjectSample] = (),
+    ):
+        """`kind`: class of the session, which says what it needs; `speed` times real time, inf: as fast as it goes;
+        `objects`: samples of objects in order of time, as `Session.of_objects` has them.
 
         Raises WearcapError for a recording that has not all of these devices, and for a speed that is not positive.
         """
@@ -43,6 +60,7 @@ class ReplaySource(Source):
         if not speed > 0:
             raise WearcapError(f"speed={speed}", expected="a positive number, or inf: as fast as it goes")
         self.recording, self.kind, self.speed, self.wearer = recording, kind, speed, wearer
+        self.objects = list(objects)
         self.streams = {device: self._stream(device, kind.tracks_wrists) for device in kind.devices}
 
     @property
@@ -90,9 +108,21 @@ class ReplaySource(Source):
         # Of samples at one time the head's comes last: a frame may then be final at once.
         last = owner == names.index(HEAD) if HEAD in names else torch.zeros(len(owner), dtype=torch.bool)
         order = sorted(range(len(every)), key=lambda k: (every[k].item(), last[k].item()))
+        waiting = self._objects(every.min().item())
         for k in order:
+            while waiting and waiting[0].timestamp <= every[k].item() + SAME_S:
+                sample = waiting.pop(0)
+                device = OBJECT if isinstance(sample, ActiveObject) else f"{OBJECT} {sample.name}"
+                yield sample.timestamp, device, sample
             device, index = names[int(owner[k])], int(row[k])
             yield every[k].item(), device, self._sample(device, index, points)
+
+    def _objects(self, first_s: float) -> list[ActiveObject | ObjectSample]:
+        """The samples of objects; which object is active at the first time (s) of all devices is said then."""
+        choices = [sample for sample in self.objects if isinstance(sample, ActiveObject)]
+        active = next((sample for sample in reversed(choices) if sample.timestamp <= first_s + SAME_S), None)
+        first = [] if active is None else [active._replace(timestamp=first_s)]
+        return first + [sample for sample in self.objects if sample.timestamp > first_s + SAME_S]
 
     def _sample(self, device: str, k: int, points: list[Tensor | None]) -> object:
         stream = self.streams[device]

@@ -23,7 +23,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording import Motion
 from wearcap.recording import motion as motion_types
-from wearcap.recording.acts import SAME_S
+from wearcap.recording.acts import SAME_S, changes
 from wearcap.recording.timing import joined
 from wearcap.runtime import wearer as wearer_types
 from wearcap.runtime.graphs import undisturbed
@@ -329,6 +329,7 @@ class EchoSession(Session):
     classes = classes_of(*_STATE, sys.modules[__name__])
     devices = ("head", *WRISTS)
     given_floor = True
+    takes_objects = True
     tracks_wrists = True
 
     def __init__(
@@ -349,6 +350,11 @@ class EchoSession(Session):
     ) -> "EchoSession":
         environment = None if source is None else system.objects(source)
         return cls(system, wearers, range(seed, seed + len(wearers)), environment)
+
+    @classmethod
+    def of_objects(cls, system: Echo, source: CaptureInput) -> list[ActiveObject | ObjectSample]:
+        scenario = system.scenario(source.recording, system.objects(source))
+        return [ActiveObject(name, time_s) for time_s, name in changes(scenario.acts)]
 
     @classmethod
     def settings(cls, system: Echo) -> dict[str, Any]:
