@@ -1,6 +1,7 @@
 """One wearer of a live capture: clocks, first minute, session, and the counts that the page and the report show."""
 
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -31,6 +32,8 @@ BEHIND_S = 2.0
 """Time for which packets may wait before the page says that the machine is too slow."""
 MAX_DEVICES = 32
 """Most devices of a wearer; packets of further ones are counted as unknown."""
+MAX_HELD = 2_000
+"""Most samples of the head that wait for a late watch."""
 RATE_S = 2.0
 """Time over which rates are averaged."""
 ARRIVAL = "arrival"
@@ -53,6 +56,8 @@ class Opener:
 class _Device:
     """What is known of one device."""
 
+    clock: str = ARRIVAL
+    """Clock of its newest packet."""
     arrived_s: float = -np.inf
     count: int = 0
     since_s: float = 0.0
@@ -106,6 +111,8 @@ class LiveWearer:
         self._dropped = 0
         """Packets that earlier sessions refused or dropped."""
         self._last: Motion | None = None
+        self._held: deque[HeadSample] = deque(maxlen=MAX_HELD)
+        """Samples of the head that wait for the latest watch."""
 
     # --- packets ----------------------------------------------------------------------------------------------------
 
@@ -120,9 +127,13 @@ class LiveWearer:
         leads = packet.device == self.opener.devices[0]
         if leads and self.clocks.leader is None:
             self.clocks.leader = clock
-        self.clocks.see(clock, sent_s, packet.arrived_s)
-        time_s = self.clocks.on_leader(clock, sent_s)
+        for name in self.clocks.see(clock, sent_s, packet.arrived_s):
+            self._note(
+                f"{name}: a clock was set anew; what the turn on the spot showed of it is void. Guide the wearer again."
+            )
+        time_s = self.clocks.on_leader(clock, sent_s, packet.device)
         device = self._devices[packet.device]
+        device.clock = clock
         device.see(packet, time_s)
         now_s = time.monotonic()
         self._heard_s = max(packet.arrived_s, now_s)  # of a capture that is behind, packets wait
@@ -142,11 +153,26 @@ class LiveWearer:
         assert self.session is not None
         if (seated := self._seated(packet.device, sample)) is None:
             self.unknown += 1
-        else:
-            try:
-                self.session.push([[seated]])
-            except WearcapError as error:
-                self._note(str(error))
+            return
+        late_s = self.clocks.late_s if leads else 0.0
+        if late_s:  # the session takes a watch for silent that stays behind the head: the head waits for the latest one
+            self._held.append(seated)
+        if leads:
+            self._release(time_s - late_s if late_s else np.inf)
+        if not late_s:
+            self._push(seated)
+
+    def _release(self, until_s: float) -> None:
+        """Push what was held back up to a time (s, head's clock)."""
+        while self._held and self._held[0].timestamp <= until_s:
+            self._push(self._held.popleft())
+
+    def _push(self, sample: Any) -> None:
+        assert self.session is not None
+        try:
+            self.session.push([[sample]])
+        except WearcapError as error:
+            self._note(str(error))
 
     def _is_prepared(self, device: str, sample: Any, now_s: float) -> bool:
         """Look for the set-up, and open the session once it is known."""
@@ -155,6 +181,7 @@ class LiveWearer:
                 self.first = self.opener.first_minute(None, False)
             self.stage = "first minute"
             self.first.see(device, sample, now_s)
+            self._align()
             if self.first.found is None:
                 return False
             self.setup = self.first.found
@@ -162,6 +189,16 @@ class LiveWearer:
                 self._note(note)
         self._open(self.setup)
         return True
+
+    def _align(self) -> None:
+        """Make up for what the first minute found of the watches' clocks, from the next sample on."""
+        assert self.first is not None
+        for device, offset_s, note in self.first.aligned:
+            self._note(note)
+            if offset_s and device in self._devices:
+                self.clocks.shift(device, self._devices[device].clock, offset_s)
+                self._devices[device].newest_s = -np.inf
+        self.first.aligned.clear()
 
     def _open(self, setup: Setup) -> None:
         head = next((seat for seat in setup.seats.values() if seat.joint == HEAD), None)
@@ -199,6 +236,7 @@ class LiveWearer:
         if self.session is None:
             if self.first is not None and self.first.found is None:
                 self.first.look(now_s)
+                self._align()
             return []
         if now_s - self._heard_s > AWAY_S:
             return self.leave()
@@ -213,6 +251,9 @@ class LiveWearer:
     def leave(self) -> list[Motion]:
         """End the session, and return the last frames."""
         motions = []
+        if self.session is not None:
+            self._release(np.inf)
+        self._held.clear()
         while self.session is not None and (found := self._final(ended=True)) is not None:
             motions.append(found)
         if self.session is not None:
@@ -238,6 +279,7 @@ class LiveWearer:
         """Begin the guided first minute; the session that runs ends."""
         self.leave()
         self.first, self.stage = self.opener.first_minute(self.setup, True), "first minute"
+        self.first.late_s = self.clocks.late_s
 
     def status(self) -> WearerStatus:
         now_s = time.monotonic()
