@@ -8,32 +8,38 @@ import torch
 from wearcap.body.skeleton import skeleton_of_height
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import about_axis, exp
+from wearcap.live.clock_offset import Aligned
 from wearcap.live.first_minute import FirstMinute
 from wearcap.recording import Motion
 from wearcap.sensors.imu import synthesize_imu
 from wearcap.sensors.samples import HeadSample, WatchSample, WristSample
 
 FPS = 60.0
+TURN_S = 4.0
 
 
-def acting(height_m: float, plan: list[tuple[str, float]], heading: float = 0.7) -> Motion:
-    """Someone who does "stand", "raise" (the left hand), "walk" or "turn" for some seconds each."""
+def acting(height_m: float, plan: list[tuple[str, float]], heading: float = 0.7, head_leads_s: float = 0.0) -> Motion:
+    """Someone who does "stand", "raise" (the left hand), "walk" or "turn" (to the left and back in `TURN_S`) for some
+    seconds each. The head may turn before the body."""
     skeleton = skeleton_of_height(height_m)
     acts = [act for act, seconds in plan for _ in range(round(FPS * seconds))]
     times = torch.arange(len(acts), dtype=torch.float64) / FPS
     walks = torch.tensor([act == "walk" for act in acts]).double()
     raises = torch.tensor([act == "raise" for act in acts]).double()
-    turns = torch.tensor([act == "turn" for act in acts]).double()
+    local = torch.cat([torch.arange(round(FPS * seconds)) for _, seconds in plan]) / FPS
+    turns = torch.tensor([act == "turn" for act in acts]) * (2 * torch.pi * local.double() / TURN_S).sin()
     blend = torch.hann_window(31, periodic=False, dtype=torch.float64)
     walks, raises, turns = (
         torch.nn.functional.conv1d(one[None, None], blend[None, None] / blend.sum(), padding=15)[0, 0]
         for one in (walks, raises, turns)
     )
-    yaw = heading + (2.0 * turns * (1.3 * times).sin()).cumsum(0) / FPS
+    yaw = heading + (1.6 * turns).cumsum(0) / FPS
+    lead = round(head_leads_s * FPS)
     way = (1.1 * walks).cumsum(0) / FPS
     swing = (0.45 * walks * (2 * torch.pi * 0.9 * times).sin()).float()
     R = torch.eye(3).repeat(len(acts), len(skeleton), 1, 1)
     R[:, 0] = about_axis("z", yaw).float()
+    R[:, skeleton.index("head")] = about_axis("z", torch.cat([yaw[lead:], yaw[-1:].repeat(lead)]) - yaw).float()
     for side, sign in (("left", 1.0), ("right", -1.0)):
         up = (1.4 * raises * (sign > 0)).float()
         down = about_axis("x", torch.tensor(-sign * 1.45))
@@ -61,6 +67,10 @@ class Devices:
     noise_deg: float = 0.3
     batch_s: float = 0.0
     """Time (s) of hands' samples that come at once."""
+    offset_s: tuple[float, float] = (0.0, 0.0)
+    """Seconds to add to each watch's times; until they are, its samples count and come as late or early."""
+    aligned: dict[str, Aligned] = field(default_factory=dict)
+    """What the first minute found of clocks; from then on samples count it."""
     now_s: float = 5.0
     """Our time; it goes on from one play to the next."""
 
@@ -77,18 +87,23 @@ class Devices:
             self.now_s += 1 / FPS
             at_s = begin_s + time_s
             first.see("head", HeadSample(at_s, self._noisy(head[frame], random)), self.now_s)
-            for name, (pose, acc) in zip(self.names, hands):
+            for name, offset_s, (pose, acc) in zip(self.names, self.offset_s, hands):
                 if not name:
                     continue
-                noisy = self._noisy(pose[frame], random)
+                measured = min(max(frame + round(offset_s * FPS), 0), len(motion) - 1)
+                noisy = self._noisy(pose[measured], random)
                 sample = WristSample(name, at_s, noisy)
                 if self.watches:
-                    sample = WatchSample(at_s, noisy.R, acc[frame] + 0.05 * torch.randn(3, generator=random), name)
+                    sample = WatchSample(at_s, noisy.R, acc[measured] + 0.05 * torch.randn(3, generator=random), name)
                 waiting.append((name, sample))
             if not waiting or at_s - waiting[0][1].timestamp >= self.batch_s:
                 for name, sample in waiting:
-                    first.see(name, sample, self.now_s)
+                    found = self.aligned.get(name)
+                    time_s = sample.timestamp + (0.0 if found is None else found.offset_s)
+                    first.see(name, sample._replace(timestamp=time_s), self.now_s)
                 waiting.clear()
+            self.aligned |= {each.device: each for each in first.aligned}
+            first.aligned.clear()
         return math.inf
 
     def _hand(self, motion: Motion, shift: Rigid, side: int) -> tuple[Rigid, torch.Tensor]:

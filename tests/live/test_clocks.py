@@ -79,9 +79,32 @@ def test_three_clocks_meet_on_the_heads():
     moment = 1055.0
     for name, offset in offsets.items():
         assert clocks.on_leader(name, moment - offset) == pytest.approx(moment - 3.0, abs=0.002)
-    clocks.shift("left", 0.25)
-    assert clocks.on_leader("left", moment + 50.0) == pytest.approx(moment - 3.0 + 0.25, abs=0.002)
+    clocks.shift("left_wrist", "left", 0.25)
+    assert clocks.on_leader("left", moment + 50.0, "left_wrist") == pytest.approx(moment - 3.0 + 0.25, abs=0.002)
+    assert clocks.on_leader("left", moment + 50.0, "phone") == pytest.approx(moment - 3.0, abs=0.002)
+    clocks.shift("left_wrist", "left", -0.5)  # found of samples that count the first one
+    assert clocks.on_leader("left", moment + 50.0, "left_wrist") == pytest.approx(moment - 3.0 - 0.25, abs=0.002)
+    assert clocks.on_leader("right", moment - 1.7e9, "left_wrist") == pytest.approx(moment - 3.0, abs=0.002)
     assert clocks.on_leader("head", 12.345) == 12.345
+
+
+@pytest.mark.parametrize(("anew", "void"), [("left", ["left_wrist"]), ("head", ["left_wrist", "right_wrist"])])
+def test_a_clock_set_anew_voids_shifts(anew: str, void: list[str]):
+    """Of the devices that count on it; the leading clock's restart those of all."""
+    clocks = Clocks()
+    clocks.leader = "head"
+    for k in range(100):
+        for name in ("head", "left", "right"):
+            assert clocks.see(name, 50.0 + k / 60, 500.0 + k / 60) == []
+    for joint in ("left_wrist", "right_wrist"):
+        clocks.shift(joint, joint.split("_")[0], -1.7)
+    found = [each for k in range(AGREEING + 3) for each in clocks.see(anew, 3.0 + k / 60, 502.0 + k / 60)]
+    assert found == void
+    for joint in ("left_wrist", "right_wrist"):
+        ours = 502.0
+        time_s = clocks.on_leader(joint.split("_")[0], 3.0 if anew == joint.split("_")[0] else 52.0, joint)
+        truly = 3.0 if anew == "head" else ours - 450.0
+        assert time_s == pytest.approx(truly - (0.0 if joint in void else 1.7))
 
 
 def test_a_sender_that_invents_clocks_gets_no_memory():

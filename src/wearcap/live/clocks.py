@@ -28,6 +28,8 @@ class DeviceClock:
     def __init__(self) -> None:
         self.restarts = 0
         """How often the device's clock was set anew."""
+        self.arrived_s = 0.0
+        """Our time (s) of its newest packet."""
         self._far = 0
         """Packets in a row that are off by more than `RESTART_S`."""
         self._far_since_s = 0.0
@@ -43,6 +45,7 @@ class DeviceClock:
 
     def see(self, sent_s: float, arrived_s: float) -> None:
         """A packet with the device's time arrived."""
+        self.arrived_s = arrived_s
         delay_s = arrived_s - sent_s
         if not self._quickest:
             self._quickest.append((sent_s, delay_s))
@@ -105,28 +108,59 @@ class Clocks:
         self.leader: str | None = None
         """Name of the clock that motion counts on; None: the first one seen decides."""
         self._clocks: dict[str, DeviceClock] = {}
-        self._shifts_s: dict[str, float] = {}
+        self._shifts: dict[str, tuple[str, float]] = {}
+        """By device, the clock that it counted on, and seconds."""
 
     def __contains__(self, clock: str) -> bool:
         return clock in self._clocks
 
-    def see(self, clock: str, sent_s: float, arrived_s: float) -> None:
-        """A packet that counts on a clock arrived."""
+    def see(self, clock: str, sent_s: float, arrived_s: float) -> list[str]:
+        """A packet that counts on a clock arrived; returns the devices whose shift no longer holds.
+
+        A shift is void once the device's clock or the leading one is set anew: its delays are then others.
+        """
         if clock not in self._clocks:
-            if len(self._clocks) >= MAX_CLOCKS:
-                return
+            if clock != self.leader and len(self._clocks) >= MAX_CLOCKS:
+                oldest = min((name for name in self._clocks if name != self.leader), key=self._seen_s)
+                if arrived_s - self._seen_s(oldest) < FORGOTTEN_S:
+                    return []
+                del self._clocks[oldest]
             self._clocks[clock] = DeviceClock()
+        restarts = self._clocks[clock].restarts
         self._clocks[clock].see(sent_s, arrived_s)
+        if self._clocks[clock].restarts == restarts:
+            return []
+        void = [device for device, (own, _) in self._shifts.items() if clock in (own, self.leader)]
+        for device in void:
+            del self._shifts[device]
+        return void
 
-    def shift(self, clock: str, seconds: float) -> None:
-        """What is to be added to a clock's time beyond what its delays show, found by a clap or by motion."""
-        self._shifts_s[clock] = seconds
+    def _seen_s(self, clock: str) -> float:
+        """Our time (s) of a clock's newest packet."""
+        return self._clocks[clock].arrived_s
 
-    def on_leader(self, clock: str, time_s: float) -> float:
-        """A time of one clock on the leading one; unchanged on the same clock, and while one of them is unknown."""
+    def shift(self, device: str, clock: str, seconds: float) -> None:
+        """Add to the times of a device that counts on a clock, beyond what delays show and what was added before.
+
+        Devices that share a clock may come by different ways: each has its own shift.
+        """
+        own, before_s = self._shifts.get(device, (clock, 0.0))
+        if device in self._shifts or len(self._shifts) < MAX_CLOCKS:
+            self._shifts[device] = clock, seconds + (before_s if own == clock else 0.0)
+
+    def on_leader(self, clock: str, time_s: float, device: str = "") -> float:
+        """A device's time of one clock on the leading one; but for its shift unchanged on the same clock, and while one of
+        them is unknown."""
+        own, shift_s = self._shifts.get(device, (clock, 0.0))
+        time_s = time_s + shift_s if own == clock else time_s
         if clock == self.leader or self.leader not in self._clocks or clock not in self._clocks:
             return time_s
-        return self._clocks[self.leader].theirs(self._clocks[clock].ours(time_s)) + self._shifts_s.get(clock, 0.0)
+        return self._clocks[self.leader].theirs(self._clocks[clock].ours(time_s))
+
+    @property
+    def late_s(self) -> float:
+        """Time (s) by which the latest device's samples come after the leading device's of the same time."""
+        return max(0.0, *(-seconds for _, seconds in self._shifts.values())) if self._shifts else 0.0
 
     def ours(self, time_s: float) -> float:
         """Our time at a time of the leading clock."""
@@ -140,4 +174,6 @@ class Clocks:
 
 
 MAX_CLOCKS = 32
-"""Most clocks of one wearer; a sender that invents names gets no more."""
+"""Most clocks, and shifts, of one wearer; a sender that invents names gets no more."""
+FORGOTTEN_S = 60.0
+"""Time without packets after which a clock makes room for another."""

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from torch import Tensor
@@ -10,7 +10,10 @@ from torch import Tensor
 from wearcap.body.skeleton import WRISTS, Skeleton, skeleton_of_height, xsens23
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.trajectory import Trajectory
 from wearcap.live import wearing
+from wearcap.live.clock_offset import Aligned, aligned_by_turning, turned
+from wearcap.live.guided import ARMS, RAISE, SENTENCES, STAND, TURN, WALK, Step
 from wearcap.live.packets import HEAD
 from wearcap.live.setup import Seat, Setup, hand_seat, head_seat
 from wearcap.live.wearing import Seen, Window
@@ -37,30 +40,6 @@ NO_CONTROLLER_DEG = 50.0
 """Angle between a hanging hand and a controller's nominal seat above which it is no controller that is held."""
 MAX_DEVICES = 32
 """Most devices that are looked at."""
-
-STAND, ARMS, RAISE, WALK = "stand", "arms", "raise", "walk"
-SENTENCES = {
-    STAND: "Stand still and look straight ahead.",
-    ARMS: "Let your arms hang.",
-    RAISE: "Raise your left hand.",
-    WALK: "Walk some steps forward.",
-}
-
-
-@dataclass(frozen=True)
-class Step:
-    """A step of the guided first minute."""
-
-    name: str
-    sentence: str
-    """What to do."""
-    progress: float
-    """0…1."""
-    reason: str = ""
-    """Why it does not go on."""
-
-    def __str__(self) -> str:
-        return f"{self.sentence} {self.reason}".strip()
 
 
 class FirstMinute:
@@ -94,6 +73,11 @@ class FirstMinute:
             self.skeleton, self.height_m = setup.skeleton, setup.skeleton.stature
         self.found: Setup | None = None
         self.notes: list[str] = []
+        self.aligned: list[Aligned] = []
+        """What was found of the watches' clocks, for the one who keeps them to take away: their next samples should count
+        it. It is of the clocks that run, not of the set-up."""
+        self.late_s = 0.0
+        """Time (s) by which samples of the latest watch are known to come after the head's of the same time."""
         self._seen: dict[str, Seen] = {}
         self._seats: dict[str, Seat] = {}
         """Found so far, by device."""
@@ -109,7 +93,7 @@ class FirstMinute:
         self._hold_s = -math.inf
         """Time (s, head's clock) since which the wearer does as the step says."""
         self._progress, self._reason = 0.0, ""
-        self._steps = [STAND, ARMS, RAISE, WALK]
+        self._steps = [STAND, ARMS, TURN, RAISE, WALK]
         if setup is not None and HEAD in setup.seats:
             self._head = setup.seats[HEAD]
 
@@ -198,12 +182,12 @@ class FirstMinute:
     def _window(self, device: str, start_s: float) -> Window | None:
         """Samples of a device since a time (s, head's clock), in the head's case of the head joint.
 
-        Of a device whose samples come late, up to `LAG_S`, as many from before.
+        Of a device whose samples come late, up to `LAG_S` beyond what is known of it, as many from before.
         """
         if device not in self._seen:
             return None
         now_s = self._now_s
-        lag_s = min(max(now_s - self._seen[device].newest_s, 0.0), LAG_S)
+        lag_s = min(max(now_s - self._seen[device].newest_s, 0.0), LAG_S + self.late_s)
         found = self._seen[device].between(start_s - lag_s, now_s - lag_s)
         if found is None or device != HEAD:
             return found
@@ -378,6 +362,7 @@ class FirstMinute:
         does: dict[str, Callable[[], bool]] = {
             STAND: self._stand,
             ARMS: self._arms,
+            TURN: self._turn,
             RAISE: self._raise,
             WALK: self._walk,
         }
@@ -496,6 +481,34 @@ class FirstMinute:
                 f"{_plain(seat.joint)}: {device!r} is not held like a controller; seated by the hanging arm."
             )
 
+    def _turn(self) -> bool:
+        """Find the offsets of watches' clocks once all have turned to and fro, and rest again.
+
+        What is not found within `STEP_S` is left as it is.
+        """
+        start_s = max(self._hold_s - HOLD_S, self._now_s - wearing.KEEP_S + 1.0)
+        worn = [device for device in self._seen if device in self._seats or (device != HEAD and self._missing)]
+        watches = {device: self._track(device, start_s) for device in worn}
+        head, over = self._track(HEAD, start_s), self._looked_s - self._step_s > STEP_S
+        names = {device: _plain(self._seats[device].joint if device in self._seats else device) for device in watches}
+        self._progress, self._reason = turned({"Head": head, **{names[device]: watches[device] for device in watches}})
+        if not watches or (self._progress < 1.0 and not over):
+            return over
+        found = {device: aligned_by_turning(head, track, device, names[device]) for device, track in watches.items()}
+        if not over and not all(sure for _, sure in found.values()):
+            self._reason = "Once more, head and body together, arms hanging."
+            return False
+        for device, (aligned, _) in found.items():
+            self.aligned.append(aligned)
+            self._seen[device].shift(aligned.offset_s)
+        self.late_s += max(0.0, *(-aligned.offset_s for aligned in self.aligned))
+        return True
+
+    def _track(self, device: str, start_s: float) -> Trajectory | None:
+        """Poses of a device from a time (s) on its own clock to its newest one."""
+        found = self._seen[device].between(start_s, self._seen[device].newest_s)
+        return None if found is None else Trajectory(*found)
+
     def _raise(self) -> bool:
         candidates = [device for device in self._hanging if device not in self._seats]
         risen = {device: self._rise(device) for device in candidates}
@@ -529,9 +542,10 @@ class FirstMinute:
             self._reason = "" if self._now_s - self._hold_s < 1.0 else "The head is not tracked."
             return False
         walk = wearing.walk_of(head)
-        self._progress = walk.seconds / WALKED_S
+        shown = walk.before(self._now_s - self.late_s)
+        self._progress = shown.seconds / WALKED_S
         self._reason = "" if walk.seconds else "You are not walking yet."
-        if walk.seconds < WALKED_S:
+        if shown.seconds < WALKED_S:
             return False
         for device, seat in list(self._seats.items()):
             watch = None if seat.joint not in WRISTS else self._window(device, head.timestamps[0].item())

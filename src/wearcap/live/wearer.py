@@ -1,6 +1,7 @@
 """One wearer of a live capture: clocks, first minute, session, and the counts that the page and the report show."""
 
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -14,11 +15,12 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.live.clocks import Clocks
+from wearcap.live.devices import Devices
 from wearcap.live.first_minute import FirstMinute
 from wearcap.live.latency import Latencies
 from wearcap.live.packets import HEAD, SUIT, Packet
 from wearcap.live.setup import Setup
-from wearcap.live.status import MAX_POINTS, DeviceStatus, Stage, WearerStatus
+from wearcap.live.status import MAX_POINTS, Stage, WearerStatus
 from wearcap.recording import Motion
 from wearcap.runtime.session import Session
 from wearcap.runtime.wearer import Wearer
@@ -37,10 +39,8 @@ AWAY_S = 5.0
 """Time without packets after which a wearer has left: the last poses are returned, and the next packet begins anew."""
 BEHIND_S = 2.0
 """Time for which packets may wait before the page says that the machine is too slow."""
-MAX_DEVICES = 32
-"""Most devices of a wearer; packets of further ones are counted as unknown."""
-RATE_S = 2.0
-"""Time over which rates are averaged."""
+MAX_HELD = 2_000
+"""Most samples of the head that wait for a late watch."""
 ARRIVAL = "arrival"
 """Clock of packets that state no time."""
 
@@ -56,32 +56,6 @@ class Opener:
     takes_objects: bool
     first_minute: Callable[[Setup | None, bool], FirstMinute]
     """(set-up of last time, whether guided) → a new first minute."""
-
-
-@dataclass(eq=False)
-class _Device:
-    """What is known of one device."""
-
-    arrived_s: float = -np.inf
-    count: int = 0
-    since_s: float = 0.0
-    hz: float = 0.0
-    newest_s: float = -np.inf
-    """Newest device time."""
-    late: int = 0
-    pose: Rigid | None = None
-
-    def see(self, packet: Packet, time_s: float) -> None:
-        if not self.since_s:
-            self.since_s = packet.arrived_s
-        self.count += 1
-        if packet.arrived_s - self.since_s >= RATE_S:
-            self.hz = self.count / (packet.arrived_s - self.since_s)
-            self.count, self.since_s = 0, packet.arrived_s
-        self.arrived_s = packet.arrived_s
-        if time_s <= self.newest_s and self.newest_s - time_s < 1.0:
-            self.late += 1
-        self.newest_s = time_s
 
 
 @dataclass(eq=False)
@@ -108,7 +82,7 @@ class LiveWearer:
         self.session: Session | None = None
         self.skeleton: Skeleton | None = None
         self.fps = 0.0
-        self._devices: dict[str, _Device] = {}
+        self._devices = Devices(self.opener.devices)
         self._heard_s = -np.inf
         self._head_s = -np.inf
         self._points: Tensor | None = None
@@ -119,64 +93,95 @@ class LiveWearer:
         """The newest choice of the active object."""
         self._taken = self._taken_before = False
         """Whether the session, and an earlier one, took that choice."""
+        self._held: deque[HeadSample] = deque(maxlen=MAX_HELD)
+        """Samples of the head that wait for the latest watch."""
 
     # --- packets ----------------------------------------------------------------------------------------------------
 
     def take(self, packet: Packet) -> None:
         """Take in one packet."""
-        of_object = isinstance(packet.sample, ActiveObject | ObjectSample)
-        if of_object and not self.opener.takes_objects:
+        if isinstance(packet.sample, ActiveObject | ObjectSample) and not self.opener.takes_objects:
             self.unknown += 1
-            return
-        if isinstance(packet.sample, ActiveObject):
-            self._active, self._taken, self._taken_before = packet, False, False
-            if self.session is not None and self.clocks.leader is not None:
-                self._activate(np.inf)
-            return
+        elif isinstance(packet.sample, ActiveObject):
+            self._choose(packet)
+        elif (time_s := self._time_of(packet)) is None:
+            self.unknown += 1
+        else:
+            self._hear(packet, time_s)
+            self._pass_on(packet, _timed(packet.sample, time_s), time_s)
+
+    def _leads(self, packet: Packet) -> bool:
+        """Whether a packet is of the device whose clock times the motion."""
+        return packet.device == self.opener.devices[0]
+
+    def _time_of(self, packet: Packet) -> float | None:
+        """Time (s) of a packet on the leading clock; None for a device too many."""
+        device = self._devices.admit(packet.device)
+        if device is None:
+            return None
         clock, sent_s = (ARRIVAL, packet.arrived_s) if packet.sent_s is None else (packet.clock, packet.sent_s)
-        if packet.device not in self._devices:
-            if len(self._devices) >= MAX_DEVICES:
-                self.unknown += 1
-                return
-            self._devices[packet.device] = _Device()
-        leads = packet.device == self.opener.devices[0]
-        if leads and self.clocks.leader is None:
+        if self._leads(packet) and self.clocks.leader is None:
             self.clocks.leader = clock
-        self.clocks.see(clock, sent_s, packet.arrived_s)
-        time_s = self.clocks.on_leader(clock, sent_s)
-        device = self._devices[packet.device]
-        device.see(packet, time_s)
-        now_s = time.monotonic()
-        if not of_object:  # objects stay when their wearer leaves
+        for name in self.clocks.see(clock, sent_s, packet.arrived_s):
+            self.note(
+                f"{name}: a clock was set anew; what the turn on the spot showed of it is void. Guide the wearer again."
+            )
+        time_s = self.clocks.on_leader(clock, sent_s, packet.device)
+        device.see(packet, clock, time_s)
+        return time_s
+
+    def _hear(self, packet: Packet, time_s: float) -> None:
+        """Keep what the page and the report show of a packet, whatever becomes of it."""
+        now_s, sample = time.monotonic(), packet.sample
+        if not isinstance(sample, ObjectSample):  # objects stay when their wearer leaves
             self._heard_s = max(packet.arrived_s, now_s)  # of a capture that is behind, packets wait
         if now_s - packet.arrived_s > BEHIND_S:
-            self._note(
+            self.note(
                 "The capture is slower than the packets come: end other programs, or give it more cores (threads=N)."
             )
-        sample = _timed(packet.sample, time_s)
-        device.pose = _shown(sample) or device.pose
-        if leads:
+        if self._leads(packet):
             self.gaps += MAX_GAP_S < time_s - self._head_s < AWAY_S
             self._head_s = time_s
         if isinstance(sample, HeadSample) and sample.points_world is not None and len(sample.points_world):
             self._keep_points(sample.points_world)
-        if of_object and (self.session is None or self.clocks.leader is None):
+
+    def _pass_on(self, packet: Packet, sample: Any, time_s: float) -> None:
+        """Give a sample to the session, or to the first minute while there is none."""
+        if isinstance(sample, ObjectSample) and (self.session is None or self.clocks.leader is None):
             return
         if self.session is None and not self._is_prepared(packet.device, sample, packet.arrived_s):
             return
+        leads = self._leads(packet)
         if leads and not self._taken:
             self._activate(time_s)
         if (seated := self._seated(packet.device, sample)) is None:
             self.unknown += 1
-        else:
+            return
+        late_s = self.clocks.late_s if leads else 0.0
+        if late_s:  # the session takes a watch for silent that stays behind the head: the head waits for the latest one
+            self._held.append(seated)
+        if leads:
+            self._release(time_s - late_s if late_s else np.inf)
+        if not late_s:
             self._push(seated)
+
+    def _choose(self, packet: Packet) -> None:
+        """Which object is active was said anew."""
+        self._active, self._taken, self._taken_before = packet, False, False
+        if self.session is not None and self.clocks.leader is not None:
+            self._activate(np.inf)
+
+    def _release(self, until_s: float) -> None:
+        """Push what was held back up to a time (s, head's clock)."""
+        while self._held and self._held[0].timestamp <= until_s:
+            self._push(self._held.popleft())
 
     def _push(self, sample: Any) -> None:
         assert self.session is not None
         try:
             self.session.push([[sample]])
         except WearcapError as error:
-            self._note(str(error))
+            self.note(str(error))
 
     def _activate(self, now_s: float) -> None:
         """Pass on which object is active; `now_s` is the time of the leading device.
@@ -203,13 +208,24 @@ class LiveWearer:
                 self.first = self.opener.first_minute(None, False)
             self.stage = "first minute"
             self.first.see(device, sample, now_s)
+            self._align()
             if self.first.found is None:
                 return False
             self.setup = self.first.found
             for note in self.setup.notes:
-                self._note(note)
+                self.note(note)
         self._open(self.setup)
         return True
+
+    def _align(self) -> None:
+        """Make up for what the first minute found of the watches' clocks, from the next sample on."""
+        assert self.first is not None
+        for device, offset_s, note in self.first.aligned:
+            self.note(note)
+            if offset_s and (known := self._devices.get(device)) is not None:
+                self.clocks.shift(device, known.clock, offset_s)
+                known.newest_s = -np.inf
+        self.first.aligned.clear()
 
     def _open(self, setup: Setup) -> None:
         head = next((seat for seat in setup.seats.values() if seat.joint == HEAD), None)
@@ -250,6 +266,7 @@ class LiveWearer:
         if self.session is None:
             if self.first is not None and self.first.found is None:
                 self.first.look(now_s)
+                self._align()
             return []
         if now_s - self._heard_s > AWAY_S:
             return self.leave()
@@ -264,6 +281,9 @@ class LiveWearer:
     def leave(self) -> list[Motion]:
         """End the session, and return the last frames."""
         motions = []
+        if self.session is not None:
+            self._release(np.inf)
+        self._held.clear()
         while self.session is not None and (found := self._final(ended=True)) is not None:
             motions.append(found)
         if self.session is not None:
@@ -276,7 +296,7 @@ class LiveWearer:
         try:
             found = self.session.poses(ended)[0]
         except WearcapError as error:  # a suit that was never localised
-            self._note(str(error))
+            self.note(str(error))
             self.session, self.stage = None, "away"
             return None
         if found is not None:
@@ -289,14 +309,10 @@ class LiveWearer:
         """Begin the guided first minute; the session that runs ends."""
         self.leave()
         self.first, self.stage = self.opener.first_minute(self.setup, True), "first minute"
+        self.first.late_s = self.clocks.late_s
 
     def status(self) -> WearerStatus:
-        now_s = time.monotonic()
-        devices = []
-        for name, device in list(self._devices.items()):
-            silent_s = now_s - device.arrived_s
-            hz = device.hz or (device.count / max(now_s - device.since_s, RATE_S))
-            devices.append(DeviceStatus(name, 0.0 if silent_s > RATE_S else hz, device.pose, silent_s))
+        """What the page shows; any thread may ask."""
         step = None if self.first is None else self.first.step
         session = self.session
         return WearerStatus(
@@ -304,16 +320,21 @@ class LiveWearer:
             self.stage,
             None if step is None else str(step),
             0.0 if step is None else step.progress,
-            tuple(devices),
+            self._devices.status(),
             self.latencies.quantiles,
             self.frames,
             self._dropped + (0 if session is None else session.dropped[0]),
-            sum(device.late for device in list(self._devices.values())),
+            self._devices.late,
             self.gaps,
             None if self.setup is None else self.setup.floor_m,
             self._points,
             tuple(self.notes),
         )
+
+    @property
+    def silent_s(self) -> float:
+        """Time (s) since the last packet; infinite before the first."""
+        return time.monotonic() - self._heard_s
 
     @property
     def refused(self) -> dict[str, int]:
@@ -324,7 +345,8 @@ class LiveWearer:
         kept = points if self._points is None else torch.cat([self._points, points])
         self._points = kept[-MAX_POINTS:]
 
-    def _note(self, note: str) -> None:
+    def note(self, note: str) -> None:
+        """Show a sentence on the page and in the report, once."""
         if note not in self.notes:
             self.notes = [*self.notes, note][-20:]
 
@@ -335,19 +357,3 @@ def _timed(sample: Any, time_s: float) -> Any:
         shift = time_s - sample.suit.timestamps[0]
         return sample._replace(suit=replace(sample.suit, timestamps=sample.suit.timestamps + shift))
     return sample._replace(timestamp=time_s)
-
-
-def _shown(sample: Any) -> Rigid | None:
-    """The pose that the page shows of a sample; a watch has no place."""
-    match sample:
-        case HeadSample():
-            return sample.T_world_device
-        case WristSample():
-            return sample.T_world_joint
-        case WatchSample():
-            return Rigid(sample.R_world_imu, torch.full((3,), torch.nan))
-        case LocalizationSample():
-            return sample.T_world_cam
-        case ObjectSample():
-            return sample.T_world_object
-    return None

@@ -75,6 +75,10 @@ class Seen:
         while self._samples[0][0] < time_s - KEEP_S:
             self._samples.popleft()
 
+    def shift(self, seconds: float) -> None:
+        """Move what is kept in time."""
+        self._samples = deque(((time_s + seconds, R, v) for time_s, R, v in self._samples), maxlen=MAX_KEPT)
+
     def between(self, start_s: float, stop_s: float) -> Window | None:
         """Samples of a span of time; None unless they fill it, but for `EDGE_S` at each end."""
         found = [sample for sample in self._samples if start_s <= sample[0] <= stop_s]
@@ -195,6 +199,10 @@ class Walk(NamedTuple):
         if len(self.timestamps) < 2:
             return 0.0
         return len(self.timestamps) * self.timestamps.diff().median().item()
+
+    def before(self, time_s: float) -> "Walk":
+        """What was walked before a time."""
+        return Walk(self.timestamps[self.timestamps < time_s], self.yaw[self.timestamps < time_s])
 
 
 def walk_of(head: Window) -> Walk:

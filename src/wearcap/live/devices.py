@@ -1,0 +1,107 @@
+"""The devices of one wearer: whose packets are admitted, their rates, and their poses as the page shows them."""
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from wearcap.geometry.rigid import Rigid
+from wearcap.live.packets import Packet, Sample
+from wearcap.live.status import DeviceStatus
+from wearcap.sensors.samples import HeadSample, LocalizationSample, ObjectSample, WatchSample, WristSample
+
+MAX_DEVICES = 32
+"""Most devices of a wearer, beside those that the session needs."""
+FORGOTTEN_S = 60.0
+"""Time without packets after which a device makes room for another."""
+RATE_S = 2.0
+"""Time over which rates are averaged."""
+
+
+@dataclass(eq=False)
+class Device:
+    """What is known of one device."""
+
+    clock: str = ""
+    """Clock of its newest packet."""
+    arrived_s: float = -math.inf
+    count: int = 0
+    """Packets since `since_s`."""
+    since_s: float = 0.0
+    hz: float = 0.0
+    newest_s: float = -math.inf
+    """Newest time (s) on the leading clock."""
+    late: int = 0
+    """Packets that came after newer ones."""
+    pose: Rigid | None = None
+
+    def see(self, packet: Packet, clock: str, time_s: float) -> None:
+        """A packet has come, which counts as of a time (s) on the leading clock."""
+        self.since_s = self.since_s or packet.arrived_s
+        self.count += 1
+        if packet.arrived_s - self.since_s >= RATE_S:
+            self.hz = self.count / (packet.arrived_s - self.since_s)
+            self.count, self.since_s = 0, packet.arrived_s
+        self.clock, self.arrived_s = clock, packet.arrived_s
+        self.late += time_s <= self.newest_s and self.newest_s - time_s < 1.0
+        self.newest_s = time_s
+        self.pose = _shown(packet.sample) or self.pose
+
+    def status(self, name: str, now_s: float) -> DeviceStatus:
+        silent_s = now_s - self.arrived_s
+        hz = self.hz or self.count / max(now_s - self.since_s, RATE_S)
+        return DeviceStatus(name, 0.0 if silent_s > RATE_S else hz, self.pose, silent_s)
+
+
+class Devices:
+    """A wearer's devices by name, bounded: names come from the network."""
+
+    def __init__(self, needed: Sequence[str]):
+        """`needed`: those that are always admitted."""
+        self.needed = tuple(needed)
+        self._devices: dict[str, Device] = {}
+
+    def admit(self, name: str) -> Device | None:
+        """The device of a name, new where it was not known; None where there are too many."""
+        if (known := self._devices.get(name)) is not None:
+            return known
+        if name not in self.needed and len(self._devices) >= MAX_DEVICES:
+            others = (each for each in self._devices if each not in self.needed)
+            oldest = min(others, key=lambda each: self._devices[each].arrived_s)
+            if time.monotonic() - self._devices[oldest].arrived_s < FORGOTTEN_S:
+                return None
+            del self._devices[oldest]
+        device = self._devices[name] = Device()
+        return device
+
+    def get(self, name: str) -> Device | None:
+        """The device of a name, if it is known."""
+        return self._devices.get(name)
+
+    @property
+    def late(self) -> int:
+        """Packets of all of them that came after newer ones."""
+        return sum(device.late for device in list(self._devices.values()))
+
+    def status(self) -> tuple[DeviceStatus, ...]:
+        """All of them, for the page; any thread may ask."""
+        now_s = time.monotonic()
+        return tuple(device.status(name, now_s) for name, device in list(self._devices.items()))
+
+
+def _shown(sample: Sample) -> Rigid | None:
+    """The pose that the page shows of a sample; a watch has no place."""
+    match sample:
+        case HeadSample():
+            return sample.T_world_device
+        case WristSample():
+            return sample.T_world_joint
+        case WatchSample():
+            return Rigid(sample.R_world_imu, torch.full((3,), torch.nan))
+        case LocalizationSample():
+            return sample.T_world_cam
+        case ObjectSample():
+            return sample.T_world_object
+    return None
