@@ -68,7 +68,7 @@ def packets(plan, late_s, batch_s: float = 0.0, head_leads_s: float = 0.06):
 def guided() -> tuple[LiveWearer, Kept]:
     session = Kept()
     minute = lambda setup, guide: FirstMinute(DEVICES, tracked=False, setup=setup, guided=guide)  # noqa: E731
-    wearer = LiveWearer("", Opener(lambda wearer: session, DEVICES, False, minute))  # type: ignore[arg-type]
+    wearer = LiveWearer("", Opener(lambda wearer: session, DEVICES, False, False, minute))  # type: ignore[arg-type]
     wearer.guide()
     return wearer, session
 
@@ -112,7 +112,7 @@ def test_a_session_waits_for_the_latest_watch():
         return sessions[-1]
 
     minute = lambda setup, guide: FirstMinute(DEVICES, tracked=False, setup=setup, guided=guide)  # noqa: E731
-    wearer = LiveWearer("", Opener(opened, DEVICES, False, minute))
+    wearer = LiveWearer("", Opener(opened, DEVICES, False, False, minute))
     wearer.guide()
     frames = 0
     for packet, true_s in packets(PLAN, LATE_S):

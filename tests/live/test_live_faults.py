@@ -154,18 +154,20 @@ def test_a_source_that_fails_is_started_again_and_ends_no_other(monkeypatch):
 
 
 def test_a_source_that_never_runs_ends_the_capture_with_its_reason():
-    with pytest.raises(WearcapError, match=r"cannot start \(label too long\).*failing:1"):
+    with pytest.raises(WearcapError, match=r"failing:1: cannot start \(label too long\)"):
         LiveCapture(small_hmd2(), [Failing(listens=False)], []).run(10.0)
 
 
-def test_silent_strangers_make_room(monkeypatch):
+def test_silent_strangers_make_room(tmp_path: Path, monkeypatch):
     monkeypatch.setattr("wearcap.live.capture.FORGOTTEN_S", 0.0)
     sensed, kept = swaying(60), Kept()
     strangers = [next(heads(sensed, f"stranger {k}")) for k in range(20)]
     lone = [(packet._replace(device=f"tracker {k}", wearer="anna"), 0.0) for k, (packet, _) in enumerate(strangers * 3)]
     script = [*strangers, *lone, *heads(sensed, "anna")]
     setup = ReplaySource(sensed, HMD2Session).setup
-    LiveCapture(small_hmd2(), [Scripted(script)], [kept], setup=setup).run(30.0)
+    assert setup is not None
+    write_setup(setup, tmp_path / "setup_anna.json")
+    LiveCapture(small_hmd2(), [Scripted(script)], [kept], setup_file=tmp_path / "setup.json").run(30.0)
     assert len(kept.motion("anna")) == 60
 
 
