@@ -46,7 +46,7 @@ def windows(motion: Motion, seconds: float):
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("datasets", nargs="*", default=["datasets/cmu", "datasets/hdm05"], metavar="DATASET")
+    parser.add_argument("datasets", nargs="*", default=["datasets/cmu"], metavar="DATASET")
     parser.add_argument("--seconds", type=float, default=10.0)
     options = parser.parse_args()
     torch.set_num_threads(1)

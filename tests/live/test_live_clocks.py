@@ -51,15 +51,16 @@ def packets(plan, late_s, batch_s: float = 0.0, head_leads_s: float = 0.06):
         T_world_device = motion.joint(device) @ (
             seat if head else Rigid(exp(torch.tensor([0.0, 0.0, 1.5])), 0 * seat.t)
         )
-        turn = about_axis("z", torch.tensor(0.0 if head else 1.3))
+        turn, jitter_s = about_axis("z", torch.tensor(0.0 if head else 1.3)), 0.0
         for k, true_s in enumerate(motion.timestamps.tolist()):
             sent_s = CLOCKS_S[device] + true_s
             pose = T_world_device[k]
             sample = (
                 HeadSample(sent_s, pose) if acc is None else WatchSample(sent_s, turn @ pose.R, turn @ acc[k], device)
             )
-            left_s = true_s if device != "left_wrist" or not batch_s else batch_s * (true_s // batch_s + 1) - 1 / FPS
-            jitter_s = 0.004 * torch.rand((), generator=random).item()
+            if not batch_s or device != "left_wrist" or k % round(batch_s * FPS) == 0:  # what comes at once is in order
+                jitter_s = 0.004 * torch.rand((), generator=random).item()
+            left_s = true_s if device != "left_wrist" or not batch_s else batch_s * (k // round(batch_s * FPS) + 1)
             arrived_s = begin_s + left_s + late_s[device] + jitter_s
             found.append((Packet("", device, f"clock of {device}", sent_s, arrived_s, sample), true_s))
     return sorted(found, key=lambda each: each[0].arrived_s)
