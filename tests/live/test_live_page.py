@@ -120,14 +120,16 @@ def test_objects_are_where_the_motion_has_them_and_stay_there(show):
         page.draw(1.0)
         person = page._persons["anna"]
         assert not person.objects
-        page.take("anna", replace(motion, timestamps=track.timestamps + 1, object_motion={"box_1": later(track)}))
-        page.draw(1.1)
-        motion, shown_s = person.playout.step(1.1)
+        page.take("anna", replace(motion, timestamps=later(track).timestamps, object_motion={"box_1": later(track)}))
+        page.draw(1.13)
+        motion, shown_s = person.playout.step(1.13)
         assert motion.object_motion
         (handle,) = person.objects["box_1"].handles
-        truth = track.t_world_body[round((shown_s - 1) * FPS)]
+        truth = track.t_world_body[max(0, round(shown_s * FPS) - 40)]
         np.testing.assert_allclose(handle.position, truth, atol=1e-5)
-        page.take("anna", replace(motion, timestamps=motion.timestamps + 1, object_motion={"box_7": later(track)}))
+        page.take(
+            "anna", replace(motion, timestamps=motion.timestamps + 40 / FPS, object_motion={"box_7": later(track)})
+        )
         page.draw(3.0)
         np.testing.assert_allclose(handle.position, track.t_world_body[-1], atol=1e-5)
         assert list(person.objects) == ["box_1"]
@@ -139,7 +141,7 @@ def test_objects_are_where_the_motion_has_them_and_stay_there(show):
 
 
 def later(track: Trajectory) -> Trajectory:
-    return replace(track, timestamps=track.timestamps + 1)
+    return replace(track, timestamps=track.timestamps + 40 / FPS)
 
 
 def test_devices_are_where_they_are_and_watches_at_their_wrists(page, show):
