@@ -3,7 +3,6 @@
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +20,7 @@ from wearcap.live.page_panel import sinks_html, wearer_html
 from wearcap.live.playout import BEHIND_S, Playout
 from wearcap.live.status import DeviceStatus, Latency, LiveStatus, SinkStatus, WearerStatus
 from wearcap.viewer.page import COLORS
-from wearcap_browser import Chromium, chromium
+from wearcap_browser import chromium
 
 NASTY = "<img src=x onerror=\"document.title='broken'\">"
 
@@ -233,23 +232,6 @@ def like(picture: np.ndarray, color: tuple[int, int, int]) -> int:
     return int(((np.abs(share - np.array(color) / sum(color)) < 0.035).all(-1) & (total[..., 0] > 90)).sum())
 
 
-def until(browser: Chromium, find: Callable[[], tuple[float, float]], wanted: Callable[[], bool]) -> None:
-    """Click what is found until it has done what is wanted: on a page that is being laid out a click may miss."""
-    for _ in range(6):
-        browser.click(*find())
-        end = time.monotonic() + 6
-        while time.monotonic() < end:
-            if wanted():
-                return
-            time.sleep(0.1)
-    pytest.fail("a click did nothing")
-
-
-def press(browser: Chromium, label: str, wanted: Callable[[], bool]) -> None:
-    """Press a button until it has done what is wanted."""
-    until(browser, lambda: browser.labelled(label), wanted)
-
-
 @pytest.mark.browser
 @pytest.mark.slow
 def test_chromium_shows_a_walking_person_and_its_buttons_work(tmp_path: Path):
@@ -265,7 +247,7 @@ def test_chromium_shows_a_walking_person_and_its_buttons_work(tmp_path: Path):
                 "[...document.querySelectorAll('input[type=checkbox]')].filter(e => e.getBoundingClientRect().width)"
             )
             shown = page._panel.wearers[NASTY].shown
-            until(browser, lambda: browser.element(f"{boxes}.at(-1)"), lambda: not shown.value)  # 40 m away
+            browser.click_until(lambda: browser.element(f"{boxes}.at(-1)"), lambda: not shown.value)  # 40 m away
             browser.poll(lambda: like(browser.screenshot(), COLORS[0]) > 1500)
             text = browser.text()
             for part in ("anna", NASTY[:30], "● live", "72 Hz", "4.2 s ago", "41", "63", "88", "the disk is full"):
@@ -276,15 +258,15 @@ def test_chromium_shows_a_walking_person_and_its_buttons_work(tmp_path: Path):
             )
             assert like(browser.screenshot(), COLORS[0]) > 1500  # followed by the camera
 
-            press(browser, "Record", lambda: ("record", True) in show.asked)
+            browser.press("Record", lambda: ("record", True) in show.asked)
             browser.poll(lambda: "Recording to walk" in browser.text())
-            press(browser, "Stop recording", lambda: ("record", False) in show.asked)
-            press(browser, "Guide me", lambda: ("guide", "anna") in show.asked)
+            browser.press("Stop recording", lambda: ("record", False) in show.asked)
+            browser.press("Guide me", lambda: ("guide", "anna") in show.asked)
             browser.poll(lambda: "Stand still and look straight ahead." in browser.text())
-            press(browser, "Skip", lambda: ("skip", "anna") in show.asked)
+            browser.press("Skip", lambda: ("skip", "anna") in show.asked)
             browser.poll(lambda: "The left watch still moves." in browser.text())
-            press(browser, "Redo", lambda: ("redo", "anna") in show.asked)
-            press(browser, "Stop the capture", lambda: ("stop",) in show.asked)
+            browser.press("Redo", lambda: ("redo", "anna") in show.asked)
+            browser.press("Stop the capture", lambda: ("stop",) in show.asked)
             assert browser.evaluate("document.title") != "broken"
             assert browser.evaluate("document.querySelectorAll('img[src=x]').length") == 0
             assert not browser.exceptions

@@ -136,7 +136,7 @@ class Panel:
 
     def __init__(self, server: viser.ViserServer, controls: LiveControls):
         self.gui, self.controls = server.gui, controls
-        self.title = self.gui.add_html("")
+        self.title = self.gui.add_html('<div style="padding:2px 12px">Starting: the network is being loaded.</div>')
         self.record = self.gui.add_button("Record", color="red")
         self.stop = self.gui.add_button("Stop the capture", color="gray")
         self.follow = self.gui.add_checkbox("Follow with the camera", initial_value=True)
