@@ -196,10 +196,10 @@ class Worn:
 class Sender(threading.Thread):
     """Sends what the devices measure of the actor, in real time, until `stopped`."""
 
-    def __init__(self, actor: Actor, ports: tuple[int, ...], watches: bool, seed: int = 0):
-        """`ports`: of head, left and right watch; of a tracked head and hands, one."""
+    def __init__(self, actor: Actor, ports: tuple[int, ...], watches: bool, slow: float = 1.0, seed: int = 0):
+        """`ports`: of head, left and right watch; of a tracked head and hands, one. All goes `slow` times slower."""
         super().__init__(daemon=True)
-        self.actor, self.ports, self.watches = actor, ports, watches
+        self.actor, self.ports, self.watches, self.slow = actor, ports, watches, slow
         self.worn = Worn.of(actor.person, watches)
         self.stopped = threading.Event()
         self.sent = 0
@@ -211,7 +211,7 @@ class Sender(threading.Thread):
         out, begun_s = socket.socket(type=socket.SOCK_DGRAM), time.monotonic()
         waiting: list[tuple[int, int, bytes]] = []
         while not self.stopped.is_set():
-            now = (time.monotonic() - begun_s) * TICKS_HZ
+            now = (time.monotonic() - begun_s) * TICKS_HZ / self.slow
             while not waiting or waiting[-1][0] < now + CHUNK:
                 waiting += sorted(self._messages(self.actor.go_on()))
             due = [one for one in waiting if one[0] <= now]
@@ -219,7 +219,7 @@ class Sender(threading.Thread):
             for _, port, message in due:
                 out.sendto(message, ("127.0.0.1", port))
                 self.sent += 1
-            time.sleep(0.004)
+            time.sleep(0.004 * self.slow)
 
     def _messages(self, motion: Motion) -> Iterator[tuple[int, int, bytes]]:
         """(tick, port, message) of the newest ticks whose acceleration is known."""

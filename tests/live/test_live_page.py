@@ -113,13 +113,22 @@ def test_devices_are_where_they_are_and_watches_at_their_wrists(page, show):
     page.draw(1.0)
     page.draw(1.1)
     person = page._persons["anna"]
-    head, watch = (person.devices.known[name].frame for name in ("head", "left_wrist"))
+    head, watch = (person.devices.known[name].frame for name in ("head", "watch-7"))
     motion, status = show.persons["anna"], show.status().wearers[0]
     np.testing.assert_allclose(head.position, status.devices[0].T_world_device.t.numpy(), atol=1e-5)
     np.testing.assert_allclose(watch.position, motion.joint("left_wrist").t[0].numpy(), atol=1e-5)
+    assert person.devices.known["watch-7"].label.text == "left wrist (watch-7)"
     page._panel.devices.value = False
     page.draw(1.2)
     assert not head.visible
+
+
+def test_a_device_gets_its_joints_name_once_that_is_known(page):
+    devices, pose = Devices("/world/devices_of_test"), Rigid(torch.eye(3), torch.zeros(3))
+    devices.see(page.server, (DeviceStatus("serial_4", 99.0, pose),), 1.0)
+    assert devices.known["serial_4"].label.text == "serial 4"
+    devices.see(page.server, (DeviceStatus("serial_4", 99.0, pose, joint="right_wrist"),), 1.1)
+    assert devices.known["serial_4"].label.text == "right wrist (serial_4)"
 
 
 def test_devices_are_as_late_as_the_body(page):
@@ -250,7 +259,18 @@ def test_chromium_shows_a_walking_person_and_its_buttons_work(tmp_path: Path):
             browser.click_until(lambda: browser.element(f"{boxes}.at(-1)"), lambda: not shown.value)  # 40 m away
             browser.poll(lambda: like(browser.screenshot(), COLORS[0]) > 1500)
             text = browser.text()
-            for part in ("anna", NASTY[:30], "● live", "72 Hz", "4.2 s ago", "41", "63", "88", "the disk is full"):
+            for part in (
+                "anna",
+                NASTY[:30],
+                "● live",
+                "72 Hz",
+                "left wrist (watch-7)",
+                "4.2 s ago",
+                "41",
+                "63",
+                "88",
+                "the disk is full",
+            ):
                 assert part in text, part
             before = browser.screenshot()
             browser.poll(

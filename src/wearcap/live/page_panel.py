@@ -51,9 +51,7 @@ def wearer_html(wearer: WearerStatus, behind_s: float) -> str:
     for device in wearer.devices[:MAX_ROWS]:
         silent = not device.last_s_ago <= SILENT_S
         ago = f"{number(device.last_s_ago, 1)} s ago" if silent else "now"
-        rows.append(
-            row(short(device.name.replace("_", " ")), f"{number(device.hz)} Hz", ago, color=_BAD if silent else "")
-        )
+        rows.append(row(short(device.title), f"{number(device.hz)} Hz", ago, color=_BAD if silent else ""))
     if len(wearer.devices) > MAX_ROWS:
         rows.append(row(f"and {len(wearer.devices) - MAX_ROWS} more"))
     latency = wearer.latency

@@ -17,7 +17,7 @@ from wearcap.live.clocks import Clocks
 from wearcap.live.first_minute import FirstMinute
 from wearcap.live.latency import Latencies
 from wearcap.live.packets import HEAD, SUIT, Packet
-from wearcap.live.setup import Setup
+from wearcap.live.setup import Seat, Setup
 from wearcap.live.status import MAX_POINTS, DeviceStatus, Stage, WearerStatus
 from wearcap.recording import Motion
 from wearcap.runtime.session import Session
@@ -245,7 +245,9 @@ class LiveWearer:
         for name, device in list(self._devices.items()):
             silent_s = now_s - device.arrived_s
             hz = device.hz or (device.count / max(now_s - device.since_s, RATE_S))
-            devices.append(DeviceStatus(name, 0.0 if silent_s > RATE_S else hz, device.pose, silent_s))
+            seat = None if self.setup is None else self.setup.seats.get(name)
+            pose, joint = (device.pose, None) if seat is None else (_turned(device.pose, seat), seat.joint)
+            devices.append(DeviceStatus(name, 0.0 if silent_s > RATE_S else hz, pose, silent_s, joint))
         step = None if self.first is None else self.first.step
         session = self.session
         return WearerStatus(
@@ -298,3 +300,10 @@ def _shown(sample: Any) -> Rigid | None:
         case LocalizationSample():
             return sample.T_world_cam
     return None
+
+
+def _turned(pose: Rigid | None, seat: Seat) -> Rigid | None:
+    """A watch's pose, turned from its own world to the head's."""
+    if pose is None or not seat.yaw_rad:
+        return pose
+    return Rigid(rotation.about_axis("z", torch.tensor(seat.yaw_rad)) @ pose.R, pose.t)
