@@ -46,7 +46,7 @@ class Show:
         nowhere = torch.full((3,), torch.nan)
         devices = (
             DeviceStatus("head", 72.0, head, 0.01),
-            DeviceStatus("left_wrist", 99.6, Rigid(wrists[0][frame].R, nowhere), 0.01),
+            DeviceStatus("watch-7", 99.6, Rigid(wrists[0][frame].R, nowhere), 0.01, "left_wrist"),
             DeviceStatus("right_wrist", 0.0, Rigid(wrists[1][frame].R, wrists[1][frame].t), 4.2),
         )
         counts = {"frames": self._frame, "dropped": 7, "late": 11, "gaps": 2, "floor_m": 0.0}

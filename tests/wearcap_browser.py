@@ -136,6 +136,21 @@ class Chromium:
             self._mouse("mousePressed", x, y, modifiers, number)
             self._mouse("mouseReleased", x, y, modifiers, number)
 
+    def click_until(self, find: Callable[[], tuple[float, float]], wanted: Callable[[], bool]) -> None:
+        """Click what is found until it has done what is wanted: on a page that is being laid out a click may miss."""
+        for _ in range(6):
+            self.click(*find())
+            end = time.monotonic() + 6
+            while time.monotonic() < end:
+                if wanted():
+                    return
+                time.sleep(0.1)
+        pytest.fail("a click did nothing")
+
+    def press(self, label: str, wanted: Callable[[], bool]) -> None:
+        """Press a button until it has done what is wanted."""
+        self.click_until(lambda: self.labelled(label), wanted)
+
     def drag(self, way: list[tuple[float, float]], modifiers: int = 0, pause_s: float = 0.06) -> None:
         """Press at the first place, go through the others, release at the last."""
         self._mouse("mouseMoved", *way[0], modifiers)

@@ -25,13 +25,15 @@ import wearcap
 from carried_box import carrying, drawn_echo
 from small_hmd2 import hmd2_of
 from watched_walk import drawn_pipeline, watched_walk
+from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
-from wearcap.geometry.rotation import matrix_from_quat_wxyz
+from wearcap.geometry.rotation import about_axis, matrix_from_quat_wxyz
 from wearcap.io.formats.bvh import read_bvh
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.live import wearer as wearer_module
 from wearcap.live.capture import LiveCapture, write_report
 from wearcap.live.packets import HEAD, Inbox, Packet
+from wearcap.live.setup import Seat, Setup
 from wearcap.live.sink import Sink, SinkThread
 from wearcap.live.sinks import sink_of
 from wearcap.live.sinks.files import FilesSink, join_sections
@@ -40,9 +42,10 @@ from wearcap.live.sinks.websocket import WebSocketSink
 from wearcap.live.source import Address, Source
 from wearcap.live.sources import source_of
 from wearcap.live.sources.replay import ReplaySource
+from wearcap.live.wearer import LiveWearer
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import joined
-from wearcap.sensors.samples import HeadSample
+from wearcap.sensors.samples import HeadSample, WatchSample
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.stream import HMD2Session
@@ -425,6 +428,20 @@ def test_the_page_starts_and_stops_recordings_while_the_capture_runs(tmp_path: P
         first = int((whole.timestamps - motion.timestamps[0]).abs().argmin())
         part = whole.sliced(first, first + len(motion))
         torch.testing.assert_close(motion.t_world_root, part.t_world_root)
+
+
+def test_the_status_says_who_wears_a_watch_and_turns_it_to_the_heads_world():
+    quarter = about_axis("z", torch.tensor(math.pi / 2))
+    setup = Setup(xsens23(), {"watch-7": Seat("left_wrist", torch.eye(3), torch.zeros(3), math.pi / 2)}, 0.0)
+    wearer = LiveWearer("", LiveCapture(drawn_pipeline(), [], []).opener, setup)
+    for device in ("watch-7", "watch-9"):
+        sample = WatchSample(0.0, torch.eye(3), torch.zeros(3), device)
+        wearer.take(Packet("", device, device, 0.0, time.monotonic(), sample))
+    worn, unknown = wearer.status().devices
+    assert (worn.joint, worn.title) == ("left_wrist", "left wrist (watch-7)")
+    torch.testing.assert_close(worn.T_world_device.R, quarter)
+    assert (unknown.joint, unknown.title) == (None, "watch-9")
+    torch.testing.assert_close(unknown.T_world_device.R, torch.eye(3))
 
 
 def test_reports_are_json_also_without_poses(tmp_path: Path):

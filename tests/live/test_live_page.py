@@ -3,7 +3,6 @@
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from wearcap.live.page_panel import sinks_html, wearer_html
 from wearcap.live.playout import BEHIND_S, Playout
 from wearcap.live.status import DeviceStatus, Latency, LiveStatus, SinkStatus, WearerStatus
 from wearcap.viewer.page import COLORS
-from wearcap_browser import Chromium, chromium
+from wearcap_browser import chromium
 
 NASTY = "<img src=x onerror=\"document.title='broken'\">"
 
@@ -149,13 +148,22 @@ def test_devices_are_where_they_are_and_watches_at_their_wrists(page, show):
     page.draw(1.0)
     page.draw(1.1)
     person = page._persons["anna"]
-    head, watch = (person.devices.known[name].frame for name in ("head", "left_wrist"))
+    head, watch = (person.devices.known[name].frame for name in ("head", "watch-7"))
     motion, status = show.persons["anna"], show.status().wearers[0]
     np.testing.assert_allclose(head.position, status.devices[0].T_world_device.t.numpy(), atol=1e-5)
     np.testing.assert_allclose(watch.position, motion.joint("left_wrist").t[0].numpy(), atol=1e-5)
+    assert person.devices.known["watch-7"].label.text == "left wrist (watch-7)"
     page._panel.devices.value = False
     page.draw(1.2)
     assert not head.visible
+
+
+def test_a_device_gets_its_joints_name_once_that_is_known(page):
+    devices, pose = Devices("/world/devices_of_test"), Rigid(torch.eye(3), torch.zeros(3))
+    devices.see(page.server, (DeviceStatus("serial_4", 99.0, pose),), 1.0)
+    assert devices.known["serial_4"].label.text == "serial 4"
+    devices.see(page.server, (DeviceStatus("serial_4", 99.0, pose, joint="right_wrist"),), 1.1)
+    assert devices.known["serial_4"].label.text == "right wrist (serial_4)"
 
 
 def test_devices_are_as_late_as_the_body(page):
@@ -268,23 +276,6 @@ def like(picture: np.ndarray, color: tuple[int, int, int]) -> int:
     return int(((np.abs(share - np.array(color) / sum(color)) < 0.035).all(-1) & (total[..., 0] > 90)).sum())
 
 
-def until(browser: Chromium, find: Callable[[], tuple[float, float]], wanted: Callable[[], bool]) -> None:
-    """Click what is found until it has done what is wanted: on a page that is being laid out a click may miss."""
-    for _ in range(6):
-        browser.click(*find())
-        end = time.monotonic() + 6
-        while time.monotonic() < end:
-            if wanted():
-                return
-            time.sleep(0.1)
-    pytest.fail("a click did nothing")
-
-
-def press(browser: Chromium, label: str, wanted: Callable[[], bool]) -> None:
-    """Press a button until it has done what is wanted."""
-    until(browser, lambda: browser.labelled(label), wanted)
-
-
 @pytest.mark.browser
 @pytest.mark.slow
 def test_chromium_shows_a_walking_person_and_its_buttons_work(tmp_path: Path):
@@ -300,10 +291,21 @@ def test_chromium_shows_a_walking_person_and_its_buttons_work(tmp_path: Path):
                 "[...document.querySelectorAll('input[type=checkbox]')].filter(e => e.getBoundingClientRect().width)"
             )
             shown = page._panel.wearers[NASTY].shown
-            until(browser, lambda: browser.element(f"{boxes}.at(-1)"), lambda: not shown.value)  # 40 m away
+            browser.click_until(lambda: browser.element(f"{boxes}.at(-1)"), lambda: not shown.value)  # 40 m away
             browser.poll(lambda: like(browser.screenshot(), COLORS[0]) > 1500)
             text = browser.text()
-            for part in ("anna", NASTY[:30], "● live", "72 Hz", "4.2 s ago", "41", "63", "88", "the disk is full"):
+            for part in (
+                "anna",
+                NASTY[:30],
+                "● live",
+                "72 Hz",
+                "left wrist (watch-7)",
+                "4.2 s ago",
+                "41",
+                "63",
+                "88",
+                "the disk is full",
+            ):
                 assert part in text, part
             before = browser.screenshot()
             browser.poll(
@@ -311,15 +313,15 @@ def test_chromium_shows_a_walking_person_and_its_buttons_work(tmp_path: Path):
             )
             assert like(browser.screenshot(), COLORS[0]) > 1500  # followed by the camera
 
-            press(browser, "Record", lambda: ("record", True) in show.asked)
+            browser.press("Record", lambda: ("record", True) in show.asked)
             browser.poll(lambda: "Recording to walk" in browser.text())
-            press(browser, "Stop recording", lambda: ("record", False) in show.asked)
-            press(browser, "Guide me", lambda: ("guide", "anna") in show.asked)
+            browser.press("Stop recording", lambda: ("record", False) in show.asked)
+            browser.press("Guide me", lambda: ("guide", "anna") in show.asked)
             browser.poll(lambda: "Stand still and look straight ahead." in browser.text())
-            press(browser, "Skip", lambda: ("skip", "anna") in show.asked)
+            browser.press("Skip", lambda: ("skip", "anna") in show.asked)
             browser.poll(lambda: "The left watch still moves." in browser.text())
-            press(browser, "Redo", lambda: ("redo", "anna") in show.asked)
-            press(browser, "Stop the capture", lambda: ("stop",) in show.asked)
+            browser.press("Redo", lambda: ("redo", "anna") in show.asked)
+            browser.press("Stop the capture", lambda: ("stop",) in show.asked)
             assert browser.evaluate("document.title") != "broken"
             assert browser.evaluate("document.querySelectorAll('img[src=x]').length") == 0
             assert not browser.exceptions

@@ -2,13 +2,15 @@
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 
+from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.live.packets import Packet, Sample
+from wearcap.live.setup import Seat
 from wearcap.live.status import DeviceStatus
 from wearcap.sensors.samples import HeadSample, LocalizationSample, ObjectSample, WatchSample, WristSample
 
@@ -49,10 +51,14 @@ class Device:
         self.newest_s = time_s
         self.pose = _shown(packet.sample) or self.pose
 
-    def status(self, name: str, now_s: float) -> DeviceStatus:
+    def status(self, name: str, seat: Seat | None, now_s: float) -> DeviceStatus:
+        """What the page shows; a watch's own world is turned to the head's once its seat is known."""
         silent_s = now_s - self.arrived_s
-        hz = self.hz or self.count / max(now_s - self.since_s, RATE_S)
-        return DeviceStatus(name, 0.0 if silent_s > RATE_S else hz, self.pose, silent_s)
+        hz, pose = self.hz or self.count / max(now_s - self.since_s, RATE_S), self.pose
+        if pose is not None and seat is not None and seat.yaw_rad:
+            pose = Rigid(rotation.about_axis("z", torch.tensor(seat.yaw_rad)) @ pose.R, pose.t)
+        joint = None if seat is None else seat.joint
+        return DeviceStatus(name, 0.0 if silent_s > RATE_S else hz, pose, silent_s, joint)
 
 
 class Devices:
@@ -85,10 +91,10 @@ class Devices:
         """Packets of all of them that came after newer ones."""
         return sum(device.late for device in list(self._devices.values()))
 
-    def status(self) -> tuple[DeviceStatus, ...]:
-        """All of them, for the page; any thread may ask."""
+    def status(self, seats: Mapping[str, Seat]) -> tuple[DeviceStatus, ...]:
+        """All of them, for the page; any thread may ask. `seats`: by device, as far as they are known."""
         now_s = time.monotonic()
-        return tuple(device.status(name, now_s) for name, device in list(self._devices.items()))
+        return tuple(device.status(name, seats.get(name), now_s) for name, device in list(self._devices.items()))
 
 
 def _shown(sample: Sample) -> Rigid | None:

@@ -24,19 +24,25 @@ MAX_DELAY_S = 2.0
 class Device:
     """One device: its node, and where it was lately."""
 
-    def __init__(self, server: viser.ViserServer, node: str, name: str):
-        self.name = name
+    def __init__(self, server: viser.ViserServer, node: str, device: DeviceStatus):
+        self.joint = device.name
+        """Joint that wears it, or its name until that is known."""
         self.frame = server.scene.add_frame(
             node, axes_length=AXES_M, axes_radius=0.006, origin_radius=0.012, visible=False
         )
-        label = fitting(name).replace("_", " ")
-        server.scene.add_label(
-            f"{node}/name", label, anchor="bottom-left", font_size_mode="scene", font_scene_height=LABEL_M
+        self.label = server.scene.add_label(
+            f"{node}/name",
+            fitting(device.title),
+            anchor="bottom-left",
+            font_size_mode="scene",
+            font_scene_height=LABEL_M,
         )
         self._path: deque[tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "4"]]] = deque(maxlen=KEPT)
 
     def see(self, device: DeviceStatus, now_s: float) -> None:
         """Keep where it is now; one without a pose is not shown."""
+        if device.joint is not None and device.joint != self.joint:
+            self.joint, self.label.text = device.joint, fitting(device.title)
         pose = device.T_world_device
         if pose is None or not bool(pose.R.isfinite().all()):
             self._path.clear()
@@ -51,8 +57,8 @@ class Device:
         if place is not None and not np.isfinite(place).all():
             skeleton = None if body is None else body.motion.skeleton
             place = None
-            if body is not None and body.handle.visible and skeleton is not None and self.name in skeleton:
-                bone = body.handle.bones[skeleton.index(self.name)]
+            if body is not None and body.handle.visible and skeleton is not None and self.joint in skeleton:
+                bone = body.handle.bones[skeleton.index(self.joint)]
                 place = np.asarray(body.handle.position) + np.asarray(bone.position)
         if self.frame.visible != (place is not None):
             self.frame.visible = place is not None
@@ -86,7 +92,7 @@ class Devices:
         """Take in where they are now; those that are gone are hidden."""
         for device in devices[:MAX_DEVICES]:
             if device.name not in self.known and len(self.known) < MAX_DEVICES:
-                self.known[device.name] = Device(server, f"{self.node}/{len(self.known)}", device.name)
+                self.known[device.name] = Device(server, f"{self.node}/{len(self.known)}", device)
             if device.name in self.known:
                 self.known[device.name].see(device, now_s)
         for name in self.known.keys() - {device.name for device in devices}:

@@ -51,9 +51,7 @@ def wearer_html(wearer: WearerStatus, behind_s: float) -> str:
     for device in wearer.devices[:MAX_ROWS]:
         silent = not device.last_s_ago <= SILENT_S
         ago = f"{number(device.last_s_ago, 1)} s ago" if silent else "now"
-        rows.append(
-            row(short(device.name.replace("_", " ")), f"{number(device.hz)} Hz", ago, color=_BAD if silent else "")
-        )
+        rows.append(row(short(device.title), f"{number(device.hz)} Hz", ago, color=_BAD if silent else ""))
     if len(wearer.devices) > MAX_ROWS:
         rows.append(row(f"and {len(wearer.devices) - MAX_ROWS} more"))
     latency = wearer.latency
@@ -136,7 +134,7 @@ class Panel:
 
     def __init__(self, server: viser.ViserServer, controls: LiveControls):
         self.gui, self.controls = server.gui, controls
-        self.title = self.gui.add_html("")
+        self.title = self.gui.add_html('<div style="padding:2px 12px">Starting: the network is being loaded.</div>')
         self.record = self.gui.add_button("Record", color="red")
         self.stop = self.gui.add_button("Stop the capture", color="gray")
         self.follow = self.gui.add_checkbox("Follow with the camera", initial_value=True)

@@ -32,9 +32,18 @@ class DeviceStatus:
     hz: float
     """Rate of its packets over the last seconds."""
     T_world_device: Rigid | None = None
-    """Newest pose in the head's world, R "3 3", t "3" (m); None where there is none. Of a watch, t may be NaN."""
+    """Newest pose in the head's world, R "3 3", t "3" (m); None where there is none. Of a watch, t may be NaN, and until its
+    heading is known R is in its own world."""
     last_s_ago: float = float("inf")
     """Time (s) since its newest packet."""
+    joint: str | None = None
+    """Joint that wears it, once that is known."""
+
+    @property
+    def title(self) -> str:
+        """How a page names it: by its joint, and by its own name where that is another."""
+        title = (self.joint or self.name).replace("_", " ")
+        return title if self.joint in (None, self.name) else f"{title} ({self.name})"
 
 
 @dataclass(frozen=True, eq=False)

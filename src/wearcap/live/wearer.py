@@ -320,7 +320,7 @@ class LiveWearer:
             self.stage,
             None if step is None else str(step),
             0.0 if step is None else step.progress,
-            self._devices.status(),
+            self._devices.status({} if self.setup is None else self.setup.seats),
             self.latencies.quantiles,
             self.frames,
             self._dropped + (0 if session is None else session.dropped[0]),
