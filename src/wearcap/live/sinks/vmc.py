@@ -57,6 +57,8 @@ PARENTS = {
     **{f"{side}UpperLeg": "Hips" for side in ("Left", "Right")},
 }  # fmt: skip
 """Parent of each bone; None of the hips."""
+SMALL_S = 4096.0
+"""Times that begin beyond this count from the first frame: the protocol's single precision does not tell frames apart there."""
 _CALIBRATED = 3
 """Of `/VMC/Ext/OK`: the performer is calibrated."""
 
@@ -72,6 +74,8 @@ class VmcSink(Sink):
         self._pacing = Pacing(pace)
         self._socket: socket.socket | None = None
         self._step_s = 1 / 60
+        self._origin_s: float | None = None
+        """Device time (s) that `/VMC/Ext/T` counts from."""
 
     def open(self) -> None:
         where = f"{self.address.host}:{self.address.port}"
@@ -89,16 +93,20 @@ class VmcSink(Sink):
         if missing := next((joint for joint in BONES.values() if joint not in skeleton), None):
             raise WearcapError(f"a skeleton without {missing!r}", self.name, "xsens23")
         self.wearer = wearer if self.wearer is None else self.wearer
-        self._step_s = 1 / fps
+        if wearer == self.wearer:
+            self._step_s, self._origin_s = 1 / fps, None
 
     def take(self, wearer: str, motion: Motion) -> None:
         if wearer != self.wearer:
             return
+        if self._origin_s is None:
+            first_s = motion.timestamps[0].item()
+            self._origin_s = 0.0 if abs(first_s) < SMALL_S else first_s
         (positions, rotations), objects = bones_of(motion), objects_of(motion)
         for k, time_s in enumerate(motion.timestamps.tolist()):
             self._pacing.wait(self._step_s, self.waiting > 1)
             trackers = {name: seen.T_world_object for name, seen in objects[k].items()}
-            self._send(bundle(positions[k], rotations[k], time_s, trackers))
+            self._send(bundle(positions[k], rotations[k], time_s - self._origin_s, trackers))
 
     def close(self) -> None:
         if self._socket is not None:

@@ -10,6 +10,8 @@ null}}: the pose of the object's mesh in the world, and the largest probability 
 import asyncio
 import json
 import threading
+import time
+from collections.abc import Callable
 from contextlib import suppress
 from http import HTTPStatus
 from typing import Any
@@ -44,9 +46,12 @@ class WebSocketSink(Sink):
         self.address, self.guard = address, Guard(address.host)
         self.name = f"ws://{address.host}:{address.port}"
         self.open_to_others = address.host not in LOOPBACK
-        self._pacing, self._step_s = Pacing(pace), 1 / 60
+        self.pace, self._paces = pace, dict[str, tuple[Pacing, float]]()
+        """By wearer, when frames are due and the time of one (s): those of several are sent side by side."""
         self._loop = asyncio.new_event_loop()
         self._server: Server | None = None
+        self._last_s = 0.0
+        """Our time (s) at which the last frame so far is due."""
         self._clients: set[ServerConnection] = set()
         self._about: dict[str, str] = {}
         self.slow = 0
@@ -92,7 +97,7 @@ class WebSocketSink(Sink):
         self._server = ready[0]
 
     def begin(self, wearer: str, skeleton: Skeleton, fps: float) -> None:
-        self._step_s = 1 / fps
+        self._paces[wearer] = Pacing(self.pace), 1 / fps
         offsets = [[round(each, 6) for each in row] for row in skeleton.t_parent_joint.tolist()]
         names, parents = list(skeleton.joint_names), list(skeleton.parents)
         about = {"wearer": wearer, "joints": names, "parents": parents, "offsets": offsets}
@@ -102,6 +107,8 @@ class WebSocketSink(Sink):
     def take(self, wearer: str, motion: Motion) -> None:
         wxyz = quat_wxyz_from_matrix(motion.R_parent_joint.double())
         contacts, objects = motion.contact_prob, objects_of(motion)
+        pacing, step_s = self._paces[wearer]
+        hurry = pacing.behind(len(motion), step_s)
         for k, time_s in enumerate(motion.timestamps.tolist()):
             frame = {
                 "wearer": wearer,
@@ -112,14 +119,20 @@ class WebSocketSink(Sink):
             }
             if objects[k]:
                 frame["objects"] = {name: _row(seen) for name, seen in objects[k].items()}
-            self._pacing.wait(self._step_s, self.waiting > 1)
-            self._loop.call_soon_threadsafe(self._broadcast, json.dumps(frame))
+            self._at(pacing.due(step_s, hurry), self._broadcast, json.dumps(frame))
+
+    def _at(self, due_s: float, call: Callable[..., None], *arguments: str) -> None:
+        """Call something on the server's loop at our time (s); the loop's clock is the same."""
+        self._last_s = max(self._last_s, due_s)
+        self._loop.call_soon_threadsafe(self._loop.call_at, due_s, call, *arguments)
 
     def end(self, wearer: str) -> None:
-        self._loop.call_soon_threadsafe(self._leave, wearer)
+        pacing, step_s = self._paces.pop(wearer, (Pacing(False), 0.0))
+        self._at(pacing.due(step_s, False), self._leave, wearer)
 
     def close(self) -> None:
         async def end(server: Server) -> None:
+            await asyncio.sleep(max(0.0, self._last_s - time.monotonic()))
             server.close()
             with suppress(TimeoutError):
                 await asyncio.wait_for(server.wait_closed(), CLOSE_S)
