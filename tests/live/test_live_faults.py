@@ -1,12 +1,18 @@
 """A live capture outlives what names, files, sources and clocks may bring; what is lost is counted and said."""
 
 import asyncio
+import contextlib
+import json
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from serving import free_port
 from test_live_capture import Broken, Kept, Scripted, heads, small_hmd2, swaying
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
 
 from wearcap.errors import WearcapError
 from wearcap.io.formats.motion_npz import read_motion
@@ -15,6 +21,7 @@ from wearcap.live.packets import MAX_POINTS_WAITING, Inbox, Packet
 from wearcap.live.setup import read_setup, write_setup
 from wearcap.live.sink import SinkThread
 from wearcap.live.sinks.files import FilesSink, join_sections
+from wearcap.live.sinks.websocket import WebSocketSink
 from wearcap.live.source import Address, Budget, Source
 from wearcap.live.sources.replay import ReplaySource
 from wearcap.recording import Motion
@@ -196,3 +203,26 @@ def test_a_source_has_messages_bytes_and_time(monkeypatch):
     for second, allowed in ((103.0, False), (104.0, True)):
         now[0] = second
         assert budget.allows(1) == allowed, second
+
+
+def test_frames_of_two_wearers_are_sent_side_by_side():
+    port, frames = free_port(), 60
+    sink = WebSocketSink(Address("ws", "127.0.0.1", port))
+    thread, motion, got = SinkThread(sink), swaying_motion(10, 0), []
+    thread.start()
+    with connect(sink.url) as client:
+        for name in ("anna", "ben"):
+            thread.begin(name, motion.skeleton, 60.0)
+        begin_s = time.monotonic()
+        for k in range(frames // 10):
+            for name in ("anna", "ben"):
+                thread.take(name, later(motion, k / 6))
+            time.sleep(max(0.0, begin_s + (k + 1) / 6 - time.monotonic()))
+        thread.close()
+        with contextlib.suppress(ConnectionClosed):
+            while True:
+                got.append(json.loads(client.recv(5.0)))
+    times = {name: [each["time"] for each in got if each.get("wearer") == name] for name in ("anna", "ben")}
+    assert all(len(each) == frames and each == sorted(each) for each in times.values())
+    names = [each["wearer"] for each in got if "time" in each]
+    assert names[:10].count("anna") < 9  # side by side, not all of one after all of the other
