@@ -51,7 +51,7 @@ from wearcap.cli.main import main
 main()
 """
 """The command with a clock that goes slower."""
-LOOK_S = 1.2
+LOOK_S = 0.6
 """Time (s) after which a step is pictured, so that its bar has begun."""
 
 

@@ -152,7 +152,7 @@ def test_devices_are_where_they_are_and_watches_at_their_wrists(page, show):
     motion, status = show.persons["anna"], show.status().wearers[0]
     np.testing.assert_allclose(head.position, status.devices[0].T_world_device.t.numpy(), atol=1e-5)
     np.testing.assert_allclose(watch.position, motion.joint("left_wrist").t[0].numpy(), atol=1e-5)
-    assert person.devices.known["watch-7"].label.text == "left wrist (watch-7)"
+    assert person.devices.known["watch-7"].label.text == "left wrist"
     page._panel.devices.value = False
     page.draw(1.2)
     assert not head.visible
@@ -163,7 +163,7 @@ def test_a_device_gets_its_joints_name_once_that_is_known(page):
     devices.see(page.server, (DeviceStatus("serial_4", 99.0, pose),), 1.0)
     assert devices.known["serial_4"].label.text == "serial 4"
     devices.see(page.server, (DeviceStatus("serial_4", 99.0, pose, joint="right_wrist"),), 1.1)
-    assert devices.known["serial_4"].label.text == "right wrist (serial_4)"
+    assert devices.known["serial_4"].label.text == "right wrist"
 
 
 def test_devices_are_as_late_as_the_body(page):

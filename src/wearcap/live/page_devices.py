@@ -31,18 +31,14 @@ class Device:
             node, axes_length=AXES_M, axes_radius=0.006, origin_radius=0.012, visible=False
         )
         self.label = server.scene.add_label(
-            f"{node}/name",
-            fitting(device.title),
-            anchor="bottom-left",
-            font_size_mode="scene",
-            font_scene_height=LABEL_M,
+            f"{node}/name", _plain(self.joint), anchor="bottom-left", font_size_mode="scene", font_scene_height=LABEL_M
         )
         self._path: deque[tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "4"]]] = deque(maxlen=KEPT)
 
     def see(self, device: DeviceStatus, now_s: float) -> None:
         """Keep where it is now; one without a pose is not shown."""
         if device.joint is not None and device.joint != self.joint:
-            self.joint, self.label.text = device.joint, fitting(device.title)
+            self.joint, self.label.text = device.joint, _plain(device.joint)
         pose = device.T_world_device
         if pose is None or not bool(pose.R.isfinite().all()):
             self._path.clear()
@@ -103,3 +99,8 @@ class Devices:
         delay_s = min(max(delay_s, 0.0), MAX_DELAY_S) if math.isfinite(delay_s) else 0.0
         for device in self.known.values():
             device.show(now_s - delay_s, visible, body)
+
+
+def _plain(name: str) -> str:
+    """A joint's or device's name as a label."""
+    return fitting(name).replace("_", " ")

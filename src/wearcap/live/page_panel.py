@@ -35,10 +35,10 @@ def number(value: float, digits: int = 0) -> str:
 
 
 def row(*cells: str, color: str = "") -> str:
-    """A row of a table: a name, and numbers to the right."""
+    """A row of a table: a name, broken anywhere if it is long, and numbers to the right."""
     style = f' style="color:{color}"' if color else ""
     others = "".join(f'<td style="text-align:right;padding-left:6px">{cell}</td>' for cell in cells[1:])
-    return f"<tr{style}><td>{cells[0]}</td>{others}</tr>"
+    return f'<tr{style}><td style="overflow-wrap:anywhere">{cells[0]}</td>{others}</tr>'
 
 
 def table(rows: Sequence[str]) -> str:
