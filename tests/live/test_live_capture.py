@@ -160,7 +160,7 @@ def test_a_wearer_who_leaves_and_comes_back_begins_anew(monkeypatch):
     monkeypatch.setattr(wearer_module, "AWAY_S", 0.4)
     sensed, kept = swaying(120), Kept()
     again = [(packet._replace(sent_s=packet.sent_s + 5.0), 0.0) for packet, _ in heads(sensed)]
-    script = [*heads(sensed, pause_at=119, pause_s=1.0), *again]
+    script = [*heads(sensed, pause_at=119, pause_s=5.0), *again]
     setup = ReplaySource(sensed, HMD2Session).setup
     now_s = time.monotonic()
     script = [

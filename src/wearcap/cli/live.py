@@ -134,8 +134,8 @@ def _tell(config: DictConfig, sources: list[Source], sinks: list[Sink], page: Li
 
 
 def _show(line: str, file: TextIO | None = None) -> None:
-    """Print a line as it is: names from the network are no markup."""
-    show(escape(line), file=file or sys.stderr)
+    """Print a line as it is: names from the network are no markup, and addresses are not broken."""
+    print(line, file=file or sys.stderr)
 
 
 def _summarize(report: dict[str, Any]) -> None:
