@@ -2,8 +2,9 @@
 
 import time
 
-HURRY = 0.9
-"""Share of a frame's time between frames while more of them wait than came at once."""
+HURRY, RECOVERY = 0.9, 0.97
+"""Share of a frame's time between frames: while more of them wait than came at once, and otherwise, so that one piece that
+came late does not make all later ones late."""
 
 
 class Pacing:
@@ -14,12 +15,12 @@ class Pacing:
         self._due_s = 0.0
 
     def due(self, step_s: float, waiting: bool) -> float:
-        """Our time (s, `time.monotonic`) at which the next frame is due, `step_s` after the last one; `waiting`: further
+        """Our time (s, `time.monotonic`) at which the next frame is due, some `step_s` after the last one; `waiting`: further
         pieces have come already."""
         now_s = time.monotonic()
         if not self.pace:
             return now_s
-        self._due_s = max(now_s, self._due_s + step_s * (HURRY if waiting else 1.0))
+        self._due_s = max(now_s, self._due_s + step_s * (HURRY if waiting else RECOVERY))
         return self._due_s
 
     def wait(self, step_s: float, waiting: bool) -> None:
