@@ -14,6 +14,7 @@ import argparse
 import asyncio
 import gc
 import json
+import math
 import os
 import random
 import struct
@@ -40,7 +41,7 @@ import test_sources_osc as osc  # noqa: E402
 import test_sources_watches as watches  # noqa: E402
 
 from wearcap.live.packets import Inbox, Packet  # noqa: E402
-from wearcap.live.source import DatagramSource  # noqa: E402
+from wearcap.live.source import Budget, DatagramSource  # noqa: E402
 from wearcap.live.sources import SOURCES, source_of  # noqa: E402
 from wearcap.live.sources.parts import MAX_NAME  # noqa: E402
 from wearcap.live.sources.posts import MAX_HEADER, _Connections  # noqa: E402
@@ -266,7 +267,7 @@ class Fed:
 
     async def _connect(self, data: bytes) -> None:
         """A connection of its own for the bytes."""
-        self._connections.budget._second = -1  # the rate limit is not what is tried here
+        self.source.budget = Budget(parse_s=math.inf)  # the rate limit is not what is tried here
         reader, writer = asyncio.StreamReader(MAX_HEADER), _Answers()
         reader.feed_data(data)
         reader.feed_eof()
