@@ -31,7 +31,7 @@ from wearcap.geometry.rotation import about_axis, matrix_from_quat_wxyz
 from wearcap.io.formats.bvh import read_bvh
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.live import wearer as wearer_module
-from wearcap.live.capture import LiveCapture, write_report
+from wearcap.live.capture import LiveCapture, report_text
 from wearcap.live.packets import HEAD, Inbox, Packet
 from wearcap.live.setup import Seat, Setup
 from wearcap.live.sink import Sink, SinkThread
@@ -445,10 +445,9 @@ def test_the_status_says_who_wears_a_watch_and_turns_it_to_the_heads_world():
     torch.testing.assert_close(unknown.T_world_device.R, torch.eye(3))
 
 
-def test_reports_are_json_also_without_poses(tmp_path: Path):
+def test_reports_are_json_also_without_poses():
     report = LiveCapture(small_hmd2(), [Scripted([])], []).run(5.0)
-    write_report(report, tmp_path / "report.json")
-    assert json.loads((tmp_path / "report.json").read_text())["wearers"] == {}
+    assert json.loads(report_text(report))["wearers"] == {}
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,8 @@ from rich.markup import escape
 
 from wearcap.cli.conf import compose, hydra_main, load_pipeline
 from wearcap.errors import WearcapError, nearest, require_choice
-from wearcap.live.capture import LiveCapture, write_report
+from wearcap.files import write_text
+from wearcap.live.capture import LiveCapture, report_text
 from wearcap.live.page import LivePage
 from wearcap.live.setup import Setup, read_setup
 from wearcap.live.sink import Sink
@@ -75,7 +76,7 @@ def run(config: DictConfig) -> dict[str, Any]:
     _tell(config, sources, sinks, page)
     with _stopped_by_signals(capture):
         report = capture.run(float("inf") if config.seconds is None else float(config.seconds))
-    write_report(report, Path(config.report))
+    write_text(config.report, report_text(report))
     _summarize(report)
     _show(f"report: {config.report}", sys.stdout)
     return report
@@ -119,7 +120,7 @@ def _sources(config: DictConfig, system: System, place: CaptureInput | None) -> 
 def _tell(config: DictConfig, sources: list[Source], sinks: list[Sink], page: LivePage | None) -> None:
     """Say what listens where, loudly where other machines can reach it."""
     for source in sources:
-        _show(f"from {source.url}: {source.convention}")
+        _show(f"from {source.url}: {source.convention}; {source.hz:g} Hz")
     for sink in sinks:
         _show(f"to {getattr(sink, 'url', sink.name)}: {sink.convention}")
     taking = [source.name for source in sources if not source.loopback]

@@ -4,14 +4,13 @@ python -m wearcap.live MODEL.onnx --source vmc://:39540 --to vmc://127.0.0.1:395
 """
 
 import argparse
-import json
 import math
 import sys
 from pathlib import Path
 
 from wearcap.errors import WearcapError
 from wearcap.export.files import load_exported
-from wearcap.live.capture import LiveCapture
+from wearcap.live.capture import LiveCapture, report_text
 from wearcap.live.sinks import sink_of
 from wearcap.live.sinks.files import FilesSink
 from wearcap.live.sources import source_of
@@ -56,7 +55,7 @@ def main(arguments: list[str]) -> None:
         recorder=FilesSink,
         record=options.record,
     )
-    print(json.dumps(capture.run(options.seconds), indent=1))
+    print(report_text(capture.run(options.seconds)), end="")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ import torch
 
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
-from wearcap.files import write_text
 from wearcap.geometry.rigid import Rigid
 from wearcap.live.first_minute import FirstMinute
 from wearcap.live.packets import HEAD, Inbox
@@ -135,6 +134,7 @@ class LiveCapture:
                 sink.close()
             for closing in self._closing:
                 closing.join()
+            gc.unfreeze()
         if self._failure is not None:
             raise self._failure
         return self.report()
@@ -391,7 +391,6 @@ def _failure_of(source: Source, error: Exception) -> WearcapError:
     return WearcapError(f"cannot start ({error})", f"source {source.name}", fix="Check its address.")
 
 
-def write_report(report: dict[str, Any], path: Path) -> None:
-    """Write a report as JSON; a quantile without poses is null."""
-    text = json.dumps(json.loads(json.dumps(report), parse_constant=lambda _: None), indent=1)
-    write_text(path, text + "\n")
+def report_text(report: dict[str, Any]) -> str:
+    """A report as JSON; a quantile without poses is null."""
+    return json.dumps(json.loads(json.dumps(report), parse_constant=lambda _: None), indent=1) + "\n"

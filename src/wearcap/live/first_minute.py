@@ -13,6 +13,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.live import wearing
 from wearcap.live.clock_offset import Aligned, aligned_by_turning, turned
+from wearcap.live.devices import MAX_DEVICES
 from wearcap.live.guided import ARMS, RAISE, SENTENCES, STAND, TURN, WALK, Step
 from wearcap.live.packets import HEAD
 from wearcap.live.setup import Seat, Setup, hand_seat, head_seat
@@ -38,8 +39,6 @@ RAISED_M, RAISED_UP = 0.35, -0.5
 """Rise (m) of a raised tracker, and component of a raised hand's direction along the vertical."""
 NO_CONTROLLER_DEG = 50.0
 """Angle between a hanging hand and a controller's nominal seat above which it is no controller that is held."""
-MAX_DEVICES = 32
-"""Most devices that are looked at."""
 
 
 class FirstMinute:
@@ -149,7 +148,7 @@ class FirstMinute:
         ):
             return
         if device not in self._seen:
-            if len(self._seen) >= MAX_DEVICES:
+            if device not in self.requires and len(self._seen) >= MAX_DEVICES:
                 return
             self._seen[device] = Seen(watch)
         self._seen[device].add(float(time_s), packets.owned(R), packets.owned(v))

@@ -12,7 +12,7 @@ from wearcap.live.page_panel import fitting
 from wearcap.live.status import DeviceStatus
 from wearcap.viewer.page_layers import BodyLayer
 
-MAX_DEVICES = 16
+MAX_SHOWN = 16
 """Most devices of one wearer that are shown."""
 AXES_M, LABEL_M = 0.13, 0.05
 """Length of the axes, and height of the names (m)."""
@@ -86,8 +86,8 @@ class Devices:
 
     def see(self, server: viser.ViserServer, devices: tuple[DeviceStatus, ...], now_s: float) -> None:
         """Take in where they are now; those that are gone are hidden."""
-        for device in devices[:MAX_DEVICES]:
-            if device.name not in self.known and len(self.known) < MAX_DEVICES:
+        for device in devices[:MAX_SHOWN]:
+            if device.name not in self.known and len(self.known) < MAX_SHOWN:
                 self.known[device.name] = Device(server, f"{self.node}/{len(self.known)}", device)
             if device.name in self.known:
                 self.known[device.name].see(device, now_s)

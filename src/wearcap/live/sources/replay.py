@@ -68,6 +68,10 @@ class ReplaySource(Source):
         return f"replay:{self.recording.name}"
 
     @property
+    def url(self) -> str:
+        return f"a replay of {self.recording.name}"
+
+    @property
     def setup(self) -> Setup | None:
         """What the recording says of its wearer; None where it does not know the body."""
         recording, skeleton = self.recording, skeleton_of(self.recording)
