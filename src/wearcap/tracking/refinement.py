@@ -207,47 +207,46 @@ def with_feet_moved(motion: Motion, offset: Float[Tensor, "time foot 3"]) -> Mot
     Knees bend forward, and a leg never becomes straighter than it can.
     """
     skeleton, T = motion.skeleton, motion.T_world_joint
+    hip, knee, ankle = (skeleton.indices(*(f"{side}_{joint}" for side in SIDES)) for joint in ("hip", "knee", "ankle"))
+    start, middle, end = (T.t[:, joints].double() for joints in (hip, knee, ankle))
+    goal = _within_reach(start, middle, end, end + offset.double())
+    # The thigh's x axis points forward: the farther a foot is moved, the more surely its knee bends that way.
+    forward, distance = T.R[:, hip, :, 0].double(), offset.norm(dim=-1, keepdim=True)
+    backward = ((torch.lerp(start, end, 0.5) - middle) * forward).sum(-1, keepdim=True).clamp_min(0)
+    bias = forward * (distance + backward * (distance / _SURELY_M).clamp_max(1))
     R = T.R.clone()
-    for foot, side in enumerate(SIDES):
-        hip, knee, ankle = skeleton.indices(*(f"{side}_{joint}" for joint in ("hip", "knee", "ankle")))
-        start, middle, end = (T.t[:, joint].double() for joint in (hip, knee, ankle))
-        goal = _within_reach(start, middle, end, end + offset[:, foot].double())
-        # The thigh's x axis points forward: the farther a foot is moved, the more surely its knee bends that way.
-        forward, distance = T.R[:, hip, :, 0].double(), offset[:, foot].norm(dim=-1, keepdim=True)
-        backward = ((torch.lerp(start, end, 0.5) - middle) * forward).sum(-1, keepdim=True).clamp_min(0)
-        bias = forward * (distance + backward * (distance / _SURELY_M).clamp_max(1))
-        upper, lower = (turn.to(R) for turn in reach(start, middle, end, goal, bias))
-        moved = (offset[:, foot] != 0).any(-1)[:, None, None]
-        R[:, hip] = torch.where(moved, upper @ R[:, hip], R[:, hip])
-        R[:, knee] = torch.where(moved, lower @ R[:, knee], R[:, knee])
+    upper, lower = (turn.to(R) for turn in reach(start, middle, end, goal, bias))
+    moved = (offset != 0).any(-1)[..., None, None]
+    R[:, hip] = torch.where(moved, upper @ R[:, hip], R[:, hip])
+    R[:, knee] = torch.where(moved, lower @ R[:, knee], R[:, knee])
     return replace(motion, R_parent_joint=local_rotations(skeleton, R))
 
 
 def _within_reach(
-    start: Float[Tensor, "time 3"],
-    middle: Float[Tensor, "time 3"],
-    end: Float[Tensor, "time 3"],
-    goal: Float[Tensor, "time 3"],
-) -> Float[Tensor, "time 3"]:
+    start: Float[Tensor, "*batch 3"],
+    middle: Float[Tensor, "*batch 3"],
+    end: Float[Tensor, "*batch 3"],
+    goal: Float[Tensor, "*batch 3"],
+) -> Float[Tensor, "*batch 3"]:
     """The goal, nearer to the hip where the leg would have to be stretched more than it is and more than softly."""
     length = (middle - start).norm(dim=-1) + (end - middle).norm(dim=-1)
     now, wanted = ((point - start).norm(dim=-1) / length for point in (end, goal))
     soft = _STRAIGHT + _SOFT * (1 - torch.exp(-(wanted - _STRAIGHT) / _SOFT))
     share = torch.where(wanted > _STRAIGHT, torch.maximum(torch.minimum(now, wanted), soft), wanted)
-    return start + (goal - start) * (share / wanted.clamp_min(1e-9))[:, None]
+    return start + (goal - start) * (share / wanted.clamp_min(1e-9))[..., None]
 
 
 def with_wrists_at(motion: Motion, T_world_wrist: Rigid) -> Motion:
     """The motion with both wrists turned as measured, and where they were measured or as near as the arms reach."""
     skeleton, T = motion.skeleton, motion.T_world_joint
+    sides = [wrist.partition("_")[0] for wrist in WRISTS]
+    shoulder, elbow = (skeleton.indices(*(f"{side}_{joint}" for side in sides)) for joint in ("shoulder", "elbow"))
+    wrist = skeleton.indices(*WRISTS)
+    points = (T.t[:, joints].double() for joints in (shoulder, elbow, wrist))
     R = T.R.clone()
-    for number, wrist_name in enumerate(WRISTS):
-        side = wrist_name.partition("_")[0]
-        shoulder, elbow, wrist = skeleton.indices(f"{side}_shoulder", f"{side}_elbow", wrist_name)
-        points = (T.t[:, joint].double() for joint in (shoulder, elbow, wrist))
-        upper, lower = (turn.to(R) for turn in reach(*points, T_world_wrist.t[:, number].double()))
-        R[:, shoulder], R[:, elbow] = upper @ R[:, shoulder], lower @ R[:, elbow]
-        R[:, wrist] = T_world_wrist.R[:, number]
+    upper, lower = (turn.to(R) for turn in reach(*points, T_world_wrist.t.double()))
+    R[:, shoulder], R[:, elbow] = upper @ R[:, shoulder], lower @ R[:, elbow]
+    R[:, wrist] = T_world_wrist.R
     return replace(motion, R_parent_joint=local_rotations(skeleton, R))
 
 
