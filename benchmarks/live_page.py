@@ -204,6 +204,8 @@ def drive(system: str, output: Path, actor: Actor, slow: float) -> dict[str, Any
         record(browser, actor, pictures, slow)
         ended = command.process.wait(STARTS_S)
         failed = len(browser.exceptions)
+    if not command.report.is_file():
+        raise SystemExit("".join(command.errors[-20:]) or f"wearcap live has ended with {ended} and no report")
     report, setup = json.loads(command.report.read_text()), read_setup(command.setup)
     (recording,) = folder.glob("recording_*/*/motion.npz")
     captured, about = read(recording.parent).motion, report["wearers"]["wearer"]

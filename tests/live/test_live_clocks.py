@@ -94,6 +94,7 @@ def test_samples_of_late_and_early_watches_reach_the_session_at_their_time(batch
     wearer, session = guided()
     off = errors_s(wearer, session, packets(PLAN, LATE_S, batch_s))
     assert wearer.stage == "live"
+    assert all(type(count) is int for count in (wearer.gaps, wearer.unknown, wearer.status().late))  # a report is JSON
     for device in DEVICES:
         assert len(off[device]) > 50
         assert off[device].abs().max() < 0.1, device

@@ -101,7 +101,7 @@ def offset_by_turning(head: Trajectory, watch: Trajectory, max_offset_s: float =
             f"head and watch turn alike at no offset of their clocks up to {max_offset_s:g} s (correlation {best:.2f})"
         )
         raise WearcapError(what, WHERE, f"{LEAST_LIKENESS} or more", FIX)
-    return head_s - watch_s + shift / RATE_HZ
+    return float(head_s - watch_s + shift / RATE_HZ)
 
 
 def turned(tracks: Mapping[str, Trajectory | None]) -> tuple[float, str]:

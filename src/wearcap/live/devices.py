@@ -47,7 +47,7 @@ class Device:
             self.hz = self.count / (packet.arrived_s - self.since_s)
             self.count, self.since_s = 0, packet.arrived_s
         self.clock, self.arrived_s = clock, packet.arrived_s
-        self.late += time_s <= self.newest_s and self.newest_s - time_s < 1.0
+        self.late += int(time_s <= self.newest_s and self.newest_s - time_s < 1.0)
         self.newest_s = time_s
         self.pose = _shown(packet.sample) or self.pose
 

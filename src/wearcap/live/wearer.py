@@ -140,7 +140,7 @@ class LiveWearer:
                 "The capture is slower than the packets come: end other programs, or give it more cores (threads=N)."
             )
         if self._leads(packet):
-            self.gaps += MAX_GAP_S < time_s - self._head_s < AWAY_S
+            self.gaps += int(MAX_GAP_S < time_s - self._head_s < AWAY_S)
             self._head_s = time_s
         if isinstance(sample, HeadSample) and sample.points_world is not None and len(sample.points_world):
             self._keep_points(sample.points_world)
