@@ -2,7 +2,7 @@
 
 import time
 
-HURRY, RECOVERY = 0.9, 0.97
+HURRY, RECOVERY = 0.8, 0.9
 """Share of a frame's time between frames: while more of them wait than came at once, and otherwise, so that one piece that
 came late does not make all later ones late."""
 
