@@ -90,7 +90,7 @@ def test_a_killed_training_goes_on_where_it_was(datasets, tmp_path, monkeypatch)
     def killed(trainer, module, *rest, **named):
         class Kill(lightning.Callback):
             def on_train_batch_end(self, trainer, *_):
-                if trainer.global_step == 3:
+                if trainer.global_step == 9:
                     raise KeyboardInterrupt("killed")
 
         trainer.callbacks.append(Kill())
