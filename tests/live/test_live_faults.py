@@ -1,4 +1,4 @@
-"""A live capture outlives what names, files, sources and clocks may bring; what is lost is counted and said."""
+"""A live capture outlives what names, files, sources and clocks may bring; what is lost is counted and reported."""
 
 import asyncio
 import contextlib

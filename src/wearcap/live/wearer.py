@@ -166,7 +166,7 @@ class LiveWearer:
             self._push(seated)
 
     def _choose(self, packet: Packet) -> None:
-        """Which object is active was said anew."""
+        """Take in a new choice of the active object."""
         self._active, self._taken, self._taken_before = packet, False, False
         if self.session is not None and self.clocks.leader is not None:
             self._activate(np.inf)

@@ -122,7 +122,7 @@ class ReplaySource(Source):
             yield every[k].item(), device, self._sample(device, index, points)
 
     def _objects(self, first_s: float) -> list[ActiveObject | ObjectSample]:
-        """The samples of objects; which object is active at the first time (s) of all devices is said then."""
+        """The samples of objects; the object that is active at the first time (s) of all devices is named then."""
         choices = [sample for sample in self.objects if isinstance(sample, ActiveObject)]
         active = next((sample for sample in reversed(choices) if sample.timestamp <= first_s + SAME_S), None)
         first = [] if active is None else [active._replace(timestamp=first_s)]
