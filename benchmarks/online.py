@@ -99,7 +99,7 @@ class Streamed:
 
     def fill(self) -> "Streamed":
         """Until windows are full, and what is compiled is."""
-        while self.number < self.session.system.model.net.window + 3 * self.stride:
+        while self.number < self.session.system.window + 3 * self.stride:
             self.step()
         self.seconds.clear()
         return self

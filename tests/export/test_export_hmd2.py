@@ -4,6 +4,7 @@ import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
@@ -136,6 +137,17 @@ def test_runner_equals_the_eager_pipeline(pipeline, recording, exports, format):
     torch.testing.assert_close(motion.t_world_root, eager.t_world_root, atol=1e-4, rtol=0)
     other = load_exported(exports[format][0])(recording, seed=6)
     assert (other.R_parent_joint - eager.R_parent_joint).abs().max() > 1e-2
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_runner_has_windows_as_short_as_the_exported_pipeline(pipeline, recording, tmp_path, format):
+    short = replace(pipeline, overlap=replace(pipeline.overlap, window=20))
+    files.write_exports(short.exports(), tmp_path / f"model.{format}", format)
+    loaded = load_exported(tmp_path / f"model.{format}")
+    assert loaded.window == 20
+    motion, eager = loaded(recording, seed=5), short(recording, seed=5)
+    torch.testing.assert_close(motion.R_parent_joint, eager.R_parent_joint, atol=1e-4, rtol=0)
+    assert (pipeline(recording, seed=5).R_parent_joint - eager.R_parent_joint).abs().max() > 1e-3
 
 
 def test_runner_restores_settings(pipeline, exports):

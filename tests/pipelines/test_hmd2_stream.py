@@ -153,6 +153,15 @@ def test_streaming_equals_the_capture_of_the_whole(pipeline, stride, frames, win
     assert_same(streamed, hmd2(recording, seed=3))
 
 
+def test_shorter_windows_stream_as_the_capture_of_the_whole_has_them(pipeline):
+    recording, hmd2 = surrounded(133), pipeline(window=40)
+    streamed = stream(HMD2Session(hmd2, [wearer(recording)], [3]), moments(recording))[0]
+    assert_same(streamed, hmd2(recording, seed=3))
+    rotations = streamed.R_parent_joint, pipeline()(recording, seed=3).R_parent_joint
+    torch.testing.assert_close(*(R[:40] for R in rotations), atol=rounding(40), rtol=0)
+    assert (rotations[0] - rotations[1])[60:].abs().max() > 1e-3, "less of the past is seen"
+
+
 def test_poses_wait_for_the_stride(pipeline):
     session = HMD2Session(pipeline(), [Wearer(xsens23())], [0])
     predicted = [pushed(session, [[moment]])[0] for moment in moments(surrounded(25))]

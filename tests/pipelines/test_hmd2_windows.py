@@ -71,6 +71,12 @@ def test_windows_do_not_look_further_ahead_than_they_share():
         pipeline(lookahead=21)(seeing_recording(80))
 
 
+def test_a_window_splits_into_tokens_and_is_no_longer_than_the_networks():
+    assert pipeline(window=400).window == 60
+    with pytest.raises(WearcapError, match="a window of 42 frames does not split into tokens of 4"):
+        pipeline(window=42)(seeing_recording(80))
+
+
 def test_strides_and_lookahead_follow_from_the_window():
     hmd2 = pipeline(inpaint=True, stride=None)
     assert (hmd2.advance, hmd2.lookahead_frames) == (45, 0)

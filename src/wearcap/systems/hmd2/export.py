@@ -60,8 +60,8 @@ def exports(pipeline: HMD2) -> Exports:
     net, features = model.net, model.features
     if isinstance(net, _ExportedDenoiser):
         raise WearcapError("a network that is exported already", expected="one of a checkpoint")
-    shape = 2, net.window
-    made = net.graphs()
+    shape = 2, pipeline.window
+    made = net.graphs(pipeline.window)
     valid, normalizer = made["step"].inputs["valid"], net.condition_encoder.normalizer
     noise = torch.randn(*shape, len(normalizer.scale), generator=random)
     inputs = {"head": normalizer.mean.cpu() + normalizer.scale.cpu() * noise, "valid": valid}
@@ -77,7 +77,7 @@ def exports(pipeline: HMD2) -> Exports:
     feet = ["left_foot.contact", "right_foot.contact"] if features.contacts else []
     settings = asdict(pipeline.sampling) | asdict(pipeline.overlap) | {"live": pipeline.live, "use": list(pipeline.use)}
     about = {
-        "window": net.window,
+        "window": pipeline.window,
         "fps": model.fps,
         "settings": {name: settings[name] for name in SETTINGS},
         "refinement": None if pipeline.refinement is None else asdict(pipeline.refinement),
@@ -130,8 +130,8 @@ class _ExportedDenoiser(MotionDenoiser):
             inputs |= {"image": conditions.image, "image_valid": conditions.image_valid}
         return self._runs[0]["conditions"](**inputs)
 
-    def graphs(self) -> dict[str, Graph]:
-        """The exported graphs themselves."""
+    def graphs(self, window: int | None = None) -> dict[str, Graph]:
+        """The exported graphs themselves, whose window is fixed."""
         return {"step": Graph(self._runs[0]["model"], {}), "plan": Graph(self._runs[0]["plan"], {})}
 
 

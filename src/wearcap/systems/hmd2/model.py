@@ -179,22 +179,23 @@ class MotionDenoiser(nn.Module):
         x0_hat = self.head(self.norm(token)).reshape(batch, time, -1)
         return x0_hat if self.blend is None else self.blend(x0_hat, valid)
 
-    def graphs(self) -> dict[str, Graph]:
-        """The parts of a denoising step as graphs.
+    def graphs(self, window: int | None = None) -> dict[str, Graph]:
+        """The parts of a denoising step as graphs, for windows of some frames; None: of those it was trained on.
 
         "step": x̂0 from x_t, plan (that all windows share), encoded, valid, and last with self-conditioning. "plan":
         columns from levels "batch 1".
         """
         random = torch.Generator().manual_seed(0)
-        tokens, width = self.window // self.frames_per_token, self.motion_encoder.linear.out_features
-        x_t, last = torch.randn(2, 2, self.window, self.motion_size, generator=random)
+        window = window or self.window
+        tokens, width = window // self.frames_per_token, self.motion_encoder.linear.out_features
+        x_t, last = torch.randn(2, 2, window, self.motion_size, generator=random)
         level = torch.rand(2, 1, generator=random)
         step = StepGraph(self, torch.zeros(1, 1, device=self.motion_normalizer.mean.device))
         inputs = {
             "x_t": x_t,
             "plan": 0.1 * torch.randn(1, 1, step.columns, generator=random),
             "encoded": torch.randn(2, tokens, width, generator=random),
-            "valid": torch.arange(self.window).expand(2, -1) < self.window - 3,
+            "valid": torch.arange(window).expand(2, -1) < window - 3,
         }
         inputs |= {"last": last} if self.self_conditioning else {}
         return {"step": Graph(step, inputs, shared=("plan",)), "plan": Graph(PlanGraph(self), {"level": level})}
@@ -204,15 +205,22 @@ class StepRunner:
     """x̂0 at a fixed sequence of levels, for any batch size. The network's weights must not change while it is used."""
 
     def __init__(
-        self, net: MotionDenoiser, levels: Float[Tensor, "step"], runtime: str = "eager", precision: str = "float32"
+        self,
+        net: MotionDenoiser,
+        levels: Float[Tensor, "step"],
+        runtime: str = "eager",
+        precision: str = "float32",
+        window: int | None = None,
     ):
-        """Raises WearcapError for a runtime or precision that is unknown, not installed, or that do not go together."""
+        """`window`: its frames, where they are not the network's own.
+
+        Raises WearcapError for a runtime or precision that is unknown, not installed, or that do not go together."""
         device = net.motion_normalizer.mean.device
         self.net, (self.runtime, precision) = net, chosen(runtime, precision, device)
         with torch.inference_mode():
             plan = run_of(net.graphs()["plan"])
             self._plans = [plan(level=level.reshape(1, 1)) for level in levels.to(device)]
-        self._step = run_of(net.graphs()["step"], self.runtime, precision)
+        self._step = run_of(net.graphs(window)["step"], self.runtime, precision)
 
     def __call__(
         self,

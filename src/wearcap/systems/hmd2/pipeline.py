@@ -75,6 +75,8 @@ class Overlap:
     """Whether steps overwrite the overlap with the last window's poses (thesis eq. 6.5) or re-denoise it (ours)."""
     fade: int = 20
     """Frames over which the difference between successive windows fades out after their seam (without `inpaint`)."""
+    window: int | None = None
+    """Most frames of a window (ours): a shorter past is computed sooner. None: as many as the network was trained on."""
 
 
 @dataclass
@@ -108,9 +110,20 @@ class HMD2(LearnedSystem):
             raise WearcapError(f"no modality {min(unknown)!r}", expected=f"some of {', '.join(MODALITIES)}")
 
     @property
+    def window(self) -> int:
+        """Frames of a full window. Raises WearcapError for a length that does not split into the network's tokens."""
+        most, net = self.overlap.window, self.model.net
+        if most is None:
+            return net.window
+        if most < 1 or most % net.frames_per_token:
+            what = f"a window of {most} frames does not split into tokens of {net.frames_per_token}"
+            raise WearcapError(what, expected=f"a multiple of {net.frames_per_token}")
+        return min(most, net.window)
+
+    @property
     def advance(self) -> int:
         """Frames by which windows advance. Raises WearcapError when successive windows would leave a gap."""
-        window, overlap = self.model.net.window, self.overlap
+        window, overlap = self.window, self.overlap
         advance = (3 * window // 4 if overlap.inpaint else window // 2) if overlap.stride is None else overlap.stride
         if not 0 < advance <= window:
             what = f"windows of {window} frames cannot advance by {advance}"
@@ -120,7 +133,7 @@ class HMD2(LearnedSystem):
     @property
     def lookahead_frames(self) -> int:
         """Frames at a window's end that the next one re-denoises. Raises WearcapError when the overlap is shorter."""
-        shared, lookahead_frames = self.model.net.window - self.advance, self.overlap.lookahead
+        shared, lookahead_frames = self.window - self.advance, self.overlap.lookahead
         if lookahead_frames is None:
             lookahead_frames = 0 if self.overlap.inpaint else shared // 2
         if not 0 <= lookahead_frames <= shared:
@@ -147,7 +160,7 @@ class HMD2(LearnedSystem):
         self.model.net.to(self.device).eval()
         if self._steps is None or self.runtime == "eager":
             levels = step_levels(self.sampling.steps, self.sampling.spacing)[:-1]
-            self._steps = StepRunner(self.model.net, levels, self.runtime, self.precision)
+            self._steps = StepRunner(self.model.net, levels, self.runtime, self.precision, self.window)
 
     def undisturbed(self) -> AbstractContextManager[None]:
         """A context for small batches, after `prepare`, in which other threads leave the cores to the steps."""

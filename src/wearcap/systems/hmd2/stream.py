@@ -147,7 +147,7 @@ class HMD2Session(Session):
     def settings(cls, system: HMD2) -> dict[str, Any]:
         net, sampling, overlap = system.model.net, system.sampling, system.overlap
         return {
-            "window": net.window,
+            "window": system.window,
             "stride": system.advance,
             "steps": sampling.steps,
             "fps": system.model.fps,

@@ -91,7 +91,7 @@ class WindowSampler:
     def join(self, fresh: Frames) -> None:
         """Append new frames to the window and drop the oldest beyond its length."""
         new = fresh.valid.shape[1]
-        first = max(0, self.count + new - self.pipeline.model.net.window)
+        first = max(0, self.count + new - self.pipeline.window)
         self.final = max(0, self.final - first)
         noise = torch.randn(1, new, *self.noise.shape[2:], generator=self._random)
         self.noise = torch.cat([self.noise[:, first:], noise], 1)
@@ -120,11 +120,11 @@ def advance(samplers: Sequence[WindowSampler], fresh: Sequence[Frames]) -> None:
     for sampler, new in zip(samplers, fresh):
         sampler.join(new)
     pipeline = samplers[0].pipeline
-    net, features, device = pipeline.model.net, pipeline.model.features, pipeline.device
-    frames = Frames(*_padded([sampler.frames for sampler in samplers], net.window))
-    predicted = Poses(*_padded([sampler.predicted for sampler in samplers], net.window))
-    noise, *_ = _padded([(sampler.noise,) for sampler in samplers], net.window)
-    number = torch.arange(net.window)
+    net, features, device, window = pipeline.model.net, pipeline.model.features, pipeline.device, pipeline.window
+    frames = Frames(*_padded([sampler.frames for sampler in samplers], window))
+    predicted = Poses(*_padded([sampler.predicted for sampler in samplers], window))
+    noise, *_ = _padded([(sampler.noise,) for sampler in samplers], window)
+    number = torch.arange(window)
     is_observed = number < torch.tensor([[sampler.final] for sampler in samplers])
     valid = frames.valid & (number < torch.tensor([[sampler.count] for sampler in samplers]))
     size = torch.stack([sampler.size for sampler in samplers])
