@@ -411,6 +411,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     simulated, real = (
         {row["method"]: row["scores"] for row in _rows(trees, name)} for name in ("simulated_camera", "cmu_surrounded")
     )
+    strangers = next((rows for title, rows in people["tables"].items() if title.startswith("People (hdm05)")), {})
     ours, online = simulated["full"], figure_of(speed, "hmd2_online_small_fps")
     sensing = ("full, ideal sensors", "full", "full, poor sensors")
     errors = [ranged(rows[name]["mpjpe_cm"] for name in sensing if name in rows) for rows in (simulated, real)]
@@ -418,19 +419,17 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     return Page(
         title="[HMD²](../hmd2.md): figures",
         headline=Grid(
-            "Whole recordings, anchored to the true head; means over repetitions, ± their deviation (cm).",
+            "Whole recordings, anchored to the true head; means over repetitions, ± their deviation (cm). Points and images are "
+            "of simulated surroundings; HDM05's person, of another laboratory, has none.",
             (
                 "",
-                "simulated: MPJPE",
-                "hands",
-                "lower body",
-                "FID",
-                "jitter, of the truth's",
-                "CMU: MPJPE",
-                "hands",
-                "lower body",
+                *(
+                    head
+                    for what, _, heads in _shown(real, strangers, simulated)
+                    for head in (f"{what}: {heads[0]}", *heads[1:])
+                ),
             ),
-            _first_lines(simulated, real),
+            _first_lines(real, strangers, simulated),
         ),
         held_out="People and places of the test split of simulated wearers, and four CMU subjects in simulated "
         "surroundings. Everything was chosen on the validation split.",
@@ -516,27 +515,41 @@ def _strangers_off(people: Tree) -> tuple[str, ...]:
     return (f"From the head alone, on whole splits of people without surroundings: {errors}.",) if errors else ()
 
 
-def _first_lines(simulated: dict[str, Tree], real: dict[str, Tree]) -> list[list[str]]:
-    """Lines of the page's first table, from scores by row of both data sets."""
-    metrics = (("mpjpe_cm", 2), ("hand_pe_cm", 2), ("lower_pe_cm", 2), ("fid", 2), ("jitter_ratio", 2))
-    shown = [
-        [
-            label,
-            *(
-                text(rows.get(name, {}).get(metric), digits)
-                for rows, chosen in ((simulated, metrics), (real, metrics[:3]))
-                for metric, digits in chosen
-            ),
-        ]
+def _shown(
+    real: dict[str, Tree], strangers: dict[str, Tree], simulated: dict[str, Tree]
+) -> tuple[tuple[str, dict[str, Tree], tuple[str, ...]], ...]:
+    """Data sets of the page's first table, their scores by row, and the columns of each."""
+    return (
+        ("CMU", real, ("MPJPE", "hands", "lower body", "jitter, of the truth's")),
+        ("HDM05, the head alone", strangers, ("MPJPE", "lower body")),
+        ("simulated", simulated, ("MPJPE", "hands", "lower body", "FID")),
+    )
+
+
+METRICS = {
+    "MPJPE": "mpjpe_cm",
+    "hands": "hand_pe_cm",
+    "lower body": "lower_pe_cm",
+    "FID": "fid",
+    "jitter, of the truth's": "jitter_ratio",
+}
+"""Columns of the page's first table."""
+
+
+def _first_lines(real: dict[str, Tree], strangers: dict[str, Tree], simulated: dict[str, Tree]) -> list[list[str]]:
+    """Lines of the page's first table, from scores by row of each data set."""
+    shown = _shown(real, strangers, simulated)
+    lines = [
+        [label, *(text(rows.get(name, {}).get(METRICS[head])) for _, rows, heads in shown for head in heads)]
         for name, label in HEADLINE.items()
-        if name in simulated or name in real
+        if any(name in rows for _, rows, _ in shown)
     ]
     paper = [
-        [f"the paper's {name}, on Nymeria", f"{row[0]:.2f}", f"{row[1]:.2f}", NONE, f"{row[2]:.2f}", *[NONE] * 4]
+        [f"the paper's {name}, on Nymeria", *[NONE] * 6, f"{row[0]:.2f}", f"{row[1]:.2f}", NONE, f"{row[2]:.2f}"]
         for name, row in PAPER.items()
         if name in ("EgoEgo", "HMD² (h = 180)")
     ]
-    return shown + paper
+    return lines + paper
 
 
 def _grids(trees: Trees) -> list[Grid]:
