@@ -130,16 +130,17 @@ class EchoTrack:
         if head is not None and len(head.timestamps) == len(motion):
             T_world_head = head.T_world_head[take]
             points.R_world_point[:, 0], points.t_world_point[:, 0] = T_world_head.R, T_world_head.t
-        surface = contact_points(anny_body(motion.skeleton, recording.shape or None))
         acts = true_acts(recording) if environment is not None and recording.object_motion else []
         names = list(dict.fromkeys(act.object for act in acts))
         objects = [reader(environment.by_name(name)) for name in names] if environment is not None else []
+        # The body's surface takes a quarter of a second, and is asked for where there is something to touch alone.
+        surface = contact_points(anny_body(motion.skeleton, recording.shape or None)) if objects else None
         active = active_at(acts, names, times)
         R, t = torch.eye(3).repeat(len(take), 1, 1), torch.zeros(len(take), 3)
         contact = torch.zeros(len(take), CONTACTS)
         for number, shape in enumerate(objects):
             rows = (active == number).nonzero()[:, 0]
-            if not len(rows) or environment is None:
+            if not len(rows) or environment is None or surface is None:
                 continue
             # The motion and an object's trajectory share their clock; an object without one stays where it was.
             track, still = recording.object_motion.get(names[number]), environment.by_name(names[number]).T_world_object
