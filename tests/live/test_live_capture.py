@@ -182,6 +182,35 @@ def test_two_wearers_have_their_own_clocks_and_motion():
     assert len(kept.motion("anna")) == 100
 
 
+def test_sinks_count_the_frames_that_they_really_send(tmp_path: Path):
+    """A sink of one wearer, one to which nobody is connected, one with a client, and files of a disk that fails once."""
+    motion = swaying_motion(30, 0)
+    with socket.socket(type=socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        vmc = VmcSink(Address("vmc", "127.0.0.1", receiver.getsockname()[1], {"wearer": "anna"}), pace=False)
+        heard, unheard = (WebSocketSink(Address("ws", "127.0.0.1", free_port()), pace=False) for _ in range(2))
+        files = FilesSink(tmp_path)
+        threads = [SinkThread(sink) for sink in (vmc, heard, unheard, files)]
+        for thread in threads:
+            thread.start()
+        with connect(heard.url) as client:
+            for name, pieces in (("anna", 4), ("ben", 6)):
+                for thread in threads:
+                    thread.begin(name, motion.skeleton, 60.0)
+                    for k in range(pieces):
+                        bad = thread.sink is files and name == "ben" and k == 2
+                        root = motion.t_world_root * (torch.nan if bad else 1.0)
+                        thread.take(name, replace(motion, timestamps=motion.timestamps + k / 2, t_world_root=root))
+            got = [json.loads(client.recv(10.0)) for _ in range(2 + 10 * 30)]
+        for thread in threads:
+            thread.close()
+    assert sum("time" in message for message in got) == heard.sent == 10 * 30
+    assert vmc.sent == 4 * 30
+    assert unheard.sent == 0
+    kept = sum(len(read_motion(tmp_path / name / "motion.npz")) for name in ("anna", "ben"))
+    assert files.sent == kept < 10 * 30
+
+
 class Broken(Sink):
     name, convention = "broken", ""
 
@@ -197,6 +226,7 @@ class Stalled(Sink):
 
     def take(self, wearer: str, motion: Motion) -> None:
         self.go.wait(20.0)
+        self.sent += len(motion)
 
 
 def test_a_broken_and_a_stalled_sink_delay_nobody():
@@ -217,7 +247,7 @@ def test_a_full_sink_drops_the_oldest_pieces_and_counts_them():
     assert thread.dropped >= 6
     stalled.go.set()
     thread.close()
-    assert thread.sent <= 4 * 5
+    assert 0 < stalled.sent <= 4 * 5
 
 
 def rebuilt(frame: dict[str, list[float]]) -> torch.Tensor:

@@ -267,7 +267,7 @@ class LiveCapture:
 
     def status(self) -> LiveStatus:
         sinks = tuple(
-            SinkStatus(each.sink.name, each.sent, each.dropped, each.failed, each.last_error)
+            SinkStatus(each.sink.name, each.sink.sent, each.dropped, each.failed, each.last_error)
             for each in self._all_sinks()
         )
         wearers = tuple(wearer.status() for wearer in list(self.wearers.values()))
@@ -368,7 +368,7 @@ class LiveCapture:
             }
         sinks = {
             each.sink.name: {
-                "sent": each.sent,
+                "sent": each.sink.sent,
                 "dropped": each.dropped,
                 "failed": each.failed,
                 "last_error": each.last_error,

@@ -81,7 +81,7 @@ class SinkStatus:
 
     name: str
     sent: int = 0
-    """Number of frames that it took."""
+    """Number of frames that have gone where it sends them: of the wearers that it sends, to whoever is connected."""
     dropped: int = 0
     """Number of pieces dropped because it was slow."""
     failed: int = 0

@@ -116,6 +116,7 @@ class VmcSink(Sink):
         assert self._socket is not None
         with suppress(BlockingIOError, ConnectionRefusedError):  # nobody listens yet, or the machine is busy
             self._socket.sendto(data, self._target)
+            self.sent += 1
 
 
 def bones_of(motion: Motion) -> tuple[Float[Tensor, "time bone 3"], Float[Tensor, "time bone 4"]]:

@@ -119,7 +119,7 @@ class WebSocketSink(Sink):
             }
             if objects[k]:
                 frame["objects"] = {name: _row(seen) for name, seen in objects[k].items()}
-            self._at(pacing.due(step_s, hurry), self._broadcast, json.dumps(frame))
+            self._at(pacing.due(step_s, hurry), self._send_frame, json.dumps(frame))
 
     def _at(self, due_s: float, call: Callable[..., None], *arguments: str) -> None:
         """Call something on the server's loop at our time (s); the loop's clock is the same."""
@@ -170,6 +170,10 @@ class WebSocketSink(Sink):
     def _leave(self, wearer: str) -> None:
         self._about.pop(wearer, None)
         self._broadcast(json.dumps({"left": wearer}))
+
+    def _send_frame(self, frame: str) -> None:
+        self._broadcast(frame)
+        self.sent += bool(self._clients)
 
     def _broadcast(self, text: str) -> None:
         for client in list(self._clients):
