@@ -17,12 +17,12 @@ import torch
 from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
 from pythonosc.osc_packet import OscPacket
-from serving import free_port
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 import wearcap
 from carried_box import carrying, drawn_echo
+from ports import free_port
 from small_hmd2 import hmd2_of
 from watched_walk import drawn_pipeline, watched_walk
 from wearcap.body.skeleton import xsens23

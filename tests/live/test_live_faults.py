@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from serving import free_port
 from test_live_capture import Broken, Kept, Scripted, heads, small_hmd2, swaying
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from ports import free_port
 from wearcap.errors import WearcapError
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.live.capture import LiveCapture
