@@ -84,6 +84,8 @@ class Source(ABC):
     """Nominal rate of each device's packets (Hz)."""
     convention: ClassVar[str]
     """Axes and units of what is received, as text for people."""
+    lossless: ClassVar[bool] = False
+    """Whether all that it delivers must be captured, however late the capture is."""
 
     def __init__(self, address: Address):
         """Listen at an address. Raises WearcapError for options that the source does not have."""

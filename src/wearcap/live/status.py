@@ -62,11 +62,12 @@ class WearerStatus:
     frames: int = 0
     """Number of poses so far."""
     dropped: int = 0
-    """Number of packets dropped because the capture was slow."""
+    """Number of the head's poses that its session dropped as late, doubled or refused, and of all packets that were left out
+    because the capture was behind."""
     late: int = 0
     """Number of packets that came too late to be used."""
     gaps: int = 0
-    """Number of gaps in the head's path."""
+    """Number of gaps in the head's path, those that a capture left while it caught up among them."""
     floor_m: float | None = None
     """Floor height (m) in the head's world."""
     points_world: Float[Tensor, "point 3"] | None = None

@@ -41,6 +41,9 @@ BEHIND_S = 2.0
 """Time for which packets may wait before the page says that the machine is too slow."""
 MAX_HELD = 2_000
 """Most samples of the head that wait for a late watch."""
+LEFT_OUT_S = 10.0
+"""Time for which a capture that catches up leaves out what was measured before: sockets hold back that of some seconds. What
+seems as old afterwards counts on a clock that was set back."""
 ARRIVAL = "arrival"
 """Clock of packets that state no time."""
 
@@ -88,7 +91,10 @@ class LiveWearer:
         self._points: Tensor | None = None
         self._dropped = 0
         """Packets that earlier sessions refused or dropped."""
-        self._last: Motion | None = None
+        self._frames_before = 0
+        """Frames of earlier sessions."""
+        self._caught_up_s = -np.inf
+        """Our time (s) from which on packets count again after the capture was behind."""
         self._active: Packet | None = None
         """The newest choice of the active object."""
         self._taken = self._taken_before = False
@@ -104,6 +110,9 @@ class LiveWearer:
             self.unknown += 1
         elif isinstance(packet.sample, ActiveObject):
             self._choose(packet)
+        elif self._is_left_out(packet):
+            self._dropped += 1
+            self._heard_s = time.monotonic()
         elif (time_s := self._time_of(packet)) is None:
             self.unknown += 1
         else:
@@ -129,6 +138,15 @@ class LiveWearer:
         time_s = self.clocks.on_leader(clock, sent_s, packet.device)
         device.see(packet, clock, time_s)
         return time_s
+
+    def _is_left_out(self, packet: Packet) -> bool:
+        """Whether a packet was measured before the capture caught up, by its clock as it stood before the stall."""
+        if packet.arrived_s - self._caught_up_s > LEFT_OUT_S:
+            return False
+        if packet.sent_s is None or packet.clock not in self.clocks:
+            return packet.arrived_s < self._caught_up_s
+        time_s = self.clocks.on_leader(packet.clock, packet.sent_s, packet.device)
+        return self.clocks.ours(time_s) < self._caught_up_s
 
     def _hear(self, packet: Packet, time_s: float) -> None:
         """Keep what the page and the report show of a packet, whatever becomes of it."""
@@ -234,6 +252,7 @@ class LiveWearer:
         wearer = Wearer(setup.skeleton, R_wrist_imu=mounts, floor_m=setup.floor_m, **placed)
         self.session, self.skeleton, self.stage = self.opener.session(wearer), setup.skeleton, "live"
         self._taken, self._taken_before = False, self._taken
+        self._frames_before = self.frames
         self.sessions, self.fps = self.sessions + 1, self.session.fps
 
     def _seated(self, device: str, sample: Any) -> Any:
@@ -290,6 +309,21 @@ class LiveWearer:
             self._dropped += self.session.dropped[0]
             self.session, self.stage = None, "away"
         return motions
+
+    def catch_up(self, now_s: float) -> list[Motion]:
+        """End the session, leave out what was measured before now (our time, s), and begin anew with what comes then.
+
+        Returns the last frames. A session that has given none goes on: its beginning may be what took so long.
+        """
+        if self.session is None or self.frames == self._frames_before:
+            return []
+        self._caught_up_s, self._head_s = now_s, -np.inf
+        self.gaps += 1
+        self.note(
+            "The capture was behind by seconds, or suspended: it left out what had come meanwhile, and began anew. "
+            "End other programs, or give it more cores (threads=N)."
+        )
+        return self.leave()
 
     def _final(self, ended: bool) -> Motion | None:
         assert self.session is not None
