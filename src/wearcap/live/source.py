@@ -14,7 +14,6 @@ from wearcap.errors import WearcapError
 from wearcap.live.packets import Inbox, Packet
 from wearcap.viewer.guard import LOOPBACK
 
-MAX_DATAGRAM = 65_536
 MAX_MESSAGES_PER_S, MAX_BYTES_PER_S, MAX_PARSE_S_PER_S = 5_000, 1 << 24, 0.2
 """Limits of one source in a second: messages, their bytes, and the time that understanding them takes; what comes beyond
 them is dropped and counted, so that no sender takes the time of the others."""
