@@ -11,6 +11,7 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -134,6 +135,7 @@ class Scripted(Source):
     """Delivers given packets, then ends."""
 
     scheme, port, hz, convention = "scripted", 0, 60.0, "ours"
+    lossless = True
 
     def __init__(self, packets):
         super().__init__(Address("scripted", "127.0.0.1", 0))
@@ -503,6 +505,21 @@ def test_a_port_that_is_taken_ends_the_capture_with_its_reason():
         source = source_of(f"vmc://127.0.0.1:{taken.getsockname()[1]}")
         with pytest.raises(WearcapError, match="cannot listen"):
             LiveCapture(small_hmd2(), [source], []).run(10.0)
+
+
+def test_a_replay_of_an_export_has_wrists_and_no_controllers_also_with_a_height(tmp_path: Path, monkeypatch):
+    from wearcap.live import __main__ as command
+    from wearcap.recording.store import save_recording
+
+    given: dict = {}
+    monkeypatch.setattr(command, "load_exported", lambda _: drawn_echo())
+    ran = SimpleNamespace(run=lambda _: {})
+    monkeypatch.setattr(command, "LiveCapture", lambda *_, **settings: given.update(settings) or ran)
+    save_recording(carried(), tmp_path / "in.safetensors")
+    command.main(["model.onnx", "--recording", str(tmp_path / "in.safetensors"), "--height", "1.8"])
+    assert (given["hands"], given["setup"]) == ("joint", None)
+    command.main(["model.onnx", "--source", "vmc://:39540"])
+    assert given["hands"] == "grip"
 
 
 @pytest.mark.slow
