@@ -75,11 +75,14 @@ class SinkThread:
         self._put(False, lambda: self.sink.end(wearer))
 
     def close(self, seconds: float = 10.0) -> None:
-        """Let the sink take what waits for it, for at most so many seconds, and close it."""
+        """Let the sink take what waits for it, for at most so many seconds, and close it; the rest counts as dropped."""
         with self._ready:
             self._closing = True
             self._ready.notify()
         self._thread.join(seconds)
+        with self._ready:
+            self.dropped += sum(droppable for droppable, _ in self._calls)
+            self._calls.clear()
 
     def _put(self, droppable: bool, call: Callable[[], None]) -> None:
         with self._ready:

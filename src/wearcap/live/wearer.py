@@ -1,7 +1,7 @@
 """One wearer of a live capture: clocks, first minute, session, and the counts that the page and the report show."""
 
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -90,7 +90,9 @@ class LiveWearer:
         self._head_s = -np.inf
         self._points: Tensor | None = None
         self._dropped = 0
-        """Packets that earlier sessions refused or dropped."""
+        """Head poses that earlier sessions dropped, and packets that were left out."""
+        self._refused: Counter[str] = Counter()
+        """Samples that earlier sessions refused, by reason."""
         self._frames_before = 0
         """Frames of earlier sessions."""
         self._caught_up_s = -np.inf
@@ -302,13 +304,18 @@ class LiveWearer:
         motions = []
         if self.session is not None:
             self._release(np.inf)
-        self._held.clear()
         while self.session is not None and (found := self._final(ended=True)) is not None:
             motions.append(found)
+        self._close()
+        return motions
+
+    def _close(self) -> None:
+        """Keep the counts of the session, which ends; what waits for a late watch is forgotten."""
+        self._held.clear()
         if self.session is not None:
             self._dropped += self.session.dropped[0]
+            self._refused.update(self.session.refused[0])
             self.session, self.stage = None, "away"
-        return motions
 
     def catch_up(self, now_s: float) -> list[Motion]:
         """End the session, leave out what was measured before now (our time, s), and begin anew with what comes then.
@@ -331,7 +338,7 @@ class LiveWearer:
             found = self.session.poses(ended)[0]
         except WearcapError as error:  # a suit that was never localised
             self.note(str(error))
-            self.session, self.stage = None, "away"
+            self._close()
             return None
         if found is not None:
             self.frames += len(found)
@@ -372,8 +379,8 @@ class LiveWearer:
 
     @property
     def refused(self) -> dict[str, int]:
-        """Samples that the session refused, by reason."""
-        return {} if self.session is None else self.session.refused[0]
+        """Samples that the sessions refused, by reason."""
+        return dict(self._refused + Counter({} if self.session is None else self.session.refused[0]))
 
     def _keep_points(self, points: Tensor) -> None:
         kept = points if self._points is None else torch.cat([self._points, points])

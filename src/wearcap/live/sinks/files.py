@@ -5,7 +5,7 @@ written once and atomically. At the end, and by `join_sections` after a kill, th
 that cannot be written is lost with its half second, and nothing else.
 """
 
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from itertools import count
 from pathlib import Path
 
@@ -52,13 +52,16 @@ class FilesSink(Sink):
     def end(self, wearer: str) -> None:
         if wearer in self._tracks:
             track = self._tracks.pop(wearer)
-            self.sent += track.flush()
-            if motion_files(track.folder):
-                join_sections(track.folder)
+            try:
+                self.sent += track.flush()
+            finally:
+                if motion_files(track.folder):
+                    join_sections(track.folder)
 
     def close(self) -> None:
-        for wearer in list(self._tracks):
-            self.end(wearer)
+        with ExitStack() as ends:  # of all wearers, also where the files of one cannot be written
+            for wearer in list(self._tracks):
+                ends.callback(self.end, wearer)
 
 
 class _Track:

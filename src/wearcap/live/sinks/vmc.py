@@ -84,7 +84,7 @@ class VmcSink(Sink):
                 0
             ]
             self._socket = socket.socket(family, kind)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # the latter of a host's name
             raise WearcapError(f"cannot send to this address ({error})", where, "vmc://HOST:PORT") from error
         self._socket.setblocking(False)
         self._target = target
