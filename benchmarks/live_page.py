@@ -33,6 +33,7 @@ from acted_wearer import ACTS, STAND, Actor, Sender, act_of
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[1] / "tests")]
 
+from ports import free_port  # noqa: E402
 from wearcap.body.skeleton import WRISTS  # noqa: E402
 from wearcap.geometry import rotation  # noqa: E402
 from wearcap.live.setup import Setup, read_setup  # noqa: E402
@@ -67,7 +68,7 @@ class Command:
             sources = [f"json://127.0.0.1:{ports[0]}", *(f"watch://127.0.0.1:{port}" for port in ports[1:])]
         program = ["-m", "wearcap.cli.main"] if slow == 1 else ["-c", SLOWED, str(slow)]
         command = [sys.executable, *program, "live", f"system={system}", f"source=[{','.join(sources)}]"]
-        command += ["view=true", "guided=true", f"port={free_port(socket.SOCK_STREAM)}", f"setup={self.setup}"]
+        command += ["view=true", "guided=true", f"port={free_port()}", f"setup={self.setup}"]
         command += [f"report={self.report}", f"hydra.run.dir={folder}", f"paths.run={folder}"]
         # One line each: messages that are not for a terminal are wrapped at 80 columns otherwise.
         self.process = subprocess.Popen(
@@ -89,12 +90,6 @@ class Command:
             with suppress(subprocess.TimeoutExpired):
                 self.process.wait(60)
             self.process.kill()
-
-
-def free_port(kind: socket.SocketKind) -> int:
-    with socket.socket(type=kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 @contextmanager

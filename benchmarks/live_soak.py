@@ -31,11 +31,14 @@ import psutil
 from pythonosc.osc_packet import OscPacket
 from websockets.sync.client import connect
 
-from wearcap.cli.conf import compose, load_pipeline
-from wearcap.geometry.rotation import quat_wxyz_from_matrix
-from wearcap.live.sources.replay import ReplaySource
-from wearcap.reading import read
-from wearcap.sensors.samples import HeadSample, WatchSample, WristSample
+sys.path[:0] = [str(Path(__file__).resolve().parents[1] / "tests")]
+
+from ports import free_port, listens  # noqa: E402
+from wearcap.cli.conf import compose, load_pipeline  # noqa: E402
+from wearcap.geometry.rotation import quat_wxyz_from_matrix  # noqa: E402
+from wearcap.live.sources.replay import ReplaySource  # noqa: E402
+from wearcap.reading import read  # noqa: E402
+from wearcap.sensors.samples import HeadSample, WatchSample, WristSample  # noqa: E402
 
 SYSTEMS = ("hmd2", "mocap_every", "echo")
 LOSS, JITTER_S, OVERTAKES, OVERTAKEN_S = 0.05, 0.02, 0.01, 0.03
@@ -144,7 +147,7 @@ def stalled_client(port: int) -> None:
 
 def soak(system: str, minutes: float, rough: bool, where: str, threads: int | None = None) -> dict[str, Any]:
     """Run one system; the row that is printed."""
-    port, ws_port = _free(socket.SOCK_DGRAM), _free(socket.SOCK_STREAM)
+    port, ws_port = free_port(socket.SOCK_DGRAM), free_port()
     sender = Sender(system, where, port, 60 * minutes, rough)
     receiver = Receiver(sender, rough)
     assert sender.setup is not None
@@ -165,7 +168,7 @@ def soak(system: str, minutes: float, rough: bool, where: str, threads: int | No
         errors: list[str] = []
         threading.Thread(target=lambda: errors.extend(process.stderr or []), daemon=True).start()
         watched, memory = psutil.Process(process.pid), []
-        while not _listens(port) and process.poll() is None:
+        while not listens(port, socket.SOCK_DGRAM) and process.poll() is None:
             time.sleep(0.5)
         time.sleep(3.0)
         if rough:
@@ -224,22 +227,6 @@ def row_of(
     latest = max(row["p95_beyond_ms"], row["received_p95_beyond_ms"])
     row["sound"] = bool(memory[-1][1] - early <= GROWTH_MIB and not lost and latest <= BEYOND_MS)
     return row
-
-
-def _listens(port: int) -> bool:
-    """Whether a UDP port is taken."""
-    with socket.socket(type=socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind(("127.0.0.1", port))
-        except OSError:
-            return True
-    return False
-
-
-def _free(kind: socket.SocketKind) -> int:
-    with socket.socket(type=kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def main() -> None:

@@ -1,18 +1,11 @@
 """Sources that run in a thread while a test sends to them."""
 
 import asyncio
-import socket
 import threading
 import time
 
 from wearcap.live.packets import Inbox
 from wearcap.live.sources import source_of
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    with socket.socket(type=kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 class Served:

@@ -11,18 +11,19 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
 from pythonosc.osc_packet import OscPacket
-from serving import free_port
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 import wearcap
 from carried_box import carrying, drawn_echo
+from ports import free_port
 from small_hmd2 import hmd2_of
 from watched_walk import drawn_pipeline, watched_walk
 from wearcap.body.skeleton import xsens23
@@ -134,6 +135,7 @@ class Scripted(Source):
     """Delivers given packets, then ends."""
 
     scheme, port, hz, convention = "scripted", 0, 60.0, "ours"
+    lossless = True
 
     def __init__(self, packets):
         super().__init__(Address("scripted", "127.0.0.1", 0))
@@ -182,6 +184,35 @@ def test_two_wearers_have_their_own_clocks_and_motion():
     assert len(kept.motion("anna")) == 100
 
 
+def test_sinks_count_the_frames_that_they_really_send(tmp_path: Path):
+    """A sink of one wearer, one to which nobody is connected, one with a client, and files of a disk that fails once."""
+    motion = swaying_motion(30, 0)
+    with socket.socket(type=socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        vmc = VmcSink(Address("vmc", "127.0.0.1", receiver.getsockname()[1], {"wearer": "anna"}), pace=False)
+        heard, unheard = (WebSocketSink(Address("ws", "127.0.0.1", free_port()), pace=False) for _ in range(2))
+        files = FilesSink(tmp_path)
+        threads = [SinkThread(sink) for sink in (vmc, heard, unheard, files)]
+        for thread in threads:
+            thread.start()
+        with connect(heard.url) as client:
+            for name, pieces in (("anna", 4), ("ben", 6)):
+                for thread in threads:
+                    thread.begin(name, motion.skeleton, 60.0)
+                    for k in range(pieces):
+                        bad = thread.sink is files and name == "ben" and k == 2
+                        root = motion.t_world_root * (torch.nan if bad else 1.0)
+                        thread.take(name, replace(motion, timestamps=motion.timestamps + k / 2, t_world_root=root))
+            got = [json.loads(client.recv(10.0)) for _ in range(2 + 10 * 30)]
+        for thread in threads:
+            thread.close()
+    assert sum("time" in message for message in got) == heard.sent == 10 * 30
+    assert vmc.sent == 4 * 30
+    assert unheard.sent == 0
+    kept = sum(len(read_motion(tmp_path / name / "motion.npz")) for name in ("anna", "ben"))
+    assert files.sent == kept < 10 * 30
+
+
 class Broken(Sink):
     name, convention = "broken", ""
 
@@ -197,6 +228,7 @@ class Stalled(Sink):
 
     def take(self, wearer: str, motion: Motion) -> None:
         self.go.wait(20.0)
+        self.sent += len(motion)
 
 
 def test_a_broken_and_a_stalled_sink_delay_nobody():
@@ -217,7 +249,7 @@ def test_a_full_sink_drops_the_oldest_pieces_and_counts_them():
     assert thread.dropped >= 6
     stalled.go.set()
     thread.close()
-    assert thread.sent <= 4 * 5
+    assert 0 < stalled.sent <= 4 * 5
 
 
 def rebuilt(frame: dict[str, list[float]]) -> torch.Tensor:
@@ -473,6 +505,21 @@ def test_a_port_that_is_taken_ends_the_capture_with_its_reason():
         source = source_of(f"vmc://127.0.0.1:{taken.getsockname()[1]}")
         with pytest.raises(WearcapError, match="cannot listen"):
             LiveCapture(small_hmd2(), [source], []).run(10.0)
+
+
+def test_a_replay_of_an_export_has_wrists_and_no_controllers_also_with_a_height(tmp_path: Path, monkeypatch):
+    from wearcap.live import __main__ as command
+    from wearcap.recording.store import save_recording
+
+    given: dict = {}
+    monkeypatch.setattr(command, "load_exported", lambda _: drawn_echo())
+    ran = SimpleNamespace(run=lambda _: {})
+    monkeypatch.setattr(command, "LiveCapture", lambda *_, **settings: given.update(settings) or ran)
+    save_recording(carried(), tmp_path / "in.safetensors")
+    command.main(["model.onnx", "--recording", str(tmp_path / "in.safetensors"), "--height", "1.8"])
+    assert (given["hands"], given["setup"]) == ("joint", None)
+    command.main(["model.onnx", "--source", "vmc://:39540"])
+    assert given["hands"] == "grip"
 
 
 @pytest.mark.slow

@@ -3,23 +3,26 @@
 import asyncio
 import contextlib
 import json
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from serving import free_port
-from test_live_capture import Broken, Kept, Scripted, heads, small_hmd2, swaying
+from test_live_capture import Broken, Kept, Scripted, Stalled, heads, small_hmd2, swaying
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from ports import free_port
 from wearcap.errors import WearcapError
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.live.capture import LiveCapture
+from wearcap.live.devices import Devices
 from wearcap.live.packets import MAX_POINTS_WAITING, Inbox, Packet
 from wearcap.live.setup import read_setup, write_setup
 from wearcap.live.sink import SinkThread
+from wearcap.live.sinks import sink_of
 from wearcap.live.sinks.files import FilesSink, join_sections
 from wearcap.live.sinks.websocket import WebSocketSink
 from wearcap.live.source import Address, Budget, Source
@@ -134,6 +137,64 @@ def test_a_recorder_that_fails_is_in_the_report(tmp_path: Path):
     assert sinks["broken"]["last_error"] == "the cable was pulled"
 
 
+def test_a_file_that_cannot_be_written_at_the_end_costs_its_own_frames_alone(tmp_path: Path):
+    sink, motion = FilesSink(tmp_path), swaying_motion(20, 0)
+    sink.open()
+    for name in ("anna", "ben"):
+        for k in range(3):  # the last one fills no section before the end
+            bad = replace(motion, t_world_root=motion.t_world_root * torch.nan) if k == 2 else motion
+            sink.take(name, later(bad, k / 3))
+    with pytest.raises(WearcapError, match="finite"):
+        sink.close()
+    assert [len(read_motion(tmp_path / name / "motion.npz")) for name in ("anna", "ben")] == [40, 40]
+
+
+def test_what_a_stalled_sink_never_took_is_counted():
+    stalled = Stalled()
+    thread = SinkThread(stalled)
+    thread.start()
+    for _ in range(5):
+        thread.take("", swaying_motion(5, 0))
+    thread.close(0.2)
+    stalled.go.set()
+    thread.close()
+    assert stalled.sent + 5 * thread.dropped == 5 * 5
+
+
+@pytest.mark.parametrize("scheme", ["vmc", "ws"])
+def test_a_host_without_a_possible_name_is_refused(scheme):
+    sink = sink_of(f"{scheme}://a..b:9102", "127.0.0.1", True)
+    with pytest.raises(WearcapError, match=r"a\.\.b"):
+        sink.open()
+
+
+def test_what_sessions_refused_and_dropped_is_in_the_report_at_the_end(monkeypatch):
+    """Of a wearer who has left and come back, both sessions' counts."""
+    monkeypatch.setattr("wearcap.live.wearer.AWAY_S", 0.4)
+    sensed = swaying(60)
+    script = [(packet._replace(arrived_s=0.0), pause_s) for packet, pause_s in heads(sensed, "", 59, 2.0)]
+    bad = script[30][0].sample.T_world_device
+    for k in (20, 30):
+        packet = script[k][0]
+        wrong = replace(bad, t=bad.t * torch.nan)
+        script[k] = packet._replace(sample=packet.sample._replace(T_world_device=wrong)), 0.0
+    again = [(packet._replace(sent_s=packet.sent_s + 9.0), 0.0) for packet, _ in script]
+    setup = ReplaySource(sensed, HMD2Session).setup
+    about = LiveCapture(small_hmd2(), [Scripted(script + again)], [], setup=setup).run(60.0)["wearers"]["wearer"]
+    assert about["sessions"] == 2
+    assert about["refused"] == {"head: not finite": 4}
+    assert about["dropped"] == 4
+
+
+def test_packets_behind_the_newest_are_late_also_one_after_another():
+    devices, pose = Devices(("head",)), swaying(2).head.T_world_device[0]
+    device = devices.admit("head")
+    assert device is not None
+    for time_s in (1.0, 1.3, 1.1, 1.2, 1.4, 0.1, 0.2):  # at last the clock is set back
+        device.see(Packet("", "head", "", time_s, time_s, HeadSample(time_s, pose)), "", time_s)
+    assert devices.late == 2
+
+
 class Failing(Source):
     """Fails in its second run, or before its first."""
 
@@ -205,6 +266,22 @@ def test_a_source_has_messages_bytes_and_time(monkeypatch):
         assert budget.allows(1) == allowed, second
 
 
+def test_the_last_frames_are_sent_before_a_capture_has_ended():
+    """At their own rate, which takes longer than the capture needs."""
+    sink, motion = WebSocketSink(Address("ws", "127.0.0.1", free_port())), swaying_motion(60, 0)
+    thread = SinkThread(sink)
+    thread.start()
+    with connect(sink.url) as client:
+        thread.begin("", motion.skeleton, 60.0)
+        thread.take("", motion)
+        assert "skeleton" in json.loads(client.recv(10.0))
+        reading = threading.Thread(target=lambda: [*client])
+        reading.start()
+        thread.close()
+        assert sink.sent == 60
+        reading.join(10.0)
+
+
 def test_frames_of_two_wearers_are_sent_side_by_side():
     port, frames = free_port(), 60
     sink = WebSocketSink(Address("ws", "127.0.0.1", port))
@@ -218,10 +295,12 @@ def test_frames_of_two_wearers_are_sent_side_by_side():
             for name in ("anna", "ben"):
                 thread.take(name, later(motion, k / 6))
             time.sleep(max(0.0, begin_s + (k + 1) / 6 - time.monotonic()))
-        thread.close()
+        closing = threading.Thread(target=thread.close)
+        closing.start()
         with contextlib.suppress(ConnectionClosed):
             while True:
                 got.append(json.loads(client.recv(5.0)))
+        closing.join()
     times = {name: [each["time"] for each in got if each.get("wearer") == name] for name in ("anna", "ben")}
     assert all(len(each) == frames and each == sorted(each) for each in times.values())
     names = [each["wearer"] for each in got if "time" in each]

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 import torch
 from pythonosc.osc_packet import OscPacket
-from serving import free_port
 from test_live_capture import UNITY, Kept
 from websockets.sync.client import connect
 
 from carried_box import boxes, carrying, drawn_echo
+from ports import free_port, listens
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
@@ -136,7 +136,7 @@ def sent_over_udp(place: CaptureInput, *sinks: Sink) -> tuple[Motion, dict]:
     thread.start()
     sound = [each for each in messages(place.recording) if "device" in each]
     with socket.socket(type=socket.SOCK_DGRAM) as sender:
-        wait_for(lambda: listens(port))
+        wait_for(lambda: listens(port, socket.SOCK_DGRAM))
         for message in messages(place.recording):
             sender.sendto(json.dumps(message).encode(), ("127.0.0.1", port))
         head = [each for each in sound if each["device"] == "head"]
@@ -144,15 +144,6 @@ def sent_over_udp(place: CaptureInput, *sinks: Sink) -> tuple[Motion, dict]:
     capture.stop()
     thread.join(120.0)
     return kept.motion(), reports[0]
-
-
-def listens(port: int) -> bool:
-    with socket.socket(type=socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind(("127.0.0.1", port))
-        except OSError:
-            return True
-    return False
 
 
 def wait_for(wanted: Callable[[], bool], seconds: float = 120.0) -> None:
@@ -168,7 +159,7 @@ def test_an_adapter_names_the_active_object_and_sinks_send_it(tmp_path: Path):
     frames: list[dict] = []
 
     def read() -> None:
-        wait_for(lambda: listens_tcp(port))
+        wait_for(lambda: listens(port))
         with connect(served.url) as client:
             for text in client:
                 frames.append(json.loads(text))
@@ -213,11 +204,6 @@ def test_an_adapter_names_the_active_object_and_sinks_send_it(tmp_path: Path):
             np.testing.assert_allclose(row["position"], box.t_world_body[k - 6], atol=1e-4)
             assert abs(np.dot(row["rotation_wxyz"], wxyz)) == pytest.approx(1.0, abs=1e-4)
             assert row["contact"] == pytest.approx(motion.body_contact_prob[k].max().item(), abs=1e-3)
-
-
-def listens_tcp(port: int) -> bool:
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
 def test_touch_is_of_the_only_object_of_a_frame():

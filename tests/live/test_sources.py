@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from serving import Served, free_port
+from serving import Served
 
+from ports import free_port
 from wearcap.live.packets import Packet
 from wearcap.live.source import DatagramSource
 from wearcap.live.sources import SOURCES, source_of

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import websockets.sync.client
 from scipy.spatial.transform import Rotation
-from serving import Served, free_port
+from serving import Served
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from ports import free_port
 from wearcap.errors import WearcapError
 from wearcap.live.packets import Packet
 from wearcap.live.sources import SOURCES, source_of

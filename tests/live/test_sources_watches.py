@@ -10,8 +10,9 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from serving import Served, free_port
+from serving import Served
 
+from ports import free_port
 from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.io.devices.watch_log import read_watch_log

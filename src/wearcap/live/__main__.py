@@ -52,6 +52,7 @@ def main(arguments: list[str]) -> None:
         source=place,
         setup=setup,
         height_m=options.height,
+        hands="grip" if place is None else "joint",  # a recording has the wrists themselves
         recorder=FilesSink,
         record=options.record,
     )

@@ -3,6 +3,7 @@
 import asyncio
 import gc
 import json
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -34,6 +35,10 @@ FORGOTTEN_S = 60.0
 """Time without packets after which a wearer who is not captured makes room for another."""
 WAIT_S = 0.02
 """Longest time without a look at who has left and what the page wishes."""
+CATCH_UP_S = 5.0
+"""Time without a look at what has come, as of a slow engine or a suspended process, after which that is left out: as long as
+that without packets after which a wearer has left (`wearer.AWAY_S`). Nobody who watches needs poses that are so late, and
+computing them would make the next ones late, too. What a machine takes now and then, it makes up for within seconds."""
 WARM_UP_S = 2.0
 """Length of what the network is run on before the first packet."""
 JOIN_S = 600.0
@@ -99,6 +104,8 @@ class LiveCapture:
         self._wishes: list[Callable[[], None]] = []
         self._stopping = threading.Event()
         self._began_s = time.monotonic()
+        self._looked_s = math.inf
+        """Our time (s) of the last look at what has come."""
         self._failure: WearcapError | None = None
         self._sources_done = threading.Event()
 
@@ -168,7 +175,9 @@ class LiveCapture:
     def _step(self) -> None:
         """One turn: wishes, packets, poses."""
         self._fulfil()
-        for packet in self.inbox.wait(WAIT_S):
+        packets = self.inbox.wait(WAIT_S)
+        self._catch_up()
+        for packet in packets:
             wearer = self.wearers.get(packet.wearer) or self._welcome(packet.wearer)
             if wearer is None:
                 self.inbox.refuse("capture", f"more than {MAX_WEARERS} wearers")
@@ -181,8 +190,23 @@ class LiveCapture:
         for wearer in self.wearers.values():
             live = wearer.stage == "live"
             self._send(wearer, wearer.poses(now_s))
-            if live and wearer.stage == "away":
-                self._each_sink(lambda sink, name=wearer.name: sink.end(name))
+            self._say_left(wearer, live)
+
+    def _catch_up(self) -> None:
+        """Begin all sessions anew where the last look is `CATCH_UP_S` ago; not of a replay, which must lose nothing."""
+        now_s, before_s = time.monotonic(), self._looked_s
+        self._looked_s = now_s
+        if now_s - before_s < CATCH_UP_S or any(source.lossless for source in self.sources):
+            return
+        for wearer in self.wearers.values():
+            live = wearer.stage == "live"
+            self._send(wearer, wearer.catch_up(now_s))
+            self._say_left(wearer, live)
+
+    def _say_left(self, wearer: LiveWearer, was_live: bool) -> None:
+        """Tell the sinks that a wearer has left, if so."""
+        if was_live and wearer.stage == "away":
+            self._each_sink(lambda sink: sink.end(wearer.name))
 
     def _welcome(self, name: str) -> LiveWearer | None:
         """A new wearer, in the place of one who has been silent where there are too many; None where there is none."""
@@ -267,7 +291,7 @@ class LiveCapture:
 
     def status(self) -> LiveStatus:
         sinks = tuple(
-            SinkStatus(each.sink.name, each.sent, each.dropped, each.failed, each.last_error)
+            SinkStatus(each.sink.name, each.sink.sent, each.dropped, each.failed, each.last_error)
             for each in self._all_sinks()
         )
         wearers = tuple(wearer.status() for wearer in list(self.wearers.values()))
@@ -368,7 +392,7 @@ class LiveCapture:
             }
         sinks = {
             each.sink.name: {
-                "sent": each.sent,
+                "sent": each.sink.sent,
                 "dropped": each.dropped,
                 "failed": each.failed,
                 "last_error": each.last_error,

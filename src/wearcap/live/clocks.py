@@ -87,11 +87,6 @@ class DeviceClock:
         self._at_s = last_s
         self._delay_s = min(delay_s - self._drift * (sent_s - last_s) for sent_s, delay_s in done)
 
-    @property
-    def known(self) -> bool:
-        """Whether a packet has arrived."""
-        return bool(self._quickest)
-
     def ours(self, device_s: float) -> float:
         """Our time (s) at a time of the device, as if its packets took no time."""
         return device_s + self._delay_at(device_s)

@@ -18,6 +18,8 @@ MAX_DEVICES = 32
 """Most devices of a wearer, beside those that the session needs."""
 FORGOTTEN_S = 60.0
 """Time without packets after which a device makes room for another."""
+LATE_S = 1.0
+"""Time by which a packet may be behind the newest one and be late; beyond it the device's clock was set back."""
 RATE_S = 2.0
 """Time over which rates are averaged."""
 
@@ -47,8 +49,9 @@ class Device:
             self.hz = self.count / (packet.arrived_s - self.since_s)
             self.count, self.since_s = 0, packet.arrived_s
         self.clock, self.arrived_s = clock, packet.arrived_s
-        self.late += int(time_s <= self.newest_s and self.newest_s - time_s < 1.0)
-        self.newest_s = time_s
+        late = self.newest_s - LATE_S < time_s <= self.newest_s
+        self.late += int(late)
+        self.newest_s = self.newest_s if late else time_s
         self.pose = _shown(packet.sample) or self.pose
 
     def status(self, name: str, seat: Seat | None, now_s: float) -> DeviceStatus:

@@ -187,6 +187,7 @@ class LivePage(ServedPage, Sink):
         if (person := self._person(wearer)) is not None:
             person.wanted = motion.skeleton
             person.playout.put(motion)
+            self.sent += len(motion)
 
     def end(self, wearer: str) -> None:
         """A wearer has left: the body is hidden until it comes back."""

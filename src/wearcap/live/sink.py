@@ -19,6 +19,8 @@ class Sink:
     """Name in messages and counters."""
     waiting: int = 0
     """Pieces that wait for the sink, kept by its thread."""
+    sent: int = 0
+    """Number of frames that have gone where the sink sends them; each sink counts its own."""
     convention: str
     """Axes and units of what is sent, as text for people."""
     serves: ClassVar[bool] = False
@@ -33,7 +35,7 @@ class Sink:
         """A wearer's motion begins, or begins anew, with a skeleton."""
 
     def take(self, wearer: str, motion: Motion) -> None:
-        """The next frames of a wearer."""
+        """The next frames of a wearer; a sink may leave wearers out."""
         raise NotImplementedError
 
     def end(self, wearer: str) -> None:
@@ -50,8 +52,6 @@ class SinkThread:
         self.sink, self.capacity = sink, capacity
         self.dropped = 0
         """Number of pieces dropped because the sink was slow."""
-        self.sent = 0
-        """Number of frames that the sink took."""
         self.failed = 0
         """Number of pieces that the sink could not take."""
         self.last_error = ""
@@ -69,21 +69,20 @@ class SinkThread:
         self._put(False, lambda: self.sink.begin(wearer, skeleton, fps))
 
     def take(self, wearer: str, motion: Motion) -> None:
-        def take() -> None:
-            self.sink.take(wearer, motion)
-            self.sent += len(motion)
-
-        self._put(True, take)
+        self._put(True, lambda: self.sink.take(wearer, motion))
 
     def end(self, wearer: str) -> None:
         self._put(False, lambda: self.sink.end(wearer))
 
     def close(self, seconds: float = 10.0) -> None:
-        """Let the sink take what waits for it, for at most so many seconds, and close it."""
+        """Let the sink take what waits for it, for at most so many seconds, and close it; the rest counts as dropped."""
         with self._ready:
             self._closing = True
             self._ready.notify()
         self._thread.join(seconds)
+        with self._ready:
+            self.dropped += sum(droppable for droppable, _ in self._calls)
+            self._calls.clear()
 
     def _put(self, droppable: bool, call: Callable[[], None]) -> None:
         with self._ready:

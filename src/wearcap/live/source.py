@@ -14,7 +14,6 @@ from wearcap.errors import WearcapError
 from wearcap.live.packets import Inbox, Packet
 from wearcap.viewer.guard import LOOPBACK
 
-MAX_DATAGRAM = 65_536
 MAX_MESSAGES_PER_S, MAX_BYTES_PER_S, MAX_PARSE_S_PER_S = 5_000, 1 << 24, 0.2
 """Limits of one source in a second: messages, their bytes, and the time that understanding them takes; what comes beyond
 them is dropped and counted, so that no sender takes the time of the others."""
@@ -84,6 +83,8 @@ class Source(ABC):
     """Nominal rate of each device's packets (Hz)."""
     convention: ClassVar[str]
     """Axes and units of what is received, as text for people."""
+    lossless: ClassVar[bool] = False
+    """Whether all that it delivers must be captured, however late the capture is."""
 
     def __init__(self, address: Address):
         """Listen at an address. Raises WearcapError for options that the source does not have."""

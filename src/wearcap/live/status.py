@@ -62,11 +62,12 @@ class WearerStatus:
     frames: int = 0
     """Number of poses so far."""
     dropped: int = 0
-    """Number of packets dropped because the capture was slow."""
+    """Number of the head's poses that its session dropped as late, doubled or refused, and of all packets that were left out
+    because the capture was behind."""
     late: int = 0
     """Number of packets that came too late to be used."""
     gaps: int = 0
-    """Number of gaps in the head's path."""
+    """Number of gaps in the head's path, those that a capture left while it caught up among them."""
     floor_m: float | None = None
     """Floor height (m) in the head's world."""
     points_world: Float[Tensor, "point 3"] | None = None
@@ -81,7 +82,7 @@ class SinkStatus:
 
     name: str
     sent: int = 0
-    """Number of frames that it took."""
+    """Number of frames that have gone where it sends them: of the wearers that it sends, to whoever is connected."""
     dropped: int = 0
     """Number of pieces dropped because it was slow."""
     failed: int = 0

@@ -1,7 +1,7 @@
 """One wearer of a live capture: clocks, first minute, session, and the counts that the page and the report show."""
 
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -41,6 +41,9 @@ BEHIND_S = 2.0
 """Time for which packets may wait before the page says that the machine is too slow."""
 MAX_HELD = 2_000
 """Most samples of the head that wait for a late watch."""
+LEFT_OUT_S = 10.0
+"""Time for which a capture that catches up leaves out what was measured before: sockets hold back that of some seconds. What
+seems as old afterwards counts on a clock that was set back."""
 ARRIVAL = "arrival"
 """Clock of packets that state no time."""
 
@@ -87,8 +90,13 @@ class LiveWearer:
         self._head_s = -np.inf
         self._points: Tensor | None = None
         self._dropped = 0
-        """Packets that earlier sessions refused or dropped."""
-        self._last: Motion | None = None
+        """Head poses that earlier sessions dropped, and packets that were left out."""
+        self._refused: Counter[str] = Counter()
+        """Samples that earlier sessions refused, by reason."""
+        self._frames_before = 0
+        """Frames of earlier sessions."""
+        self._caught_up_s = -np.inf
+        """Our time (s) from which on packets count again after the capture was behind."""
         self._active: Packet | None = None
         """The newest choice of the active object."""
         self._taken = self._taken_before = False
@@ -104,6 +112,9 @@ class LiveWearer:
             self.unknown += 1
         elif isinstance(packet.sample, ActiveObject):
             self._choose(packet)
+        elif self._is_left_out(packet):
+            self._dropped += 1
+            self._heard_s = time.monotonic()
         elif (time_s := self._time_of(packet)) is None:
             self.unknown += 1
         else:
@@ -129,6 +140,15 @@ class LiveWearer:
         time_s = self.clocks.on_leader(clock, sent_s, packet.device)
         device.see(packet, clock, time_s)
         return time_s
+
+    def _is_left_out(self, packet: Packet) -> bool:
+        """Whether a packet was measured before the capture caught up, by its clock as it stood before the stall."""
+        if packet.arrived_s - self._caught_up_s > LEFT_OUT_S:
+            return False
+        if packet.sent_s is None or packet.clock not in self.clocks:
+            return packet.arrived_s < self._caught_up_s
+        time_s = self.clocks.on_leader(packet.clock, packet.sent_s, packet.device)
+        return self.clocks.ours(time_s) < self._caught_up_s
 
     def _hear(self, packet: Packet, time_s: float) -> None:
         """Keep what the page and the report show of a packet, whatever becomes of it."""
@@ -234,6 +254,7 @@ class LiveWearer:
         wearer = Wearer(setup.skeleton, R_wrist_imu=mounts, floor_m=setup.floor_m, **placed)
         self.session, self.skeleton, self.stage = self.opener.session(wearer), setup.skeleton, "live"
         self._taken, self._taken_before = False, self._taken
+        self._frames_before = self.frames
         self.sessions, self.fps = self.sessions + 1, self.session.fps
 
     def _seated(self, device: str, sample: Any) -> Any:
@@ -283,13 +304,33 @@ class LiveWearer:
         motions = []
         if self.session is not None:
             self._release(np.inf)
-        self._held.clear()
         while self.session is not None and (found := self._final(ended=True)) is not None:
             motions.append(found)
+        self._close()
+        return motions
+
+    def _close(self) -> None:
+        """Keep the counts of the session, which ends; what waits for a late watch is forgotten."""
+        self._held.clear()
         if self.session is not None:
             self._dropped += self.session.dropped[0]
+            self._refused.update(self.session.refused[0])
             self.session, self.stage = None, "away"
-        return motions
+
+    def catch_up(self, now_s: float) -> list[Motion]:
+        """End the session, leave out what was measured before now (our time, s), and begin anew with what comes then.
+
+        Returns the last frames. A session that has given none goes on: its beginning may be what took so long.
+        """
+        if self.session is None or self.frames == self._frames_before:
+            return []
+        self._caught_up_s, self._head_s = now_s, -np.inf
+        self.gaps += 1
+        self.note(
+            "The capture was behind by seconds, or suspended: it left out what had come meanwhile, and began anew. "
+            "End other programs, or give it more cores (threads=N)."
+        )
+        return self.leave()
 
     def _final(self, ended: bool) -> Motion | None:
         assert self.session is not None
@@ -297,7 +338,7 @@ class LiveWearer:
             found = self.session.poses(ended)[0]
         except WearcapError as error:  # a suit that was never localised
             self.note(str(error))
-            self.session, self.stage = None, "away"
+            self._close()
             return None
         if found is not None:
             self.frames += len(found)
@@ -338,8 +379,8 @@ class LiveWearer:
 
     @property
     def refused(self) -> dict[str, int]:
-        """Samples that the session refused, by reason."""
-        return {} if self.session is None else self.session.refused[0]
+        """Samples that the sessions refused, by reason."""
+        return dict(self._refused + Counter({} if self.session is None else self.session.refused[0]))
 
     def _keep_points(self, points: Tensor) -> None:
         kept = points if self._points is None else torch.cat([self._points, points])

@@ -5,7 +5,7 @@ written once and atomically. At the end, and by `join_sections` after a kill, th
 that cannot be written is lost with its half second, and nothing else.
 """
 
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from itertools import count
 from pathlib import Path
 
@@ -47,18 +47,21 @@ class FilesSink(Sink):
     def take(self, wearer: str, motion: Motion) -> None:
         if wearer not in self._tracks or not self._tracks[wearer].continues(motion):
             self.begin(wearer, motion.skeleton, 0.0)
-        self._tracks[wearer].take(motion)
+        self.sent += self._tracks[wearer].take(motion)
 
     def end(self, wearer: str) -> None:
         if wearer in self._tracks:
             track = self._tracks.pop(wearer)
-            track.flush()
-            if motion_files(track.folder):
-                join_sections(track.folder)
+            try:
+                self.sent += track.flush()
+            finally:
+                if motion_files(track.folder):
+                    join_sections(track.folder)
 
     def close(self) -> None:
-        for wearer in list(self._tracks):
-            self.end(wearer)
+        with ExitStack() as ends:  # of all wearers, also where the files of one cannot be written
+            for wearer in list(self._tracks):
+                ends.callback(self.end, wearer)
 
 
 class _Track:
@@ -74,21 +77,23 @@ class _Track:
         """Whether a piece goes on from the last one: later, and by no more than `MAX_GAP_S`."""
         return self.last_s is None or 0.0 < motion.timestamps[0].item() - self.last_s <= MAX_GAP_S
 
-    def take(self, motion: Motion) -> None:
+    def take(self, motion: Motion) -> int:
+        """Take in the next frames; returns how many frames were written now."""
         self._parts.append(motion)
         self.last_s = motion.timestamps[-1].item()
-        if self.last_s - self._parts[0].timestamps[0].item() >= SECTION_S:
-            self.flush()
+        return self.flush() if self.last_s - self._parts[0].timestamps[0].item() >= SECTION_S else 0
 
-    def flush(self) -> None:
-        """Write what has come since the last section; it is tried once. Raises what the writers raise."""
+    def flush(self) -> int:
+        """Write what has come since the last section, and return its number of frames; it is tried once. Raises what the
+        writers raise."""
         parts, self._parts = self._parts, []
         if (section := joined(parts)) is None:
-            return
+            return 0
         path, self._number = self.folder / f"motion-{self._number:06d}.npz", self._number + 1
         write_motion(section, path)
         if len(section) > 1:
             write_bvh(section, path.with_suffix(".bvh"))
+        return len(section)
 
 
 def join_sections(folder: Path) -> Motion:

@@ -84,7 +84,7 @@ class VmcSink(Sink):
                 0
             ]
             self._socket = socket.socket(family, kind)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # the latter of a host's name
             raise WearcapError(f"cannot send to this address ({error})", where, "vmc://HOST:PORT") from error
         self._socket.setblocking(False)
         self._target = target
@@ -116,6 +116,7 @@ class VmcSink(Sink):
         assert self._socket is not None
         with suppress(BlockingIOError, ConnectionRefusedError):  # nobody listens yet, or the machine is busy
             self._socket.sendto(data, self._target)
+            self.sent += 1
 
 
 def bones_of(motion: Motion) -> tuple[Float[Tensor, "time bone 3"], Float[Tensor, "time bone 4"]]:

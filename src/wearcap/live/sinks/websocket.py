@@ -31,7 +31,7 @@ from wearcap.viewer.guard import LOOPBACK, Guard, Refused
 
 MAX_CLIENTS = 16
 CLOSE_S = 2.0
-"""Time in which clients may close their connections at the end."""
+"""Time in which clients may close their connections at the end, before that is done for them."""
 MAX_WAITING_BYTES = 1 << 20
 """Bytes that may wait for one client; a client that reads more slowly is disconnected."""
 
@@ -80,7 +80,7 @@ class WebSocketSink(Sink):
                         compression=None,
                     )
                 )
-            except OSError as error:
+            except (OSError, UnicodeError) as error:  # the latter of a host's name
                 ready.append(error)
             done.set()
 
@@ -89,10 +89,12 @@ class WebSocketSink(Sink):
             self._loop.create_task(begin())
             self._loop.run_forever()
 
-        threading.Thread(target=run, name=self.name, daemon=True).start()
+        self._thread = threading.Thread(target=run, name=self.name, daemon=True)
+        self._thread.start()
         done.wait()
-        if isinstance(ready[0], OSError):
-            what = f"cannot serve here ({ready[0].strerror or ready[0]})"
+        if isinstance(ready[0], Exception):
+            self._end_loop()
+            what = f"cannot serve here ({getattr(ready[0], 'strerror', None) or ready[0]})"
             raise WearcapError(what, self.name, fix="Choose another port.") from ready[0]
         self._server = ready[0]
 
@@ -119,7 +121,7 @@ class WebSocketSink(Sink):
             }
             if objects[k]:
                 frame["objects"] = {name: _row(seen) for name, seen in objects[k].items()}
-            self._at(pacing.due(step_s, hurry), self._broadcast, json.dumps(frame))
+            self._at(pacing.due(step_s, hurry), self._send_frame, json.dumps(frame))
 
     def _at(self, due_s: float, call: Callable[..., None], *arguments: str) -> None:
         """Call something on the server's loop at our time (s); the loop's clock is the same."""
@@ -131,15 +133,26 @@ class WebSocketSink(Sink):
         self._at(pacing.due(step_s, False), self._leave, wearer)
 
     def close(self) -> None:
+        """Returns once the last frame has been sent when it is due, and clients have left."""
+
         async def end(server: Server) -> None:
             await asyncio.sleep(max(0.0, self._last_s - time.monotonic()))
             server.close()
             with suppress(TimeoutError):
                 await asyncio.wait_for(server.wait_closed(), CLOSE_S)
-            self._loop.stop()
+            for client in list(self._clients):  # that do not read
+                client.transport.abort()
+            with suppress(TimeoutError):
+                await asyncio.wait_for(server.wait_closed(), CLOSE_S)
 
         if self._server is not None:
-            asyncio.run_coroutine_threadsafe(end(self._server), self._loop)
+            asyncio.run_coroutine_threadsafe(end(self._server), self._loop).result()
+            self._end_loop()
+
+    def _end_loop(self) -> None:
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
         """Refuses other sites' pages, clients without the token beyond loopback, and too many of them."""
@@ -170,6 +183,10 @@ class WebSocketSink(Sink):
     def _leave(self, wearer: str) -> None:
         self._about.pop(wearer, None)
         self._broadcast(json.dumps({"left": wearer}))
+
+    def _send_frame(self, frame: str) -> None:
+        self._broadcast(frame)
+        self.sent += bool(self._clients)
 
     def _broadcast(self, text: str) -> None:
         for client in list(self._clients):

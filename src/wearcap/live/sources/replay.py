@@ -42,6 +42,8 @@ class ReplaySource(Source):
 
     scheme, port, hz = "replay", 0, 60.0
     convention = "the recording's own"
+    lossless = True
+    """What comes out must be the capture of the whole recording."""
 
     def __init__(
         self,
