@@ -88,6 +88,20 @@ def test_a_box_that_is_turned_over_is_a_box(truth):
     assert scores["add_s_cm"] == pytest.approx(0.0, abs=0.05)
 
 
+def test_doors_and_loose_objects_are_scored_by_themselves_too(truth):
+    track = RECORDING.object_motion["box_1"]
+    shifted = Trajectory(track.timestamps, track.R_world_body, track.t_world_body + torch.tensor([0.03, 0.0, 0.04]))
+    moved = replace(perfect(truth), object_motion={"box_1": shifted})
+    loose = score_echo(moved, truth, "a", 0).scores
+    assert loose["loose_center_cm"] == pytest.approx(5.0, rel=1e-3)
+    assert loose["loose_symmetric_v2v_cm"] == loose["symmetric_v2v_cm"]
+    assert "fastened_center_cm" not in loose
+    door = replace(truth, objects=[replace(truth.objects[0], category="door")])
+    fastened = score_echo(moved, door, "a", 0).scores
+    assert fastened["fastened_center_cm"] == pytest.approx(5.0, rel=1e-3)
+    assert "loose_center_cm" not in fastened
+
+
 def test_objects_count_while_they_are_active_alone(truth):
     track, busy = RECORDING.object_motion["box_1"], truth.active >= 0
     assert busy.any()

@@ -80,8 +80,8 @@ class Echo(LearnedSystem):
     """File of the objects; None: the recording's own."""
     placed: bool = False
     """Whether the objects' initial poses in the environment count as observed (ours; ECHO has no initial poses)."""
-    freedoms: bool = False
-    """Whether objects keep to the freedom that the environment gives them: hinges, axes, the floor (ours)."""
+    freedoms: bool = True
+    """Whether objects keep to the freedom that the environment gives them: hinges, axes, the floor (ours); ECHO knows none."""
     runtime: str = "eager"
     """Backend of the denoising steps (`runtime.graphs.RUNTIMES`)."""
     precision: str = "float32"

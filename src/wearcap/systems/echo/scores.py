@@ -25,6 +25,9 @@ from wearcap.recording.timing import at_times
 from wearcap.systems.echo.model import MODALITIES
 from wearcap.systems.echo.observations import ObjectReader, ObjectShape, Observed, Scenario
 
+FASTENED = "cabinet_door", "door", "drawer", "window"
+"""Categories of objects that hinges and rails hold; the others are loose."""
+
 
 @dataclass(frozen=True, eq=False)
 class Truth:
@@ -111,7 +114,7 @@ def foot_patches(recording: Recording) -> Bool[Tensor, "time patch"]:
 
 def score_echo(motion: Motion, truth: Truth, name: str, seed: int) -> Row:
     """ECHO's metrics of one capture in world coordinates without alignment: body over all frames, object over the
-    frames in which one is active."""
+    frames in which one is active, of doors, drawers and windows (`FASTENED`) and of loose ones by themselves, too."""
     skeleton, fps = motion.skeleton, motion.fps
     pose, pose_true = motion.T_world_joint.to(torch.float64), truth.motion.T_world_joint.to(torch.float64)
     joints, true = motion.T_world_joint.t, truth.motion.T_world_joint.t
@@ -151,6 +154,9 @@ def score_echo(motion: Motion, truth: Truth, name: str, seed: int) -> Row:
                 "add_s_cm": closest_surface_error_cm(T_found, T_true, shape.cloud, shape.middle, shape.surface),
             }.items():
                 parts.setdefault(key, []).append(value)
+                if key in ("center_cm", "symmetric_v2v_cm"):
+                    kind = "fastened" if shape.category in FASTENED else "loose"
+                    parts.setdefault(f"{kind}_{key}", []).append(value)
         scores |= {key: torch.cat(values).mean().item() for key, values in parts.items()}
     touch = truth.touch[busy]
     if motion.body_contact_prob is not None and motion.object_motion and touch.any():
