@@ -170,7 +170,8 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
         found[title] = [result for result in results[: len(methods)] if result is not None]
         results = results[len(methods) :]
         split = options.split if where is case else options.sweep_split
-        console.print(_table(f"{title} ({case.dataset.name}, {split}, {case.sensors} sensors)", found[title]))
+        if found[title]:
+            console.print(_table(f"{title} ({case.dataset.name}, {split}, {case.sensors} sensors)", found[title]))
     heads = {name: COLUMNS[name] for name in PAPER_METRICS}
     paper = rich_lines("the paper", _papers(heads, PAPER), heads)
     console.print(f"The truth's are, beside the sensors', {TRUTH_GIVEN}.", paper)
@@ -353,7 +354,7 @@ def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
 def _table(title: str, results: list[Result]) -> Table:
     rows = {result.method: result.scores for result in results}
     columns = {name: head for name, head in COLUMNS.items() if any(name in scores for scores in rows.values())}
-    return rich_lines(title, rows | ({"truth": truth_row(results[0].scores)} if results else {}), columns)
+    return rich_lines(title, rows | {"truth": truth_row(results[0].scores)}, columns)
 
 
 def _papers(columns: Iterable[str], paper: Mapping[str, tuple[float, ...]]) -> Scores:
@@ -472,8 +473,8 @@ def _briefly(simulated: dict[str, Tree], real: dict[str, Tree]) -> tuple[str, ..
     ]
     return (
         f"Learned baselines that see the head alone, and ours beside them, saw {mean(one[BRIEF]['frames_seen_m'], 2)} "
-        "million frames each, in one training, of a part of the simulated motion and of CMU's, which is far less than our "
-        f"checkpoint saw. MPJPE (cm), so trained: {'; '.join(phrases)}.",
+        "million frames each, in one training at the best of three learning rates, of a part of the simulated motion and of "
+        f"CMU's, which is far less than our checkpoint saw. MPJPE (cm), so trained: {'; '.join(phrases)}.",
         "Trained so briefly a diffusion with a token for each frame passes on noise that more training would remove; "
         f"jitter, of the truth's: {', '.join(jitters)}.",
     )
