@@ -237,7 +237,11 @@ def _objects(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapp
         Method("ours, human alone", options.checkpoint, ("pipeline=echo", "pipeline.acts=none")),
     ]
     scores |= _scores(more, options, progress, store, names)
-    return f"Table 1: objects, {options.split}; {TRUTH_GIVEN}; hinges and rails but where a row says not", OBJECTS, scores | PAPER
+    return (
+        f"Table 1: objects, {options.split}; {TRUTH_GIVEN}; hinges and rails but where a row says not",
+        OBJECTS,
+        scores | PAPER,
+    )
 
 
 def _settings(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapping[str, str], Scores]:

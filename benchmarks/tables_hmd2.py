@@ -440,6 +440,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         limits=(
             *_against_hands(simulated),
             *_strangers_off(people),
+            *_conditions(real),
             f"Jitter is {mean(ours['jitter_ratio'])} times the truth's.",
             "Bad are arms out of the camera's sight, and CMU's dances and jumps.",
             *_briefly(simulated, real),
@@ -507,6 +508,18 @@ def _against_hands(scores: dict[str, Tree]) -> tuple[str, ...]:
         return ()
     errors = [f"{mean(theirs[name])} cm against {mean(ours[name])}" for name in ("mpjpe_cm", "lower_pe_cm")]
     return (f"The regressor that also sees both hands is {errors[0]} off, and {errors[1]} in the lower body.",)
+
+
+def _conditions(real: dict[str, Tree]) -> tuple[str, ...]:
+    """What points and pictures are worth on real motion."""
+    errors = [
+        f"{text(real[name]['mpjpe_cm'])} cm {how}" for name, how in ((OURS, "with"), (ALONE, "without")) if name in real
+    ]
+    return (
+        (f"Points and pictures of simulated surroundings on real motion (CMU): {', '.join(errors)} them.",)
+        if errors
+        else ()
+    )
 
 
 def _strangers_off(people: Tree) -> tuple[str, ...]:
