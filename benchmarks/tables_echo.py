@@ -20,7 +20,18 @@ from result_pages import NONE, Grid, Page, Tree, Trees, figure_of, mean, picked,
 from rich.console import Console
 from rich.progress import Progress
 from sensed import WRONG_HEIGHTS
-from tabling import TRAINING, add_people, budget, finite, left_out, recordings_of, split_of, titled, training_of
+from tabling import (
+    TRAINING,
+    add_people,
+    budget,
+    finite,
+    is_trained,
+    left_out,
+    recordings_of,
+    split_of,
+    titled,
+    training_of,
+)
 
 from wearcap.cli.conf import compose
 from wearcap.files import write_text
@@ -272,7 +283,7 @@ def _trained(rows: dict[str, tuple[str, ...]], options: argparse.Namespace, prog
     methods = []
     for name, (run, *pipeline) in rows.items():
         path = options.runs / run / "checkpoints" / "best.ckpt"
-        if path.is_file():
+        if is_trained(path):
             methods.append(Method(name, str(path), tuple(pipeline)))
         else:
             progress.console.print(left_out(name, "echo", run, path), markup=False, soft_wrap=True)
@@ -407,7 +418,6 @@ HEADLINE = (
     ("Table 1:", "nearest training window", "objects: nearest training window"),
     ("Table 1, equal", "ours, the same budget", "objects: ours, the rivals' budget"),
     ("Table 1, equal", "BoDiffusion-style + object", "objects: BoDiffusion-style + object, the same frame and budget"),
-    ("Table 1, equal", "BoDiffusion-style", "objects: BoDiffusion-style, the same frame and budget"),
     ("Table 1:", "truth", "objects: the truth itself"),
     ("Table 1:", "paper: BEHAVE", "the paper's, on BEHAVE"),
     ("Table 2", "ours", "people alone (CMU): **ours**"),

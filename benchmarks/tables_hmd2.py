@@ -18,7 +18,7 @@ from result_pages import NONE, Grid, Page, Tree, Trees, figure_of, grid_of, mean
 from rich.console import Console
 from rich.table import Table
 from sensed import GIVEN, WRONG_HEIGHTS, add_sensors
-from tabling import TRAINING, add_people, budget, finite, left_out, split_of, titled
+from tabling import TRAINING, add_people, budget, finite, is_trained, left_out, split_of, titled
 
 from wearcap.errors import WearcapError
 from wearcap.evaluation.breakdown import extremes
@@ -288,7 +288,7 @@ def _case(options: argparse.Namespace) -> Case:
 
 def _exists(checkpoint: str) -> bool:
     try:
-        return checkpoint_file(checkpoint).is_file()
+        return is_trained(checkpoint_file(checkpoint))
     except WearcapError:
         return False
 

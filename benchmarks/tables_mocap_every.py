@@ -19,7 +19,18 @@ from result_pages import Grid, Page, Tree, Trees, figure_of, mean, picked, range
 from rich.console import Console
 from rich.progress import Progress
 from sensed import GIVEN, WRONG_HEIGHTS, add_sensors
-from tabling import TRAINING, add_people, budget, finite, left_out, recordings_of, split_of, titled, training_of
+from tabling import (
+    TRAINING,
+    add_people,
+    budget,
+    finite,
+    is_trained,
+    left_out,
+    recordings_of,
+    split_of,
+    titled,
+    training_of,
+)
 
 from wearcap.files import write_text
 from wearcap.metrics.table import Row, Scores, Summary, aggregate, markdown_table, truth_row
@@ -384,7 +395,7 @@ def _rivals(options: argparse.Namespace, console: Console) -> dict[str, list[Met
         paths = _seeded(options.runs, run)
         sensors = GIVEN if run in HANDS else options.sensors
         overrides = (*pipeline, "pipeline.floor=fixed", "pipeline.refinement=null")
-        trained[name] = [Method(name, str(path), sensors, overrides) for path in paths if path.is_file()]
+        trained[name] = [Method(name, str(path), sensors, overrides) for path in paths if is_trained(path)]
         if not trained[name]:
             console.print(left_out(name, "mocap_every", run, paths[0]), markup=False, soft_wrap=True)
     return {name: methods for name, methods in trained.items() if methods}

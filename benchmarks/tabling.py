@@ -136,10 +136,16 @@ def budget(frames: int, per_step: int) -> list[str]:
     ]
 
 
+def is_trained(checkpoint: Path) -> bool:
+    """Whether a training is there, and not one of `rivals.py` that has not finished."""
+    rate = checkpoint.parent.parent / RATE_FILE
+    return checkpoint.is_file() and (not rate.is_file() or bool(json.loads(rate.read_text())["finished"]))
+
+
 def left_out(row: str, system: str, run: str, checkpoint: str | Path | None) -> str:
     """A line on a row whose training is not there."""
     command = f"python benchmarks/rivals.py {system} --only {run}"
-    return f"left out: {row} (no checkpoint {checkpoint}); train it by: {command}"
+    return f"left out: {row} (no finished training {checkpoint}); train it by: {command}"
 
 
 def new_table(title: str, columns: list[str]) -> Table:

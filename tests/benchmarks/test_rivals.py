@@ -129,3 +129,16 @@ def test_budgets_scale_with_what_is_asked_for(system):
         assert 3 <= small.trainer.max_steps / small.data.loading.steps_per_epoch <= tabling.EPOCHS + 1
         assert large.trainer.max_steps // large.data.loading.steps_per_epoch == tabling.EPOCHS
         assert 0.98 <= small.callbacks.average.decay <= large.callbacks.average.decay <= 0.995
+
+
+def test_a_training_that_was_stopped_is_no_row(tmp_path):
+    checkpoint = tmp_path / NAME / "checkpoints" / "best.ckpt"
+    assert not tabling.is_trained(checkpoint)
+    checkpoint.parent.mkdir(parents=True)
+    checkpoint.touch()
+    assert tabling.is_trained(checkpoint), "a training by hand"
+    note = tmp_path / NAME / tabling.RATE_FILE
+    note.write_text(json.dumps({"rate": 1e-3, "finished": {}}))
+    assert not tabling.is_trained(checkpoint)
+    note.write_text(json.dumps({"rate": 1e-3, "finished": {"0": 0.4}}))
+    assert tabling.is_trained(checkpoint)
