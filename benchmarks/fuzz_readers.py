@@ -101,10 +101,11 @@ class Fuzzed:
         path.write_bytes(mutated(self.files[path], other, random_))
         return path
 
-    def run(self, number: int, kept: Path | None = None) -> str:
-        """Read input `number`; a failure's files are kept in a folder below `kept`."""
+    def run(self, number: int, kept: Path | None = None, alarm_s: float = 0.0) -> str:
+        """Read input `number`; a failure's files are kept in a folder below `kept`. `alarm_s`: its time, in a process that
+        hears the alarm; 0: any."""
         path = self.damage(number)
-        signal.setitimer(signal.ITIMER_REAL, ALARM_S)
+        signal.setitimer(signal.ITIMER_REAL, alarm_s)
         try:
             found = outcome(self.reader.read, self.folder)
         except TooSlowError:
@@ -148,7 +149,7 @@ def _work(name: str, seed: int, first: int, last: int, kept: Path, place, pipe) 
         counts: Counter[str] = Counter()
         for number in range(first, last):
             place[0], place[1] = number, time.monotonic()
-            counts[fuzzed.run(number, kept)] += 1
+            counts[fuzzed.run(number, kept, ALARM_S)] += 1
         pipe.send((counts, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))
 
 

@@ -6,7 +6,6 @@ import socket
 import struct
 import subprocess
 import sys
-import time
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
@@ -70,9 +69,7 @@ def test_damaged_packets_never_raise(scheme, data):
         for _ in range(data.draw(st.integers(0, 4))):
             place = data.draw(st.integers(0, len(packet)))
             packet[place : place + data.draw(st.integers(0, 8))] = data.draw(st.binary(max_size=8))
-        begin = time.thread_time()
         packets = source.parse(bytes(packet), 10.0 + number, lambda why: refused.update([why]))
-        assert time.thread_time() - begin < 1.0
         for each in packets:
             assert_valid(each)
 
