@@ -11,7 +11,7 @@ is compared at all, quantiles (0, 5, 50, 95, 100 %) of the offset (s) found, and
 `--headings`: each test recording's head and watches are shown to the first minute that is not guided, from the recording's begin
 on. Watches sit as they are usually worn and count headings of their own, with the errors of mounting and attitude that the
 recording's sensors have, or where it has none those of `sensors.imu.ImuNoise`. Prints for each data set one JSON line for
-watches on arms whose forearm hung in the last two seconds of the first minute, and one for all others: numbers of watches,
+watches on arms whose forearm is hanging in the last two seconds of the first minute, and one for all others: numbers of watches,
 recordings and persons, quantiles (50, 75, 95, 100 %) of the error (degrees) of the heading that was found, and the median of
 each wrist with its sign. Recordings that end before the first minute does are left out.
 """
@@ -114,8 +114,8 @@ class Heading(NamedTuple):
     recording: str
     subject: str
     wrist: str
-    hung: bool
-    """Whether the forearm hung when the heading was found."""
+    is_hanging: bool
+    """Whether the forearm was hanging when the heading was found."""
     off_deg: float
 
 
@@ -162,9 +162,9 @@ def print_headings(datasets: list[str]) -> None:
     """Print by how much the headings of watches are off after the first minute that is not guided."""
     for folder in datasets:
         found = [each for seed, one in enumerate(recordings(folder, "test")) for each in headings(one, seed)]
-        for hung in (True, False):
-            group = [each for each in found if each.hung == hung]
-            row = {"dataset": Path(folder).name, "arms": "hanging" if hung else "others", "watches": len(group)}
+        for is_hanging in (True, False):
+            group = [each for each in found if each.is_hanging == is_hanging]
+            row = {"dataset": Path(folder).name, "arms": "hanging" if is_hanging else "others", "watches": len(group)}
             row |= {
                 "recordings": len({each.recording for each in group}),
                 "persons": len({each.subject for each in group}),

@@ -7,11 +7,11 @@ out, which is printed. Checkpoints come by name (checkpoints/) or path.
 
 import argparse
 import json
-from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from hmd2_paper import PAPER, PAPER_METRICS, PAPER_TAIL, paper_rows
 from hmd2_runs import BASELINES, Case, Method, Result, run_method
 from joblib import Parallel, delayed
 from result_pages import NONE, Grid, Page, Tree, Trees, figure_of, grid_of, mean, ranged, score_grids, summaries, text
@@ -57,21 +57,6 @@ PARTS = {
 }
 """Columns of Tables 6.6 and 6.8 to 6.10."""
 TAIL = {f"{P95}{name.removeprefix('mpjpe_')}": title for name, title in PARTS.items()}
-PAPER_TAIL = {
-    "EgoEgo": (30.91, 60.81, 58.63, 19.26, 10.33),
-    "AvatarPoser (head)": (22.09, 43.19, 44.18, 13.01, 18.96),
-    "AvatarPoser (head and hands)": (16.48, 11.23, 37.91, 5.63, 18.15),
-    "HMD² (h = 180)": (15.49, 34.86, 27.35, 10.80, 4.22),
-}
-"""Thesis Table 6.6, on Nymeria."""
-PAPER = {
-    "EgoEgo": (16.61, 34.64, 35.69, 20.15, 3.68, 2.43),
-    "AvatarPoser (head)": (10.64, 21.51, 27.61, 12.99, 1.69, 4.21),
-    "HMD² (h = 180)": (8.36, 16.64, 2.16, 15.74, 1.03, 1.03),
-    "HMD² (h = 10)": (9.19, 17.67, 5.00, 15.23, 1.30, 1.19),
-}
-"""Thesis Table 6.1, on Nymeria: MPJPE, hand, FID, Diversity (truth 16.13), Physicality (truth 0.56), floor penetration."""
-PAPER_METRICS = ("mpjpe_cm", "hand_pe_cm", "fid", "diversity", "physicality", "floor_penetration_cm")
 FIRST = "Tables 6.1 and 6.3"
 OURS = "full"
 TRUTH_GIVEN = "hands of the AvatarPoser-style row that sees them (with exact sensors and bones), and the bones of rows that say so"
@@ -173,11 +158,11 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
         if found[title]:
             console.print(_table(f"{title} ({case.dataset.name}, {split}, {case.sensors} sensors)", found[title]))
     heads = {name: COLUMNS[name] for name in PAPER_METRICS}
-    paper = rich_lines("the paper", _papers(heads, PAPER), heads)
+    paper = rich_lines("the paper", paper_rows(heads, PAPER), heads)
     console.print(f"The truth's are, beside the sensors', {TRUTH_GIVEN}.", paper)
     tail = {row.method: {name: row.scores[name] for name in TAIL} for row in found[FIRST]}
     title = "Table 6.6: 95th percentiles of each recording (cm)"
-    console.print(rich_lines(title, tail | _papers(TAIL, PAPER_TAIL), TAIL))
+    console.print(rich_lines(title, tail | paper_rows(TAIL, PAPER_TAIL), TAIL))
     scenarios = _scenarios(found[FIRST])
     for title, rows in scenarios.items():
         console.print(rich_lines(f"{title} (cm)", rows, PARTS))
@@ -355,14 +340,6 @@ def _table(title: str, results: list[Result]) -> Table:
     rows = {result.method: result.scores for result in results}
     columns = {name: head for name, head in COLUMNS.items() if any(name in scores for scores in rows.values())}
     return rich_lines(title, rows | {"truth": truth_row(results[0].scores)}, columns)
-
-
-def _papers(columns: Iterable[str], paper: Mapping[str, tuple[float, ...]]) -> Scores:
-    """Rows of the paper."""
-    return {
-        f"the paper's {name}, on Nymeria": {metric: Summary(value, None, 1) for metric, value in zip(columns, values)}
-        for name, values in paper.items()
-    }
 
 
 def _activities(title: str, results: list[Result], metric: str) -> Table:
