@@ -16,6 +16,8 @@ from wearcap.sensors.samples import HeadSample, WatchSample, WristSample
 
 FPS = 60.0
 TURN_S = 4.0
+PRONATED_RAD = 0.3
+"""Angle by which the palms of hanging arms face backwards, as people's do."""
 
 
 def acting(height_m: float, plan: list[tuple[str, float]], heading: float = 0.7, head_leads_s: float = 0.0) -> Motion:
@@ -45,6 +47,7 @@ def acting(height_m: float, plan: list[tuple[str, float]], heading: float = 0.7,
         down = about_axis("x", torch.tensor(-sign * 1.45))
         R[:, skeleton.index(f"{side}_shoulder")] = about_axis("y", -sign * swing - up) @ down
         R[:, skeleton.index(f"{side}_elbow")] = about_axis("z", torch.full_like(swing, -sign * 0.15))
+        R[:, skeleton.index(f"{side}_wrist")] = about_axis("y", torch.tensor(PRONATED_RAD))
         R[:, skeleton.index(f"{side}_hip")] = about_axis("y", sign * swing)
     root = torch.stack([way * math.cos(heading), way * math.sin(heading), 0 * way + skeleton.root_height], -1).float()
     root[:, 2] += 0.01 * (walks * (4 * torch.pi * 0.9 * times).sin()).float()

@@ -128,7 +128,9 @@ def reach(
     beside = (upper**2 - along**2).clamp_min(0).sqrt()
     elbow = start + along[..., None] * aim + beside[..., None] * bend
     hand = start + distance[..., None] * aim
-    return swing_between(middle - start, elbow - start), swing_between(end - middle, hand - elbow)
+    bones, goals = torch.stack([middle - start, end - middle]), torch.stack([elbow - start, hand - elbow])
+    upper_turn, lower_turn = swing_between(bones, goals)
+    return upper_turn, lower_turn
 
 
 def fit_offsets(source: Skeleton, target: Skeleton) -> Skeleton:

@@ -44,10 +44,14 @@ def posterior_step(
     noise_left, noise_now = 1 - after, (1 - now).clamp_min(1e-12)
     variance = noise_left / noise_now * (1 - now / after)
     spread = eta * variance.clamp_min(0).sqrt()
-    epsilon_hat = (x_t - now.sqrt() * x0_hat) / noise_now.sqrt()
-    x_next = after.sqrt() * x0_hat + (noise_left - spread**2).clamp_min(0).sqrt() * epsilon_hat + spread * noise
-    x_next = torch.where(level_next == 0, x0_hat, x_next)
-    return torch.where(level == level_next, x_t, x_next)
+    # Weights of x̂0, x_t and the noise, which one level for all frames makes three numbers.
+    kept = ((noise_left - spread**2).clamp_min(0) / noise_now).sqrt()
+    clean = after.sqrt() - kept * now.sqrt()
+    stays, ends = level == level_next, level_next == 0
+    clean = torch.where(stays, 0.0, torch.where(ends, 1.0, clean))
+    kept = torch.where(stays, 1.0, torch.where(ends, 0.0, kept))
+    spread = torch.where(stays | ends, 0.0, spread)
+    return clean * x0_hat + kept * x_t + spread * noise
 
 
 def _wide(level: Level) -> Float[Tensor, "batch #time #feature"]:

@@ -1,7 +1,7 @@
 """What the first seconds of devices show of how they are worn: stillness, height, sides, seats and headings.
 
-Worlds have z up. In a standing wearer's rest the arms hang with the palms to the thighs. A watch is on the back of the
-wrist, its z axis out of its face.
+Worlds have z up. In a standing wearer's rest the arms hang with the palms to the thighs and a little backwards
+(`PRONATED_DEG`). A watch is on the back of the wrist, its z axis out of its face.
 """
 
 import math
@@ -41,6 +41,9 @@ ALONG_FACE = 0.75
 """Component of the hanging hand's direction along a watch's z axis above which z cannot be its face."""
 WALK_M_S, SMOOTH_S = 0.4, 0.4
 """Speed of walking, and the span (s) over which it is measured."""
+PRONATED_DEG = 20.0
+"""Angle by which the palms of hanging arms face backwards from the thighs: the median of people who stand, 20 for left and
+30 for right arms in CMU's training recordings (4 persons), 14 and 51 in HDM05's (3 and 2 persons)."""
 SWING_RATIO = 2.0
 """Least ratio of a swinging arm's angular speed about its axis to that across it."""
 
@@ -152,8 +155,9 @@ def sides_of(places: dict[str, Placed], wanted: tuple[str, ...], head_m: float |
 
 def hanging(joint: str, yaw: float | Tensor) -> Float[Tensor, "3 3"]:
     """R_world_joint of the wrist of a hanging arm, of a wearer with this heading (rad)."""
-    down = torch.tensor((-1.0 if joint.startswith("left") else 1.0) * math.pi / 2)
-    return rotation.about_axis("z", torch.as_tensor(yaw, dtype=torch.float32)) @ rotation.about_axis("x", down)
+    sign = -1.0 if joint.startswith("left") else 1.0
+    turn = torch.as_tensor(yaw, dtype=torch.float32) + sign * math.radians(PRONATED_DEG)
+    return rotation.about_axis("z", turn) @ rotation.about_axis("x", torch.tensor(sign * math.pi / 2))
 
 
 def watch_side(R_ref_imu: Float[Tensor, "time 3 3"]) -> str | None:
@@ -177,7 +181,7 @@ def watch_mount(R_ref_imu: Float[Tensor, "time 3 3"], joint: str) -> Float[Tenso
 
 
 def hanging_yaw(R_ref_joint: Float[Tensor, "time 3 3"], joint: str, heading: float) -> float:
-    """Turn (rad) from a watch's world to the head's, of a hanging arm whose palm is at the thigh."""
+    """Turn (rad) from a watch's world to the head's, of a hanging arm."""
     R = rotation.mean_rotation(R_ref_joint.double())
     return yaw_between(R, hanging(joint, heading).double())[0].item()
 

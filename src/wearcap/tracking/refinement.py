@@ -206,6 +206,8 @@ def with_feet_moved(motion: Motion, offset: Float[Tensor, "time foot 3"]) -> Mot
 
     Knees bend forward, and a leg never becomes straighter than it can.
     """
+    if not offset.any():
+        return motion
     skeleton, T = motion.skeleton, motion.T_world_joint
     hip, knee, ankle = (skeleton.indices(*(f"{side}_{joint}" for side in SIDES)) for joint in ("hip", "knee", "ankle"))
     start, middle, end = (T.t[:, joints].double() for joints in (hip, knee, ankle))

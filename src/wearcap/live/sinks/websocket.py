@@ -107,21 +107,13 @@ class WebSocketSink(Sink):
         self._loop.call_soon_threadsafe(self._describe, wearer, text)
 
     def take(self, wearer: str, motion: Motion) -> None:
-        wxyz = quat_wxyz_from_matrix(motion.R_parent_joint.double())
-        contacts, objects = motion.contact_prob, objects_of(motion)
+        objects = objects_of(motion)
         pacing, step_s = self._paces[wearer]
         hurry = pacing.behind(len(motion), step_s)
-        for k, time_s in enumerate(motion.timestamps.tolist()):
-            frame = {
-                "wearer": wearer,
-                "time": time_s,
-                "root": [round(each, 5) for each in motion.t_world_root[k].tolist()],
-                "rotations_wxyz": [[round(each, 6) for each in row] for row in wxyz[k].tolist()],
-                "contact": None if contacts is None else [round(each, 3) for each in contacts[k].tolist()],
-            }
-            if objects[k]:
-                frame["objects"] = {name: _row(seen) for name, seen in objects[k].items()}
-            self._at(pacing.due(step_s, hurry), self._send_frame, json.dumps(frame))
+        for k in range(len(motion)):
+            due_s = pacing.due(step_s, hurry)
+            if self._clients:
+                self._at(due_s, self._send_frame, _frame(wearer, motion, k, objects[k]))
 
     def _at(self, due_s: float, call: Callable[..., None], *arguments: str) -> None:
         """Call something on the server's loop at our time (s); the loop's clock is the same."""
@@ -196,6 +188,21 @@ class WebSocketSink(Sink):
                 client.transport.abort()
                 continue
             self._loop.create_task(_sent(client, text))
+
+
+def _frame(wearer: str, motion: Motion, k: int, objects: dict[str, SeenObject]) -> str:
+    """The message of one frame of a motion."""
+    wxyz, contact = quat_wxyz_from_matrix(motion.R_parent_joint[k].double()), motion.contact_prob
+    frame = {
+        "wearer": wearer,
+        "time": motion.timestamps[k].item(),
+        "root": [round(each, 5) for each in motion.t_world_root[k].tolist()],
+        "rotations_wxyz": [[round(each, 6) for each in row] for row in wxyz.tolist()],
+        "contact": None if contact is None else [round(each, 3) for each in contact[k].tolist()],
+    }
+    if objects:
+        frame["objects"] = {name: _row(seen) for name, seen in objects.items()}
+    return json.dumps(frame)
 
 
 def _row(seen: SeenObject) -> dict[str, Any]:
