@@ -20,7 +20,7 @@ from wearcap.io.formats.motion_npz import read_motion
 from wearcap.live.capture import LiveCapture
 from wearcap.live.devices import Devices
 from wearcap.live.packets import MAX_POINTS_WAITING, Inbox, Packet
-from wearcap.live.setup import read_setup, write_setup
+from wearcap.live.setup import plain_name, read_setup, write_setup
 from wearcap.live.sink import SinkThread
 from wearcap.live.sinks import sink_of
 from wearcap.live.sinks.files import FilesSink, join_sections
@@ -46,7 +46,23 @@ def test_two_wearers_whose_names_look_alike_have_a_folder_each(tmp_path: Path):
         for name in ("太郎", "花子"):
             sink.take(name, later(motion, k))
     sink.close()
-    assert [len(read_motion(tmp_path / folder / "motion.npz")) for folder in ("__", "___2")] == [180, 180]
+    folders = [plain_name(name) for name in ("太郎", "花子")]
+    assert [len(read_motion(tmp_path / folder / "motion.npz")) for folder in folders] == [180, 180]
+
+
+def test_names_that_look_alike_have_files_of_their_own():
+    names = ("anna", "", "a/b", "a.b", "a_b", "x" * 50, "x" * 51)
+    assert len({plain_name(name) for name in names}) == len(names)
+    assert (plain_name("anna"), plain_name("")) == ("anna", "wearer")
+
+
+def test_a_wearer_without_a_name_and_one_called_wearer_are_both_in_the_report():
+    sensed, kept = swaying(60), Kept()
+    script = [packet for pair in zip(heads(sensed, ""), heads(sensed, "wearer")) for packet in pair]
+    report = LiveCapture(small_hmd2(), [Scripted(script)], [kept], setup=ReplaySource(sensed, HMD2Session).setup).run(
+        30.0
+    )
+    assert {name: row["sessions"] for name, row in report["wearers"].items()} == {"unnamed wearer": 1, "wearer": 1}
 
 
 def test_a_piece_that_cannot_be_written_costs_its_half_second(tmp_path: Path):
@@ -91,11 +107,11 @@ def test_a_name_from_the_network_is_no_path_and_a_named_wearer_keeps_their_set_u
     sensed, kept = swaying(60), Kept()
     known = ReplaySource(sensed, HMD2Session).setup
     assert known is not None
-    write_setup(known.with_height(1.61), tmp_path / "setup_a_b.json")
+    write_setup(known.with_height(1.61), tmp_path / f"setup_{plain_name('a/b')}.json")
     script = list(heads(sensed, "a/b"))
     LiveCapture(small_hmd2(), [Scripted(script)], [kept], setup_file=tmp_path / "setup.json").run(30.0)
     assert kept.motion("a/b").skeleton.stature == pytest.approx(1.61, abs=1e-3)
-    assert [path.name for path in tmp_path.iterdir()] == ["setup_a_b.json"]
+    assert [path.name for path in tmp_path.iterdir()] == [f"setup_{plain_name('a/b')}.json"]
 
 
 def test_a_height_that_is_given_is_that_of_a_known_set_up_too():
@@ -147,6 +163,25 @@ def test_a_file_that_cannot_be_written_at_the_end_costs_its_own_frames_alone(tmp
     with pytest.raises(WearcapError, match="finite"):
         sink.close()
     assert [len(read_motion(tmp_path / name / "motion.npz")) for name in ("anna", "ben")] == [40, 40]
+
+
+def test_wearers_who_come_and_leave_fill_no_memory_while_a_sink_stalls():
+    stalled, motion = Stalled(), swaying_motion(5, 0)
+    thread = SinkThread(stalled, capacity=10)
+    thread.start()
+    thread.take("", motion)
+    for _ in range(100):
+        thread.begin("", motion.skeleton, 60.0)
+        thread.end("")
+    assert len(thread._calls) <= 10
+    stalled.go.set()
+    thread.close()
+
+
+@pytest.mark.parametrize("scheme", ["vmc", "ws"])
+def test_an_option_that_a_sink_does_not_have_is_refused(scheme):
+    with pytest.raises(WearcapError, match="no option 'wearrer'.*wearer"):
+        sink_of(f"{scheme}://127.0.0.1:39539?wearrer=anna", "127.0.0.1", True)
 
 
 def test_what_a_stalled_sink_never_took_is_counted():

@@ -370,10 +370,10 @@ class LiveCapture:
     def report(self) -> dict[str, Any]:
         """Latencies, rates and counts as plain data."""
         status = self.status()
-        wearers = {}
+        wearers, unnamed = {}, "wearer" if "wearer" not in self.wearers else "unnamed wearer"
         for each in status.wearers:
             live = self.wearers[each.name]
-            wearers[each.name or "wearer"] = {
+            wearers[each.name or unnamed] = {
                 "frames": each.frames,
                 "sessions": live.sessions,
                 "latency_ms": {

@@ -8,6 +8,7 @@ first.
 import json
 import math
 import re
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -67,8 +68,12 @@ class Setup:
 
 
 def plain_name(wearer: str) -> str:
-    """A wearer's name as part of a file's or folder's name: names from the network are no paths."""
-    return re.sub(r"[^A-Za-z0-9_-]", "_", wearer)[:40] or "wearer"
+    """A wearer's name as part of a file's or folder's name: names from the network are no paths.
+
+    A name that has to be changed ends with a checksum, so that names that look alike remain different.
+    """
+    plain = re.sub(r"[^A-Za-z0-9_-]", "_", wearer)[:40] or "wearer"
+    return plain if plain == wearer or not wearer else f"{plain}_{zlib.crc32(wearer.encode('utf-8', 'replace')):08x}"
 
 
 def head_seat() -> Seat:

@@ -88,9 +88,8 @@ class SinkThread:
         with self._ready:
             if len(self._calls) >= self.capacity:
                 oldest = next((i for i, (may_drop, _) in enumerate(self._calls) if may_drop), None)
-                if oldest is not None:
-                    del self._calls[oldest]
-                    self.dropped += 1
+                del self._calls[oldest or 0]  # beginnings and ends alone wait when many come and leave
+                self.dropped += oldest is not None
             self._calls.append((droppable, call))
             self._ready.notify()
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 from urllib.parse import parse_qs, urlsplit
 
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, nearest
 from wearcap.live.packets import Inbox, Packet
 from wearcap.viewer.guard import LOOPBACK
 
@@ -70,6 +70,12 @@ class Address:
         if not parts.scheme or parts.path not in ("", "/"):
             raise WearcapError(f"no address {text!r}", expected="SCHEME://HOST:PORT")
         return cls(parts.scheme, parts.hostname or host, default_port if port is None else port, options)
+
+    def require_options(self, *allowed: str) -> None:
+        """Raise WearcapError for an option that is neither `wearer` nor one of these."""
+        for name in self.options:
+            if name not in ("wearer", *allowed):
+                raise WearcapError(f"no option {name!r}", f"{self.scheme}://", fix=nearest(name, ("wearer", *allowed)))
 
 
 class Source(ABC):

@@ -14,7 +14,7 @@ def sink_of(text: str, host: str, pace: bool) -> Sink:
     """The sink of an address ("vmc://127.0.0.1:39539"); `pace`: whether frames are sent at their own rate; `host`: where one
     that serves does so, unless its address says it.
 
-    Raises WearcapError for an unknown scheme and for anything that is no address.
+    Raises WearcapError for an unknown scheme, anything that is no address, and options that the sink does not have.
     """
     scheme, separator, _ = text.partition("://")
     if scheme not in SINKS:

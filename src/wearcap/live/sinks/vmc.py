@@ -69,6 +69,8 @@ class VmcSink(Sink):
     convention = "Unity's humanoid bones, objects as trackers; left-handed, y up, z forward, metres"
 
     def __init__(self, address: Address, pace: bool = True):
+        """Raises WearcapError for options that the sink does not have."""
+        address.require_options()
         self.address, self.name = address, f"vmc://{address.host}:{address.port}"
         self.wearer = address.options.get("wearer")
         self._pacing = Pacing(pace)

@@ -43,6 +43,8 @@ class WebSocketSink(Sink):
     convention = "JSON; wearcap's axes (x forward, y left, z up), metres, quaternions wxyz"
 
     def __init__(self, address: Address, pace: bool = True):
+        """Raises WearcapError for options that the sink does not have."""
+        address.require_options()
         self.address, self.guard = address, Guard(address.host)
         self.name = f"ws://{address.host}:{address.port}"
         self.open_to_others = address.host not in LOOPBACK

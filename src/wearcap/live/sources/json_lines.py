@@ -26,7 +26,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.live.packets import CAMERA, HEAD, OBJECT, SUIT, Inbox, Packet, Sample
 from wearcap.live.source import Address, Budget, DatagramSource
-from wearcap.live.sources.parts import AXES, MAX_LISTS, Names, bounded_json, checked_pose, matrix_of, require_options
+from wearcap.live.sources.parts import AXES, MAX_LISTS, Names, bounded_json, checked_pose, matrix_of
 from wearcap.live.sources.posts import admitting
 from wearcap.sensors.packets import MAX_ACC_M_S2, MAX_POSITION_M, WRONG_TYPE, number_fault, time_fault, values_fault
 from wearcap.sensors.samples import ActiveObject, HeadSample, LocalizationSample, ObjectSample, WatchSample, WristSample
@@ -68,7 +68,7 @@ class JsonSource(DatagramSource):
 
     def __init__(self, address: Address):
         super().__init__(address)
-        require_options(address, *self.own_options)
+        address.require_options(*self.own_options)
         self._names = {kind: Names() for kind in ("device", "object", "wearer", "clock")}
 
     def parse(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> list[Packet]:

@@ -28,7 +28,7 @@ from wearcap.geometry.rotation import matrix_from_quat_wxyz
 from wearcap.io.formats.mvnx import BONE_CHANGE_M, JOINT_OF, SITE_OF, bone_offsets, plain_label
 from wearcap.live.packets import SUIT, Packet
 from wearcap.live.source import Address, DatagramSource
-from wearcap.live.sources.parts import UNIT_TOLERANCE, require_options
+from wearcap.live.sources.parts import UNIT_TOLERANCE
 from wearcap.recording import Motion
 from wearcap.sensors.packets import MAX_POSITION_M, NOT_A_ROTATION, NOT_FINITE, OUT_OF_RANGE
 from wearcap.sensors.samples import SuitPiece
@@ -107,7 +107,7 @@ class MvnSource(DatagramSource):
 
     def __init__(self, address: Address):
         super().__init__(address)
-        require_options(address, "up")
+        address.require_options("up")
         self.up = address.options.get("up", "z")
         require_choice(self.up, ("z", "y"), f"up={self.up[:20]}")
         self._characters: dict[int, _Character] = {}

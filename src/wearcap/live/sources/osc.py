@@ -13,7 +13,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import about_axis
 from wearcap.live.packets import HEAD, Packet
 from wearcap.live.source import Address, DatagramSource
-from wearcap.live.sources.parts import UNTRACKED, Names, checked_pose, device_of, pose_of, require_options, untracked
+from wearcap.live.sources.parts import UNTRACKED, Names, checked_pose, device_of, pose_of, untracked
 from wearcap.sensors.packets import NOT_FINITE, OUT_OF_RANGE, time_fault
 from wearcap.sensors.samples import HeadSample, WristSample
 
@@ -118,7 +118,7 @@ class VmcSource(DatagramSource):
 
     def __init__(self, address: Address):
         super().__init__(address)
-        require_options(address)
+        address.require_options()
         self._names = Names()
         self._time_s: float | None = None
         self._global_s: dict[str, float] = {}
@@ -225,7 +225,7 @@ class OscTrackerSource(DatagramSource):
 
     def __init__(self, address: Address):
         super().__init__(address)
-        require_options(address)
+        address.require_options()
         self._halves = {tracker: _Halves() for tracker in _TRACKERS}
 
     def parse(self, data: bytes, arrived_s: float, refuse: Callable[[str], None]) -> list[Packet]:

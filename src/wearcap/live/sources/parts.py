@@ -10,12 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS
-from wearcap.errors import WearcapError, nearest
+from wearcap.errors import WearcapError
 from wearcap.files import parse_json
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.devices.axes import CONVENTIONS
 from wearcap.live.packets import CAMERA, HEAD, SUIT
-from wearcap.live.source import Address
 from wearcap.sensors.packets import MAX_POSITION_M, NOT_A_ROTATION, NOT_FINITE, rotation_fault, values_fault
 
 MAX_NAME = 64
@@ -58,14 +57,6 @@ class Names:
             del self._last_s[oldest]
         self._last_s[name] = now_s
         return None
-
-
-def require_options(address: Address, *allowed: str) -> None:
-    """Raise WearcapError for an option that a source does not have; every source has `wearer`."""
-    for name in address.options:
-        if name not in ("wearer", *allowed):
-            what = f"no option {name!r}"
-            raise WearcapError(what, f"source {address.scheme}://", fix=nearest(name, ("wearer", *allowed)))
 
 
 def bounded_json(data: bytes) -> Any:

@@ -20,7 +20,7 @@ from wearcap.errors import WearcapError, require_choice
 from wearcap.io.devices.watch_log import G_M_S2, WatchConvention, logging_time, watch_convention
 from wearcap.live.packets import Inbox, Packet
 from wearcap.live.source import Address, DatagramSource
-from wearcap.live.sources.parts import Names, bounded_json, device_of, matrix_of, require_options
+from wearcap.live.sources.parts import Names, bounded_json, device_of, matrix_of
 from wearcap.live.sources.posts import serve_posts
 from wearcap.sensors.packets import MAX_ACC_M_S2, NOT_FINITE, OUT_OF_RANGE, time_fault, values_fault
 from wearcap.sensors.samples import WatchSample
@@ -141,7 +141,7 @@ class WatchSource(DatagramSource):
 
     def __init__(self, address: Address):
         super().__init__(address)
-        require_options(address, "joint", *self.own_options)
+        address.require_options("joint", *self.own_options)
         self.joint = address.options.get("joint")
         if self.joint is not None:
             require_choice(self.joint, WRISTS, f"joint={self.joint}")
