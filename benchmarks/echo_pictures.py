@@ -53,7 +53,7 @@ def draw(
         environment = pipeline.objects(sources[number])
         assert environment is not None
         save_png(
-            folder / f"{kind}.png",
+            folder / f"echo_{kind}.png",
             sheet(with_objects(recording, environment), motion, environment, act, recording.shape),
         )
         print(

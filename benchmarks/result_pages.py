@@ -31,6 +31,10 @@ MOST_ROWS = 12
 """Of a headline table."""
 TRANSCRIBED = "transcribed"
 """Key of a JSON's `about` whose figures were taken from an earlier page and not from the command's own output."""
+RANKED = (
+    "The worst, the median and the best of CMU's test recordings, truth above and captured below; dots mark contact"
+)
+"""Caption of the pictures of `contact_sheets.py`."""
 NONE = "–"
 OURS = "ours"
 """Row of our checkpoint."""

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from echo_rows import Captured, Method, captured, pipeline_of, scenario_of
 from hydra.utils import instantiate
-from result_pages import NONE, Grid, Page, Tree, Trees, figure_of, mean, picked, rows_of, score_grids
+from result_pages import NONE, RANKED, Grid, Page, Tree, Trees, figure_of, mean, picked, rows_of, score_grids
 from rich.console import Console
 from rich.progress import Progress
 from sensed import WRONG_HEIGHTS
@@ -479,6 +479,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         speed=f"{online['ratio']:.0f} × online" if online else "",
         clocks=CLOCKS,
         pictures=(
+            ("echo_cmu.png", RANKED),
             ("echo_box.png", "A box that is carried, truth above and captured below, points that touch lit"),
             ("echo_table.png", "A table that is pushed: the act of median error"),
             ("echo_suitcase.png", "A suitcase that is carried: the act of median error"),

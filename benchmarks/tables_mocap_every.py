@@ -15,7 +15,7 @@ from pathlib import Path
 
 from mocap_every_calibration import GOALS, calibration_scores
 from mocap_every_rows import Method, body_row, captures, cue_row, floor_row, pipeline_of
-from result_pages import Grid, Page, Tree, Trees, figure_of, mean, picked, ranged, rows_of, score_grids
+from result_pages import RANKED, Grid, Page, Tree, Trees, figure_of, mean, picked, ranged, rows_of, score_grids
 from rich.console import Console
 from rich.progress import Progress
 from sensed import GIVEN, WRONG_HEIGHTS, add_sensors
@@ -268,6 +268,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         speed=f"{online['ratio']:.0f} × online, head poses given" if online else "",
         clocks=CLOCKS,
         pictures=(
+            ("mocap_every_cmu.png", RANKED),
             (
                 "mocap_every_hillside.png",
                 "Stairs and slopes, truth above and captured below (the floor drawn is that of the beginning)",
