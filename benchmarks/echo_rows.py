@@ -4,12 +4,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from sensed import GIVEN, sensed
 
 from wearcap.cli.conf import compose, load_pipeline
 from wearcap.recording import Motion, RecordingStore
 from wearcap.runtime.system import CaptureInput
+from wearcap.simulation.recordings.measured import EnvironmentErrors, as_measured
 from wearcap.systems.echo.observations import BatchItem, Scenario, batch_item_of
 from wearcap.systems.echo.pipeline import Echo
 from wearcap.systems.echo.scores import Truth, observed_share
@@ -27,6 +29,8 @@ class Method:
     """A modality, and the share of its frames that are given."""
     height_off_m: float | None = None
     """How far the height that the wearer gives is off (m); None: the wearer's own bones are given."""
+    measured: bool = False
+    """Whether objects, hinges and rails are where people measure them (`as_measured`), instead of where they are."""
 
 
 def pipeline_of(method: Method) -> Echo:
@@ -58,7 +62,9 @@ def captured(
     for start in range(0, len(jobs), items):
         batch = jobs[start : start + items]
         given = {name: sensed(store.load(name), GIVEN, method.height_off_m) for name, _ in batch}
-        observed_parts = {name: scenario_of(echo, CaptureInput(part, store.root)) for name, part in given.items()}
+        observed_parts = {
+            name: scenario_of(echo, CaptureInput(part, store.root), method.measured) for name, part in given.items()
+        }
         scenarios = [_observing(method, echo, observed_parts[name], store.root, seed) for name, seed in batch]
         motions = echo.capture_scenarios(scenarios, [seed for _, seed in batch])
         for (name, seed), motion in zip(batch, motions):
@@ -67,9 +73,13 @@ def captured(
             yield Captured(name, seed, motion, echo.truth(motion, CaptureInput(scenario.recording, store.root)), item)
 
 
-def scenario_of(echo: Echo, source: CaptureInput) -> Scenario:
-    """The recording with the objects of its own file."""
-    return echo.scenario(source.recording, echo.objects(source))
+def scenario_of(echo: Echo, source: CaptureInput, measured: bool) -> Scenario:
+    """The recording with the objects of its own file, exactly or as `measured`: the same errors in every run."""
+    environment = echo.objects(source)
+    if measured and environment is not None:
+        rng = np.random.default_rng([7, *source.recording.name.encode()])
+        environment = as_measured(environment, EnvironmentErrors(), rng)
+    return echo.scenario(source.recording, environment)
 
 
 def _observing(method: Method, echo: Echo, scenario: Scenario, root: Path, seed: int) -> Scenario:
