@@ -435,7 +435,6 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
             f"Jitter is {mean(ours['jitter_ratio'])} times the truth's.",
             "Bad are arms out of the camera's sight, and CMU's dances and jumps.",
             *_briefly(simulated, real),
-            *_transcribed(trees),
             *_counted(trees),
             "FID needs more windows than CMU's held-out subjects have.",
             "No recording of a real head-mounted device has been scored.",
@@ -483,16 +482,6 @@ def _counted(trees: Trees) -> tuple[str, ...]:
     return (
         f"CMU's rows are of {about['recordings']} short recordings of held-out subjects, {about['seeds']} repetitions of each.",
     )
-
-
-def _transcribed(trees: Trees) -> tuple[str, ...]:
-    """Which data set's rows are of an earlier page."""
-    about = trees.get("hmd2_simulated_camera", {}).get("about", {})
-    what = (
-        "Figures on simulated people are of an earlier page: exact sensors but for the head's jitter, and baselines of "
-        "other and longer trainings than CMU's."
-    )
-    return (what,) if about.get("transcribed") else ()
 
 
 def _against_hands(scores: dict[str, Tree]) -> tuple[str, ...]:
