@@ -34,7 +34,7 @@ from wearcap.io.formats.motion_npz import read_motion
 from wearcap.live import wearer as wearer_module
 from wearcap.live.capture import LiveCapture, report_text
 from wearcap.live.packets import HEAD, Inbox, Packet
-from wearcap.live.setup import Seat, Setup
+from wearcap.live.setup import Seat, Setup, plain_name
 from wearcap.live.sink import Sink, SinkThread
 from wearcap.live.sinks import sink_of
 from wearcap.live.sinks.files import FilesSink, join_sections
@@ -387,7 +387,7 @@ def test_a_recording_of_many_sections_is_one_motion(tmp_path: Path):
     for k in range(25):
         sink.take("../..", replace(motion, timestamps=motion.timestamps + k))
     sink.close()
-    whole = read_motion(tmp_path / "_____" / "motion.npz")
+    whole = read_motion(tmp_path / plain_name("../..") / "motion.npz")
     torch.testing.assert_close(whole.timestamps, torch.arange(1500, dtype=torch.float64) / 60)
     torch.testing.assert_close(whole.R_parent_joint[-60:], motion.R_parent_joint)
 

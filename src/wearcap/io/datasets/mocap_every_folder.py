@@ -161,7 +161,7 @@ def mocap_every_recording(folder: MocapEveryFolder, scale: float = 1.0, T_world_
     )
 
 
-def _board(track: Trajectory, config: dict[str, Any], marks: dict[str, Any], folder: Path) -> _BoardWalks | None:
+def _board(track: Trajectory, config: dict[str, Any], marks: dict[Any, Any], folder: Path) -> _BoardWalks | None:
     measured = config.get("cam_scale_origin")
     if measured is None or not {"x", "y"} <= marks.keys():
         return None
