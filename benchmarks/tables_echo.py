@@ -415,7 +415,7 @@ LABELS = {
 """Columns of the page's tables with their digits."""
 HEADLINE = (
     ("Table 1:", "ours", "objects: **ours**"),
-    ("Table 1:", "ours, hinges and rails unknown", "objects: **ours**, hinges and rails unknown, as in the rows of rivals"),
+    ("Table 1:", "ours, hinges and rails unknown", "objects: **ours**, hinges and rails unknown, as for rivals"),
     ("Table 1:", "nearest training window", "objects: nearest training window"),
     ("Table 1, equal", "ours, the same budget", "objects: ours, the rivals' budget"),
     ("Table 1, equal", "BoDiffusion-style + object", "objects: BoDiffusion-style + object, the same frame and budget"),
