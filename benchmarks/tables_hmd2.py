@@ -435,6 +435,9 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
             f"Jitter is {mean(ours['jitter_ratio'])} times the truth's.",
             "Bad are arms out of the camera's sight, and CMU's dances and jumps.",
             *_briefly(simulated, real),
+            *["Simulated people: an earlier page's, with exact sensors."][
+                : "transcribed" in trees["hmd2_simulated_camera"]["about"]
+            ],
             *_counted(trees),
             "FID needs more windows than CMU's held-out subjects have.",
             "No recording of a real head-mounted device has been scored.",
@@ -498,11 +501,8 @@ def _conditions(real: dict[str, Tree]) -> tuple[str, ...]:
     errors = [
         f"{text(real[name]['mpjpe_cm'])} cm {how}" for name, how in ((OURS, "with"), (ALONE, "without")) if name in real
     ]
-    return (
-        (f"Points and pictures of simulated surroundings on real motion (CMU): {', '.join(errors)} them.",)
-        if errors
-        else ()
-    )
+    what = f"Points and pictures of simulated surroundings on real motion (CMU): {', '.join(errors)} them."
+    return (what,) if errors else ()
 
 
 def _strangers_off(people: Tree) -> tuple[str, ...]:
