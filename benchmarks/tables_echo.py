@@ -489,16 +489,20 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
 
 
 def _orientation(objects: dict[str, Tree]) -> str:
-    """How far objects are turned, beside what knows nothing but the nearest training window."""
+    """How far objects are turned, by what is known of them."""
+    rows = {
+        "ours": "An object's orientation is off by",
+        "ours, hinges and rails unknown": "with unknown hinges and rails by",
+        "nearest training window": "that of the nearest training window by",
+    }
     phrases = [
-        f"{mean(row['rotation_deg'], 0)}° ({mean(row['symmetric_rotation_deg'], 0)}° modulo its symmetry)"
-        for row in (objects["ours"], objects["nearest training window"])
-        if "symmetric_rotation_deg" in row
+        f"{what} {mean(objects[row]['rotation_deg'], 0)}° ({mean(objects[row].get('symmetric_rotation_deg'), 0)}° modulo its symmetry)"
+        for row, what in rows.items()
+        if row in objects
     ]
-    beside = f", that of the nearest training window's by {phrases[1]}" if len(phrases) > 1 else ""
     return (
-        f"An object's orientation is off by {phrases[0] if phrases else mean(objects['ours']['rotation_deg'], 0) + '°'}{beside}: "
-        "head and wrists tell little of it, and large objects' vertices go with it."
+        ", ".join(phrases)
+        + ": head and wrists alone tell little of it, and large objects' vertices go with it. With hinges and rails most of it is known."
     )
 
 

@@ -394,6 +394,7 @@ CLOCKS = {
 }
 """Benchmarks of the page's table of speed: what their clocks count, and what is given."""
 MAIN = "Tables 6.1 and 6.3"
+OLDER = "Figures on simulated people are of an earlier page: exact sensors, and baselines of other trainings."
 
 
 def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
@@ -435,9 +436,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
             f"Jitter is {mean(ours['jitter_ratio'])} times the truth's.",
             "Bad are arms out of the camera's sight, and CMU's dances and jumps.",
             *_briefly(simulated, real),
-            *["Simulated people: an earlier page's, with exact sensors."][
-                : "transcribed" in trees["hmd2_simulated_camera"]["about"]
-            ],
+            *([OLDER] if trees["hmd2_simulated_camera"]["about"].get("transcribed") else []),
             *_counted(trees),
             "FID needs more windows than CMU's held-out subjects have.",
             "No recording of a real head-mounted device has been scored.",

@@ -47,9 +47,8 @@ class OptionalInput(nn.Module):
     def forward(
         self, x: Float[Tensor, "batch time feature"], valid: Bool[Tensor, "batch time"]
     ) -> Float[Tensor, "batch token width"]:
-        if not (
-            self.training or torch.compiler.is_compiling() or valid.any()
-        ):  # all tokens are the same: one is encoded
+        # Without any valid frame all tokens are the same, and one is encoded; exported graphs have no such branch.
+        if not (self.training or torch.compiler.is_compiling() or valid.any()):
             nothing = F.pad(self.null, (0, 1)).expand(1, self.widen.kernel_size[0], -1)
             return self.widen(nothing).expand(len(valid), valid.shape[1] // self.widen.stride[0], -1)
         there = valid[..., None]
