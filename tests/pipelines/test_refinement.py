@@ -15,7 +15,7 @@ from wearcap.metrics.physics import foot_contact, foot_points, foot_skate_cm_s, 
 from wearcap.recording import Motion
 from wearcap.recording.timing import joined
 from wearcap.tracking.foot_lock import FootLock
-from wearcap.tracking.refinement import Measured, Refinement, Refiner, with_feet_moved, with_wrists_at
+from wearcap.tracking.refinement import Measured, Refinement, Refiner, with_limbs_bent
 
 FPS = 30.0
 FEET = FootLock(
@@ -50,7 +50,7 @@ def slid(motion: Motion, speed_m_s: float = 0.25, sink_m: float = 0.0) -> Motion
     """The walk with both feet sliding to and fro, and sunk into the floor."""
     way = speed_m_s / (2 * torch.pi) * (2 * torch.pi * motion.timestamps).sin()
     offset = torch.stack([way, 0 * way, torch.full_like(way, -sink_m)], -1).float()
-    return with_feet_moved(motion, offset[:, None].expand(-1, 2, 3))
+    return with_limbs_bent(motion, offset[:, None].expand(-1, 2, 3))
 
 
 def skate(motion: Motion, contact: torch.Tensor) -> float:
@@ -107,7 +107,7 @@ def test_knees_bend_forward_and_legs_reach_no_farther_than_they_can():
     motion, _ = truth()
     length = 0.85
     for offset in ((0.0, 0.0, 0.2), (0.0, 0.0, -0.5), (0.3, 0.0, -0.2), (-0.2, 0.1, 0.1)):
-        moved = with_feet_moved(motion, torch.tensor(offset).expand(len(motion), 2, 3))
+        moved = with_limbs_bent(motion, torch.tensor(offset).expand(len(motion), 2, 3))
         hip, knee, ankle = (moved.joint(f"left_{name}") for name in ("hip", "knee", "ankle"))
         before = (motion.joint("left_ankle").t - motion.joint("left_hip").t).norm(dim=-1)
         assert ((ankle.t - hip.t).norm(dim=-1) < before.clamp_min(0.996 * length) + 1e-5).all()
@@ -125,7 +125,7 @@ def test_a_straight_knee_bends_forward_when_its_foot_is_raised():
     back = rotation.about_axis("y", torch.tensor(-0.02))  # bent backwards by a degree
     R[:, motion.skeleton.index("left_knee")] = back
     stiff = replace(motion, R_parent_joint=R)
-    raised = with_feet_moved(stiff, torch.tensor([0.0, 0.0, 0.1]).expand(len(motion), 2, 3))
+    raised = with_limbs_bent(stiff, torch.tensor([0.0, 0.0, 0.1]).expand(len(motion), 2, 3))
     for side in ("left", "right"):
         assert (raised.joint(f"{side}_knee").t - raised.joint(f"{side}_hip").t)[:, 0].min() > 0.1
 
@@ -202,7 +202,7 @@ def test_arms_reach_tracked_wrists_or_as_near_as_they_can():
     shoulder = motion.joint("left_shoulder").t
     goal.t[:, 0] = torch.lerp(shoulder, goal.t[:, 0], 0.8) + 0.03
     goal.t[:, 1] += 5 * (T.t[:, 1] - motion.joint("right_shoulder").t)
-    found = with_wrists_at(motion, goal)
+    found = with_limbs_bent(motion, T_world_wrist=goal)
     left, right = (found.joint(name) for name in WRISTS)
     torch.testing.assert_close(left.t, goal.t[:, 0], atol=1e-4, rtol=0)
     torch.testing.assert_close(found.T_world_joint.R[:, wrists], goal.R, atol=1e-4, rtol=0)

@@ -103,8 +103,10 @@ def swing_between(a: Float[Tensor, "*#batch 3"], b: Float[Tensor, "*#batch 3"]) 
     K = torch.stack([zero, -v[..., 2], v[..., 1], v[..., 2], zero, -v[..., 0], -v[..., 1], v[..., 0], zero], -1)
     K = K.unflatten(-1, (3, 3))
     eye = torch.eye(3, dtype=a.dtype, device=a.device)
-    swing = eye + K + K @ K / (1 + cos).clamp_min(1e-6)
+    swing, opposite = eye + K + K @ K / (1 + cos).clamp_min(1e-6), cos < -1 + 1e-6
+    if not opposite.any():
+        return swing
     across = torch.linalg.cross(a, eye[a.abs().argmin(-1)])
     across = torch.nn.functional.normalize(across, dim=-1)[..., None]
     half_turn = 2 * across @ across.transpose(-1, -2) - eye
-    return torch.where(cos < -1 + 1e-6, half_turn, swing)
+    return torch.where(opposite, half_turn, swing)

@@ -154,12 +154,10 @@ class Refiner:
         final, self._smooth = _split(self._smooth, count)
         assert final is not None
         motion, measured = final
-        moved = motion
-        if offsets is not None:
-            moved = with_feet_moved(moved, offsets)
+        wrists = None
         if self.refinement.wrists and measured.t_world_wrist.shape[1]:
-            moved = with_wrists_at(moved, Rigid(measured.R_world_wrist, measured.t_world_wrist))
-        return [_except_given(moved, motion, measured.given)]
+            wrists = Rigid(measured.R_world_wrist, measured.t_world_wrist)
+        return [_except_given(with_limbs_bent(motion, offsets, wrists), motion, measured.given)]
 
     def _smoothed(self, piece: tuple[Motion, Measured]) -> tuple[Motion, Measured]:
         """The next frames with the average of their neighbours, anchored to the head."""
@@ -201,27 +199,61 @@ def held_in_gaps(motion: Motion, path: HeadPath, anchored: bool) -> Motion:
     return anchored_to_head(held, path.T_world_head) if anchored else held
 
 
-def with_feet_moved(motion: Motion, offset: Float[Tensor, "time foot 3"]) -> Motion:
-    """The motion with its ankles moved by an offset in the world (m), hips and knees following, feet turned as before.
+def with_limbs_bent(
+    motion: Motion, foot_offset: Float[Tensor, "time foot 3"] | None = None, T_world_wrist: Rigid | None = None
+) -> Motion:
+    """The motion with its ankles moved by an offset in the world (m), hips and knees following, feet turned as before, and
+    with both wrists turned as measured, and where they were measured or as near as the arms reach; None: these stay.
 
     Knees bend forward, and a leg never becomes straighter than it can.
     """
-    if not offset.any():
-        return motion
     skeleton, T = motion.skeleton, motion.T_world_joint
-    hip, knee, ankle = (skeleton.indices(*(f"{side}_{joint}" for side in SIDES)) for joint in ("hip", "knee", "ankle"))
-    start, middle, end = (T.t[:, joints].double() for joints in (hip, knee, ankle))
-    goal = _within_reach(start, middle, end, end + offset.double())
+    limbs: list[_Limbs] = []
+    if foot_offset is not None and foot_offset.any():
+        limbs.append(_legs(skeleton, T, foot_offset.double()))
+    if T_world_wrist is not None:
+        limbs.append(_arms(skeleton, T, T_world_wrist.t.double()))
+    if not limbs:
+        return motion
+    # All limbs at once, in double precision: the bend of a nearly straight one is the root of a small difference of squares.
+    upper, lower, end = ([joint for each in limbs for joint in each.joints[k]] for k in range(3))
+    goal, bias, moved = (torch.cat([each[k] for each in limbs], 1) for k in range(1, 4))
+    points = (T.t[:, joints].double() for joints in (upper, lower, end))
+    R, moved = T.R.clone(), moved[..., None, None]
+    for joints, turn in zip((upper, lower), reach(*points, goal, bias)):
+        R[:, joints] = torch.where(moved, turn.to(R) @ R[:, joints], R[:, joints])
+    if T_world_wrist is not None:
+        R[:, skeleton.indices(*WRISTS)] = T_world_wrist.R
+    return replace(motion, R_parent_joint=local_rotations(skeleton, R))
+
+
+class _Limbs(NamedTuple):
+    """A pair of limbs, left and right, and where they are to end."""
+
+    joints: tuple[list[int], ...]
+    """Indices of hips or shoulders, knees or elbows, and ankles or wrists."""
+    goal: Float[Tensor, "time limb 3"]
+    bias: Float[Tensor, "time limb 3"]
+    """As of `reach` (m)."""
+    moved: Bool[Tensor, "time limb"]
+    """False where a limb stays as it is."""
+
+
+def _legs(skeleton: Skeleton, T: Rigid, offset: Float[Tensor, "time foot 3"]) -> _Limbs:
+    joints = tuple(skeleton.indices(*(f"{side}_{joint}" for side in SIDES)) for joint in ("hip", "knee", "ankle"))
+    start, middle, end = (T.t[:, each].double() for each in joints)
     # The thigh's x axis points forward: the farther a foot is moved, the more surely its knee bends that way.
-    forward, distance = T.R[:, hip, :, 0].double(), offset.norm(dim=-1, keepdim=True)
+    forward, distance = T.R[:, joints[0], :, 0].double(), offset.norm(dim=-1, keepdim=True)
     backward = ((torch.lerp(start, end, 0.5) - middle) * forward).sum(-1, keepdim=True).clamp_min(0)
     bias = forward * (distance + backward * (distance / _SURELY_M).clamp_max(1))
-    R = T.R.clone()
-    upper, lower = (turn.to(R) for turn in reach(start, middle, end, goal, bias))
-    moved = (offset != 0).any(-1)[..., None, None]
-    R[:, hip] = torch.where(moved, upper @ R[:, hip], R[:, hip])
-    R[:, knee] = torch.where(moved, lower @ R[:, knee], R[:, knee])
-    return replace(motion, R_parent_joint=local_rotations(skeleton, R))
+    return _Limbs(joints, _within_reach(start, middle, end, end + offset), bias, (offset != 0).any(-1))
+
+
+def _arms(skeleton: Skeleton, T: Rigid, goal: Float[Tensor, "time wrist 3"]) -> _Limbs:
+    sides = [wrist.partition("_")[0] for wrist in WRISTS]
+    joints = [skeleton.indices(*(f"{side}_{joint}" for side in sides)) for joint in ("shoulder", "elbow")]
+    unbiased, moved = torch.zeros_like(goal), torch.ones(goal.shape[:2], dtype=torch.bool)
+    return _Limbs((*joints, skeleton.indices(*WRISTS)), goal, unbiased, moved)
 
 
 def _within_reach(
@@ -236,20 +268,6 @@ def _within_reach(
     soft = _STRAIGHT + _SOFT * (1 - torch.exp(-(wanted - _STRAIGHT) / _SOFT))
     share = torch.where(wanted > _STRAIGHT, torch.maximum(torch.minimum(now, wanted), soft), wanted)
     return start + (goal - start) * (share / wanted.clamp_min(1e-9))[..., None]
-
-
-def with_wrists_at(motion: Motion, T_world_wrist: Rigid) -> Motion:
-    """The motion with both wrists turned as measured, and where they were measured or as near as the arms reach."""
-    skeleton, T = motion.skeleton, motion.T_world_joint
-    sides = [wrist.partition("_")[0] for wrist in WRISTS]
-    shoulder, elbow = (skeleton.indices(*(f"{side}_{joint}" for side in sides)) for joint in ("shoulder", "elbow"))
-    wrist = skeleton.indices(*WRISTS)
-    points = (T.t[:, joints].double() for joints in (shoulder, elbow, wrist))
-    R = T.R.clone()
-    upper, lower = (turn.to(R) for turn in reach(*points, T_world_wrist.t.double()))
-    R[:, shoulder], R[:, elbow] = upper @ R[:, shoulder], lower @ R[:, elbow]
-    R[:, wrist] = T_world_wrist.R
-    return replace(motion, R_parent_joint=local_rotations(skeleton, R))
 
 
 def _joined(before: tuple[Motion, Measured] | None, new: tuple[Motion, Measured]) -> tuple[Motion, Measured]:

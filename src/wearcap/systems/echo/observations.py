@@ -221,7 +221,9 @@ def wrist_poses(track: Trajectory, at: Float64[Tensor, "time"]) -> Rigid:
     last = (torch.searchsorted(times, inside + SAME_S, right=True) - 1).clamp_min(0)
     gone = (times[(last + 1).clamp_max(len(times) - 1)] - times[last] > MAX_GAP_S) | (inside - times[last] <= SAME_S)
     held = track.T_world_body[last]
-    found = resample(track, inside).T_world_body if len(times) > 1 else held
+    if gone.all():  # as where wrists and head come in one packet
+        return held
+    found = resample(track, inside).T_world_body
     return Rigid(torch.where(gone[:, None, None], held.R, found.R), torch.where(gone[:, None], held.t, found.t))
 
 
