@@ -42,8 +42,8 @@ ALONG_FACE = 0.75
 WALK_M_S, SMOOTH_S = 0.4, 0.4
 """Speed of walking, and the span (s) over which it is measured."""
 PRONATED_DEG = 20.0
-"""Angle by which the palms of hanging arms face backwards from the thighs: the median of people who stand, 20 for left and
-30 for right arms in CMU's training recordings (4 persons), 14 and 51 in HDM05's (3 and 2 persons)."""
+"""Angle by which the palms of hanging arms face backwards from the thighs, as those of people who stand: the median of 4
+persons in CMU's training recordings is 24 for left and 16 for right arms, one of HDM05's has 17 (left)."""
 SWING_RATIO = 2.0
 """Least ratio of a swinging arm's angular speed about its axis to that across it."""
 
