@@ -138,7 +138,7 @@ def stalled_client(port: int) -> None:
     """A WebSocket client that reads nothing, anew whenever it is thrown out."""
     while True:
         try:
-            with connect(f"ws://127.0.0.1:{port}", max_queue=1, open_timeout=2.0) as client:
+            with connect(f"ws://127.0.0.1:{port}", max_queue=1, open_timeout=2.0, ping_interval=None) as client:
                 client.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
                 time.sleep(30.0)
         except Exception:  # not there yet, or gone
