@@ -565,7 +565,7 @@ def _grids(trees: Trees) -> list[Grid]:
         grids += score_grids({"about": tree["about"], "tables": found}, _labels())
     first = {name: _results(tree["tables"].get(FIRST, [])) for name, tree in trees.items()}
     for name, rows in first.items():
-        if any(row.activities for row in rows):
+        if max((len(row.activities) for row in rows), default=0) > 4:  # of fewer, Tables 6.8 to 6.10 show enough
             table = _activities(
                 f"Tables 6.8–6.10: MPJPE (cm) by what was mostly done ({name.removeprefix('hmd2_')})", rows, "mpjpe_cm"
             )
