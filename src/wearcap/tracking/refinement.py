@@ -207,14 +207,15 @@ def with_limbs_bent(
 
     Knees bend forward, and a leg never becomes straighter than it can.
     """
+    feet_move = foot_offset is not None and bool(foot_offset.any())
+    if not feet_move and T_world_wrist is None:
+        return motion
     skeleton, T = motion.skeleton, motion.T_world_joint
     limbs: list[_Limbs] = []
-    if foot_offset is not None and foot_offset.any():
+    if foot_offset is not None and feet_move:
         limbs.append(_legs(skeleton, T, foot_offset.double()))
     if T_world_wrist is not None:
         limbs.append(_arms(skeleton, T, T_world_wrist.t.double()))
-    if not limbs:
-        return motion
     # All limbs at once, in double precision: the bend of a nearly straight one is the root of a small difference of squares.
     upper, lower, end = ([joint for each in limbs for joint in each.joints[k]] for k in range(3))
     goal, bias, moved = (torch.cat([each[k] for each in limbs], 1) for k in range(1, 4))
