@@ -325,6 +325,8 @@ def test_frames_of_two_wearers_are_sent_side_by_side():
     with connect(sink.url) as client:
         for name in ("anna", "ben"):
             thread.begin(name, motion.skeleton, 60.0)
+        for _ in range(2):  # the client is served from here on
+            assert "skeleton" in json.loads(client.recv(10.0))
         begin_s = time.monotonic()
         for k in range(frames // 10):
             for name in ("anna", "ben"):

@@ -55,6 +55,8 @@ class WebSocketSink(Sink):
         self._last_s = 0.0
         """Our time (s) at which the last frame so far is due."""
         self._clients: set[ServerConnection] = set()
+        self._sending: set[asyncio.Task[None]] = set()
+        """Messages on their way: the loop itself refers to its tasks only weakly."""
         self._about: dict[str, str] = {}
         self.slow = 0
         """Number of clients disconnected because they read too slowly."""
@@ -189,7 +191,9 @@ class WebSocketSink(Sink):
                 self._clients.discard(client)
                 client.transport.abort()
                 continue
-            self._loop.create_task(_sent(client, text))
+            task = self._loop.create_task(_sent(client, text))
+            self._sending.add(task)
+            task.add_done_callback(self._sending.discard)
 
 
 def _frame(wearer: str, motion: Motion, k: int, objects: dict[str, SeenObject]) -> str:
