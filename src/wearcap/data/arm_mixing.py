@@ -71,7 +71,7 @@ class ArmDonors:
             share = (torch.arange(start, stop) + 0.5 - start) / (stop - start)
             share = share.square() * (3 - 2 * share)
             sides = [self._arms(own, joints, each, start, stop) for each in (before, segment)]
-            arms[start:stop] = _blended(*sides, share)
+            arms[start:stop] = blended(*sides, share)
         mixed = motion.R_parent_joint.clone()
         mixed[:, joints] = arms
         return replace(motion, R_parent_joint=mixed)
@@ -131,7 +131,7 @@ class ArmDonors:
         return file.window("motion.R_parent_joint", first, int(frames[-1]) + 1)[:, joints][frames - first]
 
 
-def _blended(
+def blended(
     R_a: Float[Tensor, "frame arm 3 3"], R_b: Float[Tensor, "frame arm 3 3"], share: Float[Tensor, "frame"]
 ) -> Float[Tensor, "frame arm 3 3"]:
     """Rotations on the way from R_a to R_b; the way stays on its side where the two are half a turn apart."""

@@ -155,7 +155,8 @@ class LastPoseEstimator(WatchEstimator):
 class MLPEstimator(WatchEstimator):
     """Baseline after AGRoL's network without its diffusion (Du et al. 2023): one MLP predicts all frames of a window."""
 
-    def __init__(self, feature_size: int, motion_size: int, window: int, width: int, layers: int):
+    def __init__(self, feature_size: int, motion_size: int, window: int, width: int, layers: int, blend: int = 0):
+        """`blend`: as `TwoStageEstimator`'s (ours)."""
         super().__init__()
         self.window = window
         self.feature_normalizer, self.motion_normalizer = Normalizer(feature_size), Normalizer(motion_size)
@@ -163,6 +164,7 @@ class MLPEstimator(WatchEstimator):
         self.embed = nn.Linear(feature_size, width)
         self.blocks = nn.ModuleList(MixingBlock(width, window, has_level=False) for _ in range(layers))
         self.head = nn.Linear(width, motion_size + FEET)
+        self.blend = TemporalBlend(blend) if blend else None
 
     def forward(self, features: Float[Tensor, "batch window feature"]) -> Estimate:
         """Predict every frame of the window from raw features."""
@@ -172,6 +174,8 @@ class MLPEstimator(WatchEstimator):
         for block in self.blocks:
             x = block(x, no_level, mask)
         motion, logit = self.head(x).split([len(self.motion_normalizer.mean), FEET], -1)
+        if self.blend is not None:
+            motion = self.blend(motion, torch.ones(motion.shape[:2], dtype=torch.bool, device=motion.device))
         return Estimate(self.motion_normalizer.inverse(motion), logit, None)
 
 
