@@ -162,6 +162,17 @@ def test_an_mlp_sees_the_whole_window_and_predicts_all_frames():
     assert (net(features).motion - output.motion)[:, 0].abs().max() > 1e-5
 
 
+def test_an_mlps_output_is_blended_over_time():
+    """What shakes from frame to frame shakes less."""
+    torch.manual_seed(0)
+    net, plain = MLPEstimator(27, 141, 40, 32, 2, blend=7).eval(), MLPEstimator(27, 141, 40, 32, 2).eval()
+    assert net.blend is not None
+    plain.load_state_dict({name: value for name, value in net.state_dict().items() if not name.startswith("blend.")})
+    features = torch.randn(3, 40, 27)
+    shaking = [each(features).motion.diff(dim=1).norm() for each in (net, plain)]
+    assert shaking[0] < 0.7 * shaking[1]
+
+
 def test_the_papers_size():
     config = compose("train", ["experiment=full/mocap_every", "paths.run=none"])
     net = instantiate(config.model, _convert_="all").net
