@@ -1,4 +1,4 @@
-"""MocapEvery's two-stage estimator (§3.3): end-effectors first, then contacts, then the body."""
+"""MocapEvery's two-stage estimator (§3.3): end-effectors first, then contacts, then the body; and one MLP in its place (ours)."""
 
 from typing import Any, NamedTuple
 
@@ -153,7 +153,7 @@ class LastPoseEstimator(WatchEstimator):
 
 
 class MLPEstimator(WatchEstimator):
-    """Baseline after AGRoL's network without its diffusion (Du et al. 2023): one MLP predicts all frames of a window."""
+    """AGRoL's network without its diffusion (Du et al. 2023): one MLP predicts all frames of a window; with `blend` ours."""
 
     def __init__(self, feature_size: int, motion_size: int, window: int, width: int, layers: int, blend: int = 0):
         """`blend`: as `TwoStageEstimator`'s (ours)."""
