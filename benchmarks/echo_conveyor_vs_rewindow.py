@@ -1,6 +1,6 @@
 """ECHO's conveyor against windows that are denoised from scratch (h = 10): time per frame, errors and jitter of both.
 
-All have the context of `pipeline=echo`, no guidance, in the same batch, in turn. Windows with all of a frame's steps on
+All have the context of `pipeline=ablation/echo_conveyor`, no guidance, in the same batch, in turn. Windows with all of a frame's steps on
 the conveyor (112) need those for 10 frames, the conveyor two for each: 5.6 times as many evaluations of the network,
 less its queue. "Equal" windows take the 20 evaluations that the conveyor takes for 10 frames. Of times (ms per frame and
 batch item, once the conveyor's window is full) value is the conveyor's, baseline the windows', ratio = baseline / value, to be
@@ -31,8 +31,8 @@ SCORES = {"mpjpe_mm": "mm MPJPE", "v2v_cm": "cm E_v2v", "jitter_m_s3": "m/s³ of
 
 
 def measure(items: int = 4, rounds: int = 6, recordings: int = 4, seconds: float = 20.0) -> list[dict]:
-    conveyor = pipeline_of("echo", guided=False)
-    windows = replace(conveyor, sampling=replace(conveyor.sampling, rewindow=STRIDE))
+    conveyor = pipeline_of("ablation/echo_conveyor", guided=False)
+    windows = replace(conveyor, sampling=replace(conveyor.sampling, rewindow=STRIDE, average=False))
     few = replace(windows.sampling, rewindow_steps=STRIDE * conveyor.sampling.per_frame)
     pipelines = {"conveyor": conveyor, "rewindow": windows, EQUAL: replace(windows, sampling=few)}
     rows = _time(pipelines, items, rounds)

@@ -1,6 +1,6 @@
 """ECHO on a GPU, the paper's size without guidance: milliseconds per frame.
 
-Drawn weights; context and steps of `pipeline=echo` (two for every frame that enters), compiled with CUDA graphs in float32.
+Drawn weights; the conveyor of `pipeline=ablation/echo_conveyor` (two steps for every frame that enters), compiled with CUDA graphs in float32.
 A frame is everything from its conditions to body, object and contacts in the world: one wearer alone, and eight side by
 side, of whom each has an eighth of the time. baseline: the paper's 13.73 ms on an RTX 4090; ratio = baseline / value, to
 be at least `goal` (1.4 ms, on an H200). Without a CUDA device it is left out.
@@ -22,7 +22,7 @@ def measure(frames: int = 200, items: tuple[int, ...] = (1, 8), device: str = "c
     if device == "cuda" and without_cuda("echo_ms_per_frame"):
         return []
     runtime = "compile" if device == "cuda" else "eager"
-    pipeline = pipeline_of("echo", device, "full/echo", runtime=runtime, guided=False)
+    pipeline = pipeline_of("ablation/echo_conveyor", device, "full/echo", runtime=runtime, guided=False)
     rows = []
     for count in items:
         value = _milliseconds(pipeline, frames, count)

@@ -1,7 +1,7 @@
 """ECHO while it happens, for half an hour: whether memory stays as it is, and a frame of a long stream costs what one of
 a short stream does.
 
-A small network (one layer) with the context and steps of `pipeline=echo_online` follows a walk there and back; a box is
+A small network (one layer) with the windows of `pipeline=echo_online` follows a walk there and back; a box is
 taken up and laid down all the time. memory: peak (MiB) after the whole stream; baseline: after its first tenth; ratio =
 value / baseline. time: CPU seconds per frame of the whole; baseline: of its first tenth; ratio = value / baseline. Both
 are to be at most `goal`.

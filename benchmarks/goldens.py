@@ -70,7 +70,7 @@ HMD2, WATCHES, ECHO = ("hmd2", "walkers"), ("mocap_every", "keyed"), ("echo", "o
 CAPTURES: dict[str, tuple[str | None, str, tuple[str, ...]]] = {
     "hmd2": (*HMD2, ()),
     "hmd2_paper": (*HMD2, ()),
-    "hmd2_mean": (*HMD2, ()),
+    "hmd2_sampled": (*HMD2, ()),
     "hmd2_online": (*HMD2, ()),
     "egoego_style": (*HMD2, ("pipeline.sampling.steps=4",)),
     "mocap_every": (*WATCHES, ()),
@@ -80,6 +80,7 @@ CAPTURES: dict[str, tuple[str | None, str, tuple[str, ...]]] = {
     "echo": (*ECHO, ()),
     "echo_paper": (*ECHO, ()),
     "echo_online": (*ECHO, ("pipeline.runtime=eager",)),
+    "echo_conveyor": (*ECHO, ("pipeline.sampling.per_frame=1",)),
     "echo_rewindow": (*ECHO, ("pipeline.sampling.per_frame=1",)),
     "echo_search": (*ECHO, ()),
     "bodiffusion_object": (*ECHO, ()),
@@ -99,10 +100,11 @@ CAPTURES: dict[str, tuple[str | None, str, tuple[str, ...]]] = {
 """Captures with their checkpoint, data set, and overrides that keep them short."""
 PIPELINES = {
     "hmd2_paper": "paper/hmd2",
-    "hmd2_mean": "ablation/hmd2_mean",
+    "hmd2_sampled": "ablation/hmd2_sampled",
     "egoego_style": "baseline/egoego_style",
     "mocap_every_paper": "paper/mocap_every",
     "echo_paper": "paper/echo",
+    "echo_conveyor": "ablation/echo_conveyor",
     "echo_rewindow": "ablation/echo_rewindow",
     "bodiffusion_object": "baseline/bodiffusion_object",
     "hps_paper": "paper/hps",

@@ -77,6 +77,8 @@ WHOLE = ("mpjpe_mm", "mpjve_printed", "foot_contact", "v2v_cm", "center_cm", "ro
 """The paper's columns of Table 1."""
 ANYWHERE = ("pipeline=echo", "pipeline.freedoms=false")
 """Like the rivals, which know no hinges, rails or floor that an object keeps to."""
+CONVEYOR = ("pipeline=ablation/echo_conveyor",)
+"""A sample of the plausible motions, as ECHO's, in place of their mean."""
 EQUAL = "Table 1, equal budgets"
 """Title of the table of rivals."""
 UNGUIDED = (*ANYWHERE, "pipeline.contacts.guidance=null")
@@ -150,14 +152,26 @@ SETTINGS = {
     "initial object poses observed": ("pipeline=echo", "pipeline.placed=true"),
     "not guided by contacts": UNGUIDED,
     "not anchored to the head": ("pipeline=echo", "pipeline.anchor=false"),
-    "steps evenly spaced": ("pipeline=echo", "pipeline.sampling.spacing=1.0"),
-    "the stochastic posterior": ("pipeline=echo", "pipeline.sampling.eta=1.0"),
-    "noise redrawn (eq. 11 as printed)": (
-        "pipeline=echo",
+    "windows in two steps": ("pipeline=echo", "pipeline.sampling.rewindow_steps=2"),
+    "windows in five steps": ("pipeline=echo", "pipeline.sampling.rewindow_steps=5"),
+    "windows that advance by 28 frames": ("pipeline=echo", "pipeline.sampling.rewindow=28"),
+    "windows that advance by 7 frames": ("pipeline=echo", "pipeline.sampling.rewindow=7"),
+    "overlap inpainted, not averaged": ("pipeline=echo", "pipeline.sampling.average=false"),
+    "online: 20 frames of latency": ("pipeline=echo_online", "pipeline.runtime=eager"),
+    "conveyor": CONVEYOR,
+    "conveyor, online: 20 frames of latency": (
+        "pipeline=echo_online",
+        "pipeline.runtime=eager",
+        "pipeline.sampling.rewindow=null",
+        "pipeline.sampling.rewindow_steps=null",
+    ),
+    "conveyor, steps evenly spaced": (*CONVEYOR, "pipeline.sampling.spacing=1.0"),
+    "conveyor, the stochastic posterior": (*CONVEYOR, "pipeline.sampling.eta=1.0"),
+    "conveyor, noise redrawn (eq. 11 as printed)": (
+        *CONVEYOR,
         "pipeline.sampling.step=redraw",
         "pipeline.sampling.spacing=1.0",
     ),
-    "context of 40: latency of 20 frames": ("pipeline=echo", "pipeline.sampling.context=40"),
     "all as in the paper": ("pipeline=paper/echo",),
 }
 TRUTH_GIVEN = "exact wrists and heads, floor, bones (but in rows of wrong height), and which object is active, are given to all rows"
@@ -259,7 +273,7 @@ def _objects(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapp
 
 
 def _settings(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapping[str, str], Scores]:
-    """How the conveyor runs; defaults are chosen by this table, on the validation split."""
+    """How frames are denoised; defaults are chosen by this table, on the validation split."""
     store, names = recordings_of(options, "simulated_objects")
     methods = [Method(name, options.checkpoint, changes) for name, changes in SETTINGS.items()]
     return f"Settings: {options.split}", OBJECTS, _scores(methods, options, progress, store, names)

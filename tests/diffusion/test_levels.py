@@ -30,6 +30,17 @@ def test_independent_levels_are_those_of_the_frames():
     assert torch.equal(levels, frames)
 
 
+def test_a_share_of_the_windows_is_pure_noise():
+    levels, _ = drawn(independent=0.1, conveyor=0.3, observed=0.0, pure=0.5)
+    pure = (levels == 1).all(-1).all(-1).float().mean().item()
+    assert pure == pytest.approx(0.5, abs=0.03)
+
+
+def test_pure_noise_has_observed_frames_too():
+    levels, _ = drawn(independent=0.0, conveyor=0.0, observed=1.0, pure=1.0)
+    assert set(levels.unique().tolist()) == {0.0, 1.0}
+
+
 def test_a_conveyors_levels_grow_and_are_alike_for_all_modalities():
     levels, _ = drawn(independent=0.0, conveyor=1.0, observed=0.0)
     assert (levels.diff(dim=1) >= 0).all()

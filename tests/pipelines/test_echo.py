@@ -18,11 +18,12 @@ from wearcap.recording import Motion
 from wearcap.systems.echo.features import CONTACTS, Body
 from wearcap.systems.echo.observations import Observed, batch_item_of
 from wearcap.systems.echo.pipeline import Echo
-from wearcap.systems.echo.queue import Conditioning, EchoQueue, Rewindow
+from wearcap.systems.echo.queue import AveragedWindows, Conditioning, EchoQueue, Rewindow
 from wearcap.tracking.head_path import head_path
 
 TWO = (("box_1", "left", 0.1, 0.35), ("box_2", "right", 0.6, 0.8))
 FRAMES = ("own", "window", "world")
+AVERAGED = {"rewindow": 3, "rewindow_steps": 1, "average": True}
 
 
 def batch_item(echo: Echo, scenario):
@@ -48,11 +49,11 @@ def assert_true(motion: Motion, recording, scenario, atol: float = 2e-4) -> None
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-@pytest.mark.parametrize("rewindow", [None, 3])
-def test_what_is_observed_comes_out_as_it_is(frame, rewindow):
+@pytest.mark.parametrize("settings", [{}, {"rewindow": 3}, AVERAGED])
+def test_what_is_observed_comes_out_as_it_is(frame, settings):
     recording = carrying(1.0, carried=TWO)
     scenario = scenario_of(recording, TWO, observed=everything(recording))
-    echo = drawn_echo(frame, anchor=False, rewindow=rewindow)
+    echo = drawn_echo(frame, anchor=False, **settings)
     motion = echo.capture_scenarios([scenario], [0])[0]
     assert_true(motion, recording, scenario)
     contact = scenario.observed.contact
@@ -140,7 +141,12 @@ def knowing(frame: str, **settings) -> Echo:
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize(
     ("make", "step"),
-    [(EchoQueue, "posterior"), (EchoQueue, "redraw"), (lambda *given: Rewindow(*given, stride=3), "posterior")],
+    [
+        (EchoQueue, "posterior"),
+        (EchoQueue, "redraw"),
+        (lambda *given: Rewindow(*given, stride=3), "posterior"),
+        (lambda *given: AveragedWindows(*given, stride=3), "posterior"),
+    ],
 )
 def test_a_perfect_denoiser_gives_the_ground_truth_in_any_frame(frame, make, step):
     """Clean frames stay the ground truth while the window's frame of reference moves."""
@@ -181,7 +187,7 @@ def test_noised_frames_are_re_expressed_when_the_window_advances():
     assert (new.t - old.t).norm() > 0.1
 
 
-@pytest.mark.parametrize("settings", [{}, {"frame": "window"}, {"rewindow": 3}, {"per_frame": 2}])
+@pytest.mark.parametrize("settings", [{}, {"frame": "window"}, {"rewindow": 3}, AVERAGED, {"per_frame": 2}])
 def test_batch_items_are_independent(settings):
     echo = drawn_echo(**settings)
     scenarios = [scenario_of(carrying(0.9)), scenario_of(carrying(0.7, carried=TWO[1:]), TWO[1:])]
@@ -201,10 +207,10 @@ def test_a_seed_determines_the_sample():
 
 
 @pytest.mark.parametrize("seconds", [0.55, 1.1])
-@pytest.mark.parametrize("rewindow", [None, 3, 8])
-def test_every_frame_is_output_however_short_the_recording(seconds, rewindow):
+@pytest.mark.parametrize("settings", [{}, {"rewindow": 3}, {"rewindow": 8}, AVERAGED, AVERAGED | {"rewindow": 8}])
+def test_every_frame_is_output_however_short_the_recording(seconds, settings):
     recording = carrying(seconds)
-    motion = drawn_echo(rewindow=rewindow).capture([recording], [0])[0].motion
+    motion = drawn_echo(**settings).capture([recording], [0])[0].motion
     assert torch.equal(motion.timestamps, recording.motion.timestamps)
     assert motion.R_parent_joint.isfinite().all()
     assert motion.object_motion is None
@@ -232,6 +238,47 @@ def test_windows_take_as_many_steps_as_asked_for(monkeypatch):
     motion = given.capture([recording], [0])[0].motion
     assert len(taken) == 2 * math.ceil(len(motion) / 3)
     assert not torch.allclose(motion.R_parent_joint, whole.R_parent_joint, atol=1e-3)
+
+
+def test_the_mean_of_windows_averages_what_they_predict(monkeypatch):
+    """Windows take turns in predicting a root at 0 and at 1 m: every frame's is between."""
+    echo, recording, drawn = drawn_echo(**AVERAGED), carrying(1.0), []
+    conditioning = batch_item(echo, scenario_of(recording)).conditioning
+    window = AveragedWindows.window
+
+    def shifted(self, conditioning, before):
+        x = torch.zeros_like(window(self, conditioning, before))
+        x[..., 0], x[..., 3], x[..., 7] = len(drawn) % 2, 1.0, 1.0
+        drawn.append(x.shape[1])
+        return x
+
+    monkeypatch.setattr(AveragedWindows, "window", shifted)
+    echo.model.net.motion_normalizer.set(torch.zeros(x_size(echo)), torch.ones(x_size(echo)))
+    queue = AveragedWindows(echo, [echo.model.skeleton], [0], stride=3, steps=1)
+    root = queue.run(conditioning).t_world_root[0]
+    frame = echo.model.features.canonical(conditioning.points)
+    along = ((frame.R.mT @ (root - frame.t)[..., None])[0, ..., 0])[:, 0]
+    middle = along[6:-10]
+    assert max(drawn) == WINDOW
+    assert ((middle > 0.05) & (middle < 0.95)).all()
+
+
+def x_size(echo: Echo) -> int:
+    return sum(echo.model.net.sizes)
+
+
+def test_averaged_windows_have_the_latency_of_a_conveyor():
+    echo, recording = drawn_echo(**AVERAGED), carrying(1.0)
+    conditioning = batch_item(echo, scenario_of(recording)).conditioning
+    queue, final = echo.queue([echo.model.skeleton], [0], [{}], [[]]), []
+    for k in range(30):
+        outputs = queue.push(conditioning.frames(slice(k, k + 1)))
+        final.append(0 if outputs is None else outputs.t_world_root.shape[1])
+        assert queue.conditioning.valid.shape[1] <= WINDOW
+    latest = [first for first, count in zip(torch.tensor(final).cumsum(0).tolist(), final) if count]
+    assert set(final) == {0, 1, 3}, "the first window has one frame that is old enough"
+    assert latest == [k + 1 - (8 - 3) for k, count in enumerate(final) if count]
+    assert echo.latency_s == pytest.approx(7 / FPS)
 
 
 @pytest.mark.parametrize("settings", [{"rewindow_steps": 4}, {"rewindow": 3, "rewindow_steps": 0}])

@@ -81,6 +81,32 @@ def test_a_stream_equals_a_capture_of_the_whole_recording(settings):
     assert session.dropped == session.silent == 0
 
 
+@pytest.mark.parametrize("settings", [{}, {"frame": "window"}, {"anchor": False}, {"placed": True}])
+def test_a_stream_of_averaged_windows_equals_a_capture_of_the_whole_recording(settings):
+    recording, echo = carrying(1.2, carried=TWO), drawn_echo(rewindow=3, rewindow_steps=1, average=True, **settings)
+    scenario = replace(scenario_of(recording, TWO), placed=echo.placed)
+    session = EchoStream(echo, wearer(recording), boxes(TWO), seed=3)
+    activate_acts(session, scenario)
+    motion, counts = streamed(session, recording)
+    assert_same(motion, echo.capture_scenarios([scenario], [3])[0], scenario)
+    assert all(0 <= k + 1 - count <= round(echo.latency_s * echo.fps) + 1 for k, count in enumerate(counts))
+
+
+def test_averaged_windows_forget_what_they_predicted_before_an_object_was_seen():
+    """The object's pose arrives after windows have predicted that frame."""
+    recording = carrying(1.2)
+    echo = drawn_echo(rewindow=3, rewindow_steps=1, average=True, anchor=False)
+    session = EchoStream(echo, wearer(recording), boxes(), seed=3)
+    activate_acts(session, scenario_of(recording))
+    track, at = recording.object_motion["box_1"], 15
+    time = recording.motion.timestamps[at].item()
+    seen = Rigid(track.R_world_body[at], track.t_world_body[at])
+    motion, _ = streamed(session, recording, lambda k: session.see_object("box_1", time, seen) if k == at + 4 else None)
+    found = motion.object_motion["box_1"]
+    k = int((found.timestamps - time).abs().argmin())
+    torch.testing.assert_close(found.t_world_body[k], seen.t, atol=1e-4, rtol=0)
+
+
 def test_objects_in_a_stream_are_static_from_their_first_contact_on():
     """Frames before the first contact are final before it is detected; afterwards the object moves only while
     touched."""
@@ -376,6 +402,6 @@ def test_objects_that_cannot_be_used_are_refused_when_they_are_named():
         session.activate("c", 0.0)
 
 
-def test_windows_from_scratch_are_no_stream():
-    with pytest.raises(WearcapError, match="rewindow=3. Expected a conveyor"):
+def test_windows_that_inpaint_their_overlap_are_no_stream():
+    with pytest.raises(WearcapError, match="rewindow=3. Expected average=true, or a conveyor"):
         EchoStream(drawn_echo(rewindow=3), Wearer(carrying(0.6).skeleton))

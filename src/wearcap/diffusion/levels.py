@@ -17,13 +17,15 @@ class LevelMix:
     """Shares of the windows whose levels are drawn by each scheme; the remaining windows have one level per modality.
 
     independent: a level for every frame and modality (ECHO eq. 6). conveyor: levels grow along the window, as in a
-    conveyor that fills, runs or empties. One level per modality for the whole window is TriDi's scheme. In a share
-    `observed` of the windows some frames of one modality are at level 0, as sparse observations are.
+    conveyor that fills, runs or empties. pure: all levels are 1, from which one step leads to the mean of the plausible
+    motions (ours). One level per modality for the whole window is TriDi's scheme. In a share `observed` of the windows some
+    frames of one modality are at level 0, as sparse observations are.
     """
 
     independent: float
     conveyor: float
     observed: float
+    pure: float = 0.0
     whole: float = 0.0
     """Share of the windows with observations in which all frames of that modality are observed."""
     ramp: tuple[int, int] | list[int] = (10, 60)
@@ -40,14 +42,14 @@ class LevelMix:
         low, high = self.ramp
         if (
             not 1 <= low <= high
-            or min(self.independent, self.conveyor) < 0
-            or self.independent + self.conveyor > 1 + 1e-9
+            or min(self.independent, self.conveyor, self.pure) < 0
+            or self.independent + self.conveyor + self.pure > 1 + 1e-9
             or not 0 <= self.whole < 1
             or not all(0 <= lead < 1 for lead in self.lead)
             or min(self.chances, default=1.0) < 0
         ):
             raise WearcapError(
-                f"shares {self.independent} and {self.conveyor}, {self.whole} of windows fully observed, ramps of {low} to {high} frames",
+                f"shares {self.independent}, {self.conveyor} and {self.pure}, {self.whole} of windows fully observed, ramps of {low} to {high} frames",
                 expected="shares that add up to no more than 1, less than 1 fully observed and in the lead, and a rising pair of 1 or more frames",
             )
 
@@ -66,7 +68,7 @@ class LevelMix:
         ramps = ramp * (1 - ahead * frames.new_tensor(list(self.lead) or [0.0] * count))
         grows = (1 - (tail - place) / ramps).clamp(0, 1)
         single = draws[:, None, -1:] if self.together else draws[:, None, -count:]
-        single = single.expand(-1, time, count)
+        single = torch.where(kind >= 1 - self.pure, 1.0, single.expand(-1, time, count))
         levels = torch.where(
             kind < self.independent, frames, torch.where(kind < self.independent + self.conveyor, grows, single)
         )

@@ -26,7 +26,7 @@ from wearcap.scene.objects import Environment
 from wearcap.systems.echo.contacts import ContactUse, GuidedScene, with_static_objects
 from wearcap.systems.echo.model import EchoRunner
 from wearcap.systems.echo.observations import BatchItem, ObjectReader, ObjectShape, Scenario, batch_item_of
-from wearcap.systems.echo.queue import Conditioning, EchoModel, EchoQueue, Outputs, Rewindow
+from wearcap.systems.echo.queue import AveragedWindows, Conditioning, EchoModel, EchoQueue, Outputs, Rewindow
 from wearcap.systems.echo.scores import Truth, score_echo, truth_of
 from wearcap.systems.echo.wrists import Reaching, reaches
 from wearcap.tracking.anchor import anchored_to_head
@@ -53,9 +53,12 @@ class Sampling:
     """Share of its distance from the tracked wrists by which x̂0 approaches them in every step (ours); None: not at all
     (ECHO)."""
     rewindow: int | None = None
-    """Frames by which overlapping windows advance that are each denoised from scratch; None: a conveyor."""
+    """Frames by which overlapping windows advance that are each denoised from scratch; None: a conveyor (ECHO)."""
     rewindow_steps: int | None = None
-    """Denoising steps of such a window; None: as many as a frame takes on the conveyor."""
+    """Denoising steps of such a window: 1 leads to the mean of the plausible motions; None: as many as a frame takes on
+    the conveyor."""
+    average: bool = False
+    """Whether what these windows predict for a frame is averaged (ours) or their overlap is inpainted (ECHO Fig. 3)."""
 
 
 MAX_ENVIRONMENTS = 16
@@ -267,7 +270,8 @@ class Echo(LearnedSystem):
         """An empty queue for a batch, with the bodies and objects that guidance needs, if any."""
         queue = EchoQueue(self, skeletons, seeds)
         if self.sampling.rewindow is not None:
-            queue = Rewindow(self, skeletons, seeds, self.sampling.rewindow, self.sampling.rewindow_steps)
+            windows = AveragedWindows if self.sampling.average else Rewindow
+            queue = windows(self, skeletons, seeds, self.sampling.rewindow, self.sampling.rewindow_steps)
         if self.contact_use.guidance is not None:
             queue.guided = pulled_by(skeletons, shapes, objects)
         return queue

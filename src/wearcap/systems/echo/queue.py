@@ -1,5 +1,6 @@
 """ECHO's queue of frames (ECHO §3.3): conditioning enters frame by frame, final outputs leave frame by frame; and
-overlapping windows in place of the conveyor, denoised from scratch with inpainted overlap (ECHO Fig. 3, left)."""
+overlapping windows in place of the conveyor that are denoised from scratch, with inpainted overlap (ECHO Fig. 3, left) or
+averaged (ours)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional as F
 
 from wearcap.body.skeleton import Skeleton
 from wearcap.data.features import body_size
@@ -18,8 +20,9 @@ from wearcap.diffusion.observed import spreading, with_residuals
 from wearcap.diffusion.process import posterior_step, step_levels
 from wearcap.diffusion.schedule import Schedule
 from wearcap.geometry.rigid import Rigid
+from wearcap.geometry.rotation import matrix_from_rot6d, rot6d_from_matrix
 from wearcap.models.point_encoder import PointNeXt
-from wearcap.systems.echo.features import Body, EchoFeatures, ThreePoints
+from wearcap.systems.echo.features import CONTACTS, Body, EchoFeatures, ThreePoints
 from wearcap.systems.echo.model import MODALITIES, EchoDenoiser
 
 
@@ -131,7 +134,7 @@ class EchoQueue:
 
     @torch.no_grad()
     def push(self, fresh: Conditioning) -> Outputs | None:
-        """Add one frame of every batch item (padding after a batch item's end); returns the frame that became final, if
+        """Add one frame of every batch item (padding after a batch item's end); returns the frames that became final, if
         any."""
         noise = self._noise(1)[:, 0]
         full = self.conveyor.push(noise)
@@ -156,16 +159,19 @@ class EchoQueue:
 
     def run(self, whole: Conditioning) -> Outputs:
         """Outputs of all frames of a batch."""
-        count, first = whole.valid.shape[1], self.rolling.ramp - 1
+        count, pushed, final = whole.valid.shape[1], 0, 0
         out = None
-        for frame in range(count + first):
-            outputs = self.push(whole.frames(slice(frame, frame + 1)) if frame < count else self.padding())
+        while final < count:
+            outputs = self.push(whole.frames(slice(pushed, pushed + 1)) if pushed < count else self.padding())
+            pushed += 1
             if outputs is None:
                 continue
             if out is None:  # allocate once: keeping small per-frame tensors fragments memory
                 out = Outputs(*(field.new_empty(len(field), count, *field.shape[2:]) for field in outputs))
+            stop = min(final + outputs.t_world_root.shape[1], count)
             for all_frames, field in zip(out, outputs):
-                all_frames[:, frame - first] = field[:, 0]
+                all_frames[:, final:stop] = field[:, : stop - final]
+            final = stop
         assert out is not None
         return out
 
@@ -307,3 +313,82 @@ class Rewindow(EchoQueue):
             final = x[:, : stop - first]
             before, start = final[:, -context:] if context else final[:, :0], stop
         return Outputs(*(torch.cat(parts, 1) for parts in zip(*outputs)))
+
+
+class AveragedWindows(Rewindow):
+    """Windows that advance by `stride` frames without knowing of each other; what they predict for a frame is averaged.
+
+    In one step from noise (`steps` 1) each is the mean of the plausible motions. Predictions weigh by the square of the
+    frame's distance from the window's ends, unless the capture begins or ends there. Frames become final at the same
+    latency as on the conveyor, `stride` at a time.
+    """
+
+    def __init__(
+        self, pipeline: _Pipeline, skeletons: Sequence, seeds: Sequence[int], stride: int = 10, steps: int | None = None
+    ):
+        super().__init__(pipeline, skeletons, seeds, stride, steps)
+        self._sum = torch.zeros(len(seeds), 0, 0)
+        """Weighted sums of the predictions for the frames of `conditioning` (`_flat`), and sums of weights."""
+        self._given = torch.zeros(len(seeds), 0, 1 + len(MODALITIES))
+        """The object and the observed modalities that these predictions were for."""
+        self._pushed, self._final = 0, 0
+        """Numbers of frames that were taken in, and that are final."""
+
+    @torch.no_grad()
+    def push(self, fresh: Conditioning) -> Outputs | None:
+        """Add one frame of every batch item (padding after its end); returns the frames that became final, if any."""
+        full = self.conditioning is not None and self.conditioning.valid.shape[1] == self.rolling.window
+        if self.conditioning is not None:
+            fresh = Conditioning(*(torch.cat([a[:, int(full) :], b], 1) for a, b in zip(self.conditioning, fresh)))
+        self.conditioning = fresh
+        self._pushed += 1
+        self._sum, self._given = (F.pad(part[:, int(full) :], (0, 0, 0, 1)) for part in (self._sum, self._given))
+        if self._pushed % self.stride:
+            return None
+        self._predict(self.conditioning)
+        return self._finalized()
+
+    def _predict(self, conditioning: Conditioning) -> None:
+        """Add the window's prediction to the sums; a frame with another object or other observations starts anew."""
+        given = torch.cat([conditioning.object_number[..., None], conditioning.is_observed.float()], -1)
+        same, self._given = (given == self._given).all(-1, keepdim=True), given
+        frame = self.pipeline.model.features.canonical(conditioning.points)
+        x = self.window(conditioning, self._sum.new_zeros(len(given), 0, sum(self.pipeline.model.net.sizes)))
+        flat = _flat(self._decoded(x, slice(None), frame))
+        flat = torch.cat([flat, torch.ones_like(flat[..., :1])], -1)
+        before = self._sum if self._sum.shape[-1] else torch.zeros_like(flat)
+        self._sum = before * same + flat * self._weight(conditioning.valid)[..., None]
+
+    def _weight(self, valid: Bool[Tensor, "batch frame"]) -> Float[Tensor, "batch frame"]:
+        count, window = valid.shape[1], self.rolling.window
+        place = torch.arange(1, count + 1).expand_as(valid)
+        begins, ended = self._pushed <= window, ~valid[:, -1:]
+        behind = torch.full_like(place, window) if begins else place
+        ahead = torch.where(ended, window, count + 1 - place)
+        return torch.minimum(behind, ahead).clamp_max(window // 2).square().float()
+
+    def _finalized(self) -> Outputs | None:
+        """The frames that no later window changes."""
+        count, lookahead = self._sum.shape[1], self.rolling.ramp - self.stride
+        stop, start = count - lookahead, count - (self._pushed - self._final)
+        if stop <= start:
+            return None
+        self._final += stop - start
+        rows = self._sum[:, start:stop]
+        return _unflat(rows[..., :-1] / rows[..., -1:], self.t_parent_joint.shape[-2])
+
+    def run(self, whole: Conditioning) -> Outputs:
+        return EchoQueue.run(self, whole)
+
+
+def _flat(outputs: Outputs) -> Float[Tensor, "batch frame value"]:
+    """Outputs as values that may be averaged, rotations in 6D."""
+    R = torch.cat([outputs.R_parent_joint, outputs.R_world_object[:, :, None]], 2)
+    return torch.cat([rot6d_from_matrix(R).flatten(-2), outputs.t_world_root, outputs.t_world_object, outputs.contact_prob], -1)
+
+
+def _unflat(values: Float[Tensor, "batch frame value"], joints: int) -> Outputs:
+    """The inverse of `_flat`."""
+    rotations, root, scene_object, contact = values.split([6 * (joints + 1), 3, 3, CONTACTS], -1)
+    R = matrix_from_rot6d(rotations.unflatten(-1, (-1, 6)))
+    return Outputs(R[:, :, :-1], root, R[:, :, -1], scene_object, contact)

@@ -61,9 +61,11 @@ class EchoStream(HeadAndWristsStream):
     """A streaming capture of one wearer and some objects; the active object is kept when the clock is set back."""
 
     def __init__(self, pipeline: Echo, wearer: Wearer, environment: Environment | None = None, seed: int = 0):
-        """Raises WearcapError for a pipeline without a conveyor."""
-        if (rewindow := pipeline.sampling.rewindow) is not None:
-            raise WearcapError(f"a stream with rewindow={rewindow}", expected="a conveyor: rewindow=null")
+        """Raises WearcapError for a pipeline whose windows inpaint their overlap."""
+        how = pipeline.sampling
+        if how.rewindow is not None and not how.average:
+            what = f"a stream with rewindow={how.rewindow}"
+            raise WearcapError(what, expected="average=true, or a conveyor: rewindow=null")
         super().__init__(pipeline, pipeline.fps, 1)
         self.wearer, self.seed = wearer, seed
         self._names: list[str] = []
@@ -301,8 +303,14 @@ class EchoStream(HeadAndWristsStream):
         self._queue.conditioning = Conditioning(*(torch.cat(fields, 1) for fields in zip(*frames)))
 
     def _emit(self, outputs: Outputs | None) -> list[Motion]:
-        if outputs is None or not self._pending:
+        """The motion of frames that became final; those of padding are left out."""
+        if outputs is None:
             return []
+        count = min(outputs.t_world_root.shape[1], len(self._pending))
+        frames = (Outputs(*(field[:, k : k + 1] for field in outputs)) for k in range(count))
+        return [motion for frame in frames for motion in self._emit_frame(frame)]
+
+    def _emit_frame(self, outputs: Outputs) -> list[Motion]:
         time, conditioning, T_world_head = self._pending.pop(0)
         times, floor_height = torch.tensor([time], dtype=torch.float64), conditioning.floor_height[0]
         path = HeadPath(times, T_world_head, T_world_head, floor_height, self.wearer.skeleton, ((0, 1),))
@@ -339,7 +347,7 @@ class EchoSession(Session):
         seeds: Sequence[int] | None = None,
         environment: Environment | None = None,
     ):
-        """Raises WearcapError without wearers, and for a pipeline without a conveyor."""
+        """Raises WearcapError without wearers, and for a pipeline whose windows inpaint their overlap."""
         seeds = [0] * len(wearers) if seeds is None else seeds
         pairs = zip(wearers, seeds, strict=True)
         super().__init__(pipeline, [EchoStream(pipeline, wearer, environment, seed) for wearer, seed in pairs])
