@@ -7,6 +7,7 @@ from torch import nn
 from wearcap.body.skeleton import xsens23
 from wearcap.data.windows import Source, Windows, collate
 from wearcap.diffusion.schedule import CosineSchedule
+from wearcap.errors import WearcapError
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.training import MotionDiffusion
@@ -30,7 +31,7 @@ class Spy(nn.Module):
         return self.answer
 
 
-def system(batch, level_tilt: float) -> MotionDiffusion:
+def system(batch, level_tilt: float, pure: float = 0.0) -> MotionDiffusion:
     features = HeadFeatures()
 
     def net(motion_size, condition_size, points_size, image_size):
@@ -38,9 +39,8 @@ def system(batch, level_tilt: float) -> MotionDiffusion:
         return Spy(plain, features.encode(batch.R_parent_joint, batch.R_world_head, batch.foot_contact))
 
     weights = {"motion": 1.0, "joints": 1.0, "velocity": 1.0}
-    return MotionDiffusion(
-        net, features, CosineSchedule(), xsens23(), 60.0, weights, torch.optim.AdamW, level_tilt=level_tilt
-    )
+    levels = {"level_tilt": level_tilt, "pure": pure}
+    return MotionDiffusion(net, features, CosineSchedule(), xsens23(), 60.0, weights, torch.optim.AdamW, **levels)
 
 
 def test_a_tilt_draws_high_levels_more_often_and_the_truth_costs_nothing(tmp_path):
@@ -56,6 +56,24 @@ def test_a_tilt_draws_high_levels_more_often_and_the_truth_costs_nothing(tmp_pat
         assert terms["motion"] < 1e-9
         assert terms["velocity"] < 1e-6
         assert terms["joints"] < 2e-3  # the distance's own smallest value
+
+
+def test_a_share_of_the_windows_is_pure_noise_and_the_others_keep_their_levels(tmp_path):
+    store = small_dataset(tmp_path)
+    windows = Windows([Source(str(store.root))], "train", content=HeadContent(), window=60, stride=30, fps=60.0)
+    batch = collate([windows[(i % len(windows), i)] for i in range(400)])
+    module = system(batch, 0.0, pure=0.6)
+    module.terms(batch)
+    pure = module.net.level == 1
+    assert abs(pure.float().mean().item() - 0.6) < 0.08
+    assert abs(module.net.level[~pure].mean().item() - 0.5) < 0.06
+
+
+def test_all_windows_of_pure_noise_are_refused(tmp_path):
+    store = small_dataset(tmp_path)
+    windows = Windows([Source(str(store.root))], "train", content=HeadContent(), window=60, stride=30, fps=60.0)
+    with pytest.raises(WearcapError, match="pure=1.0.*Expected from 0 to less than 1"):
+        system(collate([windows[(0, 0)]]), 0.0, pure=1.0)
 
 
 def test_the_last_frames_that_exist_weigh_more_by_the_tail(tmp_path):

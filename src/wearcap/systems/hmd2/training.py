@@ -31,8 +31,9 @@ class MotionDiffusion(Training):
     "motion" is the thesis's plain MSE; "joints", "velocity", "skate" and "contact" (cross entropy in which both classes
     weigh alike, if `contact_share` says what share of the labels is contact) are ours (0 leaves them out). Levels are drawn
     with a density proportional to the level to the power of `level_tilt`: 0 draws them uniformly, as the thesis does;
-    more (ours) favours high noise levels, on which sampling in few steps depends. Points and images are each replaced
-    by their null vector with probability `drop` per window, so that one checkpoint runs with any subset of them.
+    more (ours) favours high noise levels, on which sampling in few steps depends; a share `pure` of the windows is pure
+    noise (level 1), on which the mean in one step depends (ours). Points and images are each replaced by their null vector
+    with probability `drop` per window, so that one checkpoint runs with any subset of them.
     A window's last frames weigh up to 1 + `tail` in the loss (ours): with small strides they are the output.
     """
 
@@ -49,6 +50,7 @@ class MotionDiffusion(Training):
         optimizer: OptimizerOf,
         scheduler: SchedulerOf = None,
         level_tilt: float = 0.0,
+        pure: float = 0.0,
         drop: float = 0.0,
         tail: float = 0.0,
         contact_share: float | None = None,
@@ -61,6 +63,8 @@ class MotionDiffusion(Training):
         """`place_encoder` (frozen, thesis §6.2) encodes the points; `image_encoder` names the encoder of the image
         embeddings, `image_size` features each. None leaves that modality out."""
         super().__init__(optimizer, scheduler, loss_weights, seed)
+        if not 0 <= pure < 1:
+            raise WearcapError(f"a share pure={pure} of the windows", expected="from 0 to less than 1")
         self.net = net(
             motion_size=features.motion_size,
             condition_size=features.condition_size,
@@ -70,7 +74,7 @@ class MotionDiffusion(Training):
         self.place_encoder = None if place_encoder is None else place_encoder.requires_grad_(False).eval()
         self.image_encoder, self.drop, self.tail = image_encoder, drop, tail
         self.features, self.schedule, self.skeleton, self.fps = features, schedule, skeleton, fps
-        self.level_tilt, self.contact_share = level_tilt, contact_share
+        self.level_tilt, self.pure, self.contact_share = level_tilt, pure, contact_share
         self._feet = [skeleton.index(f"{side}_{joint}") for side in ("left", "right") for joint in ("ankle", "toe")]
         # Methods, since compiled modules would put every weight into checkpoints a second time.
         self._denoise = torch.compile(self.net.forward) if compile else self.net.forward
@@ -114,7 +118,7 @@ class MotionDiffusion(Training):
     def _predicted(self, batch: HeadWindow, x0: Tensor) -> Tensor:
         """x̂0 of a batch in normalised motion space; half the windows are self-conditioned on a first estimate."""
         encoded = self._encode(self.conditions(batch), batch.valid)
-        level = batch.level ** (1 / (1 + self.level_tilt))
+        level = (batch.level / (1 - self.pure)).clamp_max(1) ** (1 / (1 + self.level_tilt))
         x_t = add_noise(x0, batch.noise[..., : x0.shape[-1]], level, self.schedule)
         if not self.net.self_conditioning:
             return self._denoise(x_t, level, encoded, batch.valid)
