@@ -11,7 +11,7 @@ import math
 import os
 import platform
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,8 @@ MOST_ROWS = 12
 """Of a headline table."""
 TRANSCRIBED = "transcribed"
 """Key of a JSON's `about` whose figures were taken from an earlier page and not from the command's own output."""
+LEFT = "left"
+"""Key of a table's `about` that names rows of an earlier run, which this one left as they were, and its command."""
 RANKED = (
     "The worst, the median and the best of CMU's test recordings, truth above and captured below; dots mark contact"
 )
@@ -199,7 +201,12 @@ def about(command: str) -> dict[str, str]:
 def origin(about: Mapping[str, Any], spread: str = "") -> str:
     """A table's command, date and machine, and over what it spreads."""
     parts = [f"`{about['command']}`", about["date"], about["machine"], *([spread] if spread else [])]
-    return ", ".join(map(str, parts)) + ("; transcribed from an earlier page" if about.get(TRANSCRIBED) else "") + "."
+    words = ", ".join(map(str, parts)) + ("; transcribed from an earlier page" if about.get(TRANSCRIBED) else "") + "."
+    if left := about.get(LEFT):
+        words += (
+            f" Of an earlier run: {', '.join(left['rows'])} (`{left['command']}`, {left['date']}, {left['machine']})."
+        )
+    return words
 
 
 def markdown(grid: Grid) -> str:
@@ -238,14 +245,44 @@ def write_speed(path: Path, benchmark: str, figures: list[Tree], about: Mapping[
     write_text(path, "\n".join(lines) + "\n")
 
 
+def with_left(old: Tree, new: Tree, left: Collection[str]) -> Tree:
+    """The new tree with those rows of the old one's tables that are in `left` and that it lacks, in front; what the old
+    command was stands in the table's `about`."""
+    tables, abouts = dict(new.get("tables", {})), {}
+    for title, rows in tables.items():
+        before = next((name for name in old.get("tables", {}) if _number(name) == _number(title)), None)
+        stay = {} if before is None else _missing(old["tables"][before], rows, left)
+        if before is not None and stay:
+            tables[title] = [*stay.values(), *rows] if isinstance(rows, list) else {**stay, **rows}
+            known = old.get("origins", {}).get(before, old["about"])
+            known = known[LEFT] if set(stay) <= set(known.get(LEFT, {}).get("rows", ())) else known
+            facts = {key: known[key] for key in ("command", "date", "machine")}
+            abouts[title] = {**new["about"], LEFT: {"rows": list(stay), **facts}}
+    more = {}
+    if isinstance(new.get("percentiles"), dict):
+        more["percentiles"] = _missing(old.get("percentiles", {}), new["percentiles"], left) | new["percentiles"]
+    if isinstance(new.get("scenarios"), dict):
+        known = old.get("scenarios", {})
+        more["scenarios"] = {
+            title: _missing(known.get(title, {}), rows, left) | rows for title, rows in new["scenarios"].items()
+        }
+    return {**new, **({"tables": tables, "abouts": abouts} if tables else {}), **more}
+
+
+def _missing(old: Any, new: Any, left: Collection[str]) -> dict[str, Any]:
+    """Rows of an old table, by name, that are in `left` and not in the new one."""
+    named, known = ({row["method"]: row for row in rows} if isinstance(rows, list) else rows for rows in (old, new))
+    return {name: row for name, row in named.items() if name in left and name not in known}
+
+
 def merged(old: Tree, new: Tree) -> Tree:
     """A tree as published: of trees with `tables`, tables of other numbers stay, each with the `about` of its own
     command; what was measured of each seed alone is left out."""
-    new = {key: value for key, value in new.items() if key != "seeds"}
+    new, abouts = {key: value for key, value in new.items() if key not in ("seeds", "abouts")}, new.get("abouts", {})
     if "tables" not in new:
         return new
     again = {_number(title) for title in new["tables"]}
-    origins = {**old.get("origins", {}), **dict.fromkeys(new["tables"], new["about"])}
+    origins = {**old.get("origins", {}), **dict.fromkeys(new["tables"], new["about"]), **abouts}
     kept = {title: rows for title, rows in old.get("tables", {}).items() if _number(title) not in again}
     tables = {**kept, **new["tables"]}
     return {**new, "tables": tables, "origins": {title: origins[title] for title in tables}}
@@ -256,11 +293,11 @@ def _number(title: str) -> str:
     return title.split(":")[0]
 
 
-def publish(path: Path, folder: Path = RESULTS) -> Path:
-    """Put a table's JSON beside its page."""
+def publish(path: Path, folder: Path = RESULTS, left: Collection[str] = ()) -> Path:
+    """Put a table's JSON beside its page; rows in `left` stay as they were published."""
     target = folder / path.name
     old = json.loads(target.read_text(encoding="utf-8")) if target.is_file() else {}
-    tree = merged(old, json.loads(path.read_text(encoding="utf-8")))
+    tree = merged(old, with_left(old, json.loads(path.read_text(encoding="utf-8")), left))
     write_text(target, compact(tree))
     return target
 

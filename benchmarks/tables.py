@@ -1,6 +1,6 @@
 """A system's tables as in its paper, with ours, baselines and ablations.
 
-    python benchmarks/tables.py SYSTEM [--quick] [--publish] [--help]
+    python benchmarks/tables.py SYSTEM [--quick] [--publish [--leave ROW …]] [--help]
     python benchmarks/tables.py SYSTEM --page
 
 Prints them and writes OUTPUT/SYSTEM.json (OUTPUT is outputs/tables), which --publish puts into docs/results as well.
@@ -53,6 +53,8 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--quick", action="store_true", help="minutes instead of hours: a look, not a result")
     parser.add_argument("--output", type=Path, default=Path("outputs/tables"), help="folder of the table")
     parser.add_argument("--publish", action="store_true", help="put the JSON into docs/results, too, and make its page")
+    leave = "rows that stay as they were published, such as rivals whose trainings are not here: the page says so"
+    parser.add_argument("--leave", nargs="+", default=[], metavar="ROW", help=leave)
     parser.add_argument("--page", action="store_true", help="make the page of what is in docs/results, nothing else")
     system.add_arguments(parser)
     options = parser.parse_args(arguments[1:])
@@ -63,7 +65,7 @@ def main(arguments: list[str]) -> None:
         sys.exit(f"error: {error}")
     print(f"written: {path}")
     if options.publish:
-        print(f"written: {publish(path)}")
+        print(f"written: {publish(path, left=options.leave)}")
         if hasattr(system, "page"):
             print(f"written: {write_page(arguments[0])}")
 

@@ -132,6 +132,31 @@ def test_published_tables_are_merged_by_number(tmp_path):
     assert set(json.loads(publish(made, folder).read_text())) == {"about", "rows"}
 
 
+@pytest.mark.parametrize("as_list", [False, True])
+def test_rows_that_a_run_leaves_stay_and_name_their_own_command(tmp_path, as_list):
+    from result_pages import origin, publish
+
+    def made(date: str, rows: dict) -> dict:
+        table = [{"method": name, "x": value} for name, value in rows.items()] if as_list else rows
+        about = {**ABOUT, "date": date, "command": f"run {date}"}
+        return {"about": about, "tables": {f"A: {date}": table}, "percentiles": rows, "scenarios": {"B": rows}}
+
+    folder, path = tmp_path / "results", tmp_path / "hmd2.json"
+    folder.mkdir()
+    runs = (("d1", {"rival": 1, "gone": 2, "ours": 3}), ("d2", {"ours": 4}), ("d3", {"ours": 5}))
+    for date, rows in runs:
+        path.write_text(json.dumps(made(date, rows)))
+        found = json.loads(publish(path, folder, ["rival", "absent"]).read_text())
+    (title, table), expected = next(iter(found["tables"].items())), {"rival": 1, "ours": 5}
+    assert title == "A: d3"
+    assert ({row["method"]: row["x"] for row in table} if as_list else table) == expected
+    assert found["percentiles"] == found["scenarios"]["B"] == expected
+    words = origin(found["origins"][title])
+    assert words.startswith("`run d3`, d3")
+    assert "Of an earlier run: rival (`run d1`, d1" in words
+    assert "abouts" not in found
+
+
 def test_published_json_is_short():
     from result_pages import compact
 

@@ -384,7 +384,9 @@ class AveragedWindows(Rewindow):
 def _flat(outputs: Outputs) -> Float[Tensor, "batch frame value"]:
     """Outputs as values that may be averaged, rotations in 6D."""
     R = torch.cat([outputs.R_parent_joint, outputs.R_world_object[:, :, None]], 2)
-    return torch.cat([rot6d_from_matrix(R).flatten(-2), outputs.t_world_root, outputs.t_world_object, outputs.contact_prob], -1)
+    return torch.cat(
+        [rot6d_from_matrix(R).flatten(-2), outputs.t_world_root, outputs.t_world_object, outputs.contact_prob], -1
+    )
 
 
 def _unflat(values: Float[Tensor, "batch frame value"], joints: int) -> Outputs:
