@@ -583,10 +583,12 @@ def _briefly(objects: dict[str, Tree], people: dict[str, Tree]) -> tuple[str, ..
     theirs, mine = objects.get("BoDiffusion-style + object", {}), objects[ours]
     parts = (("jitter_m_s3", "m/s³ of jitter", 0), ("center_cm", "cm of the object's centre", 1))
     rest = [f"{mean(mine[key], n)} against {mean(theirs[key], n)} {unit}" for key, unit, n in parts if key in theirs]
+    sampled = "All are samples, ours on the conveyor; rows of our checkpoint are means of averaged windows."
     noise = ["Contacts of BoDiffusion-style rows are noise: they learn none."] if "touch_f1" in theirs else []
     return (
         f"Learned baselines, and ours beside them, saw {seen} million frames each, in one training, of a part of the "
         f"simulated motion and of CMU's; the losses of all were still falling: {'; '.join(phrases)}. In the same frame and "
         f"budget bodies are alike; what ours has over BoDiffusion-style + object are {' and '.join(rest)}.",
+        sampled,
         *noise,
     )

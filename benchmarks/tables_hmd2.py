@@ -470,6 +470,8 @@ def _briefly(simulated: dict[str, Tree], real: dict[str, Tree]) -> tuple[str, ..
         f"Learned baselines that see the head alone, and ours beside them, saw {mean(one[BRIEF]['frames_seen_m'], 2)} "
         "million frames each, in one training at the best of three learning rates, of a part of the simulated motion and of "
         f"CMU's, which is far less than our checkpoint saw. MPJPE (cm), so trained: {'; '.join(phrases)}.",
+        "The diffusions among them, ours too, are samples, in the steps of their papers and five of ours; our checkpoint's rows "
+        "are the mean in one step, but where they say so.",
         "Trained so briefly a diffusion with a token for each frame passes on noise that more training would remove; "
         f"jitter, of the truth's: {', '.join(jitters)}.",
     )
