@@ -82,6 +82,7 @@ CONVEYOR = ("pipeline=ablation/echo_conveyor",)
 EQUAL = "Table 1, equal budgets"
 """Title of the table of rivals."""
 UNGUIDED = (*ANYWHERE, "pipeline.contacts.guidance=null")
+EVEN = (*CONVEYOR, "pipeline.sampling.spacing=1.0")
 SAMPLED = (*CONVEYOR, "pipeline.freedoms=false")
 """Samples on the conveyor, like the rivals'; ablations of the network, which is trained for it, are scored so."""
 SAMPLED_UNGUIDED = (*SAMPLED, "pipeline.contacts.guidance=null")
@@ -163,7 +164,6 @@ SETTINGS = {
     "not anchored to the head": ("pipeline=echo", "pipeline.anchor=false"),
     "windows in two steps": ("pipeline=echo", "pipeline.sampling.rewindow_steps=2"),
     "windows in five steps": ("pipeline=echo", "pipeline.sampling.rewindow_steps=5"),
-    "windows that advance by 28 frames": ("pipeline=echo", "pipeline.sampling.rewindow=28"),
     "windows that advance by 7 frames": ("pipeline=echo", "pipeline.sampling.rewindow=7"),
     "overlap inpainted, not averaged": ("pipeline=echo", "pipeline.sampling.average=false"),
     "online: 20 frames of latency": ("pipeline=echo_online", "pipeline.runtime=eager"),
@@ -174,13 +174,9 @@ SETTINGS = {
         "pipeline.sampling.rewindow=null",
         "pipeline.sampling.rewindow_steps=null",
     ),
-    "conveyor, steps evenly spaced": (*CONVEYOR, "pipeline.sampling.spacing=1.0"),
+    "conveyor, steps evenly spaced": EVEN,
     "conveyor, the stochastic posterior": (*CONVEYOR, "pipeline.sampling.eta=1.0"),
-    "conveyor, noise redrawn (eq. 11 as printed)": (
-        *CONVEYOR,
-        "pipeline.sampling.step=redraw",
-        "pipeline.sampling.spacing=1.0",
-    ),
+    "conveyor, noise redrawn (eq. 11 as printed)": (*EVEN, "pipeline.sampling.step=redraw"),
     "all as in the paper": ("pipeline=paper/echo",),
 }
 TRUTH_GIVEN = "exact wrists and heads, floor, bones (but in rows of wrong height), and which object is active, are given to all rows"
@@ -477,7 +473,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         title="[ECHO](../echo.md): figures",
         headline=Grid(
             "Whole recordings, bodies and objects measured where they stand in the world; means over seeds of the "
-            "diffusion, ± their deviation.",
+            "noise, ± their deviation, which leaves the mean of the plausible motions almost as it is.",
             ("", *(name for name, _, _ in columns)),
             picked(trees, HEADLINE, columns),
         ),
