@@ -221,6 +221,16 @@ def test_windows_that_would_leave_frames_out_are_refused():
         drawn_echo(rewindow=9)
 
 
+def test_averaged_windows_of_a_short_network_advance_by_what_it_has():
+    recording = carrying(1.0)
+    wide, most = (
+        drawn_echo(**AVERAGED | {"rewindow": stride}).capture([recording], [0])[0].motion for stride in (14, 8)
+    )
+    assert torch.equal(wide.R_parent_joint, most.R_parent_joint)
+    with pytest.raises(WearcapError, match=r"advance by 0.*Expected 1 to 8"):
+        drawn_echo(**AVERAGED | {"rewindow": 0})
+
+
 def test_windows_take_as_many_steps_as_asked_for(monkeypatch):
     echo, taken = drawn_echo(rewindow=3), []
     given = replace(echo, sampling=replace(echo.sampling, rewindow_steps=2))

@@ -58,7 +58,8 @@ class Sampling:
     """Denoising steps of such a window: 1 leads to the mean of the plausible motions; None: as many as a frame takes on
     the conveyor."""
     average: bool = False
-    """Whether what these windows predict for a frame is averaged (ours) or their overlap is inpainted (ECHO Fig. 3)."""
+    """Whether what these windows predict for a frame is averaged (ours), which advances by no more than the window less the
+    context, or their overlap is inpainted (ECHO Fig. 3)."""
 
 
 MAX_ENVIRONMENTS = 16
@@ -104,7 +105,7 @@ class Echo(LearnedSystem):
             raise WearcapError(f"unknown acts {self.acts!r}", expected=expected)
         ramp, _ = self.rolling.ramp, self._listed_acts()
         rewindow = self.sampling.rewindow
-        if rewindow is not None and not 0 < rewindow <= ramp:
+        if rewindow is not None and not (rewindow > 0 and (self.sampling.average or rewindow <= ramp)):
             what = f"windows that advance by {rewindow} frames"
             raise WearcapError(what, expected=f"1 to {ramp}, the window less the context")
         if self.sampling.rewindow_steps is not None and (rewindow is None or self.sampling.rewindow_steps < 1):
@@ -271,7 +272,8 @@ class Echo(LearnedSystem):
         queue = EchoQueue(self, skeletons, seeds)
         if self.sampling.rewindow is not None:
             windows = AveragedWindows if self.sampling.average else Rewindow
-            queue = windows(self, skeletons, seeds, self.sampling.rewindow, self.sampling.rewindow_steps)
+            stride = min(self.sampling.rewindow, self.rolling.ramp)
+            queue = windows(self, skeletons, seeds, stride, self.sampling.rewindow_steps)
         if self.contact_use.guidance is not None:
             queue.guided = pulled_by(skeletons, shapes, objects)
         return queue
