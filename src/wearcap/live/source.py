@@ -17,6 +17,9 @@ from wearcap.viewer.guard import LOOPBACK
 MAX_MESSAGES_PER_S, MAX_BYTES_PER_S, MAX_PARSE_S_PER_S = 5_000, 1 << 24, 0.2
 """Limits of one source in a second: messages, their bytes, and the time that understanding them takes; what comes beyond
 them is dropped and counted, so that no sender takes the time of the others."""
+MAX_MESSAGE_S = 0.05
+"""The most that one message counts (s). The largest take less; what takes longer is a pause of the program's own, such as
+a garbage collection (half a second where much is held), for which no sender shall lose messages."""
 TOO_MANY = "too many messages"
 
 
@@ -33,7 +36,7 @@ class Budget:
         """Whether one more message, of so many bytes, is within the limits."""
         now = int(time.monotonic())
         if now != self._second:
-            # A message that took longer than its second is paid for in the next ones.
+            # What was spent beyond a second's limit is paid for in the next ones.
             self._spent_s = max(0.0, self._spent_s - (now - self._second) * self.parse_s)
             self._second, self._messages, self._bytes = now, 0, 0
         self._messages, self._bytes = self._messages + 1, self._bytes + size
@@ -41,12 +44,12 @@ class Budget:
 
     @contextmanager
     def spending(self) -> Iterator[None]:
-        """Time in here counts as spent."""
+        """Time in here counts as spent, up to what a message can take."""
         begin_s = time.thread_time()
         try:
             yield
         finally:
-            self._spent_s += time.thread_time() - begin_s
+            self._spent_s += min(time.thread_time() - begin_s, MAX_MESSAGE_S)
 
 
 @dataclass(frozen=True)
