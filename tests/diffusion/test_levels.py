@@ -108,6 +108,8 @@ def test_as_many_windows_as_asked_for_are_known_whole(whole):
         {"ramp": [20, 10]},
         {"ramp": [0, 5]},
         {"independent": 0.7, "conveyor": 0.6},
+        {"pure": 0.2},
+        {"pure": -0.1},
     ],
 )
 def test_shares_and_ramps_that_cannot_be_are_refused(wrong):

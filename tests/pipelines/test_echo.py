@@ -224,9 +224,10 @@ def test_windows_that_would_leave_frames_out_are_refused():
 def test_averaged_windows_of_a_short_network_advance_by_what_it_has():
     recording = carrying(1.0)
     wide, most = (
-        drawn_echo(**AVERAGED | {"rewindow": stride}).capture([recording], [0])[0].motion for stride in (14, 8)
+        drawn_echo(**AVERAGED | {"rewindow": stride}).capture([recording], [0])[0].motion for stride in (14, 4)
     )
     assert torch.equal(wide.R_parent_joint, most.R_parent_joint)
+    assert wide.provenance["rewindow"] == "4"
     with pytest.raises(WearcapError, match=r"advance by 0.*Expected 1 to 8"):
         drawn_echo(**AVERAGED | {"rewindow": 0})
 
@@ -250,31 +251,58 @@ def test_windows_take_as_many_steps_as_asked_for(monkeypatch):
     assert not torch.allclose(motion.R_parent_joint, whole.R_parent_joint, atol=1e-3)
 
 
-def test_the_mean_of_windows_averages_what_they_predict(monkeypatch):
-    """Windows take turns in predicting a root at 0 and at 1 m: every frame's is between."""
-    echo, recording, drawn = drawn_echo(**AVERAGED), carrying(1.0), []
-    conditioning = batch_item(echo, scenario_of(recording)).conditioning
-    window = AveragedWindows.window
+@pytest.fixture
+def counting(monkeypatch) -> tuple[AveragedWindows, Conditioning]:
+    """An empty queue whose windows predict a root at x = 0 m, 1 m, 2 m …, one after the other, and 40 frames for it."""
+    echo, drawn = drawn_echo("world", **AVERAGED), []
+    window, size = AveragedWindows.window, sum(echo.model.net.sizes)
 
-    def shifted(self, conditioning, before):
+    def placed(self, conditioning, before):
         x = torch.zeros_like(window(self, conditioning, before))
-        x[..., 0], x[..., 3], x[..., 7] = len(drawn) % 2, 1.0, 1.0
+        x[..., 0], x[..., 3], x[..., 7] = len(drawn), 1.0, 1.0
         drawn.append(x.shape[1])
         return x
 
-    monkeypatch.setattr(AveragedWindows, "window", shifted)
-    echo.model.net.motion_normalizer.set(torch.zeros(x_size(echo)), torch.ones(x_size(echo)))
-    queue = AveragedWindows(echo, [echo.model.skeleton], [0], stride=3, steps=1)
-    root = queue.run(conditioning).t_world_root[0]
-    frame = echo.model.features.canonical(conditioning.points)
-    along = ((frame.R.mT @ (root - frame.t)[..., None])[0, ..., 0])[:, 0]
-    middle = along[6:-10]
-    assert max(drawn) == WINDOW
-    assert ((middle > 0.05) & (middle < 0.95)).all()
+    monkeypatch.setattr(AveragedWindows, "window", placed)
+    echo.model.net.motion_normalizer.set(torch.zeros(size), torch.ones(size))
+    queue = echo.queue([echo.model.skeleton], [0], [{}], [[]])
+    assert isinstance(queue, AveragedWindows)
+    return queue, batch_item(echo, scenario_of(carrying(40 / FPS))).conditioning
 
 
-def x_size(echo: Echo) -> int:
-    return sum(echo.model.net.sizes)
+def test_the_mean_of_windows_weighs_by_the_distance_from_their_ends(counting):
+    queue, conditioning = counting
+    root = queue.run(conditioning).t_world_root[0, :, 0]
+    lookahead, expected = queue.rolling.ramp - queue.stride, torch.zeros(40)
+    for frame in range(40):
+        total = 0.0
+        for k in range(20):
+            stop = 3 * (k + 1)  # frames that have arrived
+            start = max(0, stop - WINDOW)
+            if not start <= frame < stop or frame < stop - 3 - lookahead:
+                continue
+            behind = frame - start + 1 if start else WINDOW
+            ahead = stop - frame if stop <= 40 else WINDOW  # the capture has ended
+            weight = min(behind, ahead, WINDOW // 2) ** 2
+            expected[frame] += weight * k
+            total += weight
+        expected[frame] /= total
+    torch.testing.assert_close(root, expected, atol=1e-4, rtol=0)
+
+
+def test_what_was_predicted_before_a_head_pose_was_corrected_does_not_count(counting):
+    """That of frame 13 is corrected when windows k = 4 (of 15 frames) have predicted it; those that end with 18 and 21 follow."""
+    queue, conditioning = counting
+    found = []
+    for k in range(40):
+        outputs = queue.push(conditioning.frames(slice(k, k + 1)))
+        found += [] if outputs is None else outputs.t_world_root[0, :, 0].tolist()
+        if k == 14:
+            points = queue.conditioning.t_world_point.clone()
+            points[:, 13] += 0.1
+            queue.conditioning = queue.conditioning._replace(t_world_point=points)
+    assert found[13] == pytest.approx((5**2 * 5 + 8**2 * 6) / (5**2 + 8**2), abs=1e-4)
+    assert found[12] < 5.5, "windows before count for its neighbours"
 
 
 def test_averaged_windows_have_the_latency_of_a_conveyor():

@@ -18,6 +18,7 @@ from wearcap.systems.echo.stream import EchoStream
 
 TWO = (("box_1", "left", 0.1, 0.4), ("box_2", "right", 0.7, 0.9))
 WRISTS = ("left_wrist", "right_wrist")
+AVERAGED = {"rewindow": 3, "rewindow_steps": 1, "average": True}
 NAN = Rigid(torch.full((3, 3), torch.nan), torch.zeros(3))
 
 
@@ -83,7 +84,7 @@ def test_a_stream_equals_a_capture_of_the_whole_recording(settings):
 
 @pytest.mark.parametrize("settings", [{}, {"frame": "window"}, {"anchor": False}, {"placed": True}])
 def test_a_stream_of_averaged_windows_equals_a_capture_of_the_whole_recording(settings):
-    recording, echo = carrying(1.2, carried=TWO), drawn_echo(rewindow=3, rewindow_steps=1, average=True, **settings)
+    recording, echo = carrying(1.2, carried=TWO), drawn_echo(**AVERAGED, **settings)
     scenario = replace(scenario_of(recording, TWO), placed=echo.placed)
     session = EchoStream(echo, wearer(recording), boxes(TWO), seed=3)
     activate_acts(session, scenario)
@@ -95,7 +96,7 @@ def test_a_stream_of_averaged_windows_equals_a_capture_of_the_whole_recording(se
 def test_averaged_windows_forget_what_they_predicted_before_an_object_was_seen():
     """The object's pose arrives after windows have predicted that frame."""
     recording = carrying(1.2)
-    echo = drawn_echo(rewindow=3, rewindow_steps=1, average=True, anchor=False)
+    echo = drawn_echo(**AVERAGED, anchor=False)
     session = EchoStream(echo, wearer(recording), boxes(), seed=3)
     activate_acts(session, scenario_of(recording))
     track, at = recording.object_motion["box_1"], 15
@@ -139,10 +140,10 @@ def test_a_human_alone_needs_no_objects():
     assert motion.object_motion is None
 
 
-@pytest.mark.parametrize("late", [0, 3, 6])
-def test_an_object_may_be_activated_until_its_frames_are_final(late):
+@pytest.mark.parametrize(("late", "settings"), [(0, {}), (3, {}), (6, {}), (0, AVERAGED), (3, AVERAGED)])
+def test_an_object_may_be_activated_until_its_frames_are_final(late, settings):
     """The act begins at frame 20; frames that were output already do not change."""
-    recording, echo = carrying(1.4), drawn_echo()
+    recording, echo = carrying(1.4), drawn_echo(**settings)
     session = EchoStream(echo, wearer(recording), boxes(), seed=3)
     start = recording.motion.timestamps[20].item()
     motion, _ = streamed(
@@ -154,13 +155,14 @@ def test_an_object_may_be_activated_until_its_frames_are_final(late):
     assert track.t_world_body.isfinite().all()
 
 
-def test_what_is_final_stays_as_it_was():
-    recording, echo = carrying(1.4), drawn_echo()
+@pytest.mark.parametrize(("final", "settings"), [(18, {}), (19, AVERAGED)])
+def test_what_is_final_stays_as_it_was(final, settings):
+    recording, echo = carrying(1.4), drawn_echo(**settings)
     session = EchoStream(echo, wearer(recording), boxes(), seed=3)
     motion, _ = streamed(session, recording, lambda frame: session.activate("box_1", 0.0) if frame == 25 else None)
     alone = echo.capture([recording], [3])[0].motion
-    torch.testing.assert_close(motion.T_world_joint.t[:18], alone.T_world_joint.t[:18], atol=1e-3, rtol=0)
-    assert motion.object_motion["box_1"].timestamps[0].item() == pytest.approx(18 / 30, abs=1e-6)
+    torch.testing.assert_close(motion.T_world_joint.t[:final], alone.T_world_joint.t[:final], atol=1e-3, rtol=0)
+    assert motion.object_motion["box_1"].timestamps[0].item() == pytest.approx(final / 30, abs=1e-6)
 
 
 def test_an_observed_object_is_at_its_observed_pose():
@@ -181,8 +183,9 @@ def test_an_observed_object_is_at_its_observed_pose():
     assert (found.t_world_body[18] - track.t_world_body[18]).norm() > 0.01
 
 
-def test_the_observation_nearest_in_time_counts():
-    recording, echo = carrying(1.0), drawn_echo(anchor=False)
+@pytest.mark.parametrize("settings", [{}, AVERAGED])
+def test_the_observation_nearest_in_time_counts(settings):
+    recording, echo = carrying(1.0), drawn_echo(anchor=False, **settings)
     session = EchoStream(echo, wearer(recording), boxes(), seed=3)
     session.activate("box_1", 0.0)
     track = recording.object_motion["box_1"]

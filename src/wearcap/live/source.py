@@ -17,9 +17,10 @@ from wearcap.viewer.guard import LOOPBACK
 MAX_MESSAGES_PER_S, MAX_BYTES_PER_S, MAX_PARSE_S_PER_S = 5_000, 1 << 24, 0.2
 """Limits of one source in a second: messages, their bytes, and the time that understanding them takes; what comes beyond
 them is dropped and counted, so that no sender takes the time of the others."""
-MAX_MESSAGE_S = 0.05
-"""The most that one message counts (s). The largest take less; what takes longer is a pause of the program's own, such as
-a garbage collection (half a second where much is held), for which no sender shall lose messages."""
+MAX_MESSAGE_S, MAX_BYTE_S = 0.005, 1e-6
+"""The most that one message counts, and each of its bytes (s). The slowest to parse take less (0.6 µs a byte); what takes
+longer is a pause of the program's own, such as a garbage collection (half a second where much is held), for which no
+sender shall lose messages."""
 TOO_MANY = "too many messages"
 
 
@@ -43,13 +44,13 @@ class Budget:
         return self._messages <= self.messages and self._bytes <= self.size and self._spent_s < self.parse_s
 
     @contextmanager
-    def spending(self) -> Iterator[None]:
-        """Time in here counts as spent, up to what a message can take."""
+    def spending(self, size: int) -> Iterator[None]:
+        """Time in here counts as spent, up to what a message of so many bytes can take."""
         begin_s = time.thread_time()
         try:
             yield
         finally:
-            self._spent_s += min(time.thread_time() - begin_s, MAX_MESSAGE_S)
+            self._spent_s += min(time.thread_time() - begin_s, MAX_MESSAGE_S + size * MAX_BYTE_S)
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,7 @@ class DatagramSource(Source):
         if not self.budget.allows(len(data)):
             refuse(TOO_MANY)
             return
-        with self.budget.spending():
+        with self.budget.spending(len(data)):
             packets = self.parse(data, time.monotonic(), refuse)
         inbox.deliver(packets)
 

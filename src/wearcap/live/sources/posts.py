@@ -103,7 +103,7 @@ class _Connections:
         if headers.get("Expect", "").lower() == "100-continue":
             writer.write(b"HTTP/1.1 100 Continue\r\n\r\n")
         body = await reader.readexactly(int(length))
-        with self.source.budget.spending():
+        with self.source.budget.spending(len(body)):
             packets = self.source.parse(body, time.monotonic(), self._refuse)
         self.inbox.deliver(packets)
         close = headers.get("Connection", "").lower() == "close"

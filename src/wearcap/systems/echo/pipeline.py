@@ -58,8 +58,8 @@ class Sampling:
     """Denoising steps of such a window: 1 leads to the mean of the plausible motions; None: as many as a frame takes on
     the conveyor."""
     average: bool = False
-    """Whether what these windows predict for a frame is averaged (ours), which advances by no more than the window less the
-    context, or their overlap is inpainted (ECHO Fig. 3)."""
+    """Whether what these windows predict for a frame is averaged (ours; they then advance by no more than half of the window
+    less the context, so that two at least predict each frame), or their overlap is inpainted (ECHO Fig. 3)."""
 
 
 MAX_ENVIRONMENTS = 16
@@ -68,7 +68,8 @@ MAX_ENVIRONMENTS = 16
 
 @dataclass
 class Echo(LearnedSystem):
-    """Captures recordings with a rolling schedule over frames (the conveyor); batching does not change results."""
+    """Captures recordings in averaged windows (ours), or with a rolling schedule over frames (the conveyor, ECHO §3.3);
+    batching does not change results."""
 
     model: EchoModel
     sampling: Sampling = Sampling()
@@ -110,10 +111,13 @@ class Echo(LearnedSystem):
             raise WearcapError(what, expected=f"1 to {ramp}, the window less the context")
         if self.sampling.rewindow_steps is not None and (rewindow is None or self.sampling.rewindow_steps < 1):
             what = f"rewindow_steps={self.sampling.rewindow_steps} with rewindow={rewindow}"
-            raise WearcapError(what, expected="at least one step, of windows (rewindow=FRAMES)")
-        if rewindow is not None and self.sampling.step == "redraw":
-            what = "step=redraw with windows that are denoised from scratch"
-            raise WearcapError(what, expected="step=posterior, or rewindow=null")
+            fix = "On a conveyor, say rewindow_steps=null, too."
+            raise WearcapError(what, expected="at least one step, of windows (rewindow=FRAMES)", fix=fix)
+        for name, value, usual in (("step", self.sampling.step, "posterior"), ("lead", self.sampling.lead, 0.0)):
+            if rewindow is not None and value != usual:
+                what = f"{name}={value} with windows that are denoised from scratch"
+                expected = f"{name}={usual}, or a conveyor: rewindow=null, rewindow_steps=null"
+                raise WearcapError(what, expected=expected)
         chosen(self.runtime, self.precision, self.device)
         self._runner: EchoRunner | None = None
         self._environments: dict[Path, Environment] = {}
@@ -125,6 +129,13 @@ class Echo(LearnedSystem):
         how = self.sampling
         lead = (0.0, 0.0, how.lead) if how.lead else ()
         return RollingSchedule(self.model.net.window, how.context, how.per_frame, how.spacing, how.eta, how.step, lead)
+
+    @property
+    def stride(self) -> int | None:
+        """Frames by which windows advance; None on a conveyor."""
+        if self.sampling.rewindow is None or not self.sampling.average:
+            return self.sampling.rewindow
+        return min(self.sampling.rewindow, max(1, self.rolling.ramp // 2))
 
     @property
     def fps(self) -> float:
@@ -222,8 +233,8 @@ class Echo(LearnedSystem):
             for key, scenario in once.items()
         }
         items = [item_by[id(scenario)] for scenario in scenarios]
-        # 2. Sampling with the rolling schedule: frames enter as noise one by one and leave clean. All stretches are
-        # sampled side by side.
+        # 2. Denoising: overlapping windows, whose predictions are averaged, or the rolling schedule, on which frames enter
+        # as noise one by one and leave clean. All stretches are denoised side by side.
         parts = [(k, *stretch) for k, item in enumerate(items) for stretch in item.path.stretches]
         queue = self.queue(
             [items[k].path.skeleton for k, *_ in parts],
@@ -270,16 +281,15 @@ class Echo(LearnedSystem):
     ) -> EchoQueue:
         """An empty queue for a batch, with the bodies and objects that guidance needs, if any."""
         queue = EchoQueue(self, skeletons, seeds)
-        if self.sampling.rewindow is not None:
+        if self.stride is not None:
             windows = AveragedWindows if self.sampling.average else Rewindow
-            stride = min(self.sampling.rewindow, self.rolling.ramp)
-            queue = windows(self, skeletons, seeds, stride, self.sampling.rewindow_steps)
+            queue = windows(self, skeletons, seeds, self.stride, self.sampling.rewindow_steps)
         if self.contact_use.guidance is not None:
             queue.guided = pulled_by(skeletons, shapes, objects)
         return queue
 
     def denoiser(self, queue: EchoQueue, conditioning: Conditioning, frame: Rigid) -> tuple[Denoise, list[Correct]]:
-        """x̂0 of the conveyor's frames as a function of x_t and levels, and what corrects it: tracked wrists, guidance.
+        """x̂0 of a window's frames as a function of x_t and levels, and what corrects it: tracked wrists, guidance.
 
         The condition is encoded once per call; the level-dependent part is cached between calls.
         """
@@ -303,6 +313,7 @@ class Echo(LearnedSystem):
         """Settings that a capture depends on, for its provenance."""
         acts, use = "search" if callable(self.acts) else self.acts, self.contact_use
         own = {
+            "rewindow": self.stride,
             "anchor": self.anchor,
             "refinement": self.refinement,
             "static_threshold": use.static_threshold,

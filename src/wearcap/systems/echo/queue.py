@@ -329,8 +329,8 @@ class AveragedWindows(Rewindow):
         super().__init__(pipeline, skeletons, seeds, stride, steps)
         self._sum = torch.zeros(len(seeds), 0, 0)
         """Weighted sums of the predictions for the frames of `conditioning` (`_flat`), and sums of weights."""
-        self._given = torch.zeros(len(seeds), 0, 1 + len(MODALITIES))
-        """The object and the observed modalities that these predictions were for."""
+        self._given = torch.zeros(len(seeds), 0, _GIVEN)
+        """What these predictions were for (`_given`)."""
         self._pushed, self._final = 0, 0
         """Numbers of frames that were taken in, and that are final."""
 
@@ -349,9 +349,10 @@ class AveragedWindows(Rewindow):
         return self._finalized()
 
     def _predict(self, conditioning: Conditioning) -> None:
-        """Add the window's prediction to the sums; a frame with another object or other observations starts anew."""
-        given = torch.cat([conditioning.object_number[..., None], conditioning.is_observed.float()], -1)
-        same, self._given = (given == self._given).all(-1, keepdim=True), given
+        """Add the window's prediction to the sums; a frame with another object, observation or pose of a tracked point than
+        in the last window starts anew."""
+        given = _given(conditioning)
+        same, self._given = ((given - self._given).abs() < _ALIKE).all(-1, keepdim=True), given
         frame = self.pipeline.model.features.canonical(conditioning.points)
         x = self.window(conditioning, self._sum.new_zeros(len(given), 0, sum(self.pipeline.model.net.sizes)))
         flat = _flat(self._decoded(x, slice(None), frame))
@@ -368,7 +369,7 @@ class AveragedWindows(Rewindow):
         return torch.minimum(behind, ahead).clamp_max(window // 2).square().float()
 
     def _finalized(self) -> Outputs | None:
-        """The frames that no later window changes."""
+        """The frames that are old enough; what later windows predict for them is not used."""
         count, lookahead = self._sum.shape[1], self.rolling.ramp - self.stride
         stop, start = count - lookahead, count - (self._pushed - self._final)
         if stop <= start:
@@ -379,6 +380,19 @@ class AveragedWindows(Rewindow):
 
     def run(self, whole: Conditioning) -> Outputs:
         return EchoQueue.run(self, whole)
+
+
+_GIVEN, _ALIKE = 1 + len(MODALITIES) + 3 * 12 + 12, 1e-4
+"""Values of `_given`, and the difference up to which they are the same."""
+
+
+def _given(conditioning: Conditioning) -> Float[Tensor, "batch frame value"]:
+    """What a stream may change in a frame that windows have predicted: the active object, what is observed, tracked points
+    whose poses are corrected after a loss, and the observed pose of the object."""
+    observed = conditioning.is_observed.float()
+    points = conditioning.R_world_point.flatten(2), conditioning.t_world_point.flatten(2)
+    pose = torch.cat([conditioning.R_world_object.flatten(2), conditioning.t_world_object], -1) * observed[..., 1:2]
+    return torch.cat([conditioning.object_number[..., None], observed, *points, pose], -1)
 
 
 def _flat(outputs: Outputs) -> Float[Tensor, "batch frame value"]:

@@ -65,7 +65,7 @@ class EchoStream(HeadAndWristsStream):
         how = pipeline.sampling
         if how.rewindow is not None and not how.average:
             what = f"a stream with rewindow={how.rewindow}"
-            raise WearcapError(what, expected="average=true, or a conveyor: rewindow=null")
+            raise WearcapError(what, expected="average=true, or a conveyor: rewindow=null, rewindow_steps=null")
         super().__init__(pipeline, pipeline.fps, 1)
         self.wearer, self.seed = wearer, seed
         self._names: list[str] = []
@@ -288,7 +288,7 @@ class EchoStream(HeadAndWristsStream):
         )
 
     def _update_pending(self) -> None:
-        """Update the conditioning of the conveyor's frames with inputs that arrived after them."""
+        """Update the conditioning of the queue's frames with inputs that arrived after them."""
         if self._queue is None or self._queue.conditioning is None or not self._pending:
             return
         whole, first = self._queue.conditioning, self._queue.conditioning.valid.shape[1] - len(self._pending)
