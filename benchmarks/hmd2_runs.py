@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from result_pages import Tree, summaries
 from sensed import SensedStore
 from tabling import training_of
 
@@ -59,6 +60,12 @@ class Result:
     method: str
     scores: dict[str, Summary]
     activities: dict[str, dict[str, Summary]]
+
+    @classmethod
+    def of(cls, tree: Tree) -> "Result":
+        """As it was before it became JSON."""
+        activities = {name: summaries(scores) for name, scores in tree["activities"].items()}
+        return cls(tree["method"], summaries(tree["scores"]), activities)
 
 
 def run_method(method: Method, case: Case) -> Result:

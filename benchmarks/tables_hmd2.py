@@ -14,21 +14,7 @@ from typing import Any
 from hmd2_paper import PAPER, PAPER_METRICS, PAPER_TAIL, paper_rows
 from hmd2_runs import BASELINES, Case, Method, Result, run_method
 from joblib import Parallel, delayed
-from result_pages import (
-    NONE,
-    RANKED,
-    Grid,
-    Page,
-    Tree,
-    Trees,
-    figure_of,
-    grid_of,
-    mean,
-    ranged,
-    score_grids,
-    summaries,
-    text,
-)
+from result_pages import NONE, RANKED, Grid, Page, Tree, Trees, figure_of, grid_of, mean, ranged, score_grids, text
 from rich.console import Console
 from rich.table import Table
 from sensed import GIVEN, WRONG_HEIGHTS, add_sensors
@@ -77,16 +63,22 @@ TRUTH_GIVEN = "hands of the AvatarPoser-style row that sees them (with exact sen
 """What of the truth is given to rows."""
 MODALITIES = {OURS: "[points,images]", "w/o images": "[points]", "w/o points": "[images]", "head alone": "[]"}
 BRIEF = "head alone, the rivals' budget"
+MEAN = ("pipeline=hmd2", "pipeline.refinement.feet=null")
+"""Captures a rival as ours: the mean in one step, smoothed. Of standing feet their networks learn little or nothing."""
 TRAINED = {
     "EgoEgo-style": ("egoego_style", ("pipeline=baseline/egoego_style",), None),
+    "EgoEgo-style, its mean": ("egoego_style", MEAN, None),
     "EgoAllo-style": ("egoallo_style", ("pipeline=baseline/egoallo_style",), None),
+    "EgoAllo-style, its mean": ("egoallo_style", MEAN, None),
     "AGRoL-style (head)": ("agrol_style", ("pipeline=baseline/agrol_style",), None),
+    "AGRoL-style (head), its mean": ("agrol_style", MEAN, None),
     "AvatarPoser-style (head)": ("avatarposer_head", ("pipeline=pose_regressor",), None),
     "AvatarPoser-style (head and hands)": ("avatarposer_hands", ("pipeline=pose_regressor",), GIVEN),
     BRIEF: ("motion_diffusion_head", ("pipeline=hmd2", "pipeline.runtime=auto"), None),
 }
-"""Baselines, and our network with as little training: run, overrides that capture, and sensors (None: the table's)."""
-RUNS = tuple(run for run, _, _ in TRAINED.values())
+"""Baselines, and our network with as little training: run, overrides that capture, and sensors (None: the table's).
+Diffusions are captured twice, as their papers sample them and as the mean in one step."""
+RUNS = tuple(dict.fromkeys(run for run, _, _ in TRAINED.values()))
 BUDGET, BATCH = 300_000, 8
 """Frames that each of these sees, unless `rivals.py` is given another budget, and windows of a batch."""
 WINDOW = {
@@ -371,9 +363,9 @@ def _activities(title: str, results: list[Result], metric: str) -> Table:
 
 HEADLINE = {
     "nearest window": "nearest window of the training",
-    "EgoEgo-style": "EgoEgo-style, head",
-    "EgoAllo-style": "EgoAllo-style, head",
-    "AGRoL-style (head)": "AGRoL-style, head",
+    "EgoEgo-style, its mean": "EgoEgo-style, head: its mean",
+    "EgoAllo-style, its mean": "EgoAllo-style, head: its mean",
+    "AGRoL-style (head), its mean": "AGRoL-style, head: its mean",
     "AvatarPoser-style (head)": "AvatarPoser-style, head",
     "AvatarPoser-style (head and hands)": "AvatarPoser-style, which also sees the hands",
     BRIEF: "ours, head alone, trained as briefly as the rivals",
@@ -471,8 +463,8 @@ def _briefly(simulated: dict[str, Tree], real: dict[str, Tree]) -> tuple[str, ..
         f"Learned baselines that see the head alone, and ours beside them, saw {mean(one[BRIEF]['frames_seen_m'], 2)} "
         "million frames each, in one training at the best of three learning rates, of a part of the simulated motion and of "
         f"CMU's, which is far less than our checkpoint saw. MPJPE (cm), so trained: {'; '.join(phrases)}.",
-        "The diffusions among them, ours too, are samples, in the steps of their papers and five of ours; our checkpoint's rows "
-        "are the mean in one step, but where they say so.",
+        "The diffusions among them are captured twice: as their papers sample them, and, named so, as the mean in one step that "
+        "ours are, smoothed as ours.",
         "Trained so briefly a diffusion with a token for each frame passes on noise that more training would remove; "
         f"jitter, of the truth's: {', '.join(jitters)}.",
     )
@@ -554,7 +546,7 @@ def _grids(trees: Trees) -> list[Grid]:
     """All tables."""
     grids = [
         grid_of(
-            _table(f"{title} ({name.removeprefix('hmd2_')})", _results(rows)),
+            _table(f"{title} ({name.removeprefix('hmd2_')})", [Result.of(row) for row in rows]),
             tree.get("origins", {}).get(title, tree["about"]),
             _repetitions(rows),
         )
@@ -566,7 +558,7 @@ def _grids(trees: Trees) -> list[Grid]:
         parts = {"Table 6.6: 95th percentiles": tree.get("percentiles"), **tree.get("scenarios", {})}
         found = {title: rows for title, rows in parts.items() if rows}
         grids += score_grids({"about": tree["about"], "tables": found}, _labels())
-    first = {name: _results(tree["tables"].get(FIRST, [])) for name, tree in trees.items()}
+    first = {name: [Result.of(row) for row in tree["tables"].get(FIRST, [])] for name, tree in trees.items()}
     for name, rows in first.items():
         if max((len(row.activities) for row in rows), default=0) > 4:  # of fewer, Tables 6.8 to 6.10 show enough
             table = _activities(
@@ -583,16 +575,6 @@ def _labels() -> dict[str, tuple[str, int]]:
 
 def _rows(trees: Trees, name: str) -> list[Tree]:
     return trees.get(f"hmd2_{name}", {}).get("tables", {}).get(FIRST, [])
-
-
-def _results(rows: list[Tree]) -> list[Result]:
-    """Results as they were before they became JSON."""
-    return [
-        Result(
-            row["method"], summaries(row["scores"]), {name: summaries(each) for name, each in row["activities"].items()}
-        )
-        for row in rows
-    ]
 
 
 def _repetitions(rows: list[Tree]) -> str:

@@ -359,7 +359,7 @@ def frames_of(overrides: list[str]) -> tuple[str, int]:
 def test_learned_rivals_of_hmd2_see_as_many_frames_as_ours():
     import tables_hmd2
 
-    for run, _, _ in tables_hmd2.TRAINED.values():
+    for run in tables_hmd2.RUNS:
         name, frames = frames_of(tables_hmd2.training(run))
         assert name == run
         if run.startswith("avatarposer"):  # of 240 frames drawn, its two pairs of poses see 41 each
