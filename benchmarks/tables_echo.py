@@ -425,7 +425,11 @@ HEADLINE = (
     ("Table 1:", "paper: BEHAVE", "the paper's, on BEHAVE"),
     ("Table 2", "ours", "people alone (CMU): **ours**"),
     ("Table 2", "ours, the same budget", "people alone (CMU): ours, the rivals' budget"),
-    ("Table 2", "BoDiffusion-style, its mean", "people alone (CMU): BoDiffusion-style, the same budget, its mean"),
+    (
+        "Table 2",
+        "BoDiffusion-style + object, its mean",
+        "people alone (CMU): BoDiffusion-style + object, the same budget",
+    ),
     ("People (hdm05)", "ours", "people alone (another laboratory's, HDM05): **ours**"),
 )
 """Rows of the page's first table: table, row, and what the page calls it."""
@@ -586,8 +590,8 @@ def _briefly(objects: dict[str, Tree], people: dict[str, Tree]) -> tuple[str, ..
     rest = [f"{mean(mine[key], n)} against {mean(theirs[key], n)} {unit}" for key, unit, n in parts if key in theirs]
     return (
         f"Learned baselines, and ours beside them, saw {seen} million frames each, in one training, of a part of the "
-        f"simulated motion and of CMU's; the losses of all were still falling: {'; '.join(phrases)}. In the same frame, budget "
-        f"and way of capturing ours and BoDiffusion-style + object have {' and '.join(rest)}.",
+        f"simulated motion and of CMU's; the losses of all were still falling: {'; '.join(phrases)}. Against BoDiffusion-"
+        f"style + object, which has one noise level for a whole window, ours so trained and captured has {', '.join(rest)}.",
         "Diffusions are captured twice: as samples, ours on the conveyor, and, named so, as the mean of averaged windows in one "
         "step, with arms that reach the wrists, as ours.",
         *(["Contacts of BoDiffusion-style rows are noise: they learn none."] if "touch_f1" in theirs else []),
