@@ -117,15 +117,19 @@ TRAINING = {
 """Columns of what a row's training took."""
 
 
-def score_grids(tree: Tree, labels: Mapping[str, tuple[str, int]], spread: str = "seeds") -> list[Grid]:
+def score_grids(
+    tree: Tree, labels: Mapping[str, tuple[str, int]], spread: str = "seeds", hidden: Collection[str] = ()
+) -> list[Grid]:
     """The tables of a tree {"tables": {title: {row: {metric: summary}}}}: columns are the metrics that have a label
-    (and digits), then all others but those of the truth, which has a row."""
+    (and digits), then all others but those of the truth, which has a row, and hidden ones, which the JSON has."""
     grids, labels = [], {**labels, **TRAINING}
     for title, rows in tree["tables"].items():
         rows = {**rows}
         for name, earlier in kept(tree, title).items():
             rows |= {f"{name}: {row}": scores for row, scores in earlier.items() if row != "truth"}
-        present = list(dict.fromkeys(m for row in rows.values() for m in row if not m.startswith("truth_")))
+        present = list(
+            dict.fromkeys(m for row in rows.values() for m in row if not m.startswith("truth_") and m not in hidden)
+        )
         metrics = [name for name in labels if name in present] + [name for name in present if name not in labels]
         cells = [[name, *(text(row.get(m), labels.get(m, ("", 2))[1]) for m in metrics)] for name, row in rows.items()]
         count = max(

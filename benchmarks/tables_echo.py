@@ -411,6 +411,7 @@ LABELS = {
     "training_minutes": ("minutes learned from", 0),
 }
 """Columns of the page's tables with their digits."""
+BODY_PARTS = tuple(f"{part}_pe_mm" for part in ("head", "trunk", "arm", "leg", "foot"))
 HEADLINE = (
     ("Table 1:", "ours", "objects: **ours**"),
     ("Table 1:", "ours, hinges and rails unknown", "objects: **ours**, hinges and rails unknown, as for rivals"),
@@ -480,7 +481,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
             "The trainings of the ablation have one seed each, and are scored without guidance but where the row says so.",
             "No recording of real people with objects has been captured.",
         ),
-        full=[grid for tree in trees.values() for grid in score_grids(tree, LABELS)],
+        full=[grid for tree in trees.values() for grid in score_grids(tree, LABELS, hidden=BODY_PARTS)],
         measured=f"joints {ours['mpjpe_mm']['mean'] / 10:.1f} cm{real}; objects {placed}",
         speed=f"{online['ratio']:.0f} × online" if online else "",
         clocks=CLOCKS,
