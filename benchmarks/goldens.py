@@ -121,22 +121,24 @@ PIPELINES = {
 
 QUIET = "callbacks.capture=null"
 TWO = "data.sources.cmu=null"
+THREE = "data.sources.hdm05=null"
 VAL = "data.val_sources.cmu.root=data/walkers"
 ONE = "data.sources.simulated.root=data/walkers"
 TRAININGS: dict[str, tuple[str, ...]] = {
     "motion_diffusion_head": (QUIET, ONE, "data.dataset.window=120"),
-    "hmd2": (QUIET, ONE, TWO, "data.dataset.window=120"),
-    "mocap_every": (ONE, TWO, VAL),
+    "hmd2": (QUIET, ONE, TWO, THREE, "data.dataset.window=120"),
+    "mocap_every": (ONE, TWO, THREE, VAL),
     "echo": (
         "data.sources.objects.root=data/objects",
         TWO,
+        THREE,
         "data.val_sources.objects.root=data/objects",
         "trainer.precision=32-true",
     ),
     "contact_sequence": ("data.sources.simulated.root=data/flats", "callbacks.tracking=null"),
     "contact_transformer_sliding": ("data.sources.simulated.root=data/flats", "callbacks.tracking=null"),
     "pose_regressor_hands": (ONE, "data.dataset.window=120"),
-    "motion_manifold": (ONE, TWO, VAL),
+    "motion_manifold": (ONE, TWO, THREE, VAL),
     "motion_autoencoder": (ONE, TWO),
     "voxel_autoencoder": (ONE, TWO, "data.dataset.window=120"),
     "object_encoder": ("data.dataset.per_class={train: 2, val: 1}", "data.dataset.root=data/clouds"),
