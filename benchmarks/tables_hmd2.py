@@ -64,7 +64,7 @@ TRUTH_GIVEN = "hands of the AvatarPoser-style row that sees them (with exact sen
 MODALITIES = {OURS: "[points,images]", "w/o images": "[points]", "w/o points": "[images]", "head alone": "[]"}
 BRIEF = "head alone, the rivals' budget"
 MEAN = ("pipeline=hmd2", "pipeline.refinement.feet=null")
-"""Captures a rival as ours: the mean in one step, smoothed. Of standing feet their networks learn little or nothing."""
+"""Captures a rival as ours: the mean in one step, smoothed. Feet are not held: two of three learn no contacts."""
 TRAINED = {
     "EgoEgo-style": ("egoego_style", ("pipeline=baseline/egoego_style",), None),
     "EgoEgo-style, its mean": ("egoego_style", MEAN, None),
@@ -476,7 +476,7 @@ def _briefly(simulated: dict[str, Tree], real: dict[str, Tree]) -> tuple[str, ..
         "million frames each, in one training at the best of three learning rates, of a part of the simulated motion and of "
         f"CMU's, which is far less than our checkpoint saw. MPJPE (cm), so trained: {'; '.join(phrases)}.",
         "The diffusions among them are captured twice: as their papers sample them, and, named so, as the mean in one step that "
-        "ours are, smoothed as ours.",
+        "ours are, smoothed as ours, but with feet that are not held; which of the two is nearer differs from row to row.",
         "Trained so briefly a diffusion with a token for each frame passes on noise that more training would remove; "
         f"jitter, of the truth's: {', '.join(jitters)}.",
     )
