@@ -433,7 +433,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
             "FID needs more windows than CMU's held-out subjects have.",
             "No recording of a real head-mounted device has been scored.",
         ),
-        full=[*score_grids(_without_tails(people), _labels(), "repetitions"), *_grids(trees)],
+        full=[*score_grids(people, _labels(), "repetitions", hidden=_tails(people)), *_grids(trees)],
         measured=f"joints {errors[0]} cm off{ours_real}",
         speed=f"{online['ratio']:.0f} × online, head's path and points given" if online else "",
         clocks=CLOCKS,
@@ -444,16 +444,10 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     )
 
 
-def _without_tails(people: Tree) -> Tree:
-    """Tables of people without 95th percentiles of body parts, which Table 6.6 has of CMU."""
-    tables = {
-        title: {
-            row: {name: one for name, one in scores.items() if name in COLUMNS or not name.startswith(P95)}
-            for row, scores in rows.items()
-        }
-        for title, rows in people["tables"].items()
-    }
-    return {**people, "tables": tables}
+def _tails(people: Tree) -> set[str]:
+    """95th percentiles of body parts, which Table 6.6 has of CMU."""
+    names = {name for rows in people["tables"].values() for scores in rows.values() for name in scores}
+    return {name for name in names - {*COLUMNS} if name.startswith(P95)}
 
 
 def _briefly(simulated: dict[str, Tree], real: dict[str, Tree]) -> tuple[str, ...]:
