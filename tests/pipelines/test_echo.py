@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from scipy.spatial import KDTree
 
 from carried_box import FPS, GRIP, WINDOW, boxes, carrying, drawn_echo, scenario_of, with_settings
 from wearcap.body.contact_points import BODY_POINTS
@@ -15,15 +16,18 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording import Motion
+from wearcap.systems.echo.contacts import Guidance
 from wearcap.systems.echo.features import CONTACTS, Body
 from wearcap.systems.echo.observations import Observed, batch_item_of
 from wearcap.systems.echo.pipeline import Echo
-from wearcap.systems.echo.queue import AveragedWindows, Conditioning, EchoQueue, Rewindow
+from wearcap.systems.echo.queue import Conditioning, EchoQueue
+from wearcap.systems.echo.windows import AveragedWindows, Rewindow
 from wearcap.tracking.head_path import head_path
 
 TWO = (("box_1", "left", 0.1, 0.35), ("box_2", "right", 0.6, 0.8))
 FRAMES = ("own", "window", "world")
 AVERAGED = {"rewindow": 3, "rewindow_steps": 1, "average": True}
+MIRRORED = AVERAGED | {"mirror_average": True}
 
 
 def batch_item(echo: Echo, scenario):
@@ -49,7 +53,7 @@ def assert_true(motion: Motion, recording, scenario, atol: float = 2e-4) -> None
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-@pytest.mark.parametrize("settings", [{}, {"rewindow": 3}, AVERAGED])
+@pytest.mark.parametrize("settings", [{}, {"rewindow": 3}, AVERAGED, MIRRORED])
 def test_what_is_observed_comes_out_as_it_is(frame, settings):
     recording = carrying(1.0, carried=TWO)
     scenario = scenario_of(recording, TWO, observed=everything(recording))
@@ -187,7 +191,7 @@ def test_noised_frames_are_re_expressed_when_the_window_advances():
     assert (new.t - old.t).norm() > 0.1
 
 
-@pytest.mark.parametrize("settings", [{}, {"frame": "window"}, {"rewindow": 3}, AVERAGED, {"per_frame": 2}])
+@pytest.mark.parametrize("settings", [{}, {"frame": "window"}, {"rewindow": 3}, AVERAGED, MIRRORED, {"per_frame": 2}])
 def test_batch_items_are_independent(settings):
     echo = drawn_echo(**settings)
     scenarios = [scenario_of(carrying(0.9)), scenario_of(carrying(0.7, carried=TWO[1:]), TWO[1:])]
@@ -303,6 +307,29 @@ def test_what_was_predicted_before_a_head_pose_was_corrected_does_not_count(coun
             queue.conditioning = queue.conditioning._replace(t_world_point=points)
     assert found[13] == pytest.approx((5**2 * 5 + 8**2 * 6) / (5**2 + 8**2), abs=1e-4)
     assert found[12] < 5.5, "windows before count for its neighbours"
+
+
+@pytest.mark.parametrize("guidance", [None, Guidance(object=2.0)])
+def test_a_mirrored_wearer_moves_as_the_mirrored_motion(guidance):
+    """Without the mirrored windows, left and right differ. Meshes of objects are mirrored, too."""
+    recording, apart = carrying(1.0, carried=TWO), {}
+    observed = replace(everything(recording), motion=None, object_motion={})
+    for name, settings in (("alone", AVERAGED), ("averaged", MIRRORED)):
+        echo = drawn_echo(**settings, guidance=guidance)
+        item = batch_item(echo, scenario_of(recording, TWO, observed=observed))
+        seen = torch.arange(item.conditioning.valid.shape[1]) % 7 == 0
+        whole = item.conditioning._replace(is_observed=item.conditioning.is_observed & seen[:, None])
+        found = []
+        for mirrored in (False, True):
+            queue = echo.queue([echo.model.skeleton], [0], [{}], [item.objects])
+            if mirrored and queue.guided is not None:
+                surfaces, trees = queue.guided
+                queue.guide((surfaces, [[KDTree(tree.data * [1.0, -1.0, 1.0]) for tree in mine] for mine in trees]))
+            found.append(queue.run(whole.mirrored(echo.model.skeleton) if mirrored else whole))
+        one, other = found[0], found[1].mirrored(echo.model.skeleton)
+        apart[name] = max((a - b).abs().max().item() for a, b in zip(one, other))
+    assert apart["averaged"] < 1e-3
+    assert apart["alone"] > 0.1
 
 
 def test_averaged_windows_have_the_latency_of_a_conveyor():

@@ -82,7 +82,9 @@ def test_a_stream_equals_a_capture_of_the_whole_recording(settings):
     assert session.dropped == session.silent == 0
 
 
-@pytest.mark.parametrize("settings", [{}, {"frame": "window"}, {"anchor": False}, {"placed": True}])
+@pytest.mark.parametrize(
+    "settings", [{}, {"frame": "window"}, {"anchor": False}, {"placed": True}, {"mirror_average": True}]
+)
 def test_a_stream_of_averaged_windows_equals_a_capture_of_the_whole_recording(settings):
     recording, echo = carrying(1.2, carried=TWO), drawn_echo(**AVERAGED, **settings)
     scenario = replace(scenario_of(recording, TWO), placed=echo.placed)

@@ -118,8 +118,17 @@ def test_mocap_every_goes_on_with_two_wearers(floor, tmp_path):
         MocapEverySession.load(tmp_path / "s.safetensors", replace(pipeline, floor="points"))
 
 
+AVERAGED = {"rewindow": 3, "rewindow_steps": 1, "average": True}
+
+
 @pytest.mark.parametrize(
-    "settings", [{}, {"guidance": Guidance(object=2.0)}, {"rewindow": 3, "rewindow_steps": 1, "average": True}]
+    "settings",
+    [
+        {},
+        {"guidance": Guidance(object=2.0)},
+        AVERAGED,
+        AVERAGED | {"mirror_average": True, "guidance": Guidance(object=2.0)},
+    ],
 )
 def test_echo_goes_on_with_two_wearers(settings, tmp_path):
     recording, echo = carrying(1.2, carried=TWO), drawn_echo(**settings)

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body.contact_points import BODY_POINTS, HAND_POINTS
+from wearcap.body.contact_points import BODY_POINTS, HAND_POINTS, mirrored_points
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.data.features import LIMBS
 from wearcap.errors import WearcapError, require_choice
@@ -20,6 +20,10 @@ FRAMES = ("own", "window", "world")
 """Coordinate frames that features can be expressed in (`EchoFeatures.frame`)."""
 CONTACTS = BODY_POINTS + len(FOOT_PATCHES)
 """Number of contact labels per frame."""
+TWIN_POINTS = [0, 2, 1]
+"""Index of each tracked point's mirror twin."""
+TWIN_CONTACTS = [*mirrored_points().tolist(), *(BODY_POINTS + k for k in (2, 3, 0, 1))]
+"""Index of each contact label's mirror twin."""
 HANDS = {"left_wrist": slice(0, HAND_POINTS), "right_wrist": slice(BODY_POINTS // 2, BODY_POINTS // 2 + HAND_POINTS)}
 """Points of the body that are each hand's."""
 OBJECT_SIZE = 9

@@ -168,10 +168,11 @@ def batch_item_of(scenario: Scenario, path: HeadPath, reader: ObjectReader) -> B
     objects = _objects(scenario, names, reader)
     active = active_at(scenario.acts, names, path.timestamps)
     codes = torch.stack([*(shape.code for shape in objects), reader.nothing])
+    mirrored = torch.stack([*(shape.code_mirrored for shape in objects), reader.nothing])
     floor = path.floor_height
     if recording.floor is not None:
         floor = interpolate_clamped(recording.floor.timestamps, recording.floor.height, path.timestamps)
-    objects_of_frames = active != NO_OBJECT, codes[active], active.float()
+    objects_of_frames = active != NO_OBJECT, codes[active], mirrored[active], active.float()
     valid = torch.ones(len(path.timestamps), dtype=torch.bool)
     observed = _observed(scenario, path, names, objects, active)
     parts = R, t, floor.float(), *objects_of_frames, valid, *observed

@@ -26,8 +26,9 @@ from wearcap.scene.objects import Environment
 from wearcap.systems.echo.contacts import ContactUse, GuidedScene, with_static_objects
 from wearcap.systems.echo.model import EchoRunner
 from wearcap.systems.echo.observations import BatchItem, ObjectReader, ObjectShape, Scenario, batch_item_of
-from wearcap.systems.echo.queue import AveragedWindows, Conditioning, EchoModel, EchoQueue, Outputs, Rewindow
+from wearcap.systems.echo.queue import Conditioning, EchoModel, EchoQueue, Guided, Outputs
 from wearcap.systems.echo.scores import Truth, score_echo, truth_of
+from wearcap.systems.echo.windows import AveragedWindows, Rewindow
 from wearcap.systems.echo.wrists import Reaching, reaches
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.head_path import head_path
@@ -60,6 +61,8 @@ class Sampling:
     average: bool = False
     """Whether what these windows predict for a frame is averaged (ours; they then advance by no more than half of the window
     less the context, so that two at least predict each frame), or their overlap is inpainted (ECHO Fig. 3)."""
+    mirror_average: bool = False
+    """Mirror test-time augmentation of averaged windows: the prediction for the mirrored window is averaged in (ours)."""
 
 
 MAX_ENVIRONMENTS = 16
@@ -285,7 +288,7 @@ class Echo(LearnedSystem):
             windows = AveragedWindows if self.sampling.average else Rewindow
             queue = windows(self, skeletons, seeds, self.stride, self.sampling.rewindow_steps)
         if self.contact_use.guidance is not None:
-            queue.guided = pulled_by(skeletons, shapes, objects)
+            queue.guide(pulled_by(skeletons, shapes, objects))
         return queue
 
     def denoiser(self, queue: EchoQueue, conditioning: Conditioning, frame: Rigid) -> tuple[Denoise, list[Correct]]:
@@ -359,7 +362,7 @@ def measured_of(item: BatchItem) -> Measured:
 
 def pulled_by(
     skeletons: Sequence[Skeleton], shapes: Sequence[dict[str, float]], objects: Sequence[Sequence[ObjectShape]]
-) -> tuple[list, list]:
+) -> Guided:
     """Inputs of guidance per batch item: contact points of the body, and KD-trees over the points of its objects."""
     surfaces = [contact_points(anny_body(skeleton, shape or None)) for skeleton, shape in zip(skeletons, shapes)]
     return surfaces, [[KDTree(shape.cloud.numpy()) for shape in mine] for mine in objects]

@@ -34,7 +34,7 @@ from wearcap.scene.objects import Environment
 from wearcap.sensors import packets, samples
 from wearcap.sensors.packets import MAX_WAITING
 from wearcap.sensors.samples import ActiveObject, HeadSample, ObjectSample, WristSample
-from wearcap.systems.echo import contacts, queue
+from wearcap.systems.echo import contacts, queue, windows
 from wearcap.systems.echo.contacts import StaticObjects
 from wearcap.systems.echo.features import CONTACTS
 from wearcap.systems.echo.model import MODALITIES
@@ -47,7 +47,20 @@ from wearcap.tracking.head_path import Chunk, HeadPath
 from wearcap.tracking.refinement import Refiner
 
 _STATE = (
-    *(skeleton, motion_types, trajectory, rigid, head_path, packets, samples, floor, conveyor, queue, contacts),
+    *(
+        skeleton,
+        motion_types,
+        trajectory,
+        rigid,
+        head_path,
+        packets,
+        samples,
+        floor,
+        conveyor,
+        queue,
+        windows,
+        contacts,
+    ),
     *(refinement, foot_lock, wearer_types),
 )
 """Modules with the classes that a session's state consists of."""
@@ -90,7 +103,7 @@ class EchoStream(HeadAndWristsStream):
         """Give the queue the bodies and objects that guidance needs, if any."""
         if self._queue is not None and self.pipeline.contact_use.guidance is not None:
             shape, objects = dict(self.wearer.shape), list(self._shapes.values())
-            self._queue.guided = pulled_by([self.wearer.skeleton], [shape], [objects])
+            self._queue.guide(pulled_by([self.wearer.skeleton], [shape], [objects]))
 
     def _restart(self, again: bool = False) -> None:
         if again:
@@ -264,13 +277,14 @@ class EchoStream(HeadAndWristsStream):
         fields = R, t, floor, *self._active(time), valid, *unobserved, is_observed
         return self._with_observed_object(Conditioning(*(value[None] for value in fields)), time)
 
-    def _active(self, time: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Whether an object is active at a time, its code and its index."""
+    def _active(self, time: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Whether an object is active at a time, its codes and its index."""
         name = next((name for start, name in reversed(self._acts) if start <= time + SAME_S), None)
         if name is None:
-            return torch.zeros(1, dtype=torch.bool), self._reader.nothing[None], torch.full((1,), -1.0)
-        number = torch.full((1,), float(list(self._shapes).index(name)))
-        return torch.ones(1, dtype=torch.bool), self._shapes[name].code[None], number
+            nothing = self._reader.nothing[None]
+            return torch.zeros(1, dtype=torch.bool), nothing, nothing, torch.full((1,), -1.0)
+        number, shape = torch.full((1,), float(list(self._shapes).index(name))), self._shapes[name]
+        return torch.ones(1, dtype=torch.bool), shape.code[None], shape.code_mirrored[None], number
 
     def _with_observed_object(self, conditioning: Conditioning, time: float) -> Conditioning:
         """The conditioning with the active object's observation nearest in time, if one is within half a frame."""
@@ -294,9 +308,9 @@ class EchoStream(HeadAndWristsStream):
         whole, first = self._queue.conditioning, self._queue.conditioning.valid.shape[1] - len(self._pending)
         frames = [whole.frames(slice(k, k + 1)) for k in range(max(first, 0))]
         for k, (time, conditioning, head) in enumerate(self._pending):
-            has, code, number = (value[None] for value in self._active(time))
-            none = torch.zeros_like(conditioning.is_observed)
-            changed = conditioning._replace(has_object=has, object_code=code, object_number=number, is_observed=none)
+            names = "has_object", "object_code", "object_code_mirrored", "object_number"
+            active = {name: value[None] for name, value in zip(names, self._active(time), strict=True)}
+            changed = conditioning._replace(**active, is_observed=torch.zeros_like(conditioning.is_observed))
             changed = self._with_observed_object(changed, time)
             self._pending[k] = (time, changed, head)
             frames.append(changed)

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from wearcap.body.anny_body import anny_body
-from wearcap.body.contact_points import TOUCH_M, contact_points, mirrored_points
+from wearcap.body.contact_points import TOUCH_M, contact_points
 from wearcap.body.skeleton import FOOT_PATCHES, MIRROR, Skeleton
 from wearcap.data.bodies import OtherPerson
 from wearcap.data.features import body_size, on_level_ground
@@ -108,10 +108,9 @@ class EchoTrack:
     @cached_property
     def twins(self) -> dict[str, list[int]]:
         """What a mirror exchanges: joints, wrists, points of the body, heels and toe tips."""
-        patches = [len(mirrored_points()) + k for k in (2, 3, 0, 1)]
-        joints = dict.fromkeys(("R_parent_joint", "t_parent_joint"), joint_twins(self.skeleton))
-        points = {key: [0, 2, 1] for key in ("R_world_point", "t_world_point")}
-        return joints | points | {"contact": [*mirrored_points().tolist(), *patches]}
+        joints = joint_twins(self.skeleton)
+        points = {"R_world_point": TWIN_POINTS, "t_world_point": TWIN_POINTS}
+        return {"R_parent_joint": joints, "t_parent_joint": joints, "contact": TWIN_CONTACTS} | points
 
     @classmethod
     def read(
