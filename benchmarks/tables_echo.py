@@ -166,6 +166,7 @@ SETTINGS = {
     "windows in two steps": ("pipeline=echo", "pipeline.sampling.rewindow_steps=2"),
     "windows in five steps": ("pipeline=echo", "pipeline.sampling.rewindow_steps=5"),
     "windows that advance by 7 frames": ("pipeline=echo", "pipeline.sampling.rewindow=7"),
+    "windows without their mirrored twins": ("pipeline=echo", "pipeline.sampling.mirror_average=false"),
     "overlap inpainted, not averaged": ("pipeline=echo", "pipeline.sampling.average=false"),
     "online: 20 frames of latency": ("pipeline=echo_online", "pipeline.runtime=eager"),
     "conveyor": CONVEYOR,
@@ -323,10 +324,10 @@ def _strangers(root: Path, options: argparse.Namespace, progress: Progress) -> t
 
 def _people(options: argparse.Namespace, progress: Progress, store: RecordingStore, names: list[str]) -> Scores:
     """Rows of bodies: ours, with the wearer's bones and with a wrong height, then trained rivals."""
+    plain = {"as sampled": "pipeline.refinement=null", "windows not mirrored": "pipeline.sampling.mirror_average=false"}
     methods = [Method("ours", options.checkpoint)]
-    methods.append(Method("ours, as sampled", options.checkpoint, ("pipeline=echo", "pipeline.refinement=null")))
-    for what, off in WRONG_HEIGHTS.items():
-        methods.append(Method(f"ours, {what}", options.checkpoint, height_off_m=off))
+    methods += [Method(f"ours, {row}", options.checkpoint, ("pipeline=echo", how)) for row, how in plain.items()]
+    methods += [Method(f"ours, {what}", options.checkpoint, height_off_m=off) for what, off in WRONG_HEIGHTS.items()]
     methods = [method for method in methods if options.rows is None or method.name in options.rows]
     methods += [] if options.keep else _trained(HUMANS, options, progress)
     return _scores(methods, options, progress, store, names)

@@ -191,6 +191,17 @@ def _safe_losses(run: Path) -> dict[int, str]:
     return losses(run) if (run / "metrics.csv").is_file() else {}
 
 
+@pytest.mark.parametrize(("has", "used"), [(False, "32-true"), (True, "bf16-mixed")])
+def test_bfloat16_is_for_cpus_that_have_instructions_for_it(has, used, data, tmp_path, monkeypatch, capsys):
+    """Elsewhere a step takes tens of times as long as in float32."""
+    taken = []
+    monkeypatch.setattr("wearcap.training.run.computes_bfloat16", lambda: has)
+    monkeypatch.setattr(train, "fit", lambda system, data, trainer, *others: taken.append(trainer.precision))
+    train.main(arguments(data, tmp_path / "run", "trainer.precision=bf16-mixed"))
+    assert taken == [used]
+    assert ("trainer.precision=32-true, not bf16-mixed" in " ".join(capsys.readouterr().out.split())) is not has
+
+
 def test_overfits_one_batch(data, tmp_path):
     run = tmp_path / "run"
     more = [

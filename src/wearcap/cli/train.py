@@ -20,6 +20,7 @@ from wearcap.recording.store import RecordingStore
 from wearcap.training.run import (
     RunCheckpointIO,
     RunRecord,
+    affordable_precision,
     fit,
     keep_freed_memory,
     last_checkpoint,
@@ -53,11 +54,15 @@ def train(config: DictConfig) -> float:
         if config.test and system.system is None:
             raise WearcapError(f"test=true, but no pipeline captures with {type(system).__name__}", fix="Leave it out.")
         loggers = [instantiate(logger, _convert_="all") for logger in (config.logger or {}).values() if logger]
-        trainer: lightning.Trainer = instantiate(
-            config.trainer, callbacks=_callbacks(config), logger=loggers or False, plugins=[RunCheckpointIO(run)]
-        )
+        precision = affordable_precision(str(config.trainer.precision), str(config.trainer.accelerator))
+        more = {"callbacks": _callbacks(config), "logger": loggers or False, "plugins": [RunCheckpointIO(run)]}
+        trainer: lightning.Trainer = instantiate(config.trainer, precision=precision, **more)
         start = f", going on from {resume}" if resume else f", from the weights of {config.init}" if config.init else ""
         show(f"[bold]{config.name}[/bold] in {run}{start}")
+        if precision != str(config.trainer.precision):
+            show(
+                f"trainer.precision={precision}, not {config.trainer.precision}: this CPU computes bfloat16 in software"
+            )
         fit(system, data, trainer, resume, config.init)
         last = last_checkpoint(run)
         if trainer.is_global_zero:

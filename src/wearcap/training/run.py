@@ -169,6 +169,24 @@ def keep_freed_memory() -> None:
     libc.mallopt(trim_threshold, 2**31 - 1)
 
 
+def affordable_precision(precision: str, accelerator: str) -> str:
+    """`trainer.precision` as it is asked for, but float32 in place of bfloat16 on a CPU that has no instructions for bfloat16.
+
+    PyTorch then computes it in software, and a training step takes tens of times as long.
+    """
+    on_cpu = accelerator == "cpu" or (accelerator == "auto" and not torch.accelerator.is_available())
+    if not (precision.startswith("bf16") and on_cpu) or computes_bfloat16():
+        return precision
+    return "32-true"
+
+
+def computes_bfloat16() -> bool:
+    """Whether this machine's CPU has instructions for bfloat16."""
+    if platform.machine() in ("x86_64", "AMD64"):
+        return torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
+    return torch.ops.mkldnn._is_mkldnn_bf16_supported()
+
+
 def resume_path(resume: str | None, run: Path, config_yaml: str) -> Path | None:
     """The checkpoint to resume from: none, a path, or ("auto") the `last.ckpt` of the run's own folder if it has one.
 
