@@ -323,7 +323,7 @@ def test_a_mirrored_wearer_moves_as_the_mirrored_motion(guidance):
         for mirrored in (False, True):
             queue = echo.queue([echo.model.skeleton], [0], [{}], [item.objects])
             if mirrored and queue.guided is not None:
-                surfaces, trees = queue.guided
+                surfaces, trees = (part[:1] for part in queue.guided)
                 queue.guide((surfaces, [[KDTree(tree.data * [1.0, -1.0, 1.0]) for tree in mine] for mine in trees]))
             found.append(queue.run(whole.mirrored(echo.model.skeleton) if mirrored else whole))
         one, other = found[0], found[1].mirrored(echo.model.skeleton)

@@ -8,6 +8,7 @@ import math
 import sys
 from bisect import bisect_left
 from collections.abc import Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -320,28 +321,38 @@ class EchoStream(HeadAndWristsStream):
         """The motion of frames that became final; those of padding are left out."""
         if outputs is None:
             return []
-        count = min(outputs.t_world_root.shape[1], len(self._pending))
-        frames = (Outputs(*(field[:, k : k + 1] for field in outputs)) for k in range(count))
-        return [motion for frame in frames for motion in self._emit_frame(frame)]
+        count, first = min(outputs.t_world_root.shape[1], len(self._pending)), 0
+        leaving, self._pending = self._pending[:count], self._pending[count:]
+        motions: list[Motion] = []
+        for _, alike in groupby(leaving, key=lambda frame: frame[1].object_number.item()):
+            frames = list(alike)
+            part, first = slice(first, first + len(frames)), first + len(frames)
+            motions += self._emit_frames(frames, Outputs(*(field[:, part] for field in outputs)))
+        return motions
 
-    def _emit_frame(self, outputs: Outputs) -> list[Motion]:
-        time, conditioning, T_world_head = self._pending.pop(0)
-        times, floor_height = torch.tensor([time], dtype=torch.float64), conditioning.floor_height[0]
-        path = HeadPath(times, T_world_head, T_world_head, floor_height, self.wearer.skeleton, ((0, 1),))
+    def _emit_frames(self, frames: Sequence[tuple[float, Conditioning, Rigid]], outputs: Outputs) -> list[Motion]:
+        """The same for successive frames with one active object, or none."""
+        times, every, heads = zip(*frames)
+        conditioning = Conditioning(*(torch.cat(fields, 1) for fields in zip(*every)))
+        T_world_head = Rigid(torch.cat([head.R for head in heads]), torch.cat([head.t for head in heads]))
+        clock, stretches = torch.tensor(times, dtype=torch.float64), ((0, len(times)),)
+        skeleton, floor_height = self.wearer.skeleton, conditioning.floor_height[0]
+        path = HeadPath(clock, T_world_head, T_world_head, floor_height, skeleton, stretches)
         # Object events that no later frame needs are dropped.
-        self._seen = [row for row in self._seen if row[0] > time - 1.0]
-        past = [k for k, (start, _) in enumerate(self._acts) if start <= time]
+        self._seen = [row for row in self._seen if row[0] > times[-1] - 1.0]
+        past = [k for k, (start, _) in enumerate(self._acts) if start <= times[-1]]
         self._acts = self._acts[past[-1] :] if past else self._acts
-        batch_item = BatchItem(path, conditioning, list(self._shapes.values()))
         if self._static is not None:
-            outputs = self._static(conditioning, outputs)
-        pipeline = self.pipeline
-        motion = motion_of(batch_item, outputs, pipeline.anchor, pipeline.settings(), pipeline.model.contacts)
+            one = (Outputs(*(field[:, k : k + 1] for field in outputs)) for k in range(len(times)))
+            static = [self._static(each, part) for each, part in zip(every, one)]
+            outputs = Outputs(*(torch.cat(fields, 1) for fields in zip(*static)))
+        pipeline, item = self.pipeline, BatchItem(path, conditioning, list(self._shapes.values()))
+        motion = motion_of(item, outputs, pipeline.anchor, pipeline.settings(), pipeline.model.contacts)
         if pipeline.refinement is None:
             return [motion]
         if self._refiner is None:
             self._refiner = Refiner(pipeline.refinement, motion.skeleton, pipeline.fps, pipeline.anchor)
-        return self._refiner.push(motion, measured_of(batch_item))
+        return self._refiner.push(motion, measured_of(item))
 
 
 class EchoSession(Session):

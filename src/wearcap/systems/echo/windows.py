@@ -4,6 +4,7 @@ left), or averaged (ours)."""
 from collections.abc import Sequence
 from itertools import pairwise
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
@@ -68,12 +69,6 @@ class Rewindow(EchoQueue):
             )
         return x
 
-    def predicted(self, conditioning: Conditioning) -> Outputs:
-        """A window on its own, in world coordinates."""
-        frame = self.pipeline.model.features.canonical(conditioning.points)
-        x = self.window(conditioning, torch.zeros(len(conditioning.valid), 0, sum(self.pipeline.model.net.sizes)))
-        return self._decoded(x, slice(None), frame)
-
     @torch.no_grad()
     def run(self, whole: Conditioning) -> Outputs:
         """Outputs of all frames of a batch."""
@@ -102,8 +97,8 @@ class AveragedWindows(Rewindow):
 
     In one step from noise (`steps` 1) each is the mean of the plausible motions. Predictions weigh by the square of the
     frame's distance from the window's ends, unless the capture begins or ends there. Frames become final at the same
-    latency as on the conveyor, `stride` at a time. With `mirror_average` what is predicted for the
-    mirrored window counts as much.
+    latency as on the conveyor, `stride` at a time. With `mirror_average` what is predicted for the mirrored
+    window counts as much.
     """
 
     def __init__(
@@ -115,12 +110,12 @@ class AveragedWindows(Rewindow):
         steps: int | None = None,
     ):
         super().__init__(pipeline, skeletons, seeds, stride, steps)
-        self._twin: Rewindow | None = None
-        """Predicts the mirrored windows."""
-        if pipeline.sampling.mirror_average:
-            self._twin = Rewindow(pipeline, skeletons, seeds, stride, steps)
+        self._mirror = pipeline.sampling.mirror_average
+        if self._mirror:  # the batch items' mirrored twins follow them
             twins = joint_twins(pipeline.model.skeleton)
-            self._twin.t_parent_joint = self.t_parent_joint[..., twins, :] * torch.tensor(MIRROR)
+            mirrored = self.t_parent_joint[..., twins, :] * torch.tensor(MIRROR)
+            self.t_parent_joint, self.size = torch.cat([self.t_parent_joint, mirrored]), self.size.repeat(2, 1)
+            self._random += [torch.Generator().manual_seed(seed) for seed in seeds]
         self._sum = torch.zeros(len(seeds), 0, 0)
         """Weighted sums of the predictions for the frames of `conditioning` (`_flat`), and sums of weights."""
         self._given = torch.zeros(len(seeds), 0, _GIVEN)
@@ -129,10 +124,12 @@ class AveragedWindows(Rewindow):
         """Numbers of frames that were taken in, and that are final."""
 
     def guide(self, guided: Guided) -> None:
+        if self._mirror:
+            surfaces, objects = guided
+            flip = np.array(MIRROR)
+            mirrored = [[KDTree(tree.data * flip) for tree in mine] for mine in objects]
+            guided = [*surfaces, *surfaces], [*objects, *mirrored]
         super().guide(guided)
-        if self._twin is not None:
-            flip = torch.tensor(MIRROR).double().numpy()
-            self._twin.guide((guided[0], [[KDTree(tree.data * flip) for tree in mine] for mine in guided[1]]))
 
     @torch.no_grad()
     def push(self, fresh: Conditioning) -> Outputs | None:
@@ -153,14 +150,23 @@ class AveragedWindows(Rewindow):
         in the last window starts anew."""
         given = _given(conditioning)
         same, self._given = ((given - self._given).abs() < _ALIKE).all(-1, keepdim=True), given
-        flat = _flat(self.predicted(conditioning))
-        if self._twin is not None:
-            skeleton = self.pipeline.model.skeleton
-            mirrored = self._twin.predicted(conditioning.mirrored(skeleton)).mirrored(skeleton)
-            flat = (flat + _flat(mirrored)) / 2
+        flat = self._predicted(conditioning)
         flat = torch.cat([flat, torch.ones_like(flat[..., :1])], -1)
         before = self._sum if self._sum.shape[-1] else torch.zeros_like(flat)
         self._sum = before * same + flat * self._weight(conditioning.valid)[..., None]
+
+    def _predicted(self, conditioning: Conditioning) -> Float[Tensor, "batch frame value"]:
+        """What a window is predicted to be on its own, flat."""
+        model, count = self.pipeline.model, len(conditioning.valid)
+        if self._mirror:
+            both = zip(conditioning, conditioning.mirrored(model.skeleton))
+            conditioning = Conditioning(*(torch.cat(fields) for fields in both))
+        x = self.window(conditioning, torch.zeros(len(conditioning.valid), 0, sum(model.net.sizes)))
+        outputs = self._decoded(x, slice(None), model.features.canonical(conditioning.points))
+        flat = _flat(Outputs(*(field[:count] for field in outputs)))
+        if not self._mirror:
+            return flat
+        return (flat + _flat(Outputs(*(field[count:] for field in outputs)).mirrored(model.skeleton))) / 2
 
     def _weight(self, valid: Bool[Tensor, "batch frame"]) -> Float[Tensor, "batch frame"]:
         count, window = valid.shape[1], self.rolling.window
