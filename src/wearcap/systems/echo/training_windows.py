@@ -26,7 +26,17 @@ from wearcap.recording.acts import NO_OBJECT, active_at, true_acts
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
 from wearcap.scene.objects import Environment
-from wearcap.systems.echo.features import CONTACTS, EXTENTS, OBJECT_SIZE, POINTS, Body, EchoFeatures, ThreePoints
+from wearcap.systems.echo.features import (
+    CONTACTS,
+    EXTENTS,
+    OBJECT_SIZE,
+    POINTS,
+    TWIN_CONTACTS,
+    TWIN_POINTS,
+    Body,
+    EchoFeatures,
+    ThreePoints,
+)
 from wearcap.systems.echo.observations import ObjectReader, ObjectShape
 from wearcap.systems.echo.scores import body_contact, foot_patches
 
