@@ -429,7 +429,6 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
             *_briefly(simulated, real),
             *([] if set(TRAINED) & set(simulated) else [UNSCORED]),
             *_counted(trees),
-            "Rows of simulated people are of the checkpoint before, sampled in five steps but where they say one.",
             "FID needs more windows than CMU's held-out subjects have.",
             "No recording of a real head-mounted device has been scored.",
         ),
