@@ -596,5 +596,6 @@ def _briefly(objects: dict[str, Tree], people: dict[str, Tree]) -> tuple[str, ..
         f"style + object, which has one noise level for a whole window, ours so trained and captured has {', '.join(rest)}.",
         "Diffusions are captured twice: as samples, ours on the conveyor, and, named so, as the mean of averaged windows in one "
         "step, with arms that reach the wrists, as ours, but with feet that are not held: they learn no contacts. The learning "
-        "rate of these, and of ours beside them, is the one that was best in a sweep before, 0.003.",
+        "rate of these, and of ours beside them, is the one that was best in a sweep before, 0.003. Of people alone their rows, "
+        "and ours beside them, are of before windows were mirrored.",
     )
