@@ -418,11 +418,7 @@ HEADLINE = (
     ("Table 1:", "ours, hinges and rails unknown", "objects: **ours**, hinges and rails unknown, as for rivals"),
     ("Table 1:", "nearest training window", "objects: nearest training window"),
     ("Table 1, equal", "ours, the same budget", "objects: ours, the rivals' budget"),
-    (
-        "Table 1, equal",
-        "BoDiffusion-style + object, its mean",
-        "objects: BoDiffusion-style + object, the same budget, its mean",
-    ),
+    ("Table 1, equal", "BoDiffusion-style + object, its mean", "objects: BoDiffusion-style + object, its mean"),
     ("Table 1:", "truth", "objects: the truth itself"),
     ("Table 1:", "paper: BEHAVE", "the paper's, on BEHAVE"),
     ("Table 2", "ours", "people alone (CMU): **ours**"),
@@ -596,6 +592,6 @@ def _briefly(objects: dict[str, Tree], people: dict[str, Tree]) -> tuple[str, ..
         f"style + object, which has one noise level for a whole window, ours so trained and captured has {', '.join(rest)}.",
         "Diffusions are captured twice: as samples, ours on the conveyor, and, named so, as the mean of averaged windows in one "
         "step, with arms that reach the wrists, as ours, but with feet that are not held: they learn no contacts. The learning "
-        "rate of these, and of ours beside them, is the one that was best in a sweep before, 0.003. Of people alone their rows, "
-        "and ours beside them, are of before windows were mirrored.",
+        "rate of these, and of ours beside them, is the one that was best in a sweep before, 0.003. Their "
+        "rows, and ours beside them, are of before windows were mirrored.",
     )
