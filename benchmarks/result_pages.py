@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.table import Table
-from tabling import cell
+from tabling import UPSIDE_DOWN, cell
 
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
@@ -376,3 +376,16 @@ def with_readme(readme: str, system: str, page: Page) -> str:
             lines[place] = "| " + " | ".join(cells) + " |\n"
             return "".join(lines)
     raise WearcapError(f"no row of {system!r}", where="README.md", expected=f"a row that links docs/{system}.md")
+
+
+def upside_down(rows: Mapping[str, Tree], metric: str, unit: str, digits: int) -> tuple[str, ...]:
+    """What recordings with heads upside down add to the error of people."""
+    names = ", ".join(UPSIDE_DOWN)
+    whole, rest = (rows.get(f"ours{end}") for end in ("", f", without {names}"))
+    if whole is None or rest is None:
+        return ()
+    return (
+        f"CMU's file of {names} has the head upside down on an upright neck (158° about one axis), and the body is put "
+        f"above it: the MPJPE is {mean(whole[metric], digits)} {unit} with this recording and {mean(rest[metric], digits)} "
+        f"{unit} without it.",
+    )

@@ -15,7 +15,20 @@ from pathlib import Path
 
 from mocap_every_calibration import GOALS, calibration_scores
 from mocap_every_rows import Method, body_row, captures, cue_row, floor_row, pipeline_of
-from result_pages import RANKED, Grid, Page, Tree, Trees, figure_of, mean, picked, ranged, rows_of, score_grids
+from result_pages import (
+    RANKED,
+    Grid,
+    Page,
+    Tree,
+    Trees,
+    figure_of,
+    mean,
+    picked,
+    ranged,
+    rows_of,
+    score_grids,
+    upside_down,
+)
 from rich.console import Console
 from rich.progress import Progress
 from sensed import GIVEN, WRONG_HEIGHTS, add_sensors
@@ -30,10 +43,11 @@ from tabling import (
     split_of,
     titled,
     training_of,
+    upright,
 )
 
 from wearcap.files import write_text
-from wearcap.metrics.table import Row, Scores, Summary, aggregate, markdown_table, truth_row
+from wearcap.metrics.table import Scores, Summary, aggregate, markdown_table, truth_row
 from wearcap.models.checkpoint import checkpoint_file
 from wearcap.recording import RecordingStore
 from wearcap.sensors.wearables import WEARABLES
@@ -130,9 +144,6 @@ PAPER_TOTALCAPTURE: Scores = {
 """TotalCapture, real sensors, all five subjects."""
 FLOORS = ("fixed", "update", "points", "follow")
 GIVEN_ALL = "ours, exact sensors, floor and bones given"
-UPSIDE_DOWN = ("127_32",)
-"""Recordings of CMU whose file has the head upside down on an upright neck (158° about one axis), as no head can be: rows
-are given with and without them."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -261,7 +272,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
             f"Legs are guessed from how head and hands move: the lower body is {mean(body['ours']['lower_pe_cm'])} cm "
             "off on CMU, where the network overfits few minutes of real motion.",
             *_briefly(body, rows_of(trees, "People (hdm05)")),
-            *_broken(body),
+            *upside_down(body, "mpjpe_cm", "cm", 2),
             "CMU's frames with a cue, those of Table 4, are of dances, pantomime and obstacles that are jumped over.",
             "No log of a real watch has been measured.",
         ),
@@ -276,18 +287,6 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
                 "Stairs and slopes, truth above and captured below (the floor drawn is that of the beginning)",
             ),
         ),
-    )
-
-
-def _broken(rows: dict[str, Tree]) -> tuple[str, ...]:
-    """What recordings with heads upside down add to the error."""
-    whole, rest = (rows.get(f"ours{end}") for end in ("", f", without {', '.join(UPSIDE_DOWN)}"))
-    if whole is None or rest is None:
-        return ()
-    return (
-        f"CMU's file of {', '.join(UPSIDE_DOWN)} has the head upside down on an upright neck (158° about one axis), and the "
-        f"body is put above it: the MPJPE is {mean(whole['mpjpe_cm'], 2)} cm with this recording and "
-        f"{mean(rest['mpjpe_cm'], 2)} cm without it.",
     )
 
 
@@ -343,14 +342,8 @@ def _people(
         ]
         scores[name] = aggregate(scored) | training_of(methods[0].checkpoint)
         if name in ("ours", GIVEN_ALL):
-            scores |= _upright(name, scored)
+            scores |= upright(name, scored)
     return scores | {"truth": truth_row(scores[next(reversed(rows))])}
-
-
-def _upright(name: str, scored: list[Row]) -> Scores:
-    """A row without the recordings that are `UPSIDE_DOWN`, where there are any."""
-    upright = [row for row in scored if row.recording not in UPSIDE_DOWN]
-    return {f"{name}, without {', '.join(UPSIDE_DOWN)}": aggregate(upright)} if len(upright) < len(scored) else {}
 
 
 def _trainings(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
@@ -367,7 +360,7 @@ def _trainings(options: argparse.Namespace, progress: Progress) -> tuple[str, tu
                 method = Method(name, checkpoint, sensors, ("pipeline=mocap_every", *pipeline))
                 found = captures(method, store, names, lambda b=bar: progress.advance(b))
                 scored += [body_row(recording, captured, seed) for recording, _, captured in found]
-            scores |= {name: aggregate(scored) | training_of(checkpoints[0])} | _upright(name, scored)
+            scores |= {name: aggregate(scored) | training_of(checkpoints[0])} | upright(name, scored)
     return f"Three trainings: {options.split}, {options.sensors} sensors", BODY, scores
 
 

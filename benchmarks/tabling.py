@@ -3,13 +3,14 @@
 import argparse
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from rich.table import Table
 
 from wearcap.errors import WearcapError
-from wearcap.metrics.table import Summary
+from wearcap.metrics.table import Row, Scores, Summary, aggregate
 from wearcap.models.checkpoint import read_checkpoint
 from wearcap.recording import RecordingStore
 
@@ -31,6 +32,9 @@ _RECORDED = {
     "core_minutes": ("core_seconds", 60.0),
 }
 """A checkpoint's own record of each, and how many of its units make one of the column's."""
+UPSIDE_DOWN = ("127_32",)
+"""Recordings of CMU whose file has the head upside down on an upright neck (158° about one axis), as no head can be: rows
+are given with and without them."""
 PREPARE = {
     "cmu": "Run: wearcap prepare cmu source=FOLDER",
     "simulated": "Run: wearcap prepare simulated",
@@ -153,6 +157,12 @@ def new_table(title: str, columns: list[str]) -> Table:
     for number, column in enumerate(columns):
         table.add_column(column, justify="right" if number else "left", no_wrap=True)
     return table
+
+
+def upright(name: str, scored: Sequence[Row]) -> Scores:
+    """A row without the recordings that are `UPSIDE_DOWN`, where there are any."""
+    others = [row for row in scored if row.recording not in UPSIDE_DOWN]
+    return {f"{name}, without {', '.join(UPSIDE_DOWN)}": aggregate(others)} if len(others) < len(scored) else {}
 
 
 def finite(tree: Any) -> Any:
