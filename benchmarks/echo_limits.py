@@ -110,5 +110,5 @@ def budgets(objects: dict[str, Tree], people: dict[str, Tree]) -> tuple[str, ...
         "Diffusions are captured twice: as samples, ours on the conveyor, and, named so, as the mean of averaged windows in one "
         "step, with arms that reach the wrists, as ours, but with feet that are not held: they learn no contacts. The learning "
         "rate of these, and of ours beside them, is the one that was best in a sweep before, 0.003. Their "
-        "rows, and ours beside them, are of before windows were mirrored.",
+        "rows and ours beside them, and the table of settings, are of before windows were mirrored.",
     )
