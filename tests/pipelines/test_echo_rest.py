@@ -39,6 +39,7 @@ def frames(active=ACTS, touched=TOUCHED, observed=()) -> tuple[Conditioning, Out
         zeros[..., 0],
         number >= 0,
         zeros[..., :1],
+        zeros[..., :1],
         number,
         number > -2,
         eye[:, :, None],
