@@ -304,7 +304,7 @@ def _latencies(options: argparse.Namespace, h: int) -> list[Method]:
 def training(run: str, frames: int = BUDGET) -> list[str]:
     """Overrides that train one of `RUNS` within a budget, all on the motion of the same data."""
     experiment = run if run == "motion_diffusion_head" else f"baseline/{run}"
-    data = [f"experiment={experiment}", "data=cmu_simulated", f"data.loading.batch_size={BATCH}", "callbacks=averaged"]
+    data = [f"experiment={experiment}", "data=hmd2_head", f"data.loading.batch_size={BATCH}", "callbacks=averaged"]
     return [*data, *budget(frames, BATCH * WINDOW.get(run, 240))]
 
 

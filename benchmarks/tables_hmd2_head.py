@@ -45,7 +45,7 @@ QUICK = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--data", default="cmu", help="config of the data: cmu, simulated, cmu_simulated")
+    parser.add_argument("--data", default="cmu", help="config of the data: cmu, simulated, hmd2_head")
     parser.add_argument("--datasets", default="datasets", help="folder of the prepared data sets")
     parser.add_argument("--checkpoint", nargs="+", help="our checkpoints, one per seed, instead of training")
     parser.add_argument("--seeds", type=int, default=3, help="trainings per row (1 when quick)")
