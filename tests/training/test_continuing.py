@@ -120,7 +120,8 @@ def test_a_training_starts_from_weights(kind, data, trained, tmp_path):
     run = tmp_path / "run"
     still = ["optimizer.optimizer.lr=1e-12", "optimizer.optimizer.weight_decay=0"]
     train.main(arguments(data, tmp_path, f"init={source}", f"hydra.run.dir={run}", "seed=3", *still))
-    before, after = read_checkpoint(source)[1], read_checkpoint(run / "checkpoints/last.ckpt")[1]
+    (config, before), (now, after) = read_checkpoint(source), read_checkpoint(run / "checkpoints/last.ckpt")
+    assert now["training"]["frames"] == config["training"]["frames"] + 2 * 2 * 60, "what the weights had seen counts"
     assert before.keys() == after.keys()
     assert all(torch.allclose(before[name].float(), after[name].float(), atol=1e-6) for name in before)
     saved = torch.load(run / "checkpoints/last.ckpt", weights_only=True)

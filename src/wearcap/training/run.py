@@ -45,7 +45,8 @@ class RunRecord(Callback):
 
     The config's entry "training" holds the number of trained "parameters" and of "steps", the "frames" of all windows
     drawn (samples, where they have no time axis), the "seconds" of training without its validations, the "core_seconds"
-    of the process meanwhile, and the "machine". A resumed run adds to what its checkpoint records.
+    of the process meanwhile, and the "machine". A resumed run, and one from the weights of another (but for "steps"), adds
+    to what that checkpoint records.
     """
 
     def __init__(self, config: dict[str, Any]):
@@ -59,8 +60,12 @@ class RunRecord(Callback):
                 logger.log_hyperparams(self.config | {"parameters": trained_parameters(pl_module)})
 
     def on_load_checkpoint(self, trainer, pl_module, checkpoint: dict[str, Any]) -> None:
-        before = json.loads(checkpoint.get("wearcap", {}).get("config", "{}")).get("training", {})
-        self._taken = {name: before.get(name, value) for name, value in self._taken.items()}
+        self.add_to(json.loads(checkpoint.get("wearcap", {}).get("config", "{}")))
+
+    def add_to(self, before: Mapping[str, Any]) -> None:
+        """Count on from what an earlier training has taken, by its checkpoint's config."""
+        taken = before.get("training", {})
+        self._taken = {name: taken.get(name, value) for name, value in self._taken.items()}
 
     def on_train_start(self, trainer, pl_module) -> None:
         self._clocks = _clocks()
@@ -136,7 +141,10 @@ def fit(
     if resume is not None:
         require_resumable(resume, system.state_dict())
     elif init is not None:
-        start_from(init, system)
+        before = start_from(init, system)
+        for callback in trainer.callbacks:  # pyright: ignore[reportAttributeAccessIssue]
+            if isinstance(callback, RunRecord):
+                callback.add_to(before)
     else:
         system.set_statistics(data.dataset("train"))
     trainer.fit(system, datamodule=data, ckpt_path=resume, weights_only=True)
@@ -263,12 +271,12 @@ def _another_config(run: Path, different: list[str]) -> WearcapError:
     return WearcapError(f"this run was trained with another config: {shown}", run, "the same config and seed", fix)
 
 
-def start_from(checkpoint: str | Path, system: Training) -> None:
-    """Give a system the weights and statistics of a checkpoint; its optimiser starts anew.
+def start_from(checkpoint: str | Path, system: Training) -> dict[str, Any]:
+    """Give a system the weights and statistics of a checkpoint, whose config is returned; its optimiser starts anew.
 
     Raises WearcapError that names the tensors that are missing, unexpected or of another size.
     """
-    own, (_, state) = system.state_dict(), read_checkpoint(checkpoint)
+    own, (config, state) = system.state_dict(), read_checkpoint(checkpoint)
     sizes = {
         f"{name} ({list(state[name].shape)}, here {list(value.shape)})": None
         for name, value in own.items()
@@ -285,6 +293,7 @@ def start_from(checkpoint: str | Path, system: Training) -> None:
         fix = "Give init=… a checkpoint of the same experiment, or the settings that it was trained with."
         raise WearcapError(f"its weights are not this model's; {'; '.join(parts)}", checkpoint, fix=fix)
     system.load_state_dict(state)
+    return config
 
 
 def _clocks() -> tuple[float, float]:
