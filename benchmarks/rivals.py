@@ -1,6 +1,7 @@
 """Trains the learned rivals of a system, and ours at their budget, each at the best of a few learning rates.
 
-    python benchmarks/rivals.py SYSTEM [--budget FRAMES] [--rates 3e-4 1e-3 3e-3] [--seeds 0] [--only NAME …] [--jobs N]
+    python benchmarks/rivals.py SYSTEM [--budget FRAMES] [--batch WINDOWS] [--rates 3e-4 1e-3 3e-3] [--seeds 0]
+        [--only NAME …] [--jobs N]
 
 SYSTEM is hmd2, mocap_every or echo; names and settings of the trainings are those of its tables (`RUNS`, `training`),
 which take RUNS/NAME/checkpoints/best.ckpt. Of each rate a tenth of the budget is trained; the rate of the least validation
@@ -13,7 +14,6 @@ import csv
 import importlib
 import json
 import math
-import os
 import shutil
 import sys
 from collections.abc import Iterable, Sequence
@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
-from joblib import Parallel, delayed
+from joblib import Parallel, cpu_count, delayed
 from tabling import RATE_FILE
 
 from wearcap.cli import train
@@ -48,6 +48,8 @@ class Rival:
     runs: Path
     overrides: tuple[str, ...] = ()
     """Further ones of `wearcap train`."""
+    batch: int | None = None
+    """Windows of a batch; none: the tables' own number."""
 
     @property
     def folder(self) -> Path:
@@ -56,7 +58,7 @@ class Rival:
     def fit(self, rate: float, share: float, run: Path, seed: int = 0) -> float:
         """Train on a share of the budget, from where an earlier attempt was stopped; returns the least validation loss."""
         table = importlib.import_module(f"tables_{self.system}")
-        given = [*table.training(self.name, round(share * self.frames)), *self.overrides, f"seed={seed}"]
+        given = [*table.training(self.name, round(share * self.frames), self.batch), *self.overrides, f"seed={seed}"]
         place = [f"name={self.name}", f"paths.run={run}", "resume=auto", "++callbacks.capture=null"]
         train.train(compose("train", [*given, f"optimizer.optimizer.lr={rate:g}", *place]))
         return least_loss(run / "metrics.csv")
@@ -97,13 +99,15 @@ def train_rival(rival: Rival, threads: int) -> str:
 
 def _note(rival: Rival) -> dict[str, Any]:
     """What is known of earlier attempts with the same budget and settings."""
-    path, settings = rival.folder / RATE_FILE, {"frames": rival.frames, "overrides": list(rival.overrides)}
+    path = rival.folder / RATE_FILE
+    settings = {"frames": rival.frames, "batch": rival.batch, "overrides": list(rival.overrides)}
     if not path.is_file():
         return {**settings, "losses": {}, "finished": {}}
     note = json.loads(path.read_text(encoding="utf-8"))
-    if {key: note.get(key) for key in settings} != settings:
-        what = f"{rival.name} has been trained on {note.get('frames')} frames with {note.get('overrides')}"
-        raise WearcapError(what, rival.folder, f"{rival.frames} frames with {list(rival.overrides)}", "Move it away.")
+    before = {key: note.get(key) for key in settings}
+    if before != settings:
+        what, asked = (", ".join(f"{key} {value}" for key, value in each.items()) for each in (before, settings))
+        raise WearcapError(f"{rival.name} has been trained with {what}", rival.folder, asked, "Move it away.")
     return note
 
 
@@ -138,6 +142,7 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument(
         "--budget", type=int, metavar="FRAMES", help="frames that each sees; default: the tables' BUDGET"
     )
+    parser.add_argument("--batch", type=int, metavar="WINDOWS", help="windows of a batch; default: the tables' own")
     parser.add_argument("--rates", type=float, nargs="+", default=[3e-4, 1e-3, 3e-3], help="one: no sweep")
     parser.add_argument(
         "--seeds", type=int, nargs="+", default=[0], help="trainings at the best rate; the sweep has one"
@@ -159,8 +164,9 @@ def main(arguments: Sequence[str]) -> None:
         tuple(options.seeds),
         options.runs,
         tuple(options.overrides),
+        options.batch,
     )
-    threads = max(1, (os.cpu_count() or 1) // options.jobs)
+    threads = max(1, cpu_count() // options.jobs)
     rivals = [Rival(options.system, name, *rest) for name in names]
     jobs = (delayed(_attempt)(rival, threads) for rival in rivals)
     outcomes = cast(Iterable[tuple[bool, str]], Parallel(n_jobs=options.jobs, return_as="generator")(jobs))

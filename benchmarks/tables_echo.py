@@ -303,9 +303,10 @@ def _trained(rows: dict[str, tuple[str, ...]], options: argparse.Namespace, prog
     return methods
 
 
-def training(run: str, frames: int = BUDGET) -> list[str]:
-    """Overrides that train one of `RUNS` within a budget."""
+def training(run: str, frames: int = BUDGET, batch: int | None = None) -> list[str]:
+    """Overrides that train one of `RUNS` within a budget, in batches of as many frames as BATCH windows of ours have."""
     windows, length = LONG if run == "agrol_human" else BATCH
+    windows = round(batch * windows / BATCH[0]) if batch else windows
     return [*TRAININGS[run], f"data.loading.batch_size={windows}", *budget(frames, windows * length)]
 
 

@@ -301,11 +301,12 @@ def _latencies(options: argparse.Namespace, h: int) -> list[Method]:
     ]
 
 
-def training(run: str, frames: int = BUDGET) -> list[str]:
-    """Overrides that train one of `RUNS` within a budget, all on the motion of the same data."""
+def training(run: str, frames: int = BUDGET, batch: int | None = None) -> list[str]:
+    """Overrides that train one of `RUNS` within a budget, all on the motion of the same data, in batches of BATCH windows."""
+    batch = batch or BATCH
     experiment = run if run == "motion_diffusion_head" else f"baseline/{run}"
-    data = [f"experiment={experiment}", "data=hmd2_head", f"data.loading.batch_size={BATCH}", "callbacks=averaged"]
-    return [*data, *budget(frames, BATCH * WINDOW.get(run, 240))]
+    data = [f"experiment={experiment}", "data=hmd2_head", f"data.loading.batch_size={batch}", "callbacks=averaged"]
+    return [*data, *budget(frames, batch * WINDOW.get(run, 240))]
 
 
 def _methods(options: argparse.Namespace, console: Console) -> list[Method]:

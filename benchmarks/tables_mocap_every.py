@@ -164,9 +164,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_people(parser)
 
 
-def training(run: str, frames: int = BUDGET) -> list[str]:
-    """Overrides that train one of `RUNS` within a budget, all on the same data."""
-    return [*TRAININGS[run], f"data.loading.batch_size={BATCH}", *budget(frames, BATCH * WINDOW)]
+def training(run: str, frames: int = BUDGET, batch: int | None = None) -> list[str]:
+    """Overrides that train one of `RUNS` within a budget, all on the same data, in batches of BATCH windows."""
+    batch = batch or BATCH
+    return [*TRAININGS[run], f"data.loading.batch_size={batch}", *budget(frames, batch * WINDOW)]
 
 
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:

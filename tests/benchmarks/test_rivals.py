@@ -30,7 +30,7 @@ def importable(monkeypatch):
 @pytest.fixture(scope="module")
 def datasets(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("datasets")
-    for name in ("cmu", "simulated"):
+    for name in ("cmu", "simulated", "hdm05"):
         small_dataset(folder / name)
     return folder
 
@@ -116,7 +116,7 @@ def test_another_budget_and_no_finite_loss_are_refused(datasets, tmp_path, monke
     with pytest.raises(WearcapError, match=r"no rate of 0.001, 1 gives a finite loss. Give lower --rates"):
         rivals.train_rival(rival, 1)
     assert finish(given(datasets, tmp_path)) == 1
-    assert f"{NAME} has been trained on 100 frames" in capsys.readouterr().out
+    assert f"{NAME} has been trained with frames 100, batch None" in capsys.readouterr().out
     assert finish(["hmd2", "--only", "motion_diffusion"]) == 2
 
 
