@@ -129,6 +129,10 @@ def test_budgets_scale_with_what_is_asked_for(system):
         assert 3 <= small.trainer.max_steps / small.data.loading.steps_per_epoch <= tabling.EPOCHS + 1
         assert large.trainer.max_steps // large.data.loading.steps_per_epoch == tabling.EPOCHS
         assert 0.98 <= small.callbacks.average.decay <= large.callbacks.average.decay <= 0.995
+        windows = large.data.loading.batch_size
+        wide = compose("train", table.training(run, 10 * table.BUDGET, 3 * (16 if run == "agrol_human" else windows)))
+        assert wide.data.loading.batch_size == 3 * windows, run
+        assert wide.trainer.max_steps == pytest.approx(large.trainer.max_steps / 3, rel=0.01), run
 
 
 def test_a_training_that_was_stopped_is_no_row(tmp_path):
