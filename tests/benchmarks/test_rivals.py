@@ -123,15 +123,15 @@ def test_another_budget_and_no_finite_loss_are_refused(datasets, tmp_path, monke
 @pytest.mark.parametrize("system", rivals.SYSTEMS)
 def test_budgets_scale_with_what_is_asked_for(system):
     table = benchmark(f"tables_{system}")
+    ours = compose("train", table.training(table.RUNS[0])).data.loading.batch_size
     for run in table.RUNS:
         small, large = (compose("train", table.training(run, frames)) for frames in (table.BUDGET, 10 * table.BUDGET))
         assert large.trainer.max_steps == pytest.approx(10 * small.trainer.max_steps, rel=0.05), run
         assert 3 <= small.trainer.max_steps / small.data.loading.steps_per_epoch <= tabling.EPOCHS + 1
         assert large.trainer.max_steps // large.data.loading.steps_per_epoch == tabling.EPOCHS
         assert 0.98 <= small.callbacks.average.decay <= large.callbacks.average.decay <= 0.995
-        windows = large.data.loading.batch_size
-        wide = compose("train", table.training(run, 10 * table.BUDGET, 3 * (16 if run == "agrol_human" else windows)))
-        assert wide.data.loading.batch_size == 3 * windows, run
+        wide = compose("train", table.training(run, 10 * table.BUDGET, 3 * ours))
+        assert wide.data.loading.batch_size == 3 * large.data.loading.batch_size, run
         assert wide.trainer.max_steps == pytest.approx(large.trainer.max_steps / 3, rel=0.01), run
 
 
