@@ -110,7 +110,8 @@ def budgets(objects: dict[str, Tree], people: dict[str, Tree], strangers: dict[s
         if {theirs, ours, "ours"} <= set(rows)
     ]
     return (
-        "BoDiffusion-style + object has ECHO's network, inputs and losses of bodies and objects, one noise level for a whole "
+        "BoDiffusion-style + object has ECHO's network, inputs and losses (a quarter of our weight on skating, none on held "
+        "objects, whose orientations it learns as they are, not modulo symmetry), one noise level for a whole "
         f"window, and no contacts. It saw {mean(objects[theirs]['frames_seen_m'], 1)} million frames, as did ours beside it, "
         "of the data that our checkpoint learned from last, in one training each from drawn weights at a learning rate of 0.003, "
         f"for the rival the better of two. Captured alike, with objects: {', '.join(parts)}. People alone, the rival, ours beside "

@@ -474,8 +474,8 @@ def _briefly(simulated: dict[str, Tree], real: dict[str, Tree], strangers: dict[
         f"{row} {mean(one[row]['jitter_ratio'])}" for row in (*rivals, BRIEF) if "jitter_ratio" in one.get(row, {})
     ]
     seen = {r: one[r]["frames_seen_m"]["mean"] for r in (*rivals, BRIEF) if r in one and not r.endswith("its mean")}
-    short = [row for row, frames in seen.items() if frames < seen[BRIEF] / 2]
-    less = f" {' and '.join(short)} learned from CMU's and simulated people alone." if short else ""
+    hands = one.get("AvatarPoser-style (head and hands)", {}).get("frames_seen_m")
+    less = f" The one that sees hands, too, saw {mean(hands, 2)}, of CMU's and simulated people alone." if hands else ""
     return (
         "Learned baselines that see the head alone, and ours beside them, learned from the people that our checkpoint learned "
         "from last, in one training each at the learning rate that was the best of three in shorter ones. They saw (million "
