@@ -31,6 +31,8 @@ class Method:
     """How far the height that the wearer gives is off (m); None: the wearer's own bones are given."""
     measured: bool = False
     """Whether objects, hinges and rails are where people measure them (`as_measured`), instead of where they are."""
+    others: tuple[str, ...] = ()
+    """Checkpoints of the same training with other seeds, which the row is the mean of, too."""
 
 
 def pipeline_of(method: Method) -> Echo:

@@ -35,6 +35,8 @@ class Method:
     """Preset of the device's errors (`WEARABLES`), or `GIVEN`; None: the case's."""
     height_off_m: float | None = None
     """How far the height that the wearer gives is off (m); None: as the preset knows it."""
+    others: tuple[str, ...] = ()
+    """Checkpoints of the same training with other seeds, which the row is the mean of, too, each captured once."""
 
 
 @dataclass(frozen=True)
@@ -73,27 +75,32 @@ def run_method(method: Method, case: Case) -> Result:
     torch.set_num_threads(1)
     store = SensedStore.open(case.dataset, method.sensors or case.sensors, method.height_off_m)
     if method.checkpoint is None:
-        pipeline = BASELINES[method.name].fit([RecordingStore.open(root) for root in case.training])
-        seeds = case.seeds[:1]
+        runs = [(BASELINES[method.name].fit([RecordingStore.open(root) for root in case.training]), case.seeds[:1])]
     else:
-        config = compose("evaluate", [*method.pipeline, "checkpoint=none"])
-        pipeline, seeds = load_pipeline(method.checkpoint, config.pipeline, case.device), case.seeds
-        if "pipeline=pose_regressor" in method.pipeline:
-            seeds = seeds[:1]
+        config = compose("evaluate", [*method.pipeline, "checkpoint=none"]).pipeline
+        seeds = case.seeds[:1] if "pipeline=pose_regressor" in method.pipeline else case.seeds
+        runs = [(load_pipeline(method.checkpoint, config, case.device), seeds)]
+        if method.others:
+            paths = (method.checkpoint, *method.others)
+            runs = [(load_pipeline(path, config, case.device), (number,)) for number, path in enumerate(paths)]
     realism = None if case.realism is None else Realism.load(case.realism, case.stride_s)
     of_truth = scored if realism is None else realism.beside(scored, method.name)
 
     def measure(motion: Motion, source: CaptureInput, seed: int) -> Row:
         return of_truth(motion, CaptureInput(store.true(source.recording.name)), seed)
 
-    rows = list(evaluate(pipeline, store, case.names, seeds, batch_size=8, measure=measure))
+    rows = [
+        row
+        for pipeline, seeds in runs
+        for row in evaluate(pipeline, store, case.names, seeds, batch_size=8, measure=measure)
+    ]
     scores = aggregate(rows)
-    if len(seeds) > 1:
+    if len(runs) == 1 and len(runs[0][1]) > 1:
         scores |= {f"best_{name}": value for name, value in aggregate(best_of(rows)).items() if name in BEST}
     if realism is not None:
         scores |= realism.scores(method.name)
     if method.checkpoint is not None:
-        scores |= training_of(method.checkpoint)
+        scores |= training_of(method.checkpoint, *method.others)
     return Result(method.name, scores, by_activity(rows, {name: store.entries[name].activity for name in case.names}))
 
 

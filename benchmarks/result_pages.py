@@ -113,6 +113,7 @@ TRAINING = {
     "frames_seen_m": ("frames seen (M)", 2),
     "core_minutes": ("core minutes", 0),
     "rate_swept": ("rate swept", 4),
+    "trainings": ("trainings", 0),
 }
 """Columns of what a row's training took."""
 

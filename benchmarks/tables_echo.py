@@ -3,7 +3,7 @@
 Bodies and objects are measured where they are put in the world, over whole recordings. Checkpoints come by name
 (checkpoints/) or path; those of baselines and ablations from RUNS/NAME/checkpoints/best.ckpt. A row without its
 checkpoint is left out, and the command that trains it is printed (`TRAININGS`). Means and spreads are over seeds of the
-diffusion, as in the paper.
+diffusion, as in the paper; where there are trainings with other seeds (RUNS/NAME_1, …_2), over these.
 """
 
 import argparse
@@ -40,12 +40,12 @@ from tabling import (
     add_people,
     budget,
     finite,
-    is_trained,
     left_out,
     recordings_of,
     split_of,
     titled,
     training_of,
+    trainings_of,
     upright,
 )
 
@@ -295,10 +295,10 @@ def _trained(rows: dict[str, tuple[str, ...]], options: argparse.Namespace, prog
     for name, (run, *pipeline) in rows.items():
         if name in options.leave:
             continue
-        path = options.runs / run / "checkpoints" / "best.ckpt"
-        if is_trained(path):
-            methods.append(Method(name, str(path), tuple(pipeline)))
+        if paths := trainings_of(options.runs, run):
+            methods.append(Method(name, str(paths[0]), tuple(pipeline), others=tuple(map(str, paths[1:]))))
         else:
+            path = options.runs / run / "checkpoints" / "best.ckpt"
             progress.console.print(left_out(name, "echo", run, path), markup=False, soft_wrap=True)
     return methods
 
@@ -356,7 +356,7 @@ def _scores(
             score_echo(one.motion, one.truth, one.name, one.seed)
             for one in _captured(method, options, progress, store, names)
         ]
-        scores[method.name] = aggregate(made) | training_of(method.checkpoint)
+        scores[method.name] = aggregate(made) | training_of(method.checkpoint, *method.others)
         scores |= upright(method.name, made) if method.name == "ours" else {}
         shown = (f"{key} {scores[method.name][key]}" for key in OBJECTS if key in scores[method.name])
         progress.console.print(f"{method.name}: {', '.join(shown)}", soft_wrap=True)
@@ -366,13 +366,16 @@ def _scores(
 def _captured(
     method: Method, options: argparse.Namespace, progress: Progress, store: RecordingStore, names: list[str]
 ) -> Iterator[Captured]:
-    """With all seeds."""
-    seeds = list(range(2 if options.quick else options.seeds))
-    bar = progress.add_task(method.name, total=len(seeds) * len(names))
-    changed = replace(method, pipeline=(*method.pipeline, *options.pipeline))
-    for one in captured(changed, store, names, seeds, options.items):
-        progress.advance(bar)
-        yield one
+    """With all seeds; of several trainings, each with a seed of its own."""
+    changed = replace(method, pipeline=(*method.pipeline, *options.pipeline), others=())
+    runs = [(changed, list(range(2 if options.quick else options.seeds)))]
+    if method.others:
+        runs = [(replace(changed, checkpoint=path), [n]) for n, path in enumerate((method.checkpoint, *method.others))]
+    bar = progress.add_task(method.name, total=sum(len(seeds) for _, seeds in runs) * len(names))
+    for training, seeds in runs:
+        for one in captured(training, store, names, seeds, options.items):
+            progress.advance(bar)
+            yield one
 
 
 def _baseline(method: NearestEcho, store: RecordingStore, names: list[str], like: Method) -> dict[str, Summary]:

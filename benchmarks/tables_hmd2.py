@@ -18,7 +18,7 @@ from result_pages import NONE, RANKED, Grid, Page, Tree, Trees, figure_of, grid_
 from rich.console import Console
 from rich.table import Table
 from sensed import GIVEN, WRONG_HEIGHTS, add_sensors
-from tabling import TRAINING, add_people, budget, finite, is_trained, left_out, split_of, titled
+from tabling import TRAINING, add_people, budget, finite, is_trained, left_out, split_of, titled, trainings_of
 
 from wearcap.errors import WearcapError
 from wearcap.evaluation.breakdown import extremes
@@ -315,10 +315,10 @@ def training(run: str, frames: int = BUDGET, batch: int | None = None) -> list[s
 
 def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
     """Rows of the first table; those whose checkpoint is not there are named and left out."""
-    trained = [
-        Method(name, str(options.runs / run / "checkpoints" / "best.ckpt"), pipeline, sensors)
-        for name, (run, pipeline, sensors) in TRAINED.items()
-    ]
+    trained = []
+    for name, (run, pipeline, sensors) in TRAINED.items():
+        first, *others = trainings_of(options.runs, run) or [options.runs / run / "checkpoints" / "best.ckpt"]
+        trained.append(Method(name, str(first), pipeline, sensors, others=tuple(map(str, others))))
     full = _ours(options, OURS)
     sensing = [replace(full, name=f"full, {n} sensors", sensors=n) for n in WEARABLES if n != options.sensors]
     sensing.append(replace(full, name="full, the data's own sensors, bones given", sensors=GIVEN))

@@ -37,7 +37,6 @@ from tabling import (
     add_people,
     budget,
     finite,
-    is_trained,
     left_out,
     recordings_of,
     split_of,
@@ -80,7 +79,7 @@ FLOOR = (
     "r_mpjpe_cm",
 )
 CUES = ("right_hand_cm", "right_arm_cm", "upper_cm", "mpjpe_cm", "jitter_m_s3")
-OURS = "experiment=mocap_every"
+OURS, MLP = "experiment=mocap_every", "mocap_every_mlp"
 TRAININGS: dict[str, tuple[str, ...]] = {
     "mocap_every_avatarposer": ("experiment=baseline/mocap_every_avatarposer",),
     "mocap_every_agrol": ("experiment=baseline/mocap_every_agrol",),
@@ -340,15 +339,17 @@ def _people(
             for seed, method in enumerate(methods)
             for recording, _, captured in captures(method, store, names, lambda b=bar: progress.advance(b))
         ]
-        scores[name] = aggregate(scored) | training_of(methods[0].checkpoint)
+        scores[name] = aggregate(scored) | training_of(*(method.checkpoint for method in methods))
         if name in ("ours", GIVEN_ALL):
             scores |= upright(name, scored)
     return scores | {"truth": truth_row(scores[next(reversed(rows))])}
 
 
 def _trainings(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
-    """Our checkpoint beside the mean and spread of three trainings, RUNS/mocap_every, …_1 and …_2."""
-    trained = {"ours": [options.checkpoint], "three trainings": [*map(str, _seeded(options.runs, "mocap_every"))]}
+    """Our checkpoint, of seed 0, beside the mean and spread of it and of the same training with seeds 1 and 2, which are
+    mocap_every_mlp_1 and mocap_every_mlp_2 in RUNS."""
+    others = [str(path) for path in trainings_of(options.runs, MLP) if path.parents[1].name != MLP]
+    trained = {"ours": [options.checkpoint], "three trainings": [options.checkpoint, *others]}
     sensing = {"": (options.sensors, ()), ", exact sensors, floor and bones given": (GIVEN, ("pipeline.floor=fixed",))}
     scores: Scores = {}
     for root in (options.datasets / "cmu", *options.strangers):
@@ -360,7 +361,7 @@ def _trainings(options: argparse.Namespace, progress: Progress) -> tuple[str, tu
                 method = Method(name, checkpoint, sensors, ("pipeline=mocap_every", *pipeline))
                 found = captures(method, store, names, lambda b=bar: progress.advance(b))
                 scored += [body_row(recording, captured, seed) for recording, _, captured in found]
-            scores |= {name: aggregate(scored) | training_of(checkpoints[0])} | upright(name, scored)
+            scores |= {name: aggregate(scored) | training_of(*checkpoints)} | upright(name, scored)
     return f"Three trainings: {options.split}, {options.sensors} sensors", BODY, scores
 
 
@@ -388,18 +389,14 @@ def _rivals(options: argparse.Namespace, console: Console) -> dict[str, list[Met
     """Methods of the rows with trainings of their own, by seed; those without a checkpoint are named and left out."""
     trained = {}
     for name, (run, pipeline) in TRAINED.items():
-        paths = _seeded(options.runs, run)
+        paths = trainings_of(options.runs, run)
         sensors = GIVEN if run in HANDS else options.sensors
         overrides = (*pipeline, "pipeline.floor=fixed", "pipeline.refinement=null")
-        trained[name] = [Method(name, str(path), sensors, overrides) for path in paths if is_trained(path)]
-        if not trained[name]:
-            console.print(left_out(name, "mocap_every", run, paths[0]), markup=False, soft_wrap=True)
+        trained[name] = [Method(name, str(path), sensors, overrides) for path in paths]
+        if not paths:
+            path = options.runs / run / "checkpoints" / "best.ckpt"
+            console.print(left_out(name, "mocap_every", run, path), markup=False, soft_wrap=True)
     return {name: methods for name, methods in trained.items() if methods}
-
-
-def _seeded(runs: Path, run: str) -> list[Path]:
-    """Checkpoints of a training with three seeds."""
-    return [runs / seeded / "checkpoints" / "best.ckpt" for seeded in (run, f"{run}_1", f"{run}_2")]
 
 
 def _totalcapture(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:

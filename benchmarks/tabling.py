@@ -19,9 +19,11 @@ TRAINING = {
     "frames_seen_m": "M frames",
     "core_minutes": "core min",
     "rate_swept": "rate swept",
+    "trainings": "trainings",
 }
 """Columns of what a row's training took: trained parameters and frames of drawn windows, both in millions, and minutes of a
-core; the learning rate, where `rivals.py` chose it of several; and their headings."""
+core; the learning rate, where `rivals.py` chose it of several; how many with other seeds the row is the mean of, if several;
+and their headings."""
 RATE_FILE = "rate.json"
 """In the folder of a run of `rivals.py`: the rate that was chosen, and by what."""
 EPOCHS = 12
@@ -111,8 +113,8 @@ class NotRecorded(Summary):
         return "not recorded"
 
 
-def training_of(checkpoint: str) -> dict[str, Summary]:
-    """What a checkpoint's training took, as columns (`TRAINING`) of its row."""
+def training_of(checkpoint: str, *others: str) -> dict[str, Summary]:
+    """What a checkpoint's training took, as columns (`TRAINING`) of its row; `others` are the same with other seeds."""
     config, state = read_checkpoint(checkpoint)
     weights = sum(value.numel() for name, value in state.items() if name.startswith("net."))
     taken: dict[str, Any] = {"parameters": weights, **config.get("training", {})}
@@ -124,7 +126,7 @@ def training_of(checkpoint: str) -> dict[str, Summary]:
     if Path(checkpoint).is_file() and rate.is_file():
         note = json.loads(rate.read_text(encoding="utf-8"))
         found |= {"rate_swept": Summary(note["rate"], None, 1)} if note["losses"] else {}
-    return found
+    return found | ({"trainings": Summary(1 + len(others), None, 1)} if others else {})
 
 
 def budget(frames: int, per_step: int) -> list[str]:
@@ -144,6 +146,12 @@ def is_trained(checkpoint: Path) -> bool:
     """Whether a training is there, and not one of `rivals.py` that has not finished."""
     rate = checkpoint.parent.parent / RATE_FILE
     return checkpoint.is_file() and (not rate.is_file() or bool(json.loads(rate.read_text())["finished"]))
+
+
+def trainings_of(runs: Path, run: str) -> list[Path]:
+    """Checkpoints of a training, and of the same with other seeds (`rivals.py --seeds 0 1 2`), those that are there."""
+    paths = [runs / seeded / "checkpoints" / "best.ckpt" for seeded in (run, f"{run}_1", f"{run}_2")]
+    return [path for path in paths if is_trained(path)]
 
 
 def left_out(row: str, system: str, run: str, checkpoint: str | Path | None) -> str:

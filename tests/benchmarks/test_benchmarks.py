@@ -55,7 +55,9 @@ def test_a_row_prints_what_its_training_took(tmp_path):
     from wearcap.models.checkpoint import read_checkpoint
 
     took = tabling.training_of("hmd2")
-    assert [*took, "rate_swept"] == list(tabling.TRAINING), "no rate of it was chosen by a sweep"
+    assert [*took, "rate_swept", "trainings"] == list(tabling.TRAINING), (
+        "no rate of it was swept, and it is one training"
+    )
     assert 5 < took["parameters_m"].mean < 7
     assert "training" in read_checkpoint("hmd2")[0] or str(took["frames_seen_m"]) == "not recorded"
     record = {"parameters": 2_500_000, "frames": 13_824_000, "core_seconds": 1815.0}
@@ -63,6 +65,7 @@ def test_a_row_prints_what_its_training_took(tmp_path):
     torch.save({"wearcap": {"config": config}, "state_dict": {"net.weight": torch.zeros(2)}}, tmp_path / "run.ckpt")
     took = tabling.training_of(str(tmp_path / "run.ckpt"))
     assert [str(value) for value in took.values()] == ["2.50", "13.82", "30.25"]
+    assert tabling.training_of(str(tmp_path / "run.ckpt"), "seed_1.ckpt", "seed_2.ckpt")["trainings"].mean == 3
 
 
 def test_windows_from_the_store_are_faster_than_npz():

@@ -1,12 +1,15 @@
 """Rivals are trained at the best of a few rates, go on after a kill, and their tables say so."""
 
+import argparse
 import json
 from pathlib import Path
 
 import pytest
+from rich.progress import Progress
 
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
+from wearcap.metrics.table import Row, Summary
 from wearcap.models.checkpoint import read_checkpoint
 from wearcap_testing import benchmark, small_dataset
 
@@ -146,3 +149,47 @@ def test_a_training_that_was_stopped_is_no_row(tmp_path):
     assert not tabling.is_trained(checkpoint)
     note.write_text(json.dumps({"rate": 1e-3, "finished": {"0": 0.4}}))
     assert tabling.is_trained(checkpoint)
+
+
+@pytest.fixture
+def two_trainings(tmp_path) -> tuple[str, str]:
+    """Of seeds 0 and 2; that of seed 1 has not finished."""
+    for run in (NAME, f"{NAME}_1", f"{NAME}_2"):
+        (tmp_path / run / "checkpoints").mkdir(parents=True)
+        (tmp_path / run / "checkpoints" / "best.ckpt").touch()
+    (tmp_path / f"{NAME}_1" / tabling.RATE_FILE).write_text(json.dumps({"rate": 1e-3, "finished": {}}))
+    first, second = map(str, tabling.trainings_of(tmp_path, NAME))
+    assert second == str(tmp_path / f"{NAME}_2" / "checkpoints" / "best.ckpt")
+    return first, second
+
+
+def test_a_row_of_hmd2_is_the_mean_of_trainings_that_differ_in_the_seed(two_trainings, tmp_path, monkeypatch):
+    runs = benchmark("hmd2_runs")
+    errors = dict(zip(two_trainings, (3.0, 5.0)))
+
+    def evaluate(path, store, names, seeds, **_):
+        return [Row(name, seed, 60, {"mpjpe_cm": errors[path]}) for seed in seeds for name in names]
+
+    store = small_dataset(tmp_path / "data")
+    monkeypatch.setattr(runs, "load_pipeline", lambda path, *_: path)
+    monkeypatch.setattr(runs, "training_of", lambda *paths: {"trainings": Summary(len(paths), None, 1)})
+    monkeypatch.setattr(runs, "evaluate", evaluate)
+    case = runs.Case(store.root, tuple(store.names("test")), (0, 1, 2, 3), (), None, "typical")
+    scores = runs.run_method(runs.Method(NAME, two_trainings[0], others=two_trainings[1:]), case).scores
+    assert (scores["mpjpe_cm"].mean, scores["mpjpe_cm"].seeds, scores["trainings"].mean) == (4.0, 2, 2)
+    assert "best_mpjpe_cm" not in scores, "of other networks, not of other samples"
+
+
+def test_a_row_of_echo_captures_each_training_with_a_seed_of_its_own(two_trainings, tmp_path, monkeypatch):
+    tables = benchmark("tables_echo")
+    options = argparse.Namespace(runs=tmp_path, leave=(), quick=False, seeds=4, items=2, pipeline=[])
+    made = tables._trained({"ours": (NAME, "pipeline=echo")}, options, Progress())
+    monkeypatch.setattr(
+        tables, "captured", lambda method, _, names, seeds, __: [(method.checkpoint, seeds, method.others)]
+    )
+    assert list(tables._captured(made[0], options, Progress(), None, ["walk"])) == [
+        (two_trainings[0], [0], ()),
+        (two_trainings[1], [1], ()),
+    ]
+    alone = tables.Method("ours", "echo")
+    assert list(tables._captured(alone, options, Progress(), None, ["walk"])) == [("echo", [0, 1, 2, 3], ())]
