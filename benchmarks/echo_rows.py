@@ -29,6 +29,8 @@ class Method:
     """A modality, and the share of its frames that are given."""
     height_off_m: float | None = None
     """How far the height that the wearer gives is off (m); None: the wearer's own bones are given."""
+    sensors: str = GIVEN
+    """Preset of the errors of head, wrists and body (`WEARABLES`), with an unknown floor; or `GIVEN`."""
     measured: bool = False
     """Whether objects, hinges and rails are where people measure them (`as_measured`), instead of where they are."""
     others: tuple[str, ...] = ()
@@ -63,7 +65,7 @@ def captured(
     jobs = [(name, seed) for name in ordered for seed in seeds]
     for start in range(0, len(jobs), items):
         batch = jobs[start : start + items]
-        given = {name: sensed(store.load(name), GIVEN, method.height_off_m) for name, _ in batch}
+        given = {name: sensed(store.load(name), method.sensors, method.height_off_m) for name, _ in batch}
         observed_parts = {
             name: scenario_of(echo, CaptureInput(part, store.root), method.measured) for name, part in given.items()
         }
@@ -72,7 +74,8 @@ def captured(
         for (name, seed), motion in zip(batch, motions):
             scenario = observed_parts[name]
             item = batch_item_of(scenario, head_path(scenario.recording, echo.model.skeleton, echo.fps), reader)
-            yield Captured(name, seed, motion, echo.truth(motion, CaptureInput(scenario.recording, store.root)), item)
+            true = scenario.recording if method.sensors == GIVEN else store.load(name)
+            yield Captured(name, seed, motion, echo.truth(motion, CaptureInput(true, store.root)), item)
 
 
 def scenario_of(echo: Echo, source: CaptureInput, measured: bool) -> Scenario:

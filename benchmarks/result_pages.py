@@ -21,7 +21,7 @@ from tabling import UPSIDE_DOWN, cell
 
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
-from wearcap.metrics.table import Summary
+from wearcap.metrics.table import Summary, decimals
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results"
@@ -110,7 +110,7 @@ def grid_of(table: Table, about: Mapping[str, Any], spread: str = "") -> Grid:
 
 TRAINING = {
     "parameters_m": ("parameters (M)", 2),
-    "frames_seen_m": ("frames seen (M)", 2),
+    "frames_seen_m": ("frames of its last training (M)", 2),
     "core_minutes": ("core minutes", 0),
     "rate_swept": ("rate swept", 4),
     "trainings": ("trainings", 0),
@@ -132,7 +132,10 @@ def score_grids(
             dict.fromkeys(m for row in rows.values() for m in row if not m.startswith("truth_") and m not in hidden)
         )
         metrics = [name for name in labels if name in present] + [name for name in present if name not in labels]
-        cells = [[name, *(text(row.get(m), labels.get(m, ("", 2))[1]) for m in metrics)] for name, row in rows.items()]
+        cells = [
+            [name, *(text(row.get(m), _digits(name, row.get(m), labels.get(m, ("", 2))[1])) for m in metrics)]
+            for name, row in rows.items()
+        ]
         count = max(
             (
                 each["seeds"]
@@ -146,6 +149,12 @@ def score_grids(
         heads = ("", *(labels.get(metric, (metric, 2))[0] for metric in metrics))
         grids.append(Grid(title, heads, cells, origin(about, f"{count} {spread}" if count > 1 else "")))
     return grids
+
+
+def _digits(row: str, summary: Mapping[str, Any] | None, usual: int) -> int:
+    """Decimals of a cell: of the truth's as many as show it, however small it is."""
+    value = None if summary is None else summary["mean"]
+    return max(usual, decimals(value, usual)) if row == "truth" and value else usual
 
 
 def kept(tree: Tree, title: str) -> dict[str, Tree]:

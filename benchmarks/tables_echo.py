@@ -342,6 +342,7 @@ def _people(options: argparse.Namespace, progress: Progress, store: RecordingSto
     methods = [Method("ours", options.checkpoint)]
     methods += [Method(f"ours, {row}", options.checkpoint, ("pipeline=echo", how)) for row, how in plain.items()]
     methods += [Method(f"ours, {what}", options.checkpoint, height_off_m=off) for what, off in WRONG_HEIGHTS.items()]
+    methods += [Method(f"ours, {name} tracking", options.checkpoint, sensors=name) for name in ("typical", "poor")]
     methods = [method for method in methods if options.rows is None or method.name in options.rows]
     methods += [] if options.keep else _trained(HUMANS, options, progress)
     return _scores(methods, options, progress, store, names)
@@ -503,7 +504,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         ),
         full=[grid for tree in trees.values() for grid in score_grids(tree, LABELS, hidden=BODY_PARTS)],
         measured=f"joints {ours['mpjpe_mm']['mean'] / 10:.1f} cm{real}; objects {placed}",
-        speed=f"{online['ratio']:.0f} × online" if online else "",
+        speed=f"{online['ratio']:.0f} × online, head and wrists tracked, active object given" if online else "",
         clocks=CLOCKS,
         pictures=(
             ("echo_cmu.png", RANKED),

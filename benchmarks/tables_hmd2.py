@@ -30,7 +30,7 @@ from wearcap.sensors.wearables import WEARABLES
 
 COLUMNS = {
     "mpjpe_cm": "MPJPE",
-    "best_mpjpe_cm": "best of n",
+    "best_mpjpe_cm": "best of these",
     "hand_pe_cm": "hand",
     "upper_pe_cm": "upper",
     "lower_pe_cm": "lower",
@@ -340,10 +340,9 @@ def _methods(options: argparse.Namespace, console: Console) -> list[Method]:
     for method in wanted:
         if method not in there:
             run = TRAINED.get(method.name, ("",))[0]
-            missing = f"left out: {method.name} (no checkpoint {method.checkpoint!r})"
-            console.print(
-                left_out(method.name, "hmd2", run, method.checkpoint) if run else missing, markup=False, soft_wrap=True
-            )
+            line = f"left out: {method.name} (no checkpoint {method.checkpoint!r})"
+            line = left_out(method.name, "hmd2", run, method.checkpoint) if run else line
+            console.print(line, markup=False, soft_wrap=True)
     return there
 
 
@@ -563,7 +562,9 @@ def _grids(trees: Trees) -> list[Grid]:
     """All tables."""
     grids = [
         grid_of(
-            _table(f"{title} ({name.removeprefix('hmd2_')})", [Result.of(row) for row in rows]),
+            _table(
+                f"{title} ({name.removeprefix('hmd2_')}{', validation' * (title != FIRST)})", [*map(Result.of, rows)]
+            ),
             tree.get("origins", {}).get(title, tree["about"]),
             _repetitions(rows),
         )

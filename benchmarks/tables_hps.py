@@ -170,8 +170,8 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
 
 
 CLOCKS = {
-    "hps_solver_vs_best_adam": "the optimisation, to an equal energy; map, body and start given; against Adam at its "
-    "best",
+    "hps_solver_vs_best_adam": "the optimisation of a walk of 60 s, to an equal energy; map, body and start given; against Adam at "
+    "its best",
     "hps_frames_per_second": "the optimisation; map, body and start given; against real time",
     "hps_end_to_end_realtime": "all of it, from suit and video to motion, localisation included; map given",
     "localization_frames_per_second": "features, retrieval, matching, pose; decoding and map given; against pairwise "

@@ -31,6 +31,13 @@ def test_the_body_is_anchored_to_the_measured_head(recording, floor):
     assert motion.provenance["floor"] == floor
 
 
+def test_a_floor_that_nobody_measured_is_below_a_head_that_is_carried_lower_than_in_the_rest_pose(recording):
+    unknown = replace(recording, floor=None, points=None)
+    high, low = (drawn_pipeline(floor="fixed", carried=share).run(unknown) for share in (0.97, 1.0))
+    above_m = 0.03 * low.motion.skeleton.height_of("head")
+    torch.testing.assert_close(high.floor.height, low.floor.height + above_m, atol=1e-5, rtol=0)
+
+
 def test_without_hanging_the_root_is_where_the_estimator_puts_it(recording):
     anchored, free = (drawn_pipeline(floor="fixed", anchor=anchor)(recording) for anchor in (True, False))
     assert (anchored.t_world_root - free.t_world_root).norm(dim=-1).mean() > 0.01

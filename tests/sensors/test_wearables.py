@@ -55,6 +55,27 @@ def test_ideal_devices_sense_the_truth():
     torch.testing.assert_close(found.points.points_world, true.points.points_world, atol=1e-4, rtol=0)
     wrist = true.motion.joint("left_wrist")
     torch.testing.assert_close(found.imu["left_wrist"].R_world_imu, wrist.R, atol=1e-4, rtol=0)
+    torch.testing.assert_close(found.tracked["left_wrist"].T_world_body.R, wrist.R, atol=1e-4, rtol=0)
+    torch.testing.assert_close(found.tracked["left_wrist"].T_world_body.t, wrist.t, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("preset", ["typical", "poor"])
+def test_tracked_wrists_drift_with_the_head_and_sit_where_nobody_measured(preset):
+    """Seen from the head they are off by how they are held, and by little else."""
+    noise, true = WornNoise.preset(preset), recorded().motion
+    off_m, off_deg = [], []
+    for seed in range(12):
+        found = sensed(noise, seed)
+        for joint in ("left_wrist", "right_wrist"):
+            # `seat` is how the device sits on the head, which the path as sensed holds, too
+            device = found.head.T_world_head @ Rigid(found.head.R_head_device, found.head.t_head_device)
+            seen = device.inverse() @ found.tracked[joint].T_world_body
+            as_worn = Rigid(torch.eye(3), SEAT)
+            expected = (true.joint("head") @ as_worn).inverse() @ true.joint(joint)
+            off_m.append((seen.t.norm(dim=-1) - expected.t.norm(dim=-1)).abs().mean())
+            off_deg.append(rotation.geodesic(seen.R, expected.R).rad2deg().mean())
+    assert 0.2 * noise.grip_m < torch.stack(off_m).mean() < 1.5 * (noise.grip_m + noise.seat_m)
+    assert 0.5 * noise.grip_deg < torch.stack(off_deg).mean() < 1.5 * (noise.grip_deg + noise.seat_deg)
 
 
 @pytest.mark.parametrize(

@@ -258,8 +258,8 @@ class FloorFollow:
     """Horizontal distance to a foot, and vertical distance to its sole, within which points belong to the floor."""
     POINTS, MIN_POINTS = 12, 4
     """Number of nearest points that are used, and fewest of them within both distances (else the sole is used)."""
-    GAIN, GAIN_POINTS = 0.05, 0.1
-    """Share of the floor's error that a frame of full contact corrects, measured by the sole's height or by points."""
+    GAIN = 0.1
+    """Share of the floor's error that a frame of full contact corrects, measured by points or by the sole's height."""
     WALKING_M_S = (0.3, 0.5)
     """Speeds of the head, over `STEP_S`, between which its rise starts to move the floor, and moves it fully."""
     STEP_S = 2.0
@@ -312,8 +312,8 @@ class FloorFollow:
         heights[np.abs(heights - positions[:, 2:]) > self.REACH_M] = np.nan
         few = np.isfinite(heights).sum(1, keepdims=True) < self.MIN_POINTS
         heights = np.where(few, positions[:, 2:], heights)
-        height, from_points = (part.reshape(feet.shape[:-1]) for part in (np.nanmedian(heights, 1), ~few))
-        weight = weight * np.where(from_points, self.GAIN_POINTS, self.GAIN)
+        height = np.nanmedian(heights, 1).reshape(feet.shape[:-1])
+        weight = self.GAIN * weight
         total = weight.sum(1)
         target = (weight * height).sum(1) / np.where(total > 0, total, 1)
         share = weight.max(1)

@@ -17,7 +17,8 @@ from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.trajectory import nearest_frames
+from wearcap.geometry.trajectory import Trajectory, nearest_frames
+from wearcap.recording.motion import Motion
 from wearcap.recording.recording import HeadStream, Recording
 from wearcap.sensors.imu import ImuNoise, synthesize_imu
 from wearcap.sensors.simulated import SlamNoise, slam_poses
@@ -35,6 +36,13 @@ class WornNoise:
     """Root mean square angle between the device's axes and the head's, likewise."""
     watches: ImuNoise
     body: BodyErrors
+    wrists: SlamNoise
+    """Errors of wrists that are tracked by the head's device, beside those of its own path, which they share."""
+    grip_m: float
+    """Root mean square distance of a tracked wrist from where it is believed to be, constant in a recording: a controller or
+    a strap sits differently every time."""
+    grip_deg: float
+    """Root mean square angle of a tracked wrist's axes, likewise."""
 
     @classmethod
     def preset(cls, name: str) -> "WornNoise":
@@ -51,6 +59,9 @@ WEARABLES = {
         seat_deg=0.0,
         watches=ImuNoise(0.0, 8.0, 0.0, 0.0, 0.0, 0.0, 0.0),
         body=SUITS["ideal"].body,
+        wrists=SlamNoise(jitter_m=0.0, jitter_deg=0.0),
+        grip_m=0.0,
+        grip_deg=0.0,
     ),
     "typical": WornNoise(
         SlamNoise(
@@ -66,6 +77,9 @@ WEARABLES = {
         seat_deg=2.0,
         watches=ImuNoise(clock_offset_s=0.017, clock_ppm=50.0, play_deg=3.0, heading_deg=2.0),
         body=SUITS["typical"].body,
+        wrists=SlamNoise(jitter_m=0.002, jitter_deg=0.3),
+        grip_m=0.01,
+        grip_deg=3.0,
     ),
     "poor": WornNoise(
         SlamNoise(
@@ -82,6 +96,9 @@ WEARABLES = {
         seat_deg=4.0,
         watches=ImuNoise(2.5, 8.0, 2.5, 0.08, 0.05, 0.6, 6.0, 0.05, 100.0, play_deg=6.0, heading_deg=5.0),
         body=SUITS["poor"].body,
+        wrists=SlamNoise(jitter_m=0.004, jitter_deg=0.6, wander_m=0.01, wander_deg=2.0),
+        grip_m=0.025,
+        grip_deg=6.0,
     ),
 }
 """Head trackers and watches by name; those of "ideal" have no error at all, as in the papers' synthetic data."""
@@ -90,7 +107,8 @@ WEARABLES = {
 def worn(recording: Recording, noise: WornNoise, rng: np.random.Generator) -> Recording:
     """What devices sense of a recording's true motion, and what their wearer knows: nothing of the truth is left in it.
 
-    The head's path, watches and points are in one SLAM world: points lie where they were seen from the path as tracked.
+    The head's path, watches, tracked wrists and points are in one SLAM world: points and wrists lie where they were seen
+    from the path as tracked.
     The body is guessed from a measured stature; there is no floor. Raises WearcapError without a head or a true motion.
     """
     motion, head = recording.motion, recording.head
@@ -107,16 +125,27 @@ def worn(recording: Recording, noise: WornNoise, rng: np.random.Generator) -> Re
         frame = nearest_frames(motion.timestamps, seen)
         from_device: Tensor = T_true[frame].inverse() @ points.points_world  # pyright: ignore[reportAssignmentType]
         points = replace(points, points_world=T_sensed[frame] @ (scale * from_device))
+    imu = {joint: synthesize_imu(motion, joint, noise=noise.watches, rng=rng) for joint in WRISTS}
+    skeleton = estimated_skeleton(motion.skeleton, noise.body, rng)
     return Recording(
         recording.name,
         head=HeadStream(motion.timestamps, T_sensed.R, T_sensed.t, head.R_head_device, head.t_head_device),
-        imu={joint: synthesize_imu(motion, joint, noise=noise.watches, rng=rng) for joint in WRISTS},
+        imu=imu,
+        tracked={joint: _tracked(motion, joint, T_sensed @ T_true.inverse(), noise, rng) for joint in WRISTS},
         camera=recording.camera,
         points=points,
-        skeleton=estimated_skeleton(motion.skeleton, noise.body, rng),
+        skeleton=skeleton,
         subject=recording.subject,
         location=recording.location,
         activity=recording.activity,
         source=recording.source,
         license=recording.license,
     )
+
+
+def _tracked(motion: Motion, joint: str, drift: Rigid, noise: WornNoise, rng: np.random.Generator) -> Trajectory:
+    """A wrist as the head's device tracks it: `drift` (time) leads from the true world to that of its SLAM."""
+    turned, shifted = torch.from_numpy(rng.standard_normal((2, 3)) / np.sqrt(3)).float()
+    grip = Rigid(rotation.exp(np.deg2rad(noise.grip_deg) * turned), noise.grip_m * shifted)
+    T_sensed, _ = slam_poses(drift @ motion.joint(joint) @ grip, motion.fps, noise.wrists, rng)
+    return Trajectory(motion.timestamps, T_sensed.R, T_sensed.t)

@@ -16,6 +16,9 @@ from wearcap.scene.floor import estimate_floor
 
 MIN_POINTS = 500
 """Fewest points that a floor is estimated from."""
+CARRIED = 0.97
+"""How high people carry the head joint while upright, as a share of its height in the rest pose: neck, hips and knees are a
+little bent. It is 0.97 of the people of CMU's and HDM05's training splits (simulated people: 1.0)."""
 UPRIGHT_WITHIN_S = 30.0
 """People are assumed to be upright for a tenth of any interval of this length (s)."""
 _LOOK_EVERY_S = 0.25

@@ -40,7 +40,7 @@ class HeadPath:
     T_world_head: Rigid
     T_world_device: Rigid
     floor_height: Float[Tensor, "time"]
-    """Floor height (m) below the head, estimated from the head's path alone."""
+    """Floor height (m) below the head, estimated from the head's path alone, as if people were as upright as the rest pose."""
     skeleton: Skeleton
     stretches: tuple[tuple[int, int], ...]
     """Frame ranges (start, stop) between gaps and jumps of the tracking; head poses in the gaps are interpolated."""
@@ -49,6 +49,10 @@ class HeadPath:
     def stature(self) -> float:
         """Height of the head joint in the rest pose (m)."""
         return self.skeleton.height_of("head")
+
+    def floor_below(self, carried: float) -> Float[Tensor, "time"]:
+        """Floor height (m) below a head that is carried at a share of its height in the rest pose (`CARRIED`)."""
+        return self.floor_height + (1 - carried) * self.stature
 
     @property
     def held_frames(self) -> Int64[Tensor, "time"]:

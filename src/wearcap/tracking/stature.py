@@ -8,7 +8,7 @@ from wearcap.body.skeleton import Skeleton, skeleton_of_height
 from wearcap.errors import WearcapError
 from wearcap.recording import Recording
 from wearcap.scene.floor import estimate_floor
-from wearcap.tracking.floor import MIN_POINTS, UPRIGHT_WITHIN_S
+from wearcap.tracking.floor import CARRIED, MIN_POINTS, UPRIGHT_WITHIN_S
 
 UPRIGHT = 0.9
 """Quantile of the head's height over the floor that is taken for upright, as in `tracking.floor.floor_from_path`."""
@@ -61,7 +61,7 @@ def with_stature(
 
 
 def estimate_stature(recording: Recording, skeleton: Skeleton) -> Stature | None:
-    """Height of a wearer whose head joint stands over a known floor as high as `skeleton`'s does in its rest pose, scaled.
+    """Height of a wearer whose head joint stands over a known floor as high as people of `skeleton`, scaled, carry it.
 
     The floor is the recording's own, else that below its points. None without a head path or floor, over less than
     `LEAST_S`, and for heights outside `HEIGHTS_M`.
@@ -89,7 +89,7 @@ def estimate_stature(recording: Recording, skeleton: Skeleton) -> Stature | None
     upright = torch.stack([piece.quantile(UPRIGHT) for piece in pieces if len(piece) * step_s >= LEAST_S])
     high = upright.quantile(0.75)  # in half of the half-minutes people may sit
     near = upright[(upright - high).abs() < 0.1]
-    height_m = near.median().item() * skeleton.stature / skeleton.height_of("head")
+    height_m = near.median().item() * skeleton.stature / (CARRIED * skeleton.height_of("head"))
     if not HEIGHTS_M[0] <= height_m <= HEIGHTS_M[1]:
         return None
     spread = near.std().item() if len(near) > 1 else 0.0

@@ -27,6 +27,7 @@ from wearcap.scene.objects import Environment, SceneObject
 from wearcap.systems.echo.features import CONTACTS, EchoFeatures
 from wearcap.systems.echo.model import MODALITIES
 from wearcap.systems.echo.queue import Conditioning
+from wearcap.tracking.floor import CARRIED
 from wearcap.tracking.head_path import HeadPath
 
 MAX_GAP_S = 0.5
@@ -169,7 +170,7 @@ def batch_item_of(scenario: Scenario, path: HeadPath, reader: ObjectReader) -> B
     active = active_at(scenario.acts, names, path.timestamps)
     codes = torch.stack([*(shape.code for shape in objects), reader.nothing])
     mirrored = torch.stack([*(shape.code_mirrored for shape in objects), reader.nothing])
-    floor = path.floor_height
+    floor = path.floor_below(CARRIED)
     if recording.floor is not None:
         floor = interpolate_clamped(recording.floor.timestamps, recording.floor.height, path.timestamps)
     objects_of_frames = active != NO_OBJECT, codes[active], mirrored[active], active.float()

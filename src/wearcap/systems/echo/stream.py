@@ -43,7 +43,7 @@ from wearcap.systems.echo.observations import MAX_GAP_S, BatchItem, ObjectShape,
 from wearcap.systems.echo.pipeline import Echo, measured_of, motion_of, pulled_by, stretch_seed
 from wearcap.systems.echo.queue import Conditioning, EchoQueue, Outputs
 from wearcap.tracking import floor, foot_lock, head_path, refinement
-from wearcap.tracking.floor import FloorTracker
+from wearcap.tracking.floor import CARRIED, FloorTracker
 from wearcap.tracking.head_path import Chunk, HeadPath
 from wearcap.tracking.refinement import Refiner
 
@@ -116,7 +116,7 @@ class EchoStream(HeadAndWristsStream):
         self._refiner: Refiner | None = None
         self._pending: list[tuple[float, Conditioning, Rigid]] = []
         """Time, conditioning and head pose of frames that were consumed but not output yet."""
-        self._floor = FloorTracker(self.wearer.skeleton.height_of("head"), self.pipeline.fps)
+        self._floor = FloorTracker(CARRIED * self.wearer.skeleton.height_of("head"), self.pipeline.fps)
         threshold = self.pipeline.contact_use.static_threshold
         self._static = None if threshold is None else StaticObjects(threshold)
 

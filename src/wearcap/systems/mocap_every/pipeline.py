@@ -28,12 +28,12 @@ from wearcap.systems.mocap_every.model import Estimate, WatchEstimator
 from wearcap.systems.mocap_every.visual_cues import VisualCues
 from wearcap.systems.mocap_every.windows import EstimatorWindows, FinalPoses
 from wearcap.tracking.anchor import anchored_to_head
-from wearcap.tracking.floor import floor_from_points
+from wearcap.tracking.floor import CARRIED, floor_from_points
 from wearcap.tracking.head_path import HeadPath, head_path
 from wearcap.tracking.refinement import Measured, Refinement, held_in_gaps
 
 FLOORS = ("follow", "update", "points", "fixed")
-SETTINGS = ("stride", "lookahead", "floor", "anchor", "mirror_average")
+SETTINGS = ("stride", "lookahead", "floor", "carried", "anchor", "mirror_average")
 """Settings that a motion depends on; an exported model carries them along."""
 
 
@@ -71,6 +71,8 @@ class MocapEvery(LearnedSystem):
     """Frames that must follow a pose before it is final (latency)."""
     floor: str = "follow"
     """follow: ours. update: the paper's D.2. points: below the head, from points only. fixed: constant height."""
+    carried: float = CARRIED
+    """How high the head is carried while upright, as a share of its height in the rest pose (ours); 1: as in that pose."""
     anchor: bool = True
     """Whether the body is anchored to the measured head (ours) or keeps the estimator's translation (the paper)."""
     mirror_average: bool = True
@@ -204,11 +206,11 @@ class MocapEvery(LearnedSystem):
             begin = path.timestamps[start : start + 1]
             initial_m = interpolate_clamped(track.timestamps, track.height, begin).item()
         else:
-            initial_m = path.floor_height[start].item()
+            initial_m = path.floor_below(self.carried)[start].item()
         floor, floor_height = self.follower(path.skeleton, initial_m), None
         if self.floor == "points":  # below the head; from the head path where there are too few points
             height = floor_from_points(recording.points, path.T_world_head.t, path.stature)
-            floor_height = path.floor_height if height is None else height
+            floor_height = path.floor_below(self.carried) if height is None else height
         cloud = recording.points if self.floor in ("follow", "update") else None
         if cloud is not None and cloud.first_seen is None:
             floor.see(cloud.points_world)

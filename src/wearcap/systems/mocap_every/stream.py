@@ -135,7 +135,7 @@ class MocapEveryStream(HeadAndWristsStream):
             self._begin_s = chunk.timestamps[0].item()
             floor_m = self.wearer.floor_m if self._windows is None else self._windows.floor_m
             if floor_m is None:
-                floor_m = T_world_head.t[0, 2].item() - self.wearer.skeleton.height_of("head")
+                floor_m = T_world_head.t[0, 2].item() - self.pipeline.carried * self.wearer.skeleton.height_of("head")
             follower = self.pipeline.follower(self.wearer.skeleton, floor_m)
             self._windows = EstimatorWindows(self.pipeline, self.wearer.skeleton, follower)
         elif len(chunk.corrected.t):
