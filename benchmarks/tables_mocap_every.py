@@ -42,6 +42,7 @@ from tabling import (
     split_of,
     titled,
     training_of,
+    trainings_of,
     upright,
 )
 

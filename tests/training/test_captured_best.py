@@ -1,0 +1,33 @@
+"""The best checkpoint by the error of captured recordings."""
+
+import csv
+
+import torch
+
+from wearcap.cli import train
+from wearcap_testing import small_dataset
+
+SMALL = [f"model.net.{name}" for name in ("width=32", "layers=1", "heads=4", "feedforward=32")]
+
+
+def test_the_best_checkpoint_is_that_of_the_least_captured_error(tmp_path):
+    small_dataset(tmp_path / "data")
+    given = [
+        "experiment=motion_diffusion_head",
+        "callbacks=captured",
+        "callbacks.progress=null",
+        f"data.sources.simulated.root={tmp_path / 'data'}",
+        f"paths.run={tmp_path / 'run'}",
+        "data.dataset.window=60",
+        "data.loading={batch_size: 4, steps_per_epoch: 2, val_windows: 8}",
+        "trainer={max_steps: 8, accelerator: cpu, precision: 32-true, enable_progress_bar: false}",
+        "early_stop=3",
+        *SMALL,
+    ]
+    train.main(given)
+    with open(tmp_path / "run" / "metrics.csv", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row.get("capture/mpjpe_cm")]
+    errors = {int(row["step"]) + 1: float(row["capture/mpjpe_cm"]) for row in rows}
+    assert list(errors) == [2, 4, 6, 8], "every epoch captures"
+    best = torch.load(tmp_path / "run" / "checkpoints" / "best.ckpt", weights_only=True)
+    assert best["global_step"] == min(errors, key=lambda step: errors[step])
