@@ -9,12 +9,14 @@ table gives their mean and spread. A row without its checkpoint is left out, and
 
 import argparse
 import json
+from collections import defaultdict
 from functools import partial
 from itertools import product
 from pathlib import Path
 
 from mocap_every_calibration import GOALS, calibration_scores
 from mocap_every_rows import Method, body_row, captures, cue_row, floor_row, pipeline_of
+from mocap_every_several import VIEW_DEG, Watched, session_rows, watched_pair, watched_person
 from result_pages import (
     RANKED,
     Grid,
@@ -47,7 +49,7 @@ from tabling import (
 )
 
 from wearcap.files import write_text
-from wearcap.metrics.table import Scores, Summary, aggregate, markdown_table, truth_row
+from wearcap.metrics.table import Row, Scores, Summary, aggregate, markdown_table, truth_row
 from wearcap.models.checkpoint import checkpoint_file
 from wearcap.recording import RecordingStore
 from wearcap.sensors.wearables import WEARABLES
@@ -79,6 +81,7 @@ FLOOR = (
     "floor_within_3cm_smoothed",
     "r_mpjpe_cm",
 )
+SEVERAL = ("mpjpe_cm", "upper_pe_cm", "lower_pe_cm", "hand_pe_cm", "jitter_m_s3")
 CUES = ("right_hand_cm", "right_arm_cm", "upper_cm", "mpjpe_cm", "jitter_m_s3")
 OURS, MLP = "experiment=mocap_every", "mocap_every_mlp"
 TRAININGS: dict[str, tuple[str, ...]] = {
@@ -157,10 +160,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--runs", type=Path, default=Path("outputs/train"), help="folder of the other trainings")
     parser.add_argument("--recordings", type=int, help="no more than so many of each data set")
     parser.add_argument("--sessions", type=int, default=30, help="simulated calibrations")
+    parser.add_argument("--pairs", type=int, default=8, help="simulated pairs of wearers who see each other")
     parser.add_argument(
         "--parts",
         nargs="*",
-        default=["body", "floor", "cues", "calibration"],
+        default=["body", "floor", "cues", "several", "calibration"],
         help="tables to make; trainings, too, for those who have three, and totalcapture for those who have prepared it",
     )
     add_people(parser)
@@ -492,6 +496,32 @@ def _cues(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[s
     return title, CUES, scores | paper
 
 
+def _several(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
+    """§3.4, φ_T, of which the paper gives no figures: poses as the other wearer's head camera sees them."""
+    editor = load_visual_cues(options.manifold)
+    pipeline = pipeline_of(Method("ours", options.checkpoint, options.sensors))
+    store, names = recordings_of(options, "cmu")
+    people = [watched_person(store.load(name), options.split) for name in names]
+    pairs = [watched_pair(options.split, number) for number in range(2 if options.quick else options.pairs)]
+    sessions: dict[str, list[list[Watched]]] = {
+        "simulated": pairs,
+        "cmu": [[person] for person in people if person is not None],
+    }
+    scores: Scores = {}
+    for data, found in sessions.items():
+        bar = progress.add_task(f"several: {data}", total=len(found))
+        rows: dict[str, list[Row]] = defaultdict(list)
+        for session in found:
+            for label, each in session_rows(session, options.sensors, pipeline, editor).items():
+                rows[label] += each
+            progress.advance(bar)
+        scores |= {f"{data}: {label}": aggregate(each) for label, each in rows.items()}
+        frames = {label.split(",")[0]: sum(row.frames for row in each) for label, each in rows.items()}
+        progress.console.print(f"{data}: {frames}", markup=False)
+    title = f"Several wearers: views {VIEW_DEG:.0f}° off per joint, {options.split}, {options.sensors} sensors"
+    return title, SEVERAL, scores
+
+
 def _calibration(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
     """Appendix C.2: planted frames, mounts, scales and clocks."""
     sessions = 3 if options.quick else options.sessions
@@ -506,5 +536,6 @@ PARTS = {
     "totalcapture": _totalcapture,
     "floor": _floor,
     "cues": _cues,
+    "several": _several,
     "calibration": _calibration,
 }

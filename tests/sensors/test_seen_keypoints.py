@@ -9,7 +9,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording import Motion
-from wearcap.sensors.keypoints import ACTION_CAMERA, action_camera, camera_path, seen_joints
+from wearcap.sensors.keypoints import ACTION_CAMERA, action_camera, camera_path, seen_joints, seen_pose
 from wearcap.sensors.slam import R_DEVICE_CAM
 from wearcap_testing import swaying_motion
 
@@ -95,3 +95,21 @@ def test_what_lies_behind_is_not_seen(motion, path):
 def test_a_clock_of_its_own_is_refused(motion):
     with pytest.raises(WearcapError, match="0 pictures of the head camera during the motion"):
         camera_path(motion, action_camera(motion.timestamps + 1e4))
+
+
+def test_an_estimated_pose_is_as_wrong_as_asked_and_of_what_is_in_the_picture(motion):
+    path = watching(motion, 1.2)
+    exact, seen = seen_pose(motion, path, ACTION_CAMERA, 0.0, 0.0, np.random.default_rng(0))
+    off, confidence = seen_pose(motion, path, ACTION_CAMERA, 12.0, 0.2, np.random.default_rng(0))
+    assert torch.allclose(exact.R_parent_joint, motion.R_parent_joint[::2][: len(path)], atol=1e-5)
+    inside = {j: truth(motion, path, j)[1] for j in ("left_knee", "left_ankle", "left_toe")}
+    skeleton = motion.skeleton
+    assert torch.equal(seen[:, skeleton.index("left_toe")] > 0, inside["left_toe"])
+    assert torch.equal(seen[:, skeleton.index("left_knee")] > 0, inside["left_knee"] & inside["left_ankle"])
+    angle = rotation.geodesic(off.R_parent_joint, exact.R_parent_joint).rad2deg()
+    assert angle[:, 0].max() < 1e-3
+    assert angle[:, 1:].square().mean().sqrt() == pytest.approx(12.0, rel=0.3)
+    missed = (seen > 0).any(1) & ~(confidence > 0).any(1)
+    assert missed.float().mean() == pytest.approx(0.2, abs=0.1)
+    assert ((confidence > 0) <= (seen > 0)).all()
+    assert (confidence <= 1).all()

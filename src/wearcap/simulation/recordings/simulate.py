@@ -10,11 +10,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
+from wearcap.recording.motion import Motion
 from wearcap.recording.recording import ContactTrack, FloorTrack, Recording
 from wearcap.sensors.imu import ImuNoise, synthesize_imu
 from wearcap.sensors.keypoints import action_camera
@@ -112,13 +114,8 @@ def simulate_two_wearers(
     first, second = (
         simulate_motion(world, person, rng, config.duration_s, config.fps, list(activities)) for person in people
     )
-    a, b = first.motion, second.motion
-    ahead, heading = (rotation.yaw_of(motion.R_parent_joint[0, 0]) for motion in (a, b))
-    R = rotation.about_axis("z", ahead + torch.pi - heading)
-    place = a.t_world_root[0] + distance_m * torch.stack([ahead.cos(), ahead.sin(), torch.zeros(())])
     rise = first.floor_height[0] - second.floor_height[0]
-    place = torch.stack([place[0], place[1], b.t_world_root[0, 2] + rise])
-    moved = b.moved(Rigid(R, place - R @ b.t_world_root[0]))
+    moved = second.motion.moved(face_to_face(first.motion, second.motion, distance_m, rise))
     facing = replace(second, motion=moved, floor_height=second.floor_height + rise)
     recordings = []
     for letter, person, simulated in zip("ab", people, (first, facing)):
@@ -127,6 +124,16 @@ def simulate_two_wearers(
         camera = action_camera(simulated.motion.timestamps[::every].contiguous())
         recordings.append(replace(recording, session=name, camera=camera))
     return recordings[0], recordings[1]
+
+
+def face_to_face(first: Motion, second: Motion, distance_m: float, rise_m: float | Tensor = 0.0) -> Rigid:
+    """Displacement of the second motion that puts its first frame in front of the first motion's, facing it, and raises
+    it by `rise_m`."""
+    ahead, heading = (rotation.yaw_of(motion.R_parent_joint[0, 0]) for motion in (first, second))
+    R = rotation.about_axis("z", ahead + torch.pi - heading)
+    place = first.t_world_root[0] + distance_m * torch.stack([ahead.cos(), ahead.sin(), torch.zeros(())])
+    place = torch.stack([place[0], place[1], second.t_world_root[0, 2] + rise_m])
+    return Rigid(R, place - R @ second.t_world_root[0])
 
 
 def seeded(salt: int, split: str, number: int) -> np.random.Generator:

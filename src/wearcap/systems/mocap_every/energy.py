@@ -23,6 +23,9 @@ quadratically, so that the energy is differentiable at zero."""
 SPEED_SMOOTHING_M2_S2 = 1e-4
 """Smoothing constant of foot speeds (m²/s²): without it the energy has a kink at zero speed, where second-order solvers
 get stuck."""
+POSE_SMOOTHING = 0.1
+"""Smoothing constant of distances between rotation matrices: about the square of what 12° make, a monocular estimator's
+error per joint. Within it views hardly pull, so that a capture that is nearer than they are stays."""
 SOLVERS = ("lbfgs", "adam")
 FIRST_STEP, CURVATURES = 3.0, 10
 """Norm of the first change of a window's latent that L-BFGS tries, and number of steps whose curvature it keeps."""
@@ -75,9 +78,11 @@ class PoseCue(NamedTuple):
     confidence: Float[Tensor, "batch time joint"]
 
     def error(self, body: Body) -> Float[Tensor, "batch time"]:
-        """Σ_j w_j ‖τ_j − q_j‖ over all joints but the root (eq. 5, φ_T), on rotation matrices."""
+        """Mean of w_j ‖τ_j − q_j‖ over all joints but the root (eq. 5, φ_T), on rotation matrices; quadratic within
+        an estimator's errors (ours)."""
         difference = body.R_parent_joint[:, :, 1:] - self.R_parent_joint[:, :, 1:]
-        distance = _norm(rearrange(difference, "batch time joint row column -> batch time joint (row column)"))
+        difference = rearrange(difference, "batch time joint row column -> batch time joint (row column)")
+        distance = _norm(difference, POSE_SMOOTHING) - POSE_SMOOTHING**0.5
         return (distance * self.confidence[:, :, 1:]).mean(-1)
 
 
@@ -100,7 +105,7 @@ class LatentWeights:
     """Weight of `PixelCue.error`, per radian of view angle."""
     place: float = 1.0
     """Weight of `PlaceCue.error`, per metre."""
-    pose: float = 0.3
+    pose: float = 3.0
     """Weight of `PoseCue.error`, per unit of distance between rotation matrices."""
     stay: float = 1.0
     """Weight of the latents' mean squared change from their start (L_reg, which the paper does not define)."""
