@@ -12,9 +12,11 @@ from hps_walk import CLAPS_S, MOUNT, floor_points, hps_dataset, hps_recording
 from hydra.utils import instantiate
 from PIL import Image
 
+from wearcap.body.kinematics import local_rotations
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
 from wearcap.evaluation.evaluate import evaluate
+from wearcap.geometry import rotation
 from wearcap.localization.features import RootSift
 from wearcap.localization.localizer import Localizer
 from wearcap.localization.map_builder import MapSettings, build_map
@@ -101,6 +103,11 @@ def test_planted_errors_of_suit_and_clock_go():
     assert root_error_m(wrong_clock, recording).mean() > 0.5
 
 
+def prior(**deviations: float) -> ConstantsPrior:
+    """Constants that are nominal but for those named."""
+    return ConstantsPrior(**dict.fromkeys(("scale", "mount_m", "height_m", "segments_deg"), 0.0) | deviations)
+
+
 @pytest.mark.parametrize(("scale", "moved_m"), [(1.0, 0.0), (0.97, 0.0), (1.0, 0.03)])
 def test_a_body_of_the_wrong_size_and_a_mount_that_was_not_measured_are_found(walk, scale, moved_m):
     suit, camera = walk.suit, walk.camera
@@ -109,7 +116,7 @@ def test_a_body_of_the_wrong_size_and_a_mount_that_was_not_measured_are_found(wa
         suit=replace(suit, skeleton=suit.skeleton.scaled(scale)),
         camera=replace(camera, t_head_cam=camera.t_head_cam - torch.tensor([0.0, 0.0, moved_m])),
     )
-    pipeline = replace(PIPELINE, constants=ConstantsPrior(*((0.0, 0.03) if moved_m else (0.03, 0.0))))
+    pipeline = replace(PIPELINE, constants=prior(mount_m=0.03) if moved_m else prior(scale=0.03))
     source = CaptureInput(wrong, scan=Scan(floor_points()))
     results = pipeline.results(source)
     constants = results["constants"]
@@ -122,6 +129,42 @@ def test_a_body_of_the_wrong_size_and_a_mount_that_was_not_measured_are_found(wa
         true = resampled(walk.motion, 30.0).joint("head").t[:, 2]
         off = [(motion.joint("head").t[:, 2] - true[: len(motion)]).abs().mean() for motion in (found, given)]
         assert off[0] < 0.6 * off[1]
+
+
+def test_legs_that_are_too_short_are_found_and_the_height_of_the_suits_root_does_not_matter(walk):
+    suit, legs = walk.suit, [f"{side}_{joint}" for side in ("left", "right") for joint in ("knee", "ankle")]
+    bones = suit.skeleton.indices(*legs)
+    offsets = suit.skeleton.t_parent_joint.clone()
+    offsets[bones] *= 1 - 0.03 / offsets[bones[:2]].norm(dim=1).sum()
+    short = replace(suit.skeleton, t_parent_joint=offsets)
+    lifted = replace(suit, skeleton=short, t_world_root=suit.t_world_root + torch.tensor([0.0, 0.0, 0.1]))
+    pipeline = replace(PIPELINE, constants=prior(height_m=0.03))
+    source = CaptureInput(replace(walk, suit=lifted), scan=Scan(floor_points()))
+    results = pipeline.results(source)
+    assert results["constants"].height_m == pytest.approx(0.03, abs=0.015)
+    found = pipeline.motion_of(results).skeleton.t_parent_joint[bones].norm(dim=1).sum()
+    assert found == pytest.approx(2 * (0.85 - 0.03 + results["constants"].height_m), abs=1e-4)
+
+
+def test_a_constant_error_of_a_shank_is_found(walk):
+    suit, turn = walk.suit, torch.tensor(6.0).deg2rad()
+    R_world_joint = suit.T_world_joint.R.clone()
+    R_world_joint[:, suit.skeleton.index("left_knee")] @= rotation.about_axis("y", -turn)
+    wrong = replace(suit, R_parent_joint=local_rotations(suit.skeleton, R_world_joint))
+    pipeline = replace(PIPELINE, constants=prior(segments_deg=4.0))
+    source = CaptureInput(replace(walk, suit=wrong), scan=Scan(floor_points()))
+    turned = pipeline.report(source, pipeline.results(source))["segments_turned_deg"]
+    # Soles that are thicker than the wearer's bend both knees alike.
+    assert 3.0 < turned["left_knee"][1] - turned["right_knee"][1] < 9.0
+    assert turned["left_knee"][1] > 1.5
+
+
+def test_constants_without_a_deviation_change_nothing(walk):
+    source = CaptureInput(walk, scan=Scan(floor_points()))
+    with_prior, without = (replace(PIPELINE, constants=given)(source) for given in (prior(), None))
+    assert torch.equal(with_prior.R_parent_joint, without.R_parent_joint)
+    assert torch.equal(with_prior.t_world_root, without.t_world_root)
+    assert torch.equal(with_prior.skeleton.t_parent_joint, without.skeleton.t_parent_joint)
 
 
 def test_the_report_tells_what_was_found(walk, tmp_path):

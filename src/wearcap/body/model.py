@@ -61,6 +61,12 @@ class BodyModel:
             rest = rest + torch.einsum("...f,fvc->...vc", entries, self.pose_blend[:, rows].to(local))
         return (blended[..., :3] @ rest[..., None])[..., 0] + blended[..., 3]
 
+    def with_offsets(self, t_parent_joint: Float[Tensor, "joint 3"]) -> "BodyModel":
+        """The body with other bone offsets (m): vertices move with the joints that they are skinned to."""
+        skeleton = replace(self.skeleton, t_parent_joint=t_parent_joint)
+        moved = self._weights @ (skeleton.rest_joints - self.skeleton.rest_joints)
+        return replace(self, skeleton=skeleton, rest_vertices=self.rest_vertices + moved)
+
     def scaled(self, scale: float) -> "BodyModel":
         """The body with all lengths scaled by one factor."""
         blend = None if self.pose_blend is None else self.pose_blend * scale

@@ -154,10 +154,6 @@ class FootPatches:
         one = torch.nn.functional.one_hot(self.patch, len(FOOT_REGIONS)).to(points)
         return torch.einsum("tvi,vp->tpi", points, one / one.sum(0))
 
-    def scaled(self, scale: float) -> "FootPatches":
-        """The patches of a body of which all is longer by one factor."""
-        return replace(self, body=self.body.scaled(scale))
-
     @cached_property
     def soles(self) -> BodyModel:
         """Body model that consists of the patches only."""

@@ -23,7 +23,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, finite_difference, resample
 from wearcap.optimize.hps import FootPatches, HpsData, HpsEnergy, HpsState, Solution, SuitSteps
-from wearcap.optimize.hps_constants import Constants, ConstantsPrior, estimate_constants, with_constants
+from wearcap.optimize.hps_constants import Constants, ConstantsPrior, estimate_constants, segments, with_constants
 from wearcap.recording import Motion, Recording
 from wearcap.recording.growing import follow_pieces
 from wearcap.recording.recording import Localization
@@ -169,8 +169,11 @@ class HPS(StagedSystem):
             angle, _ = yaw_between(source.recording.suit.R_parent_joint[0, 0], results["align"].R_parent_joint[0, 0])
             about["alignment_deg"] = angle.rad2deg().item()
         if "constants" in results:
-            constants = results["constants"]
+            constants, skeleton = results["constants"], results["initialize"].motion.skeleton
             about |= {"bone_scale": constants.scale, "mount_moved_cm": (100 * constants.t_mount).tolist()}
+            turned = constants.turns.rad2deg().tolist()
+            names = (skeleton.joint_names[joint] for joint in segments(skeleton))
+            about |= {"legs_longer_cm": 100 * constants.height_m, "segments_turned_deg": dict(zip(names, turned))}
         if "optimize" in results:
             about |= {"stopped": results["optimize"].reason, "energy": results["optimize"].history}
         return about
@@ -246,7 +249,7 @@ class HPS(StagedSystem):
         state, skeleton = solution.state, start.motion.skeleton
         return replace(
             start.motion,
-            skeleton=skeleton.scaled(constants.scale) if constants else skeleton,
+            skeleton=constants.skeleton(skeleton) if constants else skeleton,
             R_parent_joint=state.R_parent_joint.float(),
             t_world_root=state.t_world_root.float(),
             provenance={"pipeline": self.name, "solver": solution.reason},
