@@ -3,7 +3,7 @@
     python benchmarks/contact_sheets.py SYSTEM [--dataset datasets/cmu] [--split test] [--output docs]
 
 SYSTEM is hmd2, mocap_every or echo, with its shared checkpoint and default pipeline; recordings are ranked by the joints'
-mean error over whole recordings, those of less than `LEAST_S` left out. Feet and other points in contact are marked by
+mean error over whole recordings, without those of less than `LEAST_S` and those whose file is wrong (`UPSIDE_DOWN`). Feet and other points in contact are marked by
 dots. Writes OUTPUT/SYSTEM_DATASET.png, which the results' pages show.
 """
 
@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 from sensed import GIVEN, SensedStore
+from tabling import UPSIDE_DOWN
 
 from wearcap.cli.conf import compose, load_pipeline
 from wearcap.evaluation.evaluate import evaluate
@@ -37,7 +38,9 @@ def sheet(system: str, store: SensedStore, split: str) -> np.ndarray:
         captured[source.recording.name] = motion
         return pipeline.score(motion, CaptureInput(store.true(source.recording.name), store.root), seed)
 
-    names = [name for name in store.names(split) if store.entries[name].duration_s >= LEAST_S]
+    names = [
+        name for name in store.names(split) if store.entries[name].duration_s >= LEAST_S and name not in UPSIDE_DOWN
+    ]
     rows = list(evaluate(pipeline, store, names, (0,), measure=measure))
     errors = {row.recording: row.scores.get("mpjpe_cm", 0.1 * row.scores.get("mpjpe_mm", 0.0)) for row in rows}
     ranked = sorted(errors, key=errors.__getitem__)
