@@ -11,14 +11,19 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from wearcap.body.skeleton import MIRROR, Skeleton
 from wearcap.geometry import rotation
+from wearcap.geometry.rigid import Rigid
+from wearcap.sensors.imu import GRAVITY, PUSHED, acceleration, mean_filter
+from wearcap.sensors.simulated import SlamNoise, slam_poses
+from wearcap.sensors.watches import FILTER, MAX_GAP_S
 
 _RATES = {"vel": 1, "acc": 2}
 """Power of the playback speed by which values of a kind grow, by the beginning of their names."""
@@ -156,6 +161,8 @@ class Window:
     """What a mirror exchanges: the order of joints, wrists, feet … of the mirrored values, by their names."""
     mirrored: bool = False
     scale: float = 1.0
+    fps: float = math.nan
+    """Frames per second, which `Windows` fills in."""
 
     def changed(self, **values: Tensor) -> "Window":
         """The window with other values."""
@@ -261,46 +268,175 @@ class Scale:
 
 @dataclass(frozen=True)
 class SensorErrors:
-    """Errors of trackers, of the floor and of the body's size that are constant within a window, and white noise of
-    accelerations.
+    """Errors of trackers and watches, of the floor and of the body's size.
 
-    All are standard deviations, those of orientations about each axis and of positions along each. Values that a window
-    lacks are left out.
+    They are constant within a window, where they say no other, and standard deviations, those of orientations about each
+    axis and of positions along each. Values that a window lacks are left out. Random numbers are drawn for the first
+    seven in any case, for the others unless they are 0.
     """
 
     head_deg: float = 0.0
     wrist_deg: float = 0.0
     """Orientation of a wrist's sensor: strap, attitude, heading."""
     acc_m_s2: float = 0.0
+    """White noise of accelerations."""
     floor_m: float = 0.0
     head_m: float = 0.0
     """Where the device sits on the head, in the head's axes."""
     wrist_m: float = 0.0
-    """Where a tracked wrist is, in its own axes."""
+    """Where a wrist's sensor is, in its own axes: a watch there has that place's acceleration."""
     size: float = 0.0
     """Of each measure of the body's size, as a share."""
+    tilt_deg: float = 0.0
+    """Root mean square angle by which gravity, as the head's tracking knows it, is off: its world is turned about a
+    horizontal axis through the window's first head."""
+    jitter_m: float = 0.0
+    """Of the head's tracked place, changing over 0.4 s."""
+    jitter_deg: float = 0.0
+    """Of the head's tracked orientation, likewise."""
+    drift: float = 0.0
+    """Of the head's tracked place after a metre of its path, as a share; it grows with the path's square root."""
+    watch_tilt_deg: float = 0.0
+    """Of gravity as each watch knows it, about both horizontal axes: its world is turned, and a part of gravity taken for
+    acceleration."""
+    bias_m_s2: float = 0.0
+    """Of accelerations, in the watch's axes."""
+    play_deg: float = 0.0
+    """Largest angle by which a strap gives under the arm's acceleration."""
+    delay_s: float = 0.0
+    """Of each watch against the head; negative ones are early."""
+    silent: float = 0.0
+    """Share of windows in which a watch is silent for half a second or longer. As in captures, its orientation is then
+    the last one, and its acceleration zero (`sensors.watches.bridged`)."""
 
     def __call__(self, window: Window, random: Draws) -> Window:
-        values, changed = window.values, {}
-        angle = torch.randn(3, 3, generator=random.generator).deg2rad()
-        turn = rotation.exp(angle * torch.tensor([[self.wrist_deg], [self.wrist_deg], [self.head_deg]]))
-        for name, order in (("R_world_wrist", [0, 1]), ("R_world_head", 2), ("R_world_point", [2, 0, 1])):
-            if name in values:
-                changed[name] = values[name] @ turn[order]
-        if (acc := values.get("acc_world_wrist")) is not None:
-            noise = torch.randn(acc.shape, generator=random.generator)
-            changed["acc_world_wrist"] = (turn[:2] @ acc[..., None])[..., 0] + self.acc_m_s2 * noise
-        floor = self.floor_m * torch.randn(1, generator=random.generator)
-        changed |= {name: value + floor for name, value in values.items() if name.startswith("floor")}
-        seat = torch.randn(3, 3, generator=random.generator)
-        seat = seat * torch.tensor([[self.wrist_m], [self.wrist_m], [self.head_m]])
-        for point, order in (("wrist", [0, 1]), ("head", 2), ("point", [2, 0, 1])):
-            t, R = f"t_world_{point}", f"R_world_{point}"
-            if t in values and R in values:
-                changed[t] = values[t] + (values[R] @ seat[order][..., None])[..., 0]
-        if (size := values.get("size")) is not None:
-            changed["size"] = size * (1 + self.size * torch.randn(size.shape, generator=random.generator))
-        return window.changed(**changed)
+        """What moves differently or at another time comes first, what is measured wrongly follows."""
+        generator = random.generator
+        if self.tilt_deg or self.jitter_m or self.jitter_deg or self.drift:
+            slam = SlamNoise(self.jitter_m, self.jitter_deg, drift_share=self.drift, lean_deg=self.tilt_deg)
+            window = _tracked(window, slam, generator)
+        window = _worn(window, ((_slack, self.play_deg), (_delayed, self.delay_s)), generator)
+        window = _constant(window, self, generator)
+        measured = (_tilted, self.watch_tilt_deg), (_biased, self.bias_m_s2), (_silenced, self.silent)
+        return _worn(window, measured, generator)
+
+
+def _constant(window: Window, errors: SensorErrors, generator: torch.Generator) -> Window:
+    """With constant errors of places, orientations, floor and size, and white noise of accelerations."""
+    values, changed = window.values, {}
+    angle = torch.randn(3, 3, generator=generator).deg2rad()
+    turn = rotation.exp(angle * torch.tensor([[errors.wrist_deg], [errors.wrist_deg], [errors.head_deg]]))
+    for name, order in (("R_world_wrist", [0, 1]), ("R_world_head", 2), ("R_world_point", [2, 0, 1])):
+        if name in values:
+            changed[name] = values[name] @ turn[order]
+    if (acc := values.get("acc_world_wrist")) is not None:
+        noise = torch.randn(acc.shape, generator=generator)
+        changed["acc_world_wrist"] = (turn[:2] @ acc[..., None])[..., 0] + errors.acc_m_s2 * noise
+    floor = errors.floor_m * torch.randn(1, generator=generator)
+    changed |= {name: value + floor for name, value in values.items() if name.startswith("floor")}
+    seat = torch.randn(3, 3, generator=generator)
+    seat = seat * torch.tensor([[errors.wrist_m], [errors.wrist_m], [errors.head_m]])
+    for point, order in (("wrist", [0, 1]), ("head", 2), ("point", [2, 0, 1])):
+        t, R = f"t_world_{point}", f"R_world_{point}"
+        if t in values and R in values:
+            changed[t] = values[t] + (values[R] @ seat[order][..., None])[..., 0]
+    if errors.wrist_m and "acc_world_wrist" in values:
+        lever = (values["R_world_wrist"] @ seat[:2, :, None])[..., 0]
+        changed["acc_world_wrist"] = changed["acc_world_wrist"] + _filtered_acceleration(lever, window.fps)
+    if (size := values.get("size")) is not None:
+        changed["size"] = size * (1 + errors.size * torch.randn(size.shape, generator=generator))
+    return window.changed(**changed)
+
+
+def _filtered_acceleration(t: Float[Tensor, "time wrist 3"], fps: float) -> Float[Tensor, "time wrist 3"]:
+    """Acceleration (m/s²) of points as watches give it (MocapEvery eq. 8)."""
+    return mean_filter(acceleration(t.flatten(1), fps), FILTER).unflatten(1, t.shape[1:])
+
+
+def _tracked(window: Window, noise: SlamNoise, generator: torch.Generator) -> Window:
+    """With the head's path as SLAM tracks it, and with it the points that are tracked from the head."""
+    values, points = window.values, "R_world_point" in window.values
+    if not points and "R_world_head" not in values:
+        return window
+    name = "point" if points else "head"
+    true = Rigid(values[f"R_world_{name}"], values[f"t_world_{name}"])
+    head = Rigid(true.R[:, 0], true.t[:, 0]) if points else true
+    rng = np.random.default_rng(int(torch.randint(2**62, (), generator=generator)))
+    sensed, _ = slam_poses(head, window.fps, noise, rng)
+    if points:
+        seen: Rigid = (sensed @ head.inverse())[:, None] @ true  # pyright: ignore[reportAssignmentType]
+        return window.changed(R_world_point=seen.R, t_world_point=seen.t)
+    changed = {"R_world_head": sensed.R, "t_world_head": sensed.t}
+    if (wrist := values.get("t_world_wrist")) is not None:
+        changed["t_world_wrist"] = (sensed @ head.inverse())[:, None] @ wrist
+    return window.changed(**changed)
+
+
+class _Watches(NamedTuple):
+    R: Float[Tensor, "time wrist 3 3"]
+    acc: Float[Tensor, "time wrist 3"]
+    fps: float
+
+
+_WatchError = Callable[[_Watches, float, torch.Generator], _Watches]
+
+
+def _worn(window: Window, errors: tuple[tuple[_WatchError, float], ...], generator: torch.Generator) -> Window:
+    """With errors of watches, each of its size; without watches as it is."""
+    values = window.values
+    if "acc_world_wrist" not in values:
+        return window
+    watches = _Watches(values["R_world_wrist"], values["acc_world_wrist"], window.fps)
+    for error, size in errors:
+        if size:
+            watches = error(watches, size, generator)
+    return window.changed(R_world_wrist=watches.R, acc_world_wrist=watches.acc)
+
+
+def _slack(watches: _Watches, play_deg: float, generator: torch.Generator) -> _Watches:
+    """On straps that give under the arms' acceleration (as in `sensors.imu.synthesize_imu`)."""
+    sideways, axis = torch.nn.functional.normalize(torch.randn(2, 2, 3, generator=generator), dim=-1)
+    pushed = ((watches.R.mT @ watches.acc[..., None])[..., 0] * sideways).sum(-1, keepdim=True)
+    gives = math.radians(play_deg) * torch.tanh(pushed / PUSHED) * axis
+    return watches._replace(R=watches.R @ rotation.exp(gives))
+
+
+def _delayed(watches: _Watches, delay_s: float, generator: torch.Generator) -> _Watches:
+    """Late or early; before the first frame and after the last one they repeat these."""
+    R, acc, fps = watches
+    count, wrist = len(R), torch.arange(2)
+    place = torch.arange(count)[:, None] - delay_s * fps * torch.randn(2, generator=generator)
+    place = place.clamp(0, count - 1)
+    low = place.long()
+    high, share = (low + 1).clamp_max(count - 1), (place - low)[..., None]
+    acc = torch.lerp(acc[low, wrist], acc[high, wrist], share)
+    R = torch.lerp(R[low, wrist], R[high, wrist], share[..., None])
+    return _Watches(rotation.matrix_from_rot6d(rotation.rot6d_from_matrix(R)), acc, fps)
+
+
+def _tilted(watches: _Watches, tilt_deg: float, generator: torch.Generator) -> _Watches:
+    """With a gravity that is off, and does not cancel in their free acceleration."""
+    angle = math.radians(tilt_deg) * torch.randn(2, 3, generator=generator)
+    turn = rotation.exp(angle * torch.tensor([1.0, 1.0, 0.0]))
+    gravity = torch.tensor([0.0, 0.0, GRAVITY])
+    acc = (turn @ (watches.acc + gravity)[..., None])[..., 0] - gravity
+    return watches._replace(R=turn @ watches.R, acc=acc)
+
+
+def _biased(watches: _Watches, bias_m_s2: float, generator: torch.Generator) -> _Watches:
+    """With a constant error of their accelerations, in their own axes."""
+    bias = bias_m_s2 * torch.randn(2, 3, 1, generator=generator)
+    return watches._replace(acc=watches.acc + (watches.R @ bias)[..., 0])
+
+
+def _silenced(watches: _Watches, share: float, generator: torch.Generator) -> _Watches:
+    """Silent for `MAX_GAP_S` or longer; shorter gaps are interpolated (`DropFrames`)."""
+    R, acc, fps = watches
+    happens, begins, lasts = torch.rand(3, 2, generator=generator)
+    frame, last = torch.arange(len(R))[:, None], (len(R) * begins).long()
+    silent = (happens < share) & (frame > last) & (frame <= last + (MAX_GAP_S * fps + len(R) * lasts).long())
+    R = torch.where(silent[..., None, None], R[last, torch.arange(2)], R)
+    return _Watches(R, acc.masked_fill(silent[..., None], 0), fps)
 
 
 def mirrored(window: Window) -> Window:

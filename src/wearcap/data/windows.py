@@ -6,7 +6,7 @@ split are computed of windows drawn from it, and saved with the weights.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -197,7 +197,7 @@ class Windows(Dataset):
         cut = self.content.cut(track, start, frames, self.recordings[number][2], self)
         for transform in self.in_time:
             cut = transform.retimed(cut, random)
-        window = self.content.read(track, cut, random)
+        window = replace(self.content.read(track, cut, random), fps=self.fps)
         for transform in self.in_space:
             window = transform(window, random)
         return self.content.item(track, cut, window, random)
