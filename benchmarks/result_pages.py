@@ -33,10 +33,7 @@ TRANSCRIBED = "transcribed"
 """Key of a JSON's `about` whose figures were taken from an earlier page and not from the command's own output."""
 LEFT = "left"
 """Key of a table's `about` that names rows of an earlier run, which this one left as they were, and its command."""
-RANKED = (
-    "The worst, the median and the best of CMU's test recordings, truth above and captured below; dots mark contact"
-)
-"""Caption of the pictures of `contact_sheets.py`."""
+_RANKED = "The worst, the median and the best of {}, truth above and captured below; dots mark contact"
 NONE = "–"
 OURS = "ours"
 """Row of our checkpoint."""
@@ -74,6 +71,15 @@ class Page:
     """What the clock of a benchmark (by name) counts, and what is given."""
     pictures: tuple[tuple[str, str], ...] = ()
     """Files of docs/, and what they show."""
+
+
+def ranked(system: str) -> tuple[tuple[str, str], ...]:
+    """Pictures of `contact_sheets.py`, and their captions."""
+    whose = {
+        "cmu": "CMU's test recordings, without 127_32",
+        "hdm05": "the recordings of another laboratory's person (HDM05)",
+    }
+    return tuple((f"{system}_{data}.png", _RANKED.format(what)) for data, what in whose.items())
 
 
 def text(summary: Mapping[str, Any] | None, digits: int = 2) -> str:

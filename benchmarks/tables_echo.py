@@ -20,7 +20,6 @@ from echo_rows import Captured, Method, captured, pipeline_of, scenario_of
 from hydra.utils import instantiate
 from result_pages import (
     NONE,
-    RANKED,
     Grid,
     Page,
     Tree,
@@ -28,6 +27,7 @@ from result_pages import (
     figure_of,
     mean,
     picked,
+    ranked,
     rows_of,
     score_grids,
     upside_down,
@@ -507,7 +507,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         speed=f"{online['ratio']:.0f} × online, head and wrists tracked, active object given" if online else "",
         clocks=CLOCKS,
         pictures=(
-            ("echo_cmu.png", RANKED),
+            *ranked("echo"),
             ("echo_box.png", "A box that is carried, truth above and captured below, points that touch lit"),
             ("echo_table.png", "A table that is pushed: the act of median error"),
             ("echo_suitcase.png", "A suitcase that is carried: the act of median error"),

@@ -14,7 +14,7 @@ from typing import Any
 from hmd2_paper import PAPER, PAPER_METRICS, PAPER_TAIL, paper_rows
 from hmd2_runs import BASELINES, Case, Method, Result, run_method
 from joblib import Parallel, delayed
-from result_pages import NONE, RANKED, Grid, Page, Tree, Trees, figure_of, grid_of, mean, ranged, score_grids, text
+from result_pages import NONE, Grid, Page, Tree, Trees, figure_of, grid_of, mean, ranged, ranked, score_grids, text
 from rich.console import Console
 from rich.table import Table
 from sensed import GIVEN, WRONG_HEIGHTS, add_sensors
@@ -441,7 +441,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         speed=f"{online['ratio']:.0f} × online, head's path and points given" if online else "",
         clocks=CLOCKS,
         pictures=(
-            ("hmd2_cmu.png", RANKED),
+            *ranked("hmd2"),
             ("hmd2_samples.png", "One input, several motions (four samples, above them the truth)"),
         ),
     )

@@ -18,7 +18,6 @@ from mocap_every_calibration import GOALS, calibration_scores
 from mocap_every_rows import Method, body_row, captures, cue_row, floor_row, pipeline_of
 from mocap_every_several import VIEW_DEG, Watched, session_rows, watched_pair, watched_person
 from result_pages import (
-    RANKED,
     Grid,
     Page,
     Tree,
@@ -27,6 +26,7 @@ from result_pages import (
     mean,
     picked,
     ranged,
+    ranked,
     rows_of,
     score_grids,
     upside_down,
@@ -292,7 +292,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         speed=f"{online['ratio']:.0f} × online, head poses given" if online else "",
         clocks=CLOCKS,
         pictures=(
-            ("mocap_every_cmu.png", RANKED),
+            *ranked("mocap_every"),
             (
                 "mocap_every_hillside.png",
                 "Stairs and slopes, truth above and captured below (the floor drawn is that of the beginning)",
