@@ -175,6 +175,8 @@ SETTINGS = {
     "objects move untouched": ("pipeline=echo", "pipeline.contacts.static_threshold=null"),
     "initial object poses observed": ("pipeline=echo", "pipeline.placed=true"),
     "not guided by contacts": UNGUIDED,
+    "guided to 5 cm from the surface": ("pipeline=echo", "pipeline.contacts.guidance.within_m=0.05"),
+    "guided by the holding wrists, too": ("pipeline=echo", "pipeline.contacts.guidance.held=1.0"),
     "not anchored to the head": ("pipeline=echo", "pipeline.anchor=false"),
     "windows in two steps": ("pipeline=echo", "pipeline.sampling.rewindow_steps=2"),
     "windows in five steps": ("pipeline=echo", "pipeline.sampling.rewindow_steps=5"),
@@ -271,7 +273,8 @@ def _objects(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapp
 def _settings(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapping[str, str], Scores]:
     """How frames are denoised; defaults are chosen by this table, on the validation split."""
     store, names = recordings_of(options, "simulated_objects")
-    methods = [Method(name, options.checkpoint, changes) for name, changes in SETTINGS.items()]
+    chosen = {name: changes for name, changes in SETTINGS.items() if name not in options.leave}
+    methods = [Method(name, options.checkpoint, changes) for name, changes in chosen.items()]
     return f"Settings: {options.split}", OBJECTS, _scores(methods, options, progress, store, names)
 
 
