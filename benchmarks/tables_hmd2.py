@@ -469,9 +469,6 @@ def _briefly(simulated: dict[str, Tree], real: dict[str, Tree], strangers: dict[
         return ", ".join(f"{row} {mean(rows[row]['mpjpe_cm'])}" for row in (*rivals, BRIEF) if row in rows)
 
     phrases = [f"on {what} {errors(rows)}" for what, rows in found.items()]
-    jitters = [
-        f"{row} {mean(one[row]['jitter_ratio'])}" for row in (*rivals, BRIEF) if "jitter_ratio" in one.get(row, {})
-    ]
     seen = {r: one[r]["frames_seen_m"]["mean"] for r in (*rivals, BRIEF) if r in one and not r.endswith("its mean")}
     hands = one.get("AvatarPoser-style (head and hands)", {}).get("frames_seen_m")
     less = f" The one that sees hands, too, saw {mean(hands, 2)}, of CMU's and simulated people alone." if hands else ""
@@ -482,7 +479,6 @@ def _briefly(simulated: dict[str, Tree], real: dict[str, Tree], strangers: dict[
         f"trainings.{less} MPJPE (cm), so trained: {'; '.join(phrases)}.",
         "The diffusions among them are captured twice: as their papers sample them, and, named so, as the mean in one step that "
         "ours are, smoothed as ours, but with feet that are not held; which of the two is nearer differs from row to row.",
-        f"Jitter, of the truth's, so trained: {', '.join(jitters)}.",
     )
 
 
