@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from carried_box import WINDOW, carried_dataset, carrying, drawn_echo, scenario_of, small_features, small_net
+from wearcap.body.skeleton import xsens23
 from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.errors import WearcapError
 from wearcap.export.files import load_exported, write_exports
@@ -18,7 +19,7 @@ from wearcap.geometry.trajectory import Trajectory
 from wearcap.models.point_encoder import PointNeXt
 from wearcap.recording.store import RecordingFile
 from wearcap.systems.echo.contacts import Guidance
-from wearcap.systems.echo.export import condition_channels
+from wearcap.systems.echo.export import condition_channels, motion_channels
 from wearcap.systems.echo.pipeline import Echo
 
 FORMATS = ("onnx", "pt2")
@@ -81,6 +82,9 @@ def test_channels_are_named_for_every_frame_of_reference():
         for body in (True, False):
             features = small_features(frame, body=body)
             assert len(condition_channels(features)) == features.condition_size
+    alone, in_wrists = (motion_channels(xsens23(), small_features(object_in_wrists=each)) for each in (False, True))
+    assert alone == [name for name in in_wrists if "_in_" not in name]
+    assert in_wrists[141 + 9 : 141 + 13] == [f"object_in_left_wrist{entry}" for entry in ("_x", "_y", "_z", ".xx")]
 
 
 def test_it_runs_without_lightning_and_hydra(exports, tmp_path):

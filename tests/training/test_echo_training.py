@@ -20,7 +20,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.models.checkpoint import load_trained
 from wearcap.recording import RecordingStore
-from wearcap.systems.echo.features import HANDS, OBJECT_SIZE
+from wearcap.systems.echo.features import HANDS, OBJECT_SIZE, EchoFeatures
 from wearcap.systems.echo.model import EchoDenoiser
 from wearcap.systems.echo.scores import score_echo
 from wearcap.systems.echo.training import SLOPE, STANDING, EchoDiffusion
@@ -65,8 +65,8 @@ def batch(features, *roots: str, count: int = 8) -> EchoWindow:
     return collate([windows[(k * 5 % len(windows), k)] for k in range(count)])
 
 
-def learner(net=None, frame: str = "own", **changes) -> EchoDiffusion:
-    features = small_features(frame)
+def learner(net=None, frame: str = "own", features: EchoFeatures | None = None, **changes) -> EchoDiffusion:
+    features = features or small_features(frame)
     make = net or partial(EchoDenoiser, window=WINDOW, width=32, layers=1, heads=2, feedforward=32, dropout=0.0)
     given = {"loss_weights": WEIGHTS, "levels": LevelMix(0.25, 0.6, 0.15, ramp=(4, 16)), "optimizer": torch.optim.AdamW}
     return EchoDiffusion(make, features, CosineSchedule(), xsens23(), **given | changes)
@@ -79,8 +79,25 @@ class Oracle(EchoDenoiser):
         return self.outputs
 
 
-def oracle(frame: str = "own") -> EchoDiffusion:
-    return learner(partial(Oracle, window=WINDOW, width=32, layers=1, heads=2, feedforward=32), frame)
+def oracle(frame: str = "own", **changes) -> EchoDiffusion:
+    net = partial(Oracle, window=WINDOW, width=32, layers=1, heads=2, feedforward=32)
+    return learner(net, features=small_features(frame, **changes))
+
+
+def test_what_is_in_the_hand_is_learned_where_the_wrist_has_it(data):
+    """Errors in the wrists' channels cost vertices in frames of contact alone, and are held by the left hand alone here."""
+    system = oracle(object_in_wrists=True)
+    windows = batch(system.features, data)
+    truth = system.truth(windows, system.features.canonical(windows.points))
+    own, left, right = (slice(system.net.sizes[0] + k, system.net.sizes[0] + k + 3) for k in (0, 9, 18))
+    costs = {}
+    for name, part in {"none": slice(0), "own": own, "left": left, "right": right}.items():
+        system.net.outputs = truth.clone()
+        system.net.outputs[..., part] += 0.1
+        costs[name] = system.terms(windows)["object_vertices"].item()
+    assert costs["none"] < 0.01
+    assert costs["right"] == pytest.approx(costs["none"], abs=1e-4), "this hand holds nothing"
+    assert 0.03 < costs["left"] - costs["none"] < costs["own"]
 
 
 def explicit_vertices(batch: EchoWindow, cloud: torch.Tensor, R, t) -> torch.Tensor:
@@ -90,9 +107,10 @@ def explicit_vertices(batch: EchoWindow, cloud: torch.Tensor, R, t) -> torch.Ten
     return ((found - true).square().sum(-1).mean(-1) + 1e-6).sqrt()
 
 
+@pytest.mark.parametrize("in_wrists", [False, True])
 @pytest.mark.parametrize("frame", ["own", "window", "world"])
-def test_the_truth_costs_nothing(data, people, frame):
-    system = oracle(frame)
+def test_the_truth_costs_nothing(data, people, frame, in_wrists):
+    system = oracle(frame, object_in_wrists=in_wrists)
     windows = batch(system.features, data, people)
     at = system.features.canonical(windows.points)
     system.net.outputs = system.truth(windows, at)
@@ -146,6 +164,11 @@ def test_objects_that_are_not_there_count_for_nothing(data, people):
 
 def small_net_like(**_):
     return small_net(small_features())
+
+
+def test_windows_draw_noise_for_every_channel(data):
+    for features in (small_features(), small_features(object_in_wrists=True)):
+        assert batch(features, data, count=1).noise.shape[-1] == sum(learner(features=features).net.sizes)
 
 
 def test_absent_objects_are_noise_alone(data, people):
@@ -226,10 +249,11 @@ def test_alike_orientations_are_asked_for_where_no_clean_frame_shows_the_true_on
     assert torch.equal(asked.R_world_object, windows.R_world_canonical), "what is not there shows nothing"
 
 
+@pytest.mark.parametrize("in_wrists", [False, True])
 @pytest.mark.parametrize("frame", ["own", "window", "world"])
-def test_every_term_is_finite_and_every_weight_is_learned(data, people, frame):
+def test_every_term_is_finite_and_every_weight_is_learned(data, people, frame, in_wrists):
     torch.manual_seed(0)
-    system = learner(frame=frame)
+    system = learner(features=small_features(frame, object_in_wrists=in_wrists))
     system.set_statistics(dataset(system.features, data, people), limit=100)
     terms = system.terms(batch(system.features, data, people))
     assert set(terms) == set(WEIGHTS)

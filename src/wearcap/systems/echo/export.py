@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from wearcap.body.contact_points import BODY_POINTS
-from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
+from wearcap.body.skeleton import FOOT_PATCHES, WRISTS, Skeleton
 from wearcap.data.features import LIMBS
 from wearcap.errors import WearcapError
 from wearcap.models.layers import Normalizer
@@ -53,7 +53,7 @@ def exports(pipeline: Echo) -> Exports:
             *(f"middle_{axis}" for axis in "xyz"),
             *(f"shape.{k}" for k in range(features.shape_size)),
         ],
-        "motion_channels": motion_channels(model.skeleton),
+        "motion_channels": motion_channels(model.skeleton, features),
         "motion_mean": net.motion_normalizer.mean.tolist(),
         "motion_scale": net.motion_normalizer.scale.tolist(),
         "schedule": schedule_to_json(model.schedule),
@@ -86,13 +86,14 @@ def condition_channels(features: EchoFeatures) -> list[str]:
     ]
 
 
-def motion_channels(skeleton: Skeleton) -> list[str]:
+def motion_channels(skeleton: Skeleton, features: EchoFeatures) -> list[str]:
     """Names of a frame's output channels in order; normalised by `motion_mean` and `motion_scale`."""
+    pose = [*(f"_{axis}" for axis in "xyz"), *(f".{entry}" for entry in ROT6D)]
+    objects = ["object", *(f"object_in_{wrist}" for wrist in WRISTS if features.object_in_wrists)]
     return [
         *(f"root_{axis}" for axis in "xyz"),
         *(f"{joint}.{entry}" for joint in skeleton.joint_names for entry in ROT6D),
-        *(f"object_{axis}" for axis in "xyz"),
-        *(f"object.{entry}" for entry in ROT6D),
+        *(f"{each}{entry}" for each in objects for entry in pose),
         *(f"point_{k}.contact" for k in range(BODY_POINTS)),
         *(f"{patch}.contact" for patch in FOOT_PATCHES),
     ]

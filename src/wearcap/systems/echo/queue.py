@@ -19,7 +19,7 @@ from wearcap.diffusion.observed import spreading, with_residuals
 from wearcap.diffusion.schedule import Schedule
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.point_encoder import PointNeXt
-from wearcap.systems.echo.features import TWIN_CONTACTS, TWIN_POINTS, Body, EchoFeatures, ThreePoints
+from wearcap.systems.echo.features import OBJECT_SIZE, TWIN_CONTACTS, TWIN_POINTS, Body, EchoFeatures, ThreePoints
 from wearcap.systems.echo.model import EchoDenoiser
 
 
@@ -230,7 +230,8 @@ class EchoQueue:
             features = self.pipeline.model.features
             body = features.encode_body(Body(conditioning.R_parent_joint, conditioning.t_world_root), frame)
             T_world_object = Rigid(conditioning.R_world_object, conditioning.t_world_object)
-            raw = torch.cat([body, features.encode_object(T_world_object, frame), 2 * conditioning.contact - 1], -1)
+            scene_object = features.encode_object(T_world_object, *features.object_frames(conditioning.points, frame))
+            raw = torch.cat([body, scene_object, 2 * conditioning.contact - 1], -1)
             observed = self.pipeline.model.net.motion_normalizer(raw.to(self.pipeline.device)).cpu()
         never = torch.zeros_like(conditioning.has_object)
         absent = [never, ~conditioning.has_object, never if self.pipeline.model.contacts else ~never]
@@ -282,5 +283,5 @@ class EchoQueue:
         raw = net.motion_normalizer.inverse(x[:, part].to(self.pipeline.device)).cpu()
         human, scene_object, contact = raw.split(net.sizes, -1)
         at = frame if frame.t.shape[1] == 1 else Rigid(frame.R[:, part], frame.t[:, part])
-        body, T = features.decode_body(human, at), features.decode_object(scene_object, at)
+        body, T = features.decode_body(human, at), features.decode_object(scene_object[..., :OBJECT_SIZE], at)
         return Outputs(*body, T.R, T.t, ((contact + 1) / 2).clamp(0, 1))
