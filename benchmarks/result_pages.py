@@ -333,7 +333,7 @@ def compact(tree: Tree) -> str:
         return float(f"{part:.6g}") if isinstance(part, float) else part
 
     lines = json.dumps(rounded(tree), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-    return re.sub(r"\{\s+(\"mean\":[^{}\[\]]*?)\s+\}", lambda found: "{" + " ".join(found[1].split()) + "}", lines)
+    return re.sub(r"\{\s+(\"mean\":[^{}\[\]]*?)\s+\}", lambda found: "{" + "".join(found[1].split()) + "}", lines)
 
 
 def render(system: str, page: Page, speed: Mapping[str, list[Tree]]) -> str:
