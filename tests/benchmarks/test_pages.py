@@ -162,7 +162,7 @@ def test_published_json_is_short():
 
     shown = compact({"about": ABOUT, "rows": {"ours": [summary(1.23456789, None, 4), {"a": summary(2.0)}]}})
     assert json.loads(shown)["rows"]["ours"] == [summary(1.23457, None, 4), {"a": summary(2.0)}]
-    assert '{"mean": 1.23457, "std": null, "seeds": 4}' in shown
+    assert '{"mean":1.23457,"std":null,"seeds":4}' in shown
 
 
 def test_figures_of_speed_replace_those_of_their_benchmark_alone(tmp_path):
