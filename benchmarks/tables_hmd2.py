@@ -471,10 +471,12 @@ def _briefly(simulated: dict[str, Tree], real: dict[str, Tree], strangers: dict[
     phrases = [f"on {what} {errors(rows)}" for what, rows in found.items()]
     seen = {r: one[r]["frames_seen_m"]["mean"] for r in (*rivals, BRIEF) if r in one and not r.endswith("its mean")}
     hands = one.get("AvatarPoser-style (head and hands)", {}).get("frames_seen_m")
+    count = one[BRIEF].get("trainings")
+    several = f" (ours beside them: the mean of {mean(count, 0)} of other seeds)" if count else ""
     less = f" The one that sees hands, too, saw {mean(hands, 2)}, of CMU's and simulated people alone." if hands else ""
     return (
         "Learned baselines that see the head alone, and ours beside them, learned from the people that our checkpoint learned "
-        "from last, in one training each at the learning rate that was the best of three in shorter ones. They saw (million "
+        f"from last, in one training each{several} at the learning rate that was the best of three in shorter ones. They saw (million "
         f"frames) {', '.join(f'{row} {frames:.2f}' for row, frames in seen.items())}; our checkpoint {OURS_SAW} in three "
         f"trainings.{less} MPJPE (cm), so trained: {'; '.join(phrases)}.",
         "The diffusions among them are captured twice: as their papers sample them, and, named so, as the mean in one step that "

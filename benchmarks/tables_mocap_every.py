@@ -165,7 +165,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--parts",
         nargs="*",
         default=["body", "floor", "cues", "several", "calibration"],
-        help="tables to make; trainings, too, for those who have three, and totalcapture for those who have prepared it",
+        help="tables to make; trainings, too, for those who have several, and totalcapture for those who have prepared it",
     )
     add_people(parser)
 
@@ -375,7 +375,7 @@ def _trainings(options: argparse.Namespace, progress: Progress) -> tuple[str, tu
     """Our checkpoint, of seed 0, beside the mean and spread of it and of the same training with seeds 1 and 2, which are
     mocap_every_mlp_1 and mocap_every_mlp_2 in RUNS."""
     others = [str(path) for path in trainings_of(options.runs, MLP) if path.parents[1].name != MLP]
-    trained = {"ours": [options.checkpoint], "three trainings": [options.checkpoint, *others]}
+    trained = {"ours": [options.checkpoint], f"{1 + len(others)} trainings": [options.checkpoint, *others]}
     sensing = {"": (options.sensors, ()), ", exact sensors, floor and bones given": (GIVEN, ("pipeline.floor=fixed",))}
     scores: Scores = {}
     for root in (options.datasets / "cmu", *options.strangers):
@@ -388,7 +388,7 @@ def _trainings(options: argparse.Namespace, progress: Progress) -> tuple[str, tu
                 found = captures(method, store, names, lambda b=bar: progress.advance(b))
                 scored += [body_row(recording, captured, seed) for recording, _, captured in found]
             scores |= {name: aggregate(scored) | training_of(*checkpoints)} | upright(name, scored)
-    return f"Three trainings: {options.split}, {options.sensors} sensors", BODY, scores
+    return f"Trainings that differ in the seed: {options.split}, {options.sensors} sensors", BODY, scores
 
 
 def _ours(options: argparse.Namespace) -> list[Method]:
