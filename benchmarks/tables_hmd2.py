@@ -448,9 +448,10 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
 
 
 def _tails(people: Tree) -> set[str]:
-    """95th percentiles of body parts, which Table 6.6 has of CMU."""
+    """95th percentiles of body parts, which Table 6.6 has of CMU, and what the JSON has besides."""
     names = {name for rows in people["tables"].values() for scores in rows.values() for name in scores}
-    return {name for name in names - {*COLUMNS} if name.startswith(P95)}
+    tails = {name for name in names - {*COLUMNS} if name.startswith(P95)}
+    return tails | {"head_pe_cm", "rotation_deg", "world_root_cm"}
 
 
 def _briefly(simulated: dict[str, Tree], real: dict[str, Tree], strangers: dict[str, Tree]) -> tuple[str, ...]:
