@@ -15,7 +15,7 @@ from wearcap.recording.timing import joined
 from wearcap.runtime.wearer import Wearer
 from wearcap.scene.objects import Environment
 from wearcap.systems.echo.stream import EchoStream
-from wearcap.tracking.floor import CARRIED
+from wearcap.tracking.floor import CARRIED as HEAD_CARRIED
 
 TWO = (("box_1", "left", 0.1, 0.4), ("box_2", "right", 0.7, 0.9))
 WRISTS = ("left_wrist", "right_wrist")
@@ -383,7 +383,7 @@ def test_the_floor_is_found_after_sitting_and_standing_up():
     sitting = [session._frame(k / 30, Rigid(head.R, head.t - low)).floor_height.item() for k in range(30)]
     standing = [session._frame(1 + k / 30, head).floor_height.item() for k in range(60)]
     assert sitting == pytest.approx([standing[-1] - 0.5] * 30, abs=1e-3)
-    carried_m = CARRIED * recording.skeleton.height_of("head")
+    carried_m = HEAD_CARRIED * recording.skeleton.height_of("head")
     assert standing[-1] == pytest.approx(head.t[0, 2].item() - carried_m, abs=1e-3)
 
 
