@@ -197,7 +197,7 @@ SETTINGS = {
     "conveyor, noise redrawn (eq. 11 as printed)": (*EVEN, "pipeline.sampling.step=redraw"),
     "all as in the paper": ("pipeline=paper/echo",),
 }
-TRUTH_GIVEN = "exact wrists and heads, floor, bones (but in rows of wrong height), and which object is active, are given to all rows"
+TRUTH_GIVEN = "exact wrists and heads, floor, bones (but in rows of wrong height and of typical and poor tracking), and which object is active, are given to all rows"
 SHARES = {"human": (0.01, 0.05, 0.1, 0.25, 1.0), "object": (0.01, 0.05, 0.1, 0.25, 1.0), "contact": (0.01, 0.05, 0.1, 0.25, 1.0)}  # fmt: skip
 
 
