@@ -69,10 +69,10 @@ def test_observed_contacts_say_who_holds_it():
     torch.testing.assert_close(misses(scene, scene.corrected(x), box), torch.full((FRAMES,), AWAY_M), atol=1e-4, rtol=0)
     is_observed = scene.conditioning.is_observed.clone()
     is_observed[..., 2] = True
-    told = scene.conditioning._replace(contact=contact_of("left_wrist"), is_observed=is_observed)
-    assert (misses(scene, replace(scene, conditioning=told).corrected(x), box)[HELD][FADE:-FADE] < 1e-4).all()
-    gone: Conditioning = told._replace(has_object=torch.zeros_like(told.has_object))
-    torch.testing.assert_close(replace(scene, conditioning=gone).corrected(x), x, atol=1e-5, rtol=0)
+    with_contact = scene.conditioning._replace(contact=contact_of("left_wrist"), is_observed=is_observed)
+    assert (misses(scene, replace(scene, conditioning=with_contact).corrected(x), box)[HELD][FADE:-FADE] < 1e-4).all()
+    without_object: Conditioning = with_contact._replace(has_object=torch.zeros_like(with_contact.has_object))
+    torch.testing.assert_close(replace(scene, conditioning=without_object).corrected(x), x, atol=1e-5, rtol=0)
 
 
 def test_a_contact_goes_on_beyond_the_windows_ends_and_padding():

@@ -2,7 +2,8 @@
 
 "typical": a headset with visual-inertial SLAM such as Aria or Quest (millimetres of jitter, drift below 0.5 % of the way,
 gravity known), and calibrated smartwatches (attitude 1 to 2°, some degrees of heading in ten minutes, a strap that is 3°
-off and gives as much, clocks that agree to half a frame at 30 Hz by arm swings). "poor": heads as MocapEvery's paper
+off and gives as much, clocks that agree to half a frame at 30 Hz by arm swings); wrists by controllers that are held, or
+trackers that are strapped, 1 cm and 3° off (our assumption: we know of no published figure). "poor": heads as MocapEvery's paper
 measured them with monocular SLAM (Table 5: 2.1 and 2.7°, 4.7 and 5.1 cm off), whose scale and vertical are calibration's,
 and watches on loose straps. Bodies are guessed from a stature, as suits do it.
 """

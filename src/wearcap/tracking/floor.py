@@ -18,7 +18,8 @@ MIN_POINTS = 500
 """Fewest points that a floor is estimated from."""
 CARRIED = 0.97
 """How high people carry the head joint while upright, as a share of its height in the rest pose: neck, hips and knees are a
-little bent. It is 0.97 of the people of CMU's and HDM05's training splits (simulated people: 1.0)."""
+little bent. In the training splits it is 0.976 of CMU's people and 0.958 of HDM05's, but 0.997 of simulated ones
+(benchmarks/carried_heads.py)."""
 UPRIGHT_WITHIN_S = 30.0
 """People are assumed to be upright for a tenth of any interval of this length (s)."""
 _LOOK_EVERY_S = 0.25
