@@ -22,7 +22,7 @@ TRAINING = {
     "trainings": "trainings",
 }
 """Columns of what a row's training took: trained parameters and frames of drawn windows, both in millions, and minutes of a
-core; the learning rate, where `rivals.py` chose it of several; how many with other seeds the row is the mean of, if several;
+core (none, where it was trained on a GPU); the learning rate, where `rivals.py` chose it of several; how many with other seeds the row is the mean of, if several;
 and their headings."""
 RATE_FILE = "rate.json"
 """In the folder of a run of `rivals.py`: the rate that was chosen, and by what."""
@@ -118,6 +118,8 @@ def training_of(checkpoint: str, *others: str) -> dict[str, Summary]:
     config, state = read_checkpoint(checkpoint)
     weights = sum(value.numel() for name, value in state.items() if name.startswith("net."))
     taken: dict[str, Any] = {"parameters": weights, **config.get("training", {})}
+    if not str(taken.get("machine", "CPU")).endswith("CPU"):
+        taken.pop("core_seconds", None)  # on a GPU they are not what the training took
     found = {
         name: Summary(taken[key] / unit, None, 1) if key in taken else NotRecorded(math.nan, None, 0)
         for name, (key, unit) in _RECORDED.items()

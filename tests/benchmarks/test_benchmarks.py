@@ -65,6 +65,9 @@ def test_a_row_prints_what_its_training_took(tmp_path):
     torch.save({"wearcap": {"config": config}, "state_dict": {"net.weight": torch.zeros(2)}}, tmp_path / "run.ckpt")
     took = tabling.training_of(str(tmp_path / "run.ckpt"))
     assert [str(value) for value in took.values()] == ["2.50", "13.82", "30.25"]
+    on_gpu = json.dumps({"model": {}, "training": record | {"machine": "x86_64, 1 threads, NVIDIA H200"}})
+    torch.save({"wearcap": {"config": on_gpu}, "state_dict": {"net.weight": torch.zeros(2)}}, tmp_path / "gpu.ckpt")
+    assert str(tabling.training_of(str(tmp_path / "gpu.ckpt"))["core_minutes"]) == "not recorded"
     assert tabling.training_of(str(tmp_path / "run.ckpt"), "seed_1.ckpt", "seed_2.ckpt")["trainings"].mean == 3
 
 

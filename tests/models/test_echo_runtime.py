@@ -90,7 +90,7 @@ def worst_of_compiled(device: str) -> float:
     """In its own process: the tests' shape checks cannot be compiled."""
     program = f"from test_echo_runtime import worst_of; print(worst_of('compile', {device!r}))"
     here = Path(__file__).parent
-    paths = os.pathsep.join([str(here), str(here.parent)])
+    paths = os.pathsep.join([str(here), str(here.parent), *sys.path])
     # Compiled in that process itself: others that help would have to import PyTorch first.
     environment = os.environ | {"PYTHONPATH": paths, "TORCHINDUCTOR_COMPILE_THREADS": "1"}
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment)
