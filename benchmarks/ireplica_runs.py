@@ -66,6 +66,8 @@ class RecordingRun:
     name: str
     networks: Networks
     robustness: bool
+    rows: tuple[str, ...] = ()
+    """Rows that are captured, without what head and depth cameras see; none: all."""
 
 
 @dataclass(frozen=True)
@@ -103,13 +105,14 @@ def run_recording(run: RecordingRun) -> dict[str, Any]:
     motion, bent = ours.registered(case.source), published.registered(case.source)
     placed = ours.placed(case.environment, case.source)
     contacts = {"ours": _contacts(ours, case), "published": _contacts(published, case)}
-    seen = SeenFlat.of(case.recording)
+    seen = None if run.rows else SeenFlat.of(case.recording)
     objects = None if seen is None else found_objects(seen)
     if seen is not None:
         contacts["detections"] = detected_contacts(seen, contacts["ours"]["timestamps"])
     rows = {
         name: capture(bent if name in ON_BENT_PATH else motion)
         for name, capture in _rows(case, ours, published, contacts).items()
+        if not run.rows or name in run.rows
     }
     found = {
         "recording": run.name,
@@ -284,6 +287,17 @@ def places_off(metres: float) -> Callable[[Recording], Recording]:
     return change
 
 
+def clocks_apart(seconds: float) -> Callable[[Recording], Recording]:
+    """The camera's clock late against the suit's, as claps that are heard late leave it."""
+
+    def change(recording: Recording) -> Recording:
+        found = recording.localization
+        assert found is not None
+        return replace(recording, localization=replace(found, timestamps=found.timestamps + seconds))
+
+    return change
+
+
 def frames_lost(share: float) -> Callable[[Recording], Recording]:
     """The suit's frames missing at random, but for the first and the last."""
 
@@ -321,6 +335,8 @@ DISTURBANCES: dict[str, Callable[[Recording], Recording]] = {
     "poses off by 5° more": poses_off(5.0),
     "localisation off by 2 cm more": places_off(0.02),
     "localisation off by 5 cm more": places_off(0.05),
+    "camera's clock 10 ms late": clocks_apart(0.01),
+    "camera's clock 33 ms late": clocks_apart(1 / 30),
     "10 % of the suit's frames lost": frames_lost(0.1),
     "20 % of the suit's frames lost": frames_lost(0.2),
     "suit at 50 Hz": at_rate(50.0),

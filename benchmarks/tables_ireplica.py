@@ -2,7 +2,8 @@
 
 HPS with noisy localisation registers the wearer; every row below captures the same motion. Recordings of the split are
 dealt out to `--seeds` groups: means are over groups, ± their deviation. Without checkpoints, the networks are those in
-checkpoints/.
+checkpoints/. Of a data set datasets/simulated_interactions_NAME, as with NAME's sensors, the file is ireplica_NAME.json;
+the page takes ideal, typical and poor.
 """
 
 import argparse
@@ -64,13 +65,16 @@ KINDS = {
 }
 """Columns of the tables, and the categories that they gather."""
 WIDTH = 170
+DATASET = "simulated_interactions"
+PRESETS = ("ideal", "typical", "poor")
+"""Sensors of data sets DATASET_PRESET, whose rows the page shows beside the others."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--dataset",
         type=Path,
-        default=Path("datasets/simulated_interactions"),
+        default=Path("datasets") / DATASET,
         help="made by `wearcap prepare simulated_interactions preset=standard`",
     )
     parser.add_argument("--split", default="test", help="whose people and objects: train, val or test")
@@ -82,6 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[f"contact_transformer_{name}" for name in CONTACT_CLASSES],
         help="checkpoints of the published networks, one per class",
     )
+    parser.add_argument("--rows", nargs="+", default=[], metavar="ROW", help="these rows alone, 'ours' among them")
     parser.add_argument("--no-robustness", action="store_true", help="leave out the runs with worse sensors")
     parser.add_argument("--jobs", type=int, default=2, help="recordings at a time")
 
@@ -100,7 +105,13 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     networks = Networks(tuple(options.ours), tuple(options.published))
     # worse sensors once per group: HPS is run again for each
     runs = [
-        RecordingRun(options.dataset, name, networks, index < seeds and not (options.no_robustness or options.quick))
+        RecordingRun(
+            options.dataset,
+            name,
+            networks,
+            index < seeds and not (options.no_robustness or options.quick),
+            tuple(dict.fromkeys(["ours", *options.rows])) if options.rows else (),
+        )
         for index, name in enumerate(names)
     ]
     found = Parallel(n_jobs=options.jobs)(delayed(_run_printed)(run) for run in runs)
@@ -109,7 +120,8 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
         groups
     )
     _show(tree)
-    path = options.output / "ireplica.json"
+    preset = options.dataset.name.removeprefix(DATASET).removeprefix("_")
+    path = options.output / ("ireplica.json" if preset not in PRESETS else f"ireplica_{preset}.json")
     write_text(path, json.dumps(finite(tree), indent=1, allow_nan=False) + "\n")
     return path
 
@@ -124,7 +136,6 @@ HEADLINE = {
     "as published, contacts from detections": "the paper's tracker and path, contacts from detections",
     "ours, contacts from detections": "ours, contacts from detections",
     "ours, published networks": "ours, contacts by the published networks",
-    "ours, true contacts": "ours, contacts true",
 }
 """Rows of the page's first table, and what the page calls them."""
 CONTACTS = {
@@ -159,6 +170,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         f"{PAPER_HAND['as published']:.1f}",
     ]
     known = PAPER_DETECTION["the paper's, on H-contact"][0]
+    beside = {name: trees[f"ireplica_{name}"] for name in PRESETS if f"ireplica_{name}" in trees}
     return Page(
         title="[iReplica](../ireplica.md): figures",
         headline=Grid(
@@ -175,17 +187,23 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
                 "contacts' AP",
             ),
             [[label, *_headline(tree, row)] for row, label in HEADLINE.items() if row in rows]
+            + [
+                [f"**ours**, {name} sensors", *_headline(other, "ours")]
+                for name, other in beside.items()
+                if name != "typical"
+            ]
             + [["the paper's, on its own recordings", *paper, NONE, NONE, f"{known:.3f}"]],
         ),
         held_out="People, flats and objects are those of the test split; networks were trained on the training "
         "split, and all settings were chosen on the validation split.",
         simulated="All of it: people, flats, objects, suits and localisation (`typical`), and environments as people "
         "measure them, with objects and hinges away from their true places; sizes beside the literature's in "
-        "[simulation](simulation.md). Camera and suit share one clock; claps are heard in [HPS](hps.md)'s sessions. Every row "
-        "captures the same motion.",
+        "[simulation](simulation.md). Camera and suit share one clock, but in rows that say so; claps are heard in [HPS](hps.md)'s "
+        "sessions. Every row captures the same motion.",
         limits=_limits(tree),
-        full=[grid_of(table, about, spread) for table in shown],
-        measured=f"objects end {mean(rows['ours']['all']['end_cm'])} cm off, in environments measured by hand (the "
+        full=[grid_of(table, about, spread) for table in shown]
+        + [grid_of(each, other["about"], spread) for name, other in beside.items() for each in _beside(name, other)],
+        measured=f"objects end {mean(rows['ours']['all']['end_cm'])} cm off{_from_ideal_to_poor(beside)}, in environments measured by hand (the "
         f"paper's tracker with our contacts {both}; as published {theirs})",
         speed=f"{factor['ratio']:.0f} × real time, localised cameras given" if factor else "",
         clocks=CLOCKS,
@@ -198,6 +216,20 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
             )
         ),
     )
+
+
+def _from_ideal_to_poor(beside: Trees) -> str:
+    """Where objects end by what sensors measured."""
+    ends = [mean(beside[name]["rows"]["ours"]["all"]["end_cm"]) for name in ("ideal", "poor") if name in beside]
+    return f" ({' to '.join(ends)} by sensors from ideal to poor)" if len(ends) == 2 else ""
+
+
+def _beside(name: str, tree: Tree) -> list[Table]:
+    """The tables of a data set with other sensors."""
+    shown = [_ends(tree), _hands(tree), *([_robustness(tree)] if tree["robustness"] else [])]
+    for table in shown:
+        table.title = f"{name} sensors, {table.title}"
+    return shown
 
 
 def _headline(tree: Tree, row: str) -> list[str]:
