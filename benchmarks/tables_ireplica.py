@@ -93,11 +93,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     """Print and write the tables; returns the file."""
+    preset = options.dataset.name.removeprefix(f"{DATASET}_")
+    sensors = f" suit={preset} camera_errors={preset}" if preset in PRESETS else ""
     if not (options.dataset / "manifest.json").is_file():
         raise WearcapError(
             "no such data set",
             where=options.dataset,
-            fix=f"Run: wearcap prepare simulated_interactions preset=standard output={options.dataset}",
+            fix=f"Run: wearcap prepare simulated_interactions preset=standard{sensors} output={options.dataset}",
         )
     names = RecordingStore.open(options.dataset).names(options.split)
     seeds = min(2 if options.quick else options.seeds, len(names))
@@ -120,8 +122,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
         groups
     )
     _show(tree)
-    preset = options.dataset.name.removeprefix(DATASET).removeprefix("_")
-    path = options.output / ("ireplica.json" if preset not in PRESETS else f"ireplica_{preset}.json")
+    path = options.output / (f"ireplica_{preset}.json" if sensors else "ireplica.json")
     write_text(path, json.dumps(finite(tree), indent=1, allow_nan=False) + "\n")
     return path
 
