@@ -226,8 +226,9 @@ def _from_ideal_to_poor(beside: Trees) -> str:
 
 
 def _beside(name: str, tree: Tree) -> list[Table]:
-    """The tables of a data set with other sensors."""
-    shown = [_ends(tree), _hands(tree), *([_robustness(tree)] if tree["robustness"] else [])]
+    """The tables of a data set with one preset's sensors; the rows of typical ones are the page's other tables."""
+    shown = [] if name == "typical" else [_ends(tree), _hands(tree)]
+    shown += [_robustness(tree)] if tree["robustness"] else []
     for table in shown:
         table.title = f"{name} sensors, {table.title}"
     return shown
