@@ -474,10 +474,10 @@ def _briefly(simulated: dict[str, Tree], real: dict[str, Tree], strangers: dict[
     hands = one.get("AvatarPoser-style (head and hands)", {}).get("frames_seen_m")
     count = one[BRIEF].get("trainings")
     several = f" (ours beside them: the mean of {mean(count, 0)} of other seeds)" if count else ""
-    less = f" The one that sees hands, too, saw {mean(hands, 2)}." if hands else ""
+    less = f" The one that sees hands, too, saw {mean(hands, 2)}, at one rate." if hands else ""
     return (
         "Learned baselines that see the head alone, and ours beside them, learned from the people that our checkpoint learned "
-        f"from last, in one training each{several} at the learning rate that was the best of three in shorter ones (on a GPU those "
+        f"from last, in one training each{several} at the learning rate that was the best of three in shorter ones, of other batches (on a GPU those "
         f"without core minutes). They saw (million frames) {', '.join(f'{row} {frames:.2f}' for row, frames in seen.items())}; our "
         f"checkpoint {OURS_SAW} in three trainings.{less} MPJPE (cm), so trained: {'; '.join(phrases)}.",
         "The diffusions among them are captured twice: as their papers sample them, and, named so, as the mean in one step that "

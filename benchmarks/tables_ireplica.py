@@ -165,12 +165,6 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     spread = f"{groups} groups of {len(about['recordings'])} recordings"
     theirs, both = (mean(rows[name]["all"]["end_cm"]) for name in ("as published", "as published, our contacts"))
     factor = figure_of(speed, "ireplica_realtime_factor")
-    paper = [
-        f"{PAPER_END['as published'][0]:.1f}",
-        f"{PAPER_END['as published'][1]:.1f}",
-        f"{PAPER_HAND['as published']:.1f}",
-    ]
-    known = PAPER_DETECTION["the paper's, on H-contact"][0]
     beside = {name: trees[f"ireplica_{name}"] for name in PRESETS if f"ireplica_{name}" in trees}
     return Page(
         title="[iReplica](../ireplica.md): figures",
@@ -187,13 +181,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
                 "object off (cm)",
                 "contacts' AP",
             ),
-            [[label, *_headline(tree, row)] for row, label in HEADLINE.items() if row in rows]
-            + [
-                [f"**ours**, {name} sensors", *_headline(other, "ours")]
-                for name, other in beside.items()
-                if name != "typical"
-            ]
-            + [["the paper's, on its own recordings", *paper, NONE, NONE, f"{known:.3f}"]],
+            _headline_rows(tree, beside),
         ),
         held_out="People, flats and objects are those of the test split; networks were trained on the training "
         "split, and all settings were chosen on the validation split.",
@@ -232,6 +220,16 @@ def _beside(name: str, tree: Tree) -> list[Table]:
     for table in shown:
         table.title = f"{name} sensors, {table.title}"
     return shown
+
+
+def _headline_rows(tree: Tree, beside: Trees) -> list[list[str]]:
+    """Rows of the page's first table: of typical sensors, ours with others, and the paper's."""
+    rows = [[label, *_headline(tree, row)] for row, label in HEADLINE.items() if row in tree["rows"]]
+    others = {name: other for name, other in beside.items() if name != "typical"}
+    rows += [[f"**ours**, {name} sensors", *_headline(other, "ours")] for name, other in others.items()]
+    paper = [f"{value:.1f}" for value in (*PAPER_END["as published"], PAPER_HAND["as published"])]
+    known = PAPER_DETECTION["the paper's, on H-contact"][0]
+    return [*rows, ["the paper's, on its own recordings", *paper, NONE, NONE, f"{known:.3f}"]]
 
 
 def _headline(tree: Tree, row: str) -> list[str]:
