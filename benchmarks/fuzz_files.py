@@ -38,6 +38,7 @@ import foreign_bvh  # noqa: E402
 import keypoint_files  # noqa: E402
 import short_walk  # noqa: E402
 from wearcap.body.skeletons import smplh52  # noqa: E402
+from wearcap.boundary import arrays, pickles, texts  # noqa: E402
 from wearcap.geometry.camera import Camera  # noqa: E402
 from wearcap.geometry.rigid import Rigid  # noqa: E402
 from wearcap.io.datasets import (  # noqa: E402
@@ -64,14 +65,11 @@ from wearcap.io.formats import (  # noqa: E402
     hand_detections,
     motion_npz,
     mvnx,
-    npz,
     ocamcalib,
     pcd,
     ply,
-    restricted_pickle,
     scene_folder,
     smpl,
-    text,
     trajectory,
     video,
     wavefront,
@@ -362,7 +360,7 @@ READERS: dict[str, Reader] = {
         lambda folder: hps_files.write_unity(hps_files.motion(4), folder, "u"),
         lambda folder: hps.read_unity_motion(folder / "u_pose.txt", folder / "u_trans.txt"),
     ),
-    "json_text": _one("a.json", '{"a": [1, 2.5, null], "b": {"c": "x"}}', text.read_json_object),
+    "json_text": _one("a.json", '{"a": [1, 2.5, null], "b": {"c": "x"}}', texts.read_json_object),
     "keypoints_csv": _made("k.csv", _cues, keypoints.read_keypoints),
     "mocap_every": Reader(_mocap_every, mocap_every_folder.read_mocap_every_folder),
     "motion_npz": _made("m.npz", lambda path: motion_npz.write_motion(swaying_motion(4), path), motion_npz.read_motion),
@@ -373,7 +371,7 @@ READERS: dict[str, Reader] = {
     "npz": _made(
         "a.npz",
         lambda path: np.savez_compressed(path, a=np.arange(12.0), b=np.array("text"), c=np.asfortranarray(np.eye(3))),
-        npz.read_npz,
+        arrays.read_npz,
     ),
     "nymeria_xdata": _made("x.npz", _xdata, nymeria.read_xdata),
     "nymeria_metadata": Reader(
@@ -401,9 +399,9 @@ READERS: dict[str, Reader] = {
     ),
     "ply_little": _one("a.ply", _uneven_ply("little"), ply.read_ply),
     "ply_big": _one("a.ply", _uneven_ply("big"), ply.read_ply),
-    "pickle": _one("a.pkl", PICKLED, restricted_pickle.read_pickle),
-    "pickle_packed": _one("a.pkl", zlib.compress(PICKLED), restricted_pickle.read_pickle),
-    "pickle_joblib": Reader(_joblib, lambda folder: restricted_pickle.read_pickle(next(folder.glob("*.p")))),
+    "pickle": _one("a.pkl", PICKLED, pickles.read_pickle),
+    "pickle_packed": _one("a.pkl", zlib.compress(PICKLED), pickles.read_pickle),
+    "pickle_joblib": Reader(_joblib, lambda folder: pickles.read_pickle(next(folder.glob("*.p")))),
     "scan": _made("s.ply", lambda path: ply.write_ply(ply.Ply(_points(300)), path), scene_folder.read_scan),
     "scene_folder": Reader(hps_files.write_scan, scene_folder.read_scene),
     "smpl_files": _made("m.npz", _smpl, smpl.read_smpl),
@@ -414,7 +412,7 @@ READERS: dict[str, Reader] = {
     "text": _one(
         "a.txt.gz",
         gzip.compress(b"some words\nof text\n"),
-        lambda path: (text.read_text(path), list(text.numbered_lines(path))),
+        lambda path: (texts.read_text(path), list(texts.numbered_lines(path))),
     ),
     "totalcapture": Reader(
         lambda folder: totalcapture_files.write_totalcapture(folder, frames=6),

@@ -17,7 +17,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any
 
 from wearcap.errors import WearcapError
 
@@ -25,9 +24,6 @@ try:
     import fcntl
 except ModuleNotFoundError:  # Windows
     fcntl = None
-
-MAX_JSON_DEPTH = 64
-"""Deepest nesting of JSON that is read; what wearcap writes stays below 16."""
 
 _TEMPORARY = re.compile(r"\..+\.tmp-[0-9a-f]{8}(\.[^.]+)?")
 _OF_WRITES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG)
@@ -153,43 +149,6 @@ def write_text(path: str | Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def parse_json(text: str | bytes, where: str | Path) -> Any:
-    """Content of untrusted JSON text.
-
-    Raises WearcapError for text that is no JSON, not UTF-8, nested deeper than `MAX_JSON_DEPTH`, or with whole numbers
-    beyond 64 bits.
-    """
-
-    def whole_number(digits: str) -> int:
-        value = int(digits)
-        if not -(1 << 63) <= value < 1 << 64:
-            raise ValueError(f"the whole number {digits[:30]}… has more than 64 bits")
-        return value
-
-    try:
-        content = json.loads(text, parse_int=whole_number)
-    except RecursionError as error:
-        raise _too_deep(where) from error
-    except ValueError as error:  # JSONDecodeError and UnicodeDecodeError are ValueErrors
-        raise WearcapError(f"not readable JSON ({error})"[:300], where, "a whole JSON text") from error
-    level = [content]
-    for _ in range(MAX_JSON_DEPTH):
-        level = [
-            inner
-            for outer in level
-            if isinstance(outer, dict | list)
-            for inner in (outer.values() if isinstance(outer, dict) else outer)
-            if isinstance(inner, dict | list)
-        ]
-        if not level:
-            return content
-    raise _too_deep(where)
-
-
-def _too_deep(where: str | Path) -> WearcapError:
-    return WearcapError("JSON that is nested too deeply", where, f"at most {MAX_JSON_DEPTH} levels")
-
-
 def sha256_of(path: str | Path) -> str:
     """Hex digest of a file's bytes."""
     with open(path, "rb") as file:
@@ -238,11 +197,15 @@ def _key(path: Path) -> Key:
     return str(path.resolve()), found.st_size, found.st_mtime_ns, found.st_ino
 
 
-def _ledger_path() -> Path:
-    """Cache of checksums in $WEARCAP_CACHE, else in `wearcap` in the user's cache folder."""
+def cache_folder() -> Path:
+    """$WEARCAP_CACHE, else `wearcap` in the user's cache folder."""
     if chosen := os.environ.get("WEARCAP_CACHE"):
-        return Path(chosen) / "sha256.jsonl"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "wearcap" / "sha256.jsonl"
+        return Path(chosen)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "wearcap"
+
+
+def _ledger_path() -> Path:
+    return cache_folder() / "sha256.jsonl"
 
 
 @cache

@@ -13,12 +13,12 @@ import torch
 
 from foreign_bvh import CONVENTIONS, walk, write
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
+from wearcap.boundary.texts import read_bytes
 from wearcap.cli import prepare as verb
 from wearcap.cli.conf import compose, splits_dir
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.datasets.amass import write_amass
-from wearcap.io.formats.text import read_bytes
 from wearcap.prepare import Splits, check_recording
 from wearcap.prepare.mocap import About, CleaningLimits, MocapSettings, foot_patches, mocap_recording, without_glitches
 from wearcap.prepare.mocap_sources import amass_tasks, bvh_tasks, cmu_tasks

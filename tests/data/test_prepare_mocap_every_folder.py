@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+from wearcap.boundary.pickles import read_pickle
 from wearcap.cli import prepare as verb
 from wearcap.cli.main import run_verb
-from wearcap.io.formats.restricted_pickle import read_pickle
 from wearcap.recording import RecordingStore
 
 

@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from wearcap.body.skeleton import xsens23
+from wearcap.boundary.arrays import read_npz, require
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.motion_npz import read_motion, write_motion
-from wearcap.io.formats.npz import read_npz, require
 from wearcap.recording import Motion
 from wearcap.recording.motion import Interactions
 

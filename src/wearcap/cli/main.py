@@ -8,8 +8,8 @@ import sys
 import traceback
 
 from wearcap import __version__
+from wearcap.boundary.limits import VARIABLE, gib_bytes
 from wearcap.errors import WearcapError, nearest
-from wearcap.io.formats.bounded import VARIABLE, gib_bytes
 
 VERBS = "train evaluate capture live export prepare view render annotate scene calibrate track doctor demo".split()  # noqa: SIM905
 """Verbs in the order of the help, each a module."""

@@ -11,6 +11,8 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from wearcap.body.skeleton import xsens23
+from wearcap.boundary.arrays import read_npz
+from wearcap.boundary.texts import read_json_object
 from wearcap.doctor.agreement import (
     check_camera,
     check_claps,
@@ -37,10 +39,8 @@ from wearcap.io.devices.aria_mps import find_mps_file, is_mps_folder, read_close
 from wearcap.io.devices.headset_log import is_headset_log
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.io.formats.mvnx import read_mvnx
-from wearcap.io.formats.npz import read_npz
 from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply
-from wearcap.io.formats.text import read_json_object
 from wearcap.io.formats.trajectory import read_trajectory_file, trajectory_file
 from wearcap.prepare.foreign import read_foreign_motion
 from wearcap.recording import FloorTrack, HeadStream, Motion, PointCloud, Recording, RecordingStore

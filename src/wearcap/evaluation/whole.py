@@ -21,9 +21,10 @@ from typing import Any
 from rich.table import Table
 
 import wearcap
+from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError
 from wearcap.evaluation.evaluate import Measure, evaluate
-from wearcap.files import parse_json, remembered_sha256, write_text
+from wearcap.files import remembered_sha256, write_text
 from wearcap.io.formats.scene_folder import cloud_file
 from wearcap.locks import folder_lock
 from wearcap.metrics.table import TRUTH, Row, decimals

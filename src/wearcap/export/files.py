@@ -18,8 +18,9 @@ import torch
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
+from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError
-from wearcap.files import atomic_path, parse_json, sha256_of, write_text
+from wearcap.files import atomic_path, sha256_of, write_text
 from wearcap.runtime.graphs import Exports, Graph, Run, missing_libraries, open_onnx, program, quiet
 
 VERSION = 6

@@ -2,7 +2,7 @@
 
 `formats/` are files that programs exchange, `devices/` what wearables write, `datasets/` public data sets. What a reader
 returns is metric, z up and checked; errors name the file, what was expected and what to do. Open
-`formats/poses.py` first, a small whole one. Shared by all: `bounded.py`, `text.py`, `npz.py`, `csv_table.py`,
-`restricted_pickle.py`, and `smpl.py`, which converts SMPL's axes to wearcap's. wearcap's own files: `motion_npz.py`,
+`formats/poses.py` first, a small whole one. Bytes come in through
+`wearcap.boundary`. Shared by all: `csv_table.py`, and `smpl.py`, which converts SMPL's axes to wearcap's. wearcap's own files: `motion_npz.py`,
 `environment.py`, `camera_json.py`.
 """

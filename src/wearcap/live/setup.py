@@ -19,14 +19,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS, Site, Skeleton, skeleton_of_height
+from wearcap.boundary.opening import placed, understood
+from wearcap.boundary.texts import read_json_object
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
 from wearcap.io.devices.aria_mps import T_HEAD_DEVICE
 from wearcap.io.devices.axes import wrist_of_hand
 from wearcap.io.devices.headset_log import PALM_M
-from wearcap.io.formats.bounded import placed, understood
-from wearcap.io.formats.text import read_json_object
 
 MAX_SEATS, MAX_JOINTS, MAX_NOTES = 64, 256, 100
 """Most seats, joints and notes of a file."""

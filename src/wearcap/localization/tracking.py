@@ -14,6 +14,7 @@ from jaxtyping import Float64, UInt8
 from PIL import Image
 from torch import Tensor
 
+from wearcap.boundary.texts import read_json
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, write_text
 from wearcap.geometry.camera import Camera
@@ -22,7 +23,6 @@ from wearcap.io.formats.camera_json import camera_row, write_camera
 from wearcap.io.formats.colmap import ColmapModel, read_colmap
 from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.io.formats.poses import write_tum
-from wearcap.io.formats.text import read_json
 from wearcap.io.formats.video import SUFFIXES, read_frames, read_image, video_info
 from wearcap.localization.point_map import check_size
 from wearcap.localization.structure import Advance, MappingSettings, map_pictures

@@ -13,8 +13,9 @@ import torch
 from jaxtyping import Float32, Int8, Int32, Int64
 from safetensors.numpy import save
 
+from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError
-from wearcap.files import atomic_path, parse_json
+from wearcap.files import atomic_path
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.localization.features import Extractor, GlobalDescriptor, Vlad

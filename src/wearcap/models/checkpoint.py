@@ -17,8 +17,9 @@ import torch
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
+from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError, nearest
-from wearcap.files import atomic_path, parse_json, resource
+from wearcap.files import atomic_path, resource
 from wearcap.models.build import build, check_config
 
 Network = TypeVar("Network", bound=nn.Module)

@@ -15,8 +15,8 @@ from wearcap.body.joint_matching import convention
 from wearcap.body.position_fit import fit_positions
 from wearcap.body.retarget import fit_offsets, retarget
 from wearcap.body.skeleton import xsens23
+from wearcap.boundary.opening import placed
 from wearcap.errors import WearcapError
-from wearcap.io.formats.bounded import placed
 from wearcap.io.formats.bvh import axes_rotation
 from wearcap.prepare.foreign_conventions import (
     Mapping,

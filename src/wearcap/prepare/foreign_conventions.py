@@ -11,9 +11,9 @@ from torch import Tensor
 from wearcap.body.foreign_tree import LIMBS, SIDES
 from wearcap.body.joint_matching import BodyJoints, joints_by_name, joints_by_topology
 from wearcap.body.skeleton import xsens23
+from wearcap.boundary.texts import read_yaml_object
 from wearcap.errors import WearcapError, nearest
 from wearcap.io.formats.bvh import HEIGHT_M, UNITS_M
-from wearcap.io.formats.text import read_yaml_object
 from wearcap.prepare.foreign_files import BALL_OF_FOOT, Take
 
 USUAL_HEIGHT_M = (1.25, 2.15)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from wearcap.boundary.arrays import read_npz
 from wearcap.doctor.logs import is_kit, log_kind, read_kit, read_table
 from wearcap.errors import WearcapError
 from wearcap.io.datasets.adt import is_adt, read_adt
@@ -12,7 +13,6 @@ from wearcap.io.datasets.nymeria import is_nymeria, read_nymeria, read_xdata
 from wearcap.io.datasets.totalcapture import is_totalcapture, read_totalcapture, totalcapture_files
 from wearcap.io.devices.aria_mps import head_stream, is_mps_folder, read_closed_loop, read_mps
 from wearcap.io.formats.motion_npz import motion_files, read_motion, read_sections
-from wearcap.io.formats.npz import read_npz
 from wearcap.io.formats.trajectory import trajectory_format
 from wearcap.prepare.foreign import read_foreign_motion
 from wearcap.prepare.logs import HeadsetSettings, TrajectorySettings, read_path

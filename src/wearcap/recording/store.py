@@ -13,8 +13,9 @@ import safetensors
 from safetensors.torch import save
 from torch import Tensor
 
+from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError, require_choice
-from wearcap.files import atomic_path, parse_json, remembered_sha256, sha256_of, write_text
+from wearcap.files import atomic_path, remembered_sha256, sha256_of, write_text
 from wearcap.recording.recording import Recording
 from wearcap.recording.serialize import dumps, flatten, require_part, unflatten
 

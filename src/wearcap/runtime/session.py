@@ -22,8 +22,9 @@ from jaxtyping import Float
 from safetensors.torch import load, save
 from torch import Tensor
 
+from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError
-from wearcap.files import atomic_path, parse_json
+from wearcap.files import atomic_path
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
 from wearcap.runtime.stages import digest

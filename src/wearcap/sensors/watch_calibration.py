@@ -26,13 +26,13 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS
+from wearcap.boundary.opening import understood
+from wearcap.boundary.texts import read_json_object
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry import rotation
 from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
 from wearcap.geometry.trajectory import Trajectory, interpolate
-from wearcap.io.formats.bounded import understood
-from wearcap.io.formats.text import read_json_object
 from wearcap.recording.recording import FloorTrack, HeadStream, ImuStream, PointCloud, Recording
 from wearcap.sensors.camera_alignment import HeadMount, SlamAlignment
 from wearcap.sensors.clock import Clock, SwingClock, fit_swing_clock, swing_peaks

@@ -17,12 +17,12 @@ import torch
 from jaxtyping import Float32, Float64
 
 from wearcap.body.kinematics import site_positions
+from wearcap.boundary.texts import read_json
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, write_text
 from wearcap.io.formats.contact_labels import LabelClock, Labels, annotation_of, hcontact_text, labels_of, parse_labels
 from wearcap.io.formats.environment import read_environment
 from wearcap.io.formats.motion_npz import read_motion
-from wearcap.io.formats.text import read_json
 from wearcap.io.formats.video import video_info
 from wearcap.recording.motion import HANDS, Interactions, Motion
 from wearcap.recording.recording import Recording

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from wearcap.boundary.opening import understood
+from wearcap.boundary.texts import read_json_object
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.devices.aria_mps import head_stream, read_closed_loop, turn_up
-from wearcap.io.formats.bounded import understood
 from wearcap.io.formats.csv_table import read_columns
 from wearcap.io.formats.poses import check_finite, check_rising, checked_trajectory
-from wearcap.io.formats.text import read_json_object
 from wearcap.recording import Cue, Recording
 
 _BODY = {

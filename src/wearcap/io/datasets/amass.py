@@ -13,11 +13,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.skeletons import smplh52, smplx22
+from wearcap.boundary.arrays import read_npz, require
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 from wearcap.geometry import rotation
 from wearcap.io.formats.motion_npz import even_frames, nominal_fps
-from wearcap.io.formats.npz import read_npz, require
 from wearcap.io.formats.smpl import A, shape_from_arrays, smpl_motion
 from wearcap.recording import Motion, Recording
 

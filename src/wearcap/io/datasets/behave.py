@@ -15,18 +15,18 @@ import torch
 from jaxtyping import Float64
 
 from wearcap.body.skeletons import smplh52
+from wearcap.boundary.arrays import read_npz, require
+from wearcap.boundary.opening import understood
+from wearcap.boundary.texts import read_json
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.amass import PELVIS_SMPLH
 from wearcap.io.datasets.one_object import OneObject
-from wearcap.io.formats.bounded import understood
-from wearcap.io.formats.npz import read_npz, require
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import check_rising
 from wearcap.io.formats.smpl import shape_from_betas, smpl_motion
-from wearcap.io.formats.text import read_json
 from wearcap.scene.objects import centered, check_object_mesh
 
 FPS = 30

@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 import torch
 
+from wearcap.boundary.opening import understood
+from wearcap.boundary.texts import read_json
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.hcontact import about_sequence, read_smpl_json
 from wearcap.io.datasets.hps import read_hps_subject, subject_of
-from wearcap.io.formats.bounded import understood
 from wearcap.io.formats.contact_labels import LabelClock, interactions_of, labels_of, parse_labels
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import checked_trajectory
-from wearcap.io.formats.text import read_json
 from wearcap.recording.motion import HANDS, Interactions
 from wearcap.recording.recording import Recording
 from wearcap.scene.objects import Environment, Freedom, SceneObject

@@ -6,7 +6,6 @@ up, joint frames are SMPL's (x left, y up, z forward) as in AMASS, but `transl` 
 Fingers may be relative to SMPL+H's mean hand, which the files do not state.
 """
 
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,15 +14,14 @@ import numpy as np
 import torch
 
 from wearcap.body.skeletons import smpl24, smplh52
+from wearcap.boundary.arrays import read_packed_json, require
+from wearcap.boundary.opening import understood
+from wearcap.boundary.texts import read_json
 from wearcap.errors import WearcapError
-from wearcap.files import parse_json
 from wearcap.io.datasets.hps import subject_of
-from wearcap.io.formats.bounded import Budget, counted, file_size, understood
 from wearcap.io.formats.contact_labels import LabelClock, read_contact_labels
-from wearcap.io.formats.npz import readable, require
 from wearcap.io.formats.poses import check_rising
 from wearcap.io.formats.smpl import shape_from_betas, smpl_motion
-from wearcap.io.formats.text import MAX_JSON_BYTES, read_json
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 from wearcap.scene.objects import CONTACT_CLASSES
@@ -46,18 +44,7 @@ def read_smpl_json(path: str | Path) -> tuple[Motion, dict[str, float]]:
     Raises WearcapError for what is damaged, missing or misshapen, for NaN, and for times that do not rise.
     """
     path = Path(path)
-    if path.suffix == ".zip":
-        budget = Budget(path, file_size(path), MAX_JSON_BYTES)
-        with readable(".json.zip", path, _EXPECTED), zipfile.ZipFile(path) as archive:
-            members = [
-                info for info in archive.infolist() if not info.is_dir() and not info.filename.startswith("__MACOSX")
-            ]
-            if len(members) != 1:
-                raise WearcapError(f"an archive of {len(members)} files", path, "one JSON file")
-            with archive.open(members[0]) as file, counted(file, budget) as reader:
-                content = parse_json(reader.read(), path)
-    else:
-        content = read_json(path)
+    content = read_packed_json(path, _EXPECTED) if path.suffix == ".zip" else read_json(path)
     frames, about = _frames(content, path)
     arrays = {}
     for name in ("time", *_SIZES):

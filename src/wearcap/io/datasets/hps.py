@@ -32,19 +32,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.skeletons import smpl24
+from wearcap.boundary.arrays import require
+from wearcap.boundary.opening import placed, understood
+from wearcap.boundary.pickles import read_pickled_dict
+from wearcap.boundary.texts import at_line, finite_floats, numbered_lines, read_json, read_json_object
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import about_axis, matrix_from_quat_wxyz
-from wearcap.io.formats.bounded import placed, understood
 from wearcap.io.formats.mvnx import read_mvnx
-from wearcap.io.formats.npz import require
 from wearcap.io.formats.ocamcalib import read_sensor_frame
 from wearcap.io.formats.poses import NORM_TOLERANCE
-from wearcap.io.formats.restricted_pickle import read_pickled_dict
 from wearcap.io.formats.smpl import A, shape_from_betas, smpl_motion
-from wearcap.io.formats.text import at_line, finite_floats, numbered_lines, read_json, read_json_object
 from wearcap.io.formats.video import video_info
 from wearcap.recording import CameraStream, ImuStream, Localization, Motion, Recording
 from wearcap.scene.scan import Photo

@@ -14,18 +14,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS
+from wearcap.boundary.arrays import require
+from wearcap.boundary.opening import understood
+from wearcap.boundary.pickles import read_pickle, read_pickled_dict
+from wearcap.boundary.texts import finite_floats, read_text, read_yaml_object
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.hps import nominal_mount
 from wearcap.io.devices.watch_log import read_watch_log
-from wearcap.io.formats.bounded import understood
-from wearcap.io.formats.npz import require
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import checked_trajectory
-from wearcap.io.formats.restricted_pickle import read_pickle, read_pickled_dict
-from wearcap.io.formats.text import finite_floats, read_text, read_yaml_object
 from wearcap.io.formats.video import video_info
 from wearcap.recording import CameraStream, HeadStream, ImuStream, PointCloud, Recording
 

@@ -11,6 +11,9 @@ import torch
 
 from wearcap.body.kinematics import local_rotations
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
+from wearcap.boundary.arrays import read_npz, require
+from wearcap.boundary.opening import placed
+from wearcap.boundary.texts import read_json_object
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
@@ -18,9 +21,6 @@ from wearcap.geometry.trajectory import Trajectory, interpolate, nearest_frames,
 from wearcap.io.devices.aria_mps import T_HEAD_DEVICE, find_mps_file, head_stream, read_closed_loop, read_mps_points
 from wearcap.io.devices.aria_vrs import extract_video
 from wearcap.io.devices.head_alignment import align_head, clock_offset
-from wearcap.io.formats.bounded import placed
-from wearcap.io.formats.npz import read_npz, require
-from wearcap.io.formats.text import read_json_object
 from wearcap.recording import ContactTrack, HeadStream, Motion, Recording
 
 SUIT_HZ = 240.0

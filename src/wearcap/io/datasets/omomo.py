@@ -17,14 +17,14 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from wearcap.body.skeletons import smplx22
+from wearcap.boundary.arrays import require
+from wearcap.boundary.pickles import read_pickled_dict
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.amass import PELVIS_SMPLX
 from wearcap.io.datasets.one_object import OneObject
-from wearcap.io.formats.npz import require
 from wearcap.io.formats.poses import are_rotations
-from wearcap.io.formats.restricted_pickle import read_pickled_dict
 from wearcap.io.formats.smpl import shape_from_arrays, smpl_motion
 from wearcap.io.formats.wavefront import read_obj
 from wearcap.scene.objects import centered, check_object_mesh

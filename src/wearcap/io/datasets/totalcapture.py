@@ -20,10 +20,10 @@ from torch import Tensor
 
 from wearcap.body.kinematics import local_rotations
 from wearcap.body.skeleton import Skeleton
+from wearcap.boundary.texts import at_line, finite_floats, numbered_lines
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import matrix_from_quat_wxyz
 from wearcap.io.formats.poses import NORM_TOLERANCE
-from wearcap.io.formats.text import at_line, finite_floats, numbered_lines
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import ImuStream
 

@@ -10,11 +10,11 @@ import torch
 from jaxtyping import UInt8
 from PIL import Image
 
+from wearcap.boundary.opening import file_size
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.devices.aria_mps import R_CPF_DEVICE, T_HEAD_DEVICE
-from wearcap.io.formats.bounded import file_size
 from wearcap.io.formats.video import write_frames
 from wearcap.recording import CameraStream
 

@@ -20,14 +20,14 @@ import numpy as np
 import torch
 
 from wearcap.body.skeleton import WRISTS
+from wearcap.boundary.limits import LIMITS
+from wearcap.boundary.opening import open_bytes, understood
+from wearcap.boundary.texts import numbered_lines, parse_json, read_json
 from wearcap.errors import WearcapError
-from wearcap.files import parse_json
 from wearcap.geometry.rotation import matrix_from_quat_wxyz
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.devices.axes import CONVENTIONS, detected_convention, turned, wrist_of_hand
-from wearcap.io.formats.bounded import open_bytes, understood
 from wearcap.io.formats.poses import check_finite, checked_trajectory
-from wearcap.io.formats.text import numbered_lines, read_json
 from wearcap.io.formats.trajectory import UNITS, check_span, time_unit_of
 
 PALM_M = 0.08
@@ -68,7 +68,7 @@ _OTHER = {
     "trigger",
 }
 _UNIT_WORDS = {"s": "s", "sec": "s", "seconds": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"}
-_MAX_COLUMNS = 2000
+_MAX_COLUMNS = LIMITS["log"].items
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,10 @@ import numpy as np
 import torch
 
 from wearcap.body.skeleton import WRISTS
+from wearcap.boundary.opening import understood
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import matrix_from_quat_wxyz
 from wearcap.geometry.trajectory import slerp
-from wearcap.io.formats.bounded import understood
 from wearcap.io.formats.csv_table import read_columns, read_header
 from wearcap.io.formats.poses import check_finite
 from wearcap.recording import ImuStream

@@ -19,17 +19,18 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.body.skeleton import Site, Skeleton
+from wearcap.boundary.limits import LIMITS
+from wearcap.boundary.opening import understood
+from wearcap.boundary.texts import at_line, finite_floats, numbered_lines
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis
-from wearcap.io.formats.bounded import understood
-from wearcap.io.formats.text import at_line, finite_floats, numbered_lines
 from wearcap.recording.motion import Motion
 
 R_WORLD_FILE = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
 """Rotation of the file's axes (x left, y up, z forward) into wearcap's (x forward, y left, z up)."""
 
 INCH_M = 0.0254
-MAX_BONES = 2000
+MAX_BONES = LIMITS["asf"].items
 ROTATIONS = ("rx", "ry", "rz")
 SIDES = {"l": "left", "r": "right"}
 END_SITES = {"toes": "toe_tip", "fingers": "fingertip", "thumb": "thumb_tip"}

@@ -19,15 +19,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.skeleton import Site, Skeleton
+from wearcap.boundary.limits import LIMITS
+from wearcap.boundary.texts import at_line, finite_floats, numbered_lines
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry.rotation import about_axis
 from wearcap.io.formats.motion_npz import even_frames, nominal_fps
-from wearcap.io.formats.text import at_line, finite_floats, numbered_lines
 from wearcap.recording.motion import Motion
 
 _CHANNELS = {f"{axis}{kind}": (kind[0], axis) for axis in "xyz" for kind in ("position", "rotation")}
-MAX_JOINTS = 2000
+MAX_JOINTS = LIMITS["bvh"].items
 _MAX_WORDS = 64
 """Most words of a joint's name."""
 _END_SITE = -1

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from wearcap.boundary.opening import placed, understood
+from wearcap.boundary.texts import read_json
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.io.formats.bounded import placed, understood
 from wearcap.io.formats.poses import are_rotations
-from wearcap.io.formats.text import read_json
 from wearcap.scene.scan import Photo
 
 _NUMBERS = ("fx", "fy", "cx", "cy")

@@ -17,15 +17,13 @@ import roma
 import torch
 from jaxtyping import Float32, Float64, Int64, UInt8
 
+from wearcap.boundary.opening import read_bytes, understood
+from wearcap.boundary.texts import at_line, finite_floats, numbered_lines
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.io.formats.bounded import read_bytes, understood
-from wearcap.io.formats.text import at_line, finite_floats, numbered_lines
 from wearcap.scene.scan import Photo
 
-_MAX_BYTES = 1 << 34
-"""Largest binary file that is read (16 GiB)."""
 _MODELS = {
     "SIMPLE_PINHOLE": ("pinhole", 3),
     "PINHOLE": ("pinhole", 4),
@@ -238,7 +236,7 @@ class _Cursor:
     """Reads structures one after another; errors name the part of the file that ended too early."""
 
     def __init__(self, path: Path):
-        self.path, self.data, self.place = path, read_bytes(path, usual=_MAX_BYTES), 0
+        self.path, self.data, self.place = path, read_bytes(path, "colmap"), 0
 
     def take(self, form: str, part: str) -> tuple:
         try:

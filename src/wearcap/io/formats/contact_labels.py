@@ -16,9 +16,9 @@ from typing import Any
 from jaxtyping import Float64
 from torch import Tensor
 
+from wearcap.boundary.opening import understood
+from wearcap.boundary.texts import read_json
 from wearcap.errors import WearcapError
-from wearcap.io.formats.bounded import understood
-from wearcap.io.formats.text import read_json
 from wearcap.recording.motion import HANDS, Interactions
 from wearcap.scene.objects import CONTACT_CLASSES
 

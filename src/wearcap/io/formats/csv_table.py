@@ -11,33 +11,21 @@ from typing import Any
 
 import numpy as np
 
+from wearcap.boundary.opening import open_bytes, understood
+from wearcap.boundary.texts import bounded_lines
 from wearcap.errors import WearcapError
-from wearcap.io.formats.bounded import open_bytes, understood
-
-MAX_BYTES = 1 << 31
-"""Largest table that is taken into memory as a whole (2 GiB: two hours of poses at 1 kHz)."""
-MAX_STREAMED_BYTES = 1 << 36
-"""Largest table that is read in chunks (64 GiB)."""
-MAX_LINE = 1 << 16
 
 
 @contextmanager
-def open_text(path: str | Path, usual: int = MAX_BYTES) -> Iterator[Iterator[str]]:
+def open_text(path: str | Path, kind: str = "table") -> Iterator[Iterator[str]]:
     """Lines of a text file (UTF-8), unpacked by its suffix.
 
-    Raises WearcapError as `open_bytes` does, for what is no text and for lines longer than `MAX_LINE`; errors that show
+    Raises WearcapError as `open_bytes` does, for what is no text and for lines that are too long; errors that show
     only while reading inside the `with` block are named too.
     """
-
-    def lines(file: io.TextIOWrapper) -> Iterator[str]:
-        while line := file.readline(MAX_LINE):
-            if len(line) == MAX_LINE:
-                raise WearcapError(f"a line longer than {MAX_LINE} characters", path, "a table as text")
-            yield line
-
-    with understood("not a text file", path, "UTF-8 text", errors=UnicodeDecodeError):  # noqa: SIM117
-        with open_bytes(path, usual=usual) as file:
-            yield lines(io.TextIOWrapper(file, "utf-8", newline=""))
+    with understood("not a text file", path, "UTF-8 text", errors=UnicodeDecodeError), open_bytes(path, kind) as file:
+        lines = bounded_lines(io.TextIOWrapper(file, "utf-8", newline=""), path, kind)
+        yield (line for _, line in lines)
 
 
 def load_rows(lines: Iterable[str], what: str, where: str | Path, expected: str = "", **options: Any) -> np.ndarray:
@@ -85,7 +73,7 @@ def iter_columns(
             raise WearcapError(f"no column {name!r}", path, f"the columns {', '.join(wanted)}", fix)
     kinds = dict.fromkeys(columns, "f8") | dict.fromkeys(text, "S64") | dict.fromkeys(whole, "i8")
     done = 0
-    with open_text(path, MAX_BYTES if rows is None else MAX_STREAMED_BYTES) as file:
+    with open_text(path, "table" if rows is None else "streamed table") as file:
         next(file)
         while True:
             table = load_rows(

@@ -11,14 +11,14 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from wearcap.boundary.opening import placed
+from wearcap.boundary.texts import read_json
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
-from wearcap.io.formats.bounded import placed
 from wearcap.io.formats.ply import Ply, read_ply, write_ply
 from wearcap.io.formats.poses import are_rotations
-from wearcap.io.formats.text import read_json
 from wearcap.scene.objects import FREEDOMS, Environment, Freedom, SceneObject
 
 SCHEMA = 1

@@ -19,11 +19,11 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from wearcap.boundary.arrays import read_npz, require
+from wearcap.boundary.opening import understood
+from wearcap.boundary.texts import read_json, read_json_object
 from wearcap.errors import WearcapError
-from wearcap.io.formats.bounded import understood
 from wearcap.io.formats.csv_table import read_columns
-from wearcap.io.formats.npz import read_npz, require
-from wearcap.io.formats.text import read_json, read_json_object
 from wearcap.recording.motion import HANDS
 
 _BOX = ("x1", "y1", "x2", "y2")

@@ -14,11 +14,12 @@ import torch
 from jaxtyping import Int64
 from torch import Tensor
 
+from wearcap.boundary.arrays import read_npz, require
+from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError
-from wearcap.files import atomic_path, parse_json
+from wearcap.files import atomic_path
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import nearest_frames
-from wearcap.io.formats.npz import read_npz, require
 from wearcap.recording.motion import HANDS, Motion
 from wearcap.recording.serialize import dumps, flatten, unflatten
 from wearcap.recording.timing import joined

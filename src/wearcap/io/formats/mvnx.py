@@ -19,16 +19,15 @@ from torch import Tensor
 
 from wearcap.body.kinematics import local_rotations
 from wearcap.body.skeleton import FOOT_PATCHES, Site, Skeleton, xsens23
+from wearcap.boundary.limits import LIMITS
+from wearcap.boundary.opening import open_bytes, understood
+from wearcap.boundary.texts import finite_floats, plain_xml, tag_of
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import matrix_from_quat_wxyz
-from wearcap.io.formats.bounded import open_bytes, understood
-from wearcap.io.formats.text import finite_floats, plain_xml, tag_of
 from wearcap.recording import ImuStream, Motion, Recording
 
-MAX_BYTES = 1 << 34
-"""Largest unpacked file that is read (16 GiB: two hours at 240 Hz)."""
-_MAX_ELEMENTS = 100_000
-_CHUNK, _MAX_SILENCE = 1 << 16, 1 << 26
+_LIMITS = LIMITS["mvnx"]
+_CHUNK = 1 << 16
 _MAX_NUMBER = 64
 """Most characters of a number."""
 
@@ -147,7 +146,7 @@ class _File:
         return torch.from_numpy(np.stack(self.frames[name])).unflatten(1, (-1, width))
 
 
-def read_mvnx(path: str | Path, max_bytes: int | None = None) -> Recording:
+def read_mvnx(path: str | Path) -> Recording:
     """Read an .mvnx file (plain, .gz or .xz): `motion` (xsens23 with the wearer's bones, contacts in FOOT_PATCHES order)
     and the sensors as `imu` streams named by their joint.
 
@@ -158,15 +157,15 @@ def read_mvnx(path: str | Path, max_bytes: int | None = None) -> Recording:
     with (
         understood("cannot be understood", path, "MVNX", errors=(ValueError, LookupError)),
         plain_xml(path, "MVNX file as MVN exports it"),
-        open_bytes(path, max_bytes, MAX_BYTES) as source,
+        open_bytes(path, "mvnx") as source,
     ):
         chunks, frames, kept = _Chunks(source), None, 0
         for event, element in iterparse(chunks, events=("start", "end"), forbid_dtd=True):
             chunks.restart()
             name = tag_of(element)
             kept += event == "start"
-            if kept > _MAX_ELEMENTS:
-                raise ValueError(f"more than {_MAX_ELEMENTS} elements beside its frames")
+            if kept > _LIMITS.items:
+                raise ValueError(f"more than {_LIMITS.items} elements beside its frames")
             if event == "start" and name == "frames":
                 frames = element
             elif (event == "start" and name == "subject") or (
@@ -188,8 +187,8 @@ class _Chunks:
     def read(self, _size: int) -> bytes:
         content = self._source.read(self._size)
         self._size *= 2
-        if self._size > _MAX_SILENCE:
-            raise ValueError(f"{_MAX_SILENCE} bytes without an element")
+        if self._size > _LIMITS.line:
+            raise ValueError(f"{_LIMITS.line} bytes without an element")
         return content
 
     def restart(self) -> None:

@@ -14,15 +14,13 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from defusedxml.ElementTree import fromstring
 
+from wearcap.boundary.opening import understood
+from wearcap.boundary.texts import finite_floats, plain_xml, read_text, tag_of
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
-from wearcap.io.formats.bounded import understood
-from wearcap.io.formats.text import finite_floats, plain_xml, read_text, tag_of
 
 _POWERS = 10
 """Number of coefficients (k1…k10): NavVis' lenses are fitted within 0.002 px at 4592 px width."""
-_MAX_BYTES = 1 << 24
-"""Largest calibration that is read (16 MiB; they take kilobytes)."""
 _MAX_SIDE = 1 << 20
 """Largest width and height of an image (pixels)."""
 _MAX_MISFIT_PX = 0.5
@@ -104,7 +102,7 @@ def read_sensor_frame(path: str | Path) -> dict[str, OCamModel]:
     Raises WearcapError for damaged XML, document types and entities, no cameras, and naming the camera for missing
     or wrong numbers.
     """
-    text = read_text(path, usual=_MAX_BYTES)
+    text = read_text(path, "lens")
     with (
         understood("cannot be understood", path, "a sensor_frame.xml", errors=ValueError),
         plain_xml(path, "sensor_frame.xml"),

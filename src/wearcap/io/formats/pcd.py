@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from wearcap.boundary.opening import read_bytes, understood
 from wearcap.errors import WearcapError
-from wearcap.io.formats.bounded import read_bytes, understood
 from wearcap.io.formats.csv_table import load_rows
 from wearcap.io.formats.ply import Ply
 

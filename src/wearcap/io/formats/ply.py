@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 
+from wearcap.boundary.opening import read_bytes, understood
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 from wearcap.geometry.mesh import Mesh
-from wearcap.io.formats.bounded import read_bytes, understood
 
 _CODES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 _C_NAMES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")

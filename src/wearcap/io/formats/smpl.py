@@ -15,10 +15,10 @@ from torch import Tensor
 
 from wearcap.body.skeleton import Skeleton
 from wearcap.body.smpl_body import SmplArrays
+from wearcap.boundary.arrays import read_npz, require
+from wearcap.boundary.pickles import read_pickle
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.formats.npz import read_npz, require
-from wearcap.io.formats.restricted_pickle import read_pickle
 from wearcap.recording.motion import Motion
 
 A = torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64)

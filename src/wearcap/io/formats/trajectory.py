@@ -22,15 +22,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from wearcap.boundary.arrays import read_npy, read_npz
+from wearcap.boundary.opening import open_bytes
+from wearcap.boundary.texts import numbered_lines
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.formats.bounded import open_bytes
 from wearcap.io.formats.colmap import read_image_poses
 from wearcap.io.formats.csv_table import read_columns
-from wearcap.io.formats.npz import read_npy, read_npz
 from wearcap.io.formats.poses import are_rotations, check_finite, checked_trajectory, row_name
-from wearcap.io.formats.text import numbered_lines
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Seconds per unit of time."""

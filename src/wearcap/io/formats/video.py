@@ -21,9 +21,10 @@ from av.video.stream import VideoStream
 from jaxtyping import UInt8
 from PIL import Image
 
+from wearcap.boundary.limits import Budget
+from wearcap.boundary.opening import file_size, read_bytes, understood
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
-from wearcap.io.formats.bounded import Budget, file_size, read_bytes, understood
 
 FORMATS = ("BMP", "JPEG", "PNG", "PPM", "TIFF", "WEBP")
 _PIXEL_BYTES = 4
@@ -41,7 +42,7 @@ def open_image(path: str | Path) -> Iterator[Image.Image]:
     Raises WearcapError, while opening or inside the `with` block, when the file is missing, none of `FORMATS`, damaged,
     or unpacks to more than `Budget` allows.
     """
-    budget = Budget(path, file_size(path, "picture"))
+    budget = Budget(path, "file", file_size(path, "picture"))
     content = io.BytesIO(read_bytes(path))  # no chunk of it can be longer than what is there
     with understood("not a readable picture", path, "a JPEG or PNG file", "Copy it again.", errors=_DAMAGE):  # noqa: SIM117
         with Image.open(content, formats=FORMATS) as image:

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
+from wearcap.boundary.texts import at_line, numbered_lines
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.io.formats.ply import GREY
-from wearcap.io.formats.text import at_line, numbered_lines
 
 _LARGEST = float(np.finfo(np.float32).max)
 

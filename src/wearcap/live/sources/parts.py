@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS
+from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError
-from wearcap.files import parse_json
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.devices.axes import CONVENTIONS
 from wearcap.live.packets import CAMERA, HEAD, SUIT

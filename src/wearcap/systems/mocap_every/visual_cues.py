@@ -14,13 +14,13 @@ from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from wearcap.body.skeleton import FEET, FOOT_JOINTS
+from wearcap.boundary.arrays import read_npz, require
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import nearest_frames
 from wearcap.io.formats.motion_npz import read_motion, write_motion
-from wearcap.io.formats.npz import read_npz, require
 from wearcap.models.checkpoint import load_trained
 from wearcap.recording import Motion, Recording
 from wearcap.recording.recording import Cue

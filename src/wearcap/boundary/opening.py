@@ -1,73 +1,22 @@
-"""Boundary check of untrusted files: only regular files are read, unpacked up to a limit that the user can raise.
-
-A compressed file of kilobytes may unpack to more than all memory. Bytes read are counted against a limit of size and,
-beyond `FREE_BYTES`, of the ratio to the packed bytes. `wearcap --max-file-gib N` (for worker processes the environment
-variable `WEARCAP_MAX_FILE_GIB`) or a reader's `max_bytes` replaces both limits.
-"""
+"""Opening what strangers hand over: regular files only, unpacked within the limits of their kind, and errors that name them."""
 
 import gzip
 import io
 import lzma
-import math
 import os
 import stat
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
+from wearcap.boundary.limits import Budget
 from wearcap.errors import WearcapError
 
-VARIABLE = "WEARCAP_MAX_FILE_GIB"
-MAX_BYTES = 1 << 32
-"""Largest unpacked size of one file unless its reader sets another (4 GiB)."""
-FREE_BYTES = 1 << 26
-"""Unpacked bytes up to which their ratio to the packed ones does not matter (64 MiB)."""
-MAX_RATIO = 100
-"""Largest ratio of unpacked to packed bytes: text captures reach 5 to 30, decompression bombs a thousand and more."""
 _CHUNK = 1 << 18
 _OPENERS: dict[str, Any] = {".gz": gzip.open, ".xz": lzma.open}
 _DAMAGE = (EOFError, lzma.LZMAError, gzip.BadGzipFile, zlib.error)
-
-
-class Budget:
-    """Number of bytes that may still be unpacked from one file."""
-
-    def __init__(self, path: str | Path, packed: int, usual: int = MAX_BYTES, max_bytes: int | None = None):
-        """`packed` is the file's size in bytes, `usual` the limit of its kind, `max_bytes` the caller's own."""
-        text = os.environ.get(VARIABLE, "").strip()
-        lifted = gib_bytes(text, VARIABLE) if max_bytes is None and text else max_bytes
-        self.path, self.spent = path, 0
-        self.max_bytes = usual if lifted is None else lifted
-        self._by_ratio = math.inf if lifted is not None else max(FREE_BYTES, MAX_RATIO * packed)
-
-    def spend(self, size: int) -> None:
-        """Count bytes before or after they are unpacked. Raises WearcapError beyond the limit."""
-        self.spent += size
-        if self.spent > self.max_bytes:
-            units = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))
-            unit, name = next((known for known in units if self.max_bytes >= known[0]), (1, "bytes"))
-            what = f"larger than {self.max_bytes / unit:.4g} {name} once unpacked"
-            raise WearcapError(what, self.path, "a smaller file", _lift(self.spent))
-        if self.spent > self._by_ratio:
-            what = f"it unpacks to more than {MAX_RATIO} times its size"
-            raise WearcapError(what, self.path, "a capture, which packs 5 to 30 times", _lift(self.spent))
-
-
-def gib_bytes(text: str, where: str) -> int:
-    """Bytes of a number of GiB. Raises WearcapError naming `where` it was given when it is no positive number."""
-    try:
-        gib = float(text)
-    except ValueError:
-        gib = math.nan
-    if not 0 < gib < 1e9:
-        raise WearcapError(f"a limit of {text[:30]!r} GiB", where, "a number above 0, such as 16")
-    return int(gib * (1 << 30))
-
-
-def _lift(size: int) -> str:
-    return f"If you trust it, lift the limit: wearcap --max-file-gib {max(1, math.ceil(2 * size / (1 << 30)))} VERB …"
 
 
 def file_size(path: str | Path, kind: str = "file") -> int:
@@ -143,18 +92,17 @@ def placed(where: str | Path) -> Iterator[None]:
 
 
 @contextmanager
-def open_bytes(path: str | Path, max_bytes: int | None = None, usual: int = MAX_BYTES) -> Iterator[io.BufferedReader]:
+def open_bytes(path: str | Path, kind: str = "file") -> Iterator[io.BufferedReader]:
     """Open a file for reading bytes, unpacked when its name ends in .gz or .xz.
 
     Raises WearcapError, while opening or while reading inside the `with` block, when the file is missing, no regular
-    file, not in the format of its suffix, or larger than `max_bytes` (default: `usual`, unless the user raised it).
+    file, not in the format of its suffix, or beyond the limits of its kind.
     """
     size = file_size(path)
     opener = _OPENERS.get(Path(path).suffix, open)
-    budget = Budget(path, size, usual, max_bytes)
     if opener is open:
-        Budget(path, size, usual, max_bytes).spend(size)  # raises before a byte is read
-    with explained(path), opener(path, "rb") as file, counted(file, budget) as reader:
+        Budget(path, kind).spend(size)  # raises before a byte is read
+    with explained(path), opener(path, "rb") as file, counted(file, Budget(path, kind, size)) as reader:
         yield reader
 
 
@@ -185,10 +133,27 @@ class _Counted(io.RawIOBase):
         return whole.getvalue()
 
 
-def read_bytes(path: str | Path, max_bytes: int | None = None, usual: int = MAX_BYTES) -> bytes:
+def read_bytes(path: str | Path, kind: str = "file") -> bytes:
     """Content of a file. Raises WearcapError as `open_bytes` does, and when it is empty."""
-    with open_bytes(path, max_bytes, usual) as file:
+    with open_bytes(path, kind) as file:
         content = file.read()
     if not content:
         raise WearcapError("the file is empty", path)
     return content
+
+
+def path_inside(folder: str | Path, name: object, where: str | Path) -> Path:
+    """The path of a file that another one names: relative to a folder and, once links are resolved, inside it.
+
+    What lies there, if anything, is a regular file or a folder. Raises WearcapError, naming `where` it is named, for
+    anything else.
+    """
+    if isinstance(name, str) and name.isprintable() and 0 < len(name.encode()) < 256 and "\\" not in name:
+        path, parts = Path(folder) / name, PurePosixPath(name).parts
+        real = Path(os.path.realpath(path))
+        if parts and parts[0] != "/" and ".." not in parts and real.is_relative_to(os.path.realpath(folder)):
+            if path.exists() and not path.is_dir():
+                file_size(path)
+            return path
+    what = f"it names the file {str(name)[:80]!r}"
+    raise WearcapError(what, where, f"a relative path inside {folder}", "Copy the file there and name it relatively.")

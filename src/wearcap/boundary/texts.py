@@ -1,44 +1,33 @@
-"""Reading untrusted text files, plain, .gz or .xz and of bounded size: whole, line by line, JSON, XML.
-
-Errors name the line.
-"""
+"""Texts of strangers, plain, .gz or .xz: whole, line by line, JSON by a declared schema, YAML, XML. Errors name the line."""
 
 import codecs
 import io
+import json
 import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, overload
 from xml.etree.ElementTree import Element, ParseError
 
+import msgspec
 import numpy as np
 import yaml
 from defusedxml.common import DefusedXmlException
 
+from wearcap.boundary.limits import LIMITS, Budget
+from wearcap.boundary.opening import open_bytes, read_bytes, understood
 from wearcap.errors import WearcapError
-from wearcap.files import MAX_JSON_DEPTH, parse_json
-from wearcap.io.formats.bounded import open_bytes, read_bytes, understood
 
-MAX_BYTES = 1 << 29
-"""Largest text that is taken into memory as a whole (512 MiB: over an hour of 120 Hz motion)."""
-MAX_JSON_BYTES = 1 << 28
-"""Largest JSON file that is read (256 MiB): as Python objects it takes up to twenty times as much."""
-MAX_YAML_BYTES = 1 << 16
-"""Largest YAML file that is read: a page of settings."""
-MAX_STREAMED_BYTES = 1 << 32
-"""Largest text that is read line by line (4 GiB)."""
-MAX_LINE = 1 << 24
-"""Longest line (characters): COLMAP lists all points of a picture in one line."""
-
+Content = TypeVar("Content")
 
 # Bytes that are no UTF-8 are read as Latin-1.
 codecs.register_error("wearcap.latin1", lambda e: (e.object[e.start : e.end].decode("latin-1"), e.end))  # pyright: ignore
 
 
-def read_text(path: str | Path, max_bytes: int | None = None, usual: int = MAX_BYTES) -> str:
+def read_text(path: str | Path, kind: str = "text") -> str:
     """Text of a file (UTF-8, else Latin-1). Raises WearcapError as `read_bytes` does, and for binary content."""
-    content = read_bytes(path, max_bytes, usual)
+    content = read_bytes(path, kind)
     if b"\0" in content:
         raise WearcapError("binary content", path, "a text file")
     try:
@@ -47,20 +36,27 @@ def read_text(path: str | Path, max_bytes: int | None = None, usual: int = MAX_B
         return content.decode("latin-1")
 
 
-def numbered_lines(path: str | Path, usual: int = MAX_STREAMED_BYTES) -> Iterator[tuple[int, str]]:
+def bounded_lines(file: io.TextIOBase, path: str | Path, kind: str = "lines") -> Iterator[tuple[int, str]]:
+    """Lines with their numbers, counted from 1. Raises WearcapError for one that is longer than its kind's may be."""
+    number, longest = 0, LIMITS[kind].line
+    while line := file.readline(longest):
+        number += 1
+        if len(line) == longest and not line.endswith("\n"):
+            raise WearcapError(f"a line longer than {longest} characters", at_line(path, number), "a text file")
+        yield number, line
+
+
+def numbered_lines(path: str | Path, kind: str = "lines") -> Iterator[tuple[int, str]]:
     """Lines of a text with their numbers, counted from 1 (UTF-8; other bytes are taken as Latin-1).
 
-    Raises WearcapError as `open_bytes` does, for an empty file, binary content and lines longer than `MAX_LINE`.
+    Raises WearcapError as `open_bytes` does, for an empty file, binary content and lines that are too long.
     """
     number = 0
-    with open_bytes(path, usual=usual) as source:
+    with open_bytes(path, kind) as source:
         file = io.TextIOWrapper(source, "utf-8-sig", errors="wearcap.latin1")
-        while line := file.readline(MAX_LINE):
-            number += 1
+        for number, line in bounded_lines(file, path, kind):
             if "\0" in line:
                 raise WearcapError("binary content", at_line(path, number), "a text file")
-            if len(line) == MAX_LINE and not line.endswith("\n"):
-                raise WearcapError(f"a line longer than {MAX_LINE} characters", at_line(path, number), "a text file")
             yield number, line
     if not number:
         raise WearcapError("the file is empty", path)
@@ -91,9 +87,51 @@ def _no_finite_number(token: str) -> bool:
         return True
 
 
-def read_json(path: str | Path, max_bytes: int | None = None) -> Any:
-    """Content of a JSON file. Raises WearcapError as `read_text` does, and when it is no JSON or nested too deeply."""
-    return parse_json(read_text(path, max_bytes, MAX_JSON_BYTES), path)
+@overload
+def parse_json(text: str | bytes, where: str | Path, kind: str = "json") -> Any: ...
+@overload
+def parse_json(text: str | bytes, where: str | Path, kind: str = "json", *, schema: type[Content]) -> Content: ...
+def parse_json(text: str | bytes, where: str | Path, kind: str = "json", *, schema: Any = Any) -> Any:
+    """Content of JSON text, laid out as a schema (a class of fields or a type as msgspec takes them) declares.
+
+    Raises WearcapError for text that is no JSON, not UTF-8, beyond the limits of its kind, with whole numbers beyond 64
+    bits, or not of the schema: the place in the text is named.
+    """
+
+    def whole_number(digits: str) -> int:
+        value = int(digits)
+        if not -(1 << 63) <= value < 1 << 64:
+            raise ValueError(f"the whole number {digits[:30]}… has more than 64 bits")
+        return value
+
+    budget = Budget(where, kind)
+    budget.spend(len(text))
+    begins = "[{" if isinstance(text, str) else (b"[", b"{")
+    budget.count(sum(map(text.count, begins)), "lists and objects")  # pyright: ignore[reportArgumentType]
+    try:
+        content = json.loads(text, parse_int=whole_number)
+        level, depth = [content], 0
+        while level := [inner for outer in level for inner in _parts(outer) if isinstance(inner, dict | list)]:
+            depth += 1
+            if depth >= budget.limits.depth:
+                raise RecursionError
+        return content if schema is Any else msgspec.convert(content, schema)
+    except RecursionError as error:
+        expected = f"at most {budget.limits.depth} levels"
+        raise WearcapError("JSON that is nested too deeply", where, expected) from error
+    except msgspec.ValidationError as error:
+        raise WearcapError(f"JSON of another layout ({error})"[:300], where) from error
+    except ValueError as error:  # JSONDecodeError and UnicodeDecodeError are ValueErrors
+        raise WearcapError(f"not readable JSON ({error})"[:300], where, "a whole JSON text") from error
+
+
+def _parts(content: Any) -> Iterable[Any]:
+    return content.values() if isinstance(content, dict) else content if isinstance(content, list) else ()
+
+
+def read_json(path: str | Path) -> Any:
+    """Content of a JSON file. Raises WearcapError as `read_text` and `parse_json` do."""
+    return parse_json(read_text(path, "json"), path)
 
 
 def read_json_object(path: str | Path) -> dict[str, Any]:
@@ -106,18 +144,19 @@ def read_json_object(path: str | Path) -> dict[str, Any]:
 
 def read_yaml_object(path: str | Path) -> dict[str, Any]:
     """Keys and values of a small YAML file. Raises WearcapError for anything else, and for references in it."""
-    damage = (yaml.YAMLError, ValueError, LookupError, AttributeError, RecursionError)
+    damage = (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError)
+    text, budget = read_text(path, "yaml"), Budget(path, "yaml")
     with understood("not readable YAML", path, errors=damage):
-        text = read_text(path, usual=MAX_YAML_BYTES)
         # Aliases and deep nesting take quadratic time to parse.
         depth = 0
-        for event in yaml.parse(text, yaml.SafeLoader):
+        for number, event in enumerate(yaml.parse(text, yaml.SafeLoader)):
             if isinstance(event, yaml.AliasEvent):
                 fix = "Write them out: such references can blow up."
                 raise WearcapError("it refers to its own parts (&name, *name)", path, "plain keys with values", fix)
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > MAX_JSON_DEPTH:
-                raise WearcapError("YAML that is nested too deeply", path, f"at most {MAX_JSON_DEPTH} levels")
+            if depth > budget.limits.depth:
+                raise WearcapError("YAML that is nested too deeply", path, f"at most {budget.limits.depth} levels")
+            budget.count(number, "values")
         content = yaml.safe_load(text)
     if not isinstance(content, dict | None):
         raise WearcapError(f"it holds a {type(content).__name__}", path, "keys with values")

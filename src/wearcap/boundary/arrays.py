@@ -1,4 +1,4 @@
-"""Arrays from untrusted .npz and .npy files: no pickles, no sizes that the file cannot hold."""
+"""Arrays of .npz and .npy files, and JSON in .zip files: no pickles, no sizes that the file cannot hold."""
 
 import io
 import lzma
@@ -11,15 +11,15 @@ import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.lib import format as npy
 
+from wearcap.boundary.limits import Budget
+from wearcap.boundary.opening import counted, file_size, read_bytes, understood
+from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError
-from wearcap.io.formats.bounded import Budget, file_size, read_bytes, understood
-
-MAX_BYTES = 1 << 32
-"""Largest total size of the arrays that are read from one file (4 GiB)."""
 
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 _MAX_HEADER = 1 << 14
@@ -31,17 +31,22 @@ _DAMAGE = (
 """Exceptions that zipfile and numpy raise on truncated or damaged files."""
 
 
-def read_npz(
-    path: str | Path, keys: Iterable[str] | None = None, max_bytes: int | None = None
-) -> dict[str, np.ndarray]:
+@contextmanager
+def open_archive(path: str | Path, kind: str, expected: str) -> Iterator[tuple[zipfile.ZipFile, Budget]]:
+    """A zip archive and the budget that its unpacked parts share. Raises WearcapError for a damaged one, too."""
+    budget = Budget(path, kind, file_size(path))
+    with readable("".join(Path(path).suffixes[-2:]), path, expected), zipfile.ZipFile(path) as archive:
+        budget.count(len(archive.infolist()), "parts")
+        yield archive, budget
+
+
+def read_npz(path: str | Path, keys: Iterable[str] | None = None) -> dict[str, np.ndarray]:
     """Arrays of an .npz file: those named in `keys` that exist (None: all).
 
     Raises WearcapError for a missing or damaged file, for an array of Python objects, and where the requested
-    arrays exceed `max_bytes` together.
+    arrays exceed the limit together.
     """
-    path = Path(path)
-    budget = Budget(path, file_size(path), MAX_BYTES, max_bytes)
-    with readable(".npz", path, "arrays saved by NumPy"), zipfile.ZipFile(path) as archive:
+    with open_archive(path, "arrays", "arrays saved by NumPy") as (archive, budget):
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         arrays = {}
         for name in members if keys is None else [key for key in keys if key in members]:
@@ -51,11 +56,21 @@ def read_npz(
         return arrays
 
 
-def read_npy(path: str | Path, max_bytes: int | None = None) -> np.ndarray:
+def read_packed_json(path: str | Path, expected: str) -> Any:
+    """Content of the one JSON file in a zip archive. Raises WearcapError as `open_archive` and `parse_json` do."""
+    with open_archive(path, "json", expected) as (archive, budget):
+        members = [entry for entry in archive.infolist() if not entry.is_dir() and "__MACOSX" not in entry.filename]
+        if len(members) != 1:
+            raise WearcapError(f"an archive of {len(members)} files", path, "one JSON file")
+        with archive.open(members[0]) as file, counted(file, budget) as reader:
+            return parse_json(reader.read(), path)
+
+
+def read_npy(path: str | Path) -> np.ndarray:
     """The array of an .npy file. Raises WearcapError as `read_npz` does."""
-    content = read_bytes(path, max_bytes, MAX_BYTES)
+    content = read_bytes(path, "arrays")
     with readable(".npy", path, "an array saved by NumPy"):
-        return _read_array(io.BytesIO(content), len(content), str(path), Budget(path, len(content)))
+        return _read_array(io.BytesIO(content), len(content), str(path), Budget(path, "arrays"))
 
 
 @contextmanager

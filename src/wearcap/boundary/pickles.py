@@ -1,4 +1,4 @@
-"""Public pickles (HPS, OMOMO, cam_traj.pkl) without running what is in them.
+"""Plain data of public data sets' pickles (HPS, OMOMO, cam_traj.pkl), without calling anything that they name.
 
 A pickle names classes and functions to call. Here a handful of names stand for functions of this file that build
 numeric arrays, scalars and bytes; every other name is refused before anything is called. joblib's files, where arrays'
@@ -12,7 +12,6 @@ import lzma
 import math
 import pickle
 import re
-import struct
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -20,48 +19,39 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from wearcap.boundary.limits import Budget
+from wearcap.boundary.opening import counted, explained, file_size
 from wearcap.errors import WearcapError
-from wearcap.io.formats.bounded import Budget, counted, explained, file_size
-
-MAX_BYTES = 1 << 33
-"""Largest pickle that is read, once unpacked (8 GiB)."""
-
-_MAX_DEPTH = 64
-_MAX_ITEMS = 1 << 24
-_MAX_STEPS = 1 << 24
-"""Opcodes of a pickle: each may put an object of a hundred bytes into memory, and takes half a microsecond."""
 
 _DTYPE = re.compile(r"[<>=|]?(b1|\?|[biuf][1248]|f16|[SU]\d{1,6})")
 _ADMITTED = (bool, int, float, complex, str, bytes, bytearray, type(None), np.generic)
 
 
-def read_pickle(path: str | Path, max_bytes: int | None = None) -> Any:
+def read_pickle(path: str | Path) -> Any:
     """The content of a pickle or joblib file (packed or not): numbers, str, bytes, lists, tuples, dicts, arrays.
 
     Python 2's byte strings come as str (Latin-1). Raises WearcapError naming the class or function when the file
     holds anything else, and when it is damaged.
     """
-    # joblib's files are packed; their first bytes name the compression.
-    packed = Budget(path, file_size(path), MAX_BYTES, max_bytes)
-    packed.spend(file_size(path))
+    size = file_size(path)
     with explained(path), open(path, "rb") as file:
-        begin = file.peek(2)
-        packers = {b"\x1f\x8b": gzip.open, b"BZ": bz2.open, b"\xfd7": lzma.open}
-        if begin[:1] == b"x":
-            file = _Inflated(file)
-        elif begin[:2] in packers:
-            file = packers[begin[:2]](file)
-        with counted(file, Budget(path, file_size(path), MAX_BYTES, max_bytes)) as reader:
+        # joblib's files are packed; their first bytes name the compression.
+        begin = file.peek(2)[:2]
+        unpack = next((opener for magic, opener in _PACKERS.items() if begin.startswith(magic)), None)
+        budget = Budget(path, "pickle", size if unpack else math.inf)
+        with counted(unpack(file) if unpack else file, budget) as reader:
             content = reader.read()
     if not content:
         raise WearcapError("the file is empty", path)
     try:
-        value = _Unpickler(io.BytesIO(content), encoding="latin1").load()
-        _require_plain(value)
+        value = _Unpickler(content, budget).load()
+        _require_plain(value, budget)
         return value
     except _RefusedError as error:
         fix = "Anything else in a pickle can run code when it is loaded, and is never read."
         raise WearcapError(str(error), path, "numbers, text, lists, dicts and NumPy arrays only", fix) from error
+    except WearcapError:
+        raise
     except Exception as error:  # the opcodes are the file's own program and can raise anything
         what = f"a damaged pickle ({type(error).__name__}: {error})"[:300]
         raise WearcapError(what, path, "a whole pickle file", "Fetch it again.") from error
@@ -96,26 +86,33 @@ class _Inflated(io.BufferedIOBase):
         return b""
 
 
-def _require_plain(value: Any) -> None:
+_PACKERS: dict[bytes, Callable[[Any], Any]] = {
+    b"\x1f\x8b": gzip.open,
+    b"BZ": bz2.open,
+    b"\xfd7": lzma.open,
+    b"x": _Inflated,
+}
+"""What unpacks a file, by its first bytes."""
+
+
+def _require_plain(value: Any, budget: Budget) -> None:
     """Raise for half-built objects, for names that were never called, and for structures that unfold without end.
 
     A list may be contained in many others, or in itself: it counts as often as it is reached.
     """
     level, count = [value], 0
-    for _ in range(_MAX_DEPTH):
+    for _ in range(budget.limits.depth):
         inner: list[Any] = []
         for item in level:
             if isinstance(item, list | tuple | dict):
-                count += len(item)
-                if count > _MAX_ITEMS:
-                    raise _RefusedError(f"it holds more than {_MAX_ITEMS} items")
+                budget.count(count := count + len(item), "items")
                 inner += [*item.keys(), *item.values()] if isinstance(item, dict) else item
             elif not isinstance(item, (*_ADMITTED, np.ndarray)):
                 raise _RefusedError(f"it holds a {getattr(item, '__name__', type(item).__name__)}")
         if not inner:
             return
         level = inner
-    raise _RefusedError(f"it holds lists within lists, {_MAX_DEPTH} deep")
+    raise _RefusedError(f"it holds lists within lists, {budget.limits.depth} deep")
 
 
 class _NdarrayName:
@@ -188,12 +185,11 @@ _PythonUnpickler: Any = getattr(pickle, "_Unpickler")  # noqa: B009
 
 
 def _stepping(load: Callable[[Any], None]) -> Callable[[Any], None]:
-    """An opcode's function that counts its calls."""
+    """An opcode's function that counts its calls: each may put an object of a hundred bytes into memory."""
 
     def step(self: Any) -> None:
         self.steps += 1
-        if self.steps > _MAX_STEPS:
-            raise ValueError(f"more than {_MAX_STEPS} steps")
+        self.budget.count(self.steps, "steps")
         load(self)
 
     return step
@@ -202,9 +198,9 @@ def _stepping(load: Callable[[Any], None]) -> Callable[[Any], None]:
 class _Unpickler(_PythonUnpickler):
     dispatch: ClassVar[dict[int, Any]] = dict(_PythonUnpickler.dispatch)
 
-    def __init__(self, file: io.BytesIO, *, encoding: str):
-        super().__init__(file, encoding=encoding)
-        self._source, self.steps = file, 0
+    def __init__(self, content: bytes, budget: Budget):
+        self._source, self.steps, self.budget = io.BytesIO(content), 0, budget
+        super().__init__(self._source, encoding="latin1")
 
     def find_class(self, module: str, name: str) -> Any:
         found = _NAMES.get(module, {}).get(name)
@@ -244,26 +240,10 @@ class _Unpickler(_PythonUnpickler):
             raise _RefusedError("it holds a subclass of numpy.ndarray")
         if state.get("numpy_array_alignment_bytes") is not None:
             self._source.read(self._source.read(1)[0])
-        size = math.prod(shape) * dtype.itemsize
-        if size < 0 or size > MAX_BYTES:
-            raise ValueError(f"an array of shape {shape}")
-        data = self._source.read(size)
+        data = self._source.read(max(0, math.prod(shape) * dtype.itemsize))
         if state["order"] == "F":
             return _array(data, dtype, shape[::-1]).T.copy()
         return _array(data, dtype, shape)
 
-    def load_bytearray8(self) -> None:
-        """The original opcode without allocating more than the file can hold."""
-        (length,) = struct.unpack("<Q", self.read(8))
-        if length > self._source.getbuffer().nbytes:
-            raise ValueError("bytes beyond the end of the file")
-        self.append(bytearray(self.read(length)))
-
-    def refuse(self) -> None:
-        raise _RefusedError("it holds a set or an outside buffer")
-
     dispatch[pickle.BUILD[0]] = load_build
-    dispatch[pickle.BYTEARRAY8[0]] = load_bytearray8
-    for opcode in (pickle.EMPTY_SET, pickle.ADDITEMS, pickle.FROZENSET, pickle.NEXT_BUFFER, pickle.READONLY_BUFFER):
-        dispatch[opcode[0]] = refuse
     dispatch = {opcode: _stepping(load) for opcode, load in dispatch.items()}

@@ -9,12 +9,12 @@ from fractions import Fraction
 import joblib
 import numpy as np
 import pytest
-from hostile import fuzz, mutated_bytes
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hostile import fuzz, mutated_bytes
+from wearcap.boundary.pickles import read_pickle
 from wearcap.errors import WearcapError
-from wearcap.io.formats.restricted_pickle import read_pickle
 
 VALUE = {
     "seq_name": "sub1_largebox_000",
