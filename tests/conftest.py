@@ -40,6 +40,12 @@ def real_data() -> Path:
     return root
 
 
+@pytest.fixture
+def trusted(monkeypatch):
+    """Files of formats that can run code open wherever a test writes them, as with `trust=true`."""
+    monkeypatch.setenv("WEARCAP_TRUST", "1")
+
+
 @pytest.fixture(scope="module")
 def few_statistics():
     """Training takes its normalisation from 100 windows in place of up to 1500, which would take most of a short run."""

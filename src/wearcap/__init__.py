@@ -3,17 +3,19 @@
 __version__ = "0.1.0"
 
 
-def load(pipeline: str, *overrides: str, checkpoint=None, device: str = "cpu"):
+def load(pipeline: str, *overrides: str, checkpoint=None, device: str = "cpu", trust: bool = False):
     """The `runtime.system.System` that `wearcap capture pipeline=PIPELINE checkpoint=CHECKPOINT` runs.
 
     wearcap.load("hmd2") has the shared checkpoint's network, wearcap.load("hps") needs none. `overrides` are those of the
     command line ("pipeline.sampling.steps=20"). Raises WearcapError for an unknown pipeline or setting, and for a checkpoint that
-    the pipeline cannot use.
+    the pipeline cannot use, or that is somebody else's `.ckpt` (`trust` opens it all the same).
     """
+    from wearcap.boundary.own import trusting
     from wearcap.cli.conf import compose, load_pipeline
 
     config = compose("capture", [f"pipeline={pipeline}", *overrides, "recording=none"])
-    return load_pipeline(checkpoint, config.pipeline, device, shared=True)
+    with trusting(trust):
+        return load_pipeline(checkpoint, config.pipeline, device, shared=True)
 
 
 def read(path, height: float | None = None):

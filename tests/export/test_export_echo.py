@@ -106,7 +106,7 @@ def test_what_was_exported_cannot_be_exported_again(exports):
         load_exported(exports["pt2"].path).exports()
 
 
-def test_files_that_do_not_belong_are_refused(exports, tmp_path):
+def test_files_that_do_not_belong_are_refused(exports, tmp_path, trusted):
     path = shutil.copytree(Path(exports["pt2"].path).parent, tmp_path, dirs_exist_ok=True) / "net.pt2"
     sidecar, encoder = tmp_path / "net.json", tmp_path / "net.encoder.safetensors"
     about = json.loads(sidecar.read_text())

@@ -8,6 +8,8 @@ import torch
 from wearcap.errors import WearcapError
 from wearcap.models.image_encoder import EgoViewEncoder, ImageEncoder, letterboxed
 
+pytestmark = pytest.mark.usefixtures("trusted")
+
 PLAIN = (0.0,) * 3, (1.0,) * 3
 
 

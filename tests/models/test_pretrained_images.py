@@ -135,7 +135,7 @@ def test_foreign_weights_and_archives_with_code_are_refused(packages, tmp_path):
     script = packages / "clip/ViT-L-14.pt"
     script.parent.mkdir(parents=True)
     torch.jit.save(torch.jit.trace(nn.Linear(2, 2), torch.zeros(1, 2)), str(script))
-    with pytest.raises(WearcapError, match=r"ViT-L-14\.pt: a TorchScript archive"):
+    with pytest.raises(WearcapError, match=r"ViT-L-14\.pt: not a readable .*TorchScript"):
         Clip()
 
 

@@ -92,7 +92,7 @@ def test_a_file_without_named_tensors_is_refused(tmp_path, content):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(WearcapError, match=r"nowhere\.pth: there is no such file"):
+    with pytest.raises(WearcapError, match=r"nowhere\.pth: no such file of weights"):
         read_weights(tmp_path / "nowhere.pth")
 
 

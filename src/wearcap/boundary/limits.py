@@ -54,6 +54,7 @@ LIMITS = {
     "header": Limits(bytes=1 << 16, items=1 << 12),  # of PLY and PCD
     "arrays": Limits(items=1 << 14),
     "pickle": Limits(bytes=1 << 33),
+    "weights": Limits(bytes=1 << 36),  # of PyTorch; items: bytes of the pickle that describes the tensors
     "tensors": Limits(bytes=1 << 25, items=1 << 16),  # the header of a .safetensors file, and its tensors
 }
 """Limits by kind."""

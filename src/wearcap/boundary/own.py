@@ -1,12 +1,13 @@
-"""Which files are the user's own: PyTorch's formats can run code when they are opened, and are not for strangers.
+"""Which files are the user's own: formats that can run code are not for strangers.
 
-A `.ckpt`, `.pt2` or `.pth` file opens where it lies in `outputs/`, in the folder of a run or under the name of an export
+A run's `.ckpt` and an exported `.pt2` open where they lie in `outputs/`, in the folder of a run or under the name of an export
 that this user's commands wrote (kept in the user's cache folder), and elsewhere with `trust=true`.
 """
 
 import json
 import os
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from wearcap.errors import WearcapError
@@ -15,6 +16,21 @@ from wearcap.files import cache_folder
 TRUST = "WEARCAP_TRUST"
 """Environment variable that `trust=true` sets to 1, for worker processes too."""
 OUTPUTS = Path("outputs")
+
+
+@contextmanager
+def trusting(trust: bool) -> Iterator[None]:
+    """A context in which, where `trust` is true, all files count as the user's own."""
+    before = os.environ.get(TRUST)
+    if trust:
+        os.environ[TRUST] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            os.environ.pop(TRUST, None)
+        else:
+            os.environ[TRUST] = before
 
 
 def _ledger() -> Path:

@@ -1,7 +1,10 @@
-"""Tensors of strangers' `.safetensors` files, and of the user's own PyTorch files without code."""
+"""Tensors of strangers' `.safetensors` files, and of PyTorch files without running their code."""
 
+import io
 import pickle
 import struct
+import warnings
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,9 +14,9 @@ import safetensors
 import torch
 from safetensors.torch import load_file
 
+from wearcap.boundary.arrays import open_archive
 from wearcap.boundary.limits import LIMITS, Budget
 from wearcap.boundary.opening import explained, file_size
-from wearcap.boundary.own import require_own
 from wearcap.errors import WearcapError
 
 _DAMAGE = (safetensors.SafetensorError, OSError, RuntimeError, ValueError, LookupError, TypeError)
@@ -27,6 +30,9 @@ _NUMBERS = [
     np.dtypes.Float64DType,
     np.dtypes.Int64DType,
 ]
+
+
+_CONVERT = "If you trust its origin, save its state_dict with safetensors.torch.save_file."
 
 
 def open_tensors(path: str | Path, kind: str, fix: str = "", framework: str = "pt") -> Any:
@@ -57,22 +63,39 @@ def read_tensors(path: str | Path, kind: str, fix: str = "") -> tuple[dict[str, 
 
 
 def read_torch(path: str | Path, kind: str, expected: str) -> Any:
-    """What a PyTorch file of the user's own holds: tensors and plain values.
+    """What a PyTorch file holds: tensors and plain values.
 
-    Raises WearcapError when it is missing, somebody else's (`require_own`), damaged, or holds more than data.
+    PyTorch's reader is given a plain copy of the archive, in memory: it takes other directories and packings than Python's,
+    and does not compare all checksums. Raises WearcapError when the file is missing, damaged, beyond the limits, or holds
+    more than data.
     """
-    file_size(path, kind)
-    require_own(path)
+    size = file_size(path, kind)
     try:
-        with torch.serialization.safe_globals(_NUMBERS):
-            return torch.load(path, map_location="cpu", weights_only=True)
+        content = _plain_copy(path) if size and zipfile.is_zipfile(path) else path
+        with torch.serialization.safe_globals(_NUMBERS), warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of TorchScript archives, which are refused
+            return torch.load(content, map_location="cpu", weights_only=True)
+    except WearcapError:
+        raise
     except pickle.UnpicklingError as error:
-        what = "the file is damaged, or holds more than data and was not opened, since loading it would run its code"
-        fix = "If you trust its origin, save its state_dict with safetensors.torch.save_file."
-        raise WearcapError(what, path, expected, fix) from error
+        what = "the file is damaged, or holds more than tensors and was not opened, since loading it would run its code"
+        raise WearcapError(what, path, expected, _CONVERT) from error
     except Exception as error:  # torch.load may raise anything on damaged bytes
         what = f"not a readable {kind} ({' '.join(str(error).split())[:120] or type(error).__name__})"
-        raise WearcapError(what, path, expected) from error
+        raise WearcapError(what, path, expected, _CONVERT if "TorchScript" in what else "") from error
+
+
+def _plain_copy(path: str | Path) -> io.BytesIO:
+    """An archive's parts as Python reads them, unpacked in a new archive."""
+    copy = io.BytesIO()
+    with open_archive(path, "weights", "a PyTorch file") as (archive, budget), zipfile.ZipFile(copy, "w") as plain:
+        for entry in archive.infolist():
+            budget.spend(entry.file_size)
+            if entry.filename.endswith(".pkl"):
+                budget.count(entry.file_size, "bytes that describe its tensors")
+            plain.writestr(entry.filename, archive.read(entry))
+    copy.seek(0)
+    return copy
 
 
 def plain_tensors(state: Any, where: str | Path) -> dict[str, torch.Tensor]:

@@ -115,14 +115,20 @@ def parse_json(text: str | bytes, where: str | Path, kind: str = "json", *, sche
             depth += 1
             if depth >= budget.limits.depth:
                 raise RecursionError
-        return content if schema is Any else msgspec.convert(content, schema)
+        return require_layout(content, schema, where)
     except RecursionError as error:
         expected = f"at most {budget.limits.depth} levels"
         raise WearcapError("JSON that is nested too deeply", where, expected) from error
-    except msgspec.ValidationError as error:
-        raise WearcapError(f"JSON of another layout ({error})"[:300], where) from error
     except ValueError as error:  # JSONDecodeError and UnicodeDecodeError are ValueErrors
         raise WearcapError(f"not readable JSON ({error})"[:300], where, "a whole JSON text") from error
+
+
+def require_layout(content: Any, schema: type[Content], where: str | Path) -> Content:
+    """Plain content as a schema declares it. Raises WearcapError naming the first place where it is something else."""
+    try:
+        return msgspec.convert(content, schema)
+    except msgspec.ValidationError as error:
+        raise WearcapError(f"content of another layout ({error})"[:300], where) from error
 
 
 def _parts(content: Any) -> Iterable[Any]:

@@ -9,6 +9,7 @@ import traceback
 
 from wearcap import __version__
 from wearcap.boundary.limits import VARIABLE, gib_bytes
+from wearcap.boundary.own import trusting
 from wearcap.errors import WearcapError, nearest
 
 VERBS = "train evaluate capture live export prepare view render annotate scene calibrate track doctor demo".split()  # noqa: SIM905
@@ -21,11 +22,12 @@ def usage() -> str:
     lines = [
         "wearcap: motion capture from what a person wears.",
         "",
-        "usage: wearcap [--debug] [--max-file-gib N] VERB [arguments]     wearcap VERB --help     wearcap --version",
+        "usage: wearcap [--debug] [--max-file-gib N] VERB [arguments] [trust=true]     wearcap VERB --help     wearcap --version",
         "",
         *(f"  {verb:10} {importlib.import_module(f'wearcap.cli.{verb}').HELP}" for verb in VERBS),
         "",
         "--debug shows the traceback of an error.",
+        "trust=true opens .ckpt and .pt2 files from elsewhere, which can run code: for files that are your own.",
         "--max-file-gib N reads files of up to N GiB once unpacked, however tightly packed: for files that you trust.",
     ]
     return "\n".join(lines)
@@ -34,9 +36,11 @@ def usage() -> str:
 def run_verb(verb: str, arguments: list[str]) -> int:
     """Run one verb and return the exit code; errors that a user can fix become one message on stderr."""
     debug = "--debug" in arguments
-    arguments = [argument for argument in arguments if argument != "--debug"]
+    trust = "trust=true" in arguments
+    arguments = [argument for argument in arguments if argument not in ("--debug", "trust=true")]
     try:
-        importlib.import_module(f"wearcap.cli.{verb}").main(arguments)
+        with trusting(trust):
+            importlib.import_module(f"wearcap.cli.{verb}").main(arguments)
         return 0
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)

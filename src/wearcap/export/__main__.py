@@ -9,6 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from wearcap.boundary.own import trusting
 from wearcap.errors import WearcapError
 from wearcap.export.files import load_exported
 from wearcap.recording import Recording
@@ -23,8 +24,10 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("recording", type=Path, help="recording (.safetensors) with what the system needs")
     parser.add_argument("output", type=Path, help="where to write the motion (.safetensors), or contact (.csv)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the sampler's noise (default 0)")
+    parser.add_argument("--trust", action="store_true", help="open a .pt2 file from elsewhere, which can run code")
     options = parser.parse_args(arguments)
-    exported = load_exported(options.model)
+    with trusting(options.trust):
+        exported = load_exported(options.model)
     recording = RecordingFile(options.recording).load()
     if not isinstance(exported, System):
         exported.write(recording, options.output)

@@ -6,19 +6,21 @@ import copy
 import importlib
 import importlib.util
 import json
-import re
 import time
-import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import torch
-from safetensors.torch import load_file, save
+from safetensors.torch import save
 from torch import Tensor, nn
 
-from wearcap.boundary.texts import parse_json
+from wearcap.boundary.opening import file_size, understood
+from wearcap.boundary.own import remember_own, require_own
+from wearcap.boundary.tensors import read_tensors
+from wearcap.boundary.texts import read_json_object, require_layout
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, sha256_of, write_text
 from wearcap.runtime.graphs import Exports, Graph, Run, missing_libraries, open_onnx, program, quiet
@@ -29,16 +31,18 @@ TIMED_RUNS = 5
 
 
 def open_pt2(path: str | Path) -> Run:
-    """A torch.export archive on the CPU. Raises WearcapError when it is missing, not readable, or refused by
-    `_check_archive`: PyTorch by itself would run code from it.
+    """A torch.export archive of the user's own on the CPU.
+
+    Raises WearcapError when it is missing, not readable, or somebody else's: PyTorch runs texts in it as code.
     """
-    if not Path(path).is_file():
-        raise WearcapError("no such exported model", where=path, fix="Make one with `wearcap export`.")
+    require_own(path)
+    return _open_program(path)
+
+
+def _open_program(path: str | Path) -> Run:
+    file_size(path, "exported model")
     try:
-        _check_archive(path)
         module = torch.export.load(str(path)).module()
-    except WearcapError:
-        raise
     except Exception as error:  # PyTorch raises arbitrary exceptions on a graph that it did not write
         why = (str(error).splitlines() or [type(error).__name__])[0][:120]
         fix = "Copy it again, or export it again with `wearcap export`."
@@ -57,39 +61,63 @@ def open_exported(path: str | Path) -> Run:
     return RUN_BY_FORMAT[format](path)
 
 
+_Name = Annotated[str, msgspec.Meta(pattern=r"^\w{1,60}$")]
+
+
+class _File(msgspec.Struct):
+    """A file beside the sidecar, which is named as the part is."""
+
+    sha256: str
+
+
+class _Sidecar(msgspec.Struct):
+    """What all sidecars have; each system's `export.Sidecar` has the rest."""
+
+    wearcap_export: int
+    network: Annotated[str, msgspec.Meta(pattern=r"^[a-z][a-z0-9_]{0,40}$")]
+    model: _File
+    parts: dict[_Name, _File]
+    weights: dict[_Name, _File]
+
+
 def load_exported(path: str | Path, network: str | None = None) -> Any:
     """The system (for iReplica: the contact detector) of an exported model, from its files.
 
     `network`: the expected system's name. Raises WearcapError when a file is missing, unreadable, of another system, or
-    does not belong to the others.
+    does not belong to the others, for a sidecar of another layout, and for somebody else's .pt2.
     """
-    runs = {"model": open_exported(path)}
+    file_size(path, "exported model")
+    if Path(path).suffix == ".pt2":
+        require_own(path)
     sidecar = sidecar_path(path)
-    try:
-        about = parse_json(sidecar.read_bytes(), sidecar)
-    except FileNotFoundError as error:
+    if not sidecar.exists():
         expected = "the .json file that `wearcap export` wrote beside the model"
-        raise WearcapError("no such sidecar", where=sidecar, expected=expected, fix="Copy both files.") from error
-    if not isinstance(about, dict) or about.get("wearcap_export") != VERSION:
+        raise WearcapError("no such sidecar", where=sidecar, expected=expected, fix="Copy both files.")
+    content = read_json_object(sidecar)
+    if content.get("wearcap_export") != VERSION:
         raise WearcapError("not a sidecar of this version", where=sidecar, fix="Export the model again.")
-    name = str(about.get("network"))
-    package = f"wearcap.systems.{name}"
-    if (network or name) != name or not (
-        name.isidentifier() and all(map(importlib.util.find_spec, (package, f"{package}.export")))
-    ):
-        raise WearcapError(f"a {name[:40]} network", where=path, expected=f"a {network or 'known'} network")
-    files = {Path(path): about["model"]}
-    files |= {_file_of(path, part): entry for part, entry in about["parts"].items()}
-    files |= {_file_of(path, part, weights=True): entry for part, entry in about["weights"].items()}
+    about = require_layout(content, _Sidecar, sidecar)
+    name, package = about.network, f"wearcap.systems.{about.network}"
+    if (network or name) != name or not all(map(importlib.util.find_spec, (package, f"{package}.export"))):
+        raise WearcapError(f"a {name} network", where=path, expected=f"a {network or 'known'} network")
+    files = {Path(path): about.model}
+    files |= {_file_of(path, part): entry for part, entry in about.parts.items()}
+    files |= {_file_of(path, part, weights=True): entry for part, entry in about.weights.items()}
     for file, entry in files.items():
         if not file.is_file():
             what = "a part of the exported model is missing"
             raise WearcapError(what, where=file, fix="Copy all files of the export.")
-        if entry["sha256"] != sha256_of(file):
+        if entry.sha256 != sha256_of(file):
             raise WearcapError("its sidecar belongs to another model file", where=file, fix="Export the model again.")
-    runs |= {name: open_exported(part_path(path, name)) for name in about["parts"]}
-    weights = {name: load_file(_file_of(path, name, weights=True)) for name in about["weights"]}
-    return importlib.import_module(f"wearcap.systems.{about['network']}.export").from_export(runs, weights, about)
+    runs = {"model": open_exported(path)} | {name: open_exported(part_path(path, name)) for name in about.parts}
+    weights = {name: read_tensors(_file_of(path, name, weights=True), "part of a model")[1] for name in about.weights}
+    module = importlib.import_module(f"{package}.export")
+    with understood(f"it describes no {name} network", sidecar, fix="Export the model again.", errors=_MISFIT):
+        return module.from_export(runs, weights, require_layout(content, module.Sidecar, sidecar))
+
+
+_MISFIT = (LookupError, TypeError, ValueError, ArithmeticError, AttributeError, RuntimeError, MemoryError)
+"""Exceptions of making a system of values that have the right types but do not fit each other."""
 
 
 def part_path(path: str | Path, part: str) -> Path:
@@ -170,7 +198,7 @@ def export_network(graph: Graph, path: str | Path, format: str, max_error: float
             torch.export.save(exported, temporary)
         else:
             torch.onnx.export(exported, (), temporary, kwargs=graph.inputs, dynamo=True, external_data=False)
-        run = RUN_BY_FORMAT[format](temporary)
+        run = (_open_program if format == "pt2" else open_onnx)(temporary)
         # The example's first row, repeated; floats are scaled differently in every row.
         windows: dict[int, dict[str, Tensor]] = {1: {}, 3: {}}
         for batch, window in windows.items():
@@ -188,6 +216,8 @@ def export_network(graph: Graph, path: str | Path, format: str, max_error: float
             raise WearcapError(what, where=path, expected=f"less than {max_error:.0e}", fix=fix)
         latency, eager = _milliseconds(run, windows[1]), _milliseconds(net, windows[1])
         size = temporary.stat().st_size
+    if format == "pt2":
+        remember_own(path)
     return ExportReport(str(path), format, size, error, latency, eager)
 
 
@@ -198,77 +228,3 @@ def _milliseconds(run: Callable[..., Tensor], inputs: dict[str, Tensor]) -> floa
         run(**inputs)
         times.append(time.perf_counter() - start)
     return sorted(times)[TIMED_RUNS // 2] * 1000
-
-
-_SYMBOL = r"Symbol\('[su]\d{1,6}'(?:, \w{1,20}=(?:True|False))*\)"
-_EXPRESSION = re.compile(
-    rf"(?:{_SYMBOL}|Integer\(-?\d{{1,18}}\)|[su]\d{{1,6}}|-?\d{{1,18}}"
-    r"|(?:Mul|Add|Pow|Min|Max|Mod|PythonMod|FloorDiv|CleanDiv|CeilDiv|ModularIndexing)\(|[(), ])+"
-)
-"""Allowed symbolic sizes, which SymPy evaluates."""
-_SIZE = r"L\['\w{1,60}'\]\.size\(\)\[\d{1,2}\]"
-_GUARD = re.compile(rf"{_SIZE} (?:==|!=|<=|>=|<|>) (?:{_SIZE}|\d{{1,18}})")
-"""Allowed comparisons of input sizes, which PyTorch compiles into a function."""
-_TARGET = re.compile(
-    r"torch\.ops\.aten\.\w+\.\w+|_operator\.(?:add|sub|mul|floordiv|mod|neg|eq|ne|ge|gt|le|lt|getitem)"
-)
-"""Operations that a graph may call."""
-_METADATA = ("stack_trace", "nn_module_stack", "torch_fn")
-MAX_JSON_BYTES = 1 << 26
-"""Largest allowed JSON description of a graph (64 MiB); exported ones have about 1 MiB."""
-
-
-def _check_archive(path: str | Path) -> None:
-    """Raise WearcapError unless an archive has only tensors and a graph of tensor operations.
-
-    Refused are pickled objects, compressed parts, guards and sizes other than arithmetic, and calls of functions that
-    are not ATen operations. Raises zipfile.BadZipFile for a file that is no archive or is damaged.
-    """
-    with zipfile.ZipFile(path) as archive:
-        names = archive.namelist()
-        if len(set(names)) < len(names):
-            raise _refused("two parts of one name", path)
-        for entry in archive.infolist():
-            if entry.compress_type != zipfile.ZIP_STORED:
-                raise _refused("compressed parts", path)
-            if "/sample_inputs/" in entry.filename and entry.file_size > 0:
-                raise _refused("pickled objects", path)
-            if entry.filename.endswith(".json"):
-                if entry.file_size > MAX_JSON_BYTES:
-                    raise _refused(f"a description of {entry.file_size} bytes", path)
-                for key, value in _members(parse_json(archive.read(entry), path)):
-                    if key == "use_pickle" and value:
-                        raise _refused("pickled objects", path)
-                    if key == "expr_str" and not (isinstance(value, str) and _EXPRESSION.fullmatch(value)):
-                        raise _refused(f"the size {str(value)[:80]!r}", path)
-                    entries = value if isinstance(value, list) else [None]
-                    if key == "guards_code" and not all(
-                        isinstance(guard, str) and _GUARD.fullmatch(guard) for guard in entries
-                    ):
-                        raise _refused(f"the guards {str(value)[:80]!r}", path)
-                    if key == "nodes" and not all(
-                        isinstance(node, dict)
-                        and isinstance(node.get("target"), str)
-                        and _TARGET.fullmatch(node["target"])
-                        and set(node.get("metadata") or {}) <= set(_METADATA)
-                        for node in entries
-                    ):
-                        raise _refused("calls of other functions than tensor operations", path)
-        if (damaged := archive.testzip()) is not None:
-            raise zipfile.BadZipFile(f"{damaged} is damaged")
-
-
-def _members(content: Any) -> Iterator[tuple[str, Any]]:
-    """Every key and value of a JSON tree."""
-    rest = [content]
-    while rest:
-        part = rest.pop()
-        if isinstance(part, dict):
-            yield from part.items()
-            rest += part.values()
-        elif isinstance(part, list):
-            rest += part
-
-
-def _refused(what: str, path: str | Path) -> WearcapError:
-    return WearcapError(f"the archive holds {what}", where=path, expected="one that `wearcap export` wrote")

@@ -8,6 +8,7 @@ import math
 import sys
 from pathlib import Path
 
+from wearcap.boundary.own import trusting
 from wearcap.errors import WearcapError
 from wearcap.export.files import load_exported
 from wearcap.live.capture import LiveCapture, report_text
@@ -31,10 +32,12 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--height", type=float, help="of the wearer (m)")
     parser.add_argument("--speed", type=float, default=1.0, help="of a replay; inf: as fast as it goes")
     parser.add_argument("--seconds", type=float, default=math.inf, help="when to stop")
+    parser.add_argument("--trust", action="store_true", help="open a .pt2 file from elsewhere, which can run code")
     options = parser.parse_args(arguments)
     if not options.source and options.recording is None:
         parser.error("give --source or --recording")
-    system = load_exported(options.model)
+    with trusting(options.trust):
+        system = load_exported(options.model)
     if not isinstance(system, System):
         raise WearcapError("a model that captures no motion", options.model, "one of hmd2, mocap_every or echo")
     sources, setup, place = [source_of(text) for text in options.source], None, None

@@ -1,23 +1,26 @@
 """Checkpoints that carry the config they were trained with, read without executing anything from them.
 
 Two kinds of file: a run's `.ckpt`, and the `.safetensors` that is shared: averaged weights and statistics, the model's
-config as JSON in the metadata. Those of `checkpoints/` go by name. Both carry checksums that every reading verifies.
+config as JSON in the metadata. Those of `checkpoints/` go by name. The shared one carries a checksum that every reading verifies, and is for
+others; a `.ckpt` is the user's own (`wearcap.boundary.own`).
 """
 
 import hashlib
 import json
+import os
 import re
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NotRequired, TypedDict, TypeVar
 
-import safetensors
 import torch
-from safetensors.torch import load_file, save
+from safetensors.torch import save
 from torch import Tensor, nn
 
-from wearcap.boundary.texts import parse_json
+from wearcap.boundary.opening import file_size
+from wearcap.boundary.own import require_own
+from wearcap.boundary.tensors import plain_tensors, read_tensors, read_torch
+from wearcap.boundary.texts import parse_json, require_layout
 from wearcap.errors import WearcapError, nearest
 from wearcap.files import atomic_path, resource
 from wearcap.models.build import build, check_config
@@ -26,9 +29,6 @@ Network = TypeVar("Network", bound=nn.Module)
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 """Number formats of weights in a shared file."""
-
-MAX_CONFIG_BYTES = 1 << 20
-"""Longest config (1 MiB of JSON) that a checkpoint may carry; a training run's has 10 kB."""
 
 _NAME = re.compile(r"[\w-]+")
 _SUFFIX = ".safetensors"
@@ -42,15 +42,34 @@ def shared_checkpoints() -> dict[str, Path]:
     return {path.stem: path for path in sorted(resource("checkpoints", "checkpoints").glob(f"*{_SUFFIX}"))}
 
 
+class _Source(TypedDict, total=False):
+    root: str
+
+
+class _Data(TypedDict, total=False):
+    sources: dict[str, _Source | None] | None
+    val_sources: dict[str, _Source | None] | None
+
+
+class _Config(TypedDict):
+    """What is read of a checkpoint's config, beside the model itself."""
+
+    model: dict[str, Any]
+    name: NotRequired[str]
+    data: NotRequired[_Data | None]
+    training: NotRequired[dict[str, float | str | None]]
+    sha256: NotRequired[str]
+
+
 def checkpoint_file(path: str | Path) -> Path:
     """The file of a path, or of the name of a checkpoint in `checkpoints/`. Raises WearcapError for an unknown name."""
     path = Path(path)
-    if path.exists() or not _NAME.fullmatch(str(path)):
+    if os.path.exists(path) or not _NAME.fullmatch(str(path)):
         return path
     shared = shared_checkpoints()
     if path.name not in shared:
         expected = "a file, or the name of a checkpoint that comes with wearcap"
-        raise WearcapError("no such checkpoint", where=path.name, expected=expected, fix=nearest(path.name, shared))
+        raise WearcapError("no such checkpoint", path.name[:80], expected, nearest(path.name[:80], shared))
     return shared[path.name]
 
 
@@ -58,18 +77,22 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
     """(config, averaged weights) of a run's `.ckpt`, of a shared `.safetensors`, or of a name in `checkpoints/`.
 
     The config is plain data, its `model` what `wearcap.models.build` accepts. Weights stored in half the width come
-    back as float32. Raises WearcapError when the file is missing, damaged or foreign, when its checksums do not fit,
-    and when its model is to be made of anything but wearcap's networks.
+    back as float32. Raises WearcapError when the file is missing, damaged or foreign, when its checksum does not fit,
+    when its model is to be made of anything but wearcap's networks, and for somebody else's `.ckpt`.
     """
     path = checkpoint_file(path)
-    if not path.is_file():
-        raise WearcapError("no such checkpoint", where=path)
-    text, state = _read_shared(path) if path.suffix == _SUFFIX else _read_run(path)
-    if len(text) > MAX_CONFIG_BYTES:
-        raise WearcapError(f"a config of {len(text)} bytes", where=path, expected=f"{MAX_CONFIG_BYTES} at most")
-    config = parse_json(text, path)
-    if not isinstance(config, dict) or not isinstance(config.get("model"), dict):
-        raise WearcapError("a checkpoint without its model's config", where=path, expected="JSON with a key 'model'")
+    if path.suffix == _SUFFIX:
+        metadata, state = read_tensors(path, "checkpoint")
+        text = metadata.get(_KEY)
+    else:
+        saved = read_run_file(path)
+        about, state = saved.get("wearcap"), saved.get("state_dict")
+        text = about.get("config") if isinstance(about, dict) else None
+    if not isinstance(text, str):
+        expected = "one that `wearcap train` or `wearcap export format=safetensors` wrote"
+        raise WearcapError("a file, but not a checkpoint of wearcap", path, expected)
+    config, state = parse_json(text, path, "config"), plain_tensors(state, path)
+    require_layout(config, _Config, path)
     if (digest := config.pop(_DIGEST, None)) is not None and digest != _digest(config, state):
         raise WearcapError("its checksum differs from its content", where=path, fix="Fetch the file again.")
     check_config(config["model"], path)
@@ -80,60 +103,15 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
 def read_run_file(path: str | Path) -> dict[str, Any]:
     """The contents of a run's `.ckpt`: tensors and plain values only.
 
-    Raises WearcapError for a file that is damaged (by the checksums of its parts), compressed or no checkpoint, and for
-    a pickle that asks for anything but data.
+    Raises WearcapError as `read_torch` does, for somebody else's, and for anything that is no dictionary.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
-                raise ValueError("compressed parts")
-            if (damaged := archive.testzip()) is not None:
-                raise ValueError(f"{damaged} is damaged")
-        saved = torch.load(path, map_location="cpu", weights_only=True)
-        if not isinstance(saved, dict):
-            raise ValueError("no dictionary")
-        return saved
-    except PermissionError as error:
-        raise WearcapError("no permission to read it", where=path) from error
-    except Exception as error:  # zipfile and torch.load may raise anything for damaged bytes
-        what = f"not a readable checkpoint ({' '.join(str(error).split())[:120] or type(error).__name__})"
-        expected = "a complete .ckpt file of `wearcap train`, with tensors and plain values only"
-        raise WearcapError(what, where=path, expected=expected) from error
-
-
-def _read_run(path: Path) -> tuple[str, dict[str, Tensor]]:
-    saved = read_run_file(path)
-    about, state = saved.get("wearcap"), saved.get("state_dict")
-    text = about.get("config") if isinstance(about, dict) else None
-    # A weight's memory is in the file: no expansion of a few numbers to any size.
-    plain = isinstance(state, dict) and all(
-        isinstance(name, str)
-        and isinstance(value, Tensor)
-        and value.device.type == "cpu"
-        and value.layout == torch.strided
-        and not value.is_quantized
-        and value.numel() * value.element_size() <= value.untyped_storage().nbytes()
-        for name, value in state.items()
-    )
-    if not isinstance(text, str) or not isinstance(state, dict) or not plain:
-        expected = "a .ckpt file that `wearcap train` wrote"
-        raise WearcapError("a checkpoint, but not of wearcap", where=path, expected=expected)
-    return text, dict[str, Tensor](state)
-
-
-def _read_shared(path: Path) -> tuple[str, dict[str, Tensor]]:
-    try:
-        with safetensors.safe_open(str(path), framework="pt") as file:
-            metadata = file.metadata() or {}
-        state = load_file(path)
-    except PermissionError as error:
-        raise WearcapError("no permission to read it", where=path) from error
-    except (safetensors.SafetensorError, OSError, RuntimeError, ValueError, KeyError) as error:
-        raise WearcapError("not a readable checkpoint", where=path, expected="a complete .safetensors file") from error
-    if _KEY not in metadata:
-        what = "a .safetensors file, but not a checkpoint of wearcap"
-        raise WearcapError(what, where=path, expected="one that `wearcap export format=safetensors` wrote")
-    return metadata[_KEY], state
+    expected = "a complete .ckpt file of `wearcap train`, with tensors and plain values only"
+    file_size(path, "checkpoint")
+    require_own(path)
+    saved = read_torch(path, "checkpoint", expected)
+    if not isinstance(saved, dict):
+        raise WearcapError(f"a {type(saved).__name__}, but no checkpoint", path, expected)
+    return saved
 
 
 def _digest(config: Mapping[str, Any], state: Mapping[str, Tensor]) -> str:

@@ -7,7 +7,6 @@ programs left them. Their networks are open_clip's and timm's, both optional pac
 import hashlib
 import importlib
 import os
-import zipfile
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -171,16 +170,6 @@ class _PretrainedEncoder:
             fix = f"pip install {self.install}, or take encoder=egoview, which needs none."
             raise WearcapError(f"{self.title} needs the package {error.name!r}", fix=fix) from error
         path = self.find_weights(weights)
-        if zipfile.is_zipfile(path):
-            with zipfile.ZipFile(path) as archive:
-                if any("code" in Path(name).parts for name in archive.namelist()):
-                    raise WearcapError(
-                        "a TorchScript archive, which holds code beside its weights and is not opened",
-                        where=path,
-                        expected="a .safetensors file, or a state_dict",
-                        fix="If you trust its origin: torch.save(torch.jit.load(PATH, 'cpu').state_dict(), "
-                        "'weights.pt'), then weights=weights.pt.",
-                    )
         network = self.network_of(package)
         load_weights(network, self.tensors_of(read_weights(path)), name=self.title, where=path)
         self.device = device or ("cuda" if torch.cuda.is_available() else "cpu")

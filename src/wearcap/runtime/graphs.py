@@ -14,13 +14,15 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+import msgspec
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from wearcap.body.skeleton import Site, Skeleton
+from wearcap.boundary.opening import file_size
 from wearcap.diffusion.schedule import CosineSchedule, Schedule
 from wearcap.errors import WearcapError, nearest, require_choice
 
@@ -32,6 +34,10 @@ PRECISIONS = ("auto", "narrowest", "float32", "bfloat16", "int8")
 int8 (weights, and dynamically quantised activations) needs ONNX Runtime."""
 Run = Callable[..., Tensor]
 """A network's output from its inputs by name."""
+Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 20)]
+"""Frames, features and other sizes in a sidecar."""
+Rate = Annotated[float, msgspec.Meta(gt=0, le=10_000)]
+"""Frame rate (Hz) in a sidecar."""
 _INSTALL = 'Run: pip install "wearcap[export]"'
 
 
@@ -194,18 +200,23 @@ def program(graph: Graph) -> torch.export.ExportedProgram:
 
 
 def open_onnx(path: str | Path) -> Run:
-    """An ONNX file in ONNX Runtime on the CPU. Raises WearcapError when it is missing or not readable."""
+    """An ONNX file in ONNX Runtime on the CPU.
+
+    Its operators are ONNX Runtime's own, its weights in the file or beside it (ONNX Runtime refuses others). Raises
+    WearcapError when it is missing or not readable.
+    """
     try:
         import onnxruntime
     except ImportError as error:
         raise WearcapError("running ONNX files needs onnxruntime", fix=_INSTALL) from error
-    if not Path(path).is_file():
-        raise WearcapError("no such exported model", where=path, fix="Make one with `wearcap export`.")
+    file_size(path, "exported model")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     options.log_severity_level = 3
     # Threads spin between the operations of a step; after it they yield the cores to other work.
     options.add_session_config_entry("session.force_spinning_stop", "1")
+    # What is computed while a file is opened may be of any size.
+    options.add_session_config_entry("optimization.constant_folding_max_output_size_in_bytes", str(1 << 24))
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's exceptions share no base of their own
@@ -262,7 +273,7 @@ def schedule_to_json(schedule: Schedule) -> dict[str, Any]:
     return {"name": name, **vars(schedule)}
 
 
-def schedule_from_json(tree: dict[str, Any]) -> Schedule:
+def schedule_from_json(tree: dict[str, float | str]) -> Schedule:
     """The inverse of `schedule_to_json`."""
     return SCHEDULES[tree["name"]](**{key: value for key, value in tree.items() if key != "name"})
 
@@ -278,8 +289,16 @@ def skeleton_to_json(skeleton: Skeleton) -> dict[str, Any]:
     }
 
 
-def skeleton_from_json(tree: dict[str, Any]) -> Skeleton:
-    """The inverse of `skeleton_to_json`."""
-    sites = {name: Site(joint, (x, y, z)) for name, (joint, x, y, z) in tree["sites"].items()}
-    offsets = torch.tensor(tree["t_parent_joint"])
-    return Skeleton(tree["name"], tuple(tree["joint_names"]), tuple(tree["parents"]), offsets, sites)
+class SkeletonEntry(msgspec.Struct):
+    """A skeleton in a sidecar; offsets in m."""
+
+    name: str
+    joint_names: tuple[str, ...]
+    parents: tuple[int, ...]
+    t_parent_joint: list[tuple[float, float, float]]
+    sites: dict[str, tuple[str, float, float, float]]
+
+    def skeleton(self) -> Skeleton:
+        """The inverse of `skeleton_to_json`."""
+        sites = {name: Site(joint, (x, y, z)) for name, (joint, x, y, z) in self.sites.items()}
+        return Skeleton(self.name, self.joint_names, self.parents, torch.tensor(self.t_parent_joint), sites)

@@ -4,9 +4,11 @@ import ctypes
 import importlib.metadata
 import io
 import json
+import os
 import platform
 import subprocess
 import time
+import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,10 @@ from lightning.pytorch import Callback
 from torch import Tensor
 
 import wearcap
+from wearcap.boundary.opening import understood
+from wearcap.boundary.own import remember_own, require_own
+from wearcap.boundary.tensors import plain_tensors
+from wearcap.boundary.texts import parse_json, read_yaml_object
 from wearcap.data.datamodule import WindowsModule
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, write_text
@@ -51,6 +57,8 @@ class RunRecord(Callback):
 
     def __init__(self, config: dict[str, Any]):
         self.config = config
+        self.stepped = False
+        """Whether a step has been made."""
         self._taken = {"frames": 0, "seconds": 0.0, "core_seconds": 0.0}
         self._clocks = _clocks()
 
@@ -60,11 +68,11 @@ class RunRecord(Callback):
                 logger.log_hyperparams(self.config | {"parameters": trained_parameters(pl_module)})
 
     def on_load_checkpoint(self, trainer, pl_module, checkpoint: dict[str, Any]) -> None:
-        self.add_to(json.loads(checkpoint.get("wearcap", {}).get("config", "{}")))
+        self.add_to(parse_json(checkpoint.get("wearcap", {}).get("config", "{}"), "the checkpoint's config", "config"))
 
     def add_to(self, before: Mapping[str, Any]) -> None:
         """Count on from what an earlier training has taken, by its checkpoint's config."""
-        taken = before.get("training", {})
+        taken = before.get("training") or {}
         self._taken = {name: taken.get(name, value) for name, value in self._taken.items()}
 
     def on_train_start(self, trainer, pl_module) -> None:
@@ -78,6 +86,7 @@ class RunRecord(Callback):
         self._clocks = _clocks()
 
     def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx: int) -> None:
+        self.stepped = True
         frames = len(batch[0]) * getattr(trainer.datamodule.train, "window", 1)  # pyright: ignore[reportAttributeAccessIssue]
         self._taken["frames"] += frames * trainer.world_size
 
@@ -138,16 +147,22 @@ def fit(
 
     A killed run resumes without repeating or skipping a step.
     """
+    record = next((each for each in trainer.callbacks if isinstance(each, RunRecord)), None)  # pyright: ignore[reportAttributeAccessIssue]
     if resume is not None:
         require_resumable(resume, system.state_dict())
     elif init is not None:
         before = start_from(init, system)
-        for callback in trainer.callbacks:  # pyright: ignore[reportAttributeAccessIssue]
-            if isinstance(callback, RunRecord):
-                callback.add_to(before)
+        if record is not None:
+            record.add_to(before)
     else:
         system.set_statistics(data.dataset("train"))
-    trainer.fit(system, datamodule=data, ckpt_path=resume, weights_only=True)
+    try:
+        trainer.fit(system, datamodule=data, ckpt_path=resume, weights_only=True)
+    except Exception as error:  # Lightning and the optimisers raise anything for states that are not theirs
+        if resume is None or record is None or record.stepped or isinstance(error, WearcapError):
+            raise
+        what = f"a training cannot go on from it ({type(error).__name__}: {' '.join(str(error).split())[:160]})"
+        raise WearcapError(what, resume, "a run's .ckpt file, as `wearcap train` writes it") from error
 
 
 def require_resumable(path: str | Path, own: Mapping[str, Tensor]) -> None:
@@ -157,10 +172,10 @@ def require_resumable(path: str | Path, own: Mapping[str, Tensor]) -> None:
     """
     saved = read_run_file(path)
     missing = [key for key in TRAINING_STATE if key not in saved]
-    if missing or not isinstance(saved["state_dict"], dict):
-        what = f"a checkpoint without {missing[0] if missing else 'weights'}"
+    if missing:
+        what = f"a checkpoint without {missing[0]}"
         raise WearcapError(what, where=path, expected="a run's .ckpt file, as `wearcap train` writes it")
-    check_weights(own, saved["state_dict"], path)
+    check_weights(own, plain_tensors(saved["state_dict"], path), path)
 
 
 def keep_freed_memory() -> None:
@@ -203,16 +218,17 @@ def resume_path(resume: str | None, run: Path, config_yaml: str) -> Path | None:
     if resume is None:
         return None
     if resume != "auto":
-        if not Path(resume).is_file():
+        if not os.path.isfile(resume):
             expected = "a run's .ckpt file, or resume=auto for this run's own"
-            raise WearcapError("no such checkpoint to resume from", where=resume, expected=expected)
+            raise WearcapError("no such checkpoint to resume from", where=resume[:200], expected=expected)
+        require_own(resume)
         return Path(resume)
     last = last_checkpoint(run)
     if not last.is_file():
         return None
     if not (run / "config.yaml").is_file():
         raise WearcapError("no config.yaml of the run to go on with", run, fix=f"Give resume={last}.")
-    if different := differing_keys((run / "config.yaml").read_text(encoding="utf-8"), config_yaml):
+    if different := differing_keys(read_yaml_object(run / "config.yaml"), config_yaml):
         raise _another_config(run, different)
     return last
 
@@ -225,15 +241,20 @@ def last_checkpoint(run: Path) -> Path:
 def run_to_continue(runs: Path, config_yaml: str) -> Path | None:
     """The newest run in a folder that was trained with a config, its seed included; None if no run has its seed.
 
-    Raises WearcapError, with the differing keys, when the runs of that seed have other configs.
+    A run whose config cannot be read is passed over, with a warning. Raises WearcapError, with the differing keys, when
+    the runs of that seed have other configs.
     """
     seed, refused = yaml.safe_load(config_yaml)["seed"], None
     found = [path.parents[1] for path in runs.glob("**/last.ckpt") if (path.parents[1] / "config.yaml").is_file()]
     for run in sorted(found, key=lambda run: last_checkpoint(run).stat().st_mtime, reverse=True):
-        recorded = (run / "config.yaml").read_text(encoding="utf-8")
-        if yaml.safe_load(recorded).get("seed") != seed:
+        try:
+            recorded = read_yaml_object(run / "config.yaml")
+            if recorded.get("seed") != seed:
+                continue
+            different = differing_keys(recorded, config_yaml)
+        except WearcapError as error:
+            warnings.warn(f"a run that cannot be gone on with: {error}", stacklevel=2)
             continue
-        different = differing_keys(recorded, config_yaml)
         if not different:
             return run
         refused = refused or _another_config(run, different)
@@ -242,9 +263,11 @@ def run_to_continue(runs: Path, config_yaml: str) -> Path | None:
     return None
 
 
-def differing_keys(before: str, now: str) -> list[str]:
-    """Keys, with both values, in which two configs (YAML) would train differently; `FREE_TO_CHANGE` does not count."""
-    values = [dict(_leaves(config, config["paths"]["run"])) for config in map(yaml.safe_load, (before, now))]
+def differing_keys(before: dict[str, Any], now: str) -> list[str]:
+    """Keys, with both values, in which a run's config and one of now (YAML) would train differently; `FREE_TO_CHANGE` does
+    not count. Raises WearcapError for a config that is none of a run."""
+    with understood("no config of a training run", "config.yaml", "one that `wearcap train` wrote"):
+        values = [dict(_leaves(config, str(config["paths"]["run"]))) for config in (before, yaml.safe_load(now))]
     keys = [key for key in {**values[0], **values[1]} if not f"{key}.".startswith(FREE_TO_CHANGE)]
     none = "nothing"
     pairs = [(key, values[0].get(key, none), values[1].get(key, none)) for key in keys]
@@ -322,5 +345,6 @@ def record_run(folder: Path, config_yaml: str) -> None:
         "machine": machine(),
         "versions": {name: importlib.metadata.version(name) for name in names},
     }
+    remember_own(folder)
     write_text(folder / "config.yaml", config_yaml)
     write_text(folder / "run.json", json.dumps(record, indent=1) + "\n")

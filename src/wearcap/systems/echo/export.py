@@ -4,6 +4,7 @@ encoder, whose neighbour search exports poorly: its weights are written beside t
 from dataclasses import asdict
 from typing import Any
 
+import msgspec
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -12,16 +13,19 @@ from wearcap.body.contact_points import BODY_POINTS
 from wearcap.body.skeleton import FOOT_PATCHES, WRISTS, Skeleton
 from wearcap.data.features import LIMBS
 from wearcap.errors import WearcapError
+from wearcap.models.build import build
 from wearcap.models.layers import Normalizer
 from wearcap.models.point_encoder import PointNeXt
 from wearcap.runtime.graphs import (
     ROT6D,
+    Count,
     Exports,
     Graph,
+    Rate,
     Run,
+    SkeletonEntry,
     schedule_from_json,
     schedule_to_json,
-    skeleton_from_json,
     skeleton_to_json,
 )
 from wearcap.systems.echo.contacts import ContactUse, Guidance
@@ -118,13 +122,12 @@ class _ExportedEchoDenoiser(EchoDenoiser):
 
     exported = True
 
-    def __init__(self, runs: dict[str, Run], about: dict[str, Any]):
-        """`about`: the sidecar."""
+    def __init__(self, runs: dict[str, Run], about: "Sidecar"):
         nn.Module.__init__(self)  # no blocks of its own
-        self._runs, self.window, self.streams = (runs,), about["window"], 1
-        self.sizes = tuple(about["sizes"][name] for name in MODALITIES)
+        self._runs, self.window, self.streams = (runs,), about.window, 1
+        self.sizes = tuple(about.sizes[name] for name in MODALITIES)
         self.motion_normalizer = Normalizer(sum(self.sizes))
-        self.motion_normalizer.set(torch.tensor(about["motion_mean"]), torch.tensor(about["motion_scale"]))
+        self.motion_normalizer.set(torch.tensor(about.motion_mean), torch.tensor(about.motion_scale))
         self.object = _Embedding(runs["objects"], self.window)
 
     def graphs(self) -> dict[str, Graph]:
@@ -134,24 +137,40 @@ class _ExportedEchoDenoiser(EchoDenoiser):
         }
 
 
-def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], about: dict[str, Any]) -> Echo:
+class Sidecar(msgspec.Struct):
+    """What running an exported model takes of its sidecar."""
+
+    features: EchoFeatures
+    window: Count
+    fps: Rate
+    sizes: dict[str, Count]
+    motion_mean: list[float]
+    motion_scale: list[float]
+    schedule: dict[str, float | str]
+    settings: dict[str, Any]
+    skeleton: SkeletonEntry
+    guidance: Guidance | None = None
+    refinement: dict[str, Any] | None = None
+    encoder: dict[str, Any] | None = None
+
+
+def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], about: Sidecar) -> Echo:
     """The pipeline of an exported model."""
+    encoder = None
+    if about.encoder is not None:
+        target = f"{PointNeXt.__module__}.{PointNeXt.__qualname__}"
+        encoder: Any = build({**about.encoder, "_target_": target}, weights["encoder"], "the sidecar's encoder")
+        encoder.requires_grad_(False)
     # Files of before these settings captured without them.
-    encoder, settings = None, {"freedoms": False, "spread": None, "wrists": None, **about["settings"]}
-    guidance = None if about["guidance"] is None else Guidance(**{"held": 0.0, "within_m": 0.0, **about["guidance"]})
-    if about["encoder"] is not None:
-        encoder = PointNeXt(**about["encoder"])
-        encoder.load_state_dict(weights["encoder"])
-        encoder.requires_grad_(False).eval()
+    settings = {"freedoms": False, "spread": None, "wrists": None, **about.settings}
     model = EchoModel(
         _ExportedEchoDenoiser(runs, about),
-        EchoFeatures(**about["features"]),
-        schedule_from_json(about["schedule"]),
-        skeleton_from_json(about["skeleton"]),
+        about.features,
+        schedule_from_json(about.schedule),
+        about.skeleton.skeleton(),
         encoder,
-        settings.pop("contacts"),
+        settings["contacts"],
     )
-    use = ContactUse(guidance, settings.pop("static_threshold"))
-    anchor, freedoms = settings.pop("anchor"), settings.pop("freedoms")
-    refinement = Refinement.of(about.get("refinement"))
-    return Echo(model, Sampling(**settings), use, anchor, refinement, freedoms=freedoms)
+    use = ContactUse(about.guidance, settings["static_threshold"])
+    sampling, refinement = msgspec.convert(settings, Sampling), Refinement.of(about.refinement)
+    return Echo(model, sampling, use, settings["anchor"], refinement, freedoms=settings["freedoms"])

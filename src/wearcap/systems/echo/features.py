@@ -1,5 +1,6 @@
 """ECHO's inputs and outputs as features (ECHO §3.1): three tracked points in; body, object and contacts out."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -58,7 +59,7 @@ class EchoFeatures:
     frame: str = "own"
     body: bool = True
     """Whether the wearer's size and the head's height above the floor are part of the condition (ours)."""
-    classes: tuple[str, ...] | list[str] = ()
+    classes: Sequence[str] = ()
     """Names of the object classes, in the order of their one-hot code."""
     shape_size: int = 256
     """Size of the object encoder's feature; 0: class and extents alone describe an object."""
@@ -66,7 +67,7 @@ class EchoFeatures:
     """Number of joints of the skeleton."""
     fps: float = 30.0
     """Frame rate of the model (Hz)."""
-    points: tuple[str, ...] | list[str] = POINTS
+    points: Sequence[str] = POINTS
     """Tracked points that the condition has, the head first: all, or for a baseline the head alone."""
     object_in_wrists: bool = False
     """Whether an object's pose is among the outputs in both wrists' axes, too, in which it changes little while it is

@@ -1,9 +1,10 @@
 """HMD²'s networks as exported graphs. Windows, features and sampler are the pipeline's own: the same noise gives the
 same motion."""
 
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from typing import Any
 
+import msgspec
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -13,7 +14,7 @@ from wearcap.errors import WearcapError
 from wearcap.models.layers import Normalizer
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.runtime import graphs
-from wearcap.runtime.graphs import ROT6D, Call, Exports, Graph, Run
+from wearcap.runtime.graphs import ROT6D, Call, Count, Exports, Graph, Rate, Run
 from wearcap.scene.voxels import VoxelGrid
 from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import Conditions, MotionDenoiser
@@ -111,16 +112,15 @@ def condition_channels(features: HeadFeatures) -> list[str]:
 class _ExportedDenoiser(MotionDenoiser):
     """A `MotionDenoiser` whose weights are in exported files, run on the CPU."""
 
-    def __init__(self, runs: dict[str, Run], about: dict[str, Any]):
-        """`about`: the sidecar."""
+    def __init__(self, runs: dict[str, Run], about: "Sidecar"):
         nn.Module.__init__(self)  # no blocks of its own
         self._runs = (runs,)
-        self.window, self.condition_size = about["window"], about["condition_size"]
-        self.points_size, self.image_size = about["points_size"], about["image_size"]
-        self.self_conditioning = about["self_conditioning"]
-        self.motion_size = len(about["motion_mean"])
+        self.window, self.condition_size = about.window, about.condition_size
+        self.points_size, self.image_size = about.points_size, about.image_size
+        self.self_conditioning = about.self_conditioning
+        self.motion_size = len(about.motion_mean)
         self.motion_normalizer = Normalizer(self.motion_size)
-        self.motion_normalizer.set(torch.tensor(about["motion_mean"]), torch.tensor(about["motion_scale"]))
+        self.motion_normalizer.set(torch.tensor(about.motion_mean), torch.tensor(about.motion_scale))
 
     def encode(self, conditions: Conditions, valid: Bool[Tensor, "batch time"]) -> Float[Tensor, "batch token width"]:
         inputs = {"head": conditions.head, "valid": valid}
@@ -147,16 +147,34 @@ class _ExportedPlaces(VoxelAutoencoder):
         return self._run(grids=flat).reshape(*grids.shape[:-3], self.size)
 
 
-def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], about: dict[str, Any]) -> HMD2:
+class Sidecar(msgspec.Struct):
+    """What running an exported model takes of its sidecar."""
+
+    window: Count
+    fps: Rate
+    settings: dict[str, Any]
+    features: HeadFeatures
+    schedule: dict[str, float | str]
+    skeleton: graphs.SkeletonEntry
+    motion_mean: list[float]
+    motion_scale: list[float]
+    condition_size: Count
+    points_size: Count
+    image_size: Count
+    self_conditioning: bool
+    image_encoder: str | None
+    grid: VoxelGrid | None = None
+    refinement: dict[str, Any] | None = None
+
+
+def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], about: Sidecar) -> HMD2:
     """The pipeline of an exported model."""
-    places, settings = None, dict(about["settings"])
-    if "places" in runs:
-        places = _ExportedPlaces(runs["places"], VoxelGrid(**about["grid"]), about["points_size"])
-    net, features = _ExportedDenoiser(runs, about), HeadFeatures(**about["features"])
-    schedule, skeleton = graphs.schedule_from_json(about["schedule"]), graphs.skeleton_from_json(about["skeleton"])
-    model = DiffusionModel(net, features, schedule, skeleton, about["fps"], places, about["image_encoder"])
-    sampling, overlap = (
-        kind(**{field.name: settings.pop(field.name) for field in fields(kind) if field.name in settings})
-        for kind in (Sampling, Overlap)
-    )
-    return HMD2(model, sampling, overlap, refinement=Refinement.of(about.get("refinement")), **settings)
+    places = None
+    if "places" in runs and about.grid is not None:
+        places = _ExportedPlaces(runs["places"], about.grid, about.points_size)
+    schedule, skeleton = graphs.schedule_from_json(about.schedule), about.skeleton.skeleton()
+    net = _ExportedDenoiser(runs, about)
+    model = DiffusionModel(net, about.features, schedule, skeleton, about.fps, places, about.image_encoder)
+    sampling, overlap = (msgspec.convert(about.settings, kind) for kind in (Sampling, Overlap))
+    live, use = bool(about.settings["live"]), tuple(about.settings["use"])
+    return HMD2(model, sampling, overlap, use, Refinement.of(about.refinement), live)

@@ -2,8 +2,8 @@
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
+import msgspec
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -13,7 +13,7 @@ from wearcap.files import write_text
 from wearcap.geometry import rotation
 from wearcap.recording import Recording
 from wearcap.recording.motion import HANDS
-from wearcap.runtime.graphs import Call, Exports, Graph, Run
+from wearcap.runtime.graphs import Call, Exports, Graph, Rate, Run
 from wearcap.systems.ireplica.contact_prediction import FRAMES, ContactDetector, ContactNetwork, ContactStream
 from wearcap.systems.ireplica.features import FEATURES, pose_frames
 
@@ -69,11 +69,16 @@ class _ExportedDetector(ContactDetector):
         write_text(path, "".join(",".join(row) + "\n" for row in [header, *rows]))
 
 
-def from_export(
-    runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], about: dict[str, Any]
-) -> _ExportedDetector:
+class Sidecar(msgspec.Struct):
+    """What running an exported network takes of its sidecar."""
+
+    features: dict[str, str | bool]
+    classes: tuple[str, ...]
+    fps: Rate
+
+
+def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], about: Sidecar) -> _ExportedDetector:
     """The detector of an exported model."""
-    features = dict(about["features"])
+    features = dict(about.features)
     encoder = FEATURES[features.pop("name")](**features)
-    net = _ExportedContact(runs["model"], len(about["classes"]))
-    return _ExportedDetector(net, encoder, tuple(about["classes"]), about["fps"])
+    return _ExportedDetector(_ExportedContact(runs["model"], len(about.classes)), encoder, about.classes, about.fps)

@@ -3,12 +3,13 @@
 from dataclasses import asdict
 from typing import Any
 
+import msgspec
 from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.skeleton import FEET
 from wearcap.errors import WearcapError
-from wearcap.runtime.graphs import Exports, Run, skeleton_from_json, skeleton_to_json
+from wearcap.runtime.graphs import Count, Exports, Rate, Run, SkeletonEntry, skeleton_to_json
 from wearcap.systems.mocap_every.features import WatchFeatures
 from wearcap.systems.mocap_every.model import Estimate, WatchEstimator
 from wearcap.systems.mocap_every.pipeline import SETTINGS, MocapEvery, WatchModel
@@ -48,8 +49,19 @@ class _ExportedEstimator(WatchEstimator):
         return Estimate(output[..., :-FEET], output[..., -FEET:], None)
 
 
-def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], about: dict[str, Any]) -> MocapEvery:
+class Sidecar(msgspec.Struct):
+    """What running an exported model takes of its sidecar."""
+
+    features: WatchFeatures
+    window: Count
+    fps: Rate
+    skeleton: SkeletonEntry
+    settings: dict[str, int | float | str | bool]
+    refinement: dict[str, Any] | None = None
+
+
+def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], about: Sidecar) -> MocapEvery:
     """The pipeline of an exported model."""
-    net, features = _ExportedEstimator(runs["model"], about["window"]), WatchFeatures(**about["features"])
-    model = WatchModel(net, features, skeleton_from_json(about["skeleton"]), about["fps"])
-    return MocapEvery(model, refinement=Refinement.of(about.get("refinement")), **about["settings"])
+    net = _ExportedEstimator(runs["model"], about.window)
+    model = WatchModel(net, about.features, about.skeleton.skeleton(), about.fps)
+    return MocapEvery(model, refinement=Refinement.of(about.refinement), **about.settings)
