@@ -328,3 +328,11 @@ def test_arrays_of_neither_numbers_nor_text(tmp_path, dtype):
     np.savez(tmp_path / "a.npz", np.zeros(3, dtype))
     with pytest.raises(WearcapError, match="an array of"):
         read_npz(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("text", ['{"name": "\\ud800"}', '["\\uDFFF"]', '{"\\ud83d": 1}'])
+def test_halves_of_characters_are_no_text(tmp_path, text):
+    (tmp_path / "a.json").write_text(text)
+    refused(read_json, tmp_path / "a.json", "not readable JSON")
+    (tmp_path / "a.json").write_text('["\\ud83d\\ude00"]')
+    assert read_json(tmp_path / "a.json") == ["😀"]

@@ -8,9 +8,11 @@ from typing import ClassVar
 import lightning
 import pytest
 import torch
+import yaml
 from hydra.utils import instantiate
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.strategies import FSDPStrategy
+from omegaconf import OmegaConf
 
 from wearcap.cli import evaluate, train
 from wearcap.cli.conf import compose
@@ -18,7 +20,7 @@ from wearcap.errors import WearcapError
 from wearcap.models.checkpoint import read_checkpoint, share_checkpoint
 from wearcap.training.callbacks import StepsProgressBar
 from wearcap.training.loggers import read_metrics
-from wearcap.training.run import differing_keys
+from wearcap.training.run import differing_keys, resume_path, run_to_continue
 from wearcap_testing import small_dataset
 
 SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
@@ -77,7 +79,7 @@ def test_auto_goes_on_in_the_folder_of_the_same_seed_and_config(data, runs):
     assert [row["step"] for row in read_metrics(run / "metrics.csv") if "train/loss" in row] == ["0", "1", "2", "3"]
 
 
-def test_auto_leaves_another_seeds_run_alone(data, runs):
+def test_auto_leaves_another_seeds_run_alone(data, runs, trusted):
     other = f"hydra.run.dir={runs}/train/debug_fast/other"
     train.main(arguments(data, runs, "resume=auto", "seed=5", other))
     assert folders(runs) == {"first", "other"}
@@ -105,10 +107,73 @@ def test_auto_refuses_another_config_with_the_keys_that_differ(own, data, runs):
     assert folders(runs) == {"first"}
 
 
+BOMB = "a0: &a0 [x, x]\n" + "".join(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}]\n" for k in range(1, 40))
+DAMAGED = {
+    "an alias bomb": BOMB,
+    "a list": "[1, 2]",
+    "nothing": "",
+    "no paths": "seed: 0\n",
+    "paths of another type": "seed: 0\npaths: 3\n",
+    "no YAML": "seed: [0",
+    "nested": "seed: 0\na: " + "[" * 5000,
+    "binary": "seed: \0",
+    "a date that is none": "seed: 0\npaths: {run: 2001-99-99}\n",
+    "an unhashable key": "? [a]\n: b\n",
+    "a giant": "seed: 0\na: " + "x" * (1 << 20),
+    "a tag": "!!python/object/apply:os.mkdir [mark]\n",
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGED)
+def test_a_damaged_config_of_a_run_does_not_break_the_others(damage, data, runs):
+    """Runs of one name lie side by side: resume=auto goes on with the whole one, and says what it passes over."""
+    broken = runs / "train/debug_fast/broken"
+    shutil.copytree(runs / "train/debug_fast/first", broken)
+    (broken / "config.yaml").write_text(DAMAGED[damage])
+    record = OmegaConf.to_yaml(compose("train", [*arguments(data, runs), "paths.run=RUN"]), resolve=True)
+    with pytest.warns(UserWarning, match=r"cannot be gone on with: .*config\.yaml"):
+        assert run_to_continue(runs / "train/debug_fast", record) == runs / "train/debug_fast/first"
+    with pytest.raises(WearcapError, match=r"config\.yaml"):
+        resume_path("auto", broken, record)
+
+
+CRAFTED = {
+    "optimiser of another type": {"optimizer_states": "x"},
+    "no optimiser": {"optimizer_states": []},
+    "an optimiser's state of another shape": {
+        "optimizer_states": [{"state": {0: {"exp_avg": torch.zeros(1)}}, "param_groups": [{}]}]
+    },
+    "groups of another type": {"optimizer_states": [{"state": {}, "param_groups": 3}]},
+    "schedulers of another type": {"lr_schedulers": [3]},
+    "loops of another type": {"loops": 3},
+    "loops without progress": {"loops": {"fit_loop": {"state_dict": {}}}},
+    "an epoch that is text": {"epoch": "x"},
+    "a step that is a list": {"global_step": [1]},
+    "callbacks of another type": {"callbacks": {"RunRecord": 3, "ModelCheckpoint": 3}},
+    "a config that is no JSON": {"wearcap": {"config": "{"}},
+    "a config of another type": {"wearcap": 3},
+    "no version": {"pytorch-lightning_version": None},
+}
+
+
+@pytest.mark.parametrize("part", CRAFTED)
+def test_a_crafted_checkpoint_ends_a_resume_in_one_line_or_not_at_all(part, data, trained, tmp_path, trusted):
+    saved = torch.load(trained / "checkpoints/last.ckpt", weights_only=True)
+    torch.save(saved | CRAFTED[part], tmp_path / "x.ckpt")
+    run = [f"resume={tmp_path}/x.ckpt", f"hydra.run.dir={tmp_path}/run", "trainer.max_steps=3"]
+    said = f"{tmp_path}/x.ckpt: "
+    try:
+        train.main(arguments(data, tmp_path, *run))
+    except WearcapError as error:
+        said = str(error)
+    assert said.startswith(f"{tmp_path}/x.ckpt: ")
+    assert "\n" not in said
+
+
 def test_keys_that_differ_are_those_that_train_differently():
     before = "paths: {run: /a/b}\nseed: 0\ntrainer: {max_steps: 3, precision: 32}\nfolder: /a/b/pictures\n"
     now = "paths: {run: /c}\nseed: 0\ntrainer: {max_steps: 9, precision: 16}\nfolder: /c/pictures\nnew: 1\n"
-    assert differing_keys(before, now) == ["trainer.precision (32, now 16)", "new (nothing, now 1)"]
+    assert differing_keys(yaml.safe_load(before), now) == ["trainer.precision (32, now 16)", "new (nothing, now 1)"]
 
 
 @pytest.mark.parametrize("kind", ["ckpt", "safetensors"])
@@ -128,7 +193,7 @@ def test_a_training_starts_from_weights(kind, data, trained, tmp_path):
     assert saved["global_step"] == 2, "the optimiser and its steps begin anew"
 
 
-def test_weights_of_another_model_are_named_in_one_line(data, trained, tmp_path):
+def test_weights_of_another_model_are_named_in_one_line(data, trained, tmp_path, trusted):
     source, run = trained / "checkpoints/last.ckpt", f"hydra.run.dir={tmp_path}/run"
     saved = torch.load(source, weights_only=True)
     saved["state_dict"]["net.stranger"] = torch.zeros(2)

@@ -51,13 +51,21 @@ class _Data(TypedDict, total=False):
     val_sources: dict[str, _Source | None] | None
 
 
+class Training(TypedDict, total=False):
+    """What a training has taken (`wearcap.training.run.RunRecord`)."""
+
+    frames: float
+    seconds: float
+    core_seconds: float
+
+
 class _Config(TypedDict):
     """What is read of a checkpoint's config, beside the model itself."""
 
     model: dict[str, Any]
     name: NotRequired[str]
     data: NotRequired[_Data | None]
-    training: NotRequired[dict[str, float | str | None]]
+    training: NotRequired[Training | None]
     sha256: NotRequired[str]
 
 

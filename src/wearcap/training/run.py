@@ -11,7 +11,7 @@ import time
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 import lightning
 import torch
@@ -29,6 +29,7 @@ from wearcap.data.datamodule import WindowsModule
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, write_text
 from wearcap.models.build import check_weights
+from wearcap.models.checkpoint import Training as Taken
 from wearcap.models.checkpoint import read_checkpoint, read_run_file
 from wearcap.training.base import Training
 
@@ -66,9 +67,6 @@ class RunRecord(Callback):
         if stage == "fit":
             for logger in trainer.loggers:
                 logger.log_hyperparams(self.config | {"parameters": trained_parameters(pl_module)})
-
-    def on_load_checkpoint(self, trainer, pl_module, checkpoint: dict[str, Any]) -> None:
-        self.add_to(parse_json(checkpoint.get("wearcap", {}).get("config", "{}"), "the checkpoint's config", "config"))
 
     def add_to(self, before: Mapping[str, Any]) -> None:
         """Count on from what an earlier training has taken, by its checkpoint's config."""
@@ -149,13 +147,14 @@ def fit(
     """
     record = next((each for each in trainer.callbacks if isinstance(each, RunRecord)), None)  # pyright: ignore[reportAttributeAccessIssue]
     if resume is not None:
-        require_resumable(resume, system.state_dict())
+        before = require_resumable(resume, system.state_dict())
     elif init is not None:
         before = start_from(init, system)
-        if record is not None:
-            record.add_to(before)
     else:
+        before = {}
         system.set_statistics(data.dataset("train"))
+    if record is not None:
+        record.add_to(before)
     try:
         trainer.fit(system, datamodule=data, ckpt_path=resume, weights_only=True)
     except Exception as error:  # Lightning and the optimisers raise anything for states that are not theirs
@@ -165,10 +164,14 @@ def fit(
         raise WearcapError(what, resume, "a run's .ckpt file, as `wearcap train` writes it") from error
 
 
-def require_resumable(path: str | Path, own: Mapping[str, Tensor]) -> None:
-    """Raise WearcapError unless a file is a training run's checkpoint whose weights fit a model's own.
+class _Resumed(TypedDict):
+    training: NotRequired[Taken | None]
 
-    Its config is not read: the command line defines the training.
+
+def require_resumable(path: str | Path, own: Mapping[str, Tensor]) -> _Resumed:
+    """What a training run's checkpoint has taken. Raises WearcapError unless it is one, whose weights fit a model's own.
+
+    Nothing else of its config is read: the command line defines the training.
     """
     saved = read_run_file(path)
     missing = [key for key in TRAINING_STATE if key not in saved]
@@ -176,6 +179,9 @@ def require_resumable(path: str | Path, own: Mapping[str, Tensor]) -> None:
         what = f"a checkpoint without {missing[0]}"
         raise WearcapError(what, where=path, expected="a run's .ckpt file, as `wearcap train` writes it")
     check_weights(own, plain_tensors(saved["state_dict"], path), path)
+    about = saved.get("wearcap")
+    text = about.get("config") if isinstance(about, dict) else None
+    return parse_json(text if isinstance(text, str) else "{}", path, "config", schema=_Resumed)
 
 
 def keep_freed_memory() -> None:
