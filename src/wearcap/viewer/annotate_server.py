@@ -238,9 +238,6 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(data)))
         self.send_header("Cache-Control", "no-store")
-        self.send_header("X-Content-Type-Options", "nosniff")
-        if kind.startswith("text/html"):
-            self.send_header("Content-Security-Policy", "default-src 'self'")
         if download:
             quoted = re.sub(r"[^\w.\- ]", "_", download, flags=re.ASCII)
             self.send_header("Content-Disposition", f'attachment; filename="{quoted}"')
