@@ -115,6 +115,12 @@ def test_saves_that_must_not_be(dataset, tmp_path):
             ({"labels": {}}, 400, "not a save"),
             ([], 400, "not a save"),
             (good | {"labels": 3}, 422, "no contact labels"),
+            (good | {"base": 3}, 400, "not a save"),
+            (good | {"force": "yes"}, 400, "not a save"),
+            ('{"labels": ' + "[" * 100_000, 400, "not a save"),
+            ('{"labels": ' + "[" * 100 + "]" * 100 + ', "base": "", "client": "a"}', 400, "nested too deeply"),
+            (good | {"labels": {"contacts": {"left_hand": [[1, 10**400]], "right_hand": []}}}, 400, "64 bits"),
+            (good | {"labels": labels([(1.0, 2.0, "\ud800")])}, 422, "no text"),
         ):
             answered, _, data = ask(server, "POST", "/recordings/0/labels", body)
             assert answered == status
@@ -123,7 +129,8 @@ def test_saves_that_must_not_be(dataset, tmp_path):
         assert ask(server, "POST", "/recordings/0/labels", good, Origin="http://elsewhere.net")[0] == 403
         assert ask(server, "POST", "/recordings/0/labels", good, Content_Type="text/plain")[0] == 403
         assert ask(server, "GET", "/recordings", Host="elsewhere.net:18300")[0] == 403
-        assert ask(server, "POST", "/recordings/0/labels", "", Content_Length="99999999999")[0] == 413
+        for length in ("99999999999", "9" * 5000, "-1", "1e3"):
+            assert ask(server, "POST", "/recordings/0/labels", "", Content_Length=length)[0] == 413
     assert not list(tmp_path.iterdir())
 
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from wearcap.body.skeleton import Skeleton
 from wearcap.live.packets import HEAD
 from wearcap.live.page_devices import Devices
-from wearcap.live.page_panel import Panel, fitting
+from wearcap.live.page_panel import Panel
 from wearcap.live.playout import Playout
 from wearcap.live.sink import Sink
 from wearcap.live.status import MAX_POINTS, LiveControls, LiveStatus, WearerStatus
@@ -26,6 +26,7 @@ from wearcap.scene.objects import SceneObject
 from wearcap.viewer.page import COLORS, UPDATES_PER_S
 from wearcap.viewer.page_layers import BodyLayer, FeetLayer, LabelLayer, ObjectsLayer, add_points, surface_or_sticks
 from wearcap.viewer.page_server import ServedPage
+from wearcap.viewer.page_text import fitting
 
 MAX_WEARERS = 16
 """Most wearers that are drawn."""
@@ -109,7 +110,7 @@ class _Person:
             self.body = BodyLayer(server, node, motion, surface_or_sticks(motion.skeleton, {}), self.color)
             self.feet = FeetLayer.of(server, f"{node}_feet", motion, None)
             self.label = LabelLayer(server, node, motion)
-            self.label.handle.text = fitting(name)
+            self.label.handle.text = fitting(name) or "wearer"
             self.label.handle.font_size_mode, self.label.handle.font_scene_height = "scene", LABEL_M
         self.skeleton = motion.skeleton
 

@@ -8,9 +8,9 @@ import viser
 from jaxtyping import Float
 
 from wearcap.geometry.rotation import quat_wxyz_from_matrix
-from wearcap.live.page_panel import fitting
 from wearcap.live.status import DeviceStatus
 from wearcap.viewer.page_layers import BodyLayer
+from wearcap.viewer.page_text import fitting
 
 MAX_SHOWN = 16
 """Most devices of one wearer that are shown."""

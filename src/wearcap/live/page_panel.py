@@ -2,31 +2,19 @@
 
 import math
 from collections.abc import Callable, Sequence
-from html import escape
 from pathlib import Path
 
 import viser
 
 from wearcap.live.status import LiveControls, LiveStatus, SinkStatus, WearerStatus
+from wearcap.viewer.page_text import MAX_NAME, block, escaped, fitting
 
-MAX_NAME = 40
-"""Longest name (characters) that is shown: names come from the network."""
 MAX_ROWS = 12
 _GOOD, _WAITING, _BAD = "#2b8a3e", "#b06a00", "#c92a2a"
 STAGE_COLORS = {"waiting": _WAITING, "first minute": _WAITING, "live": _GOOD, "away": _BAD}
 SILENT_S = 1.0
 """Time (s) without packets after which a device is marked."""
 _TABLE = "width:100%;font-size:12px;line-height:1.45;border-spacing:0;font-variant-numeric:tabular-nums"
-
-
-def fitting(name: str, default: str = "wearer") -> str:
-    """A name that fits, as text."""
-    return "".join(one for one in name[: 4 * MAX_NAME] if one.isprintable())[:MAX_NAME].strip() or default
-
-
-def short(name: str) -> str:
-    """A name that fits, safe in HTML."""
-    return escape(fitting(name))
 
 
 def number(value: float, digits: int = 0) -> str:
@@ -51,7 +39,7 @@ def wearer_html(wearer: WearerStatus, behind_s: float) -> str:
     for device in wearer.devices[:MAX_ROWS]:
         silent = not device.last_s_ago <= SILENT_S
         ago = f"{number(device.last_s_ago, 1)} s ago" if silent else "now"
-        rows.append(row(short(device.title), f"{number(device.hz)} Hz", ago, color=_BAD if silent else ""))
+        rows.append(row(escaped(device.title, MAX_NAME), f"{number(device.hz)} Hz", ago, color=_BAD if silent else ""))
     if len(wearer.devices) > MAX_ROWS:
         rows.append(row(f"and {len(wearer.devices) - MAX_ROWS} more"))
     latency = wearer.latency
@@ -70,13 +58,13 @@ def wearer_html(wearer: WearerStatus, behind_s: float) -> str:
         ),
     ]
     stage = f'<b style="color:{STAGE_COLORS[wearer.stage]}">● {wearer.stage}</b>'
-    notes = "".join(f"<li>{escape(note[:300])}</li>" for note in wearer.notes[:MAX_ROWS])
+    notes = "".join(f"<li>{escaped(note)}</li>" for note in wearer.notes[:MAX_ROWS])
     notes = (
         f'<details style="font-size:12px"><summary>How it was set up</summary><ul>{notes}</ul></details>'
         if notes
         else ""
     )
-    return f'<div style="padding:2px 12px">{stage}{table(rows)}{table(delays)}{table(counts)}{notes}</div>'
+    return block(f"{stage}{table(rows)}{table(delays)}{table(counts)}{notes}")
 
 
 def sinks_html(sinks: Sequence[SinkStatus]) -> str:
@@ -84,17 +72,19 @@ def sinks_html(sinks: Sequence[SinkStatus]) -> str:
     rows = [row("<b>To</b>", "<b>Frames</b>", "<b>Dropped</b>", "<b>Failed</b>")]
     for sink in sinks[:MAX_ROWS]:
         color = _BAD if sink.failed else ""
-        rows.append(row(short(sink.name), number(sink.sent), number(sink.dropped), number(sink.failed), color=color))
+        rows.append(
+            row(escaped(sink.name, MAX_NAME), number(sink.sent), number(sink.dropped), number(sink.failed), color=color)
+        )
         if sink.last_error:
-            rows.append(f'<tr><td colspan="4" style="color:{_BAD}">{escape(sink.last_error[:120])}</td></tr>')
-    return f'<div style="padding:2px 12px">{table(rows)}</div>'
+            rows.append(f'<tr><td colspan="4" style="color:{_BAD}">{escaped(sink.last_error, 120)}</td></tr>')
+    return block(table(rows))
 
 
 class WearerFolder:
     """A wearer's folder: shown or hidden, the first minute, numbers."""
 
     def __init__(self, gui: viser.GuiApi, name: str, color: tuple[int, int, int], controls: LiveControls):
-        self.folder = gui.add_folder(fitting(name))
+        self.folder = gui.add_folder(fitting(name) or "wearer")
         with self.folder:
             self.shown = gui.add_checkbox("Show", initial_value=True)
             self.step = gui.add_html("", visible=False)
@@ -112,8 +102,7 @@ class WearerFolder:
         """Show a state; what has not changed is not sent."""
         guided = wearer.step is not None
         if guided:
-            step = f'<div style="padding:4px 12px;font-size:17px;font-weight:600">{escape((wearer.step or "")[:200])}</div>'
-            self._set(self.step, step)
+            self._set(self.step, block(f'<b style="font-size:17px">{escaped(wearer.step or "")}</b>'))
             if abs(self.progress.value - 100 * wearer.progress) > 0.5:
                 self.progress.value = min(max(100 * wearer.progress, 0.0), 100.0)
         for handle, visible in (
@@ -134,7 +123,7 @@ class Panel:
 
     def __init__(self, server: viser.ViserServer, controls: LiveControls):
         self.gui, self.controls = server.gui, controls
-        self.title = self.gui.add_html('<div style="padding:2px 12px">Starting: the network is being loaded.</div>')
+        self.title = self.gui.add_html(block("Starting: the network is being loaded."))
         self.record = self.gui.add_button("Record", color="red")
         self.stop = self.gui.add_button("Stop the capture", color="gray")
         self.follow = self.gui.add_checkbox("Follow with the camera", initial_value=True)
@@ -167,8 +156,8 @@ class Panel:
         if self.record.label != label:
             self.record.label = label
         minutes, seconds = divmod(int(status.seconds), 60)
-        to = f"Recording to {short(Path(status.recording).name)}" if status.recording is not None else "Not recording"
-        title = f'<div style="padding:2px 12px"><b>{minutes}:{seconds:02d}</b> &nbsp; {to}</div>'
+        to = f"Recording to {Path(status.recording).name}" if status.recording is not None else "Not recording"
+        title = block(f"<b>{minutes}:{seconds:02d}</b> &nbsp; {escaped(to)}")
         if self.title.content != title:
             self.title.content = title
         for wearer in status.wearers:

@@ -15,6 +15,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
+from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError
 from wearcap.io.formats.contact_labels import annotation_of, hcontact_text
 from wearcap.viewer.annotate import Conflict, Desk
@@ -37,6 +40,15 @@ IDLE_S = 30.0
 _CLOSE_S = 5.0
 _PORTS_TRIED = 50
 _GONE = (ConnectionError, TimeoutError)
+
+
+class _Save(msgspec.Struct):
+    """What the page sends to save: see `AnnotationFile.save`."""
+
+    labels: Any
+    base: str
+    client: str
+    force: bool = False
 
 
 class AnnotationServer(ThreadingHTTPServer):
@@ -214,17 +226,16 @@ class _Handler(BaseHTTPRequestHandler):
             return self._send_error(HTTPStatus.NOT_FOUND, f"nothing to save at {path}")
         if self.headers.get_content_type() != "application/json":
             return self._send_error(HTTPStatus.FORBIDDEN, "only this server's own page may save")
-        if not length.isdecimal() or int(length) > MAX_SAVE_BYTES:
-            return self._send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"a save of {length or '?'} bytes")
+        if not re.fullmatch("[0-9]{1,9}", length) or int(length) > MAX_SAVE_BYTES:
+            return self._send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"a save of {length[:20] or '?'} bytes")
         body = self.rfile.read(int(length))
         self.close_connection = False
         try:
-            sent = json.loads(body)
-            labels, base, client = sent["labels"], str(sent["base"]), str(sent["client"])
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
-            return self._send_error(HTTPStatus.BAD_REQUEST, f"not a save: {error}")
+            sent = parse_json(body, "not a save", "message", schema=_Save)
+        except WearcapError as error:
+            return self._send_error(HTTPStatus.BAD_REQUEST, str(error))
         file = self.server.desk.file(int(match[1]))
-        revision = file.save(labels, base, client=client, force=sent.get("force") is True)
+        revision = file.save(sent.labels, sent.base, client=sent.client, force=sent.force)
         return self._send_json({"revision": revision})
 
     def _send_json(self, content: Any) -> None:
@@ -238,9 +249,6 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(data)))
         self.send_header("Cache-Control", "no-store")
-        self.send_header("X-Content-Type-Options", "nosniff")
-        if kind.startswith("text/html"):
-            self.send_header("Content-Security-Policy", "default-src 'self'")
         if download:
             quoted = re.sub(r"[^\w.\- ]", "_", download, flags=re.ASCII)
             self.send_header("Content-Disposition", f'attachment; filename="{quoted}"')

@@ -18,8 +18,12 @@ HEADERS = {
     "Referrer-Policy": "same-origin",  # the address contains the token
     "X-Frame-Options": "DENY",
     "Cross-Origin-Resource-Policy": "same-origin",
+    "X-Content-Type-Options": "nosniff",
+    "Content-Security-Policy": "default-src 'self'; frame-src 'none'; object-src 'none'; base-uri 'none'; form-action 'none'",
 }
-"""Headers of every answer: they keep the token inside the page, and the page out of other pages' frames."""
+"""Headers of every answer: they keep the token inside the page, the page out of other pages' frames, and strangers' scripts
+and other sites out of the page.
+"""
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(?::([0-9]{1,5}))?")
 
 

@@ -23,6 +23,7 @@ from wearcap.scene.objects import Freedom, SceneObject
 from wearcap.scene.scan import Scan
 from wearcap.viewer.object_editor_view import HINTS, TOOLS, EditorView, ObjectPanel, SelectPanel
 from wearcap.viewer.page_server import ServedPage
+from wearcap.viewer.page_text import MAX_TEXT, block, escaped, fitting
 
 SNAP_M = 0.12
 SAVE_AFTER_S, TRY_AGAIN_S = 0.7, 10.0
@@ -63,10 +64,10 @@ class ObjectEditor(ServedPage):
 
     def _add_controls(self, title: str) -> None:
         gui, points = self.server.gui, self.editing.scan.points
-        gui.add_markdown(f"**{title}**")
-        self._status = gui.add_markdown("")
+        gui.add_html(block(f"<b>{escaped(title)}</b>"))
+        self._status = gui.add_html("")
         self.tool = gui.add_dropdown("Tool", TOOLS, initial_value="look")
-        self._hint = gui.add_markdown(f"*{HINTS['look']}*")
+        self._hint = gui.add_html(_hint_html("look"))
         heights = np.quantile(points[:: max(1, len(points) // 100_000), 2], [0.01, 0.999])
         low, high = round(float(heights[0]), 2), round(max(float(heights[1]), float(heights[0]) + 0.1), 2)
         self.top = gui.add_slider("Show up to (m)", low, high, 0.05, min(low + _CEILING_M, high))
@@ -104,7 +105,8 @@ class ObjectEditor(ServedPage):
                 try:
                     action()
                 except WearcapError as error:
-                    event.client.add_notification("That does not go", str(error), color="red", auto_close_seconds=10)
+                    what = fitting(str(error), MAX_TEXT)
+                    event.client.add_notification("That does not go", what, color="red", auto_close_seconds=10)
                 self.refresh()
 
         return act
@@ -162,7 +164,7 @@ class ObjectEditor(ServedPage):
         """Change the tool."""
         self.put_back()
         self.tool.value = tool
-        self._hint.content = f"*{HINTS[tool]}*"
+        self._hint.content = _hint_html(tool)
         self.view.show_brush(None, self.select.radius.value)
         self._show_box()
         self._show_objects()
@@ -334,12 +336,12 @@ class ObjectEditor(ServedPage):
         self.view.show_try_handle(item if by_hand else None)
 
     def _show_status(self) -> None:
-        state = f"saved in {self.file.name}" if self.file.exists() else "nothing to save yet"
+        state = f"saved in {escaped(self.file.name)}" if self.file.exists() else "nothing to save yet"
         if self.editing.revision is not self._saved:
-            state = self._problem or "…"
+            state = f"<b>{escaped(self._problem or '…')}</b>"
         count = len(self.editing.environment)
         chosen = f"{len(self.editing.selected):,} points selected"
-        self._status.content = f"{chosen} · {count} object{'s' * (count != 1)} · {state}"
+        self._status.content = block(f"{chosen} · {count} object{'s' * (count != 1)} · {state}")
 
     def save(self) -> None:
         """Write the environment if it has changed. Raises WearcapError if it cannot be written."""
@@ -358,7 +360,7 @@ class ObjectEditor(ServedPage):
                 try:
                     self.save()
                 except WearcapError as error:
-                    self._problem, not_before = f"**not saved: {error}**", now + TRY_AGAIN_S
+                    self._problem, not_before = f"not saved: {error}", now + TRY_AGAIN_S
                     self._show_status()
             wall.sleep(0.1)
 
@@ -369,3 +371,7 @@ class ObjectEditor(ServedPage):
             self.save()
         finally:
             super().stop()
+
+
+def _hint_html(tool: str) -> str:
+    return block(f"<i>{HINTS[tool]}</i>")

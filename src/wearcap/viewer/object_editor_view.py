@@ -1,6 +1,7 @@
 """The object editor's controls and its 3D view: scan, selection, objects at their poses, hinges, slides and handles."""
 
 from dataclasses import dataclass
+from urllib.parse import quote
 
 import numpy as np
 import viser
@@ -13,6 +14,7 @@ from wearcap.scene.editing import USUAL_KIND
 from wearcap.scene.objects import FREEDOMS, Freedom, SceneObject
 from wearcap.scene.scan import Box, Scan, first_hit
 from wearcap.viewer.page_layers import by_height
+from wearcap.viewer.page_text import fitting
 
 SHOWN_POINTS, SHOWN_SELECTED, SHOWN_OF_OBJECT = 250_000, 80_000, 40_000
 SELECTED_COLOR, BOX_COLOR, BRUSH_COLOR, HINGE_COLOR = ((255, 120, 20), (30, 120, 240), (255, 120, 20), (220, 30, 120))
@@ -117,7 +119,7 @@ class EditorView:
 
     def added(self, item: SceneObject, tinted: tuple[int, bool]) -> _Shown:
         """Draw one object, with its name above it."""
-        node, mesh = f"/objects/{item.name}", item.mesh
+        node, mesh = f"/objects/{quote(item.name, ' ', errors='replace')}", item.mesh
         tint = CURRENT_TINT if tinted[1] else TINTS[tinted[0]]
         every = max(1, -(-len(mesh.vertices) // SHOWN_OF_OBJECT))
         own = mesh.color[::every] if len(mesh.color) == len(mesh.vertices) else np.full(3, 0.6)
@@ -139,7 +141,8 @@ class EditorView:
                 point_shading="flat",
             )
         top = mesh.vertices[:, 2].max() + 0.1
-        self.scene.add_label(f"{node}/name", item.name, position=(0.0, 0.0, float(top)), anchor="bottom-center")
+        place = (0.0, 0.0, float(top))
+        self.scene.add_label(f"{node}/name", fitting(item.name), position=place, anchor="bottom-center")
         return _Shown(item, tinted, handle, item.points_world[::every])
 
     def place(self, name: str, T_world_object: Rigid) -> None:

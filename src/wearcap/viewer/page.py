@@ -35,6 +35,7 @@ from wearcap.viewer.page_layers import (
     with_objects,
 )
 from wearcap.viewer.page_server import ServedPage
+from wearcap.viewer.page_text import block, escaped
 
 UPDATES_PER_S = 30.0
 OVER, BESIDE = "over", "beside"
@@ -185,7 +186,7 @@ class Page(ServedPage):
             self.server.scene.add_mesh_trimesh("/surroundings/scene", scene)
         if environment is not None:
             still = [item for item in environment.objects if item not in moving]
-            self.layers.append(ObjectsLayer(self.server, "surroundings", still, recording.object_motion))
+            self.layers.append(ObjectsLayer(self.server, "surroundings/objects", still, recording.object_motion))
         self.layout = BESIDE if len(self.bodies) - (TRUTH in self.bodies) > 1 else OVER
         floor_z = _floor_height(recording)
         self.server.scene.add_grid("/floor", infinite_grid=True, position=(0.0, 0.0, floor_z), fade_distance=25.0)
@@ -202,7 +203,8 @@ class Page(ServedPage):
 
     def _add_controls(self, recording: Recording) -> None:
         gui, clock = self.server.gui, self.timeline
-        gui.add_markdown(f"**{recording.name}**  \n{recording.activity or recording.source}")
+        about = escaped(recording.activity or recording.source)
+        gui.add_html(block(f"<b>{escaped(recording.name)}</b><br>{about}"))
         self._play = gui.add_button("Play")
         longest = max(clock.stop - clock.start, 1e-3)
         self._slider = gui.add_slider("Time (s)", min=0.0, max=longest, step=0.01, initial_value=0.0)

@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Protocol
+from urllib.parse import quote
 
 import numpy as np
 import torch
@@ -27,6 +28,7 @@ from wearcap.recording.acts import NO_OBJECT, active_at, true_acts
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import ContactTrack, HeadStream, PointCloud, Recording
 from wearcap.scene.objects import Environment, SceneObject
+from wearcap.viewer.page_text import fitting
 
 MAX_POINTS = 200_000
 LABEL_ABOVE_M = 0.3
@@ -219,7 +221,7 @@ class LabelLayer(MotionLayer):
 
     def __init__(self, server: viser.ViserServer, name: str, motion: Motion):
         self.motion = motion
-        self.handle = server.scene.add_label(f"/{name}_label", name, anchor="bottom-center")
+        self.handle = server.scene.add_label(f"/{name}_label", fitting(name), anchor="bottom-center")
         super().__init__(self.handle)
 
     def show(self, time: float) -> None:
@@ -385,7 +387,8 @@ class ObjectsLayer(MotionLayer):
             color = 255 * np.atleast_2d(mesh.color).mean(0)
             if tint is not None:
                 color = (color + tint) / 2
-            node, faces, rgb = f"/{name}/{item.name}", mesh.faces.astype(np.uint32), tuple(int(c) for c in color)
+            node = f"/{name}/{quote(item.name, ' ', errors='replace')}"
+            faces, rgb = mesh.faces.astype(np.uint32), tuple(int(c) for c in color)
             handles.append(server.scene.add_mesh_simple(node, mesh.vertices, faces, color=rgb))
         super().__init__(*handles)
 

@@ -6,21 +6,36 @@ viser itself answers every page of every site, and has no setting for that. Requ
 
 import logging
 import math
+import secrets
 import socket
 import threading
 from http import HTTPStatus
+from pathlib import Path
 from typing import Any, Literal
 
 import rich
 import viser
 import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from wearcap.errors import WearcapError
 from wearcap.viewer.guard import Guard, Refused
 
 _starting = threading.Lock()
+_PAGE = Path(viser.__file__).parent / "client" / "build" / "index.html"
+"""The page that viser serves."""
+_SCRIPTS = {b"<script data-p=": b'<script nonce="%b" data-p=', b'e.type="module"': b'e.type="module";e.nonce="%b"'}
+"""The script in viser's page, and where it makes an element `e` of the program that it has unpacked: each with a nonce."""
+_POLICY = (
+    "default-src 'none'; script-src 'nonce-{nonce}' 'unsafe-eval'; worker-src blob:; connect-src 'self' data: blob:; "
+    "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; base-uri 'none'; form-action 'none'"
+)
+"""Content security policy of viser's page: no script but its own runs, nothing is framed, and only this server is asked.
+
+What `eval` takes comes from that program alone: a part of it, which sorts splats, does not start without.
+"""
 
 
 def _start_server(guard: Guard, port: int, label: str) -> viser.ViserServer:
@@ -41,15 +56,16 @@ def _start_server(guard: Guard, port: int, label: str) -> viser.ViserServer:
                 granted = guard.admit(request.path, request.headers)
             except Refused as refused:
                 return connection.respond(HTTPStatus.FORBIDDEN, f"{refused}\n")
-            response = answer(connection, request)
+            headers = Headers(pair for pair in request.headers.raw_items() if pair[0].lower() != "accept-encoding")
+            response = answer(connection, Request(request.path, headers))
             if response is not None:
-                response.headers.update(granted)
+                response.headers.update(granted | _restrict(response))
             return response
 
         # Another thread may start a server of its own meanwhile.
         if getattr(answer, "__module__", "").startswith("viser."):
             options["process_request"] = guarded
-            hooked = True
+            hooked = _PAGE.is_file() and all(_PAGE.read_bytes().count(script) == 1 for script in _SCRIPTS)
         return original(*arguments, **options)
 
     console = rich.get_console()
@@ -66,8 +82,19 @@ def _start_server(guard: Guard, port: int, label: str) -> viser.ViserServer:
         server.stop()
         what = f"viser {viser.__version__} does not let its pages be guarded against other sites"
         fix = "Install the version that wearcap asks for: pip install 'viser>=1.1.1,<1.2'."
-        raise WearcapError(what, expected="a viser that serves through websockets.asyncio.server.serve", fix=fix)
+        raise WearcapError(what, expected="a viser that serves its page as 1.1.1 does", fix=fix)
     return server
+
+
+def _restrict(response: Response) -> dict[str, str]:
+    """Let viser's own two scripts run in its page, and no others: they get a nonce. Returns the headers that say so."""
+    if not response.headers.get("Content-Type", "").startswith("text/html"):
+        return {}
+    nonce = secrets.token_urlsafe(16)
+    for script, marked in _SCRIPTS.items():
+        response.body = response.body.replace(script, marked % nonce.encode())
+    del response.headers["Content-Length"]
+    return {"Content-Security-Policy": _POLICY.format(nonce=nonce), "Content-Length": str(len(response.body))}
 
 
 def _check_host(host: str) -> None:
