@@ -340,7 +340,7 @@ ROWS = {
 
 
 @pytest.mark.parametrize("row", ROWS)
-def test_a_verb_reports_it_once_and_leaves_nothing(row, trained, tmp_path, capfd):
+def test_a_verb_reports_it_once_and_leaves_nothing(row, trained, tmp_path, capfd, trusted):
     arguments, message = ROWS[row]
     out = tmp_path / "out"
     out.mkdir()
