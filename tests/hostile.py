@@ -1,7 +1,28 @@
 """Damage for the fuzz tests of readers."""
 
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
+
+
+@contextmanager
+def in_time(seconds: int = 60) -> Iterator[None]:
+    """Raise TimeoutError where a pipe or a device is waited for (POSIX, main thread)."""
+
+    def late(*_: object) -> None:
+        raise TimeoutError(f"not done within {seconds} s")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
 
 fuzz = settings(max_examples=4 * settings().max_examples, deadline=None, suppress_health_check=list(HealthCheck))
 

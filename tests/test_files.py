@@ -178,3 +178,32 @@ def test_without_locks_the_run_goes_on_with_a_warning(tmp_path, monkeypatch):
         write_text(tmp_path / "a.txt", "a")
     assert descriptor is None
     assert names(tmp_path) == ["a.txt"]
+
+
+@posix
+@pytest.mark.parametrize("kind", ["link", "dangling link", "hard link", "pipe", "folder"])
+def test_a_lock_that_is_no_file_of_its_own_is_refused_and_its_target_untouched(tmp_path, kind):
+    folder, target = tmp_path / "data", tmp_path / "precious.txt"
+    folder.mkdir()
+    target.write_text("precious")
+    make = {
+        "link": lambda lock: lock.symlink_to(target),
+        "dangling link": lambda lock: lock.symlink_to(tmp_path / "new.txt"),
+        "hard link": lambda lock: lock.hardlink_to(target),
+        "pipe": os.mkfifo,
+        "folder": Path.mkdir,
+    }
+    make[kind](folder / LOCK)
+    with pytest.raises(WearcapError, match=r"\.wearcap\.lock: .*Remove it"), folder_lock(folder, "prepare"):
+        pass
+    assert target.read_text() == "precious"
+    assert names(tmp_path) == ["data", "precious.txt"]
+    assert names(folder) == [LOCK]
+
+
+@posix
+def test_a_leftover_that_is_a_pipe_or_a_link_stays(tmp_path):
+    os.mkfifo(tmp_path / ".a.tmp-0123abcd.npz")
+    (tmp_path / ".b.tmp-0123abcd.npz").symlink_to(tmp_path / "c")
+    remove_leftovers(tmp_path)
+    assert len(names(tmp_path)) == 2

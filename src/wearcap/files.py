@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import re
+import stat
 import time
 import uuid
 from collections.abc import Iterator
@@ -113,6 +114,19 @@ def _claim(temporary: Path) -> int | None:
         os.close(descriptor)  # taken for a leftover in the moment before it was locked
 
 
+def open_own(path: Path, flags: int) -> int:
+    """Descriptor of a regular file that lies under a fixed name in a folder from anywhere.
+
+    Raises OSError for a link, whose target is not touched, for a pipe, and for a device.
+    """
+    descriptor = os.open(path, flags | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0), 0o666)
+    status = os.fstat(descriptor)
+    if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
+        os.close(descriptor)
+        raise OSError(errno.ELOOP, "no regular file of its own", str(path))
+    return descriptor
+
+
 def remove_leftovers(folder: str | Path, *, below: bool = False) -> None:
     """Remove temporary files of `atomic_path` whose writer was killed, from a folder or, with `below`, from its subfolders too.
 
@@ -128,7 +142,7 @@ def remove_leftovers(folder: str | Path, *, below: bool = False) -> None:
                 if fcntl is None:
                     path.unlink()  # Windows refuses this while a writer has it open
                     continue
-                descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
+                descriptor = open_own(path, os.O_RDWR)
                 try:
                     fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     path.unlink()

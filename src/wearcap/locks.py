@@ -1,5 +1,6 @@
 """Locks of folders: one writer at a time, in all processes of this machine and its workers."""
 
+import errno
 import json
 import os
 import platform
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from wearcap.errors import WearcapError
-from wearcap.files import explaining_writes
+from wearcap.files import explaining_writes, open_own
 
 try:
     import fcntl
@@ -22,6 +23,9 @@ except ModuleNotFoundError:  # Windows
 
 LOCK = ".wearcap.lock"
 """Lock file in a folder that one process writes into; it names that process."""
+
+_MAX_HOLDER = 1 << 16
+"""Characters of a lock's file that are read."""
 
 LOCK_PATIENCE_S, ORPHANS_PATIENCE_S = 2.0, 20.0
 """Time (s) to wait for a lock that is taken, and for one that only workers of an ended process still hold."""
@@ -51,8 +55,9 @@ def folder_lock(folder: str | Path, purpose: str) -> Iterator[int | None]:
             "purpose": purpose,
             "since": time.strftime("%Y-%m-%d %H:%M:%S"),
         }
-        with explaining_writes(path.parent):
-            path.write_text(json.dumps(holder), encoding="utf-8")
+        with explaining_writes(path.parent), open(descriptor, "w", encoding="utf-8", closefd=False) as file:
+            file.truncate()
+            json.dump(holder, file)
         yield descriptor
     finally:
         if descriptor in _HELD:  # a forked child does not hold it
@@ -77,7 +82,13 @@ def _wait_for_lock(path: Path) -> int | None:
     """Open and lock a file; None where files cannot be locked. Raises WearcapError when it stays locked by another."""
     start = time.monotonic()
     while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            descriptor = open_own(path, os.O_RDWR | os.O_CREAT)
+        except OSError as error:
+            if error.errno not in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
+                raise
+            fix = "Remove it: it is not wearcap's, and nothing was written through it."
+            raise WearcapError("a link, or no regular file", path, "the lock of this folder", fix) from error
         try:
             _lock(descriptor)
             if os.path.samestat(os.fstat(descriptor), path.stat()):
@@ -93,10 +104,10 @@ def _wait_for_lock(path: Path) -> int | None:
                 stacklevel=4,
             )
             return None
-        os.close(descriptor)
         try:
-            holder = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            with open(descriptor, encoding="utf-8") as file:
+                holder = json.loads(file.read(_MAX_HOLDER))
+        except (OSError, ValueError, RecursionError):
             holder = {}
         if not isinstance(holder, dict) or not isinstance(holder.get("pid"), int):
             holder = {}  # the lock's file is being written

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from safetensors.torch import save_file
 
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
+from wearcap.boundary import tensors
 from wearcap.errors import WearcapError
 from wearcap.files import sha256_of
 from wearcap.geometry.camera import Camera
@@ -32,7 +33,6 @@ from wearcap.recording import (
     Recording,
     RecordingStore,
 )
-from wearcap.recording import store as store_module
 from wearcap.recording.motion import Interactions
 from wearcap.recording.serialize import dumps, flatten, unflatten
 from wearcap.recording.store import RecordingFile, save_recording
@@ -240,14 +240,16 @@ def test_a_part_of_another_kind_is_refused(part, tmp_path):
 
 def test_a_file_that_may_not_be_read_is_not_called_missing(store, monkeypatch):
     def refused(*_args, **_options):
-        raise FileNotFoundError(f"No such file or directory: {store.path_of('all')}")
+        raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(store_module.safetensors, "safe_open", refused)
-    with pytest.raises(WearcapError, match=r"all\.safetensors: cannot be read"):
+    monkeypatch.setattr(tensors, "open", refused, raising=False)
+    with pytest.raises(WearcapError, match=r"all\.safetensors: no permission to read it"):
         store.load("all")
 
 
-@pytest.mark.parametrize("name", ["", "..", "../up", "a/b", "/etc/x", ".hidden"])
+@pytest.mark.parametrize(
+    "name", ["", "..", "../up", "a/b", "/etc/x", ".hidden", "a\nb", "\x1b[2J", "\ud800", "a" * 300]
+)
 def test_a_name_cannot_leave_the_folder(store, name):
     with pytest.raises(WearcapError, match="cannot name a recording"):
         store.add(replace(full_recording(), name=name), split="train", config_hash="")

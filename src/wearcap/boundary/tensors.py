@@ -52,8 +52,7 @@ def open_tensors(path: str | Path, kind: str, fix: str = "", framework: str = "p
     try:
         return safetensors.safe_open(str(path), framework=framework)
     except _DAMAGE as error:
-        what = f"not a readable {kind} ({' '.join(str(error).split())[:120]})"
-        raise WearcapError(what, path, "a complete .safetensors file", fix) from error
+        raise WearcapError(f"not a readable {kind}", path, "a complete .safetensors file", fix) from error
 
 
 def read_tensors(path: str | Path, kind: str, fix: str = "") -> tuple[dict[str, str], dict[str, torch.Tensor]]:

@@ -3,6 +3,7 @@
 import json
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -50,7 +51,7 @@ def run(config: DictConfig) -> Motion | None:
     return motion
 
 
-def captured(config: DictConfig, system: System) -> Motion | None:
+def captured(config: Any, system: System) -> Motion | None:
     """Capture one recording and write motion.npz, .bvh, .glb and .mp4 (beside the ground truth, if there is one).
 
     A pipeline with stages also writes report.json, and only that if `until` names a stage before the motion exists.
@@ -90,9 +91,7 @@ def captured(config: DictConfig, system: System) -> Motion | None:
     return motion
 
 
-def _write(
-    motion: Motion, recording: Recording, environment: Environment | None, folder: Path, config: DictConfig
-) -> None:
+def _write(motion: Motion, recording: Recording, environment: Environment | None, folder: Path, config: Any) -> None:
     write_motion(motion, folder / "motion.npz")
     write_bvh(motion, folder / "motion.bvh")
     shown, body = motion, anny_body(motion.skeleton, recording.shape or None) if config.body is True else None

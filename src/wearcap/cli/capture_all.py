@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -25,8 +26,9 @@ from wearcap.recording.store import MANIFEST
 from wearcap.runtime.system import CaptureInput, System
 from wearcap.spread import reason_of
 
-Capture = Callable[[DictConfig, System], Motion | None]
-"""Captures the one recording of a config and writes its files."""
+Capture = Callable[[Any, System], Motion | None]
+"""Captures the one recording of a config and writes its files. The config's values are plain: names of recordings, in
+which OmegaConf would resolve `${…}`, are no values of its own."""
 
 WITHOUT_EFFECT = ("recording", "split", "output", "jobs", "backend", "scheduler", "overwrite", "paths", "cache", "live")
 """Settings that do not change what is captured of a recording."""
@@ -77,7 +79,7 @@ def _captured(names: Sequence[str], plain: dict[str, Any], key: str, capture: Ca
     """In a worker: capture one recording, and score it where its true motion is known."""
     (name,) = names
     folder, root = Path(plain["output"]) / name, Path(plain["recording"])
-    config = OmegaConf.create(plain | {"recording": str(root / name), "output": str(folder)})
+    config = SimpleNamespace(**plain | {"recording": str(root / name), "output": str(folder)})
     system = loaded(key, partial(load_pipeline, config.checkpoint, config.pipeline, config.device, shared=True))
     begin = time.perf_counter()
     motion = capture(config, system)

@@ -248,7 +248,7 @@ def _dotted(config: Any, prefix: str = "") -> Iterator[str]:
 
 
 def load_pipeline(
-    checkpoint: str | Path | Sequence[str] | None, pipeline: DictConfig, device: str, shared: bool = False
+    checkpoint: str | Path | Sequence[str] | None, pipeline: Any, device: str, shared: bool = False
 ) -> System:
     """The system of a pipeline config; one with a network (`_partial_`) takes it from checkpoints.
 
@@ -259,7 +259,7 @@ def load_pipeline(
     return load_systems(given, pipeline, device, shared)[0]
 
 
-def load_systems(given: Sequence[str | Path], pipeline: DictConfig, device: str, shared: bool = False) -> list[System]:
+def load_systems(given: Sequence[str | Path], pipeline: Any, device: str, shared: bool = False) -> list[System]:
     """The system of a pipeline config with all checkpoints, or one system for each of them; raises as `load_pipeline`."""
     made = instantiate(pipeline, _convert_="all")
     if isinstance(made, System):

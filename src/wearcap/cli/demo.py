@@ -1,6 +1,7 @@
 """`wearcap demo`: the complete workflow on simulated data, from preparation to a captured motion, in minutes."""
 
 import argparse
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -44,7 +45,7 @@ def main(arguments: list[str]) -> None:
     table = [f"checkpoint={SHARED}", f"dataset={data}", f"hydra.run.dir={out}/evaluate_shared", "seeds=[0]"]
     table += ["baselines=false", f"output={out}/table_shared.json"]
     _step("The shared checkpoint, which was trained for longer", evaluate.main, table)
-    name = store.names("test")[0]
+    name = next(name for name in store.names("test") if re.fullmatch(r"[\w-]+", name))  # a value of the config
     for title, taken, folder in (
         ("Capture", trained, "capture"),
         ("The same, shared", f"checkpoint={SHARED}", "shared"),

@@ -37,6 +37,7 @@ from wearcap.evaluation.whole import (
     write_outcomes,
 )
 from wearcap.metrics.table import Row, Scores, Summary, aggregate, rich_table, write_scores
+from wearcap.prepare.files import with_own_files
 from wearcap.reading import read
 from wearcap.recording import RecordingStore
 from wearcap.recording.store import MANIFEST, dataset_folder
@@ -144,8 +145,8 @@ def _chosen(config: DictConfig, checkpoints: Sequence[str], system: System) -> t
         expected = "a recording with a true motion beside its sensors"
         raise WearcapError("nothing to score against", config.recording, expected, "Capture it instead.")
     if not (folder / MANIFEST).is_file():
-        folder = Path(config.output).parent / "recording"
-        RecordingStore(folder).add(recording, split="test", config_hash="")
+        origin, folder = folder, Path(config.output).parent / "recording"
+        RecordingStore(folder).add(with_own_files(recording, folder, origin), split="test", config_hash="")
     return RecordingStore.open(folder), [recording.name]
 
 
@@ -221,7 +222,7 @@ class _Scoring:
 
 
 def _load(checkpoints: list[str], pipeline: dict[str, Any], device: str) -> System:
-    return load_systems(checkpoints, OmegaConf.create(pipeline), device)[0]
+    return load_systems(checkpoints, pipeline, device)[0]
 
 
 def _baselines(scoring: _Scoring, labels: Sequence[str], checkpoint: str, names: set[str]) -> dict[str, list[Row]]:

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save
+from safetensors.torch import save
 from torch import Tensor
 
+from wearcap.boundary.tensors import read_tensors
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, sha256_of
 from wearcap.io.formats.video import read_frames, read_image
@@ -63,12 +63,11 @@ def pictures(camera: CameraStream, folder: Path) -> Iterator[UInt8[np.ndarray, "
 
 def _files(camera: CameraStream, folder: Path) -> list[Path]:
     """The video, or the image files. Raises WearcapError where there is none, or one is missing."""
-    names = [camera.video] if camera.video is not None else list(camera.image_files or ())
-    if not names:
+    files = camera.files_in(folder)
+    if not files:
         what = "this camera stream has no pictures"
         fix = "Prepare the data set with its camera."
         raise WearcapError(what, where=folder, expected="a video or image files", fix=fix)
-    files = [folder / name for name in names]
     if missing := [file for file in files if not file.is_file()]:
         what = "no such video" if camera.video is not None else f"{len(missing)} of {len(files)} pictures are missing"
         expected = "the files that the recording names, below the data set's folder"
@@ -79,8 +78,8 @@ def _files(camera: CameraStream, folder: Path) -> list[Path]:
 def _read(path: Path, size: int) -> dict[str, Tensor] | None:
     """Cached embeddings, or None if they are missing or incomplete."""
     try:
-        tensors = load_file(path)
-    except (FileNotFoundError, SafetensorError, OSError):
+        _, tensors = read_tensors(path, "file of embeddings")
+    except WearcapError:
         return None
     whole = set(tensors) == set(_KEYS) and all(value.shape[1:] == (size,) for value in tensors.values())
     return tensors if whole else None

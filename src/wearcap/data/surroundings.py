@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from pathlib import Path
 
-import safetensors
 import torch
 from jaxtyping import Bool, Float64, Int64
 from rich.progress import track
 from safetensors.torch import save
 from torch import Tensor
 
+from wearcap.boundary.tensors import open_tensors
 from wearcap.data.windows import open_recording
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
@@ -147,7 +147,7 @@ def embeddings_of(encoder: str, stores: list[RecordingStore]) -> tuple[str, int]
     return kinds.pop()
 
 
-_codes = cache(partial(safetensors.safe_open, framework="pt"))
+_codes = cache(partial(open_tensors, kind="file of places", fix="Delete it: it is made again."))
 
 
 @cache

@@ -4,10 +4,10 @@ import math
 from pathlib import Path
 
 import numpy as np
-import safetensors
 import torch
 from jaxtyping import Float32
 
+from wearcap.boundary.tensors import open_tensors
 from wearcap.doctor.report import Check, Finding, refusal
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import face_normals, random_points
@@ -91,9 +91,8 @@ def read_place(folder: Path) -> tuple[Recording, list[Finding]]:
 def is_map(path: Path) -> bool:
     """Whether a .safetensors file is marked as a visual map."""
     try:
-        with safetensors.safe_open(str(path), framework="numpy") as file:
-            return "wearcap_map" in (file.metadata() or {})
-    except (safetensors.SafetensorError, OSError, RuntimeError):
+        return "wearcap_map" in (open_tensors(path, "map", framework="numpy").metadata() or {})
+    except WearcapError:
         return False
 
 

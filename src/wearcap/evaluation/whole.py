@@ -18,14 +18,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from rich.markup import escape
 from rich.table import Table
 
 import wearcap
-from wearcap.boundary.texts import parse_json
+from wearcap.boundary.texts import read_json
 from wearcap.errors import WearcapError
 from wearcap.evaluation.evaluate import Measure, evaluate
 from wearcap.files import remembered_sha256, write_text
-from wearcap.io.formats.scene_folder import cloud_file
+from wearcap.io.formats.scene_folder import cloud_file, used_files
 from wearcap.locks import folder_lock
 from wearcap.metrics.table import TRUTH, Row, decimals
 from wearcap.models.checkpoint import checkpoint_file, shared_checkpoints
@@ -36,7 +37,7 @@ from wearcap.spread import Spread, divided, progress_bar, reason_of
 
 SHOWN = 3
 """Metrics of a table of recordings; its file has them all."""
-_DAMAGE = (OSError, ValueError, KeyError, TypeError, AttributeError, WearcapError)
+_DAMAGE = (OSError, ValueError, LookupError, TypeError, AttributeError, WearcapError)
 
 
 @dataclass(frozen=True)
@@ -137,7 +138,7 @@ def _note(outcome: Outcome, key: str) -> str:
 def _kept(notes: Path, name: str, key: str) -> Outcome | None:
     """The outcome of a recording's note, if it has the key and all files are there as they were written."""
     try:
-        about = parse_json((notes / f"{name}.json").read_text(encoding="utf-8"), notes)
+        about = read_json(notes / f"{name}.json")
         if about.pop("key") != key:
             return None
         rows = tuple(
@@ -159,15 +160,10 @@ def _inputs(store: RecordingStore, name: str, scene: str | Path | None) -> list[
     """
     file = store.open_file(name)
     camera = file.part("camera")
-    named = [file.part("scene") if scene is None else None, file.part("environment")]
-    paths = [store.root / part for part in (*named, camera and camera.video) if part]
-    paths += [] if scene is None else [cloud_file(Path(scene))]
-    around = [each for path in paths if path.parent != store.root for each in sorted(path.parent.glob("*"))]
-    files = dict.fromkeys(path for path in (*paths, *around) if path.is_file())
-    if camera is not None and camera.video:  # of other recordings' videos beside it only its own counts
-        video = store.root / camera.video
-        files = {path: None for path in files if path == video or path.parent != video.parent}
-    return [store.entries[name].sha256, *(remembered_sha256(path) for path in files)]
+    named = [file.part("scene") if scene is None else None, file.part("environment"), camera and camera.video]
+    paths = [store.root / part for part in named if part] + ([] if scene is None else [cloud_file(scene)])
+    files = dict.fromkeys(each for path in paths if path.is_file() for each in used_files(path))
+    return [store.entries[name].sha256, *map(remembered_sha256, files)]
 
 
 def settings_key(config: dict[str, Any], checkpoints: Sequence[str | Path], *modules: str) -> str:
@@ -278,7 +274,8 @@ def outcome_table(title: str, outcomes: Iterable[Outcome]) -> Table:
         scores = row.scores()
         values = [scores.get(name, math.nan) for name in metrics]
         cells = ["–" if math.isnan(value) else f"{value:.{decimals(value)}f}" for value in values]
-        table.add_row(row.recording, f"{row.seconds:.1f}", str(row.frames), *cells, *([row.error] if failed else []))
+        cells += [escape(row.error)] if failed else []
+        table.add_row(escape(row.recording), f"{row.seconds:.1f}", str(row.frames), *cells)
     return table
 
 

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import safetensors
 import torch
 from jaxtyping import Float32, Int8, Int32, Int64
 from safetensors.numpy import save
 
+from wearcap.boundary.opening import understood
+from wearcap.boundary.tensors import open_tensors
 from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
@@ -137,19 +138,13 @@ class VisualMap:
     @classmethod
     def load(cls, path: str | Path) -> "VisualMap":
         """Read a map. Raises WearcapError for a file that is missing, damaged, no map, or of another version."""
-        try:
-            with safetensors.safe_open(str(path), framework="numpy") as file:
-                metadata = file.metadata() or {}
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        except FileNotFoundError as error:
-            raise WearcapError("no such map", where=path, fix="Build it: wearcap scene.") from error
-        except (safetensors.SafetensorError, OSError, RuntimeError) as error:
-            expected = "a complete .safetensors file"
-            raise WearcapError("not a readable map", where=path, expected=expected, fix=_AGAIN) from error
+        file = open_tensors(path, "map", _AGAIN, "numpy")
+        metadata = file.metadata() or {}
         if "wearcap_map" not in metadata:
             what = "a .safetensors file, but not a visual map"
             raise WearcapError(what, where=path, expected="one that `wearcap scene` wrote")
-        try:
+        with understood("a damaged map", path, fix=_AGAIN):
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             header = parse_json(metadata["wearcap_map"], path)
             if header["schema_version"] != SCHEMA_VERSION:
                 what = f"a map of version {header['schema_version']}"
@@ -168,8 +163,6 @@ class VisualMap:
                 float(header["cell_m"]),
             )
             loaded.check()
-        except (KeyError, TypeError, ValueError) as error:
-            raise WearcapError(f"a damaged map ({error})", where=path, fix=_AGAIN) from error
         return loaded
 
     def check(self) -> None:

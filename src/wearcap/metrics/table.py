@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Bool
+from rich.markup import escape
 from rich.table import Table
 from torch import Tensor
 
@@ -232,7 +233,7 @@ def rich_lines(title: str, methods: Scores, metrics: Columns | None = None) -> T
     for number, heading in enumerate(["", *header[1:]]):
         table.add_column(heading, justify="right" if number else "left", no_wrap=not number)
     for line in lines:
-        table.add_row(*line)
+        table.add_row(*map(escape, line))
     return table
 
 

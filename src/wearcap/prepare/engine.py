@@ -25,6 +25,7 @@ from wearcap.errors import WearcapError
 from wearcap.files import remove_leftovers, sha256_of
 from wearcap.io.formats.poses import are_rotations
 from wearcap.locks import folder_lock
+from wearcap.prepare.files import with_own_files
 from wearcap.recording.recording import MIN_DURATION_S, Recording
 from wearcap.recording.serialize import flatten
 from wearcap.recording.store import SPLITS, Entry, RecordingStore, recording_path, save_recording
@@ -190,6 +191,7 @@ def _run(task: Task, root: Path, inspect: Callable[[Recording], None] | None = N
             check_recording(recording)
             if inspect is not None:
                 inspect(recording)
+            recording = with_own_files(recording, root, root)
         except Exception as error:
             return task.name, reason_of(error), ""
         save_recording(recording, recording_path(root, task.name))

@@ -1,9 +1,8 @@
 """Adding head-camera keypoints to the recordings of a data set: detected in its pictures, recorded, or simulated.
 
-The new data set's recordings refer to videos and scenes in the old one.
+Videos and scenes of the old data set are linked into the new one.
 """
 
-import os
 import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -18,10 +17,13 @@ from wearcap.errors import WearcapError
 from wearcap.localization.keypoint_flow import FlowSettings, tracked_cues
 from wearcap.localization.keypoints import MediaPipeHands, RecordedDetections, find_model, read_keypoints
 from wearcap.prepare.engine import Report, Task, content_hash, prepare
+from wearcap.prepare.files import with_own_files
 from wearcap.recording.recording import CameraStream, Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
 from wearcap.sensors.keypoints import action_camera, camera_path, seen_joints
 
+VERSION = 2
+"""Version of the conversion, increased when the same recording and settings yield another one."""
 CAMERA_FPS = 30.0
 """Rate (Hz) of the simulated camera of a recording without one."""
 
@@ -119,7 +121,7 @@ def keypoints_dataset(
     for name in store.names():
         entry = store.entries[name]
         make = partial(_with_keypoints, store.root / entry.file, store.root, Path(output), detector)
-        tasks.append(Task(name, make, entry.split, content_hash(entry.sha256, *detector.settings(name))))
+        tasks.append(Task(name, make, entry.split, content_hash(entry.sha256, VERSION, *detector.settings(name))))
     return prepare(tasks, output, jobs=jobs, **options)
 
 
@@ -131,16 +133,5 @@ def _camera(recording: Recording) -> CameraStream:
 
 
 def _with_keypoints(file: Path, folder: Path, output: Path, source: Source) -> Recording:
-    """One recording with its keypoints; the paths of its files are made relative to the new data set's folder."""
-    recording = source(RecordingFile(file).load(), folder)
-    prefix = os.path.relpath(folder, output)
-
-    def moved(name: str | None) -> str | None:
-        return name and Path(prefix, name).as_posix()
-
-    camera = recording.camera
-    if camera is not None:
-        files = camera.image_files
-        files = None if files is None else tuple(Path(prefix, name).as_posix() for name in files)
-        camera = replace(camera, video=moved(camera.video), image_files=files)
-    return replace(recording, camera=camera, scene=moved(recording.scene), environment=moved(recording.environment))
+    """One recording with its keypoints; the files that it names become the new data set's, too."""
+    return with_own_files(source(RecordingFile(file).load(), folder), output, folder)

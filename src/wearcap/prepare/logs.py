@@ -3,7 +3,6 @@
 Each source has a function that lists its recordings as tasks, preceded by the one that makes a recording of it.
 """
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -38,7 +37,7 @@ from wearcap.sensors.slam_alignment import SceneEvidence, align_cleaned, pose_of
 from wearcap.sensors.watch_calibration import WatchSession, read_watch_calibration
 from wearcap.sensors.watches import watch_gaps
 
-VERSION = {"trajectory": 1, "watches": 1, "headset": 1}
+VERSION = {"trajectory": 2, "watches": 1, "headset": 1}
 """Versions of the conversions, increased when the same source and settings yield another recording."""
 Numbers = Sequence[float | int]
 
@@ -131,7 +130,7 @@ def read_cloud(path: str | Path) -> PointCloud:
     return PointCloud(torch.stack([torch.from_numpy(column) for column in columns.values()], 1).float())
 
 
-def read_path(file: Path, name: str, about: dict[str, str], settings: TrajectorySettings, output: Path) -> Recording:
+def read_path(file: Path, name: str, about: dict[str, str], settings: TrajectorySettings) -> Recording:
     """The head's path, points and camera of one trajectory."""
     if file.is_dir() and is_mps_folder(file):
         read = read_mps(file)
@@ -148,7 +147,7 @@ def read_path(file: Path, name: str, about: dict[str, str], settings: Trajectory
     floor = None
     if settings.camera_height_m is not None:
         floor = FloorTrack(head.timestamps[:1], torch.zeros(1))
-    camera = _camera(settings, head, output)
+    camera = _camera(settings, head)
     skeleton = settings.skeleton()
     if skeleton is None:
         note += "; height not given: taken from how high the head is carried, where the floor is known"
@@ -199,7 +198,7 @@ def _axes(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tup
     return axes.device, WORLDS[axes.up], f"{axes.up} is up (the device is upright by {axes.upright:.2f})"
 
 
-def _camera(settings: TrajectorySettings, head: HeadStream, output: Path) -> CameraStream | None:
+def _camera(settings: TrajectorySettings, head: HeadStream) -> CameraStream | None:
     """The video's camera, which looks along the device's forward axis: its frames begin `video_start_s` after the first pose."""
     if settings.video is None:
         return None
@@ -216,12 +215,11 @@ def _camera(settings: TrajectorySettings, head: HeadStream, output: Path) -> Cam
         expected = f"it and the path, {head.timestamps[0]:.2f} to {head.timestamps[-1]:.2f} s, at the same time"
         raise WearcapError(what, settings.video, expected, "Give video_start_s=SECONDS.")
     R = head.R_head_device @ CAMERA
-    video = os.path.relpath(settings.video, output)
-    return CameraStream(times, lens, R, head.t_head_device, video=video)
+    return CameraStream(times, lens, R, head.t_head_device, video=str(Path(settings.video).absolute()))
 
 
 def trajectory_tasks(
-    source: str | Path, output: str | Path, splits: Splits, subject: str, license: str, settings: TrajectorySettings
+    source: str | Path, splits: Splits, subject: str, license: str, settings: TrajectorySettings
 ) -> list[Task]:
     """One task per trajectory: a file, a folder that is one, or each trajectory in a folder.
 
@@ -241,10 +239,10 @@ def trajectory_tasks(
         what = f"{len(found)} trajectories, but points, video or head_imu of one"
         raise WearcapError(what, where=source, fix="Prepare that one alone: source=FILE.")
     files = settings.files()
-    return [_task("trajectory", path, read_path, output, splits, subject, license, settings, files) for path in found]
+    return [_task("trajectory", path, read_path, splits, subject, license, settings, files) for path in found]
 
 
-def _watches(camera: Path, name: str, about: dict[str, str], settings: "WatchesSettings", output: Path) -> Recording:
+def _watches(camera: Path, name: str, about: dict[str, str], settings: "WatchesSettings") -> Recording:
     """The head's path and both watches, calibrated where a calibration is given."""
     watches = {joint: read_watch_log(path, joint) for joint, path in settings.logs().items()}
     way = settings.camera
@@ -296,14 +294,14 @@ class WatchesSettings:
 
 
 def watches_tasks(
-    camera: str | Path, output: str | Path, splits: Splits, subject: str, license: str, settings: WatchesSettings
+    camera: str | Path, splits: Splits, subject: str, license: str, settings: WatchesSettings
 ) -> list[Task]:
     """The one recording of two watches and a head camera; hashed by all files."""
     others = [*settings.logs().values(), *([Path(settings.calibration)] if settings.calibration else [])]
     files = [Path(camera), *others, *settings.camera.files()]
     if missing := [str(file) for file in files if not file.exists()]:
         raise WearcapError("no such file", where=missing[0], fix="Give left=CSV right=CSV camera=TRAJECTORY.")
-    return [_task("watches", Path(camera), _watches, output, splits, subject, license, settings, files[1:])]
+    return [_task("watches", Path(camera), _watches, splits, subject, license, settings, files[1:])]
 
 
 @dataclass(frozen=True)
@@ -341,12 +339,12 @@ class HeadsetSettings:
         )
 
 
-def _headset(path: Path, name: str, about: dict[str, str], settings: HeadsetSettings, output: Path) -> Recording:
+def _headset(path: Path, name: str, about: dict[str, str], settings: HeadsetSettings) -> Recording:
     return settings.read(path, name, about)
 
 
 def headset_tasks(
-    source: str | Path, output: str | Path, splits: Splits, subject: str, license: str, settings: HeadsetSettings
+    source: str | Path, splits: Splits, subject: str, license: str, settings: HeadsetSettings
 ) -> list[Task]:
     """One task per log: a file, or each in a folder. Raises WearcapError where there is none."""
     source = Path(source)
@@ -359,14 +357,13 @@ def headset_tasks(
         found = [path for path in files if is_headset_log(path)]
     if not found:
         raise WearcapError("no headset's log in this folder", source, "CSV or JSON with time, head_pos_x, …")
-    return [_task("headset", path, _headset, output, splits, subject, license, settings) for path in found]
+    return [_task("headset", path, _headset, splits, subject, license, settings) for path in found]
 
 
 def _task(
     kind: str,
     path: Path,
     make: Callable[..., Recording],
-    output: str | Path,
     splits: Splits,
     subject: str,
     license: str,
@@ -381,4 +378,4 @@ def _task(
     small = [file for file in (*read, *files) if file.stat().st_size < 1 << 30]
     key = content_hash(kind, name, subject, license, asdict(settings), VERSION[kind], *small)
     about = {"subject": subject, "license": license, "source": f"{kind} {path.name}"}
-    return Task(name or kind, partial(make, path, name or kind, about, settings, Path(output)), splits.of(subject), key)
+    return Task(name or kind, partial(make, path, name or kind, about, settings), splits.of(subject), key)

@@ -1,6 +1,5 @@
 """A suit's captures (MVNX) as recordings: alone, or with the head camera's video, its localisation and the scene's scan."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -12,7 +11,7 @@ from wearcap.errors import WearcapError
 from wearcap.io.datasets.hps import nominal_mount
 from wearcap.io.formats.camera_json import read_camera
 from wearcap.io.formats.mvnx import read_mvnx
-from wearcap.io.formats.scene_folder import cloud_file
+from wearcap.io.formats.scene_folder import cloud_file, used_files
 from wearcap.io.formats.trajectory import read_trajectory
 from wearcap.io.formats.video import video_info
 from wearcap.prepare.engine import Splits, Task, content_hash
@@ -20,7 +19,7 @@ from wearcap.recording.recording import CameraStream, Localization, Recording
 from wearcap.sensors.contacts import contacts_from_motion
 from wearcap.sensors.slam_alignment import pose_of
 
-VERSION = 1
+VERSION = 2
 """Version of the conversion, increased when the same source and settings yield another recording."""
 
 
@@ -56,7 +55,7 @@ class SuitSettings:
         sure = torch.ones(len(times))
         return Localization(times, track.R_world_body.float(), track.t_world_body.float(), sure)
 
-    def filmed(self, localization: Localization | None, output: Path) -> CameraStream | None:
+    def filmed(self, localization: Localization | None) -> CameraStream | None:
         """The head camera, where there is one."""
         if self.camera is None:
             return None
@@ -70,7 +69,7 @@ class SuitSettings:
         if not info.frames or not info.fps:
             raise WearcapError("a video that does not say how many frames it has", self.video, "a whole video")
         times = float(self.video_start_s) + torch.arange(info.frames, dtype=torch.float64) / float(info.fps)
-        return CameraStream(times, read_camera(self.camera), R, t, video=os.path.relpath(self.video, output))
+        return CameraStream(times, read_camera(self.camera), R, t, video=str(Path(self.video).absolute()))
 
 
 def read_suit(path: str | Path) -> Recording:
@@ -85,10 +84,10 @@ def read_suit(path: str | Path) -> Recording:
     return replace(recording, suit=suit, motion=None)
 
 
-def _suit(path: Path, name: str, about: dict[str, str], settings: SuitSettings, output: Path) -> Recording:
+def _suit(path: Path, name: str, about: dict[str, str], settings: SuitSettings) -> Recording:
     """The suit with its camera, localisation and scene. Raises WearcapError where camera and suit share no time."""
     localization = settings.localized()
-    camera = settings.filmed(localization, output)
+    camera = settings.filmed(localization)
     recording = read_suit(path)
     assert recording.suit is not None
     suit = recording.suit.timestamps
@@ -97,13 +96,11 @@ def _suit(path: Path, name: str, about: dict[str, str], settings: SuitSettings, 
             what = f"the camera from {stream.timestamps[0]:.2f} to {stream.timestamps[-1]:.2f} s"
             expected = f"it and the suit, {suit[0]:.2f} to {suit[-1]:.2f} s, at the same time"
             raise WearcapError(what, settings.video or settings.camera_poses, expected, "Give video_start_s=SECONDS.")
-    scene = None if settings.scene is None else os.path.relpath(cloud_file(Path(settings.scene)), output)
+    scene = None if settings.scene is None else str(cloud_file(settings.scene).absolute())
     return replace(recording, name=name, camera=camera, localization=localization, scene=scene, **about)
 
 
-def suit_tasks(
-    source: str | Path, output: str | Path, splits: Splits, subject: str, license: str, settings: SuitSettings
-) -> list[Task]:
+def suit_tasks(source: str | Path, splits: Splits, subject: str, license: str, settings: SuitSettings) -> list[Task]:
     """One task per MVNX file: a file, or each in a folder.
 
     Raises WearcapError where there is none, for a video or localisation of several takes, and for one without intrinsics.
@@ -125,11 +122,12 @@ def suit_tasks(
         what = f"{len(found)} takes, but a video or localisation of one"
         raise WearcapError(what, where=source, fix="Prepare that one alone: source=FILE.")
     video = [] if settings.video is None else [str(Path(settings.video).stat().st_size)]
+    map_beside = [] if settings.scene is None else used_files(cloud_file(settings.scene))[1:]
     tasks = []
     for path in found:
         name = path.name.split(".")[0]
         about = {"subject": subject, "license": license, "source": f"mvnx {path.name}"}
-        key = content_hash(name, about, asdict(settings), VERSION, *video, path, *settings.files())
-        make = partial(_suit, path, name, about, settings, Path(output))
+        key = content_hash(name, about, asdict(settings), VERSION, *video, path, *settings.files(), *map_beside)
+        make = partial(_suit, path, name, about, settings)
         tasks.append(Task(name, make, splits.of(subject), key))
     return tasks

@@ -36,7 +36,7 @@ from wearcap.recording.timing import resampled
 from wearcap.sensors.camera_alignment import align_by_walks
 from wearcap.sensors.monocular_slam import clean_track
 
-VERSION = {"hps": 1, "egohoi": 1, "hcontact": 1, "nymeria": 2, "aria": 2, "mocap_every_folder": 1, "totalcapture": 2}
+VERSION = {"hps": 2, "egohoi": 1, "hcontact": 1, "nymeria": 2, "aria": 2, "mocap_every_folder": 2, "totalcapture": 2}
 """Versions of the conversions, increased when the same source and settings yield another recording."""
 MOUNT_S, MOUNT_DEG = 1.0, 35.0
 """Time from a sequence's start in which sensors are calibrated to the body, as a calibration pose does; and the largest

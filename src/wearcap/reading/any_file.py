@@ -72,7 +72,7 @@ def _read_log(path: Path) -> Recording:
     if "aria_trajectory" in path.name or (kind == "trajectory" and trajectory_format(path) == "MPS"):
         track = read_closed_loop(path, up="y" if "aria_trajectory" in path.name else "z")[0]
         return Recording(name, head=head_stream(track, fps=None), source="Aria MPS")
-    return read_path(path, name, {}, TrajectorySettings(), path.parent)
+    return read_path(path, name, {}, TrajectorySettings())
 
 
 def _read_npz(path: Path) -> Recording | Motion:
@@ -80,7 +80,7 @@ def _read_npz(path: Path) -> Recording | Motion:
     if path.name == "xdata.npz":
         return read_xdata(path)[0]
     if read_npz(path, ("traj_est", "tstamps", "tstamp")):
-        return read_path(path, path.stem, {}, TrajectorySettings(), path.parent)
+        return read_path(path, path.stem, {}, TrajectorySettings())
     return read_motion(path) if read_npz(path, ("wearcap",)) else read_amass(path)
 
 

@@ -1,11 +1,13 @@
 """The Recording: sensor data and ground truth; parts that do not exist are None or empty."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
+from wearcap.boundary.opening import path_inside
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
@@ -70,6 +72,12 @@ class CameraStream:
     """Embeddings of the horizontally flipped images, for training on mirrored motions."""
     embedding_name: str | None = None
     """Name of the image encoder."""
+
+    def files_in(self, folder: Path) -> list[Path]:
+        """The video or the image files, in a data set's folder. Raises WearcapError for image files that leave it."""
+        if self.video is not None:
+            return [folder / self.video]
+        return [path_inside(folder, name, folder) for name in self.image_files or ()]
 
 
 @dataclass(frozen=True)

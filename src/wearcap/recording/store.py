@@ -2,17 +2,20 @@
 
 import dataclasses
 import json
-import math
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
+from typing import Annotated, Any, Literal
 
-import safetensors
+import msgspec
+from safetensors import SafetensorError
 from safetensors.torch import save
 from torch import Tensor
 
+from wearcap.boundary.opening import explained, file_size, path_inside, read_bytes, understood
+from wearcap.boundary.tensors import open_tensors
 from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError, require_choice
 from wearcap.files import atomic_path, remembered_sha256, sha256_of, write_text
@@ -22,8 +25,17 @@ from wearcap.recording.serialize import dumps, flatten, require_part, unflatten
 SCHEMA_VERSION = 1
 SPLITS = ("train", "val", "test")
 MANIFEST, FOLDER = "manifest.json", "recordings"
-MAX_FRAMES, MAX_FPS = 10**9, 1e5
-"""Largest values accepted from a manifest: a week at 1.6 kHz."""
+_DAMAGE = (
+    WearcapError,
+    SafetensorError,
+    RuntimeError,
+    LookupError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    OverflowError,
+)
+"""Exceptions of restoring a recording from a description of another layout."""
 
 
 @dataclass(frozen=True)
@@ -32,20 +44,20 @@ class Entry:
 
     file: str
     sha256: str
-    bytes: int
-    frames: int
-    fps: float
-    duration_s: float
+    bytes: Annotated[int, msgspec.Meta(ge=0, le=1 << 50)]
+    frames: Annotated[int, msgspec.Meta(ge=0, le=10**9)]  # a week at 1.6 kHz
+    fps: Annotated[float, msgspec.Meta(ge=0, le=1e5)]
+    duration_s: Annotated[float, msgspec.Meta(ge=0, le=1e11)]
     subject: str
     location: str
     activity: str
-    split: str
+    split: Literal["train", "val", "test"]
     license: str
     config_hash: str
     """Hash of source bytes and preparation settings: prepare skips a recording whose hash is current."""
 
     @classmethod
-    def of(cls, recording: Recording, root: Path, split: str, config_hash: str) -> "Entry":
+    def of(cls, recording: Recording, root: Path, split: Any, config_hash: str) -> "Entry":
         """The manifest entry of a recording whose file has been written."""
         require_choice(split, SPLITS, f"no split {split!r}")
         path = recording_path(root, recording.name)
@@ -66,7 +78,11 @@ class Entry:
         )
 
 
-_MOST = {"frames": MAX_FRAMES, "fps": MAX_FPS, "duration_s": 1e11, "bytes": 1 << 50}
+class _Description(msgspec.Struct):
+    """What is described in a recording file beside its tensors."""
+
+    schema_version: int
+    recording: dict[str, Any]
 
 
 class RecordingFile:
@@ -80,35 +96,25 @@ class RecordingFile:
         """Open a file. Raises WearcapError when it is missing, damaged, no recording, or differs from its data set's
         manifest; files outside a data set are not compared."""
         self.path, manifest = Path(path), Path(path).parent.parent / MANIFEST
-        try:
-            if verify and self.path.parent.name == FOLDER and manifest.is_file() and self.path.is_file():
+        size = file_size(path, "recording")
+        if verify and self.path.parent.name == FOLDER and manifest.is_file():
+            with explained(path):
                 found = manifest.stat()
                 entry = _entries(manifest, found.st_size, found.st_mtime_ns, found.st_ino).get(self.path.name)
-                if entry is not None and (size := self.path.stat().st_size) != entry.bytes:
+                if entry is not None and size != entry.bytes:
                     expected = f"{entry.bytes} bytes, as the manifest says"
                     fix = "It was cut short or replaced: prepare it again."
                     raise WearcapError(f"{size} bytes long", self.path, expected, fix)
                 if entry is not None and remembered_sha256(self.path) != entry.sha256:
                     raise _differs(self.path)
-        except OSError as error:
-            raise WearcapError(f"cannot be read ({error.strerror or error})", self.path) from error
-        try:
-            self._file = safetensors.safe_open(str(self.path), framework="pt")
-        except FileNotFoundError as error:
-            if self.path.exists():  # safetensors reports unreadable files as missing
-                raise WearcapError(f"cannot be read ({error.strerror or 'no permission'})", self.path) from error
-            raise WearcapError("no such recording", self.path) from error
-        except (safetensors.SafetensorError, OSError, RuntimeError) as error:
-            what = "not a readable recording"
-            raise WearcapError(what, path, "a complete .safetensors file", "Prepare this recording again.") from error
+        self._file = open_tensors(path, "recording", "Prepare this recording again.")
         metadata = self._file.metadata() or {}
         if "wearcap" not in metadata:
             raise WearcapError("a .safetensors file, but not a recording", path, "one that `wearcap prepare` wrote")
-        content = parse_json(metadata["wearcap"], path)
-        with self._described():
-            version, self._tree = content["schema_version"], dict(content["recording"])
-        if version != SCHEMA_VERSION:
+        description = parse_json(metadata["wearcap"], path, schema=_Description)
+        if (version := description.schema_version) != SCHEMA_VERSION:
             raise WearcapError(f"schema version {version}", path, f"version {SCHEMA_VERSION}", "Prepare it again.")
+        self._tree = description.recording
 
     @cached_property
     def keys(self) -> frozenset[str]:
@@ -131,25 +137,29 @@ class RecordingFile:
     def part(self, name: str):
         """One top-level part ("skeleton", "head", "motion" …), or None if the recording lacks it."""
         with self._described():
-            part = unflatten(self._tree.get(name), self.tensor)
+            part = unflatten(self._tree.get(name), cache(self.tensor))
             require_part(Recording, name, part)
-            return part
+        self._require_inside(part if name in ("scene", "environment") else getattr(part, "video", None))
+        return part
 
     def load(self) -> Recording:
         with self._described():
-            recording = unflatten(self._tree, self.tensor)
+            recording = unflatten(self._tree, cache(self.tensor))
             if not isinstance(recording, Recording):
                 raise TypeError("not a Recording")
-            return recording
+            recording_path(Path(), recording.name)
+        self._require_inside(recording.scene, recording.environment, recording.camera and recording.camera.video)
+        return recording
 
-    @contextmanager
-    def _described(self) -> Iterator[None]:
+    def _described(self) -> AbstractContextManager[None]:
         """Turn what taking the description apart raises into a WearcapError."""
-        try:
-            yield
-        except (WearcapError, TypeError, ValueError, KeyError, AttributeError) as error:
-            what = f"its description is unreadable ({error})"
-            raise WearcapError(what, self.path, fix="Prepare this recording again.") from error
+        fix = "Prepare this recording again."
+        return understood("its description is unreadable", self.path, fix=fix, errors=_DAMAGE)
+
+    def _require_inside(self, *names: str | None) -> None:
+        """Raise WearcapError for a name of a file that leaves the data set's folder, or leads to no regular file."""
+        for name in filter(None, names):
+            path_inside(dataset_folder(self.path), name, self.path)
 
     def _require(self, key: str) -> None:
         if key not in self.keys:
@@ -186,33 +196,18 @@ class RecordingStore:
         self.entries: dict[str, Entry] = {}
         if not path.exists():
             return
-        try:
-            manifest = parse_json(path.read_bytes(), path)
-        except OSError as error:
-            raise WearcapError(f"cannot be read ({error.strerror or error})", path) from error
+        manifest = parse_json(read_bytes(path, "json"), path)
         version = manifest.get("schema_version") if isinstance(manifest, dict) else None
         if version != SCHEMA_VERSION:
             what = f"schema version {str(version)[:40]}"
             raise WearcapError(what, path, f"version {SCHEMA_VERSION}", "Prepare the data set again.")
-        try:
-            for name, row in manifest["recordings"].items():
-                for field in dataclasses.fields(Entry):
-                    value = row[field.name]
-                    if type(value) is not field.type and not (field.type is float and type(value) is int):
-                        raise ValueError(f"{field.name} of {name!r} is {str(value)[:40]!r}")
-                    if field.type in (int, float) and not 0 <= value <= _MOST.get(field.name, math.inf):
-                        raise ValueError(f"{field.name} of {name!r} is {value}")
-                entry = Entry(**row)
+        with understood("not a readable manifest", path, fix="Delete it and prepare the data set again."):
+            self.entries = msgspec.convert(manifest["recordings"], dict[str, Entry])
+            for name, entry in self.entries.items():
                 if self.root / entry.file != recording_path(self.root, name):
                     raise ValueError(f"{name!r} is at {entry.file!r}, outside this data set")
-                if entry.split not in SPLITS:
-                    raise ValueError(f"{name!r} is in split {entry.split[:40]!r}")
                 if entry.frames * entry.fps and entry.bytes < entry.frames:
                     raise ValueError(f"{name!r} has {entry.frames} frames in {entry.bytes} bytes")
-                self.entries[name] = entry
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            what = f"not a readable manifest ({str(error)[:200]})"
-            raise WearcapError(what, path, fix="Delete it and prepare the data set again.") from error
 
     @classmethod
     def open(cls, root: str | Path) -> "RecordingStore":
@@ -259,7 +254,11 @@ class RecordingStore:
         return RecordingFile(self.root / self.entries[name].file)
 
     def load(self, name: str) -> Recording:
-        return self.open_file(name).load()
+        """One recording. Raises WearcapError as `open_file` does, and for one of another name."""
+        file = self.open_file(name)
+        if (recording := file.load()).name != name:
+            raise WearcapError(f"a recording named {recording.name[:80]!r}", file.path, repr(name), "Prepare it again.")
+        return recording
 
     def verify(self) -> Iterator[tuple[str, WearcapError | None]]:
         """Check every file against its checksum, ignoring cached results; yields (name, error or None)."""
@@ -279,8 +278,8 @@ class RecordingStore:
 
 def recording_path(root: Path, name: str) -> Path:
     """Path of a recording in a data set. Raises WearcapError when the name is no plain file name."""
-    if not name or Path(name).name != name or name.startswith("."):
-        raise WearcapError(f"{name!r} cannot name a recording", expected="a plain file name")
+    if Path(name).name != name or name.startswith(".") or not name.isprintable() or not 0 < len(name.encode()) < 200:
+        raise WearcapError(f"{name[:80]!r} cannot name a recording", expected="a plain file name")
     return Path(root) / FOLDER / f"{name}.safetensors"
 
 

@@ -16,12 +16,12 @@ from types import ModuleType
 from typing import Any, ClassVar
 
 import numpy as np
-import safetensors
 import torch
 from jaxtyping import Float
-from safetensors.torch import load, save
+from safetensors.torch import save
 from torch import Tensor
 
+from wearcap.boundary.tensors import read_tensors
 from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
@@ -253,9 +253,7 @@ def read_state(path: str | Path, settings: Mapping[str, Any], classes: Mapping[s
     Raises WearcapError for a file that is no state or is damaged, and for one of a system with other settings.
     """
     try:
-        with safetensors.safe_open(str(path), framework="pt") as file:
-            about = file.metadata() or {}
-        tensors = load(Path(path).read_bytes())
+        about, tensors = read_tensors(path, "saved session")
         theirs = parse_json(about[_SETTINGS], path)
         if digest(about[_KEY], tensors) != about[_DIGEST]:
             raise ValueError("another checksum")
@@ -263,7 +261,7 @@ def read_state(path: str | Path, settings: Mapping[str, Any], classes: Mapping[s
         if (wrong := next((name for name in {**theirs, **ours} if theirs.get(name) != ours.get(name)), None)) is None:
             tree = parse_json(about[_KEY], path)
             return _Reader(classes, shared, tree["objects"], tensors).decoded(tree["state"])
-    except (OSError, safetensors.SafetensorError, WearcapError, *_DAMAGE) as error:
+    except (WearcapError, *_DAMAGE) as error:
         expected = "a whole .safetensors file of Session.save"
         raise WearcapError("not a saved session", where=path, expected=expected) from error
     what = f"a session with {wrong} {theirs.get(wrong)}, not {ours.get(wrong)}"

@@ -20,10 +20,12 @@ from typing import Any
 import numpy as np
 import torch
 from rich.console import Console
-from safetensors import SafetensorError
-from safetensors.torch import load, save
+from safetensors.torch import save
 from torch import Tensor, nn
 
+from wearcap.boundary.opening import file_size, path_inside
+from wearcap.boundary.tensors import read_tensors
+from wearcap.boundary.texts import read_json
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, sha256_of, write_text
 from wearcap.optimize.hps import HpsState, Solution
@@ -37,7 +39,7 @@ from wearcap.sensors.initialization import Initialization
 RESULTS = KNOWN | {cls.__name__: cls for cls in (Clock, Initialization, Constants, Solution, HpsState)}
 """Classes that a cached result may contain."""
 PACKAGE = Path(__file__).parents[1]
-_DAMAGE = (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, WearcapError, SafetensorError)
+_DAMAGE = (ValueError, LookupError, TypeError, AttributeError, WearcapError)
 """Exceptions that reading a damaged result may raise."""
 
 
@@ -117,11 +119,7 @@ def _parts(value: Any) -> Iterator[bytes | memoryview]:
         yield f"{array.dtype.str}{array.shape}".encode()
         yield np.ascontiguousarray(array).data.cast("B") if array.size else b""
     elif isinstance(value, Path):
-        try:
-            status = value.stat()
-            yield _unchanged_digest(value, status.st_size, status.st_mtime_ns).encode()
-        except FileNotFoundError as error:
-            raise WearcapError("no such file", where=value) from error
+        yield _unchanged_digest(value, file_size(value), value.stat().st_mtime_ns).encode()
     elif isinstance(value, dict):
         for key in sorted(value):
             yield from _parts((key, value[key]))
@@ -173,16 +171,14 @@ class StageCache:
     def read(self, stage: str, key: str) -> tuple[Any, str, float] | None:
         """(result, its digest, seconds), or None if it is not cached. Raises WearcapError when it is damaged."""
         note, tensors = self._files(stage, key)
+        if not note.exists():
+            return None
         try:
-            kept = json.loads(note.read_text(encoding="utf-8"))
-            content = load(tensors.read_bytes())
+            kept = read_json(note)
+            _, content = read_tensors(tensors, "result")
             value = unflatten(kept["result"], content.__getitem__, RESULTS).get("value")
             found, seconds = digest(kept["result"], content), float(kept["seconds"])
             expected = kept["digest"]
-        except FileNotFoundError:
-            if not note.exists():
-                return None
-            raise WearcapError("incomplete", where=tensors) from None
         except _DAMAGE as error:
             raise WearcapError(f"damaged ({error})", where=note) from error
         if found != expected:
@@ -276,7 +272,7 @@ class StagedSystem(System):
 
     def _captured(self, source: CaptureInput, options: StageOptions) -> Captured:
         name = source.recording.name
-        cache = None if options.cache is None else StageCache(options.cache / name)
+        cache = None if options.cache is None else StageCache(path_inside(options.cache, name, name))
         results, runs = run_stages(self.stages(source), cache, options.until, options.console)
         report = {"pipeline": self.name, "recording": name, "stages": runs}
         return Captured(self.motion_of(results), report | self.report(source, results))

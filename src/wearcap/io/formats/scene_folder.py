@@ -3,10 +3,13 @@
 Scans are PLY and PCD files, whose unit, extent and density are checked.
 """
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
+from wearcap.boundary.opening import path_inside, understood
+from wearcap.boundary.texts import read_json
 from wearcap.errors import WearcapError
 from wearcap.io.datasets.hps import is_hps_scene, read_hps_scene
 from wearcap.io.formats.camera_json import PHOTOS_FILE, read_photos
@@ -60,7 +63,9 @@ def read_scan(path: str | Path, *, metres_per_unit: float | None = None) -> Scan
     return Scan(points, content.colors)
 
 
-CLOUD = "pointcloud.ply"
+CLOUD, MAP_NAME = "pointcloud.ply", "map.safetensors"
+"""Files of a scene's folder: its scan, and the visual map beside it."""
+_SCANS = (".ply", ".pcd", ".glb")
 
 
 def read_scene(
@@ -92,3 +97,12 @@ def cloud_file(scene: str | Path) -> Path:
     if not path.is_file():
         raise WearcapError("no scan of a scene here", scene, f"a folder with {CLOUD}, or a .ply or .pcd file")
     return path
+
+
+def used_files(file: Path) -> list[Path]:
+    """A file that a recording names and those that are read with it: a scan's map, and the meshes of an environment."""
+    beside = [file.parent / MAP_NAME] if file.suffix.lower() in _SCANS else []
+    if file.suffix.lower() == ".json":
+        with suppress(WearcapError), understood("not an environment", file):  # what reads it says what is wrong
+            beside = [path_inside(file.parent, row["mesh"], file) for row in read_json(file)["objects"]]
+    return [file, *(path for path in dict.fromkeys(beside) if path.is_file())]

@@ -137,7 +137,7 @@ def decoded(camera: CameraStream, root: Path, every: int) -> UInt8[np.ndarray, "
     Raises WearcapError for images of several sizes, another number of them than of timestamps, and as `pictures` does.
     """
     named = camera.video or "\n".join(camera.image_files or ())
-    first = root / (camera.video or (camera.image_files or ("",))[0])
+    first = camera.files_in(root)[0]
     changed = first.stat().st_mtime_ns if first.is_file() else 0
     key = hashlib.sha256(f"{named} {changed} {len(camera.timestamps)} {every}".encode()).hexdigest()[:24]
     path = root / "cache" / "ego_frames" / f"{key}.npy"

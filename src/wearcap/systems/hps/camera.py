@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 
 from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError, require_choice
+from wearcap.io.formats.scene_folder import MAP_NAME
 from wearcap.io.formats.video import read_frames, read_image
 from wearcap.localization.features import Extractor, GlobalDescriptor, Matcher, RootSift
 from wearcap.localization.landmark_tracking import TrackingSettings, track_video
@@ -25,7 +26,6 @@ from wearcap.sensors.clock import Clock, fit_clock, retime
 from wearcap.sensors.imu import synthesize_imu
 
 CLOCKS = ("shared", "claps", "auto")
-MAP_NAME = "map.safetensors"
 USUAL_HZ, TRACKED_HZ = 6.0, 10.0
 """Default number of frames per second if each is localised anew, and if they are tracked; the suit's motion bridges the
 frames between."""
@@ -216,15 +216,13 @@ def _pictures(recording: Recording, folder: Path) -> list[Path]:
     if stream is None or (stream.video is None and stream.image_files is None):
         expected = "a video or picture files, to be localised in the map"
         raise WearcapError("no pictures of the head camera", where=recording.name, expected=expected)
-    return [folder / name for name in ([stream.video] if stream.video is not None else stream.image_files or ())]
+    return stream.files_in(folder)
 
 
 def _frames(stream: CameraStream, folder: Path, every: int) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
     """Every `every`-th image that has a timestamp."""
+    files = stream.files_in(folder)
     if stream.video is None:
-        assert stream.image_files is not None
-        for name in stream.image_files[::every]:
-            yield read_image(folder / name)
-        return
-    for _, picture in read_frames(folder / stream.video, stop=len(stream.timestamps), step=every):
-        yield picture
+        yield from map(read_image, files[::every])
+    else:
+        yield from (picture for _, picture in read_frames(files[0], stop=len(stream.timestamps), step=every))
