@@ -210,7 +210,7 @@ def test_what_cannot_be_embedded_stays_in_its_data_set(filmed):
         embed_dataset(small_dataset(filmed.root / "more", frames=(60,)).root, Corners())
 
 
-def test_the_command_embeds_by_a_checkpoint(filmed, tmp_path, capsys):
+def test_the_command_embeds_by_a_checkpoint(filmed, tmp_path, capsys, trusted):
     torch.manual_seed(0)
     encoder = EgoViewEncoder(size=8, channels=[4, 4, 4])
     net = {"_target_": "wearcap.models.image_encoder.EgoViewEncoder", "size": 8, "channels": [4, 4, 4]}

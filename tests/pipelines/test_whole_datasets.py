@@ -86,7 +86,7 @@ def test_a_data_set_is_captured_and_gone_on_with(checkpoint, data, tmp_path, cap
     assert written(output)["r4"] != other["r4"]
 
 
-def test_another_checkpoint_or_other_inputs_are_captured_again(checkpoint, data, tmp_path):
+def test_another_checkpoint_or_other_inputs_are_captured_again(checkpoint, data, tmp_path, trusted):
     own, output = Path(shutil.copytree(data, tmp_path / "own")), tmp_path / "out"
     saved = torch.load(checkpoint, weights_only=True)
     torch.save(saved, tmp_path / "a.ckpt")
@@ -189,7 +189,7 @@ def test_an_evaluation_says_where_it_errs_and_draws_the_worst(checkpoint, data, 
         assert picture.height == 2 * 240
 
 
-def test_an_evaluation_without_the_training_data_runs_and_says_what_is_missing(checkpoint, data, tmp_path, capsys):
+def test_an_evaluation_without_the_training_data_runs_and_says_what_is_missing(checkpoint, data, tmp_path, capsys, trusted):
     away, moved = tmp_path / "away", tmp_path / "moved.ckpt"
     saved = torch.load(checkpoint, weights_only=True)
     saved["wearcap"]["config"] = saved["wearcap"]["config"].replace(str(data), str(away))

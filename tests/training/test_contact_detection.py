@@ -170,7 +170,7 @@ def test_a_contact_checkpoint_is_no_motion_denoiser(learned):
         load_pipeline(learned, compose("capture", ["recording=x", "paths.run=x"]).pipeline, "cpu")
 
 
-def test_foreign_checkpoints_are_named(tmp_path, learned):
+def test_foreign_checkpoints_are_named(tmp_path, learned, trusted):
     saved = torch.load(learned, weights_only=True)
     config = json.loads(saved["wearcap"]["config"])
     config["model"]["net"]["_target_"] = "somewhere.MotionDenoiser"

@@ -142,7 +142,7 @@ def test_killed_and_resumed_equals_straight_through(data, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_run_resumed_in_its_folder_goes_on_with_its_log(data, tmp_path):
+def test_a_run_resumed_in_its_folder_goes_on_with_its_log(data, tmp_path, trusted):
     run = tmp_path / "run"
     more = ["data.loading.steps_per_epoch=3", "callbacks.capture=null", "optimizer.scheduler.total=12"]
 
@@ -234,9 +234,9 @@ def test_evaluate_capture_and_export(checkpoint, data, tmp_path):
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [(b"", "not a readable checkpoint"), (b"garbage" * 100, "not a readable checkpoint"), (None, "no such checkpoint")],
+    [(b"", "not a readable checkpoint"), (b"garbage" * 100, "the file is damaged"), (None, "no such checkpoint")],
 )
-def test_broken_checkpoints_are_named(content, message, tmp_path):
+def test_broken_checkpoints_are_named(content, message, tmp_path, trusted):
     path = tmp_path / "bad.ckpt"
     if content is not None:
         path.write_bytes(content)
@@ -244,23 +244,23 @@ def test_broken_checkpoints_are_named(content, message, tmp_path):
         read_checkpoint(path)
 
 
-def test_a_truncated_and_a_foreign_checkpoint_are_named(checkpoint, tmp_path):
+def test_a_truncated_and_a_foreign_checkpoint_are_named(checkpoint, tmp_path, trusted):
     short = tmp_path / "short.ckpt"
     short.write_bytes(checkpoint.read_bytes()[:-5000])
     with pytest.raises(WearcapError, match="not a readable checkpoint"):
         read_checkpoint(short)
     torch.save({"state_dict": {}}, tmp_path / "foreign.ckpt")
-    with pytest.raises(WearcapError, match="not of wearcap"):
+    with pytest.raises(WearcapError, match="not a checkpoint of wearcap"):
         read_checkpoint(tmp_path / "foreign.ckpt")
 
 
-def test_a_checkpoint_with_code_in_it_is_refused(tmp_path):
+def test_a_checkpoint_with_code_in_it_is_refused(tmp_path, trusted):
     torch.save({"wearcap": Path("x")}, tmp_path / "code.ckpt")
     with pytest.raises(WearcapError, match="tensors and plain values only"):
         read_checkpoint(tmp_path / "code.ckpt")
 
 
-def test_a_checkpoint_of_another_model_is_named(checkpoint, tmp_path):
+def test_a_checkpoint_of_another_model_is_named(checkpoint, tmp_path, trusted):
     saved = torch.load(checkpoint, weights_only=True)
     saved["state_dict"].pop("net.head.weight")
     torch.save(saved, tmp_path / "other.ckpt")
