@@ -45,7 +45,7 @@ LIMITS = {
     "json": Limits(bytes=1 << 28),
     "config": Limits(bytes=1 << 20, items=10_000),  # of a checkpoint's model; a training run's has 10 kB
     "yaml": Limits(bytes=1 << 16, items=10_000),  # a page of settings
-    "message": Limits(bytes=1 << 24, items=1 << 17),  # of a page or a device
+    "message": Limits(bytes=1 << 24, items=20_100),  # of a page or a device: 20,000 points, and what goes with them
     "mvnx": Limits(bytes=1 << 34, items=100_000, line=1 << 26),  # elements beside the frames, and bytes of one
     "lens": Limits(bytes=1 << 24),
     "bvh": Limits(items=2000),  # joints
