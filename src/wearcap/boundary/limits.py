@@ -47,6 +47,8 @@ LIMITS = {
     "yaml": Limits(bytes=1 << 16, items=10_000),  # a page of settings
     "message": Limits(bytes=1 << 24, items=20_100),  # of a page or a device: 20,000 points, and what goes with them
     "mvnx": Limits(bytes=1 << 34, items=100_000, line=1 << 26),  # elements beside the frames, and bytes of one
+    "video": Limits(bytes=1 << 40, items=1 << 26),  # pixels of a picture: 8192 x 8192
+    "sound": Limits(bytes=1 << 31),  # three hours at 48 kHz
     "lens": Limits(bytes=1 << 24),
     "bvh": Limits(items=2000),  # joints
     "asf": Limits(items=2000),  # bones

@@ -105,8 +105,9 @@ class _Repeats(logging.Filter):
         text = re.sub(r"\d+", "N", text)[:200]
         self.counts[text] += 1
         record.msg, record.args, record.exc_info, record.exc_text = text, (), None, None
-        record.shown = self.counts[text] == 1 and len(self.counts) <= MAX_MESSAGES
-        return record.shown
+        shown = self.counts[text] == 1 and len(self.counts) <= MAX_MESSAGES
+        record.__dict__["shown"] = shown
+        return shown
 
 
 @contextmanager
