@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 import torch
-from hostile import fuzz, mutated
 from hypothesis import given
 
+from hostile import fuzz, mutated
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh

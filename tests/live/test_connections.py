@@ -5,11 +5,8 @@ import http.client
 import json
 import logging
 import resource
-import subprocess
-import sys
 import time
 import tracemalloc
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -19,6 +16,7 @@ from test_live_faults import later
 from websockets.exceptions import ConnectionClosed, InvalidMessage
 
 from ports import free_port
+from silent_sockets import silent
 from wearcap.cli import live
 from wearcap.errors import WearcapError
 from wearcap.io.formats.motion_npz import read_motion
@@ -41,42 +39,6 @@ SAMPLE = {"motionTimestamp_sinceReboot": 1.0, "deviceID": "w"}
 SAMPLE |= {f"motionQuaternion{axis}": float(axis == "W") for axis in "WXYZ"}
 SAMPLE |= {f"motionGravity{axis}": -float(axis == "Z") for axis in "XYZ"}
 SAMPLE |= {f"motionUserAcceleration{axis}": 0.0 for axis in "XYZ"}
-
-ATTACK = """
-import resource, socket, sys, time
-port, count = int(sys.argv[1]), int(sys.argv[2])
-resource.setrlimit(resource.RLIMIT_NOFILE, (4096, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
-held, begin = {}, time.monotonic()
-while time.monotonic() - begin < 60:
-    for k in range(count):  # each is opened anew as soon as it has been closed
-        try:
-            if k not in held:
-                held[k] = socket.create_connection(("127.0.0.1", port), timeout=1)
-                held[k].setblocking(False)
-            elif held[k].recv(100) == b"":
-                held.pop(k).close()
-        except BlockingIOError:
-            pass
-        except OSError:
-            if k in held:
-                held.pop(k).close()
-    if begin and len(held) > count // 2:
-        print("ready", flush=True)
-    time.sleep(0.02)
-"""
-
-
-@contextmanager
-def silent(port: int, count: int):
-    """So many sockets that say nothing, in a process of their own, which open again when they are closed."""
-    process = subprocess.Popen([sys.executable, "-c", ATTACK, str(port), str(count)], stdout=subprocess.PIPE)
-    try:
-        assert process.stdout is not None
-        process.stdout.readline()
-        yield
-    finally:
-        process.kill()
-        process.wait()
 
 
 @pytest.fixture

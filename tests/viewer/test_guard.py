@@ -23,6 +23,7 @@ from annotated_flat import ask, labels
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from silent_sockets import silent
 from wearcap.errors import WearcapError
 from wearcap.io.formats.environment import FILE_NAME
 from wearcap.recording import PointCloud, Recording, RecordingStore
@@ -30,6 +31,7 @@ from wearcap.scene.scan import Box, Scan
 from wearcap.viewer import annotate_server
 from wearcap.viewer.annotate import Desk, Video
 from wearcap.viewer.annotate_server import MAX_CONNECTIONS, AnnotationServer
+from wearcap.viewer.connections import CONNECTIONS
 from wearcap.viewer.guard import Guard, Refused
 from wearcap.viewer.object_editor import ObjectEditor
 from wearcap.viewer.page import Page
@@ -458,5 +460,20 @@ def test_chromium_opens_the_address_with_the_token_alone(opened, word, tmp_path)
             browser.go(bare)  # the cookie is enough
             browser.poll(lambda: word in browser.text())
             assert not browser.exceptions
+    finally:
+        page.stop()
+
+
+@pytest.mark.parametrize("opened", [a_view, an_editor, an_annotator])
+def test_silent_connections_keep_no_page_from_the_user(opened, tmp_path, monkeypatch):
+    monkeypatch.setattr(CONNECTIONS, "most", 16)
+    page = opened(tmp_path)
+    try:
+        with silent(port_of(page), 150):
+            answered = 0
+            for _ in range(20):
+                with contextlib.suppress(OSError, IndexError):  # its place went to another before it had spoken
+                    answered += status(page, f"/?token={page.guard.token}") == 200
+            assert answered >= 15
     finally:
         page.stop()

@@ -106,14 +106,12 @@ def parse_json(text: str | bytes, where: str | Path, kind: str = "json", *, sche
 
     budget = Budget(where, kind)
     budget.spend(len(text))
-    begins = "[{" if isinstance(text, str) else (b"[", b"{")
+    begins, halves = ("[{", ("\\ud", "\\uD")) if isinstance(text, str) else ((b"[", b"{"), (b"\\ud", b"\\uD"))
     budget.count(sum(map(text.count, begins)), "lists and objects")  # pyright: ignore[reportArgumentType]
     try:
         content = json.loads(text, parse_int=whole_number)
-        if (
-            "\\ud" if isinstance(text, str) else b"\\ud"
-        ) in text.lower():  # halves of characters that no text can be written with
-            json.dumps(content, ensure_ascii=False).encode()
+        if any(map(text.count, halves)):  # pyright: ignore[reportArgumentType]
+            json.dumps(content, ensure_ascii=False).encode()  # halves of characters, which no text can be written with
         level, depth = [content], 0
         while level := [inner for outer in level for inner in _parts(outer) if isinstance(inner, dict | list)]:
             depth += 1

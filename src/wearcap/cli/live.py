@@ -186,6 +186,7 @@ def _show(line: str, file: TextIO | None = None) -> None:
 
 
 def _summarize(report: dict[str, Any]) -> None:
+    notes: dict[str, list[str]] = {}
     for name, wearer in report["wearers"].items():
         latency = wearer["latency_ms"]
         text = ", ".join(f"{key} {latency[key]:.0f}" for key in ("median", "p95", "p99"))
@@ -193,7 +194,9 @@ def _summarize(report: dict[str, Any]) -> None:
         own = f"(the system's own: {latency['of_the_system']:.0f})"
         _show(f"{name}: {wearer['frames']} frames, latency {text} ms {own}, {counts}", sys.stdout)
         for note in wearer["notes"]:
-            _show(f"  {note}", sys.stdout)
+            notes.setdefault(note, []).append(name)
+    for note, names in notes.items():
+        _show(f"  {note}" + (f" ({', '.join(names)})" if len(report["wearers"]) > 1 else ""), sys.stdout)
     for name, sink in report["sinks"].items():
         if sink["dropped"] or sink["failed"]:
             why = f": {sink['last_error']}" if sink["last_error"] else ""

@@ -64,6 +64,8 @@ class _Connections:
                     again = False
         except (TimeoutError, asyncio.IncompleteReadError, OSError):
             self._refuse("broken connection")
+        except asyncio.CancelledError:  # the server ends; asyncio's streams would log it
+            pass
         finally:
             if place is not None:
                 place.leave()
