@@ -185,7 +185,7 @@ def _mps(folder: Path) -> None:
     slam = folder / "slam"
     slam.mkdir()
     test_aria_mps.write(slam / "closed_loop_trajectory.csv", test_aria_mps.rows(20))
-    (slam / "semidense_points.csv.gz").write_bytes(gzip.compress(POINTS.encode()))
+    (slam / "semidense_points.csv.gz").write_bytes(gzip.compress(POINTS.encode(), mtime=0))
 
 
 def _adt_objects(folder: Path) -> None:
@@ -295,7 +295,7 @@ READERS: dict[str, Reader] = {
     "aria_closed_loop": _made(
         "a.csv", lambda path: test_aria_mps.write(path, test_aria_mps.rows(12)), aria_mps.read_closed_loop
     ),
-    "aria_points": _one("a.csv.gz", gzip.compress(POINTS.encode()), aria_mps.read_points),
+    "aria_points": _one("a.csv.gz", gzip.compress(POINTS.encode(), mtime=0), aria_mps.read_points),
     "aria_mps": Reader(_mps, aria_mps.read_mps),
     "asf": _one("a.asf", test_asf_amc.ASF, asf_amc.read_asf),
     "amc": Reader(
@@ -411,7 +411,7 @@ READERS: dict[str, Reader] = {
     ),
     "text": _one(
         "a.txt.gz",
-        gzip.compress(b"some words\nof text\n"),
+        gzip.compress(b"some words\nof text\n", mtime=0),
         lambda path: (texts.read_text(path), list(texts.numbered_lines(path))),
     ),
     "totalcapture": Reader(
@@ -443,7 +443,7 @@ READERS: dict[str, Reader] = {
     "x_imu": Reader(_x_imu, lambda folder: watch_log.read_inertial_log(folder / "Inertial.csv", "left_wrist")),
     "watch_calibration": _one("c.json", WORN, watch_calibration.read_watch_calibration),
     "tum": _one("t.txt", TUM, trajectory.read_trajectory),
-    "tum_gz": _one("t.txt.gz", gzip.compress(TUM.encode()), trajectory.read_trajectory),
+    "tum_gz": _one("t.txt.gz", gzip.compress(TUM.encode(), mtime=0), trajectory.read_trajectory),
     "tum_xz": _one("t.txt.xz", lzma.compress(TUM.encode()), trajectory.read_trajectory),
     "image": _made("a.png", lambda path: _pictures(path.parent), video.read_image),
     "video_frames": _made("a.mp4", _video, lambda path: list(video.read_frames(path))),

@@ -119,7 +119,7 @@ def _structured(content: bytes, other: bytes, seed: random.Random) -> bytes | No
     """The file with another structure, or damaged content in a sound one; None where none is known."""
     begin = content[:8]
     if begin[:2] == b"\x1f\x8b":
-        return gzip.compress(mutated(gzip.decompress(content), other, seed), 1)
+        return gzip.compress(mutated(gzip.decompress(content), other, seed), 1, mtime=0)
     if begin[:6] == b"\xfd7zXZ\0":
         return lzma.compress(mutated(lzma.decompress(content), other, seed), preset=0)
     if begin[:1] == b"x" and begin[1:2] in b"\x01\x5e\x9c\xda":
@@ -156,7 +156,7 @@ def _zip(content: bytes, other: bytes, seed: random.Random) -> bytes:
         return content + seed.choice((content, end, end[:10] + bytes(12)))
     stream = io.BytesIO()
     packing = seed.choice((0, 8)) if seed.random() < 0.9 else seed.choice((12, 14))
-    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(stream, "w", packing, compresslevel=1) as new:
+    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(stream, "w") as new:
         entries = [[info.filename, old.read(info)] for info in old.infolist()]
         entry, second = seed.choice(entries), seed.choice(entries)
         match seed.randrange(12):
@@ -173,12 +173,12 @@ def _zip(content: bytes, other: bytes, seed: random.Random) -> bytes:
             case 4:
                 entries += [[f"{entry[0]}{k}", b""] for k in range(seed.choice((1, 300)))]
             case 5:
-                entry[1] = bytes(seed.choice((1, 1 << 20, 1 << 25)))  # packs to a thousandth
+                entry[1] = bytes(1 << seed.choice((0, *[16] * 8, 20, 25)))  # packs to a thousandth
             case _:
                 entry[1] = mutated(entry[1], second[1] if seed.random() < 0.5 else other, seed)
         with warnings.catch_warnings(action="ignore"):
             for name, inner in entries:
-                new.writestr(name, inner)
+                new.writestr(zipfile.ZipInfo(name), inner, packing, 1)
     return stream.getvalue()
 
 
