@@ -107,26 +107,25 @@ class Fuzzed:
         self.name, self.seed, self.folder, self.reader = name, seed, folder, READERS[name]
         self.files, self.peak = files, 0
 
-    def reset(self) -> None:
-        """Make the folder's files the valid ones."""
-        for name, content in self.files.items():
+    def reset(self, *names: str) -> None:
+        """Make files of the folder the valid ones; without names all."""
+        for name in names or self.files:
             path = self.folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content)
+            path.write_bytes(self.files[name])
 
-    def damage(self, number: int) -> int:
-        """Write input `number`; returns the size of its files."""
-        self.reset()
+    def damage(self, number: int) -> tuple[str, int]:
+        """Write input `number`; returns the file that is damaged, and the size of all."""
         random_ = random.Random(hashlib.sha256(f"{self.seed} {self.name} {number}".encode()).digest())
         name, other = random_.choice(list(self.files)), random_.choice(list(self.files))
         content = mutated(self.files[name], self.files[other], random_)
         (self.folder / name).write_bytes(content)
-        return len(content) + sum(map(len, self.files.values())) - len(self.files[name])
+        return name, len(content) + sum(map(len, self.files.values())) - len(self.files[name])
 
     def run(self, number: int, kept: Path, alarm_s: float = 0.0) -> str:
         """Read input `number`; a failure's files are kept in a folder below `kept`. `alarm_s`: its time, in a process that
         hears the alarm; 0: any."""
-        size = self.damage(number)
+        name, size = self.damage(number)
         before = self._begin()
         signal.setitimer(signal.ITIMER_REAL, alarm_s)
         try:
@@ -141,6 +140,7 @@ class Fuzzed:
             found = "memory"
         if found not in ("fine", "refused"):
             self.keep(found, number, kept)
+        self.reset(name)
         return found
 
     @staticmethod
@@ -217,12 +217,14 @@ def block(name: str, seed: int, first: int, last: int, files: dict, kept: Path) 
             if found is not None:
                 worker.join()
                 return counts + found, max(peak, used)
+        worker.join(1)  # the pipe closes a moment before the process ends
         ended = "hangs" if worker.is_alive() else f"process ended with {worker.exitcode}"
         worker.kill()
         worker.join()
         number = int(place[0])
         with tempfile.TemporaryDirectory(dir=SHARED) as folder:
             fuzzed = Fuzzed(name, seed, Path(folder), files)
+            fuzzed.reset()
             fuzzed.damage(number)
             fuzzed.keep(ended, number, kept)
         again, used = block(name, seed, first, number, files, kept) if number > first else (Counter(), 0)
