@@ -1,6 +1,7 @@
 """Videos and pictures that were written on the spot."""
 
 import struct
+import time
 import zlib
 
 import av
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from wearcap.boundary.limits import Limits
 from wearcap.errors import WearcapError
 from wearcap.io.formats.video import read_frames, read_image, video_info, write_frames
 
@@ -38,19 +40,19 @@ def test_what_is_no_video(tmp_path):
     with pytest.raises(WearcapError, match="no such video"):
         list(read_frames(tmp_path / "a.mp4"))
     (tmp_path / "a.mp4").write_bytes(b"no video at all, but some bytes")
-    with pytest.raises(WearcapError, match="not a readable video"):
+    with pytest.raises(WearcapError, match="not a video of a kind that is read"):
         list(read_frames(tmp_path / "a.mp4"))
     write_video(tmp_path / "b.mp4")
     (tmp_path / "a.mp4").write_bytes((tmp_path / "b.mp4").read_bytes()[:400])
     with pytest.raises(WearcapError, match="video"):
         list(read_frames(tmp_path / "a.mp4"))
-    with av.open(str(tmp_path / "sound.wav"), "w") as container:
+    with av.open(str(tmp_path / "sound.mkv"), "w") as container:
         stream = container.add_stream("pcm_s16le", rate=8000)
         sound = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")
         sound.rate = 8000
         container.mux(stream.encode(sound))
     with pytest.raises(WearcapError, match="without pictures"):
-        list(read_frames(tmp_path / "sound.wav"))
+        list(read_frames(tmp_path / "sound.mkv"))
 
 
 def test_pictures_are_not_turned_by_their_exif(tmp_path):
@@ -104,7 +106,7 @@ def test_a_header_with_more_frames_than_bytes_is_refused(tmp_path):
 
 def test_pictures_of_a_video_that_are_too_large_are_refused(tmp_path, monkeypatch):
     write_video(tmp_path / "a.mp4")
-    monkeypatch.setattr("wearcap.io.formats.video.MAX_PIXELS", 48 * 63)
+    monkeypatch.setattr("wearcap.io.formats.video._LIMITS", Limits(items=48 * 63))
     for read in (video_info, lambda path: list(read_frames(path))):
         with pytest.raises(WearcapError, match="pictures of 64x48 pixels"):
             read(tmp_path / "a.mp4")
@@ -125,3 +127,50 @@ def test_pictures_that_make_no_video_are_named(shapes, message, tmp_path):
     with pytest.raises(WearcapError, match=f"a.mp4.*{message}"):
         write_frames(tmp_path / "a.mp4", (np.zeros((*shape, 3), np.uint8) for shape in shapes), 30.0)
     assert not list(tmp_path.iterdir())
+
+
+LISTS = {
+    "a list of FFmpeg's": "ffconcat version 1.0\n" + "file a.mp4\n" * 500,
+    "a list without a first line": "file 'a.mp4'\n" * 500,
+    "a playlist": "#EXTM3U\n#EXT-X-TARGETDURATION:1\n" + "#EXTINF:1,\na.mp4\n" * 500,
+    "a playlist without an end": "#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nnone.ts\n",
+    "a description of a session": "v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nm=video 5004 RTP/AVP 96\n",
+    "a manifest": '<?xml version="1.0"?><MPD type="dynamic"><Period/></MPD>',
+    "metadata": ";FFMETADATA1\ntitle=x\n",
+}
+
+
+@pytest.mark.parametrize("name", ["x.mp4", "x.mov", "x.mkv", "x.avi", "x.m3u8", "x.ffconcat"])
+@pytest.mark.parametrize("listed", LISTS)
+def test_lists_of_videos_are_not_followed(listed, name, tmp_path):
+    write_video(tmp_path / "a.mp4")
+    (tmp_path / name).write_text(LISTS[listed])
+    for read in (video_info, lambda path: list(read_frames(path))):
+        begin = time.monotonic()
+        with pytest.raises(WearcapError, match="not a video of a kind that is read"):
+            read(tmp_path / name)
+        assert time.monotonic() - begin < 1
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mov", ".mkv", ".avi"])
+def test_every_container_is_read_whatever_its_name(suffix, tmp_path):
+    write_video(tmp_path / f"a{suffix}")
+    (tmp_path / "b.mp4").write_bytes((tmp_path / f"a{suffix}").read_bytes())
+    times, pictures = zip(*read_frames(tmp_path / "b.mp4"))
+    assert len(times) == 12
+    np.testing.assert_allclose(times, np.arange(12) / 25, atol=1e-3)
+    np.testing.assert_allclose([picture.mean() for picture in pictures], 20 * np.arange(12), atol=4)
+
+
+def test_a_video_has_no_more_frames_than_bytes(tmp_path, monkeypatch):
+    write_video(tmp_path / "a.mp4")
+    monkeypatch.setattr("wearcap.io.formats.video.file_size", lambda path, kind="": 3)
+    with pytest.raises(WearcapError, match="more than 3 frames"):
+        list(read_frames(tmp_path / "a.mp4"))
+
+
+def test_a_video_whose_frames_do_not_come_is_given_up(tmp_path, monkeypatch):
+    write_video(tmp_path / "a.mp4")
+    monkeypatch.setattr("wearcap.io.formats.video._WAIT_S", -1.0)
+    with pytest.raises(WearcapError, match="no frame within"):
+        list(read_frames(tmp_path / "a.mp4"))

@@ -238,10 +238,6 @@ def test_a_websocket_is_guarded():
         foreign = {"origin": "http://evil.example"}
         assert status_of(served.source.url, **foreign) == 403
         assert status_of(served.source.url, origin=f"http://127.0.0.1:{port}") == 101
-        adapters = [websockets.sync.client.connect(served.source.url) for _ in range(16)]
-        assert status_of(served.source.url) == 503
-        for adapter in adapters:
-            adapter.close()
     assert served.error is None
 
 

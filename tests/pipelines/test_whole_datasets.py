@@ -189,7 +189,9 @@ def test_an_evaluation_says_where_it_errs_and_draws_the_worst(checkpoint, data, 
         assert picture.height == 2 * 240
 
 
-def test_an_evaluation_without_the_training_data_runs_and_says_what_is_missing(checkpoint, data, tmp_path, capsys, trusted):
+def test_an_evaluation_without_the_training_data_runs_and_says_what_is_missing(
+    checkpoint, data, tmp_path, capsys, trusted
+):
     away, moved = tmp_path / "away", tmp_path / "moved.ckpt"
     saved = torch.load(checkpoint, weights_only=True)
     saved["wearcap"]["config"] = saved["wearcap"]["config"].replace(str(data), str(away))

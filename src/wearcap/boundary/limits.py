@@ -45,13 +45,19 @@ LIMITS = {
     "json": Limits(bytes=1 << 28),
     "config": Limits(bytes=1 << 20, items=10_000),  # of a checkpoint's model; a training run's has 10 kB
     "yaml": Limits(bytes=1 << 16, items=10_000),  # a page of settings
-    "message": Limits(bytes=1 << 24, items=1 << 17),  # of a page or a device
+    "message": Limits(bytes=1 << 24, items=20_100),  # of a page or a device: 20,000 points, and what goes with them
     "mvnx": Limits(bytes=1 << 34, items=100_000, line=1 << 26),  # elements beside the frames, and bytes of one
+    "video": Limits(bytes=1 << 40, items=1 << 26),  # pixels of a picture: 8192 x 8192
+    "sound": Limits(bytes=1 << 31),  # three hours at 48 kHz
+    "mesh": Limits(bytes=1 << 31, items=1 << 21),  # lists of a .glb, its vertices and corners
+    "environment": Limits(bytes=1 << 24, items=10_000),  # objects
     "lens": Limits(bytes=1 << 24),
     "bvh": Limits(items=2000),  # joints
     "asf": Limits(items=2000),  # bones
     "colmap": Limits(bytes=1 << 34),
-    "header": Limits(bytes=1 << 16, items=1 << 12),  # of PLY and PCD
+    "header": Limits(
+        bytes=1 << 16, items=1 << 12
+    ),  # of PLY and PCD; numbers of a field, of which PCL's longest has some 2000
     "arrays": Limits(items=1 << 14),
     "pickle": Limits(bytes=1 << 33),
     "weights": Limits(bytes=1 << 36),  # of PyTorch; items: bytes of the pickle that describes the tensors

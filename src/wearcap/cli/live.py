@@ -3,8 +3,10 @@
 import json
 import logging
 import os
+import re
 import signal
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,6 +34,8 @@ from wearcap.recording.store import dataset_folder
 from wearcap.runtime.system import CaptureInput, System
 from wearcap.viewer.guard import LOOPBACK
 
+MAX_MESSAGES = 20
+"""Different messages of libraries that are shown."""
 HANDS = ("grip", "wrist", "joint")
 HELP = "capture while people move: wearcap live system=hmd2 source=vmc://:39540 to=vmc://127.0.0.1:39539 view=true"
 
@@ -74,12 +78,54 @@ def run(config: DictConfig) -> dict[str, Any]:
     for name in ("", "websockets"):  # a quantisation's and a server's messages are no news to a wearer
         logging.getLogger(name).setLevel(logging.WARNING)
     _tell(config, sources, sinks, page)
-    with _stopped_by_signals(capture):
+    with _stopped_by_signals(capture), _repeats_counted():
         report = capture.run(float("inf") if config.seconds is None else float(config.seconds))
     write_text(config.report, report_text(report))
     _summarize(report)
     _show(f"report: {config.report}", sys.stdout)
+    for name, sink in report["sinks"].items():
+        if name.startswith("files ") and (lost := sink["failed"] + sink["dropped"]):
+            what = f"{lost} parts of the recording are lost ({sink['last_error'] or 'the disk was too slow'})"
+            raise WearcapError(what, name.removeprefix("files "), fix="Free some space, or record elsewhere.")
     return report
+
+
+class _Repeats(logging.Filter):
+    """Lets a message through once, in one line, and counts it."""
+
+    def __init__(self):
+        super().__init__()
+        self.counts: Counter[str] = Counter()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        if (shown := getattr(record, "shown", None)) is not None:  # by another handler's filter
+            return shown
+        error = record.exc_info[1] if isinstance(record.exc_info, tuple) else None
+        text = " ".join((record.getMessage().splitlines() or [""])[0].split()) + (f": {error}" if error else "")
+        text = re.sub(r"\d+", "N", text)[:200]
+        self.counts[text] += 1
+        record.msg, record.args, record.exc_info, record.exc_text = text, (), None, None
+        shown = self.counts[text] == 1 and len(self.counts) <= MAX_MESSAGES
+        record.__dict__["shown"] = shown
+        return shown
+
+
+@contextmanager
+def _repeats_counted() -> Iterator[None]:
+    """Errors of servers and libraries that repeat are one line with a count."""
+    repeats, handlers = _Repeats(), [*logging.getLogger().handlers, logging.lastResort]
+    for handler in handlers:
+        if handler is not None:
+            handler.addFilter(repeats)
+    try:
+        yield
+    finally:
+        for handler in handlers:
+            if handler is not None:
+                handler.removeFilter(repeats)
+        for text, count in repeats.counts.most_common(MAX_MESSAGES):
+            if count > 1:
+                _show(f"{count} times: {text}")
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.live.first_minute import FirstMinute
-from wearcap.live.packets import HEAD, Inbox
+from wearcap.live.packets import HEAD, Inbox, Packet
 from wearcap.live.setup import Setup, plain_name, read_setup, write_setup
 from wearcap.live.sink import Sink, SinkThread
 from wearcap.live.source import Source
@@ -39,12 +39,38 @@ CATCH_UP_S = 5.0
 """Time without a look at what has come, as of a slow engine or a suspended process, after which that is left out: as long as
 that without packets after which a wearer has left (`wearer.AWAY_S`). Nobody who watches needs poses that are so late, and
 computing them would make the next ones late, too. What a machine takes now and then, it makes up for within seconds."""
+BEHIND_S, TOO_LONG_S, CALM_S = 0.25, 1.0, 60.0
+"""Age (s) of packets from which the capture is behind, time for which it may be before a wearer is let go, and time after
+which one more is tried; that doubles each time."""
 WARM_UP_S = 2.0
 """Length of what the network is run on before the first packet."""
 JOIN_S = 600.0
 """Longest time for the files of a recording to be joined at its end."""
 RESTART_S = 2.0
 """Time after which a source that failed is started again."""
+
+
+class _Capacity:
+    """How many wearers this machine captures at their rate, as the packets show that wait."""
+
+    def __init__(self):
+        self.most, self._calm_s = MAX_WEARERS, CALM_S
+        self._in_time_s = self._changed_s = time.monotonic()
+
+    def is_exceeded(self, packets: Sequence[Packet], live: int) -> bool:
+        """Whether packets wait for `TOO_LONG_S` on end, of so many wearers: there is one too many. After a calm time one more
+        is tried."""
+        now_s = time.monotonic()
+        if not packets or now_s - packets[0].arrived_s < BEHIND_S:
+            self._in_time_s = now_s
+            if self.most < MAX_WEARERS and now_s - self._changed_s > self._calm_s:
+                self.most, self._changed_s = self.most + 1, now_s
+            return False
+        if live < 2 or now_s - self._in_time_s < TOO_LONG_S:
+            return False
+        self.most, self._calm_s = live - 1, 2 * self._calm_s
+        self._in_time_s = self._changed_s = now_s
+        return True
 
 
 class LiveCapture:
@@ -106,6 +132,7 @@ class LiveCapture:
         self._began_s = time.monotonic()
         self._looked_s = math.inf
         """Our time (s) of the last look at what has come."""
+        self._capacity = _Capacity()
         self._failure: WearcapError | None = None
         self._sources_done = threading.Event()
 
@@ -177,10 +204,14 @@ class LiveCapture:
         self._fulfil()
         packets = self.inbox.wait(WAIT_S)
         self._catch_up()
+        self._share(packets)
         for packet in packets:
             wearer = self.wearers.get(packet.wearer) or self._welcome(packet.wearer)
             if wearer is None:
                 self.inbox.refuse("capture", f"more than {MAX_WEARERS} wearers")
+                continue
+            if wearer.session is None and self._live >= self._capacity.most:
+                self.inbox.refuse("capture", "a wearer more than this machine captures")
                 continue
             before = wearer.stage
             wearer.take(packet)
@@ -192,11 +223,27 @@ class LiveCapture:
             self._send(wearer, wearer.poses(now_s))
             self._say_left(wearer, live)
 
+    @property
+    def _lossless(self) -> bool:
+        return any(source.lossless for source in self.sources)
+
+    @property
+    def _live(self) -> int:
+        return sum(wearer.session is not None for wearer in self.wearers.values())
+
+    def _share(self, packets: Sequence[Packet]) -> None:
+        """Let go the wearer who came last where there are too many: who came first keeps the rate. A replay loses nobody."""
+        if self._capacity.is_exceeded(packets, self._live) and not self._lossless:
+            last = [wearer for wearer in self.wearers.values() if wearer.session is not None][-1]
+            last.note("This machine is too slow for so many wearers: who came first is captured.")
+            self._send(last, last.leave())
+            self._each_sink(lambda sink: sink.end(last.name))
+
     def _catch_up(self) -> None:
         """Begin all sessions anew where the last look is `CATCH_UP_S` ago; not of a replay, which must lose nothing."""
         now_s, before_s = time.monotonic(), self._looked_s
         self._looked_s = now_s
-        if now_s - before_s < CATCH_UP_S or any(source.lossless for source in self.sources):
+        if now_s - before_s < CATCH_UP_S or self._lossless:
             return
         for wearer in self.wearers.values():
             live = wearer.stage == "live"

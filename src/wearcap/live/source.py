@@ -4,7 +4,7 @@ import asyncio
 import socket
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -22,36 +22,70 @@ MAX_MESSAGE_S, MAX_BYTE_S = 0.005, 1e-6
 """The most that one message counts, and each of its bytes (s). The slowest to parse take less (0.6 µs a byte); what takes
 longer is a pause of the program's own, such as a garbage collection (half a second where much is held), for which no
 sender shall lose messages."""
+MAX_SENDERS, FORGOTTEN_S = 64, 60
+"""Senders of a source that are known at a time, and the time (s) of silence after which one is not."""
 TOO_MANY = "too many messages"
 
 
 class Budget:
-    """What one source may take in within a second."""
+    """What one source may take in within a second. Senders that have delivered keep a share that no others can take."""
 
     def __init__(
         self, messages: int = MAX_MESSAGES_PER_S, size: int = MAX_BYTES_PER_S, parse_s: float = MAX_PARSE_S_PER_S
     ):
         self.messages, self.size, self.parse_s = messages, size, parse_s
-        self._second, self._messages, self._bytes, self._spent_s = 0, 0, 0, 0.0
+        self._second = 0
+        self._all = _Spent()
+        self._known: dict[Hashable, _Spent] = {}
+        """Senders that have delivered, the first ones first."""
 
-    def allows(self, size: int) -> bool:
-        """Whether one more message, of so many bytes, is within the limits."""
+    def allows(self, size: int, sender: Hashable = None) -> bool:
+        """Whether one more message, of so many bytes, is within the limits of all, or within a known sender's share."""
         now = int(time.monotonic())
         if now != self._second:
-            # What was spent beyond a second's limit is paid for in the next ones.
-            self._spent_s = max(0.0, self._spent_s - (now - self._second) * self.parse_s)
-            self._second, self._messages, self._bytes = now, 0, 0
-        self._messages, self._bytes = self._messages + 1, self._bytes + size
-        return self._messages <= self.messages and self._bytes <= self.size and self._spent_s < self.parse_s
+            self._known = {one: spent for one, spent in self._known.items() if now - spent.last_s < FORGOTTEN_S}
+            for spent in (self._all, *self._known.values()):
+                # What was spent beyond a second's limit is paid for in the next ones.
+                spent.seconds = max(0.0, spent.seconds - (now - self._second) * self.parse_s)
+                spent.messages = spent.bytes = 0
+            self._second = now
+        own = self._known.get(sender)
+        for spent in (self._all, own):
+            if spent is not None:
+                spent.messages, spent.bytes, spent.last_s = spent.messages + 1, spent.bytes + size, now
+        return self._within(self._all, 1) or (own is not None and self._within(own, 2 * len(self._known)))
+
+    def _within(self, spent: "_Spent", part: int) -> bool:
+        within = part * spent.messages <= self.messages and part * spent.bytes <= self.size
+        return within and part * spent.seconds < self.parse_s
 
     @contextmanager
-    def spending(self, size: int) -> Iterator[None]:
+    def spending(self, size: int, sender: Hashable = None) -> Iterator[None]:
         """Time in here counts as spent, up to what a message of so many bytes can take."""
         begin_s = time.thread_time()
         try:
             yield
         finally:
-            self._spent_s += min(time.thread_time() - begin_s, MAX_MESSAGE_S + size * MAX_BYTE_S)
+            seconds = min(time.thread_time() - begin_s, MAX_MESSAGE_S + size * MAX_BYTE_S)
+            for spent in (self._all, self._known.get(sender)):
+                if spent is not None:
+                    spent.seconds += seconds
+
+    def know(self, sender: Hashable) -> None:
+        """A sender has delivered what could be used."""
+        if sender not in self._known and len(self._known) < MAX_SENDERS:
+            self._known[sender] = _Spent(last_s=self._second)
+
+
+@dataclass
+class _Spent:
+    """What has been taken in within this second: of all, or of one sender."""
+
+    messages: int = 0
+    bytes: int = 0
+    seconds: float = 0.0
+    last_s: int = 0
+    """Second of the last message."""
 
 
 @dataclass(frozen=True)
@@ -145,18 +179,21 @@ class DatagramSource(Source):
         of their number; what cannot be used is counted by `refuse(reason)`, whose reasons are few and fixed.
         """
 
-    def take(self, data: bytes, inbox: Inbox) -> None:
-        """Deliver what is in a message, within the limits."""
+    def take(self, data: bytes, inbox: Inbox, sender: Hashable = None) -> bool:
+        """Deliver what is in a message, within the limits; whether there was anything."""
+        if self.budget.allows(len(data), sender):
+            return self.understand(data, inbox, sender)
+        inbox.refuse(self.name, TOO_MANY)
+        return False
 
-        def refuse(why: str) -> None:
-            inbox.refuse(self.name, why)
-
-        if not self.budget.allows(len(data)):
-            refuse(TOO_MANY)
-            return
-        with self.budget.spending(len(data)):
-            packets = self.parse(data, time.monotonic(), refuse)
+    def understand(self, data: bytes, inbox: Inbox, sender: Hashable) -> bool:
+        """Deliver what is in a message; whether there was anything."""
+        with self.budget.spending(len(data), sender):
+            packets = self.parse(data, time.monotonic(), lambda why: inbox.refuse(self.name, why))
         inbox.deliver(packets)
+        if packets:
+            self.budget.know(sender)
+        return bool(packets)
 
     async def run(self, inbox: Inbox) -> None:
         loop = asyncio.get_running_loop()
@@ -182,7 +219,7 @@ class _Receiver(asyncio.DatagramProtocol):
         self.source, self.inbox = source, inbox
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
-        self.source.take(data, self.inbox)
+        self.source.take(data, self.inbox, addr)
 
     def error_received(self, exc: Exception) -> None:
         self.inbox.refuse(self.source.name, "socket error")

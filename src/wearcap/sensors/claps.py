@@ -3,6 +3,7 @@
 The thesis only states that claps are "detected in both modalities"; the detectors are ours.
 """
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,7 +15,9 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from wearcap.boundary.limits import Budget
 from wearcap.errors import WearcapError
+from wearcap.io.formats.video import open_container
 from wearcap.recording.recording import CameraStream, ImuStream
 from wearcap.sensors.clock import mutual_pairs
 from wearcap.sensors.imu import GRAVITY
@@ -173,19 +176,19 @@ def camera_claps(
     if camera.video is None:
         raise WearcapError("a camera without a video", expected="a video with sound, or the times of the claps")
     video = Path(folder) / camera.video
-    try:
-        with av.open(str(video)) as container:
-            if not container.streams.audio:
-                raise WearcapError("this video has no sound", where=video, fix="Give the times of the claps by hand.")
-            sound = container.streams.audio[0]
-            both = (sound, *container.streams.video[:1])
-            starts = [float((stream.start_time or 0) * (stream.time_base or 0)) for stream in both]
-            mono = av.AudioResampler(format="flt", layout="mono")
-            frames = [*container.decode(sound), None]
-            pieces = [piece.to_ndarray()[0] for frame in frames for piece in mono.resample(frame)]
-            rate = float(sound.rate)
-    except (av.FFmpegError, OSError) as error:
-        raise WearcapError(f"cannot be read as a video ({error})", where=video) from error
+    budget, pieces = Budget(video, "sound"), []
+    with open_container(video) as container:
+        if not container.streams.audio:
+            raise WearcapError("this video has no sound", where=video, fix="Give the times of the claps by hand.")
+        sound = container.streams.audio[0]
+        both = (sound, *container.streams.video[:1])
+        starts = [float((stream.start_time or 0) * (stream.time_base or 0)) for stream in both]
+        mono = av.AudioResampler(format="flt", layout="mono")
+        for frame in itertools.chain(container.decode(sound), (None,)):
+            for piece in mono.resample(frame):
+                budget.spend(piece.samples * 4)
+                pieces.append(piece.to_ndarray()[0])
+        rate = float(sound.rate)
     if not pieces:
         raise WearcapError("the sound track of this video is empty", where=video)
     delay_s = starts[0] - starts[-1]  # of the first sample after the first picture

@@ -17,7 +17,6 @@ import torch
 from jaxtyping import Float32, Float64
 
 from wearcap.body.kinematics import site_positions
-from wearcap.boundary.opening import understood
 from wearcap.boundary.texts import read_json
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, write_text
@@ -68,8 +67,7 @@ class AnnotationFile:
         """
         labels = parse_labels(content, self.clock, where="labels")
         text = json.dumps(annotation_of(labels, self.clock), indent=1, ensure_ascii=False) + "\n"
-        with understood("names that are no text", "labels", errors=UnicodeEncodeError):
-            new = _digest(text.encode())
+        new = _digest(text.encode())
         with self._lock:
             there = self._revision()
             if there == new:

@@ -10,6 +10,7 @@ import re
 import socket
 import sys
 import threading
+from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -21,6 +22,7 @@ from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError
 from wearcap.io.formats.contact_labels import annotation_of, hcontact_text
 from wearcap.viewer.annotate import Conflict, Desk
+from wearcap.viewer.connections import DELIVERING, Connection, Connections
 from wearcap.viewer.guard import Guard, Refused
 
 PAGE = Path(__file__).parent / "annotator"
@@ -32,12 +34,9 @@ MAX_SAVE_BYTES = 16 << 20
 PIECE_BYTES = 1 << 18
 MAX_CONNECTIONS = 32
 """Most simultaneous connections, each with its own thread; a browser opens six of them to a page.
-
-Beyond it, connections without a request yet, or without the token, are closed first.
 """
 IDLE_S = 30.0
 """Idle time (s) after which a connection is closed. A browser reopens it when needed."""
-_CLOSE_S = 5.0
 _PORTS_TRIED = 50
 _GONE = (ConnectionError, TimeoutError)
 
@@ -61,9 +60,7 @@ class AnnotationServer(ThreadingHTTPServer):
     def __init__(self, desk: Desk, port: int = 8090):
         """Raises WearcapError when no port is free."""
         self.desk, self.guard, self.stopped = desk, Guard("127.0.0.1"), False
-        self._free = threading.BoundedSemaphore(MAX_CONNECTIONS)
-        self._idle: dict[socket.socket, None] = {}
-        self._idle_lock = threading.Lock()
+        self._connections, self._places = Connections(MAX_CONNECTIONS), dict[Any, Connection]()
         for candidate in range(port, min(port + _PORTS_TRIED, 65536)):
             try:
                 super().__init__((self.guard.host, candidate), _Handler)
@@ -92,47 +89,28 @@ class AnnotationServer(ThreadingHTTPServer):
         self.server_close()
 
     def process_request(self, request: Any, client_address) -> None:
-        """Answer a connection in its own thread; if there are too many, close the one that has been idle longest."""
-        free = self._free.acquire(blocking=False)
-        if not free:
-            with self._idle_lock:
-                idle = next(iter(self._idle), None)
-                if idle is not None:
-                    del self._idle[idle]
-            if idle is not None:
-                with contextlib.suppress(OSError):  # its thread wakes up and ends
-                    idle.shutdown(socket.SHUT_RDWR)
-                free = self._free.acquire(timeout=_CLOSE_S)
-        if not free:
+        """Answer a connection in its own thread; if there are too many, one that has not been admitted is closed for it."""
+        place = self._connections.enter(partial(request.shutdown, socket.SHUT_RDWR))
+        if place is None:
             with contextlib.suppress(OSError):
                 request.sendall(b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nConnection: close\r\n\r\n")
             return self.shutdown_request(request)
-        self.begin_idle(request)
+        self._places[request] = place
         try:
             return super().process_request(request, client_address)
         except BaseException:  # no thread was available
-            self._release(request)
+            self._places.pop(request).leave()
             raise
 
     def process_request_thread(self, request, client_address) -> None:
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._release(request)
+            self._places.pop(request).leave()
 
-    def begin_idle(self, connection: socket.socket) -> None:
-        """Mark a connection as idle: it may be closed in favour of another one."""
-        with self._idle_lock:
-            self._idle.setdefault(connection)
-
-    def end_idle(self, connection: socket.socket) -> bool:
-        """Mark a connection as busy; returns False if it has already been closed in favour of another one."""
-        with self._idle_lock:
-            return self._idle.pop(connection, False) is None
-
-    def _release(self, connection: socket.socket) -> None:
-        self.end_idle(connection)
-        self._free.release()
+    def keep(self, request: Any) -> None:
+        """A connection has been admitted: others are closed before it."""
+        self._places[request].rise(DELIVERING)
 
     def handle_error(self, request, client_address) -> None:
         """Ignore dropped and idle connections, which are normal when browsers seek in a video."""
@@ -150,7 +128,6 @@ class _Handler(BaseHTTPRequestHandler):
 
     def handle_one_request(self) -> None:
         self._granted: dict[str, str] = {}
-        self.server.begin_idle(self.connection)
         super().handle_one_request()
 
     def do_GET(self) -> None:
@@ -169,8 +146,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._granted = {"Connection": "close"}
         try:
             self._granted = self.server.guard.admit(self.path, self.headers)
-            if not self.server.end_idle(self.connection):
-                raise ConnectionAbortedError("closed for another connection")
+            self.server.keep(self.request)
             action(self.path.partition("?")[0])
         except Refused as error:
             self.close_connection = True

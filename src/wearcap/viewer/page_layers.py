@@ -1,6 +1,6 @@
 """Layers of the page; each moves to a time by sending poses, without resending meshes. Objects and contacts for pictures, too."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -24,6 +24,9 @@ from wearcap.geometry.mesh import Mesh, capsules
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import quat_wxyz_from_matrix
 from wearcap.geometry.trajectory import Trajectory, nearest_frames
+from wearcap.io.formats.glb import read_glb
+from wearcap.io.formats.ply import read_ply
+from wearcap.io.formats.wavefront import read_obj
 from wearcap.recording.acts import NO_OBJECT, active_at, true_acts
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import ContactTrack, HeadStream, PointCloud, Recording
@@ -205,15 +208,22 @@ def add_points(server: viser.ViserServer, cloud: PointCloud) -> None:
     )
 
 
+_SCENES: dict[str, Callable[[Path], Mesh]] = {
+    ".ply": lambda path: read_ply(path).mesh,
+    ".obj": read_obj,
+    ".glb": read_glb,
+}
+
+
 def read_scene(path: Path) -> trimesh.Trimesh:
-    """The recording's surroundings. Raises WearcapError when the file cannot be read."""
-    try:
-        mesh = trimesh.load(path, force="mesh")
-    except Exception as error:  # trimesh's loaders raise whatever their parsers do
-        raise WearcapError(f"not a readable scene ({error})", where=path, expected="a .ply or .glb mesh") from error
-    if not isinstance(mesh, trimesh.Trimesh):
-        raise WearcapError("a scene without triangles", where=path, expected="a .ply or .glb mesh")
-    return mesh
+    """The recording's surroundings. Raises WearcapError when the file cannot be read, or has no triangles."""
+    read = _SCENES.get(path.suffix.lower())
+    mesh = None if read is None else read(path)
+    if mesh is None or not len(mesh.faces):
+        what = "not a scene of a kind that is shown" if mesh is None else "a scene without triangles"
+        raise WearcapError(what, where=path, expected="a .ply, .obj or .glb mesh")
+    colors = np.rint(255 * np.broadcast_to(mesh.color, mesh.vertices.shape)).astype(np.uint8)
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
 
 
 class LabelLayer(MotionLayer):

@@ -16,11 +16,11 @@ from typing import Any, Literal
 import rich
 import viser
 import websockets.asyncio.server
-from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from wearcap.errors import WearcapError
+from wearcap.viewer.connections import BACKLOG, DELIVERING, CountedConnection
 from wearcap.viewer.guard import Guard, Refused
 
 _starting = threading.Lock()
@@ -50,12 +50,13 @@ def _start_server(guard: Guard, port: int, label: str) -> viser.ViserServer:
         nonlocal hooked
         answer: Any = options.get("process_request")
 
-        def guarded(connection: ServerConnection, request: Request) -> Response | None:
+        def guarded(connection: Any, request: Request) -> Response | None:
             """The answer to a page request or a WebSocket handshake (None: go on), after the guard has admitted it."""
             try:
                 granted = guard.admit(request.path, request.headers)
             except Refused as refused:
                 return connection.respond(HTTPStatus.FORBIDDEN, f"{refused}\n")
+            connection.place.rise(DELIVERING)  # with the token it is the user's
             headers = Headers(pair for pair in request.headers.raw_items() if pair[0].lower() != "accept-encoding")
             response = answer(connection, Request(request.path, headers))
             if response is not None:
@@ -64,7 +65,7 @@ def _start_server(guard: Guard, port: int, label: str) -> viser.ViserServer:
 
         # Another thread may start a server of its own meanwhile.
         if getattr(answer, "__module__", "").startswith("viser."):
-            options["process_request"] = guarded
+            options |= {"process_request": guarded, "create_connection": CountedConnection, "backlog": BACKLOG}
             hooked = _PAGE.is_file() and all(_PAGE.read_bytes().count(script) == 1 for script in _SCRIPTS)
         return original(*arguments, **options)
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from wearcap.boundary.opening import placed, understood
+from wearcap.boundary.opening import path_inside, placed, understood
 from wearcap.boundary.texts import read_json
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
@@ -104,13 +104,13 @@ def write_photos(photos: list[Photo], folder: str | Path) -> None:
 
 def _photo(row: Any, folder: Path, where: str) -> Photo:
     with understood("unreadable", where, _EXAMPLE):
-        file, camera = Path(row["file"]), row["camera"]
+        file, camera = row["file"], row["camera"]
         R, t = (np.array(row[key], np.float64) for key in ("R_world_cam", "t_world_cam"))
     lens = _camera_from_row(camera, where)
-    if file.is_absolute() or ".." in file.parts:
-        raise WearcapError(f"file {str(file)!r} is outside the scene's folder", where)
     if R.shape != (3, 3) or t.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(t).all()):
         raise WearcapError(f"a pose of shapes {R.shape} and {t.shape}", where, "finite 3x3 and 3")
     if not are_rotations(torch.from_numpy(R), _NOT_ORTHONORMAL):
         raise WearcapError("R_world_cam is no rotation", where, "an orthonormal 3x3 matrix")
-    return Photo(folder / file, lens, Rigid(torch.from_numpy(R).float(), torch.from_numpy(t).float()))
+    return Photo(
+        path_inside(folder, file, where), lens, Rigid(torch.from_numpy(R).float(), torch.from_numpy(t).float())
+    )

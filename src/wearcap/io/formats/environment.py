@@ -3,7 +3,9 @@
 import json
 import math
 import re
-from pathlib import Path, PurePosixPath
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,8 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from wearcap.boundary.opening import placed
+from wearcap.boundary.limits import Budget
+from wearcap.boundary.opening import path_inside, placed
 from wearcap.boundary.texts import read_json
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
@@ -53,7 +56,10 @@ def read_environment(path: str | Path) -> Environment:
         fix = "Read it with the wearcap that wrote it, or update."
         raise WearcapError(f"schema version {content.get('schema_version')!r}", path, str(SCHEMA), fix)
     _require_keys(content, ("schema_version", "objects"), path)
-    objects = tuple(_object(row, number, path) for number, row in enumerate(content["objects"]))
+    budget = Budget(path, "environment")
+    budget.count(len(content["objects"]), "objects")
+    read = cache(lambda file: _mesh(file, path))  # once, however many objects have it
+    objects = tuple(_object(row, number, path, read) for number, row in enumerate(content["objects"]))
     with placed(path):
         return Environment(objects)
 
@@ -83,7 +89,7 @@ def write_environment(environment: Environment, path: str | Path) -> None:
     write_text(path, f'{{"schema_version": {SCHEMA}, "objects": [\n  {lines}\n]}}\n')
 
 
-def _object(row: Any, number: int, path: Path) -> SceneObject:
+def _object(row: Any, number: int, path: Path, read: Callable[[Path], Mesh]) -> SceneObject:
     named = isinstance(row, dict) and isinstance(row.get("name"), str) and row["name"].strip()
     where = f"{path}: object {row['name']!r}" if named else f"{path}: object {number}"
     if not named:
@@ -96,7 +102,7 @@ def _object(row: Any, number: int, path: Path) -> SceneObject:
         raise WearcapError(f"category {row['category']!r}", where, "text")
     R = _rotation(row["R_world_object"], where).float()
     t = torch.from_numpy(_numbers(row["t_world_object"], (3,), "t_world_object", where)).float()
-    mesh = _mesh(row["mesh"], path, where)
+    mesh = read(path_inside(path.parent, row["mesh"], where))
     about = row["freedom"]
     kind = about.get("kind") if isinstance(about, dict) else None
     if kind not in tuple(FREEDOMS):  # a file may say anything, lists too
@@ -117,15 +123,10 @@ def _object(row: Any, number: int, path: Path) -> SceneObject:
     return item
 
 
-def _mesh(name: Any, path: Path, where: str) -> Mesh:
-    plain = isinstance(name, str) and name and not set(name) & {"\0", "\\"} and len(name.encode(errors="replace")) < 256
-    if not plain or PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-        fix = "Copy it there and name it relatively, as objects/sofa_1.ply."
-        raise WearcapError(f"mesh {name!r}", where, "a .ply file below the environment's folder", fix)
-    file = path.parent / name
+def _mesh(file: Path, path: Path) -> Mesh:
     if not file.is_file():
         fix = "Copy the folder objects/ together with the environment."
-        raise WearcapError(f"its mesh {name} is missing", where, str(file), fix)
+        raise WearcapError(f"its mesh {file.relative_to(path.parent)} is missing", path, str(file), fix)
     mesh = read_ply(file).mesh
     if not len(mesh.vertices):
         raise WearcapError("an empty mesh", file, "at least one point")

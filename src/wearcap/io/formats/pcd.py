@@ -6,14 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
+from wearcap.boundary.limits import LIMITS
 from wearcap.boundary.opening import read_bytes, understood
 from wearcap.errors import WearcapError
 from wearcap.io.formats.csv_table import load_rows
 from wearcap.io.formats.ply import Ply
 
-_MAX_HEADER_BYTES = 1 << 16
-_MAX_COUNT = 1 << 12
-"""Most numbers of one field; PCL's longest features have some 2000."""
+_HEADER = LIMITS["header"]
 _TYPES = {("F", 4): "<f4", ("F", 8): "<f8"} | {
     (kind, size): f"<{letter}{size}" for kind, letter in (("I", "i"), ("U", "u")) for size in (1, 2, 4, 8)
 }
@@ -33,7 +32,7 @@ def read_pcd(path: str | Path) -> Ply:
             letter = _TYPES.get((header["TYPE"][i], int(header["SIZE"][i])))
             if letter is None:
                 raise ValueError(f"TYPE {header['TYPE'][i]} of SIZE {header['SIZE'][i]}"[:60])
-            if not 0 < int(counts[i]) <= _MAX_COUNT or (name in ("x", "y", "z") and int(counts[i]) != 1):
+            if not 0 < int(counts[i]) <= _HEADER.items or (name in ("x", "y", "z") and int(counts[i]) != 1):
                 raise ValueError(f"COUNT {counts[i]} of {name}"[:60])
             shape = (int(counts[i]),) if int(counts[i]) != 1 else ()
             fields.append((f"_padding{i}" if name == "_" else name, letter, shape))
@@ -79,7 +78,7 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[dict[str, list[str]], 
     header: dict[str, list[str]] = {}
     start = 0
     while "DATA" not in header:
-        stop = data.find(b"\n", start, _MAX_HEADER_BYTES)
+        stop = data.find(b"\n", start, _HEADER.bytes)
         if stop < 0:
             raise WearcapError("not a PCD file, or its header is cut short", path, "lines up to `DATA`")
         words = data[start:stop].decode("ascii", errors="replace").split("#")[0].split()

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 
+from wearcap.boundary.limits import LIMITS
 from wearcap.boundary.opening import read_bytes, understood
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
@@ -22,7 +23,7 @@ _TYPES = {np.dtype(code).name: code for code in _CODES} | dict(zip(_C_NAMES, _CO
 _BYTE_ORDER = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 GREY = np.array([0.7, 0.7, 0.7], np.float32)
 """Colour of meshes without one."""
-_MAX_HEADER_BYTES = 1 << 16
+_HEADER = LIMITS["header"]
 _MAX_EVEN_BYTES = 1 << 28
 """Largest row (bytes) that is read as one NumPy field, whose sizes are 32 bits."""
 
@@ -138,7 +139,7 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[str, list[_Element], i
     """Byte order, elements, and where the body begins."""
     if not data.startswith(b"ply"):
         raise WearcapError("not a PLY file", path, "a file that begins with `ply`")
-    stop = data.find(b"end_header", 0, _MAX_HEADER_BYTES)
+    stop = data.find(b"end_header", 0, _HEADER.bytes)
     newline = data.find(b"\n", stop)
     if stop < 0 or newline < 0:
         raise WearcapError("its header has no end", path, "`end_header`", "The file was cut short: copy it again.")

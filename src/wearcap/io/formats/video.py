@@ -6,6 +6,7 @@ unpack to gigabytes.
 """
 
 import io
+import re
 import struct
 import zlib
 from collections.abc import Iterable, Iterator
@@ -13,6 +14,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from time import monotonic
+from typing import cast
 
 import av
 import numpy as np
@@ -21,8 +24,8 @@ from av.video.stream import VideoStream
 from jaxtyping import UInt8
 from PIL import Image
 
-from wearcap.boundary.limits import Budget
-from wearcap.boundary.opening import file_size, read_bytes, understood
+from wearcap.boundary.limits import LIMITS, Budget
+from wearcap.boundary.opening import explained, file_size, read_bytes, understood
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 
@@ -50,9 +53,16 @@ def open_image(path: str | Path) -> Iterator[Image.Image]:
             yield image
 
 
-MAX_PIXELS = 1 << 26
-"""Most pixels of a video's picture (8192 x 8192)."""
+_LIMITS = LIMITS["video"]
 _MAX_FPS = 10_000
+_WAIT_S = 5.0
+"""Longest time (s) that FFmpeg may take for the next frame."""
+_CONTAINERS = {
+    "mov": re.compile(rb"....(?:ftyp|moov|mdat|free|skip|wide|pnot)", re.DOTALL),
+    "matroska": re.compile(rb"\x1a\x45\xdf\xa3"),
+    "avi": re.compile(rb"RIFF....AVI ", re.DOTALL),
+}
+"""FFmpeg's demuxers that are used, by how their files begin; others open further files, or follow lists of them."""
 
 
 def read_image(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
@@ -77,7 +87,7 @@ def read_frames(
         rate = float(stream.average_rate or 30)
         begin: float | None = None
         number = -1
-        for number, frame in enumerate(container.decode(stream)):
+        for number, frame in enumerate(_frames(container, stream, path)):
             time = frame.time if frame.time is not None else number / rate
             begin = time if begin is None else begin
             if stop is not None and number >= stop:
@@ -88,24 +98,61 @@ def read_frames(
             raise WearcapError("a video without frames", path)
 
 
+def _frames(container: InputContainer, stream: VideoStream, path: str | Path) -> Iterator[av.VideoFrame]:
+    """The frames of a stream, of which a file has no more than bytes, and each of which comes within `_WAIT_S`."""
+    most, count, waited_s = file_size(path), 0, 0.0
+    packets = container.demux(stream)
+    while True:
+        begin_s = monotonic()
+        packet = next(packets, None)
+        frames = [] if packet is None else packet.decode()
+        waited_s = 0.0 if frames else waited_s + monotonic() - begin_s
+        count += len(frames)
+        if count > most or waited_s > _WAIT_S:
+            what = f"more than {most} frames" if count > most else f"no frame within {_WAIT_S:g} s"
+            raise WearcapError(what, path, "a complete video", "Copy it again.")
+        yield from cast("list[av.VideoFrame]", frames)
+        if packet is None:
+            return
+
+
+@contextmanager
+def open_container(path: str | Path) -> Iterator[InputContainer]:
+    """An open video, of the container that its content shows; nothing but this file is read.
+
+    What FFmpeg raises, also later, becomes a WearcapError; so does a file of another kind.
+    """
+    size = file_size(path, "video")
+    expected, fix = "a complete MP4, MOV, MKV, WebM or AVI file", "Play it in a video player, or copy it again."
+    with explained(path, "video"), open(path, "rb") as file:
+        begin = file.read(12)
+        demuxer = next((name for name, pattern in _CONTAINERS.items() if pattern.match(begin)), None)
+        if demuxer is None:
+            raise WearcapError("not a video of a kind that is read", path, expected, fix)
+        Budget(path, "video").spend(size)
+        file.seek(0)
+        damage = (av.FFmpegError, OSError, ValueError)
+        with (
+            understood("not a readable video", path, expected, fix, errors=damage),
+            av.open(file, format=demuxer, metadata_errors="replace") as container,
+        ):
+            assert isinstance(container, InputContainer)
+            yield container
+
+
 @contextmanager
 def _open_video(path: str | Path) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """An open video and the stream of its pictures; what FFmpeg raises, also later, becomes a WearcapError."""
-    file_size(path, "video")
-    expected, fix = "a complete MP4, MKV or AVI file", "Play it in a video player, or copy it again."
-    with (
-        understood("not a readable video", path, expected, fix, errors=(av.FFmpegError, OSError)),
-        av.open(str(path), metadata_errors="replace") as container,
-    ):
+    """An open video and the stream of its pictures. Raises WearcapError as `open_container` does."""
+    with open_container(path) as container:
         if not container.streams.video:
             raise WearcapError("a file without pictures", path, "a video")
         stream = container.streams.video[0]
         if stream.codec_context is None:
             raise WearcapError("pictures packed in a way that is not known", path, "a video in H.264, say")
-        stream.codec_context.options = {"max_pixels": str(MAX_PIXELS)}  # for sizes that only the pictures have
-        if stream.width * stream.height > MAX_PIXELS:
+        stream.codec_context.options = {"max_pixels": str(_LIMITS.items)}  # for sizes that only the pictures have
+        if stream.width * stream.height > _LIMITS.items:
             what = f"pictures of {stream.width}x{stream.height} pixels"
-            raise WearcapError(what, path, f"at most {MAX_PIXELS} pixels", "Scale the video down.")
+            raise WearcapError(what, path, f"at most {_LIMITS.items} pixels", "Scale the video down.")
         yield container, stream
 
 

@@ -27,9 +27,9 @@ from wearcap.live.sink import Sink
 from wearcap.live.sinks.objects import SeenObject, objects_of
 from wearcap.live.source import Address
 from wearcap.recording import Motion
+from wearcap.viewer.connections import BACKLOG, DELIVERING, SPOKEN, CountedConnection
 from wearcap.viewer.guard import LOOPBACK, Guard, Refused
 
-MAX_CLIENTS = 16
 CLOSE_S = 2.0
 """Time in which clients may close their connections at the end, before that is done for them."""
 MAX_WAITING_BYTES = 1 << 20
@@ -80,6 +80,9 @@ class WebSocketSink(Sink):
                         self.address.host,
                         self.address.port,
                         process_request=self._admit,
+                        create_connection=CountedConnection,
+                        backlog=BACKLOG,
+                        open_timeout=5,
                         max_size=1024,
                         compression=None,
                     )
@@ -151,9 +154,7 @@ class WebSocketSink(Sink):
         self._loop.close()
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Refuses other sites' pages, clients without the token beyond loopback, and too many of them."""
-        if len(self._clients) >= MAX_CLIENTS:
-            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "too many clients\n")
+        """Refuses other sites' pages, and clients without the token beyond loopback."""
         if self.address.host in LOOPBACK and request.headers.get("Origin") is None:
             return None  # programs of this machine; a browser always names its page's origin
         try:
@@ -162,7 +163,8 @@ class WebSocketSink(Sink):
             return connection.respond(HTTPStatus.FORBIDDEN, f"{refused}\n")
         return None
 
-    async def _client(self, connection: ServerConnection) -> None:
+    async def _client(self, connection: Any) -> None:
+        connection.place.rise(DELIVERING if self.open_to_others else SPOKEN)  # with its token it is the user's
         self._clients.add(connection)
         try:
             for about in list(self._about.values()):

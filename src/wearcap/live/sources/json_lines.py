@@ -16,33 +16,31 @@ from collections.abc import Callable
 from http import HTTPStatus
 from typing import Any
 
+import msgspec
 import numpy as np
 import torch
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
+from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.live.packets import CAMERA, HEAD, OBJECT, SUIT, Inbox, Packet, Sample
 from wearcap.live.source import Address, Budget, DatagramSource
-from wearcap.live.sources.parts import AXES, MAX_LISTS, Names, bounded_json, checked_pose, matrix_of
+from wearcap.live.sources.parts import AXES, BAD_NAME, Names, checked_pose, matrix_of
 from wearcap.live.sources.posts import admitting
 from wearcap.sensors.packets import MAX_ACC_M_S2, MAX_POSITION_M, WRONG_TYPE, number_fault, time_fault, values_fault
 from wearcap.sensors.samples import ActiveObject, HeadSample, LocalizationSample, ObjectSample, WatchSample, WristSample
+from wearcap.viewer.connections import BACKLOG, DELIVERING, SPOKEN, CountedConnection
 from wearcap.viewer.guard import Refused
 
 MAX_LINES = 64
 """Objects of a message."""
 MAX_MESSAGE, MAX_POINTS_MESSAGE = 1 << 16, 1 << 20
 """Bytes of a message over WebSocket; the larger one for messages with points."""
+MAX_POINTS = 20_000
 MAX_BYTES_PER_S = 1 << 22
-MAX_CONNECTIONS = 16
-_KEYS = {
-    *("device", "wearer", "time", "clock", "position", "rotation_wxyz", "matrix", "axes", "lost"),
-    *("points", "floor", "acceleration", "confidence", "object", "active_object"),
-}
-
 _QUIET = logging.Logger("wearcap.live", logging.CRITICAL + 1)
 """What goes wrong with a connection is counted, not printed."""
 
@@ -53,6 +51,32 @@ NO_POSE = "no pose"
 TOO_LARGE = "too large"
 NO_DEVICE = "no device"
 SEVERAL = "more than one of device, object and active_object"
+
+
+_Vector = tuple[float, float, float]
+
+
+class _Message(msgspec.Struct):
+    """Layout of a message; its numbers may be too large or not finite."""
+
+    device: str | None = None
+    wearer: str | None = None
+    clock: str | None = None
+    object: str | None = None
+    active_object: str | msgspec.UnsetType | None = msgspec.UNSET
+    time: float | None = None
+    position: _Vector | None = None
+    rotation_wxyz: tuple[float, float, float, float] | None = None
+    matrix: tuple[_Vector, _Vector, _Vector] | None = None
+    axes: str = "wearcap"
+    lost: bool | None = None
+    points: list[_Vector] | None = None
+    floor: float | None = None
+    acceleration: _Vector | None = None
+    confidence: float = 1.0
+
+
+_NAMES = ("device", "wearer", "clock", "object", "active_object")
 
 
 class _Fault(Exception):
@@ -86,63 +110,69 @@ class JsonSource(DatagramSource):
         return packets
 
     def _packet(self, line: bytes, arrived_s: float, refuse: Callable[[str], None]) -> Packet:
-        content = bounded_json(line)
+        content = parse_json(line, "message", "message")
         if not isinstance(content, dict):
             raise _Fault(NO_JSON)
-        if not content.keys() <= _KEYS:
+        if not content.keys() <= set(_Message.__struct_fields__):
             refuse(UNKNOWN_KEY)  # and used without it
-        sent_s = content.get("time")
-        if sent_s is not None:
-            _require(WRONG_TYPE if isinstance(sent_s, bool) else time_fault(sent_s))
-        device, sample = self._about(content, float(arrived_s if sent_s is None else sent_s), arrived_s)
-        wearer = self._name(content, "wearer", arrived_s) or self.wearer
-        clock = self._name(content, "clock", arrived_s)
+        try:
+            message = msgspec.convert(content, _Message)
+        except msgspec.ValidationError as error:
+            key = str(error).rpartition("`$.")[2].rstrip("`")
+            raise _Fault(BAD_NAME if key in _NAMES else UNKNOWN_AXES if key == "axes" else WRONG_TYPE) from error
+        if message.time is not None:
+            _require(time_fault(message.time))
+        timestamp = arrived_s if message.time is None else message.time
+        device, sample = self._about(message, timestamp, arrived_s)
+        wearer = self._name("wearer", message.wearer, arrived_s) or self.wearer
+        clock = self._name("clock", message.clock, arrived_s)
         own_clock = f"{self.name}/{clock}" if clock else self.name
-        return Packet(wearer, device, own_clock, None if sent_s is None else float(sent_s), arrived_s, sample)
+        return Packet(wearer, device, own_clock, message.time, arrived_s, sample)
 
-    def _about(self, content: dict[str, Any], timestamp: float, arrived_s: float) -> tuple[str, Sample]:
+    def _about(self, message: _Message, timestamp: float, arrived_s: float) -> tuple[str, Sample]:
         """Device and sample of a message."""
-        device, name = (self._name(content, key, arrived_s) for key in ("device", "object"))
-        if ("active_object" in content) + (device is not None) + (name is not None) > 1:
+        chosen = message.active_object
+        device = self._name("device", message.device, arrived_s)
+        name = self._name("object", message.object, arrived_s)
+        if (chosen is not msgspec.UNSET) + (device is not None) + (name is not None) > 1:
             raise _Fault(SEVERAL)
-        if "active_object" in content:
-            return OBJECT, ActiveObject(self._name(content, "active_object", arrived_s, "object"), timestamp)
+        if chosen is not msgspec.UNSET:
+            return OBJECT, ActiveObject(self._name("object", chosen, arrived_s), timestamp)
+        if message.axes not in AXES:
+            raise _Fault(UNKNOWN_AXES)
         if name is not None:
-            return f"{OBJECT} {name}", ObjectSample(name, timestamp, _pose(content, _axes(content)))
+            return f"{OBJECT} {name}", ObjectSample(name, timestamp, _pose(message))
         if device == SUIT or device is None:
             raise _Fault(NO_DEVICE)
-        return device, self._sample(device, timestamp, content)
+        return device, _sample(device, timestamp, message)
 
-    def _name(self, content: dict[str, Any], key: str, arrived_s: float, kind: str = "") -> str | None:
-        """The name that a key holds; `kind`: of which it is one, if not the key itself."""
-        name = content.get(key)
-        if name is None or name == "":
+    def _name(self, kind: str, name: str | None, arrived_s: float) -> str | None:
+        """A name of a kind; None where there is none."""
+        if not name:
             return None
-        _require(self._names[kind or key].fault(name, arrived_s))
+        _require(self._names[kind].fault(name, arrived_s))
         return name
 
-    def _sample(self, device: str, timestamp: float, content: dict[str, Any]) -> Sample:
-        axes = _axes(content)
-        if device == HEAD:
-            pose = None if content.get("lost") is True else _pose(content, axes)
-            floor = content.get("floor")
-            if floor is not None:
-                _require(WRONG_TYPE if isinstance(floor, bool) else number_fault(floor, MAX_POSITION_M))
-            points = _points(content["points"], axes) if content.get("points") is not None else None
-            return HeadSample(timestamp, pose, points, floor_height=None if floor is None else float(floor))
-        if content.get("lost") is True:
-            raise _Fault(NO_POSE)
-        if device == CAMERA:
-            confidence = content.get("confidence", 1.0)
-            _require(WRONG_TYPE if isinstance(confidence, bool) else number_fault(confidence, 1.0))
-            return LocalizationSample(timestamp, _pose(content, axes), max(0.0, float(confidence)))
-        if content.get("acceleration") is None:
-            return WristSample(device, timestamp, _pose(content, axes))
-        R = checked_pose((0.0, 0.0, 0.0), _rotation(content), axes)
-        acc = torch.tensor(_numbers(content["acceleration"], 3))
-        _require(R if isinstance(R, str) else values_fault(acc, (3,), MAX_ACC_M_S2))
-        assert isinstance(R, Rigid)
-        return WatchSample(timestamp, R.R, AXES[axes] @ acc, device)
+
+def _sample(device: str, timestamp: float, message: _Message) -> Sample:
+    if device == HEAD:
+        pose, floor = None if message.lost else _pose(message), message.floor
+        if floor is not None:
+            _require(number_fault(floor, MAX_POSITION_M))
+        points = None if message.points is None else _points(message.points, message.axes)
+        return HeadSample(timestamp, pose, points, floor_height=floor)
+    if message.lost:
+        raise _Fault(NO_POSE)
+    if device == CAMERA:
+        _require(number_fault(message.confidence, 1.0))
+        return LocalizationSample(timestamp, _pose(message), max(0.0, message.confidence))
+    if message.acceleration is None:
+        return WristSample(device, timestamp, _pose(message))
+    R = checked_pose((0.0, 0.0, 0.0), _rotation(message), message.axes)
+    acc = torch.tensor(message.acceleration)
+    _require(R if isinstance(R, str) else values_fault(acc, (3,), MAX_ACC_M_S2))
+    assert isinstance(R, Rigid)
+    return WatchSample(timestamp, R.R, AXES[message.axes] @ acc, device)
 
 
 def _require(fault: str | None) -> None:
@@ -150,55 +180,32 @@ def _require(fault: str | None) -> None:
         raise _Fault(fault)
 
 
-def _numbers(values: object, count: int) -> list[float]:
-    """A list of so many numbers, which may be too large or not finite."""
-    if not isinstance(values, list) or len(values) != count:
-        raise _Fault(WRONG_TYPE)
-    if not all(type(value) is float or type(value) is int for value in values):
-        raise _Fault(WRONG_TYPE)
-    return [float(value) for value in values]
-
-
-def _axes(content: dict[str, Any]) -> str:
-    axes = content.get("axes", "wearcap")
-    if not isinstance(axes, str) or axes not in AXES:
-        raise _Fault(UNKNOWN_AXES)
-    return axes
-
-
-def _rotation(content: dict[str, Any]) -> torch.Tensor:
-    if content.get("rotation_wxyz") is not None:
-        R = matrix_of(_numbers(content["rotation_wxyz"], 4))
+def _rotation(message: _Message) -> torch.Tensor:
+    if message.rotation_wxyz is not None:
+        R = matrix_of(message.rotation_wxyz)
         if isinstance(R, str):
             raise _Fault(R)
         return R
-    rows = content.get("matrix")
-    if not isinstance(rows, list) or len(rows) != 3:
-        raise _Fault(NO_POSE if rows is None else WRONG_TYPE)
-    return torch.tensor([_numbers(row, 3) for row in rows])
-
-
-def _pose(content: dict[str, Any], axes: str) -> Rigid:
-    if content.get("position") is None:
+    if message.matrix is None:
         raise _Fault(NO_POSE)
-    pose = checked_pose(_numbers(content["position"], 3), _rotation(content), axes)
+    return torch.tensor(message.matrix)
+
+
+def _pose(message: _Message) -> Rigid:
+    if message.position is None:
+        raise _Fault(NO_POSE)
+    pose = checked_pose(message.position, _rotation(message), message.axes)
     if isinstance(pose, str):
         raise _Fault(pose)
     return pose
 
 
-def _points(rows: object, axes: str) -> torch.Tensor:
+def _points(rows: list[_Vector], axes: str) -> torch.Tensor:
     """Points of the surroundings, "point 3" (m)."""
-    if not isinstance(rows, list) or len(rows) > MAX_LISTS:
-        raise _Fault(WRONG_TYPE)
-    try:
-        values = np.asarray(rows if rows else np.zeros((0, 3)))
-    except ValueError as error:  # rows of several lengths
-        raise _Fault(WRONG_TYPE) from error
-    if values.dtype.kind not in "iuf" or values.shape != (len(rows), 3):
+    if len(rows) > MAX_POINTS:
         raise _Fault(WRONG_TYPE)
     with np.errstate(over="ignore"):  # becomes infinite, which is refused
-        points = torch.from_numpy(values.astype(np.float32))
+        points = torch.from_numpy(np.array(rows, np.float64).reshape(-1, 3).astype(np.float32))
     _require(values_fault(points, (len(rows), 3), MAX_POSITION_M))
     return points @ AXES[axes].T
 
@@ -214,7 +221,6 @@ class WebSocketSource(JsonSource):
         given = address.options.get("token")
         self.token = given if given or self.loopback else secrets.token_urlsafe(18)
         self.budget = Budget(size=MAX_BYTES_PER_S)
-        self._open = 0
 
     @property
     def url(self) -> str:
@@ -230,9 +236,6 @@ class WebSocketSource(JsonSource):
             except Refused as refused:
                 inbox.refuse(self.name, "forbidden")
                 return connection.respond(HTTPStatus.FORBIDDEN, f"{refused}\n")
-            if self._open >= MAX_CONNECTIONS:
-                inbox.refuse(self.name, "too many connections")
-                return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "too many connections\n")
             return None
 
         try:
@@ -252,6 +255,8 @@ class WebSocketSource(JsonSource):
             self.address.host,
             self.address.port,
             process_request=admitted,
+            create_connection=CountedConnection,
+            backlog=BACKLOG,
             compression=None,  # a small message could unpack to a large one
             max_size=MAX_POINTS_MESSAGE,
             max_queue=16,
@@ -261,21 +266,16 @@ class WebSocketSource(JsonSource):
             logger=_QUIET,
         )
 
-    async def _listen(self, connection: ServerConnection, inbox: Inbox) -> None:
+    async def _listen(self, connection: Any, inbox: Inbox) -> None:
         """Deliver what one adapter sends."""
-
-        def refuse(why: str) -> None:
-            inbox.refuse(self.name, why)
-
-        self._open += 1
-        try:
-            with contextlib.suppress(ConnectionClosed):
-                async for message in connection:
-                    data = message.encode() if isinstance(message, str) else message
-                    if len(data) > MAX_MESSAGE and b'"points"' not in data:
-                        refuse(TOO_LARGE)
-                    else:
-                        self.take(data, inbox)
-                    await asyncio.sleep(0)
-        finally:
-            self._open -= 1
+        place = connection.place
+        assert place is not None
+        place.rise(SPOKEN)
+        with contextlib.suppress(ConnectionClosed):
+            async for message in connection:
+                data = message.encode() if isinstance(message, str) else message
+                if len(data) > MAX_MESSAGE and b'"points"' not in data:
+                    inbox.refuse(self.name, TOO_LARGE)
+                elif self.take(data, inbox, place):
+                    place.rise(DELIVERING)
+                await asyncio.sleep(0)

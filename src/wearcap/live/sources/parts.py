@@ -3,15 +3,12 @@
 import math
 import re
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS
-from wearcap.boundary.texts import parse_json
-from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.devices.axes import CONVENTIONS
 from wearcap.live.packets import CAMERA, HEAD, SUIT
@@ -23,8 +20,6 @@ MAX_NAMES = 64
 """Names that a source knows at once."""
 FORGOTTEN_S = 60.0
 """A name that was silent for so long makes room for another."""
-MAX_LISTS = 20_100
-"""Lists and objects of a JSON message: 20,000 points and what goes with them. They take far longer than their bytes."""
 UNIT_TOLERANCE = 0.02
 """Tolerance of a quaternion's length."""
 AXES = {"wearcap": torch.eye(3), **CONVENTIONS}
@@ -57,13 +52,6 @@ class Names:
             del self._last_s[oldest]
         self._last_s[name] = now_s
         return None
-
-
-def bounded_json(data: bytes) -> Any:
-    """Content of a message. Raises WearcapError as `parse_json` does, and for more than `MAX_LISTS` lists and objects."""
-    if data.count(b"[") + data.count(b"{") > MAX_LISTS:
-        raise WearcapError("too many lists and objects", "message", f"at most {MAX_LISTS}")
-    return parse_json(data, "message")
 
 
 def device_of(serial: str) -> str:

@@ -3,19 +3,19 @@
 import asyncio
 import http.client
 import io
-import time
 from collections.abc import Callable
+from functools import partial
 from http import HTTPStatus
 from typing import Any
 
 from wearcap.live.packets import Inbox
 from wearcap.live.source import DatagramSource
+from wearcap.viewer.connections import BACKLOG, CONNECTIONS, DELIVERING, SPOKEN, Connection
 from wearcap.viewer.guard import Guard, Refused
 
 MAX_HEADER, MAX_BODY = 1 << 14, 1 << 20
-MAX_CONNECTIONS = 16
-REQUEST_S, IDLE_S = 10.0, 60.0
-"""Time for a request once it has begun, and until the next one of a connection (s)."""
+REQUEST_S, IDLE_S = 5.0, 60.0
+"""Time for a request, from the connection or its first byte on, and until the next one of a connection (s)."""
 
 
 def admitting(host: str, token: str | None) -> Callable[[str, Any], None]:
@@ -43,12 +43,11 @@ class _Connections:
     def __init__(self, source: DatagramSource, token: str | None, inbox: Inbox):
         self.source, self.inbox = source, inbox
         self.admit = admitting(source.address.host, token)
-        self.open = 0
         self.tasks: set[asyncio.Task] = set()
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer the requests of one connection."""
-        self.open += 1
+        place = CONNECTIONS.enter(partial(asyncio.get_running_loop().call_soon_threadsafe, writer.transport.abort))
         if task := asyncio.current_task():
             self.tasks.add(task)
             task.add_done_callback(self.tasks.discard)
@@ -56,9 +55,9 @@ class _Connections:
             again = True
             while again:
                 try:
-                    if self.open > MAX_CONNECTIONS:
+                    if place is None:
                         raise _Answer(HTTPStatus.SERVICE_UNAVAILABLE, "too many connections")
-                    again = await self._next(reader, writer)
+                    again = await self._next(reader, writer, place)
                 except _Answer as answer:
                     self._refuse(answer.status.phrase.lower())
                     await asyncio.wait_for(_write(writer, answer.status, answer.why, close=True), REQUEST_S)
@@ -66,25 +65,28 @@ class _Connections:
         except (TimeoutError, asyncio.IncompleteReadError, OSError):
             self._refuse("broken connection")
         finally:
-            self.open -= 1
+            if place is not None:
+                place.leave()
             writer.close()
 
-    async def _next(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
+    async def _next(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, place: Connection) -> bool:
         """Wait for a request and answer it; whether the connection stays open."""
         try:
             try:
-                begin = await asyncio.wait_for(reader.readuntil(b"\r\n"), IDLE_S)
+                begin = await asyncio.wait_for(reader.readuntil(b"\r\n"), IDLE_S if place.rank else REQUEST_S)
             except (TimeoutError, asyncio.IncompleteReadError) as nothing:
                 if getattr(nothing, "partial", b""):
                     raise
                 return False
-            return await asyncio.wait_for(self._request(begin, reader, writer), REQUEST_S)
+            return await asyncio.wait_for(self._request(begin, reader, writer, place), REQUEST_S)
         except asyncio.LimitOverrunError as error:
             raise _Answer(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE) from error
         except TimeoutError as error:
             raise _Answer(HTTPStatus.REQUEST_TIMEOUT) from error
 
-    async def _request(self, begin: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
+    async def _request(
+        self, begin: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, place: Connection
+    ) -> bool:
         """Answer one request; whether the connection stays open."""
         method, target, headers = await self._head(begin, reader)
         try:
@@ -98,14 +100,14 @@ class _Connections:
             raise _Answer(HTTPStatus.LENGTH_REQUIRED)
         if int(length) > MAX_BODY:
             raise _Answer(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
-        if not self.source.budget.allows(int(length)):
+        if not self.source.budget.allows(int(length), place):
             raise _Answer(HTTPStatus.TOO_MANY_REQUESTS)
         if headers.get("Expect", "").lower() == "100-continue":
             writer.write(b"HTTP/1.1 100 Continue\r\n\r\n")
         body = await reader.readexactly(int(length))
-        with self.source.budget.spending(len(body)):
-            packets = self.source.parse(body, time.monotonic(), self._refuse)
-        self.inbox.deliver(packets)
+        place.rise(SPOKEN)
+        if self.source.understand(body, self.inbox, place):
+            place.rise(DELIVERING)
         close = headers.get("Connection", "").lower() == "close"
         await _write(writer, HTTPStatus.OK, "", close)
         return not close
@@ -144,7 +146,9 @@ async def serve_posts(source: DatagramSource, token: str | None, inbox: Inbox) -
     connections = _Connections(source, token, inbox)
     where = source.address
     try:
-        server = await asyncio.start_server(connections.serve, where.host, where.port, limit=MAX_HEADER)
+        server = await asyncio.start_server(
+            connections.serve, where.host, where.port, limit=MAX_HEADER, backlog=BACKLOG
+        )
     except OSError as error:
         raise source.cannot_listen(error) from error
     source.listens = True

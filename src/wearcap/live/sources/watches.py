@@ -16,11 +16,12 @@ import numpy as np
 import torch
 
 from wearcap.body.skeleton import WRISTS
+from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError, require_choice
 from wearcap.io.devices.watch_log import G_M_S2, WatchConvention, logging_time, watch_convention
 from wearcap.live.packets import Inbox, Packet
 from wearcap.live.source import Address, DatagramSource
-from wearcap.live.sources.parts import Names, bounded_json, device_of, matrix_of
+from wearcap.live.sources.parts import Names, device_of, matrix_of
 from wearcap.live.sources.posts import serve_posts
 from wearcap.sensors.packets import MAX_ACC_M_S2, NOT_FINITE, OUT_OF_RANGE, time_fault, values_fault
 from wearcap.sensors.samples import WatchSample
@@ -175,7 +176,7 @@ class WatchSource(DatagramSource):
         """Samples by device: of Sensor Logger's message, or of SensorLog's objects, one or a list, or one a line."""
         for text in data.splitlines()[:MAX_ENTRIES] if b"}\n{" in data else [data]:
             try:
-                content = bounded_json(text)
+                content = parse_json(text, "message", "message")
             except (WearcapError, ValueError):
                 refuse(NO_SAMPLE)
                 continue

@@ -1,0 +1,161 @@
+"""Surfaces in glTF 2.0 binary files (.glb): triangles with their places and colours; textures and animations are skipped.
+
+What the file takes and holds follows from its own bytes: nothing beside it is read, and no extension is used.
+"""
+
+import struct
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from wearcap.boundary.limits import Budget
+from wearcap.boundary.opening import read_bytes, understood
+from wearcap.boundary.texts import parse_json
+from wearcap.geometry.mesh import Mesh
+from wearcap.io.formats.ply import GREY
+
+_TRIANGLES = 4
+_COMPONENTS = {5121: np.dtype("u1"), 5123: np.dtype("<u2"), 5125: np.dtype("<u4"), 5126: np.dtype("<f4")}
+_SHAPES = {"SCALAR": (), "VEC3": (3,), "VEC4": (4,)}
+
+
+class _View(msgspec.Struct):
+    byteLength: int
+    byteOffset: int = 0
+    byteStride: int | None = None
+
+
+class _Accessor(msgspec.Struct):
+    bufferView: int
+    componentType: int
+    count: int
+    type: str
+    byteOffset: int = 0
+
+
+class _Primitive(msgspec.Struct):
+    attributes: dict[str, int]
+    indices: int | None = None
+    mode: int = _TRIANGLES
+
+
+class _Surface(msgspec.Struct):
+    primitives: list[_Primitive]
+
+
+class _Node(msgspec.Struct):
+    mesh: int | None = None
+    children: list[int] = []
+    matrix: list[float] | None = None
+    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+    def transform(self) -> Float[np.ndarray, "4 4"]:
+        """T_parent_node."""
+        if self.matrix is not None:
+            return np.array(self.matrix, np.float64).reshape(4, 4).T
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_quat(self.rotation).as_matrix() * self.scale
+        T[:3, 3] = self.translation
+        return T
+
+
+class _Gltf(msgspec.Struct):
+    meshes: list[_Surface]
+    nodes: list[_Node]
+    accessors: list[_Accessor]
+    bufferViews: list[_View]
+    extensionsRequired: list[str] = []
+
+
+def read_glb(path: str | Path) -> Mesh:
+    """All triangles in the file's unit and axes (y up by glTF's rule), coloured per vertex where it has `COLOR_0`, else grey.
+
+    Raises WearcapError for a file that is no .glb, is damaged, needs an extension, holds no triangles, or whose nodes
+    repeat more than its bytes explain.
+    """
+    data = read_bytes(path, "mesh")
+    with understood("not a readable glTF file", path, "a whole .glb file of triangles", errors=_DAMAGE):
+        magic, version, length, size, kind = struct.unpack_from("<4sIII4s", data)
+        if (magic, version, length, kind) != (b"glTF", 2, len(data), b"JSON"):
+            raise ValueError("no header of glTF 2.0 binary")
+        tree = parse_json(data[20 : 20 + size], path, "mesh", schema=_Gltf)
+        if tree.extensionsRequired:
+            raise ValueError(f"it needs {tree.extensionsRequired[0][:40]}")
+        parts = _Parts(tree, data[28 + size :], Budget(path, "mesh"))
+        parts.budget.spend(len(data))
+        children = {child for node in tree.nodes for child in node.children}
+        for root in set(range(len(tree.nodes))) - children:
+            parts.add(root, np.eye(4), 0)
+        return parts.mesh()
+
+
+_DAMAGE = (struct.error, LookupError, ValueError, TypeError, OverflowError, RecursionError, MemoryError)
+
+
+class _Parts:
+    """The surfaces of a file's nodes."""
+
+    def __init__(self, tree: _Gltf, binary: bytes, budget: Budget):
+        self.tree, self.binary, self.budget = tree, binary, budget
+        self.nodes = self.count = 0
+        self.vertices: list[np.ndarray] = []
+        self.faces: list[np.ndarray] = []
+        self.colors: list[np.ndarray] = []
+
+    def add(self, number: int, T_world_parent: Float[np.ndarray, "4 4"], depth: int) -> None:
+        """Add a node and its children."""
+        self.nodes += 1
+        if depth > self.budget.limits.depth or self.nodes > len(self.tree.nodes):
+            raise ValueError("nodes within nodes without end")
+        node = self.tree.nodes[number]
+        T_world_node = T_world_parent @ node.transform()
+        for part in [] if node.mesh is None else self.tree.meshes[node.mesh].primitives:
+            if part.mode == _TRIANGLES:
+                self._add(part, T_world_node)
+        for child in node.children:
+            self.add(child, T_world_node, depth + 1)
+
+    def _add(self, part: _Primitive, T_world_node: Float[np.ndarray, "4 4"]) -> None:
+        vertices = self._array(part.attributes["POSITION"], "VEC3").astype(np.float64)
+        corners = np.arange(len(vertices)) if part.indices is None else self._array(part.indices, "SCALAR")
+        self.budget.count(self.count + len(vertices) + len(corners), "vertices and corners")
+        if len(corners) % 3 or (len(corners) and corners.max() >= len(vertices)):
+            raise ValueError("corners of vertices that are not there")
+        color = part.attributes.get("COLOR_0")
+        colors = np.broadcast_to(GREY, vertices.shape)
+        if color is not None and len(found := self._array(color, "VEC3", "VEC4")) == len(vertices):
+            whole = 1.0 if found.dtype.kind == "f" else np.iinfo(found.dtype).max
+            colors = np.clip(found[:, :3] / whole, 0, 1)
+        self.vertices.append(vertices @ T_world_node[:3, :3].T + T_world_node[:3, 3])
+        self.faces.append(corners.reshape(-1, 3).astype(np.int64) + sum(map(len, self.vertices[:-1])))
+        self.colors.append(colors)
+        self.count += len(vertices) + len(corners)
+
+    def _array(self, number: int, *kinds: str) -> np.ndarray:
+        """An accessor's values, a view of the file's bytes."""
+        accessor = self.tree.accessors[number]
+        view, dtype, shape = (
+            self.tree.bufferViews[accessor.bufferView],
+            _COMPONENTS[accessor.componentType],
+            _SHAPES[accessor.type],
+        )
+        row = dtype.itemsize * (shape[0] if shape else 1)
+        stride = view.byteStride or row
+        if accessor.type not in kinds or stride < row or min(accessor.count, view.byteOffset, accessor.byteOffset) < 0:
+            raise ValueError(f"an accessor of {accessor.count} {accessor.type}")
+        strides = (stride, dtype.itemsize)[: 1 + len(shape)]
+        offset = view.byteOffset + accessor.byteOffset
+        return np.ndarray((accessor.count, *shape), dtype, self.binary, offset, strides)
+
+    def mesh(self) -> Mesh:
+        if not self.faces:
+            raise ValueError("no triangles")
+        vertices, faces, colors = (np.concatenate(each) for each in (self.vertices, self.faces, self.colors))
+        if not np.isfinite(vertices).all() or not np.isfinite(colors).all():
+            raise ValueError("numbers that are not finite")
+        return Mesh(vertices.astype(np.float32), faces.astype(np.int32), colors.astype(np.float32))
