@@ -27,6 +27,7 @@ import test_aria_mps  # noqa: E402
 import test_asf_amc  # noqa: E402
 import test_colmap  # noqa: E402
 import test_egohoi  # noqa: E402
+import test_glb  # noqa: E402
 import test_hand_detections  # noqa: E402
 import test_hcontact  # noqa: E402
 import test_mvnx  # noqa: E402
@@ -62,6 +63,7 @@ from wearcap.io.formats import (  # noqa: E402
     contact_labels,
     csv_table,
     environment,
+    glb,
     hand_detections,
     motion_npz,
     mvnx,
@@ -124,6 +126,7 @@ end_header
 PCD = "VERSION .7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH 4\nHEIGHT 1\nPOINTS 4\nDATA "
 CONTACTS = {"contacts": {"left_hand": [[0.5, 1.0]], "right_hand": [[0.5, 1.0], [1.5, 0.0]]}}
 ENVIRONMENT_OBJECT = "door"
+NODES = [{"children": [1, 2], "translation": [1, 2, 3]}, {"mesh": 0, "scale": [2, 2, 2]}, {"mesh": 0}]
 
 
 def _one(name: str, content: str | bytes, read: Callable[[Path], Any]) -> Reader:
@@ -138,7 +141,7 @@ def _made(name: str, write: Callable[[Path], Any], read: Callable[[Path], Any]) 
 
 
 def _headset_poses() -> tuple:
-    time, R, t = short_walk.walk(seconds=3.0)
+    time, R, t = short_walk.walk(seconds=1.0)
     return time, short_walk.headset_poses(time, R, t, "unity", "grip")
 
 
@@ -331,6 +334,7 @@ READERS: dict[str, Reader] = {
     "vertex_contacts": Reader(
         _vertex_contacts, lambda folder: hand_detections.read_vertex_contacts(folder / "p.npz", folder / "s.json")
     ),
+    "glb": _one("a.glb", test_glb.glb(test_glb.content(nodes=NODES)), glb.read_glb),
     "hcontact": Reader(
         lambda folder: test_hcontact.write_set(folder, frames=FRAMES),
         lambda folder: hcontact.read_hcontact(folder, test_hcontact.DOOR),

@@ -78,7 +78,7 @@ def test_a_bad_reader_fails(read: Callable[[Path], None], found, tmp_path, monke
     monkeypatch.setattr(fuzz_readers, "ALARM_S", 0.2)
 
     def reading(folder: Path) -> None:
-        """Bad from the second file on: the first is the valid one."""
+        """Bad for all but the valid file."""
         if (folder / "a").read_bytes() != b"1 2 3":
             read(folder)
 
