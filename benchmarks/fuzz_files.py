@@ -27,6 +27,7 @@ import test_aria_mps  # noqa: E402
 import test_asf_amc  # noqa: E402
 import test_colmap  # noqa: E402
 import test_egohoi  # noqa: E402
+import test_glb  # noqa: E402
 import test_hand_detections  # noqa: E402
 import test_hcontact  # noqa: E402
 import test_mvnx  # noqa: E402
@@ -62,6 +63,7 @@ from wearcap.io.formats import (  # noqa: E402
     contact_labels,
     csv_table,
     environment,
+    glb,
     hand_detections,
     motion_npz,
     mvnx,
@@ -124,6 +126,7 @@ end_header
 PCD = "VERSION .7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\nWIDTH 4\nHEIGHT 1\nPOINTS 4\nDATA "
 CONTACTS = {"contacts": {"left_hand": [[0.5, 1.0]], "right_hand": [[0.5, 1.0], [1.5, 0.0]]}}
 ENVIRONMENT_OBJECT = "door"
+NODES = [{"children": [1, 2], "translation": [1, 2, 3]}, {"mesh": 0, "scale": [2, 2, 2]}, {"mesh": 0}]
 
 
 def _one(name: str, content: str | bytes, read: Callable[[Path], Any]) -> Reader:
@@ -138,7 +141,7 @@ def _made(name: str, write: Callable[[Path], Any], read: Callable[[Path], Any]) 
 
 
 def _headset_poses() -> tuple:
-    time, R, t = short_walk.walk(seconds=3.0)
+    time, R, t = short_walk.walk(seconds=1.0)
     return time, short_walk.headset_poses(time, R, t, "unity", "grip")
 
 
@@ -185,7 +188,7 @@ def _mps(folder: Path) -> None:
     slam = folder / "slam"
     slam.mkdir()
     test_aria_mps.write(slam / "closed_loop_trajectory.csv", test_aria_mps.rows(20))
-    (slam / "semidense_points.csv.gz").write_bytes(gzip.compress(POINTS.encode()))
+    (slam / "semidense_points.csv.gz").write_bytes(gzip.compress(POINTS.encode(), mtime=0))
 
 
 def _adt_objects(folder: Path) -> None:
@@ -295,7 +298,7 @@ READERS: dict[str, Reader] = {
     "aria_closed_loop": _made(
         "a.csv", lambda path: test_aria_mps.write(path, test_aria_mps.rows(12)), aria_mps.read_closed_loop
     ),
-    "aria_points": _one("a.csv.gz", gzip.compress(POINTS.encode()), aria_mps.read_points),
+    "aria_points": _one("a.csv.gz", gzip.compress(POINTS.encode(), mtime=0), aria_mps.read_points),
     "aria_mps": Reader(_mps, aria_mps.read_mps),
     "asf": _one("a.asf", test_asf_amc.ASF, asf_amc.read_asf),
     "amc": Reader(
@@ -331,6 +334,7 @@ READERS: dict[str, Reader] = {
     "vertex_contacts": Reader(
         _vertex_contacts, lambda folder: hand_detections.read_vertex_contacts(folder / "p.npz", folder / "s.json")
     ),
+    "glb": _one("a.glb", test_glb.glb(test_glb.content(nodes=NODES)), glb.read_glb),
     "hcontact": Reader(
         lambda folder: test_hcontact.write_set(folder, frames=FRAMES),
         lambda folder: hcontact.read_hcontact(folder, test_hcontact.DOOR),
@@ -411,7 +415,7 @@ READERS: dict[str, Reader] = {
     ),
     "text": _one(
         "a.txt.gz",
-        gzip.compress(b"some words\nof text\n"),
+        gzip.compress(b"some words\nof text\n", mtime=0),
         lambda path: (texts.read_text(path), list(texts.numbered_lines(path))),
     ),
     "totalcapture": Reader(
@@ -443,7 +447,7 @@ READERS: dict[str, Reader] = {
     "x_imu": Reader(_x_imu, lambda folder: watch_log.read_inertial_log(folder / "Inertial.csv", "left_wrist")),
     "watch_calibration": _one("c.json", WORN, watch_calibration.read_watch_calibration),
     "tum": _one("t.txt", TUM, trajectory.read_trajectory),
-    "tum_gz": _one("t.txt.gz", gzip.compress(TUM.encode()), trajectory.read_trajectory),
+    "tum_gz": _one("t.txt.gz", gzip.compress(TUM.encode(), mtime=0), trajectory.read_trajectory),
     "tum_xz": _one("t.txt.xz", lzma.compress(TUM.encode()), trajectory.read_trajectory),
     "image": _made("a.png", lambda path: _pictures(path.parent), video.read_image),
     "video_frames": _made("a.mp4", _video, lambda path: list(video.read_frames(path))),

@@ -4,6 +4,8 @@ import collections
 import io
 import os
 import pickle
+import struct
+import tracemalloc
 from fractions import Fraction
 
 import joblib
@@ -47,6 +49,16 @@ def test_plain_data_comes_back(tmp_path, protocol):
     back = read_pickle(save(tmp_path / "v.pkl", pickle.dumps(VALUE, protocol)))
     assert same(VALUE, back)
     back["poses"][0, 0] = 7  # one's own array, not a view of the file
+
+
+def test_bytes_that_are_not_there_take_no_memory(tmp_path):
+    path = save(tmp_path / "v.pkl", pickle.PROTO + b"\5" + pickle.BYTEARRAY8 + struct.pack("<Q", 1 << 30) + b"1.")
+    tracemalloc.start()
+    with pytest.raises(WearcapError):
+        read_pickle(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1 << 24
 
 
 @pytest.mark.parametrize("compress", [0, 3, ("gzip", 3), ("bz2", 3), ("xz", 3)])

@@ -154,3 +154,9 @@ def test_a_new_metric_and_a_line_cut_short_lose_no_row(tmp_path):
     rows = read_metrics(tmp_path / "metrics.csv")
     assert [int(row["step"]) for row in rows] == [0, 1, 2, 3, 5, 6, 7]
     assert rows[4] == {"step": "5", "val": "2.0"}
+
+
+def test_metrics_with_an_endless_value_are_refused(tmp_path):
+    (tmp_path / "metrics.csv").write_text(f"step\n{'1' * 200_000}\n")
+    with pytest.raises(WearcapError, match="not a table of metrics"):
+        read_metrics(tmp_path / "metrics.csv")

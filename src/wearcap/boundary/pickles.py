@@ -208,6 +208,11 @@ class _Unpickler(_PythonUnpickler):
             raise _RefusedError(f"it names {module}.{name}")
         return found
 
+    def load_bytearray(self) -> None:
+        """As bytes, of which no more are there than the file has: Python's own takes the memory first."""
+        self.load_binbytes8()
+        self.stack[-1] = bytearray(self.stack[-1])
+
     def persistent_load(self, pid: Any) -> Any:
         raise _RefusedError("it refers to objects outside the file")
 
@@ -246,4 +251,5 @@ class _Unpickler(_PythonUnpickler):
         return _array(data, dtype, shape)
 
     dispatch[pickle.BUILD[0]] = load_build
+    dispatch[pickle.BYTEARRAY8[0]] = load_bytearray
     dispatch = {opcode: _stepping(load) for opcode, load in dispatch.items()}

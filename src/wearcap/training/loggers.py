@@ -9,6 +9,7 @@ from lightning.fabric.loggers.logger import rank_zero_experiment
 from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.loggers.csv_logs import ExperimentWriter
 
+from wearcap.boundary.opening import understood
 from wearcap.files import write_text
 
 Row = dict[str, float | str]
@@ -73,11 +74,15 @@ class _MetricsFile(ExperimentWriter):
 
 
 def read_metrics(path: Path) -> list[Row]:
-    """Rows of a `metrics.csv` without empty values and without an incomplete last line; none without a file."""
+    """Rows of a `metrics.csv` without empty values and without an incomplete last line; none without a file.
+
+    Raises WearcapError for a file that is no table.
+    """
     if not path.is_file():
         return []
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
     if lines and not lines[-1].endswith("\n"):
         lines.pop()
-    rows = [{key: value for key, value in row.items() if key and value} for row in csv.DictReader(lines)]
+    with understood("not a table of metrics", path, errors=csv.Error):
+        rows = [{key: value for key, value in row.items() if key and value} for row in csv.DictReader(lines)]
     return [dict(row) for row in rows if str(row.get("step", "")).isdecimal()]
