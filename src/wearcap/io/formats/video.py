@@ -158,7 +158,7 @@ def open_container(path: str | Path) -> Iterator[InputContainer]:
         begin = file.read(12)
         demuxer = next((name for name, pattern in _CONTAINERS.items() if pattern.match(begin)), None)
         if demuxer is None:
-            raise WearcapError("not a video of a kind that is read", path, expected, fix)
+            raise WearcapError("not a readable video", path, expected, fix)
         Budget(path, "video").spend(size)
         if demuxer == "mov":
             _require_few_samples(file, size, path)
