@@ -9,6 +9,7 @@ import torch
 from hypothesis import given
 
 from hostile import fuzz, mutated
+from wearcap.boundary.limits import LIMITS, Limits
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
@@ -40,6 +41,18 @@ def every_kind() -> Environment:
             scene_object("chair", Freedom("hinge", pivot=(1.0, -2.0, 0.0)), per_face),
         )
     )
+
+
+def test_points_of_all_objects_together_have_a_limit(tmp_path, monkeypatch):
+    """A mesh is read once, but whatever moves or shows objects takes the points of each."""
+    write_environment(Environment((scene_object(),)), tmp_path)
+    content = json.loads((tmp_path / "environment.json").read_text())
+    content["objects"] = [content["objects"][0] | {"name": f"sofa {k}"} for k in range(100)]
+    (tmp_path / "environment.json").write_text(json.dumps(content))
+    assert len(read_environment(tmp_path)) == 100
+    monkeypatch.setitem(LIMITS, "mesh", Limits(bytes=99 * TETRA.nbytes))
+    with pytest.raises(WearcapError, match=r"environment.json: larger than"):
+        read_environment(tmp_path)
 
 
 def test_every_kind_survives_a_round_trip(tmp_path):

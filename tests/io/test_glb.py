@@ -52,6 +52,17 @@ def test_triangles_come_back_at_the_places_of_their_nodes(tmp_path):
     np.testing.assert_array_equal(mesh.faces, np.concatenate([FACES, FACES.astype(int) + 4]))
 
 
+def test_faces_of_a_mirrored_node_look_outwards(tmp_path):
+    (tmp_path / "a.glb").write_bytes(glb(content(nodes=[{"mesh": 0, "scale": [-1, 1, 1]}])))
+    np.testing.assert_array_equal(read_glb(tmp_path / "a.glb").faces, FACES[:, ::-1])
+
+
+def test_very_many_small_parts_are_read_soon(tmp_path):
+    (tmp_path / "a.glb").write_bytes(glb(content(nodes=[{"mesh": 0}] * 30_000)))
+    with in_time(10):
+        assert len(read_glb(tmp_path / "a.glb").faces) == 90_000
+
+
 def test_what_another_program_writes_comes_back(tmp_path):
     box = trimesh.creation.box((1, 2, 3))
     box.visual.vertex_colors = [[255, 10 * k, 51, 255] for k in range(8)]
@@ -80,6 +91,10 @@ DAMAGED = {
     "an unknown number": glb(accessor(0, componentType=7)),
     "text for a number": glb(accessor(0, count="4")),
     "a file elsewhere": glb(content(buffers=[{"uri": "/proc/kmsg", "byteLength": 66}]), b""),
+    "another buffer": glb(content(bufferViews=[{"buffer": 1, "byteLength": 48}, {"byteLength": 18}])),
+    "text for bytes": glb(content(buffers=[{"uri": "data:,AAAA", "byteLength": 66}])),
+    "sparse values": glb(accessor(0, sparse={"count": 1 << 30})),
+    "too large for single precision": glb(content(nodes=[{"mesh": 0, "scale": [1e300, 1, 1]}])),
     "no view": glb(content(accessors=[{"componentType": 5126, "count": 10**9, "type": "VEC3"}] * 2)),
     "an extension": glb(content(extensionsRequired=["KHR_draco_mesh_compression"])),
     "a circle of nodes": glb(content(nodes=[{"mesh": 0, "children": [1]}, {"children": [1]}])),

@@ -183,7 +183,7 @@ def test_a_silent_video_takes_times_by_hand(tmp_path):
         camera_claps(worn_camera("head.mkv"), tmp_path)
     assert camera_claps(worn_camera("head.mkv"), tmp_path, [2.0, 1.0]).tolist() == [101.0, 102.0]
     (tmp_path / "bad.mkv").write_bytes(b"nothing")
-    with pytest.raises(WearcapError, match=r"bad.mkv: not a video of a kind that is read"):
+    with pytest.raises(WearcapError, match=r"bad.mkv: not a readable video"):
         camera_claps(worn_camera("bad.mkv"), tmp_path)
     with pytest.raises(WearcapError, match="no such video"):
         camera_claps(worn_camera("none.mkv"), tmp_path)

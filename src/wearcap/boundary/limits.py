@@ -48,6 +48,7 @@ LIMITS = {
     "message": Limits(bytes=1 << 24, items=20_100),  # of a page or a device: 20,000 points, and what goes with them
     "mvnx": Limits(bytes=1 << 34, items=100_000, line=1 << 26),  # elements beside the frames, and bytes of one
     "video": Limits(bytes=1 << 40, items=1 << 26),  # pixels of a picture: 8192 x 8192
+    "video tables": Limits(bytes=1 << 28),  # of an MP4: all but its pictures and sound
     "sound": Limits(bytes=1 << 31),  # three hours at 48 kHz
     "mesh": Limits(bytes=1 << 31, items=1 << 21),  # lists of a .glb, its vertices and corners
     "environment": Limits(bytes=1 << 24, items=10_000),  # objects

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from wearcap.boundary.limits import Budget
 from wearcap.errors import WearcapError
-from wearcap.io.formats.video import open_container
+from wearcap.io.formats.video import decoded, open_container
 from wearcap.recording.recording import CameraStream, ImuStream
 from wearcap.sensors.clock import mutual_pairs
 from wearcap.sensors.imu import GRAVITY
@@ -184,7 +184,7 @@ def camera_claps(
         both = (sound, *container.streams.video[:1])
         starts = [float((stream.start_time or 0) * (stream.time_base or 0)) for stream in both]
         mono = av.AudioResampler(format="flt", layout="mono")
-        for frame in itertools.chain(container.decode(sound), (None,)):
+        for frame in itertools.chain(decoded(container, sound, video), (None,)):
             for piece in mono.resample(frame):
                 budget.spend(piece.samples * 4)
                 pieces.append(piece.to_ndarray()[0])

@@ -59,9 +59,12 @@ def read_environment(path: str | Path) -> Environment:
     budget = Budget(path, "environment")
     budget.count(len(content["objects"]), "objects")
     read = cache(lambda file: _mesh(file, path))  # once, however many objects have it
-    objects = tuple(_object(row, number, path, read) for number, row in enumerate(content["objects"]))
+    objects, points = [], Budget(path, "mesh")
+    for number, row in enumerate(content["objects"]):
+        objects.append(_object(row, number, path, read))
+        points.spend(objects[-1].mesh.vertices.nbytes)  # whoever moves or shows objects takes them one by one
     with placed(path):
-        return Environment(objects)
+        return Environment(tuple(objects))
 
 
 def write_environment(environment: Environment, path: str | Path) -> None:

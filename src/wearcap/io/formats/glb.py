@@ -24,6 +24,7 @@ _SHAPES = {"SCALAR": (), "VEC3": (3,), "VEC4": (4,)}
 
 class _View(msgspec.Struct):
     byteLength: int
+    buffer: int = 0
     byteOffset: int = 0
     byteStride: int | None = None
 
@@ -34,6 +35,7 @@ class _Accessor(msgspec.Struct):
     count: int
     type: str
     byteOffset: int = 0
+    sparse: dict | None = None
 
 
 class _Primitive(msgspec.Struct):
@@ -64,11 +66,16 @@ class _Node(msgspec.Struct):
         return T
 
 
+class _Buffer(msgspec.Struct):
+    uri: str | None = None
+
+
 class _Gltf(msgspec.Struct):
     meshes: list[_Surface]
     nodes: list[_Node]
     accessors: list[_Accessor]
     bufferViews: list[_View]
+    buffers: list[_Buffer]
     extensionsRequired: list[str] = []
 
 
@@ -102,7 +109,7 @@ class _Parts:
 
     def __init__(self, tree: _Gltf, binary: bytes, budget: Budget):
         self.tree, self.binary, self.budget = tree, binary, budget
-        self.nodes = self.count = 0
+        self.nodes = self.points = self.count = 0
         self.vertices: list[np.ndarray] = []
         self.faces: list[np.ndarray] = []
         self.colors: list[np.ndarray] = []
@@ -131,9 +138,13 @@ class _Parts:
         if color is not None and len(found := self._array(color, "VEC3", "VEC4")) == len(vertices):
             whole = 1.0 if found.dtype.kind == "f" else np.iinfo(found.dtype).max
             colors = np.clip(found[:, :3] / whole, 0, 1)
-        self.vertices.append(vertices @ T_world_node[:3, :3].T + T_world_node[:3, 3])
-        self.faces.append(corners.reshape(-1, 3).astype(np.int64) + sum(map(len, self.vertices[:-1])))
+        faces = corners.reshape(-1, 3).astype(np.int64) + self.points
+        with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is refused below
+            mirrored = np.linalg.det(T_world_node[:3, :3]) < 0
+            self.vertices.append((vertices @ T_world_node[:3, :3].T + T_world_node[:3, 3]).astype(np.float32))
+        self.faces.append(faces[:, ::-1] if mirrored else faces)
         self.colors.append(colors)
+        self.points += len(vertices)
         self.count += len(vertices) + len(corners)
 
     def _array(self, number: int, *kinds: str) -> np.ndarray:
@@ -146,6 +157,8 @@ class _Parts:
         )
         row = dtype.itemsize * (shape[0] if shape else 1)
         stride = view.byteStride or row
+        if accessor.sparse or view.buffer or self.tree.buffers[0].uri is not None:
+            raise ValueError("values that are sparse, or elsewhere than in the file's own buffer")
         if accessor.type not in kinds or stride < row or min(accessor.count, view.byteOffset, accessor.byteOffset) < 0:
             raise ValueError(f"an accessor of {accessor.count} {accessor.type}")
         strides = (stride, dtype.itemsize)[: 1 + len(shape)]
@@ -158,4 +171,4 @@ class _Parts:
         vertices, faces, colors = (np.concatenate(each) for each in (self.vertices, self.faces, self.colors))
         if not np.isfinite(vertices).all() or not np.isfinite(colors).all():
             raise ValueError("numbers that are not finite")
-        return Mesh(vertices.astype(np.float32), faces.astype(np.int32), colors.astype(np.float32))
+        return Mesh(vertices, faces.astype(np.int32), colors.astype(np.float32))

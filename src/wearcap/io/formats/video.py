@@ -15,10 +15,11 @@ from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from time import monotonic
-from typing import cast
+from typing import Any, BinaryIO
 
 import av
 import numpy as np
+from av.audio.stream import AudioStream
 from av.container import InputContainer
 from av.video.stream import VideoStream
 from jaxtyping import UInt8
@@ -63,6 +64,10 @@ _CONTAINERS = {
     "avi": re.compile(rb"RIFF....AVI ", re.DOTALL),
 }
 """FFmpeg's demuxers that are used, by how their files begin; others open further files, or follow lists of them."""
+_TABLES = re.compile(rb"(?=(stsz|stz2|trun|elst|cmov))")
+"""Boxes of an MP4 that number its samples and the entries of its edit list, and the one that packs them all."""
+_FEW_SAMPLES = 1 << 20
+"""Samples that any MP4 may announce: FFmpeg takes 24 to 72 bytes for each on opening, whether it is there or not."""
 
 
 def read_image(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
@@ -85,9 +90,8 @@ def read_frames(
     with _open_video(path) as (container, stream):
         stream.thread_type = "AUTO"
         rate = float(stream.average_rate or 30)
-        begin: float | None = None
-        number = -1
-        for number, frame in enumerate(_frames(container, stream, path)):
+        begin, number = None, -1
+        for number, frame in enumerate(decoded(container, stream, path)):
             time = frame.time if frame.time is not None else number / rate
             begin = time if begin is None else begin
             if stop is not None and number >= stop:
@@ -98,22 +102,48 @@ def read_frames(
             raise WearcapError("a video without frames", path)
 
 
-def _frames(container: InputContainer, stream: VideoStream, path: str | Path) -> Iterator[av.VideoFrame]:
+def decoded(container: InputContainer, stream: VideoStream | AudioStream, path: str | Path) -> Iterator[Any]:
     """The frames of a stream, of which a file has no more than bytes, and each of which comes within `_WAIT_S`."""
     most, count, waited_s = file_size(path), 0, 0.0
-    packets = container.demux(stream)
+    packets = container.demux()  # of all streams: between any two the time is checked
     while True:
         begin_s = monotonic()
         packet = next(packets, None)
-        frames = [] if packet is None else packet.decode()
+        frames = [] if packet is None or packet.stream_index != stream.index else packet.decode()
         waited_s = 0.0 if frames else waited_s + monotonic() - begin_s
         count += len(frames)
         if count > most or waited_s > _WAIT_S:
             what = f"more than {most} frames" if count > most else f"no frame within {_WAIT_S:g} s"
             raise WearcapError(what, path, "a complete video", "Copy it again.")
-        yield from cast("list[av.VideoFrame]", frames)
+        yield from frames
         if packet is None:
             return
+
+
+def _require_few_samples(file: BinaryIO, size: int, path: str | Path) -> None:
+    """Raise WearcapError for an MP4 whose tables announce more samples than it has bytes: FFmpeg lists them on opening.
+
+    They are looked for in all bytes but those of the pictures, for FFmpeg finds boxes at any depth.
+    """
+    budget, samples, edits, place = Budget(path, "video tables"), 0, 1, 0
+    while place + 16 <= size:
+        file.seek(place)
+        length, kind, long_length = struct.unpack(">I4sQ", file.read(16))
+        length = {0: size - place, 1: long_length}.get(length, length)
+        if length < 8:
+            break
+        budget.spend(16 if kind == b"mdat" else 16 + min(length, size - place))
+        file.seek(place)
+        content = b"" if kind == b"mdat" else file.read(length)
+        for found in _TABLES.finditer(content):
+            at = found.start() + (12 if found[1].startswith(b"st") else 8)
+            number = int.from_bytes(content[at : at + 4], "big")
+            samples += _FEW_SAMPLES + size if found[1] == b"cmov" else 0 if found[1] == b"elst" else number
+            edits += number if found[1] == b"elst" else 0
+        place += length
+    if samples * edits > max(size, _FEW_SAMPLES):
+        what = "a header that is packed, or announces more samples than the file has bytes"
+        raise WearcapError(what, path, "a complete video", "Convert it: ffmpeg -i FILE -c copy new.mp4")
 
 
 @contextmanager
@@ -128,13 +158,16 @@ def open_container(path: str | Path) -> Iterator[InputContainer]:
         begin = file.read(12)
         demuxer = next((name for name, pattern in _CONTAINERS.items() if pattern.match(begin)), None)
         if demuxer is None:
-            raise WearcapError("not a video of a kind that is read", path, expected, fix)
+            raise WearcapError("not a readable video", path, expected, fix)
         Budget(path, "video").spend(size)
+        if demuxer == "mov":
+            _require_few_samples(file, size, path)
         file.seek(0)
+        options = {"protocol_whitelist": "none", "max_streams": "32", "max_pixels": str(_LIMITS.items)}
         damage = (av.FFmpegError, OSError, ValueError)
         with (
             understood("not a readable video", path, expected, fix, errors=damage),
-            av.open(file, format=demuxer, metadata_errors="replace") as container,
+            av.open(file, "r", demuxer, options, metadata_errors="replace", timeout=(_WAIT_S, None)) as container,
         ):
             assert isinstance(container, InputContainer)
             yield container
@@ -150,8 +183,8 @@ def _open_video(path: str | Path) -> Iterator[tuple[InputContainer, VideoStream]
         if stream.codec_context is None:
             raise WearcapError("pictures packed in a way that is not known", path, "a video in H.264, say")
         stream.codec_context.options = {"max_pixels": str(_LIMITS.items)}  # for sizes that only the pictures have
-        if stream.width * stream.height > _LIMITS.items:
-            what = f"pictures of {stream.width}x{stream.height} pixels"
+        if not 0 < stream.width * stream.height <= _LIMITS.items:  # 0 where FFmpeg refuses them by its option
+            what = f"pictures that are too large, or of no size ({stream.width}x{stream.height} pixels)"
             raise WearcapError(what, path, f"at most {_LIMITS.items} pixels", "Scale the video down.")
         yield container, stream
 
@@ -172,8 +205,6 @@ def video_info(path: str | Path) -> _VideoInfo:
     with _open_video(path) as (container, stream):
         fps = float(stream.average_rate or 30)
         frames = stream.frames or round((container.duration or 0) / av.time_base * fps)
-        if not (stream.width > 0 and stream.height > 0):
-            raise WearcapError(f"pictures of {stream.width}x{stream.height} pixels", path, "a video")
         if not (0 < fps <= _MAX_FPS and 0 <= frames <= file_size(path)):
             what = f"a header that announces {frames} frames at {fps:.6g} per second"
             raise WearcapError(what, path, "no more frames than bytes", "The file was damaged: copy it again.")
