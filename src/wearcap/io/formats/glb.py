@@ -128,9 +128,10 @@ class _Parts:
             self.add(child, T_world_node, depth + 1)
 
     def _add(self, part: _Primitive, T_world_node: Float[np.ndarray, "4 4"]) -> None:
-        vertices = self._array(part.attributes["POSITION"], "VEC3").astype(np.float64)
+        vertices = self._array(part.attributes["POSITION"], "VEC3")
         corners = np.arange(len(vertices)) if part.indices is None else self._array(part.indices, "SCALAR")
         self.budget.count(self.count + len(vertices) + len(corners), "vertices and corners")
+        vertices = vertices.astype(np.float64)
         if len(corners) % 3 or (len(corners) and corners.max() >= len(vertices)):
             raise ValueError("corners of vertices that are not there")
         color = part.attributes.get("COLOR_0")
@@ -159,10 +160,12 @@ class _Parts:
         stride = view.byteStride or row
         if accessor.sparse or view.buffer or self.tree.buffers[0].uri is not None:
             raise ValueError("values that are sparse, or elsewhere than in the file's own buffer")
-        if accessor.type not in kinds or stride < row or min(accessor.count, view.byteOffset, accessor.byteOffset) < 0:
+        offset = view.byteOffset + accessor.byteOffset
+        stop = offset + (accessor.count - 1) * stride + row  # NumPy compares it with no buffer that is empty
+        inside = 0 <= accessor.byteOffset and 0 <= view.byteOffset and stop <= len(self.binary)
+        if accessor.type not in kinds or stride < row or accessor.count < 1 or not inside:
             raise ValueError(f"an accessor of {accessor.count} {accessor.type}")
         strides = (stride, dtype.itemsize)[: 1 + len(shape)]
-        offset = view.byteOffset + accessor.byteOffset
         return np.ndarray((accessor.count, *shape), dtype, self.binary, offset, strides)
 
     def mesh(self) -> Mesh:
