@@ -36,6 +36,7 @@ from wearcap.recording import (
 from wearcap.recording.motion import Interactions
 from wearcap.recording.serialize import dumps, flatten, unflatten
 from wearcap.recording.store import RecordingFile, save_recording
+from wearcap_testing import recording_of, swaying_motion
 
 FRAMES = 90
 
@@ -413,3 +414,13 @@ def _without_empty(value):
 def test_what_json_cannot_say_is_refused():
     with pytest.raises(ValueError, match="not JSON compliant"):
         dumps({"height": float("nan")})
+
+
+def test_poses_in_sixteen_bits_are_refused(tmp_path):
+    """They do not compute with those in 32 bits."""
+    recording = recording_of(swaying_motion(20, 0), "r0")
+    assert recording.motion is not None
+    halved = replace(recording.motion, t_world_root=recording.motion.t_world_root.bfloat16())
+    save_recording(replace(recording, motion=halved), tmp_path / "r0.safetensors")
+    with pytest.raises(WearcapError, match="t_world_root is a torch.bfloat16"):
+        RecordingFile(tmp_path / "r0.safetensors").load()

@@ -21,6 +21,8 @@ from typing import Any
 import numba
 import torch
 
+from wearcap.boundary.opening import file_size, understood
+from wearcap.boundary.texts import numbered_lines
 from wearcap.errors import WearcapError
 from wearcap.files import remove_leftovers, sha256_of
 from wearcap.io.formats.poses import are_rotations
@@ -88,12 +90,10 @@ class Splits:
         A subject may be a pattern (`HumanEva/*`), a split is train, val, test, or "hash".
         """
         path = Path(path)
-        try:
-            lines = path.read_text(encoding="utf-8").splitlines()
-        except FileNotFoundError as error:
-            expected = "a .csv with columns subject,split"
-            raise WearcapError("no such split list", where=path, expected=expected) from error
-        table = list(csv.DictReader(line for line in lines if line.strip() and not line.startswith("#")))
+        file_size(path, "split list")
+        lines = (line for _, line in numbered_lines(path, "table") if line.strip() and not line.startswith("#"))
+        with understood("not a split list", path, "columns subject,split", errors=csv.Error):
+            table = list(csv.DictReader(lines))
         if not table or set(table[0]) != {"subject", "split"}:
             raise WearcapError("not a split list", where=path, expected="columns subject,split")
         for row in table:

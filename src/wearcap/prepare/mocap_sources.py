@@ -9,6 +9,8 @@ from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
 
+from wearcap.boundary.opening import understood
+from wearcap.boundary.texts import numbered_lines
 from wearcap.errors import WearcapError, nearest
 from wearcap.io.datasets.amass import read_amass
 from wearcap.prepare.engine import NOTE, Splits, Task, content_hash, source_folder
@@ -82,8 +84,9 @@ def cmu_tasks(
     source = source_folder(source)
     index, activities = source / "index.csv", {}
     if index.is_file():
-        with open(index, newline="", encoding="utf-8") as file:
-            activities = {row["trial"]: row.get("category") for row in csv.DictReader(file) if row.get("trial")}
+        with understood("not a list of trials", index, "columns trial,category", errors=csv.Error):
+            rows = csv.DictReader(line for _, line in numbered_lines(index, "table"))
+            activities = {row["trial"]: row.get("category") for row in rows if row.get("trial")}
     trials: dict[str, Path] = {}
     for path in _motion_files(source):
         name = _stem(path)

@@ -192,7 +192,7 @@ def read_egohoi_contacts(path: str | Path, clock: LabelClock, object_name: str, 
             what = f"interaction {number} ends before it starts: {start} to {end} s"
             raise WearcapError(what, path, "start < end", "Exchange the two, if that is what was meant.")
         for part in row["parts"]:
-            if part not in parts:
+            if not isinstance(part, str) or part not in parts:
                 raise WearcapError(f"interaction {number} is with {part!r}", path, " or ".join(parts))
             parts[part].append([start, end])
     named = {

@@ -162,7 +162,7 @@ class _Parts:
             raise ValueError("values that are sparse, or elsewhere than in the file's own buffer")
         offset = view.byteOffset + accessor.byteOffset
         stop = offset + (accessor.count - 1) * stride + row  # NumPy compares it with no buffer that is empty
-        inside = 0 <= accessor.byteOffset and 0 <= view.byteOffset and stop <= len(self.binary)
+        inside = accessor.byteOffset >= 0 and view.byteOffset >= 0 and stop <= len(self.binary)
         if accessor.type not in kinds or stride < row or accessor.count < 1 or not inside:
             raise ValueError(f"an accessor of {accessor.count} {accessor.type}")
         strides = (stride, dtype.itemsize)[: 1 + len(shape)]
