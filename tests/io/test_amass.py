@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from hostile import fuzz, mutated_bytes
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from hostile import fuzz, mutated_bytes
 from wearcap.body.skeleton import xsens23
 from wearcap.body.skeletons import smpl24, smplh52, smplx22
 from wearcap.errors import WearcapError

@@ -6,10 +6,10 @@ import lzma
 import numpy as np
 import pytest
 import torch
-from hostile import fuzz, mutated
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hostile import fuzz, mutated
 from wearcap.errors import WearcapError
 from wearcap.io.formats.asf_amc import read_amc, read_asf
 from wearcap.recording import Motion

@@ -6,10 +6,10 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from hostile import fuzz, mutated
 from hypothesis import given
 from scipy.spatial.transform import Rotation
 
+from hostile import fuzz, mutated
 from wearcap.body.skeleton import Site, Skeleton, xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hostile import fuzz, mutated, mutated_bytes
 from hypothesis import given
 
+from hostile import fuzz, mutated, mutated_bytes
 from wearcap.errors import WearcapError
 from wearcap.io.formats.colmap import read_colmap
 

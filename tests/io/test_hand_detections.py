@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 from hoi_files import write_json
-from hostile import fuzz, mutated
 from hypothesis import given
 
+from hostile import fuzz, mutated
 from wearcap.errors import WearcapError
 from wearcap.io.formats.hand_detections import HOD_COLUMNS, read_hand_detections, read_vertex_contacts
 

@@ -6,9 +6,9 @@ import math
 import pytest
 import torch
 from hoi_files import motion, moved, older, smpl_content, write_json, write_zip
-from hostile import fuzz, mutated
 from hypothesis import given
 
+from hostile import fuzz, mutated
 from wearcap.cli.main import run_verb
 from wearcap.errors import WearcapError
 from wearcap.io.datasets.hcontact import (

@@ -10,10 +10,10 @@ import hps_files
 import numpy as np
 import pytest
 import torch
-from hostile import fuzz, mutated, mutated_bytes
 from hps_files import FRAMES, NAME, same_motion, write_smpl, write_unity
 from hypothesis import given
 
+from hostile import fuzz, mutated, mutated_bytes
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.datasets.hps import (

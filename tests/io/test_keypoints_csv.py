@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from hostile import fuzz, mutated
 from hypothesis import given
 
+from hostile import fuzz, mutated
 from keypoint_files import write_keypoints
 from wearcap.errors import WearcapError
 from wearcap.localization.keypoints import read_keypoints

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hostile import fuzz, mutated, mutated_bytes
 from hypothesis import given
 from hypothesis import strategies as st
 from mocap_every_files import BOARD_M, FIX, SCALE, SHUTTER_S, cloud, truth, world_of, write_capture
 
+from hostile import fuzz, mutated, mutated_bytes
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.datasets.mocap_every_folder import (

@@ -8,10 +8,10 @@ import zipfile
 import numpy as np
 import pytest
 import torch
-from hostile import fuzz, mutated_bytes
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hostile import fuzz, mutated_bytes
 from wearcap.body.skeleton import xsens23
 from wearcap.boundary.arrays import read_npz, require
 from wearcap.errors import WearcapError

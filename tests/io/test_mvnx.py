@@ -6,9 +6,9 @@ import warnings
 
 import pytest
 import torch
-from hostile import fuzz, mutated
 from hypothesis import given
 
+from hostile import fuzz, mutated
 from mvnx_files import CONTACTS, IDENTITY, mvnx, sample, sensors
 from wearcap.errors import WearcapError
 from wearcap.io.formats.mvnx import read_mvnx

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hostile import fuzz, mutated
 from hypothesis import given
 from ocam_files import lens, xml_of
 
+from hostile import fuzz, mutated
 from wearcap.errors import WearcapError
 from wearcap.io.formats.ocamcalib import OCamModel, read_sensor_frame
 

@@ -6,11 +6,11 @@ import joblib
 import numpy as np
 import pytest
 import torch
-from hostile import fuzz, mutated_bytes
 from hypothesis import given
 from hypothesis import strategies as st
 from one_object_files import CORNERS, OMOMO_NAME, SCALE, carried, obj_text, omomo_entry, standing_about, write_omomo
 
+from hostile import fuzz, mutated_bytes
 from wearcap.body.skeletons import smplx22
 from wearcap.errors import WearcapError
 from wearcap.io.datasets.amass import PELVIS_SMPLX

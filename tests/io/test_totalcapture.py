@@ -4,10 +4,10 @@ import contextlib
 
 import pytest
 import torch
-from hostile import fuzz, mutated
 from hypothesis import given
 from totalcapture_files import vicon, write_totalcapture
 
+from hostile import fuzz, mutated
 from wearcap.cli.main import run_verb
 from wearcap.doctor.examine import examine
 from wearcap.errors import WearcapError

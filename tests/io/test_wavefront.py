@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from hostile import fuzz, mutated
 from hypothesis import given
 from one_object_files import CORNERS, obj_text
 
 from boxes import BOX_FACES
+from hostile import fuzz, mutated
 from wearcap.errors import WearcapError
 from wearcap.io.formats.wavefront import read_obj
 
