@@ -122,18 +122,18 @@ class Fuzzed:
         (self.folder / name).write_bytes(content)
         return name, len(content) + sum(map(len, self.files.values())) - len(self.files[name])
 
-    def run(self, number: int, kept: Path, alarm_s: float = 0.0) -> str:
-        """Read input `number`; a failure's files are kept in a folder below `kept`. `alarm_s`: its time, in a process that
-        hears the alarm; 0: any."""
+    def run(self, number: int, kept: Path) -> str:
+        """Read input `number`, in a process that hears the alarm; a failure's files are kept in a folder below `kept`."""
         name, size = self.damage(number)
         before = self._begin()
-        signal.setitimer(signal.ITIMER_REAL, alarm_s)
         try:
-            found = outcome(self.reader.read, self.folder)
+            signal.setitimer(signal.ITIMER_REAL, ALARM_S)
+            try:
+                found = outcome(self.reader.read, self.folder)
+            finally:
+                signal.setitimer(signal.ITIMER_REAL, 0)
         except TooSlowError:
             found = "slow"
-        finally:
-            signal.setitimer(signal.ITIMER_REAL, 0)
         taken = _memory("VmHWM") - before
         self.peak = max(self.peak, taken)
         if found in ("fine", "refused") and taken > FREE_BYTES + TIMES_FILES * size:
@@ -197,7 +197,7 @@ def _work(name: str, seed: int, first: int, last: int, files: dict, kept: Path, 
             counts[f"valid files: {valid}"] += 1
         for number in range(first, last):
             place[0], place[1] = number, time.monotonic()
-            counts[fuzzed.run(number, kept, ALARM_S)] += 1
+            counts[fuzzed.run(number, kept)] += 1
         pipe.send((counts, fuzzed.peak))
 
 
