@@ -192,8 +192,8 @@ def read_egohoi_contacts(path: str | Path, clock: LabelClock, object_name: str, 
             what = f"interaction {number} ends before it starts: {start} to {end} s"
             raise WearcapError(what, path, "start < end", "Exchange the two, if that is what was meant.")
         for part in row["parts"]:
-            if part not in parts:
-                raise WearcapError(f"interaction {number} is with {part!r}", path, " or ".join(parts))
+            if part not in list(parts):  # which compares, as not everything in JSON can be a key
+                raise WearcapError(f"interaction {number} is with {part!r}"[:200], path, " or ".join(parts))
             parts[part].append([start, end])
     named = {
         key: {hand: [text] * len(spans) for hand, spans in parts.items()}
