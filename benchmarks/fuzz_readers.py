@@ -3,11 +3,10 @@
     python benchmarks/fuzz_readers.py [READER ...] [--inputs 100000] [--seed 0] [--seconds S] [--jobs 2]
 
 Prints one JSON line per reader and a total: how many inputs were read, how many refused with a WearcapError, other
-exceptions by type and place, inputs that took longer than 5 seconds of the processor (30 by the clock), that took more
-memory than 10 times the files' size and 100 MiB (on Linux) or than 1.5 GiB, and that ended the process; the most memory
-that one input took (MiB). The
-first input of each kind that failed is kept under outputs/fuzz/READER/. An input is known by its seed, reader and
-number, whatever the number of jobs.
+exceptions by type and place, inputs that took longer than 5 seconds of the processor, that took more memory than 10
+times the files' size and 100 MiB (on Linux) or than 1.5 GiB, and that ended the process; the most memory that one input
+took (MiB). The first input of each kind that failed is kept under outputs/fuzz/READER/. An input is known by its seed,
+reader and number, whatever the number of jobs.
 Leaves with 1 when anything but a result or a WearcapError came.
 """
 
@@ -123,18 +122,18 @@ class Fuzzed:
         (self.folder / name).write_bytes(content)
         return name, len(content) + sum(map(len, self.files.values())) - len(self.files[name])
 
-    def run(self, number: int, kept: Path, alarm_s: float = 0.0) -> str:
-        """Read input `number`; a failure's files are kept in a folder below `kept`. `alarm_s`: its time, in a process that
-        hears the alarm; 0: any."""
+    def run(self, number: int, kept: Path) -> str:
+        """Read input `number`, in a process that hears the alarm; a failure's files are kept in a folder below `kept`."""
         name, size = self.damage(number)
         before = self._begin()
-        signal.setitimer(signal.ITIMER_PROF, alarm_s)
         try:
-            found = outcome(self.reader.read, self.folder)
+            signal.setitimer(signal.ITIMER_PROF, ALARM_S)
+            try:
+                found = outcome(self.reader.read, self.folder)
+            finally:
+                signal.setitimer(signal.ITIMER_PROF, 0)
         except TooSlowError:
             found = "slow"
-        finally:
-            signal.setitimer(signal.ITIMER_PROF, 0)
         taken = _memory("VmHWM") - before
         self.peak = max(self.peak, taken)
         if found in ("fine", "refused") and taken > FREE_BYTES + TIMES_FILES * size:
@@ -198,7 +197,7 @@ def _work(name: str, seed: int, first: int, last: int, files: dict, kept: Path, 
             counts[f"valid files: {valid}"] += 1
         for number in range(first, last):
             place[0], place[1] = number, time.monotonic()
-            counts[fuzzed.run(number, kept, ALARM_S)] += 1
+            counts[fuzzed.run(number, kept)] += 1
         pipe.send((counts, fuzzed.peak))
 
 

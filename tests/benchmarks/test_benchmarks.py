@@ -49,7 +49,7 @@ def test_a_figure_with_other_keys_is_refused(monkeypatch, tmp_path):
         run.run("askew")
 
 
-def test_a_row_prints_what_its_training_took(tmp_path):
+def test_a_row_prints_what_its_training_took(tmp_path, trusted):
     import tabling
 
     from wearcap.models.checkpoint import read_checkpoint

@@ -165,6 +165,10 @@ CLOCK = LabelClock.of(ONE, torch.arange(120, dtype=torch.float64) / 60)
         (contact((0.5, 0.5, "left")), "is empty"),
         (contact((0.5, 1.0, "left"), (0.9, 1.2, "left", "right")), "labels of left_hand overlap"),
         (contact((40.0, 41.0, "left")), "outside the recording.*another recording"),
+        (
+            {"interactions": [{"start": 0, "end": 1, "parts": [["left_hand"]]}]},
+            "interaction 0 is with \\['left_hand'\\]",
+        ),
         (contact((0.5, 1.0, "third")), "interaction 0 is with 'third_hand'.*left_hand or right_hand"),
         (contact((0.5, math.nan, "left")), "left_hand label 0 is"),
         (contact(("0.5", 1.0, "left")), "left_hand label 0 is"),
