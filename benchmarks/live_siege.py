@@ -5,7 +5,7 @@
 A recording's head is played forth and back, 60 times a second, over a WebSocket; a watch posts over HTTP twice a second. The
 others: silent sockets on all TCP ports, opened again 5 s after they are closed; 100 that write a byte a second; and, each so
 many times a second, damaged messages and well-formed ones of seven invented wearers to every UDP source, requests and
-handshakes that are wrong to every server. They run in Linux's idle class, as on another machine. Prints one JSON line:
+handshakes that are wrong to every server. They give way to the capture (nice 10), as on another machine. Prints one JSON line:
 messages and posts of the devices and how many arrived, frames recorded and due, memory (MiB) after the first minute and at the
 end, connections at most, lines printed, latency (ms). Leaves with 1 when a device's message or a frame is lost, memory grows by
 more than 16 MiB, or 50 lines or more are printed.
@@ -47,11 +47,11 @@ GROWTH_MIB, LINES, AGAIN_S, SLOW = 16.0, 50, 5.0, 100
 WORST_HEAD = b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 10\r\n\r\n"
 
 
-def idle(target: Callable[..., None], *arguments: Any) -> multiprocessing.Process:
-    """A process that gives way to all others."""
+def enemy(target: Callable[..., None], *arguments: Any) -> multiprocessing.Process:
+    """A process that gives way to the capture, as one of another machine would."""
 
     def run() -> None:
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+        os.nice(10)
         soft, hard = 8192, resource.getrlimit(resource.RLIMIT_NOFILE)[1]
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft if hard < 0 else min(soft, hard), hard))
         target(*arguments)
@@ -210,8 +210,8 @@ def siege(system: str, minutes: float, sockets: int, rate: float, where: str) ->
         while not (listens(ws) and listens(posts) and listens(page)) and process.poll() is None:
             time.sleep(0.5)
         ports, head = [ws, posts, sink, page], sender._message("head", 0.0)
-        enemies = [idle(silent, ports, sockets), idle(slow, ports), idle(requests, ports, rate)]
-        enemies.append(idle(datagrams, list(udp.values()), rate, head))
+        enemies = [enemy(silent, ports, sockets), enemy(slow, ports), enemy(requests, ports, rate)]
+        enemies.append(enemy(datagrams, list(udp.values()), rate, head))
         time.sleep(5.0)
         adapter, watch, watched = Adapter(sender, ws, 60 * minutes), Watch(posts), psutil.Process(process.pid)
         adapter.start()
@@ -227,8 +227,8 @@ def siege(system: str, minutes: float, sockets: int, rate: float, where: str) ->
         time.sleep(1.0)
         process.send_signal(signal.SIGTERM)
         process.wait(120)
-        for enemy in enemies:
-            enemy.kill()
+        for each in enemies:
+            each.kill()
         if not report.is_file():
             raise SystemExit("".join(lines[-20:]))
         found, motion = json.loads(report.read_text()), recorded(record)
