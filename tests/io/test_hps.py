@@ -114,6 +114,8 @@ class Bomb:
         ({"poses": np.zeros((3, 72))}, "no array 'transes'"),
         ({"poses": np.zeros((0, 72)), "transes": np.zeros((0, 3))}, "no frames"),
         ({"poses": "text", "transes": np.zeros((3, 3))}, "'poses'"),
+        ({"poses": [[1.0], [1.0, 2.0]], "transes": np.zeros((3, 3))}, "'poses': no array of numbers"),
+        ({"poses": ["x" * 100_000] + ["x"] * 5000, "transes": np.zeros((3, 3))}, "'poses': no array of numbers"),
         ([1, 2], "holds a list"),
         ({"poses": Bomb(), "transes": np.zeros((3, 3))}, "builtins.print"),
     ],

@@ -113,7 +113,7 @@ FAULTS = {
     "code": ("cam_traj.pkl", pickle.dumps(Evil()), "system"),
     "code in marks": ("camera_calib.pkl", pickle.dumps({"x": Evil()}), "system"),
     "columns": ("cam_traj.pkl", pickle.dumps(POSES[:, :6]), r"'poses' has shape \(90, 6\)"),
-    "no array": ("cam_traj.pkl", pickle.dumps({"a": 1}), "'poses' has shape"),
+    "no array": ("cam_traj.pkl", pickle.dumps({"a": 1}), "'poses' has shape|no array of numbers"),
     "no poses": ("cam_traj.pkl", pickle.dumps(POSES[:0]), "no poses"),
     "nan": ("cam_traj.pkl", pickle.dumps(POSES * np.nan), "NaN"),
     "no quaternion": ("cam_traj.pkl", pickle.dumps(np.ones((9, 7))), "norm 2.0000"),

@@ -107,6 +107,14 @@ def _read_array(file: io.BufferedIOBase, file_bytes: int, where: str, budget: Bu
     return array
 
 
+def array_of(value: Any, where: str | Path) -> np.ndarray:
+    """An array, or one of lists of numbers. Raises WearcapError for rows of several lengths, and for anything else."""
+    if isinstance(value, np.ndarray):
+        return value
+    with understood("no array of numbers", where, errors=(ValueError, TypeError, OverflowError)):
+        return np.asarray(value, np.float64)  # of texts NumPy makes an array in which each is as long as the longest
+
+
 def require(arrays: dict[str, np.ndarray], path: str | Path, **shapes: tuple[int | str, ...]) -> dict[str, int]:
     """Check that arrays are there, finite numbers, and of one consistent shape; returns the named sizes.
 

@@ -82,7 +82,7 @@ def _start_server(guard: Guard, port: int, label: str) -> viser.ViserServer:
     if not hooked:  # nothing has been shown on it yet
         server.stop()
         what = f"viser {viser.__version__} does not let its pages be guarded against other sites"
-        fix = "Install the version that wearcap asks for: pip install 'viser>=1.1.1,<1.2'."
+        fix = "Install the version that wearcap asks for: pip install 'viser>=1.1.1,<1.1.2'."
         raise WearcapError(what, expected="a viser that serves its page as 1.1.1 does", fix=fix)
     return server
 

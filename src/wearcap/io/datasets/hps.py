@@ -32,7 +32,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.skeletons import smpl24
-from wearcap.boundary.arrays import require
+from wearcap.boundary.arrays import array_of, require
 from wearcap.boundary.opening import placed, understood
 from wearcap.boundary.pickles import read_pickled_dict
 from wearcap.boundary.texts import at_line, finite_floats, numbered_lines, read_json, read_json_object
@@ -66,7 +66,7 @@ def read_hps_motion(path: str | Path) -> Motion:
     and no frames.
     """
     content = read_pickled_dict(path, "a dict of poses and transes")
-    arrays = {key: np.asarray(content[key]) for key in ("poses", "transes") if key in content}
+    arrays = {key: array_of(content[key], f"{path}, {key!r}") for key in ("poses", "transes") if key in content}
     sizes = require(arrays, path, poses=("time", 72), transes=("time", 3))
     if not sizes["time"]:
         raise WearcapError("no frames", path)

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS
-from wearcap.boundary.arrays import require
+from wearcap.boundary.arrays import array_of, require
 from wearcap.boundary.opening import understood
 from wearcap.boundary.pickles import read_pickle, read_pickled_dict
 from wearcap.boundary.texts import finite_floats, read_text, read_yaml_object
@@ -95,7 +95,7 @@ def read_mocap_every_folder(folder: str | Path) -> MocapEveryFolder:
     shutter_s = 0.0 if noted is None else _numbers([noted], 1, "the shutter's time", folder)[0]
     path = folder / TRAJECTORY
     content = read_pickle(path)
-    table = np.asarray(content) if isinstance(content, np.ndarray | list) else np.zeros(0)
+    table = array_of(content, path)
     require({"poses": table}, path, poses=("time", 7))
     if not len(table):
         raise WearcapError("no poses", path, "a row of 7 numbers per picture")
