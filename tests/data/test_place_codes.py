@@ -17,6 +17,8 @@ from wearcap.scene.voxels import VoxelGrid, mirrored, voxelize
 from wearcap.systems.hmd2.point_codes_training import PlaceContent
 from wearcap_testing import recording_of, swaying_motion
 
+pytestmark = pytest.mark.usefixtures("trusted")
+
 
 def cloud(seed: int) -> PointCloud:
     random = torch.Generator().manual_seed(seed)

@@ -109,7 +109,7 @@ def decoded(container: InputContainer, stream: VideoStream | AudioStream, path: 
     while True:
         begin_s = monotonic()
         packet = next(packets, None)
-        frames = [] if packet is None or packet.stream_index != stream.index else packet.decode()
+        frames = [] if packet is None or packet.stream_index != stream.index else stream.decode(packet)
         waited_s = 0.0 if frames else waited_s + monotonic() - begin_s
         count += len(frames)
         if count > most or waited_s > _WAIT_S:
@@ -134,7 +134,7 @@ def _require_few_samples(file: BinaryIO, size: int, path: str | Path) -> None:
             break
         budget.spend(16 if kind == b"mdat" else 16 + min(length, size - place))
         file.seek(place)
-        content = b"" if kind == b"mdat" else file.read(length)
+        content = b"" if kind == b"mdat" else file.read(min(length, size - place))
         for found in _TABLES.finditer(content):
             at = found.start() + (12 if found[1].startswith(b"st") else 8)
             number = int.from_bytes(content[at : at + 4], "big")
