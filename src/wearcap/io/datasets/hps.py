@@ -107,7 +107,7 @@ def read_hps_localization(path: str | Path, fps: float | int = FPS) -> Localizat
     """
     rows = read_json_object(path)
     for key in rows:
-        if not (key.isascii() and key.isdigit() and len(key) < 20 and int(key) < MAX_FRAMES):
+        if not (key.isascii() and key.isdecimal() and len(key) < 20 and int(key) < MAX_FRAMES):
             raise WearcapError(f"frame {key[:30]!r}", path, "frame numbers from 0 as keys")
     frames = {key: int(key) for key in rows}
     if len(set(frames.values())) < len(frames):

@@ -156,7 +156,7 @@ def read_sensors(path: str | Path) -> dict[str, Float64[np.ndarray, "time value"
 
 
 def _counts(fields: list[str], where: str) -> tuple[int, int]:
-    counts = [int(field) if field.isascii() and field.isdigit() and len(field) < 10 else 0 for field in fields]
+    counts = [int(field) if field.isascii() and field.isdecimal() and len(field) < 10 else 0 for field in fields]
     if len(counts) != 2 or not (0 < counts[0] <= _MOST_SENSORS and counts[1] > 0):
         raise WearcapError(f"{' '.join(fields)[:40]!r}", where, "the numbers of sensors and of frames")
     return counts[0], counts[1]
@@ -169,7 +169,7 @@ def read_reference(path: str | Path) -> dict[str, Float[Tensor, "3 3"]]:
     for number, line in numbered_lines(path):
         fields, where = line.split(), at_line(path, number)
         if not wanted:
-            wanted = int(fields[0]) if len(fields) == 1 and fields[0].isdigit() and len(fields[0]) < 4 else 0
+            wanted = int(fields[0]) if len(fields) == 1 and fields[0].isdecimal() and len(fields[0]) < 4 else 0
             if not wanted:
                 raise WearcapError(f"{line.strip()[:40]!r}", where, "the number of sensors")
         elif fields:

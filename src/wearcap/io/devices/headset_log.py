@@ -107,7 +107,7 @@ class _Columns:
     def places(self) -> list[Any]:
         if self.as_matrix:
             return [self.matrix[number] for number in sorted(self.matrix)][:12]
-        numbered = all(name.isdigit() for name in self.quaternion)
+        numbered = all(name.isdecimal() for name in self.quaternion)
         names = "0123" if numbered else "xyzw"
         return [*(self.position[name] for name in "xyz"), *(self.quaternion[name] for name in names)]
 
@@ -290,15 +290,15 @@ def _sort_in(columns: _Columns, name: str, place: Any, parts: list[str]) -> None
     glued = re.fullmatch(r"(pos|position|p|rot|rotation|quat|q|m)([xyzw]|\d\d?)", last)
     if glued:
         words, last = words | {glued[1]}, glued[2]
-    if words & _MATRIX and last.isdigit():
+    if words & _MATRIX and last.isdecimal():
         number = (
             4 * int(last[0]) + int(last[1])
             if len(last) == 2 and name.lower().rstrip().endswith("m" + last)
             else int(last)
         )
         columns.matrix.setdefault(number, place)
-    elif last in ("x", "y", "z", "w") or last.isdigit():
-        axis = last if not last.isdigit() else ("xyz"[int(last)] if int(last) < 3 else "")
+    elif last in ("x", "y", "z", "w") or last.isdecimal():
+        axis = last if not last.isdecimal() else ("xyz"[int(last)] if int(last) < 3 else "")
         if words & _ROTATION or last == "w":
             columns.quaternion.setdefault(last, place)
         elif (words & _POSITION or last in "xyz") and axis:

@@ -291,7 +291,7 @@ def _parse_amc(path: Path, asf: _AsfSkeleton) -> tuple[np.ndarray, list[int], Fl
     beginning = list(islice(lines, 1))
     first, following = [], []
     for number, words in lines:
-        if words[0][0].isdigit():
+        if words[0][0].isdecimal():
             following = [(number, words)]
             break
         first.append((number, words))

@@ -86,7 +86,7 @@ def _parse_header(data: bytes, path: str | Path) -> tuple[dict[str, list[str]], 
             header[words[0]] = words[1:] or [""]
         start = stop + 1
     missing = {"FIELDS", "SIZE", "TYPE", "POINTS"} - set(header)
-    if missing or not (header["POINTS"][0].isdigit() and len(header["POINTS"][0]) < 15):
+    if missing or not (header["POINTS"][0].isdecimal() and len(header["POINTS"][0]) < 15):
         what = f"its header lacks {', '.join(sorted(missing)) or 'a count of points'}"
         raise WearcapError(what, path, "a PCD 0.7 header")
     return header, start

@@ -367,7 +367,7 @@ def _of_pictures(kind: str, rows: Iterator[tuple[str, tuple[float, ...]]], path:
         names.append(name)
         times.append(float(text))
         values.extend(pose)
-        whole &= text.isdigit() and float(text) < _FRAMES
+        whole &= text.isdecimal() and float(text) < _FRAMES
     order = np.argsort(np.asarray(times), kind="stable")
     table = np.asarray(values).reshape(-1, 7)[order]
     return _Table(

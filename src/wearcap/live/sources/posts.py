@@ -98,7 +98,7 @@ class _Connections:
         if method != "POST":
             raise _Answer(HTTPStatus.METHOD_NOT_ALLOWED, "a sensor app's messages are POSTed here")
         length = headers.get("Content-Length", "")
-        if not (length.isascii() and length.isdigit() and len(length) < 12) or "Transfer-Encoding" in headers:
+        if not (length.isascii() and length.isdecimal() and len(length) < 12) or "Transfer-Encoding" in headers:
             raise _Answer(HTTPStatus.LENGTH_REQUIRED)
         if int(length) > MAX_BODY:
             raise _Answer(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
