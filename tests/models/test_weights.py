@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import zipfile
 from collections import OrderedDict
 
 import numpy as np
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from safetensors.torch import save_file
 from torch import nn
 
+from hostile import in_time
 from wearcap.errors import WearcapError
 from wearcap.models.weights import load_weights, read_weights
 
@@ -89,6 +91,16 @@ def test_a_file_without_named_tensors_is_refused(tmp_path, content):
     torch.save(content, tmp_path / "w.pth")
     with pytest.raises(WearcapError, match="named tensors"):
         read_weights(tmp_path / "w.pth")
+
+
+def test_a_name_without_end_is_refused_soon(tmp_path):
+    torch.save({"a": torch.zeros(2)}, tmp_path / "w.pth")
+    with zipfile.ZipFile(tmp_path / "w.pth") as old, zipfile.ZipFile(tmp_path / "x.pth", "w") as new:
+        for name in old.namelist():
+            content = b"\x80\x02c" + b"a" * 60_000 + b"\nb\n." if name.endswith("data.pkl") else old.read(name)
+            new.writestr(name, content)
+    with in_time(5), pytest.raises(WearcapError, match="more than tensors"):
+        read_weights(tmp_path / "x.pth")
 
 
 def test_a_missing_file_is_named(tmp_path):

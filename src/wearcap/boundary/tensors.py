@@ -6,6 +6,7 @@ import struct
 import warnings
 import zipfile
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +74,14 @@ def read_torch(path: str | Path, kind: str, expected: str) -> Any:
         content = _plain_copy(path) if size and zipfile.is_zipfile(path) else path
         with torch.serialization.safe_globals(_NUMBERS), warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of TorchScript archives, which are refused
+            if isinstance(content, io.BytesIO):
+                # PyTorch's own message about a name takes time in the square of its length.
+                names = []
+                with suppress(ValueError, RuntimeError):  # of a TorchScript archive
+                    names = torch.serialization.get_unsafe_globals_in_checkpoint(content)
+                if any(len(name) > 200 for name in names):
+                    raise pickle.UnpicklingError
+                content.seek(0)
             return torch.load(content, map_location="cpu", weights_only=True)
     except WearcapError:
         raise
