@@ -161,13 +161,13 @@ def test_a_crafted_checkpoint_ends_a_resume_in_one_line_or_not_at_all(part, data
     saved = torch.load(trained / "checkpoints/last.ckpt", weights_only=True)
     torch.save(saved | CRAFTED[part], tmp_path / "x.ckpt")
     run = [f"resume={tmp_path}/x.ckpt", f"hydra.run.dir={tmp_path}/run", "trainer.max_steps=3"]
-    said = f"{tmp_path}/x.ckpt: "
+    message = f"{tmp_path}/x.ckpt: "
     try:
         train.main(arguments(data, tmp_path, *run))
     except WearcapError as error:
-        said = str(error)
-    assert said.startswith(f"{tmp_path}/x.ckpt: ")
-    assert "\n" not in said
+        message = str(error)
+    assert message.startswith(f"{tmp_path}/x.ckpt: ")
+    assert "\n" not in message
 
 
 def test_keys_that_differ_are_those_that_train_differently():
