@@ -232,6 +232,22 @@ def siege(system: str, minutes: float, sockets: int, rate: float, where: str) ->
         if not report.is_file():
             raise SystemExit("".join(lines[-20:]))
         found, motion = json.loads(report.read_text()), recorded(record)
+    return row_of(system, minutes, sender, adapter, watch, found, motion, memory, open_files, lines)
+
+
+def row_of(
+    system: str,
+    minutes: float,
+    sender: Sender,
+    adapter: Adapter,
+    watch: Watch,
+    found: dict[str, Any],
+    motion: int,
+    memory: list[tuple[float, float]],
+    open_files: int,
+    lines: list[str],
+) -> dict[str, Any]:
+    """What is printed of a run: of its report, its recorded frames, its memory over time (s, MiB), files and lines."""
     about = found["wearers"]["wearer" if "wearer" in found["wearers"] else "unnamed wearer"]
     early = next((mib for at_s, mib in memory if at_s > min(60.0, 30.0 * minutes)), memory[0][1])
     late = math.ceil(60 * sender.latency_ms / 1000) + 2

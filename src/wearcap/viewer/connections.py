@@ -1,6 +1,6 @@
 """One limit for all connections of this process's servers: pages, sources and sinks.
 
-Whoever connects gets in: where there are too many, the connection that has said least goes, the oldest first. The limit
+Whoever connects gets in: where there are too many, the connection that has done least goes, the oldest first. The limit
 leaves most of the files that the process may open to everything else, so that a recording never lacks one.
 """
 
