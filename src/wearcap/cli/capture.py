@@ -18,6 +18,7 @@ from wearcap.body.skeleton import xsens23
 from wearcap.body.smpl_body import betas_of, smpl_body, template_pelvis
 from wearcap.cli.capture_all import capture_all, is_dataset
 from wearcap.cli.conf import hydra_main, load_pipeline, with_pipeline, with_pipeline_of_content
+from wearcap.cli.stated import stated
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.io.datasets.amass import write_amass
@@ -60,7 +61,8 @@ def captured(config: Any, system: System) -> Motion | None:
     if config.samples < 1:
         raise WearcapError(f"samples={config.samples}", expected="at least 1")
     body = None if config.skeleton is None else skeleton_of(read(config.skeleton))
-    recording, stature = with_stature(read(config.recording), xsens23(), config.height, body)
+    how = stated(config if isinstance(config, DictConfig) else vars(config))
+    recording, stature = with_stature(read(config.recording, how, config.check), xsens23(), config.height, body)
     dataset = dataset_folder(config.recording)
     if stature is None:
         show(f"height unknown, {xsens23().stature:.2f} m assumed: give height=… (m)")

@@ -11,6 +11,7 @@ from rich import get_console
 from rich import print as show
 
 from wearcap.cli.conf import hydra_main, load_systems, spread_of, trained_on, with_pipeline
+from wearcap.cli.stated import stated
 from wearcap.errors import WearcapError
 from wearcap.evaluation.baselines import BASELINES
 from wearcap.evaluation.breakdown import (
@@ -140,7 +141,7 @@ def _chosen(config: DictConfig, checkpoints: Sequence[str], system: System) -> t
     if config.recording is None:
         store = RecordingStore.open(config.dataset or _validated(checkpoints, system))
         return store, store.names(config.split)
-    recording, folder = read(config.recording), dataset_folder(config.recording)
+    recording, folder = read(config.recording, stated(config)), dataset_folder(config.recording)
     if recording.motion is None:
         expected = "a recording with a true motion beside its sensors"
         raise WearcapError("nothing to score against", config.recording, expected, "Capture it instead.")
@@ -204,6 +205,7 @@ class _Scoring:
             scene=config.scene,
             metres_per_unit=config.metres_per_unit,
             cache=None if config.cache is None else Path(config.cache),
+            check=config.check,
             measure=measure,
         )
         notes = Path(config.output).with_suffix(".finished") / title.replace(" ", "_")

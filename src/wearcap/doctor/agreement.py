@@ -14,13 +14,27 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, angular_velocity, interpolate, outlier_mask, resample, smooth
 from wearcap.io.formats.video import video_info
-from wearcap.recording import CameraStream, Cue, HeadStream, ImuStream, Localization, Motion, PointCloud, Recording
+from wearcap.recording import (
+    CameraStream,
+    Cue,
+    FloorTrack,
+    HeadStream,
+    ImuStream,
+    Localization,
+    Motion,
+    PointCloud,
+    Recording,
+)
 from wearcap.scene.floor import estimate_floor
 from wearcap.sensors.claps import detect_claps
 from wearcap.sensors.imu import GRAVITY, mean_filter
 from wearcap.sensors.initialization import MAX_SPEED
 
 LONG_OUTAGE_S = 30.0
+REACH_M = (0.05, 1.3)
+"""Range of the usual distance (m) between head and hand."""
+HEAD_M = (0.2, 2.6)
+"""Range of the head's height (m) above the floor, from lying to standing."""
 _ACC_UNITS = {"g": GRAVITY, "milli-g": GRAVITY / 1000, "cm/s²": 0.01}
 
 
@@ -83,6 +97,34 @@ def check_head_cue(head: HeadStream, cue: Cue) -> Finding:
         fix = "They are in different worlds, on different clocks, or of different people."
         return check.error("the tracked head does not ride with the device", evidence, fix)
     return check.ok("the tracked head rides with the device", evidence)
+
+
+def check_hand(joint: str, hand: Trajectory, head: HeadStream) -> Finding:
+    """A tracked hand is on the head's clock and within an arm's reach of it."""
+    check = Check(f"{joint}: reach")
+    inside = (hand.timestamps >= head.timestamps[0]) & (hand.timestamps <= head.timestamps[-1])
+    if not inside.any():
+        evidence = f"{hand.timestamps[0]:.2f} … {hand.timestamps[-1]:.2f} s"
+        return check.error("shares no time with the head", evidence, "Bring both to one clock.")
+    t_head = interpolate(head.timestamps, head.t_world_device.double(), hand.timestamps[inside])
+    usual = quantile((hand.t_world_body[inside].double() - t_head).norm(dim=-1), 0.5)
+    evidence = f"half of the time within {usual:.3g} m of the head"
+    if not REACH_M[0] < usual < REACH_M[1]:
+        fix = "Say the unit of length (unit=cm, mm …), or take head and hands of one session."
+        return check.error("out of an arm's reach" if usual > 1 else "lies in the head", evidence, fix)
+    return check.ok("within an arm's reach", evidence)
+
+
+def check_carried(head: HeadStream, floor: FloorTrack) -> list[Finding]:
+    """The head is at the height of a person's above a known floor; the list is empty if so."""
+    times = head.timestamps.clamp(floor.timestamps[0].item(), floor.timestamps[-1].item())
+    height = head.t_world_device[:, 2].double() - interpolate(floor.timestamps, floor.height.double(), times)
+    usual = quantile(height, 0.9)
+    if HEAD_M[0] < usual < HEAD_M[1]:
+        return []
+    fix = "Check the unit of length (unit=cm, mm …) and the floor's height."
+    evidence = f"{usual:.3g} m above it (90 % of the time less)"
+    return [Check("head: height").error("the head is at no person's height above the floor", evidence, fix)]
 
 
 def check_points(points: PointCloud, head: HeadStream | None) -> list[Finding]:

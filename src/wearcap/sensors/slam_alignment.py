@@ -67,7 +67,7 @@ class SceneEvidence:
             scale_std = None
         if R is None or scale is None or not 0 < scale < 1e6:
             what = "the vertical" if R is None else "the unit of length"
-            fix = "Give points=PLY standing=[from,to] camera_height_m=METRES, head_imu=CSV, or scale=METRES_PER_UNIT."
+            fix = "Give unit=METRES; or find it: wearcap prepare trajectory with head_imu=, walks=, or points= and standing=."
             raise WearcapError(f"{what} of the camera's SLAM stays unknown", fix=fix)
         R = R.double()
         placed = scale * slam.t_world_body.double() @ R.mT
