@@ -19,6 +19,8 @@ from wearcap.body.smpl_body import betas_of, smpl_body, template_pelvis
 from wearcap.cli.capture_all import capture_all, is_dataset
 from wearcap.cli.conf import hydra_main, load_pipeline, with_pipeline, with_pipeline_of_content
 from wearcap.cli.stated import stated
+from wearcap.doctor import require_sound
+from wearcap.doctor.agreement import SCAN_FILE
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.io.datasets.amass import write_amass
@@ -28,7 +30,7 @@ from wearcap.io.formats.motion_npz import write_motion
 from wearcap.io.formats.scene_folder import cloud_file, read_scan
 from wearcap.io.formats.smpl import read_smpl
 from wearcap.io.saving import on_skeleton, write_smplh
-from wearcap.reading import read
+from wearcap.reading import load, read
 from wearcap.recording import Motion, Recording
 from wearcap.recording.store import dataset_folder
 from wearcap.runtime.system import CaptureInput, StageOptions, System
@@ -62,7 +64,12 @@ def captured(config: Any, system: System) -> Motion | None:
         raise WearcapError(f"samples={config.samples}", expected="at least 1")
     body = None if config.skeleton is None else skeleton_of(read(config.skeleton))
     how = stated(config if isinstance(config, DictConfig) else vars(config))
-    recording, stature = with_stature(read(config.recording, how, config.check), xsens23(), config.height, body)
+    loaded = load(config.recording, how)
+    if config.check:  # a scene that is given stands in for the recording's own
+        require_sound(
+            loaded.recording, [found for found in loaded.findings if not (config.scene and found.check == SCAN_FILE)]
+        )
+    recording, stature = with_stature(loaded.recording, xsens23(), config.height, body)
     dataset = dataset_folder(config.recording)
     if stature is None:
         show(f"height unknown, {xsens23().stature:.2f} m assumed: give height=… (m)")

@@ -152,10 +152,14 @@ def _chosen(config: DictConfig, checkpoints: Sequence[str], system: System) -> t
 
 
 def _validated(checkpoints: Sequence[str], system: System) -> str:
-    """The data set that a checkpoint was validated on. Raises WearcapError where that is not one data set."""
+    """The data set that a checkpoint was validated on. Raises WearcapError where that is not one data set, or not here."""
+    fix = "Give dataset=DIR, or recording=FILE."
     if not checkpoints or system.joins_checkpoints:
-        raise WearcapError("dataset has no value", fix="Give it on the command line: dataset=DIR.")
-    return trained_on(checkpoints[0])[1]
+        raise WearcapError("dataset has no value", fix=fix)
+    folder = trained_on(checkpoints[0])[1]
+    if not (Path(folder) / MANIFEST).is_file():
+        raise WearcapError("the data set that this checkpoint was validated on is not here", folder, fix=fix)
+    return folder
 
 
 class _Scoring:

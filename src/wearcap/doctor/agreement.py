@@ -33,6 +33,7 @@ from wearcap.sensors.initialization import MAX_SPEED
 LONG_OUTAGE_S = 30.0
 REACH_M = (0.05, 1.3)
 """Range of the usual distance (m) between head and hand."""
+SCAN_FILE = "scene: file"
 HEAD_M = (0.2, 2.6)
 """Range of the head's height (m) above the floor, from lying to standing."""
 _ACC_UNITS = {"g": GRAVITY, "milli-g": GRAVITY / 1000, "cm/s²": 0.01}
@@ -272,8 +273,8 @@ def check_files(recording: Recording, root: Path) -> list[Finding]:
             else:
                 findings.append(check.ok("fits its calibration", f"{video.frames} frames of {width}x{height}"))
     if recording.scene and not (root / recording.scene).is_file():
-        fix = "Put it there, or prepare the data set again."
-        findings.append(Check("scene: file").error("the scan is missing", str(root / recording.scene), fix))
+        fix = "Put it there, or prepare the data set again; capture takes another: scene=FOLDER."
+        findings.append(Check(SCAN_FILE).error("the scan is missing", str(root / recording.scene), fix))
     return findings
 
 
@@ -290,9 +291,13 @@ def check_imu(stream: str, imu: ImuStream, joint: Trajectory | None) -> list[Fin
     if has_error(findings):
         return findings
     if imu.acc_imu is not None:
-        # Specific force is 9.81 m/s² upwards on average.
-        check, usual = Check(f"{stream}: accelerometer"), quantile(imu.acc_imu.norm(dim=-1), 0.5)
-        evidence = f"median length {usual:.4g} m/s²"
+        # Specific force is 9.81 m/s² upwards on average; its length is more while the sensor is swung about.
+        check, lengths, up = Check(f"{stream}: accelerometer"), [quantile(imu.acc_imu.norm(dim=-1), 0.5)], None
+        if imu.R_world_imu is not None:
+            up = (imu.R_world_imu.double() @ imu.acc_imu.double()[..., None])[..., 0].mean(0) / GRAVITY
+            lengths.append(GRAVITY * up.norm().item())
+        usual = min(lengths, key=lambda length: abs(math.log(max(length, 1e-9) / GRAVITY)))
+        evidence = f"{'median' if usual == lengths[0] else 'mean in world axes'} {usual:.4g} m/s² long"
         if not 0.8 * GRAVITY < usual < 1.25 * GRAVITY:
             off = {name: abs(math.log(max(usual, 1e-9) * unit / GRAVITY)) for name, unit in _ACC_UNITS.items()}
             unit = min(off, key=lambda name: off[name])
@@ -300,10 +305,9 @@ def check_imu(stream: str, imu: ImuStream, joint: Trajectory | None) -> list[Fin
             if off[unit] < 0.25:
                 what, fix = f"is in {unit}, not m/s²", f"Multiply by {_ACC_UNITS[unit]:.5g}."
             findings.append(check.error(what, evidence, fix))
-        elif imu.R_world_imu is None:
+        elif up is None:
             findings.append(check.ok("measures gravity", evidence))
         else:
-            up = (imu.R_world_imu.double() @ imu.acc_imu.double()[..., None])[..., 0].mean(0) / GRAVITY
             evidence += f", points along ({', '.join(f'{v:+.2f}' for v in up.tolist())}) of the world"
             what = "gravity does not point along z"
             fix = "The sensor's orientation is in another world, or its axes are exchanged."
