@@ -148,7 +148,7 @@ def test_true_joints_lie_on_the_wearers_arm_in_the_real_frames(real_data):
     """Head pose, skeleton and camera model of three files meet in a picture: elbow to wrist runs along a black sleeve."""
     folder = real_data / "aria_adt_sample"
     cues = read_adt(folder / "raw").cues
-    T_world_aria = read_closed_loop(folder / "raw" / "aria_trajectory.csv", up="y")[0]
+    T_world_aria = read_closed_loop(folder / "raw" / "aria_trajectory.csv")[0]
     meta = json.loads((folder / "extracted" / "meta.json").read_text())
     about = meta["cameras"]["camera-slam-left"]
     focal, cx, cy, *lens = about["projection_params"]

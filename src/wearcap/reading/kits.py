@@ -66,7 +66,7 @@ def load_trajectory(path: Path, how: Conventions) -> Loaded:
     name = path.resolve().name.split(".")[0]
     if "aria_trajectory" in path.name or (path.is_file() and trajectory_format(path) == "MPS"):
         how.only(where=path)
-        track = read_closed_loop(path, up="y" if "aria_trajectory" in path.name else "z")[0]
+        track = read_closed_loop(path).trajectory
         return Loaded(Recording(name, head=head_stream(track, fps=None), source="Aria MPS"), [])
     how.only("unit", "up", "axes", "time_unit", "fps", where=path)
     settings = TrajectorySettings(
@@ -74,7 +74,7 @@ def load_trajectory(path: Path, how: Conventions) -> Loaded:
         how.axes,
         None if how.time_unit == AUTO else how.time_unit,
         None if how.fps == AUTO else float(how.fps),
-        how.unit_m,
+        how.unit,
     )
     recording = read_path(path, name, {}, settings)
     return Loaded(recording, [Check("trajectory").ok("read", recording.note)])
@@ -96,7 +96,7 @@ def load_mps(folder: Path) -> Loaded:
     """An MPS folder at 60 Hz, with findings about the raw file's clock, its quality score and the service's own report."""
     path = find_mps_file(folder, ("closed_loop_trajectory.csv",))
     assert path is not None, "is_mps_folder has seen it"
-    track, scores = read_closed_loop(path)
+    track, scores, _ = read_closed_loop(path)
     findings = check_clock("closed-loop file", track.timestamps)
     quality = scores.median().item()
     low = (scores < 0.5).float().mean().item()

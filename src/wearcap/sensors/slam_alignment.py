@@ -124,7 +124,9 @@ def align_cleaned(
     if dropped > MOST_DROPPED * len(kept):
         speed = first.scale * linear_velocity(slam).norm(dim=-1).median().item()
         fix = "Say the unit of length and of times, such as unit=0.01 for centimetres, time_unit=ms."
-        what = f"{dropped} of {len(kept)} poses accelerate as no head does; half of them are faster than {speed:.3g} m/s"
+        what = (
+            f"{dropped} of {len(kept)} poses accelerate as no head does; half of them are faster than {speed:.3g} m/s"
+        )
         raise WearcapError(what, expected="a head's path in metres and seconds", fix=fix)
     notes = [f"{dropped} outliers of {len(kept)} camera poses removed"] if dropped else []
     if len(jumps):
