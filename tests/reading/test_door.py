@@ -9,6 +9,7 @@ import short_walk
 from command_line import exit_code, files_in
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import Conventions
+from wearcap.io.formats.motion_npz import read_motion
 from wearcap.reading import examine, read
 from wearcap.recording import RecordingStore
 from wearcap_testing import recording_of, swaying_motion
@@ -111,3 +112,16 @@ def test_a_capture_never_passes_where_the_doctor_finds_an_error(real_data, tmp_p
             assert error.fix or error.expected, (path.name, error)
         else:
             assert not errors, (path.name, errors)
+
+
+def test_a_map_s_coordinates_can_be_put_back(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    time, R, t = short_walk.walk(seconds=4)
+    offset = np.array([458074.64, 5429380.17, 162.9])
+    short_walk.tum(tmp_path / "walk.txt", time, R, t + offset)
+    given = ["capture", "recording=walk.txt", "hydra.run.dir=out", "video=false", "smpl=false", "body=false"]
+    assert exit_code([*given, "map_coordinates=true"]) == 0
+    rows = (tmp_path / "out/motion.bvh").read_text().split("Frame Time:")[1].splitlines()[1:]
+    root = np.array([[float(word) for word in row.split()[:3]] for row in rows]) / 100  # y up: x is the world's y
+    assert np.abs(root[:, [2, 0]] - (offset[:2] + t[:, :2].mean(0))).max() < 4
+    assert "458074" in read_motion(tmp_path / "out/motion.npz").provenance["origin"]

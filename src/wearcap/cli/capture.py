@@ -96,13 +96,15 @@ def captured(config: Any, system: System) -> Motion | None:
         if config.checkpoint is not None:
             motion.provenance.update(checkpoint=str(config.checkpoint))
         motion.provenance.update(recording=str(config.recording))
+        if recording.origin is not None:
+            motion.provenance.update(origin=" ".join(map(str, recording.origin.tolist())))
         _write(motion, recording, environment, folder, config)
     return motion
 
 
 def _write(motion: Motion, recording: Recording, environment: Environment | None, folder: Path, config: Any) -> None:
     write_motion(motion, folder / "motion.npz")
-    write_bvh(motion, folder / "motion.bvh")
+    write_bvh(motion, folder / "motion.bvh", origin=recording.origin if config.map_coordinates else None)
     shown, body = motion, anny_body(motion.skeleton, recording.shape or None) if config.body is True else None
     if isinstance(config.body, str):
         shown, body, betas, pelvis = _on_smpl(motion, recording, config.body)

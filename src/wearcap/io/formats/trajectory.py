@@ -43,8 +43,8 @@ MAX_SPARSITY = 10.0
 _EPOCH_S = 9e8, 4.2e9
 """Seconds since 1970 of the years 1998 to 2103."""
 _MATRIX_WITHIN = 0.02
-_FAR, _FAR_FOR_EXTENT = 1e4, 20.0
-"""Distance from zero from which places are a map's, in units and in extents of the path."""
+_FAR, _FAR_FOR_EXTENT, _NOWHERE = 1e4, 20.0, 1e9
+"""Distance from zero from which places are a map's, in units and in extents of the path, and from which they are none."""
 _FRAMES = 1e6
 """Whole numbers below are frame numbers (nine hours at 30 Hz), larger ones times."""
 FORMATS = "TUM, EuRoC, COLMAP's images, hloc's poses, DROID-SLAM's arrays, MPS' closed loop, KITTI"
@@ -138,7 +138,7 @@ def read_trajectory_file(path: str | Path, time_unit: str | None = None, fps: fl
 def map_origin(translation: Float64[np.ndarray, "pose 3"]) -> Float64[np.ndarray, "3"] | None:
     """Whole numbers near the first place, for places much farther from zero than from one another; None for others."""
     extent = np.ptp(translation, axis=0).max()
-    if np.linalg.norm(translation[0]) < max(_FAR, _FAR_FOR_EXTENT * extent):
+    if not max(_FAR, _FAR_FOR_EXTENT * extent) < np.linalg.norm(translation[0]) < _NOWHERE:
         return None
     return np.floor(translation[0])
 
