@@ -16,8 +16,8 @@ from wearcap.io.conventions import Conventions
 from wearcap.io.devices.headset_axes import PALM_M, HeadsetLog, in_our_axes
 from wearcap.io.devices.headset_poses import raw_poses
 from wearcap.io.devices.headset_tables import (
-    Columns,
     DeviceRows,
+    PoseColumns,
     RawPoses,
     device_named,
     has_poses,
@@ -113,7 +113,7 @@ def _joined(parts: list[DeviceRows], path: Path) -> DeviceRows:
 def _replay(path: Path) -> dict[str, DeviceRows]:
     """Rows of head and sabers."""
     seconds, poses = read_bsor(path)
-    columns = Columns(dict.fromkeys("xyz"), dict.fromkeys("xyzw"), words={"saber"})
+    columns = PoseColumns("quaternion", (), frozenset({"saber"}), "xyzw")
     clocks, rows = {"time": seconds}, np.arange(1, len(seconds) + 1)
     return {
         joint: DeviceRows(columns, poses[:, k], clocks, frozenset(), rows, "frame")

@@ -2,7 +2,7 @@
 
 Names of columns are taken apart ("head_pos_x", "headPosX", "HMD.position.x", "LeftController Rotation W"): a device (head,
 left or right), a quantity (position, quaternion, Euler angles, matrix) and a component. JSON is an object or a list of
-frames, or one object a line; nested keys become such names, and arrays of 3, 4, 12 or 16 numbers their components, as do
+frames, or one object a line; nested keys become such names, and arrays of 3, 4, 7, 12 or 16 numbers their components, as do
 the vectors of a CSV's field. In a table of the long form a column names the device of each row.
 """
 
@@ -12,7 +12,7 @@ import re
 from array import array
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ _DEVICES = {
     "right_wrist": {"right", "r", "righthand", "rightcontroller", "rightwrist", "rhand"},
     "head": {"head", "h", "hmd", "headset", "camera", "centereye", "eye", "view", "viewer", "deviceanchor"},
 }
-_POSITION = {"pos", "position", "p", "loc", "location", "translation", "trans", "t", "origin"}
+_POSITION = {"pose", "pos", "position", "p", "loc", "location", "translation", "trans", "t", "origin"}
 _ROTATION = {"rot", "rotation", "quat", "quaternion", "orientation", "orient", "q", "ori"}
 _EULER = {"euler", "angle", "angles"}
 _MATRIX = {"matrix", "mat", "m", "transform"}
@@ -52,6 +52,8 @@ _LABELS = {
     "label", "joint"
 }  # fmt: skip
 _MAX_COLUMNS = LIMITS["log"].items
+_SIZES = (3, 4, 7, 12, 16)
+"""Numbers of a position or Euler angles, a quaternion, both, and matrices."""
 _LOOKED_AT = 200
 """Rows of which the layout follows."""
 _HOLOLENS = 18 + 26 * 16 + 1 + 26 * 16
@@ -74,48 +76,28 @@ class RawPoses:
     """"wrist" or "grip" where names show it, else None."""
 
 
-@dataclass
-class Columns:
-    """Places of a device's numbers: of a position, and of a quaternion, Euler angles, or Unreal's rotator; or of a matrix."""
+@dataclass(frozen=True)
+class PoseColumns:
+    """The columns of a device's pose."""
 
-    position: dict[str, Any] = field(default_factory=dict)
-    rotation: dict[str, Any] = field(default_factory=dict)
-    euler: dict[str, Any] = field(default_factory=dict)
-    rotator: dict[str, Any] = field(default_factory=dict)
-    matrix: dict[int, Any] = field(default_factory=dict)
-    tracked: list[Any] = field(default_factory=list)
-    words: set[str] = field(default_factory=set)
-
-    @property
-    def form(self) -> str | None:
-        """ "matrix", "quaternion", "rotator" or "euler"; None for columns that hold no pose."""
-        if len(self.matrix) in (12, 16) and set(self.matrix) == set(range(len(self.matrix))):
-            return "matrix"
-        if len(self.position) < 3:
-            return None
-        if set(self.rotation) in (set("xyzw"), set("0123")):
-            return "quaternion"
-        if len(self.rotator) == 3:
-            return "rotator"
-        return "euler" if len(self.euler) == 3 or set(self.rotation) in (set("xyz"), set("012")) else None
-
-    def places(self) -> list[Any]:
-        """Places in order: the matrix' elements, or x, y, z of the position and the rotation's components."""
-        if self.form == "matrix":
-            return [self.matrix[number] for number in sorted(self.matrix)]
-        turn = {"quaternion": self.rotation, "rotator": self.rotator, "euler": self.euler or self.rotation}[
-            self.form or ""
-        ]
-        return [*(self.position[name] for name in "xyz"), *(turn[name] for name in sorted(turn, key="xyzw0123".index))]
+    form: str
+    """What follows the position's x, y, z: a "quaternion", "euler" angles, or Unreal's "rotator"; or a whole "matrix"."""
+    places: tuple[Any, ...]
+    words: frozenset[str]
+    """All words of their names."""
+    order: str | None
+    """Of quaternions, where the names say it."""
+    tracked: tuple[Any, ...] = ()
+    """Places of flags that are false where the device is lost."""
 
 
 @dataclass(frozen=True)
 class DeviceRows:
     """A device's rows of a file: its numbers as they are laid out, and each column of times."""
 
-    columns: Columns
+    columns: PoseColumns
     values: np.ndarray
-    """(n, k) numbers in the order of `Columns.places`; what is missing is NaN."""
+    """(n, k) numbers of the columns; what is missing is NaN."""
     clocks: dict[str, np.ndarray]
     """(n,) by column's name, numbers as they stand there, texts as seconds of the day or since 1970."""
     texts: frozenset[str]
@@ -132,7 +114,7 @@ class _Layout:
 
     clocks: dict[str, Any]
     label: Any
-    devices: dict[str, Columns]
+    devices: dict[str, PoseColumns]
     """By joint; "" where a column names the device."""
 
 
@@ -146,7 +128,7 @@ def read_rows(path: Path, device: str | None = None) -> dict[str, DeviceRows]:
     layout = _layout(names, [row for _, row in begin], path, device)
     numbers, kinds, texts = array("q"), list[str](), set[str]()
     times = {name: array("d") for name in layout.clocks}
-    places, values = _places(layout), {joint: array("d") for joint in layout.devices}
+    values = {joint: array("d") for joint in layout.devices}
     for number, row in chain(begin, rows):
         read = row.get if isinstance(row, dict) else row.__getitem__
         kind, about = "", f"{where} {number}"
@@ -160,9 +142,9 @@ def read_rows(path: Path, device: str | None = None) -> dict[str, DeviceRows]:
             texts |= {name} if text else set()
         numbers.append(number)
         kinds.append(kind)
-        for joint, (wanted, tracked) in places.items():
-            lost = any(str(read(place)).strip().lower() in _FALSE for place in tracked)
-            found = [math.nan if lost else _value(read(place), joint or kind, about, path) for place in wanted]
+        for joint, columns in layout.devices.items():
+            lost = any(str(read(place)).strip().lower() in _FALSE for place in columns.tracked)
+            found = [math.nan if lost else _value(read(place), joint or kind, about, path) for place in columns.places]
             values[joint].extend(found)
     if not numbers:
         raise WearcapError("a header, but no rows", path, "a row for each frame")
@@ -253,11 +235,11 @@ def _fields(line: str, separator: str) -> list[str]:
 
 
 def _vector(text: str) -> list[str]:
-    """Numbers of a field that holds 3, 4, 12 or 16 of them; [] for any other."""
+    """Numbers of a field that holds as many as a pose or a part of it; [] for any other."""
     parts = re.split(r"[;,]?\s+|;", text.strip())
     parts = parts if len(parts) > 1 else text.split(",")
     number = re.compile(r"[-+]?(\d+([.,]\d*)?([eE][-+]?\d+)?|nan|NaN)")
-    return parts if len(parts) in (3, 4, 12, 16) and all(map(number.fullmatch, parts)) else []
+    return parts if len(parts) in _SIZES and all(map(number.fullmatch, parts)) else []
 
 
 def _hololens_names(count: int) -> list[str]:
@@ -313,7 +295,7 @@ def _flat(value: Any, key: str = "", depth: int = 0) -> dict[str, Any]:
             )
             value = {" ".join(named): item for item, named in words if named}
         else:
-            value = dict(enumerate(value)) if len(value) in (3, 4, 12, 16) else {}
+            value = dict(enumerate(value)) if len(value) in _SIZES else {}
     if not isinstance(value, dict):
         return {key: value}
     found: dict[str, Any] = {}
@@ -329,18 +311,18 @@ def _flat(value: Any, key: str = "", depth: int = 0) -> dict[str, Any]:
 
 def _layout(names: dict[str, Any], begin: Sequence[Any], where: Path, device: str | None) -> _Layout:
     """What the columns are, by their names and by some rows; a head with poses, or the `device`'s, is required."""
-    found: dict[str, Columns] = {joint: Columns() for joint in (*_DEVICES, "")}
-    clocks: dict[str, Any] = {}
-    labels = []
+    groups: dict[str, dict[tuple[str, str], dict[str, Any]]] = {joint: {} for joint in ("head", *WRISTS, "")}
+    clocks, labels = {}, []
     for name, place in names.items():
         parts = parts_of(name)
-        joint = device_named(parts[:-1] if parts[-1:] and not set(parts[-1:]) & _LABELS else parts)
-        if set(parts) & _TIME and (joint is None or len(parts) == 1):
+        joint = device_named(parts[:-1])
+        if found := _quantity(name, parts):
+            groups[joint or ""].setdefault(found[:2], {}).setdefault(found[2], place)
+        elif set(parts) & _TIME and (joint is None or len(parts) == 1):
             clocks[name] = place
-        if joint is None and set(parts) & _LABELS:
+        elif joint is None and set(parts) & _LABELS:
             labels.append(place)
-        _sort_in(found[joint or ""], name, place, parts)
-    devices = {joint: columns for joint, columns in found.items() if columns.form}
+    devices = {joint: one for joint, of in groups.items() if (one := _pose_columns(of)) is not None}
     label = None
     if device is not None:
         own = devices.get(device, devices.get(""))
@@ -359,37 +341,66 @@ def _layout(names: dict[str, Any], begin: Sequence[Any], where: Path, device: st
     return _Layout(clocks, label, devices)
 
 
-def _places(layout: _Layout) -> dict[str, tuple[list[Any], list[Any]]]:
-    """Places of each device's numbers, and of its flags of tracking."""
-    return {joint: (columns.places(), columns.tracked) for joint, columns in layout.devices.items()}
-
-
-def _sort_in(columns: Columns, name: str, place: Any, parts: list[str]) -> None:
-    """Enter a column under its quantity and component."""
-    words, last = set(parts[:-1]), parts[-1] if parts else ""
-    if words & _OTHER:
-        return
+def _quantity(name: str, parts: list[str]) -> tuple[str, str, str] | None:
+    """What a column is of a device ("position", "rotation", "euler", "rotator", "matrix", "tracked"), the other words of
+    its name, and its component."""
+    *before, last = parts or [""]
+    if set(before) & _OTHER:
+        return None
     if last in _TRACKED:
-        columns.tracked.append(place)
-        return
-    glued = re.fullmatch(r"(pos|position|p|rot|rotation|quat|q|r|m|euler)([xyzw]|\d\d?)", last)
-    if glued:
-        words, last = words | {"rot" if glued[1] == "r" else glued[1]}, glued[2]
-    numbered = last.isdecimal() and len(last) <= 2
-    if numbered and (words & _MATRIX or parts[-2].isdecimal()):
-        pair = last if len(last) == 2 and name.lower().rstrip().endswith("m" + last) else parts[-2] + last
-        single = len(pair) != 2 or not pair.isdecimal()
-        columns.matrix.setdefault(int(last) if single else 4 * int(pair[0]) + int(pair[1]), place)
-    elif last in _ROTATOR:
-        columns.rotator.setdefault(_ROTATOR[last], place)
-    elif last in "xyzw" or numbered:
-        if words & _EULER:
-            columns.euler.setdefault(last, place)
-        elif words & _ROTATION or parts[1:-1].count("r") or (last == "w" and not words & _POSITION):
-            columns.rotation.setdefault(last, place)
-        elif (words & _POSITION or last in "xyz") and last in ("0", "1", "2", *"xyz"):
-            columns.position.setdefault("xyz"[int(last)] if numbered else last, place)
-    columns.words |= set(parts)
+        return "tracked", "", name
+    if last in _ROTATOR:
+        return "rotator", " ".join(before), _ROTATOR[last]
+    if glued := re.fullmatch(r"(pos|position|p|rot|rotation|quat|q|r|m|euler)([xyzw]|\d\d?)", last):
+        before, last = [*before, "rot" if glued[1] == "r" else glued[1]], glued[2]
+    words, numbered = set(before), last.isdecimal() and len(last) <= 2
+    if numbered and before and (words & _MATRIX or before[-1].isdecimal()):
+        nested = before[-1].isdecimal()
+        pair = before.pop() + last if nested else last if name.lower().rstrip().endswith("m" + last) else ""
+        number = 4 * int(pair[0]) + int(pair[1]) if re.fullmatch(r"[0-3]{2}", pair) else int(last)
+        return "matrix", " ".join(before), str(number)
+    if last not in ("x", "y", "z", "w") and not numbered:
+        return None
+    turned = words & _ROTATION or "r" in parts[1:-1]
+    kind = (
+        "euler" if words & _EULER else "rotation" if turned else "position" if words & _POSITION or not numbered else ""
+    )
+    return (kind, " ".join(before), last) if kind else None
+
+
+def _pose_columns(groups: dict[tuple[str, str], dict[str, Any]]) -> PoseColumns | None:
+    """The first whole pose among a device's columns, grouped by their quantity and the other words of their names."""
+
+    def first(quantity: str, *components: Iterable[str]) -> tuple[list[Any], str, bool] | None:
+        for wanted in map(list, components):
+            for (kind, prefix), places in groups.items():
+                if (
+                    kind == quantity
+                    and set(wanted) <= set(places)
+                    and (quantity == "position" or len(wanted) == len(places))
+                ):
+                    return [places[name] for name in wanted], prefix, wanted[0] == "x"
+        return None
+
+    tracked = tuple(place for (kind, _), places in groups.items() if kind == "tracked" for place in places.values())
+    numbers = [str(number) for number in range(16)]
+    if found := first("matrix", numbers, numbers[:12]):
+        return PoseColumns("matrix", tuple(found[0]), frozenset(found[1].split()), None, tracked)
+    if found := first("position", "0123456"):
+        return PoseColumns("quaternion", tuple(found[0]), frozenset(found[1].split()), None, tracked)
+    position = first("position", "xyz", "012")
+    forms = {
+        "quaternion": ("rotation", "xyzw", "0123"),
+        "rotator": ("rotator", "012"),
+        "euler": ("rotation", "xyz", "012"),
+    }
+    for form, sought in (*forms.items(), ("euler", ("euler", "xyz", "012"))):
+        if position and (found := first(*sought)):
+            named = {*position[1].split(), *found[1].split()}
+            order = "xyzw" if found[2] else next((one for one in ("xyzw", "wxyz") if one in named), None)
+            order = order if form == "quaternion" else None
+            return PoseColumns(form, (*position[0], *found[0]), frozenset(named), order, tracked)
+    return None
 
 
 def _value(value: Any, name: str, label: str, path: Path) -> float:
