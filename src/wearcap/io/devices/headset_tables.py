@@ -13,7 +13,7 @@ from array import array
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import chain, islice
+from itertools import chain, islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -180,9 +180,9 @@ def parts_of(name: str) -> list[str]:
     return [word.lower() for word in re.findall(r"[A-Za-zµ]+|\d+", split)]
 
 
-def device_named(parts: Iterable[str]) -> str | None:
-    """The joint whose device some words name."""
-    words = set(parts)
+def device_named(parts: Sequence[str]) -> str | None:
+    """The joint whose device some words name, also two of them in one ("device anchor")."""
+    words = {*parts, *map("".join, pairwise(parts))}
     if words & _OTHER:
         return None
     named = next((joint for joint, known in _DEVICES.items() if words & known), None)
@@ -288,6 +288,8 @@ def _flat(value: Any, key: str = "", depth: int = 0) -> dict[str, Any]:
     """
     if depth > 8:
         return {}
+    if isinstance(value, str):
+        value = dict(enumerate(_vector(value))) or value
     if isinstance(value, list):
         if value and all(isinstance(item, dict) for item in value):
             words = (

@@ -36,7 +36,7 @@ def moment(value: Any, label: str, path: Path) -> tuple[float, bool]:
     try:
         if isinstance(text, bool):
             raise ValueError
-        return float(text), False
+        return float(text.replace(",", ".") if isinstance(text, str) else text), False
     except (TypeError, ValueError, OverflowError) as error:
         found = _CLOCK.fullmatch(text) if isinstance(text, str) else None
         if found is None or (found[4] is None and not (found[7] or found[8])):

@@ -9,7 +9,7 @@ from wearcap.boundary.opening import open_bytes, read_bytes
 from wearcap.errors import WearcapError
 
 _MAGIC = struct.pack("<IB", 0x442D3D69, 1)
-_STRINGS = 11, 3
+_STRINGS = 13, 3
 """Texts of the block of information: before the score, and after it."""
 _NUMBERS = 4 + 1 + 4 * 4
 """Bytes after them: the jump's distance, a flag, and four numbers."""
