@@ -21,6 +21,8 @@ SIDES = ("left", "right")
 LIMBS = {"leg": ("hip", "knee", "ankle"), "arm": ("shoulder", "elbow", "wrist")}
 _BENT = 0.26
 """Sine of the bend (15°) from which a knee or an elbow shows its axis."""
+_STRAIGHT = 0.8
+"""Cosine of the largest turn (37°) of a standing bind pose's trunk and shoulders."""
 _SNAP_DEG = 20
 """Bind poses that stand this near to the file's axes are taken to stand along them."""
 
@@ -73,6 +75,13 @@ def standing_rotation(
             return None, "its arms are crossed or raised"
     if p[found.head][2] - p[legs[0][0]][2] < 0.5 * (p[legs[0][0]] - p[legs[0][2]]).norm():
         return None, "its head is not above its hips"
+    trunk = p[[arm[0] for arm in arms]].mean(0) - p[[leg[0] for leg in legs]].mean(0)
+    shoulders = p[arms[0][0]] - p[arms[1][0]]
+    if trunk[2] < _STRAIGHT * trunk.norm() or shoulders[1] < _STRAIGHT * shoulders.norm():
+        return None, "its trunk is bent or turned"
+    feet = [p[toe] - p[found.limb[f"{side}_leg"][2]] for side, toe in found.toe.items()]
+    if any(foot[0] < 0.3 * foot[:2].norm() for foot in feet):
+        return None, "its feet do not point ahead"
     return R.T, ""
 
 
