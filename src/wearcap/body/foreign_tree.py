@@ -225,6 +225,6 @@ def _hinged(
         if weight.sum() > 0.05 * max(5, len(weight) ** 0.5):
             frames[joint] = (_frame(along[0], along[1] * bone, hinge[0], hinge[1] * axis), weight)
         else:
-            swung = swing_between(along[1] * trunk[..., along[0]], along[1] * bone) @ trunk
+            swung = swing_between(trunk[..., along[0]], along[1] * bone) @ trunk
             frames[joint] = (swung, torch.ones_like(weight))
     return frames
