@@ -14,19 +14,21 @@ from wearcap.boundary.texts import numbered_lines
 from wearcap.errors import WearcapError, nearest
 from wearcap.io.datasets.amass import read_amass
 from wearcap.prepare.engine import NOTE, Splits, Task, content_hash, source_folder
-from wearcap.prepare.foreign import read_foreign_motion
+from wearcap.prepare.foreign import read_foreign_motion, straightest
 from wearcap.prepare.foreign_conventions import Mapping, read_mapping
-from wearcap.prepare.foreign_files import asf_beside
+from wearcap.prepare.foreign_files import Take, asf_beside
 from wearcap.prepare.levels import Levels, levels_in
 from wearcap.prepare.mocap import About, MocapSettings, mocap_recording
 from wearcap.recording.recording import Recording
 
-CMU_VERSION, BVH_VERSION, AMASS_VERSION = 3, 1, 2
+CMU_VERSION, BVH_VERSION, AMASS_VERSION = 3, 2, 2
 """Versions of the conversions, increased when the same source and settings yield another recording."""
 
 MOTION_SUFFIXES = (".amc", ".amc.xz", ".amc.gz", ".bvh", ".bvh.xz", ".bvh.gz")
 LEVEL_TRIALS = 6
 """Number of a subject's trials from which the tilts of head and feet are estimated."""
+SIBLINGS, SIBLING_FRAMES = 24, 150
+"""Number of a subject's BVH files that are looked through for `LEVEL_TRIALS` straight ones, and of frames used of each."""
 
 NO_MOTION = ("shape.npz", "stagei.npz")
 """Name suffixes of AMASS's files that hold no motion."""
@@ -43,11 +45,12 @@ def _foreign_recording(
 ) -> Recording:
     """One file of motion, fitted to its joints; what was detected is kept in the motion's provenance as `conventions`.
 
-    The tilts of head and feet are estimated from `same_subject`, trials of the same subject and skeleton file. Raises
-    WearcapError for an AMC file without a skeleton.
+    The tilts of head and feet, and a BVH file's axes, are estimated from `same_subject`, trials of the same subject.
+    Raises WearcapError for an AMC file without a skeleton.
     """
     levels = None if asf is None else _levels(asf, same_subject, amc_fps)
-    read = read_foreign_motion(file, mapping, amc_fps=amc_fps, asf=asf, levels=levels)
+    siblings = _siblings(same_subject, tuple(mapping.joints.items())) if asf is None else ()
+    read = read_foreign_motion(file, mapping, amc_fps=amc_fps, asf=asf, levels=levels, siblings=siblings)
     recording = mocap_recording(read.motion, about, settings)
     assert recording.motion is not None
     known = recording.motion.provenance
@@ -66,6 +69,12 @@ def _levels(asf: Path, files: tuple[Path, ...], amc_fps: float | int) -> Levels 
             read = read_foreign_motion(file, amc_fps=amc_fps, asf=asf, levels=Levels(None, {}))
             motions.append(read.motion)
     return levels_in(motions) if motions else None
+
+
+@cache
+def _siblings(files: tuple[Path, ...], joints: tuple[tuple[str, str], ...]) -> tuple[Take, ...]:
+    """A subject's clips in which people stand straight."""
+    return straightest(files, Mapping(dict(joints)), LEVEL_TRIALS, SIBLING_FRAMES)
 
 
 def cmu_tasks(
@@ -165,14 +174,17 @@ def _motion_tasks(
             with suppress(WearcapError):  # raised again by the trial's own task
                 skeletons[name] = asf_beside(path)
         same.setdefault((abouts[name].subject, skeletons[name]), []).append(path)
+    spread, digests = {}, {}
+    for key, files in same.items():
+        spread[key] = tuple(files[:: -(-len(files) // (LEVEL_TRIALS if key[1] else SIBLINGS))])
+        digests[key] = content_hash(*spread[key])
     tasks = []
     for name, path in trials.items():
         asf, about = skeletons[name], abouts[name]
-        others = same[about.subject, asf]
-        spread = tuple(others[:: -(-len(others) // LEVEL_TRIALS)]) if asf is not None else ()
-        make = partial(_foreign_recording, path, asf, about, amc_fps, mapping, settings, spread)
-        described = [asdict(about), asdict(settings), asdict(mapping), amc_fps, version]
-        sources = [path] if asf is None else [path, asf, *spread]
+        others = (about.subject, asf)
+        make = partial(_foreign_recording, path, asf, about, amc_fps, mapping, settings, spread[others])
+        described = [asdict(about), asdict(settings), asdict(mapping), amc_fps, version, digests[others]]
+        sources = [path] if asf is None else [path, asf]
         tasks.append(Task(name, make, splits.of(about.subject), content_hash(*described, *sources)))
     return tasks
 
