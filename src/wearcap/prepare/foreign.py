@@ -108,7 +108,7 @@ def read_foreign_motion(
 
     `mapping` (a YAML file with any of joints, unit, up, forward) overrides what is detected; `levels` replaces what the
     file itself shows of how head and feet are level. Conventions and joints' axes follow from the file's frames and from
-    those of `siblings`, of which other skeletons' are passed over. Raises WearcapError for a file that is damaged or holds no body
+    those of `siblings`, clips of the same skeleton. Raises WearcapError for a file that is damaged or holds no body
     with head, arms and legs, saying what is missing.
     """
     path = Path(path)
@@ -140,7 +140,7 @@ def read_foreign_motion(
             *notes,
             f"{note} uncertain, the head's by up to 50°: read it in a folder of the same skeleton's clips.",
         )
-    with_others = f" and that of {len(siblings)} clips beside it" if len(take.t) > len(own.t) else ""
+    with_others = f" and that of {len(siblings)} clips beside it" if siblings else ""
     report = ForeignReport(
         path.name,
         naming,
@@ -159,14 +159,12 @@ def read_foreign_motion(
 
 
 def _joined(take: Take, siblings: Sequence[Take]) -> Take:
-    """The take, followed by the frames of those siblings that are of the same skeleton."""
+    """The take, followed by its siblings' frames."""
     for other in siblings:
-        if other.names == take.names and torch.allclose(other.rest, take.rest, rtol=1e-3, atol=1e-4):
-            times = other.timestamps + take.timestamps[-1] + 1  # a second between them
-            R, t, timestamps = (
-                torch.cat(pair) for pair in ((take.R, other.R), (take.t, other.t), (take.timestamps, times))
-            )
-            take = replace(take, R=R, t=t, timestamps=timestamps)
+        times = other.timestamps + take.timestamps[-1] + 1  # a second between them
+        pairs = ((take.R, other.R), (take.t, other.t), (take.timestamps, times))
+        R, t, timestamps = (torch.cat(pair) for pair in pairs)
+        take = replace(take, R=R, t=t, timestamps=timestamps)
     return take
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import cache, partial
+from itertools import takewhile
 from pathlib import Path
 
 from wearcap.boundary.opening import understood
@@ -167,26 +168,35 @@ def _motion_tasks(
     version: int,
 ) -> list[Task]:
     skeletons: dict[str, Path | None] = {}
-    same: dict[tuple[str, Path | None], list[Path]] = {}
+    groups: dict[str, tuple[str, Path | str | None]] = {}
+    same: dict[tuple[str, Path | str | None], list[Path]] = {}
     for name, path in trials.items():
-        skeletons[name] = None
-        if ".amc" in path.name.lower():
-            with suppress(WearcapError):  # raised again by the trial's own task
-                skeletons[name] = asf_beside(path)
-        same.setdefault((abouts[name].subject, skeletons[name]), []).append(path)
-    spread, digests = {}, {}
-    for key, files in same.items():
-        spread[key] = tuple(files[:: -(-len(files) // (LEVEL_TRIALS if key[1] else SIBLINGS))])
-        digests[key] = content_hash(*spread[key])
+        skeletons[name], skeleton = None, None
+        with suppress(WearcapError):  # raised again by the trial's own task
+            is_amc = ".amc" in path.name.lower()
+            skeletons[name] = asf_beside(path) if is_amc else None
+            skeleton = skeletons[name] if is_amc else _hierarchy(path)
+        groups[name] = (abouts[name].subject, skeleton)
+        same.setdefault(groups[name], []).append(path)
+    spread = {
+        group: tuple(files[:: -(-len(files) // (SIBLINGS if isinstance(group[1], str) else LEVEL_TRIALS))])
+        for group, files in same.items()
+    }
+    digests = {group: content_hash(*files) for group, files in spread.items()}
     tasks = []
     for name, path in trials.items():
         asf, about = skeletons[name], abouts[name]
-        others = (about.subject, asf)
-        make = partial(_foreign_recording, path, asf, about, amc_fps, mapping, settings, spread[others])
-        described = [asdict(about), asdict(settings), asdict(mapping), amc_fps, version, digests[others]]
+        make = partial(_foreign_recording, path, asf, about, amc_fps, mapping, settings, spread[groups[name]])
+        described = [asdict(about), asdict(settings), asdict(mapping), amc_fps, version, digests[groups[name]]]
         sources = [path] if asf is None else [path, asf]
         tasks.append(Task(name, make, splits.of(about.subject), content_hash(*described, *sources)))
     return tasks
+
+
+def _hierarchy(path: Path) -> str:
+    """Digest of a BVH file's joints and OFFSETs but for the root's place: equal for clips of one skeleton."""
+    lines = takewhile(lambda line: line.upper() != "MOTION", (line.strip() for _, line in numbered_lines(path)))
+    return content_hash("\n".join(lines).partition("CHANNELS")[2])
 
 
 def _subjects(source: Path, trials: dict[str, Path], subject: str | None) -> dict[str, str]:
