@@ -20,6 +20,7 @@ from wearcap.body.retarget import fit_offsets, retarget
 from wearcap.body.skeleton import xsens23
 from wearcap.boundary.opening import placed
 from wearcap.errors import WearcapError
+from wearcap.io.conventions import AUTO, Conventions
 from wearcap.io.formats.bvh import axes_rotation
 from wearcap.prepare.foreign_conventions import (
     Mapping,
@@ -83,7 +84,7 @@ class ForeignReport:
         frames = self.frames.split(",")[0]
         return (
             f"names {self.convention}, {self.unit}, {self.up} up, frames from {frames}; {1000 * mean:.1f} mm from the "
-            f"file's joints (worst {1000 * worst:.1f})"
+            f"file's joints (worst {1000 * worst:.1f})" + "".join(f"; {note}" for note in self.notes)
         )
 
 
@@ -103,16 +104,19 @@ def read_foreign_motion(
     asf: Path | None = None,
     levels: Levels | None = None,
     siblings: Sequence[Take] = (),
+    how: Conventions | None = None,
 ) -> ForeignMotion:
     """Read a .bvh, or an .amc with `asf` or the skeleton file beside it (plain, .xz or .gz), onto xsens23.
 
-    `mapping` (a YAML file with any of joints, unit, up, forward) overrides what is detected; `levels` replaces what the
+    `mapping` (a YAML file with any of joints, unit, up, forward) overrides what is detected, and `how` both; `levels` replaces what the
     file itself shows of how head and feet are level. Conventions and joints' axes follow from the file's frames and from
     those of `siblings`, clips of the same skeleton. Raises WearcapError for a file that is damaged or holds no body
     with head, arms and legs, saying what is missing.
     """
     path = Path(path)
     given = mapping if isinstance(mapping, Mapping) else Mapping() if mapping is None else read_mapping(mapping)
+    how = how or Conventions()
+    given = replace(given, unit_m=how.unit_m or given.unit_m, up=given.up if how.up == AUTO else how.up)
     own = read_take(path, amc_fps, asf)
     take = _joined(own, siblings)
     found, found_by = find_body(take, given, path)
@@ -133,7 +137,9 @@ def read_foreign_motion(
     motion = with_levels(motion, levels).sliced(0, len(own.t))
     if not (motion.R_parent_joint.isfinite().all() and motion.t_world_root.isfinite().all()):
         raise WearcapError("no skeleton can be fitted to its joints", path, "joints apart from one another")
-    roles, notes = joint_roles(found), take.notes
+    roles = joint_roles(found)
+    stated = [f"{name}={value}" for name in ("unit", "up") if (value := getattr(how, name)) != AUTO]
+    notes = (*take.notes, *(f"Stated: {each}." for each in stated))
     if odd and (straight := straightness(take.t, found).max().item()) < LEAST_STRAIGHT:
         note = f"Nobody stands straight in it (straightness {straight:.2f} of 1), so that the axes of its joints are"
         notes = (

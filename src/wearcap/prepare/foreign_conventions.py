@@ -147,7 +147,7 @@ def find_unit(take: Take, found: BodyJoints, mapping: Mapping, path: Path) -> tu
     likely = [(name, UNITS_M[name]) for name in LIKELY_UNITS]
     if mapping.unit_m is not None or take.unit_m is not None:
         unit_m = mapping.unit_m or take.unit_m or 1.0
-        name = "as the mapping says" if mapping.unit_m else "as the format says"
+        name = "as stated" if mapping.unit_m else "as the format says"
     else:
         usual = [row for row in likely if USUAL_HEIGHT_M[0] <= height * row[1] <= USUAL_HEIGHT_M[1]]
         name, unit_m = (usual or sorted(likely, key=lambda row: abs(torch.tensor(height * row[1] / 1.7).log().item())))[
