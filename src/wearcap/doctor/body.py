@@ -149,16 +149,17 @@ def _check_axes(check: Check, motion: Motion, parts: Landmarks) -> list[Finding]
     ahead = torch.linalg.cross(across[0], upward[0])
     walks = stands & (linear_velocity(root).norm(dim=-1) > 0.5) & ((ahead * way).sum(-1) > 0.9)
     evidence, severity = [], 0
-    for name, joint, least in (("pelvis", parts.root, 0.8), ("trunk", parts.spine[-1], 0.8), ("head", parts.head, 0.3)):
+    limits = (("pelvis", parts.root, 0.8, 0.5), ("trunk", parts.spine[-1], 0.8, 0.5), ("head", parts.head, 0.3, 0.3))
+    for name, joint, least_up, least_ahead in limits:
         R = T.R[:, joint].double()
         up, aside = R[stands, 2, 2].mean().item(), R[stands, 2, 1].mean().abs().item()
         if joint != parts.head:
             faces = (R[..., 1] * across[joint != parts.root]).sum(-1)[stands].mean().item()
         else:
             faces = quantile((R[walks, :, 0] * way[walks]).sum(-1), 0.5) if walks.sum() >= 10 else 1.0
-        if up < least + 0.1 or aside > 0.45 or faces < 0.7:
+        if up < least_up + 0.05 or aside > 0.5 or faces < least_ahead + 0.15:
             evidence.append(f"{name} up by {up:.2f}, ahead by {faces:.2f} of 1")
-            severity = max(severity, 2 if up < least or aside > 0.6 or faces < 0.5 else 1)
+            severity = max(severity, 2 if up < least_up or aside > 0.6 or faces < least_ahead else 1)
     if not severity:
         return [check.ok("pelvis, trunk and head are upright and ahead", f"in {int(stands.sum())} frames that stand")]
     fix = "The axes of its joints are not x ahead, z up: read the file that they come from, with its skeleton's other clips."
