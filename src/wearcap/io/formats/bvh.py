@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wearcap.body.skeleton import Site, Skeleton
@@ -319,8 +319,7 @@ def _channels(
 ) -> tuple[Float[Tensor, "time joint 3"], Float[Tensor, "time joint 3 3"], int]:
     """Places in the parents' frames (file units), rotations, and the number of joints whose positions are shifts.
 
-    Some writers give children shifts from OFFSET, near zero, instead of the whole offset: they are added to it. What a
-    joint's channels are is seen where they vary least: hips that travel keep their height.
+    Some writers give children shifts from OFFSET, near zero, instead of the whole offset: they are added to it.
     """
     columns = torch.from_numpy(values)
     starts = np.cumsum([0, *(len(joint.channels) for joint in joints)]).tolist()
@@ -334,9 +333,8 @@ def _channels(
                 moved.add(k)
         by_order.setdefault("".join(axis for kind, axis in joint.channels if kind == "r"), []).append(k)
     children = sorted(moved - {0})
-    median, rest = t[:, children].median(0).values, t.new_tensor([joints[k].offset for k in children]).reshape(-1, 3)
-    spread = (t[:, children] - median).square().mean(0) + (0.02 * rest).square().sum(-1, keepdim=True)
-    shifted = (((median - rest).square() - median.square()) / spread).sum(-1) > 0
+    rest = t.new_tensor([joints[k].offset for k in children]).reshape(-1, 3)
+    shifted = _are_shifts(t[:, children], rest)
     t[:, children] += rest * shifted[:, None]
     R = torch.eye(3, dtype=torch.float64).repeat(len(values), len(joints), 1, 1)
     for order, members in by_order.items():
@@ -344,6 +342,19 @@ def _channels(
             index = [starts[k] + joints[k].channels.index(("r", axis)) for k in members]
             R[:, members] = R[:, members] @ about_axis(axis, columns[:, index] * (math.pi / 180))
     return t, R, int(shifted.sum())
+
+
+def _are_shifts(values: Float[Tensor, "time joint 3"], rest: Float[Tensor, "joint 3"]) -> Bool[Tensor, "joint"]:
+    """Whether joints' position channels are shifts, near zero, from their OFFSETs `rest` rather than near these.
+
+    Each axis on which one is clearly nearer votes. A joint whose axes disagree, as of hips far from their OFFSET, or do
+    not vote, follows the others.
+    """
+    median = values.median(0).values
+    room = (values - median).abs().mean(0) + 0.02 * rest.abs() + 1e-9
+    for_shift = (((median - rest).abs() + room) / (median.abs() + room)).log()
+    votes = (for_shift > 1).any(-1).int() - (for_shift < -1).any(-1).int()
+    return torch.where(votes == 0, votes.sum(), votes) > 0
 
 
 def _bones(path: Path, content: BvhContent, unit_m: float) -> Float[Tensor, "joint 3"]:
