@@ -159,5 +159,5 @@ def test_a_sensor_without_attitude_is_read_by_the_doctor_alone(tmp_path):
     with pytest.raises(WearcapError, match="without orientation.*Quaternion.csv"):
         read_watch_log(path, "left_wrist")
     other = x_imu(replace(moved(), R_world_imu=rotation.about_axis("x", torch.full((120,), 2.0))), tmp_path)
-    with pytest.raises(WearcapError, match="upright by the attitude"):
+    with pytest.raises(WearcapError, match="the attitude turns gravity .* upright"):
         read_inertial_log(other, "left_wrist")
