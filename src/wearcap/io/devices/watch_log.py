@@ -7,20 +7,24 @@ attitude (watch to world or back) from which of the two turns gravity upright, a
 down (Core Motion, whose accelerations have the sign reversed: at rest it reports -1 g along the axis that is up) or up.
 """
 
+import itertools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS
 from wearcap.boundary.opening import understood
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
+from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
 from wearcap.geometry.trajectory import slerp
 from wearcap.io.formats.csv_table import TableLayout, read_columns, read_layout
 from wearcap.io.formats.poses import are_rotations
@@ -34,9 +38,9 @@ UPRIGHT, UPRIGHT_WHOLE = 0.98, 0.9
 known only with the movement's acceleration, which does not quite cancel."""
 _XYZ, _WXYZ = ("x", "y", "z"), ("w", "x", "y", "z")
 _NAMES: dict[str, tuple[str, Sequence[Sequence[str]]]] = {
-    "turn": ("motionrotationrate rotationrate gyroscope gyro gyr rotation angularvelocity angularrate w", [_XYZ]),
-    "gravity": ("motiongravity gravity grav", [_XYZ]),
-    "free": ("motionuseracceleration useracceleration useraccel linearacceleration linearaccel linacc", [_XYZ]),
+    "turn": ("motionrotationrate rotationrate gyroscope gyro gyr rotation angularvelocity w", [_XYZ]),
+    "gravity": ("motiongravity gravity", [_XYZ]),
+    "free": ("motionuseracceleration useracceleration linearacceleration linearaccel linacc", [_XYZ]),
     "whole": ("accelerometeracceleration watchaccelerometer totalacceleration gf", [_XYZ]),
     "either": ("acceleration accelerometer accel acc a", [_XYZ]),
     "world": ("freeacc", [("e", "n", "u"), ("n", "w", "u"), _XYZ]),
@@ -46,16 +50,22 @@ _NAMES: dict[str, tuple[str, Sequence[Sequence[str]]]] = {
     ),
     "matrix": ("mat", [[f"{row}{column}" for row in "123" for column in "123"]]),
 }
-"""Names of columns without unit, signs and capitals, but for the axis; then the axes' names. `free` is without gravity, `whole` with it,
-`either` one of both, all in the sensor's axes; `world` is without gravity, in the world's."""
+"""Columns' names without unit, signs and capitals, but for the axis, and the axes'. In the sensor's axes `free` is without
+gravity, `whole` with it, `either` one of both; `world` is without, in the world's."""
 _PLAIN = re.compile("watchaccelerometer|totalacceleration|accelerometer|gravity|gyroscope")
 """What columns x, y and z hold, by the file's name."""
-_POSITION = re.compile("[tp][xyz](?!.*rate)|pos")
-_TIMES = ("sampletimefine", "loggingtime", "time", "epoch", "unix", "secondselapsed", "elapsed", "packetcounter", "t")
+_POSITION = re.compile("[tp][xyz]|pos")
+_TIMES = re.compile(
+    "(sampletimefine)|(loggingtime)|(motiontimestamp)|(time|epoch|unix|t$)|(secondselapsed)|(packetcounter)"
+)
+"""Beginnings of the names of times, the best first."""
+_ACCELERATION, _X_IMU = {"free", "whole", "either", "world"}, "inertial"
+_PERIODS = {"sampletimefine": 2.0**32, "packetcounter": 2.0**16}
 _BESIDE = ("Inertial", "Accelerometer", "TotalAcceleration", "Gravity", "Gyroscope", "Orientation", "Quaternion")
 """Files of one sensor in one folder: x-IMU3's and Sensor Logger's of a phone."""
+_ACCELERATION, _X_IMU = {"free", "whole", "either", "world"}, "inertial"
 _PERIODS = {"sampletimefine": 2.0**32, "packetcounter": 2.0**16}
-RECORD_MOTION = (
+_RECORD_MOTION = (
     "Record whole motion samples, not single sensors: Wrist Motion (Sensor Logger), Device Motion (SensorLog), "
     "quaternion and free acceleration (MT Manager, Movella DOT), or put the sensor's other files beside."
 )
@@ -71,32 +81,27 @@ class WatchConvention:
     """Whether its attitude turns the world to the watch, and not the watch to the world."""
 
 
-_CORE_MOTION, _ANDROID = WatchConvention(-G_M_S2, False), WatchConvention(1.0, False)
 _DOCUMENTED = {
-    ("motionuseracceleration", "motionquaternion"): _CORE_MOTION,
-    ("linearacceleration", "rotationvector"): _ANDROID,
+    ("motionuseracceleration", "motionquaternion"): WatchConvention(-G_M_S2, False),  # Core Motion
+    ("linearacceleration", "rotationvector"): WatchConvention(1.0, False),  # Android
 }
 """By the names of free acceleration and attitude, for logs without gravity, which would show it."""
 
 
-@dataclass(frozen=True)
-class WatchLog:
-    """A log as it is read."""
+class WatchLog(NamedTuple):
+    """A log as it is read, and what was mended in it, with counts."""
 
     stream: ImuStream
     notes: list[str]
-    """What was mended in it, with counts."""
 
 
-@dataclass(frozen=True)
-class _Table:
-    """A file's samples in its own units."""
+class _Samples(NamedTuple):
+    """Rows in the order of time (s), by the groups of `_NAMES` (every attitude as `quaternion`), in their own units."""
 
     seconds: np.ndarray
     parts: dict[str, np.ndarray]
-    """Values by what they are: the groups of `_NAMES`, with every kind of attitude as `quaternion` (w, x, y, z)."""
     names: dict[str, str]
-    """How each of them is named, and `unit` of turn rates, and `xsens` where it is Xsens' or Movella's."""
+    """How each group is named; `unit` is the turn rate's, `xsens` there for Xsens and Movella."""
     notes: list[str]
 
 
@@ -110,12 +115,10 @@ def read_watch(path: str | Path, joint: str) -> WatchLog:
     """
     if joint not in WRISTS:
         raise WearcapError(f"a watch on {joint!r}", path, " or ".join(WRISTS))
-    log = _read(path, joint)
-    if log.stream.acc_world is None:
-        lacks = "orientation" if log.stream.R_world_imu is None else "acceleration"
-        fix = "Put the sensor's Inertial.csv and Quaternion.csv into one folder."
-        raise WearcapError(f"a sensor's log without {lacks}", path, "attitude and acceleration", fix)
-    return log
+    samples = _samples(path)
+    if "quaternion" not in samples.parts or not samples.parts.keys() & _ACCELERATION:
+        raise _lacking(samples, path)
+    return _stream(samples, joint, path)
 
 
 def read_watch_log(path: str | Path, joint: str) -> ImuStream:
@@ -125,7 +128,7 @@ def read_watch_log(path: str | Path, joint: str) -> ImuStream:
 
 def read_inertial_log(path: str | Path, joint: str) -> ImuStream:
     """A log of one sensor at any joint; what x-IMU3's files do not have is None. Raises WearcapError as `read_watch`."""
-    return _read(path, joint).stream
+    return _stream(_samples(path), joint, path).stream
 
 
 def is_watch_log(path: str | Path) -> bool:
@@ -159,7 +162,7 @@ def watch_convention(
         row = int(np.argmax(np.abs(norm - 1)))
         raise WearcapError(f"attitude of length {norm[row]:.3g} in row {row}", where, "1")
     # R_world_imu, and the mean of gravity in the world
-    R = rotation.matrix_from_quat_wxyz(torch.from_numpy(quat_wxyz)).numpy()
+    R = matrix_from_quat_wxyz(torch.from_numpy(quat_wxyz)).numpy()
     there, back = (np.einsum("tij,tj->i", turned, gravity) / len(R) for turned in (R, R.swapaxes(1, 2)))
     is_back = bool(abs(there[2]) < abs(back[2]))
     mean = back if is_back else there
@@ -185,99 +188,80 @@ def logging_time(text: str) -> float:
 # --- samples to a stream -------------------------------------------------------------------------------------------
 
 
-def _read(path: str | Path, joint: str) -> WatchLog:
-    """The stream of a log's files."""
-    tables = [_table(file) for file in sensor_files(path)]
-    table = tables[0] if len(tables) == 1 else _joined(tables, path)
-    seconds, notes = torch.from_numpy(table.seconds), list(table.notes)
-    R, turn, free, felt = None, None, None, None
-    if "quaternion" in table.parts:
-        R, free, felt = _in_world(table, path)
-    elif table.names.get("whole") == "inertial":
-        felt = G_M_S2 * torch.from_numpy(table.parts["whole"])
+def _stream(samples: _Samples, joint: str, path: str | Path) -> WatchLog:
+    """A sensor's stream; parts that it lacks are None. Raises WearcapError where no attitude shows what its numbers mean."""
+    R, free, felt, turn, notes = None, None, None, None, [*samples.notes]
+    if "quaternion" in samples.parts:
+        R, free, felt = _in_world(samples, path)
+    elif samples.names.get("whole") == _X_IMU:
+        felt = G_M_S2 * torch.from_numpy(samples.parts["whole"])
     else:
-        raise _lacking(table, path)
-    if "turn" in table.parts:
-        turn = _turn(table, R, notes)
-    R, free, felt, turn = (None if part is None else part.float() for part in (R, free, felt, turn))
-    return WatchLog(ImuStream(seconds, joint, R, free, felt, turn), notes)
+        raise _lacking(samples, path)
+    if "turn" in samples.parts:
+        turn = _turn(samples, R, notes)
+    parts = [None if part is None else part.float() for part in (R, free, felt, turn)]
+    return WatchLog(ImuStream(torch.from_numpy(samples.seconds), joint, *parts), notes)
 
 
-def _in_world(table: _Table, path: str | Path) -> tuple[Tensor, Tensor | None, Tensor | None]:
+def _in_world(samples: _Samples, path: str | Path) -> tuple[Tensor, Tensor | None, Tensor | None]:
     """(R_world_imu, free acceleration in the world, specific force), float64; accelerations where the log has them."""
-    quat_wxyz, names = table.parts["quaternion"], table.names
-    parts = {name: torch.from_numpy(values) for name, values in table.parts.items()}
-    up = torch.tensor([0.0, 0.0, G_M_S2], dtype=torch.float64)
-    R = rotation.matrix_from_quat_wxyz(parts["quaternion"])
+    parts = {name: torch.from_numpy(values) for name, values in samples.parts.items()}
+    R, up = matrix_from_quat_wxyz(parts["quaternion"]), torch.tensor([0.0, 0.0, G_M_S2], dtype=torch.float64)
     world, free, whole, down = (parts.get(name) for name in ("world", "free", "whole", "gravity"))
     if "either" in parts and whole is None and free is None:
-        measured = 1.0 if down is None else down.norm(dim=-1).median().item()
-        tilt = max((turned @ parts["either"][..., None]).mean(0)[2, 0].abs().item() for turned in (R, R.mT))
-        free, whole = (None, parts["either"]) if tilt > measured / 2 else (parts["either"], None)
-    if down is None and whole is not None:
+        measured = 1.0 if down is None else down.norm(dim=-1).median()
+        upright = max((turned @ parts["either"][..., None]).mean(0)[2, 0].abs() for turned in (R, R.mT))
+        free, whole = (None, parts["either"]) if upright > measured / 2 else (parts["either"], None)
+    if whole is not None and (free is None or down is None):
         down = whole if free is None else whole - free
+    if free is None and whole is None and world is None:
+        return R, None, None
     if down is not None:
-        sense = watch_convention(down.numpy(), quat_wxyz, path, UPRIGHT_WHOLE if down is whole else UPRIGHT)
+        least = UPRIGHT_WHOLE if down is whole else UPRIGHT
+        sense = watch_convention(down.numpy(), samples.parts["quaternion"], path, least)
     elif world is not None:
         sense = WatchConvention(1.0, False)
-    elif free is None:
-        return R, None, None
-    else:
-        sense = _DOCUMENTED.get((names.get("free", ""), names["quaternion"]))
-        if sense is None:
-            fix = "Log gravity, or the accelerometer, too: they show the unit and the sign of the acceleration."
-            raise WearcapError("acceleration without gravity, in an unknown unit", path, "gravity", fix)
-    if "xsens" in names and (sense.back or sense.m_s2 < 0):
-        fix = "Export it in east, north, up (ENU)."
-        raise WearcapError("its attitude is in a world whose z axis points down", path, "z up", fix)
+    elif (sense := _DOCUMENTED.get((samples.names.get("free", ""), samples.names["quaternion"]))) is None:
+        fix = "Log gravity (Gravity.csv) or the whole acceleration, too: it shows unit and sign."
+        raise WearcapError("acceleration without gravity, whose unit and sign are not known", path, "gravity", fix)
+    if "xsens" in samples.names and (sense.m_s2 < 0 or samples.names["xsens"] == "ned"):
+        raise WearcapError("its world's z axis points down", path, "z up", "Export in east, north, up (ENU).")
     R = R.mT.contiguous() if sense.back else R
-    if whole is not None and free is None:
-        felt = sense.m_s2 * whole
-        own = (R @ felt[..., None])[..., 0] - up
-        if world is not None and (own - world).norm(dim=-1).median() > 0.5:
-            raise WearcapError("free acceleration is not the acceleration without gravity", path, "one of the world")
-        return R, own if world is None else world, felt
-    if world is None and free is not None:
-        world = (R @ (sense.m_s2 * free)[..., None])[..., 0]
+    felt = None if down is None else sense.m_s2 * (down if free is None else free + down)
     if world is None:
-        return R, None, None
-    felt = (
-        sense.m_s2 * (free + down)
-        if free is not None and down is not None
-        else (R.mT @ (world + up)[..., None])[..., 0]
-    )
-    return R, world, felt
+        assert felt is not None or free is not None
+        world = _turned(R, felt) - up if free is None else _turned(R, sense.m_s2 * free)
+    elif felt is not None and (_turned(R, felt) - up - world).norm(dim=-1).median() > 0.5:
+        raise WearcapError("free acceleration is not acceleration without gravity", path, "FreeAcc in the world's axes")
+    return R, world, _turned(R.mT, world + up) if felt is None else felt
 
 
-def _turn(table: _Table, R: Tensor | None, notes: list[str]) -> Tensor | None:
-    """Turn rates (rad/s): their unit by its name, else by how the attitude turns; None where neither tells."""
-    turn, name = torch.from_numpy(table.parts["turn"]), table.names["turn"]
-    unit = table.names.get("unit", "rad/s" if name.endswith("rotationrate") else "")
+def _turned(R: Float[Tensor, "time 3 3"], vector: Float[Tensor, "time 3"]) -> Float[Tensor, "time 3"]:
+    return (R @ vector[..., None])[..., 0]
+
+
+def _turn(samples: _Samples, R: Tensor | None, notes: list[str]) -> Tensor | None:
+    """Turn rates (rad/s): their unit by its name, else by how the attitude turns; None where neither says it."""
+    turn, name = torch.from_numpy(samples.parts["turn"]), samples.names["turn"]
+    unit = samples.names.get("unit", "rad" if name.endswith("rotationrate") else "")
     if not unit and R is not None:
-        step = torch.from_numpy(np.diff(table.seconds))
-        turned = rotation.geodesic(R[:-1], R[1:]) / step
-        own, moving = (turn[1:] + turn[:-1]).norm(dim=-1) / 2, (turned > 0.2) & (step < 0.1)
-        ratio = (own[moving] / turned[moving]).median().item() if moving.sum() > 10 else 0.0
-        unit = "rad/s" if 0.5 < ratio < 2 else "deg/s" if 0.5 < np.deg2rad(ratio) < 2 else ""
+        step = torch.from_numpy(np.diff(samples.seconds))
+        turned, own = rotation.geodesic(R[:-1], R[1:]) / step, (turn[1:] + turn[:-1]).norm(dim=-1) / 2
+        moving = (turned > 0.2) & (step < 0.1)
+        ratio = (own / turned)[moving].median().item() if moving.any() else 0.0
+        unit = "rad" if 0.5 < ratio < 2 else "deg" if 0.5 < np.deg2rad(ratio) < 2 else ""
     if not unit:
-        notes.append("turn rates are left out: their unit is not known")
+        notes.append("turn rates left out: their unit is not known")
         return None
-    return turn.deg2rad() if unit == "deg/s" else turn
+    return turn.deg2rad() if unit == "deg" else turn
 
 
-def _lacking(table: _Table, path: str | Path) -> WearcapError:
+def _lacking(samples: _Samples, path: str | Path) -> WearcapError:
     """The error of a log that is known, but for what it lacks."""
-    wanted = {"quaternion": "attitude", "turn": "turn rate"}
-    missing = " and ".join(word for name, word in wanted.items() if name not in table.parts)
-    has = ", ".join(
-        sorted(
-            {"either": "acceleration", "whole": "acceleration", "free": "acceleration", "turn": "turn rate"}.get(
-                part, part
-            )
-            for part in table.parts
-        )
-    )
-    return WearcapError(f"a motion log with {has}, without {missing}", path, "attitude and acceleration", RECORD_MOTION)
+    wanted = {"attitude": {"quaternion"}, "acceleration": _ACCELERATION, "turn rate": {"turn"}}
+    missing = [word for word, parts in wanted.items() if not parts & samples.parts.keys()]
+    what = f"a motion log without {' and '.join(missing)}"
+    return WearcapError(what, path, "attitude and acceleration", _RECORD_MOTION)
 
 
 # --- tables to samples ---------------------------------------------------------------------------------------------
@@ -290,17 +274,15 @@ def _groups(layout: TableLayout, path: Path) -> dict[str, tuple[str, list[str]]]
         return {}
     if {*_XYZ} <= set(keys) and (plain := _PLAIN.search(_key(path.stem))):
         keys |= {plain.group() + axis: keys[axis] for axis in _XYZ}
-    if {*_WXYZ} == set(keys) - {*_TIMES, "timestamp"}:
+    if {*_WXYZ} == {key for key in keys if not _TIMES.match(key)}:
         keys |= {"quaternion" + axis: keys[axis] for axis in _WXYZ}
-    found = {}
+    found = dict[str, tuple[str, list[str]]]()
     for part, (names, axes) in _NAMES.items():
-        known = ((name, [name + each for each in axis]) for name in names.split() for axis in axes)
-        for name, columns in known:
-            if part not in found and set(columns) <= set(keys):
-                found[part] = name, [keys[column] for column in columns]
-    quaternions = found.get("quaternion", ("", []))[0]
-    alone = quaternions.endswith("quaternion") or path.stem in _BESIDE
-    return found if set(found) - {"quaternion", "matrix"} or (found and alone) else {}
+        for name, axis in itertools.product(names.split(), axes):
+            if part not in found and {name + each for each in axis} <= set(keys):
+                found[part] = name, [keys[name + each] for each in axis]
+    alone = path.stem in _BESIDE or found.get("quaternion", ("",))[0].endswith("quaternion")
+    return found if alone or found.keys() - {"quaternion", "matrix"} else {}
 
 
 def _key(column: str) -> str:
@@ -308,120 +290,112 @@ def _key(column: str) -> str:
     return re.sub(r"[^a-z0-9]", "", re.sub(r"[(\[][^)\]]*[^\d)\]][^)\]]*[)\]]", "", column.lower()))
 
 
-def _table(path: Path) -> _Table:
-    """Samples of one file in the order of time. Raises WearcapError as `read_watch` does."""
+def _samples(path: str | Path) -> _Samples:
+    """Samples of a log's files, at the times of the first of them where all have some. Raises WearcapError as `read_watch`."""
+    tables = [_table(file) for file in sensor_files(path)]
+    if len(tables) == 1:
+        return tables[0]
+    begin, end = max(table.seconds[0] for table in tables), min(table.seconds[-1] for table in tables)
+    seconds = tables[0].seconds
+    seconds = seconds[(seconds >= begin - 0.05) & (seconds <= end + 0.05)]
+    if len(seconds) < 2:
+        raise WearcapError("its sensors' files share no times", path, "files of one recording")
+    joined = _Samples(seconds, {}, {}, [note for table in tables for note in table.notes])
+    for table in reversed(tables):
+        for part, values in table.parts.items():
+            joined.parts[part] = np.stack([np.interp(seconds, table.seconds, each) for each in values.T], 1)
+        if "quaternion" in table.parts:
+            R = matrix_from_quat_wxyz(torch.from_numpy(table.parts["quaternion"]))
+            R = slerp(torch.from_numpy(table.seconds), R, torch.from_numpy(seconds))
+            joined.parts["quaternion"] = quat_wxyz_from_matrix(R).numpy()
+        joined.names.update(table.names)
+    return joined
+
+
+def _table(path: Path) -> _Samples:
+    """Samples of one file."""
     layout = read_layout(path)
     groups = _groups(layout, path)
     if not groups:
         expected = "attitude and acceleration of a watch or sensor (motionQuaternionW(R), quaternionW, Quat_q0, …)"
-        raise WearcapError("not a watch's motion log", path, expected, RECORD_MOTION)
-    keys = {_key(column): column for column in reversed(layout.header)}
+        raise WearcapError("not a watch's motion log", path, expected, _RECORD_MOTION)
     names = {part: name for part, (name, _) in groups.items()}
-    if "packetcounter" in keys:
-        names["xsens"] = "packetcounter"
-    if "turn" in groups and (unit := re.search(r"rad|deg|dps|°", groups["turn"][1][0].lower())):
-        names["unit"] = "rad/s" if unit.group() == "rad" else "deg/s"
-        if unit.group() == "deg" and names.get("either") == "accelerometer":  # x-IMU3's, whose conventions are known
-            groups["whole"], names["whole"] = groups.pop("either"), "inertial"
+    if "PacketCounter" in layout.header:
+        names["xsens"] = "ned" if "system: ned" in " ".join(layout.about).lower() else "up"
+    if "turn" in groups and (unit := re.search("rad|deg|dps|°", groups["turn"][1][0].lower())):
+        names["unit"] = "rad" if unit[0] == "rad" else "deg"
+        if unit[0] == "deg" and names.get("either") == "accelerometer":
+            groups["whole"], names["whole"] = groups.pop("either"), _X_IMU
     table = read_columns(path, list(dict.fromkeys(name for _, group in groups.values() for name in group)))
     parts = {part: np.stack([table[column] for column in group], 1) for part, (_, group) in groups.items()}
+    parts = {part: values for part, values in parts.items() if np.isfinite(values).any()}
     if (matrix := parts.pop("matrix", None)) is not None and "quaternion" not in parts:
         R = torch.from_numpy(matrix).reshape(-1, 3, 3)
         if not are_rotations(R[R.isfinite().all(-1).all(-1)], 0.02).all():
             raise WearcapError("matrices that are no rotations", path, "orthogonal matrices")
-        parts["quaternion"], names["quaternion"] = rotation.quat_wxyz_from_matrix(R).numpy(), "matrix"
-    seconds, parts, notes = _in_order(_seconds(path, layout, keys), parts, path)
-    return _Table(seconds, parts, names, notes)
+        parts["quaternion"], names["quaternion"] = quat_wxyz_from_matrix(R).numpy(), "matrix"
+    if "quaternion" in parts:  # zeros where the attitude was lost
+        parts["quaternion"][(parts["quaternion"] == 0).all(1)] = np.nan
+    return _in_order(_seconds(path, layout), parts, names, path)
 
 
-def _seconds(path: Path, layout: TableLayout, keys: dict[str, str]) -> np.ndarray:
+def _seconds(path: Path, layout: TableLayout) -> np.ndarray:
     """Times of the rows (s), not a number where a row has none."""
     rate = re.search(r"(?:update|output) ?rate\W*([\d.]+)", " ".join(layout.about).lower())
-    for key in [key for name in _TIMES for key in keys if key == name or (key.startswith(name) and len(name) > 3)]:
-        texts = read_columns(path, [], text=[keys[key]])[keys[key]]
-        if np.isin(np.char.lower(texts), (b"nan", b"")).all() or (key == "packetcounter" and rate is None):
-            continue
+    named = {_key(column): column for column in reversed(layout.header)}
+    known_as = [(match.lastindex or 0, key) for key in reversed(named) if (match := _TIMES.match(key))]
+    for _, key in sorted(known_as, key=lambda each: each[0]):
+        texts = read_columns(path, [], text=[named[key]])[named[key]]
         try:
             times = texts.astype(np.float64)
         except ValueError:
-            return _dates(texts, path)
+            times = np.empty(len(texts))
+            for row, text in enumerate(texts):
+                with understood(f"time {text!r} in row {row}", path, "such as 2024-05-01T12:00:00.123+02:00"):
+                    times[row] = logging_time(text.decode())
+            return times
         known = np.isfinite(times)
+        if not known.any() or (key == "packetcounter" and rate is None):
+            continue
         if key in _PERIODS:
             times[known] = np.unwrap(times[known], period=_PERIODS[key])
         if key == "packetcounter" and rate is not None:
             return times / float(rate[1])
         if key == "sampletimefine":  # µs of Movella DOT, else ticks of 0.1 ms
             return times * (1e-6 if np.median(np.abs(np.diff(times[known]))) >= 1000 else 1e-4)
-        unit = re.search(r"(?:\b|_)([mun]?s)\b", keys[key].lower().replace("µ", "u"))
+        unit = re.search(r"(?:\b|_)([mun]?s)\b", named[key].lower().replace("µ", "u"))
         return times * UNITS[time_unit_of(times[known], unit and unit[1], path)]
-    fix = "Export SampleTimeFine, or the update rate above the table." if "packetcounter" in keys else ""
-    raise WearcapError("no times", path, "a column such as time, timestamp or SampleTimeFine", fix)
+    raise WearcapError("no times", path, "time, timestamp, SampleTimeFine, or PacketCounter with the update rate above")
 
 
-def _dates(texts: np.ndarray, path: Path) -> np.ndarray:
-    times = np.empty(len(texts))
-    for row, text in enumerate(texts):
-        with understood(f"time {text.decode()!r} in row {row}", path, "such as 2024-05-01T12:00:00.123+02:00"):
-            times[row] = logging_time(text.decode())
-    return times
-
-
-def _in_order(
-    seconds: np.ndarray, parts: dict[str, np.ndarray], path: Path
-) -> tuple[np.ndarray, dict[str, np.ndarray], list[str]]:
-    """Rows in the order of time, one for each time, and what was done for it.
+def _in_order(seconds: np.ndarray, parts: dict[str, np.ndarray], names: dict[str, str], path: Path) -> _Samples:
+    """Rows in the order of time, one for each time, with notes of what was done for it.
 
     Raises WearcapError for fewer than 2 rows or 20 a second, and for a clock that starts again.
     """
-    values = np.concatenate([seconds[:, None], *parts.values()], 1)
-    whole = np.isfinite(values).all(1)
-    values = values[whole]
-    late = values[:, 0] < np.maximum.accumulate(values[:, 0])
-    back = (np.maximum.accumulate(values[:, 0]) - values[:, 0]).max(initial=0.0)
-    order = np.argsort(values[:, 0], kind="stable")
-    values, moved = values[order], late[order]
-    first = np.diff(values[:, 0], prepend=-np.inf) > 0
-    same = np.append(False, (values[1:] == values[:-1]).all(1))
-    if back > 1.0 and np.count_nonzero(np.diff(moved[~same])) > 0.05 * len(values):
-        what = f"the clock goes back by {back:.1f} s, over times that other rows have"
+    table = np.concatenate([seconds[:, None], *parts.values()], 1)
+    whole = np.isfinite(table).all(1)
+    table = table[whole]
+    behind = np.maximum.accumulate(table[:, 0]) - table[:, 0]
+    order = np.argsort(table[:, 0], kind="stable")
+    table, late = table[order], behind[order] > 0
+    repeats = np.diff(table[:, 0], prepend=-np.inf) == 0
+    same = np.append(False, (table[1:] == table[:-1]).all(1))[: len(table)]
+    if behind.max(initial=0) > 1 and np.count_nonzero(np.diff(late[~same])) > 0.05 * len(table):
+        what = f"the clock goes back by {behind.max():.1f} s, to times that other rows have"
         raise WearcapError(what, path, "one recording", "Two recordings stand in one file: cut it there.")
-    notes = [
-        f"{count} row{'s' * (count > 1)} {what}"
-        for count, what in (
-            (int((~whole).sum()), "without all numbers left out"),
-            (int(late.sum()), "out of order sorted"),
-            (int((~first & same).sum()), "repeated, left out"),
-            (int((~first & ~same).sum()), "at a time of another row, with other values, left out"),
-        )
-        if count
-    ]
-    values = values[first]
-    if len(values) < 2:
-        raise WearcapError(f"{len(values)} rows with numbers and a time of their own", path, "at least 2")
-    step = np.median(np.diff(values[:, 0]))
-    if step > 1 / MIN_RATE_HZ:
-        raise WearcapError(f"{1 / step:.1f} rows a second", path, f"at least {MIN_RATE_HZ:g}", "Log at 30 Hz or more.")
-    ends = np.cumsum([1, *(part.shape[1] for part in parts.values())])
-    split = {name: values[:, a:b] for name, a, b in zip(parts, ends[:-1], ends[1:])}
-    return np.ascontiguousarray(values[:, 0]), split, notes
-
-
-def _joined(tables: list[_Table], path: str | Path) -> _Table:
-    """One sensor's files at the times of the first of them, where all of them have samples."""
-    begin, end = max(table.seconds[0] for table in tables), min(table.seconds[-1] for table in tables)
-    seconds = tables[0].seconds
-    seconds = seconds[(seconds >= begin - 0.05) & (seconds <= end + 0.05)]
-    if len(seconds) < 2:
-        raise WearcapError("files of one sensor without common times", path, "files of one recording")
-    parts, names, notes = dict[str, np.ndarray](), dict[str, str](), list[str]()
-    for table in reversed(tables):
-        for part, values in table.parts.items():
-            if part == "quaternion":
-                R = rotation.matrix_from_quat_wxyz(torch.from_numpy(values))
-                R = slerp(torch.from_numpy(table.seconds), R, torch.from_numpy(seconds))
-                parts[part] = rotation.quat_wxyz_from_matrix(R).numpy()
-            else:
-                parts[part] = np.stack([np.interp(seconds, table.seconds, each) for each in values.T], 1)
-        names |= table.names
-        notes += table.notes
-    return _Table(seconds, parts, names, notes)
+    counts = {
+        "without a number in every column: left out": ~whole,
+        "out of order: sorted": late,
+        "repeated: left out": repeats & same,
+        "with other values at the time of another: the first is kept": repeats & ~same,
+    }
+    notes = [f"{rows.sum()} rows {what}" for what, rows in counts.items() if rows.any()]
+    table = table[~repeats]
+    if len(table) < 2:
+        raise WearcapError(f"{len(table)} rows with numbers and a time of their own", path, "at least 2")
+    rate = 1 / np.median(np.diff(table[:, 0]))
+    if rate < MIN_RATE_HZ:
+        raise WearcapError(f"{rate:.1f} rows a second", path, f"at least {MIN_RATE_HZ:g}", "Log at 30 Hz or more.")
+    first, *values = np.split(table, np.cumsum([1, *(part.shape[1] for part in parts.values())])[:-1], 1)
+    return _Samples(np.ascontiguousarray(first[:, 0]), dict(zip(parts, values)), names, notes)
