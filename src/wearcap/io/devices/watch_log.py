@@ -48,6 +48,7 @@ _NAMES: dict[str, tuple[str, Sequence[Sequence[str]]]] = {
         "motionquaternion quaternion quat attitude orientation rotationvector q",
         [_WXYZ, ("q0", "q1", "q2", "q3"), ("0", "1", "2", "3"), ("qw", "qx", "qy", "qz")],
     ),
+    "vector": ("rotationvector", [_XYZ]),
     "matrix": ("mat", [[f"{row}{column}" for row in "123" for column in "123"]]),
 }
 """Columns' names without unit, signs and capitals, but for the axis, and the axes'. In the sensor's axes `free` is without
@@ -282,7 +283,7 @@ def _groups(layout: TableLayout, path: Path) -> dict[str, tuple[str, list[str]]]
             if part not in found and {name + each for each in axis} <= set(keys):
                 found[part] = name, [keys[name + each] for each in axis]
     alone = path.stem in _BESIDE or found.get("quaternion", ("",))[0].endswith("quaternion")
-    return found if alone or found.keys() - {"quaternion", "matrix"} else {}
+    return found if alone or found.keys() - {"quaternion", "matrix", "vector"} else {}
 
 
 def _key(column: str) -> str:
@@ -334,6 +335,9 @@ def _table(path: Path) -> _Samples:
         if not are_rotations(R[R.isfinite().all(-1).all(-1)], 0.02).all():
             raise WearcapError("matrices that are no rotations", path, "orthogonal matrices")
         parts["quaternion"], names["quaternion"] = quat_wxyz_from_matrix(R).numpy(), "matrix"
+    if (vector := parts.pop("vector", None)) is not None and "quaternion" not in parts:  # Android's, with w at least 0
+        w = np.sqrt((1 - (vector**2).sum(1)).clip(0))
+        parts["quaternion"], names["quaternion"] = np.column_stack([w, vector]), "rotationvector"
     if "quaternion" in parts:  # zeros where the attitude was lost
         parts["quaternion"][(parts["quaternion"] == 0).all(1)] = np.nan
     return _in_order(_seconds(path, layout), parts, names, path)
