@@ -26,7 +26,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
 from wearcap.geometry.trajectory import slerp
-from wearcap.io.formats.csv_table import TableLayout, read_columns, read_layout
+from wearcap.io.formats.csv_table import read_columns, read_layout
 from wearcap.io.formats.poses import are_rotations
 from wearcap.io.formats.trajectory import UNITS, time_unit_of
 from wearcap.recording import ImuStream
@@ -60,8 +60,6 @@ _TIMES = re.compile(
     "(sampletimefine)|(loggingtime)|(motiontimestamp)|(time|epoch|unix|t$)|(secondselapsed)|(packetcounter)"
 )
 """Beginnings of the names of times, the best first."""
-_ACCELERATION, _X_IMU = {"free", "whole", "either", "world"}, "inertial"
-_PERIODS = {"sampletimefine": 2.0**32, "packetcounter": 2.0**16}
 _BESIDE = ("Inertial", "Accelerometer", "TotalAcceleration", "Gravity", "Gyroscope", "Orientation", "Quaternion")
 """Files of one sensor in one folder: x-IMU3's and Sensor Logger's of a phone."""
 _ACCELERATION, _X_IMU = {"free", "whole", "either", "world"}, "inertial"
@@ -135,7 +133,7 @@ def read_inertial_log(path: str | Path, joint: str) -> ImuStream:
 def is_watch_log(path: str | Path) -> bool:
     """Whether a table's header is one of these logs', whole or not; raises WearcapError for a file that cannot be opened."""
     try:
-        return bool(_groups(read_layout(path), Path(path)))
+        return bool(_groups(read_layout(path)[1], Path(path)))
     except WearcapError:
         if Path(path).is_file():
             return False
@@ -209,10 +207,11 @@ def _in_world(samples: _Samples, path: str | Path) -> tuple[Tensor, Tensor | Non
     parts = {name: torch.from_numpy(values) for name, values in samples.parts.items()}
     R, up = matrix_from_quat_wxyz(parts["quaternion"]), torch.tensor([0.0, 0.0, G_M_S2], dtype=torch.float64)
     world, free, whole, down = (parts.get(name) for name in ("world", "free", "whole", "gravity"))
-    if "either" in parts and whole is None and free is None:
+    if "either" in parts and whole is None:
         measured = 1.0 if down is None else down.norm(dim=-1).median()
         upright = max((turned @ parts["either"][..., None]).mean(0)[2, 0].abs() for turned in (R, R.mT))
-        free, whole = (None, parts["either"]) if upright > measured / 2 else (parts["either"], None)
+        whole = parts["either"] if upright > measured / 2 else None
+        free = parts["either"] if whole is None and free is None else free
     if whole is not None and (free is None or down is None):
         down = whole if free is None else whole - free
     if free is None and whole is None and world is None:
@@ -268,9 +267,9 @@ def _lacking(samples: _Samples, path: str | Path) -> WearcapError:
 # --- tables to samples ---------------------------------------------------------------------------------------------
 
 
-def _groups(layout: TableLayout, path: Path) -> dict[str, tuple[str, list[str]]]:
+def _groups(header: list[str], path: Path) -> dict[str, tuple[str, list[str]]]:
     """Groups of columns by what they are: (how they are named, columns); none for another kind of table."""
-    keys = {_key(column): column for column in reversed(layout.header)}
+    keys = {_key(column): column for column in reversed(header)}
     if any(_POSITION.match(key) for key in keys):
         return {}
     if {*_XYZ} <= set(keys) and (plain := _PLAIN.search(_key(path.stem))):
@@ -292,7 +291,7 @@ def _key(column: str) -> str:
 
 
 def _samples(path: str | Path) -> _Samples:
-    """Samples of a log's files, at the times of the first of them where all have some. Raises WearcapError as `read_watch`."""
+    """Samples of a log's files, at the times of the first of them where all have some."""
     tables = [_table(file) for file in sensor_files(path)]
     if len(tables) == 1:
         return tables[0]
@@ -315,14 +314,14 @@ def _samples(path: str | Path) -> _Samples:
 
 def _table(path: Path) -> _Samples:
     """Samples of one file."""
-    layout = read_layout(path)
-    groups = _groups(layout, path)
+    above, header, _ = read_layout(path)
+    about, groups = " ".join(above).lower(), _groups(header, path)
     if not groups:
         expected = "attitude and acceleration of a watch or sensor (motionQuaternionW(R), quaternionW, Quat_q0, …)"
         raise WearcapError("not a watch's motion log", path, expected, _RECORD_MOTION)
     names = {part: name for part, (name, _) in groups.items()}
-    if "PacketCounter" in layout.header:
-        names["xsens"] = "ned" if "system: ned" in " ".join(layout.about).lower() else "up"
+    if "PacketCounter" in header:
+        names["xsens"] = "ned" if "system: ned" in about else "up"
     if "turn" in groups and (unit := re.search("rad|deg|dps|°", groups["turn"][1][0].lower())):
         names["unit"] = "rad" if unit[0] == "rad" else "deg"
         if unit[0] == "deg" and names.get("either") == "accelerometer":
@@ -340,24 +339,20 @@ def _table(path: Path) -> _Samples:
         parts["quaternion"], names["quaternion"] = np.column_stack([w, vector]), "rotationvector"
     if "quaternion" in parts:  # zeros where the attitude was lost
         parts["quaternion"][(parts["quaternion"] == 0).all(1)] = np.nan
-    return _in_order(_seconds(path, layout), parts, names, path)
+    return _in_order(_seconds(path, header, about), parts, names, path)
 
 
-def _seconds(path: Path, layout: TableLayout) -> np.ndarray:
+def _seconds(path: Path, header: list[str], about: str) -> np.ndarray:
     """Times of the rows (s), not a number where a row has none."""
-    rate = re.search(r"(?:update|output) ?rate\W*([\d.]+)", " ".join(layout.about).lower())
-    named = {_key(column): column for column in reversed(layout.header)}
-    known_as = [(match.lastindex or 0, key) for key in reversed(named) if (match := _TIMES.match(key))]
-    for _, key in sorted(known_as, key=lambda each: each[0]):
-        texts = read_columns(path, [], text=[named[key]])[named[key]]
+    rate = re.search(r"(?:update|output) ?rate\W*([\d.]+)", about)
+    named = [(match.lastindex or 0, column) for column in header if (match := _TIMES.match(_key(column)))]
+    for _, column in sorted(named, key=lambda each: each[0]):
+        key, texts = _key(column), read_columns(path, [], text=[column])[column]
         try:
             times = texts.astype(np.float64)
         except ValueError:
-            times = np.empty(len(texts))
-            for row, text in enumerate(texts):
-                with understood(f"time {text!r} in row {row}", path, "such as 2024-05-01T12:00:00.123+02:00"):
-                    times[row] = logging_time(text.decode())
-            return times
+            with understood("times that cannot be read", path, "numbers, or such as 2024-05-01T12:00:00.123+02:00"):
+                return np.array([logging_time(text.decode()) for text in texts])
         known = np.isfinite(times)
         if not known.any() or (key == "packetcounter" and rate is None):
             continue
@@ -367,7 +362,7 @@ def _seconds(path: Path, layout: TableLayout) -> np.ndarray:
             return times / float(rate[1])
         if key == "sampletimefine":  # µs of Movella DOT, else ticks of 0.1 ms
             return times * (1e-6 if np.median(np.abs(np.diff(times[known]))) >= 1000 else 1e-4)
-        unit = re.search(r"(?:\b|_)([mun]?s)\b", named[key].lower().replace("µ", "u"))
+        unit = re.search(r"(?:\b|_)([mun]?s)\b", column.lower().replace("µ", "u"))
         return times * UNITS[time_unit_of(times[known], unit and unit[1], path)]
     raise WearcapError("no times", path, "time, timestamp, SampleTimeFine, or PacketCounter with the update rate above")
 

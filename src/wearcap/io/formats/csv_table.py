@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -21,17 +21,9 @@ from wearcap.boundary.opening import open_bytes, understood
 from wearcap.boundary.texts import bounded_lines
 from wearcap.errors import WearcapError
 
-_ABOUT = re.compile(r"\s*(//|sep=|©|\ufeff?\"?[\w ]+\"?:[\s,;]|$)")
+_ABOUT = re.compile(r'\s*(//|sep=|©|"?[\w ]+"?:[\s,;]|$)')
+"""Beginnings of lines that stand above a header, of which there are at most `_MAX_ABOUT`."""
 _MAX_ABOUT = 64
-
-
-class TableLayout(NamedTuple):
-    """How a table is laid out."""
-
-    about: list[str]
-    """Lines above the header."""
-    header: list[str]
-    delimiter: str
 
 
 @contextmanager
@@ -53,8 +45,8 @@ def load_rows(lines: Iterable[str], what: str, where: str | Path, expected: str 
         return np.loadtxt(lines, **options)
 
 
-def read_layout(path: str | Path) -> TableLayout:
-    """What stands above the rows. Raises WearcapError when the file is empty, and when commas stand in numbers and between."""
+def read_layout(path: str | Path) -> tuple[list[str], list[str], str]:
+    """(lines above the header, column names, delimiter). Raises WearcapError for an empty file, and commas of two kinds."""
     about, header, row, delimiter = list[str](), list[str](), list[str](), ","
     with open_text(path) as file:
         for line in file:
@@ -70,12 +62,12 @@ def read_layout(path: str | Path) -> TableLayout:
         what = f"{len(row)} fields below a header of {len(header)}"
         fix = "Are decimal commas written between commas? Export with decimal points, or semicolons between fields."
         raise WearcapError(what, path, "a field for each column", fix)
-    return TableLayout(about, [name.strip() for name in header], delimiter)
+    return about, [name.strip() for name in header], delimiter
 
 
 def read_header(path: str | Path) -> list[str]:
     """Column names. Raises WearcapError as `read_layout` does."""
-    return read_layout(path).header
+    return read_layout(path)[1]
 
 
 def read_columns(
