@@ -195,6 +195,16 @@ def android_recorder(folder: Path) -> Path:
     )
 
 
+def android_without_gravity(folder: Path) -> Path:
+    """Two kinds of acceleration, whose difference is gravity."""
+    t = seconds()
+    columns = [xyz("acc_", "xyz", "_ms2"), xyz("linear_accel_", "xyz", "_m_s2"), xyz("gyro_", "xyz", "_dps")]
+    header = ",".join(["timestamp", *columns, xyz("rotation_vector_", "xyzw")])
+    times = [round(each * 1e3) for each in t + START_S]
+    quaternion = wxyz(t)[:, [1, 2, 3, 0]]
+    return table(folder / "a.csv", header, times, own(t) + down(t), own(t), np.rad2deg(turn(t)), quaternion)
+
+
 def wear_os(folder: Path) -> Path:
     """A recorder of Wear OS: nanoseconds since the start of the device, and acceleration without gravity."""
     t = seconds()
@@ -224,6 +234,7 @@ LAYOUTS: dict[str, Callable[[Path], Path]] = {
     "SensorLog, motion only": sensor_log_motion,
     "another watch": another_watch,
     "Android recorder": android_recorder,
+    "Android, two accelerations": android_without_gravity,
     "Wear OS": wear_os,
     "attitude back": back_and_milliseconds,
 }
@@ -298,6 +309,8 @@ def test_what_a_log_lacks_is_named(tmp_path, name, header, lacks):
     [
         "timestamp,tx,ty,tz,qx,qy,qz,qw",
         "timestamp,x,y,z,qx,qy,qz,qw",
+        "t,x,y,z,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,ax,ay,az",
+        "time,head.position.x,head.position.y,head.position.z,head.rotation.x,accX,accY,accZ",
         "tracking_timestamp_us,tx_world_device,ty_world_device,tz_world_device,qx_world_device,gravity_x,gravity_y,gravity_z",
         "time,pos_x,pos_y,pos_z,rot_x,rot_y,rot_z",
         "positionX,positionY,positionZ,rotationX,rotationY,rotationZ",
@@ -326,6 +339,19 @@ def test_the_mean_in_the_world_decides_for_a_vigorous_sensor(tmp_path):
     np.testing.assert_allclose(stream.acc_world.numpy(), 8 * free(seconds()), atol=2e-3)
     with pytest.raises(WearcapError, match="z axis points down.*ENU"):
         read_watch_log(vigorous(tmp_path, "NED"), "left_wrist")
+
+
+def test_free_acceleration_that_contradicts_the_other_is_refused(tmp_path):
+    path = mt_manager(tmp_path)
+    lines = path.read_text().splitlines()
+    names = lines[4].split("\t")
+    swap = [names.index(f"FreeAcc_{axis}") for axis in "ENU"]
+    turned = [line.split("\t") for line in lines[5:]]
+    for fields in turned:  # a world that is turned
+        fields[swap[0]], fields[swap[1]] = fields[swap[1]], fields[swap[0]]
+    path.write_text("\n".join([*lines[:5], *("\t".join(fields) for fields in turned)]) + "\n")
+    with pytest.raises(WearcapError, match="free acceleration is not acceleration without gravity"):
+        read_watch(path, "left_wrist")
 
 
 def rows_of(path: Path) -> tuple[str, list[str]]:

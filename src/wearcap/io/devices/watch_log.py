@@ -53,9 +53,9 @@ _NAMES: dict[str, tuple[str, Sequence[Sequence[str]]]] = {
 }
 """Columns' names without unit, signs and capitals, but for the axis, and the axes'. In the sensor's axes `free` is without
 gravity, `whole` with it, `either` one of both; `world` is without, in the world's."""
-_PLAIN = re.compile("watchaccelerometer|totalacceleration|accelerometer|gravity|gyroscope")
+_PLAIN = re.compile("(watchaccelerometer|totalacceleration|accelerometer|gravity|gyroscope)(?!uncal)")
 """What columns x, y and z hold, by the file's name."""
-_POSITION = re.compile("[tp][xyz]|pos")
+_POSITION = re.compile("^[tp][xyz]|pos(ition)?[xyz]|hmd")
 _TIMES = re.compile(
     "(sampletimefine)|(loggingtime)|(motiontimestamp)|(time|epoch|unix|t$)|(secondselapsed)|(packetcounter)"
 )
@@ -270,12 +270,14 @@ def _lacking(samples: _Samples, path: str | Path) -> WearcapError:
 def _groups(header: list[str], path: Path) -> dict[str, tuple[str, list[str]]]:
     """Groups of columns by what they are: (how they are named, columns); none for another kind of table."""
     keys = {_key(column): column for column in reversed(header)}
-    if any(_POSITION.match(key) for key in keys):
+    if any(_POSITION.search(key) for key in keys):
         return {}
-    if {*_XYZ} <= set(keys) and (plain := _PLAIN.search(_key(path.stem))):
-        keys |= {plain.group() + axis: keys[axis] for axis in _XYZ}
     if {*_WXYZ} == {key for key in keys if not _TIMES.match(key)}:
         keys |= {"quaternion" + axis: keys[axis] for axis in _WXYZ}
+    elif {*_XYZ} <= set(keys):
+        if (plain := _PLAIN.search(_key(path.stem))) is None:
+            return {}
+        keys |= {plain[1] + axis: keys[axis] for axis in _XYZ}
     found = dict[str, tuple[str, list[str]]]()
     for part, (names, axes) in _NAMES.items():
         for name, axis in itertools.product(names.split(), axes):
@@ -287,7 +289,8 @@ def _groups(header: list[str], path: Path) -> dict[str, tuple[str, list[str]]]:
 
 def _key(column: str) -> str:
     """A column's name without unit, signs and capitals."""
-    return re.sub(r"[^a-z0-9]", "", re.sub(r"[(\[][^)\]]*[^\d)\]][^)\]]*[)\]]", "", column.lower()))
+    unit = r"[(\[][^)\]]*[^\d)\]][^)\]]*[)\]]|_(g|m_?p?_?s2|rad_?p?_?s|deg_?p?_?s|dps)$"
+    return re.sub(r"[^a-z0-9]", "", re.sub(unit, "", column.lower()))
 
 
 def _samples(path: str | Path) -> _Samples:
