@@ -315,6 +315,7 @@ def test_what_a_log_lacks_is_named(tmp_path, name, header, lacks):
         "time,pos_x,pos_y,pos_z,rot_x,rot_y,rot_z",
         "positionX,positionY,positionZ,rotationX,rotationY,rotationZ",
         "timestamp_ms,hmd_pos_x,hmd_pos_y,hmd_pos_z,hmd_rot_x",
+        "timestamp_ns,ax_mps2,ay_mps2,az_mps2,gx_radps,gy_radps,gz_radps",
         "x,y,z",
     ],
 )

@@ -284,7 +284,8 @@ def _groups(header: list[str], path: Path) -> dict[str, tuple[str, list[str]]]:
             if part not in found and {name + each for each in axis} <= set(keys):
                 found[part] = name, [keys[name + each] for each in axis]
     alone = path.stem in _BESIDE or found.get("quaternion", ("",))[0].endswith("quaternion")
-    return found if alone or found.keys() - {"quaternion", "matrix", "vector"} else {}
+    sure = {name for name, _ in found.values()} - {"a", "w"}  # of letters alone only beside others
+    return found if alone or (sure and found.keys() - {"quaternion", "matrix", "vector"}) else {}
 
 
 def _key(column: str) -> str:
