@@ -126,7 +126,7 @@ def _seen(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     turn = rotation.reshape(len(rotation), -1)
     finite = np.isfinite(position).all(1) & np.isfinite(turn).all(1)
     nothing = np.linalg.norm(turn, axis=1) < 0.5
-    still = np.abs(turn).max(1) == 1 if turn.shape[1] == 4 else (turn == np.eye(3).ravel()).all(1)
+    still = np.abs(turn).max(1) > 0.9999 if turn.shape[1] == 4 else (turn == np.eye(3).ravel()).all(1)
     return finite & ~nothing & ~((position == 0).all(1) & still)
 
 
