@@ -62,7 +62,7 @@ def matrices(device: str) -> np.ndarray:
 
 def compare(path: Path, start: float | None = TIME[0], scale=1.0, within=2e-6, late=1e-3, turned=0.02, devices=SIDES):
     """Raw poses as they were written: positions within rounding, times to 1 ms (their difference where no start is known)."""
-    poses, convention, notes = read_raw_poses(path, None)
+    poses, convention, notes = read_raw_poses(path)
     assert set(poses) == set(devices)
     for joint, device in devices.items():
         pose, (turn, at) = poses[joint], POSES[device]
@@ -289,7 +289,7 @@ def session(folder):
     return folder / "s", {"late": 1e-6}
 
 
-def replay(folder):
+def replay(folder, modifiers="", practice=0.0, speed=1.0):
     """Beat Saber's: players' names stay out."""
 
     def text(value):
@@ -299,12 +299,19 @@ def replay(folder):
         map(text, ["1", "1.29", "0", "7656", "A. Nonymous", "steam", "OpenVR", "Index", "Knuckles", "ab", "Söng"])
     )
     content = struct.pack("<IBB", 0x442D3D69, 1, 0) + info + text("me") + text("Expert") + struct.pack("<i", 5)
-    content += text("Standard") + text("") + text("") + struct.pack("<f?4f", 18, False, 1.7, 0, 0, 1)
+    content += text("Standard") + text("") + text(modifiers) + struct.pack("<f?4f", 18, False, 1.7, 0, 0, practice)
     content += struct.pack("<Bi", 1, len(TIME))
     for k, moment in enumerate(TIME - TIME[0]):
-        content += struct.pack("<fi21f", moment, 90, *all_seven()[k])
+        content += struct.pack("<fi21f", moment * speed, 90, *all_seven()[k])
     (folder / "a.bsor").write_bytes(content + struct.pack("<Bi", 2, 0))
     return folder / "a.bsor", {"start": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("modifiers", "practice", "speed"), [("GN,FS", 0.0, 1.2), ("SS", 0.0, 0.85), ("", 0.5, 0.5), ("NF", 1.0, 1.0)]
+)
+def test_a_replay_in_the_songs_time(tmp_path, modifiers, practice, speed):
+    compare(replay(tmp_path, modifiers, practice, speed)[0], 0.0)
 
 
 LAYOUTS = [
@@ -346,9 +353,20 @@ def test_unreals_rotators(tmp_path):
         T * 100,
         *(np.degrees(a) for a in (pitch, yaw, roll)),
     )
-    poses, convention, _ = read_raw_poses(path, None)
-    assert convention == "unreal"
+    poses, convention, notes = read_raw_poses(path)
+    assert "pitch, yaw and roll in degrees as Unreal's" in notes
+    assert convention is None
     assert np.abs(poses["head"].rotation - np.stack([x, y, z], 2)).max() < 1e-6
+
+
+def test_unitys_angles_by_the_names_of_unreal(tmp_path):
+    """Pitch, yaw, roll in Unity's axes: read so where the axes are stated, else the question is put."""
+    angles = euler_angles("head")
+    path = csv(tmp_path / "a.csv", "time,HMD_x,HMD_y,HMD_z,HMD_pitch,HMD_yaw,HMD_roll", TIME, POSES["head"][1], angles)
+    with pytest.raises(WearcapError):
+        read_headset_log(path)
+    found = read_headset_log(path, Conventions(axes="unity"))
+    assert max(short_walk.apart(found.head, TIME, R, T)) < 0.02
 
 
 def test_trials_of_a_session_are_one_recording_with_a_gap(tmp_path):
@@ -364,7 +382,7 @@ def test_trials_of_a_session_are_one_recording_with_a_gap(tmp_path):
             )
     write(tmp_path / "S001" / "trial_results.csv", "experiment,ppid,trial_num\nwalk,A. Nonymous,1\n")
     assert is_headset_session(tmp_path / "S001")
-    poses, convention, notes = read_raw_poses(tmp_path / "S001", None)
+    poses, convention, notes = read_raw_poses(tmp_path / "S001")
     kept = np.r_[0:cut, cut + 60 : len(TIME)]
     assert convention == "unity"
     assert "2 trials of a UXF session in one recording" in notes
@@ -463,7 +481,7 @@ def test_two_recordings_in_one_table(tmp_path):
     there = np.concatenate([all_seven(), all_seven() + np.tile([1.0, 0, 0, 0, 0, 0, 0], 3)])
     path = csv(tmp_path / "a.csv", f"time,{names_of('{d}_{q}_{a}')}", np.concatenate([TIME, TIME + 1e-3]), there)
     with pytest.raises(WearcapError, match=f"line {len(TIME) + 2}: times go back"):
-        read_raw_poses(path, None)
+        read_raw_poses(path)
 
 
 # --- tracking ------------------------------------------------------------------------------------------------------
@@ -491,18 +509,18 @@ def test_short_gaps_of_the_head_are_interpolated(tmp_path, text):
 
 
 def test_long_gaps_of_the_head_stay(tmp_path):
-    poses, _, _ = read_raw_poses(with_lost(tmp_path / "a.csv", 0, range(50, 90), NOTHING[0]), None)
+    poses, _, _ = read_raw_poses(with_lost(tmp_path / "a.csv", 0, range(50, 90), NOTHING[0]))
     assert np.array_equal(poses["head"].seconds.round(6), np.delete(TIME, range(50, 90)).round(6))
 
 
 def test_a_hand_that_freezes_is_lost(tmp_path):
     """The last pose repeated while the head moves; a pause of everything is no loss."""
     last = ",".join(f"{value:.7f}" for value in seven("left")[99])
-    poses, _, notes = read_raw_poses(with_lost(tmp_path / "a.csv", 1, range(100, 140), last), None)
+    poses, _, notes = read_raw_poses(with_lost(tmp_path / "a.csv", 1, range(100, 140), last))
     assert len(poses["left_wrist"].seconds) == len(TIME) - 40
     assert "left_wrist repeats its last pose in 40 rows, where it counts as lost" in notes
     still = np.repeat(all_seven()[:1], len(TIME), 0)
-    poses, _, _ = read_raw_poses(csv(tmp_path / "b.csv", f"time,{names_of('{d}_{q}_{a}')}", TIME, still), None)
+    poses, _, _ = read_raw_poses(csv(tmp_path / "b.csv", f"time,{names_of('{d}_{q}_{a}')}", TIME, still))
     assert len(poses["left_wrist"].seconds) == len(TIME)
 
 
@@ -516,7 +534,7 @@ def test_a_hand_that_freezes_is_lost(tmp_path):
     ],
 )
 def test_a_hand_that_is_tracked_late(tmp_path, lost, kept, message):
-    poses, _, notes = read_raw_poses(with_lost(tmp_path / "a.csv", 2, lost, NOTHING[2]), None)
+    poses, _, notes = read_raw_poses(with_lost(tmp_path / "a.csv", 2, lost, NOTHING[2]))
     assert message in notes
     assert ("right_wrist" in poses) == (kept is not None)
     assert np.array_equal(poses["head"].seconds.round(6), TIME[kept or slice(None)].round(6))
@@ -527,7 +545,7 @@ def test_flags_of_tracking(tmp_path):
     flags = ["False" if k < 20 else "True" for k in range(len(TIME))]
     names = names_of("{d}_{q}_{a}").replace("left_pos_x", "left_isTracked,left_pos_x")
     path = csv(tmp_path / "a.csv", f"time,{names}", TIME, seven("head"), flags, seven("left"), seven("right"))
-    poses, _, notes = read_raw_poses(path, None)
+    poses, _, notes = read_raw_poses(path)
     assert "left_wrist is not tracked in 20 of 240 rows" in notes
     assert poses["left_wrist"].seconds[0] == pytest.approx(poses["head"].seconds[0])
 
@@ -540,7 +558,7 @@ def test_a_replay_cut_short(tmp_path, size):
     whole, _ = replay(tmp_path)
     (tmp_path / "cut.bsor").write_bytes(whole.read_bytes()[:size])
     with pytest.raises(WearcapError):
-        read_raw_poses(tmp_path / "cut.bsor", None)
+        read_raw_poses(tmp_path / "cut.bsor")
 
 
 @pytest.mark.parametrize("count", [2**31 - 1, -1])
@@ -549,14 +567,14 @@ def test_a_replay_with_a_wrong_count(tmp_path, count):
     at = content.index(struct.pack("<Bi", 1, len(TIME)))
     (tmp_path / "a.bsor").write_bytes(content[:at] + struct.pack("<Bi", 1, count) + content[at + 5 :])
     with pytest.raises(WearcapError, match="frames"):
-        read_raw_poses(tmp_path / "a.bsor", None)
+        read_raw_poses(tmp_path / "a.bsor")
 
 
 def test_angles_that_may_be_radians(tmp_path):
     parts = [part for device in POSES for part in (POSES[device][1], np.radians(euler_angles(device)))]
     names = "time," + ",".join(f"{d}_{q}_{a}" for d in POSES for q in ("pos", "rot") for a in "xyz")
     with pytest.raises(WearcapError, match="may be radians"):
-        read_raw_poses(csv(tmp_path / "a.csv", names, TIME, *parts), None)
+        read_raw_poses(csv(tmp_path / "a.csv", names, TIME, *parts))
 
 
 def test_folders_that_are_no_sessions(tmp_path):
@@ -576,7 +594,7 @@ def test_folders_that_are_no_sessions(tmp_path):
 @pytest.mark.parametrize("name", ["J_hs_clock.csv", "J_hs_iso.csv", "J_hs_ticks.csv", "J_hs_euler.csv"])
 def test_field_logs_agree_with_each_other(real_data, name):
     """One walk at 72 Hz in four layouts."""
-    poses, _, _ = read_raw_poses(real_data / "field" / name, None)
+    poses, _, _ = read_raw_poses(real_data / "field" / name)
     head = poses["head"]
     assert len(head.seconds) == 899
     assert np.abs(head.seconds - head.seconds[0] - np.arange(899) / 72).max() < 1.1e-3
@@ -586,7 +604,7 @@ def test_field_logs_agree_with_each_other(real_data, name):
 @pytest.mark.real
 @pytest.mark.parametrize("name", ["S_unity_euler.csv", "S_uxf_session", "K_quest_session", "R_right_hand_late.csv"])
 def test_field_sessions(real_data, name):
-    poses, convention, notes = read_raw_poses(real_data / "field" / name, None)
+    poses, convention, notes = read_raw_poses(real_data / "field" / name)
     assert set(poses) == set(SIDES)
     assert convention == ("unity" if "uxf" in name else None)
     assert len(poses["head"].seconds) == {"K": 1080, "R": 420, "S": 720}[name[0]]
