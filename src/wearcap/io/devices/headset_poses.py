@@ -55,8 +55,8 @@ def raw_poses(
         pose = RawPoses(seconds, position[kept], rotation[kept], table.columns.order, kind)
         notes += _tracked(pose, seen, joint, poses)
         poses[joint] = _of_rows(pose, seen)
-    if len(poses["head"].seconds) < 2:
-        raise WearcapError("no two tracked poses of the headset", path, "positions and rotations")
+        if len(poses["head"].seconds) < 2:
+            raise WearcapError("no two tracked poses of the headset", path, "positions and rotations")
     check_span(poses["head"].seconds, path, lambda row: f"pose {row + 1} of the head")
     return _together(poses, notes), notes
 

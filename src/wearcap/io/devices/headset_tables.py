@@ -139,8 +139,8 @@ def read_rows(path: Path, device: str | None = None) -> dict[str, DeviceRows]:
             lost = any(str(read(place)).strip().lower() in _FALSE for place in columns.tracked)
             found = [math.nan if lost else _value(read(place), joint or kind, about, path) for place in columns.places]
             values[joint].extend(found)
-    if not numbers:
-        raise WearcapError("a header, but no rows", path, "a row for each frame")
+    if not numbers or (label is not None and "head" not in kinds):
+        raise WearcapError("a header, but no rows of the head with times", path, "a row for each frame")
     tables = {}
     for joint, columns in devices.items():
         table = np.asarray(values[joint]).reshape(len(numbers), -1)
@@ -215,8 +215,8 @@ def _csv_rows(path: Path) -> Iterator[Any]:
         if len(row) < len(names):
             raise WearcapError(f"line {number} has {len(row)} fields", path, f"{len(names)}, as the header")
         if any(sizes):
-            parts = ((_vector(text) or [""] * size) if size else [text] for text, size in zip(row, sizes))
-            row = [text for part in parts for text in part]
+            parts = ((_vector(text), size) if size else ([text], 1) for text, size in zip(row, sizes))
+            row = [text for part, size in parts for text in (part if len(part) == size else [""] * size)]
         yield number, row
 
 

@@ -44,7 +44,8 @@ def read_bsor(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if count > whole:
         raise WearcapError(f"{count} frames, of which {whole} are there", path, "a whole replay", "Fetch it again.")
     frames = np.frombuffer(content, _FRAME, count, at + 5)
-    return frames["seconds"] / speed, frames["poses"].astype(np.float64)
+    with np.errstate(invalid="ignore"):  # NaN is no pose
+        return frames["seconds"] / speed, frames["poses"].astype(np.float64)
 
 
 def _information(content: bytes, at: int) -> tuple[int, np.float64]:
