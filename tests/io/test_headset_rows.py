@@ -82,7 +82,7 @@ def test_a_coarse_clock_keeps_the_rate(tmp_path, tick):
 
 
 def test_repeated_and_unsorted_rows(tmp_path):
-    """BOXRR's three rows of equal times at the start are one; rows in any order are sorted; both are said with their number."""
+    """BOXRR's three rows of equal times at the start are one; rows in any order are sorted; both are noted with their number."""
     path = csv(tmp_path / "a.csv", f"time,{names_of('{d}_{q}_{a}')}", TIME, all_seven())
     head, *rows = path.read_text().splitlines()
     moved = rows[0].replace(",0.", ",0.0", 1)

@@ -69,8 +69,8 @@ def read_raw_poses(
         rows, convention, time_unit = _replay(path), "unity", "s"
     else:
         rows = read_rows(path)
-    poses, said = raw_poses(rows, time_unit, axes, path)
-    return poses, convention, said + notes
+    poses, mended = raw_poses(rows, time_unit, axes, path)
+    return poses, convention, mended + notes
 
 
 def is_headset_log(path: str | Path) -> bool:

@@ -158,7 +158,7 @@ def has_poses(path: Path, device: str | None = None) -> bool:
     try:
         rows, _ = _rows(path)
         names = next(rows)
-        with suppress(WearcapError):  # a damaged row is said when the file is read
+        with suppress(WearcapError):  # a damaged row is an error when the file is read
             begin += (row for _, row in islice(rows, _LOOKED_AT))
         _layout(names, begin, path, device)
     except (WearcapError, StopIteration):
