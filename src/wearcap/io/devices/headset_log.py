@@ -70,7 +70,8 @@ def read_raw_poses(
     else:
         rows = read_rows(path)
     poses, mended = raw_poses(rows, time_unit, axes, path)
-    return poses, convention, mended + notes
+    usual = next((allowed[0] for angles, allowed in _AXES_OF_ANGLES.items() if angles in mended), None)
+    return poses, convention or usual, mended + notes
 
 
 def is_headset_log(path: str | Path) -> bool:

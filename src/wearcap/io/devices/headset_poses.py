@@ -98,7 +98,8 @@ def _unreal(form: str, axes: str) -> bool:
 
 
 def _angles(rows: dict[str, DeviceRows], axes: str, path: Path) -> list[str]:
-    """A note on Euler angles, if there are any. Raises WearcapError for those that may be radians."""
+    """A note on Euler angles, if there are any. Raises WearcapError for those that may be radians, and for
+    Unreal's where the head is not above the hands along z, or without hands does not move least along it."""
     tables = [table for table in rows.values() if table.columns.form in ("euler", "rotator")]
     if not tables:
         return []
@@ -106,7 +107,15 @@ def _angles(rows: dict[str, DeviceRows], axes: str, path: Path) -> list[str]:
     if widest <= 2 * np.pi and not any(table.columns.words & {"deg", "degrees"} for table in tables):
         what = f"Euler angles of at most {widest:.2f}, which may be radians in any order"
         raise WearcapError(what, path, "quaternions, or degrees as Unity and Unreal write them", "Log quaternions.")
-    return [UNREAL_ANGLES if _unreal(tables[0].columns.form, axes) else UNITY_ANGLES]
+    if not _unreal(tables[0].columns.form, axes):
+        return [UNITY_ANGLES]
+    head, *hands = [table.values[np.isfinite(table.values).all(1), :3] for _, table in sorted(rows.items())]
+    below = [head.mean(0) - hand.mean(0) for hand in hands if len(hand)] if len(head) else []
+    up = np.abs(np.mean(below, 0)) if below else -np.std(head, 0) if len(head) else np.zeros(3)
+    if axes != "unreal" and up.argmax() != 2:
+        what = f"pitch, yaw and roll where {'xyz'[up.argmax()]} seems to be up, as it is not in Unreal's axes"
+        raise WearcapError(what, path, "axes of known angles", "Say whose they are: axes=unreal|unity.")
+    return [UNREAL_ANGLES]
 
 
 def _parts(table: DeviceRows, axes: str, path: Path) -> tuple[np.ndarray, np.ndarray]:
