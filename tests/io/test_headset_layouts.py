@@ -130,7 +130,7 @@ def vision_pro(folder):
         }
         for k, moment in enumerate(TIME.tolist())
     ]
-    return write(folder / "a.json", json.dumps(frames)), {}
+    return write(folder / "a.json", json.dumps(frames)), {"devices": {"head": "head"}}
 
 
 def flat_columns(folder):
@@ -272,11 +272,16 @@ LAYOUTS = [
 LAYOUTS += [long_form, long_json, euler, session, replay]
 
 
+FIXED = {hololens: "openxr", webxr: "openxr", vision_pro: "openxr", euler: "unity", replay: "unity"}
+"""Conventions by recorder; of other logs they follow from the poses."""
+
+
 @pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.__name__)
 def test_layouts(tmp_path, layout):
     path, how = layout(tmp_path)
     assert is_headset_session(path) if path.is_dir() else is_headset_log(path)
-    _, _, notes = compare(path, **how)
+    _, convention, notes = compare(path, **how)
+    assert convention == FIXED.get(layout)
     assert "Nonymous" not in str(notes)
 
 

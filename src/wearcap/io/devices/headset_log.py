@@ -14,7 +14,7 @@ from wearcap.boundary.opening import open_bytes
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import AUTO, Conventions
 from wearcap.io.devices.headset_axes import PALM_M, HeadsetLog, in_our_axes
-from wearcap.io.devices.headset_poses import UNITY_ANGLES, UNREAL_ANGLES, raw_poses
+from wearcap.io.devices.headset_poses import ARKIT, UNITY_ANGLES, UNREAL_ANGLES, raw_poses
 from wearcap.io.devices.headset_tables import (
     DeviceRows,
     PoseColumns,
@@ -31,6 +31,8 @@ __all__ = ["PALM_M", "HeadsetLog", "is_headset_log", "is_headset_session", "read
 _TABLES = {".csv", ".tsv", ".txt", ".json", ".jsonl"}
 _MOST_FILES = 2000
 _DETECTED = Conventions()
+_AXES_OF_NAMES = (({"hololens"}, "openxr"), ({"viewer", "orientation"}, "openxr"), (ARKIT, "openxr"))
+"""Conventions that a recorder fixes, by words of its columns: HoloLens2ForCV's, WebXR's, visionOS'."""
 _AXES_OF_ANGLES = {UNITY_ANGLES: ("unity", "openxr", "steamvr"), UNREAL_ANGLES: ("unreal",)}
 _TRIAL = re.compile(r"(?i)_?(?:t|trial_?)\d+$")
 
@@ -69,6 +71,7 @@ def read_raw_poses(
         rows, convention, time_unit = _replay(path), "unity", "s"
     else:
         rows = read_rows(path)
+        convention = next((axes for words, axes in _AXES_OF_NAMES if words <= rows["head"].columns.words), None)
     poses, mended = raw_poses(rows, time_unit, axes, path)
     usual = next((allowed[0] for angles, allowed in _AXES_OF_ANGLES.items() if angles in mended), None)
     return poses, convention or usual, mended + notes

@@ -12,6 +12,8 @@ from wearcap.io.devices.headset_times import grain, in_seconds, rising
 from wearcap.io.formats.trajectory import check_span
 
 _KINDS = {"wrist": {"wrist"}, "grip": {"grip", "controller", "ctrl", "leftcontroller", "rightcontroller", "saber"}}
+ARKIT = {"origin", "from", "anchor"}
+"""Words of visionOS' anchors; those of hands have axes of their own."""
 UNITY_ANGLES = "Euler angles in degrees, about z, x and y in turn as Unity's"
 UNREAL_ANGLES = "pitch, yaw and roll in degrees as Unreal's"
 FILLED_S = 1.0
@@ -39,6 +41,9 @@ def raw_poses(
     notes, shared = [f"times {_seconds(rows['head'], clock, time_unit, path)[1]} ({clock})"], None
     notes += _angles(rows, axes, path)
     for joint, table in sorted(rows.items()):  # the head first
+        if joint != "head" and table.columns.words >= ARKIT:
+            notes.append(f"{joint} is left out: visionOS' hand anchors have axes of their own")
+            continue
         position, rotation = _parts(table, axes, path)
         seen, times = _seen(position, rotation), table.clocks[clock]
         if shared is None or not np.array_equal(times, rows["head"].clocks[clock], equal_nan=True):

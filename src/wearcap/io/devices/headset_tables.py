@@ -239,7 +239,7 @@ def _vector(text: str) -> list[str]:
 
 def _hololens_names(count: int) -> list[str]:
     """Names of the columns of head_hand_eye.csv, which has no header: times of Windows, and matrices by rows."""
-    names, joints = ["filetime", *(f"head_m_{k}" for k in range(16))], 26 * 16
+    names, joints = ["filetime", *(f"hololens_head_m_{k}" for k in range(16))], 26 * 16
     for side in ("left", "right"):  # the second joint is the wrist
         names.append(f"{side}_available")
         names += [f"{side}_wrist_m_{k - 16}" if 16 <= k < 32 else "" for k in range(joints)]
