@@ -21,7 +21,7 @@ from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.conventions import AUTO, Conventions
 from wearcap.io.devices.aria_mps import T_HEAD_DEVICE, head_stream, is_mps_folder, read_mps, read_points
 from wearcap.io.devices.axes import CAMERA, DEVICES, UPRIGHT, WORLDS, DeviceAxes, device_axes, to_head_axes
-from wearcap.io.devices.headset_log import is_headset_log, read_headset_log
+from wearcap.io.devices.headset_log import is_headset_log, is_headset_session, read_headset_log
 from wearcap.io.devices.watch_log import read_inertial_log, read_watch_log
 from wearcap.io.formats.camera_json import read_camera
 from wearcap.io.formats.csv_table import read_columns, read_header
@@ -365,14 +365,25 @@ def headset_tasks(
     source = Path(source)
     if not source.exists():
         raise WearcapError("no such file or folder", where=source, fix="Give it as source=FILE or source=DIR.")
-    kinds = (".csv", ".json", ".jsonl", ".txt")
+    kinds = (".csv", ".tsv", ".json", ".jsonl", ".txt", ".bsor")
     found = [source]
-    if source.is_dir():
-        files = [path for path in sorted(source.rglob("*")) if path.is_file() and set(path.suffixes) & set(kinds)]
-        found = [path for path in files if is_headset_log(path)]
+    if source.is_dir() and not is_headset_session(source):
+        there = sorted(source.rglob("*"))
+        found = [path for path in there if path.is_dir() and path.name != "trackers" and is_headset_session(path)]
+        files = [path for path in there if path.is_file() and set(path.suffixes) & set(kinds)]
+        found += [path for path in files if not set(path.parents) & set(found) and is_headset_log(path)]
     if not found:
         raise WearcapError("no headset's log in this folder", source, "CSV or JSON with time, head_pos_x, …")
     return [_task("headset", path, _headset, splits, subject, license, settings) for path in found]
+
+
+def log_name(path: Path) -> str:
+    """A recording's name: its file's or folder's, or that of the folder above a usual one; replays are named after players."""
+    if path.suffix.lower() == ".bsor":
+        return f"replay_{content_hash(path)[:8]}"
+    name = path.resolve().name.split(".")[0] if path.is_file() else path.resolve().name
+    usual = ("images", "data", "poses", "trajectory", "closed_loop_trajectory", "trackers")
+    return path.resolve().parent.name if name in usual else name
 
 
 def _task(
@@ -386,11 +397,13 @@ def _task(
     files: Sequence[Path] = (),
 ) -> Task:
     """A task that is hashed by its files and settings, and named after its file or folder."""
-    name = path.resolve().name if path.is_dir() else path.name.split(".")[0]
-    if name in ("images", "data", "poses", "trajectory", "closed_loop_trajectory"):
-        name = path.resolve().parent.name
+    name = log_name(path)
     read = [path] if path.is_file() else [file for file in sorted(path.rglob("*")) if file.is_file()]
     small = [file for file in (*read, *files) if file.stat().st_size < 1 << 30]
     key = content_hash(kind, name, subject, license, asdict(settings), VERSION[kind], *small)
-    about = {"subject": subject, "license": license, "source": f"{kind} {path.name}"}
+    about = {
+        "subject": subject,
+        "license": license,
+        "source": f"{kind} {path.name if path.suffix != '.bsor' else name}",
+    }
     return Task(name or kind, partial(make, path, name or kind, about, settings), splits.of(subject), key)
