@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from wearcap.errors import WearcapError
@@ -15,6 +15,9 @@ from wearcap.geometry.trajectory import Trajectory
 
 NORM_TOLERANCE = 0.02
 """Largest deviation of a quaternion's norm from 1: text files round, but a mixed-up column is far off."""
+
+MAP_UNITS = 1000.0
+"""Distance from 0 (units of length) from which positions may be a map's."""
 
 
 def row_name(row: int) -> str:
@@ -46,6 +49,52 @@ def checked_trajectory(
         matrix_from_quat_wxyz(torch.tensor(quat_wxyz)).float(),
         torch.tensor(translation, dtype=torch.float32),
     )
+
+
+def map_origin(translation: np.ndarray) -> Float64[Tensor, "3"] | None:
+    """Whole place amid positions that are a map's, which single precision would keep in steps of decimetres; else None.
+
+    A map's are farther than 1000 units from 0, and ten times as far as they are apart.
+    """
+    low, middle, high = np.quantile(translation, (0.05, 0.5, 0.95), axis=0)
+    far = np.linalg.norm(middle)
+    if far < MAP_UNITS or far < 10 * np.linalg.norm(high - low):
+        return None
+    return torch.from_numpy(middle.round())
+
+
+def sound_rows(
+    timestamps: np.ndarray,
+    translation: np.ndarray,
+    quat_wxyz: np.ndarray,
+    where: str | Path,
+    name: Callable[[int], str] = row_name,
+) -> tuple[np.ndarray, list[str]]:
+    """(rows that have a pose, in the order of their times, the first of equal times; what was mended, with counts).
+
+    NaN and zero quaternions mark lost tracking. Raises WearcapError where no pose is left, and where sorting would mix
+    two recordings, which lengthens the path.
+    """
+    check_finite({"timestamp": timestamps}, where, name)
+    lost = np.isnan(translation).any(1) | np.isnan(quat_wxyz).any(1) | (np.abs(quat_wxyz).max(1) < 1e-9)
+    rows, notes = np.flatnonzero(~lost), []
+    if not len(rows):
+        what = f"none of {len(lost)} rows has a pose: NaN or a zero quaternion in each"
+        raise WearcapError(what, where, "poses", "Tracking was lost throughout, or columns are mixed up.")
+    if lost.any():
+        notes.append(f"{int(lost.sum())} of {len(lost)} rows without a pose (lost tracking) are left out")
+    order = rows[np.argsort(timestamps[rows], kind="stable")]
+    late = np.flatnonzero(np.diff(timestamps[rows]) < 0)
+    if len(late):
+        written, sorted_ = (np.linalg.norm(np.diff(translation[at], axis=0), axis=1).sum() for at in (rows, order))
+        if sorted_ > 1.5 * written + 1e-6:
+            what = f"times start again at {name(int(rows[late[0] + 1]))}, and sorted rows jump to and fro"
+            raise WearcapError(what, where, "one recording", "Two recordings stand in one file: cut it there.")
+        notes.append(f"{len(late)} rows out of order are sorted by time")
+    again = np.r_[False, np.diff(timestamps[order]) == 0]
+    if again.any():
+        notes.append(f"{int(again.sum())} rows that repeat a time are dropped")
+    return order[~again], notes
 
 
 def check_finite(columns: dict[str, np.ndarray], where: str | Path, name: Callable[[int], str] = row_name) -> None:

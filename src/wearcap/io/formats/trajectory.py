@@ -15,12 +15,14 @@ import os
 import re
 from array import array
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float64
+from torch import Tensor
 
 from wearcap.boundary.arrays import read_npy, read_npz
 from wearcap.boundary.opening import open_bytes
@@ -30,7 +32,14 @@ from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matr
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.colmap import read_image_poses
 from wearcap.io.formats.csv_table import read_columns
-from wearcap.io.formats.poses import are_rotations, check_finite, checked_trajectory, row_name
+from wearcap.io.formats.poses import (
+    are_rotations,
+    check_finite,
+    checked_trajectory,
+    map_origin,
+    row_name,
+    sound_rows,
+)
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Seconds per unit of time."""
@@ -62,6 +71,10 @@ class TrajectoryFile:
     """Whether the format's poses are a camera's, with OpenCV's axes; otherwise the file does not name its axes."""
     metric: bool
     """Whether the format's unit of length is the metre; structure from motion and one camera's SLAM know no unit."""
+    origin: Float64[Tensor, "3"] | None = None
+    """Place in the file's world and unit that is the trajectory's origin, where coordinates are a map's; None: 0."""
+    notes: tuple[str, ...] = ()
+    """What was mended, with counts."""
 
 
 @dataclass(frozen=True)
@@ -85,14 +98,17 @@ def read_trajectory(path: str | Path, time_unit: str | None = None, fps: float |
     """Trajectory in the file's own world and body axes (s; m where the format has metres).
 
     `time_unit` (s, ms, us, ns) overrides what the numbers say; `fps` is for files with frame numbers or no times.
-    Raises WearcapError for a file that is none of the formats, rows that are NaN, doubled or unsorted (named by line),
-    quaternions far from unit norm, and times that are no recording's.
+    Raises WearcapError for a file that is none of the formats or has no pose, rows that are infinite, quaternions far
+    from unit norm, two recordings in one file, and times that are no recording's.
     """
     return read_trajectory_file(path, time_unit, fps).trajectory
 
 
 def read_trajectory_file(path: str | Path, time_unit: str | None = None, fps: float | None = None) -> TrajectoryFile:
-    """A trajectory with its format and unit of time; raises as `read_trajectory` does."""
+    """A trajectory with its format and unit of time; raises as `read_trajectory` does.
+
+    Rows are sorted by time; repeated ones and those without a pose (lost tracking) are left out, which notes count.
+    """
     if time_unit not in (None, *UNITS):
         raise WearcapError(f"time_unit={time_unit!r}", expected=f"one of {', '.join(UNITS)}")
     if fps is not None and not 0 < fps < 2000:
@@ -101,12 +117,18 @@ def read_trajectory_file(path: str | Path, time_unit: str | None = None, fps: fl
     table = _read(path)
     if not len(table.translation):
         raise WearcapError("no poses in the file", path, FORMATS)
+    table, notes = _mended(table, path)
     if table.inverse:
         table = _inverted(table, path)
     seconds, unit = _seconds(table, time_unit, fps, path)
-    trajectory = checked_trajectory(seconds, table.translation, table.quat_wxyz, path, table.name)
+    check_finite({"translation": table.translation}, path, table.name)
+    origin = map_origin(table.translation)
+    place = table.translation if origin is None else table.translation - origin.numpy()
+    trajectory = checked_trajectory(seconds, place, table.quat_wxyz, path, table.name)
     check_span(seconds, path, table.name)
-    return TrajectoryFile(trajectory, table.format, unit, table.of_camera, table.metric)
+    if origin is not None:
+        notes.append(f"coordinates are a map's: {origin.tolist()} is taken off as the origin")
+    return TrajectoryFile(trajectory, table.format, unit, table.of_camera, table.metric, origin, tuple(notes))
 
 
 def trajectory_format(path: str | Path) -> str | None:
@@ -467,7 +489,22 @@ def _same_length(times: np.ndarray | None, count: int, path: Path) -> None:
         raise WearcapError(f"{len(times)} times of {count} poses", path, "one time for each pose")
 
 
-# --- times ---------------------------------------------------------------------------------------------------------
+# --- rows and times ------------------------------------------------------------------------------------------------
+
+
+def _mended(table: _Table, path: Path) -> tuple[_Table, list[str]]:
+    """Rows that have a pose in the order of their times, and notes on what was left out or sorted."""
+    times = np.arange(len(table.translation), dtype=np.float64) if table.times is None else table.times
+    rows, notes = sound_rows(times, table.translation, table.quat_wxyz, path, table.name)
+    mended = replace(
+        table,
+        times=None if table.times is None and len(rows) == len(times) else times[rows],
+        unit="frames" if table.times is None else table.unit,
+        translation=table.translation[rows],
+        quat_wxyz=table.quat_wxyz[rows],
+        name=lambda row: table.name(int(rows[row])),
+    )
+    return mended, notes
 
 
 def _inverted(table: _Table, path: Path) -> _Table:
@@ -475,8 +512,7 @@ def _inverted(table: _Table, path: Path) -> _Table:
     check_finite({"translation": table.translation, "quaternion": table.quat_wxyz}, path, table.name)
     R = matrix_from_quat_wxyz(torch.from_numpy(np.ascontiguousarray(table.quat_wxyz))).numpy()
     center = -np.einsum("nji,nj->ni", R, table.translation)
-    quat = table.quat_wxyz * np.array([1.0, -1.0, -1.0, -1.0])
-    return _Table(table.format, table.times, center, quat, table.unit, False, table.of_camera, table.metric, table.name)
+    return replace(table, translation=center, quat_wxyz=table.quat_wxyz * np.array([1.0, -1, -1, -1]), inverse=False)
 
 
 def _seconds(table: _Table, time_unit: str | None, fps: float | None, path: Path) -> tuple[np.ndarray, str]:
@@ -487,7 +523,6 @@ def _seconds(table: _Table, time_unit: str | None, fps: float | None, path: Path
             what = "frame numbers instead of times" if times is not None else "poses without times"
             raise WearcapError(what, path, "times of the poses", "Give the video's rate: fps=30.")
         return (np.arange(count) if times is None else times) / fps, "frames"
-    check_finite({"timestamp": times}, path, table.name)
     unit = time_unit or time_unit_of(times, table.unit, path)
     # Whole nanoseconds since 1970 are beyond a float's 53 bits; what is lost is below a microsecond.
     return times * UNITS[unit], unit
