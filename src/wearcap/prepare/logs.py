@@ -10,13 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float64
 from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS, Skeleton, skeleton_of_height
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, require_choice
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import swing_between
 from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.conventions import AUTO, Conventions
 from wearcap.io.devices.aria_mps import T_HEAD_DEVICE, head_stream, is_mps_folder, read_mps, read_points
 from wearcap.io.devices.axes import CAMERA, DEVICES, UPRIGHT, WORLDS, DeviceAxes, device_axes, to_head_axes
 from wearcap.io.devices.headset_log import is_headset_log, read_headset_log
@@ -37,7 +39,7 @@ from wearcap.sensors.slam_alignment import SceneEvidence, align_cleaned, pose_of
 from wearcap.sensors.watch_calibration import WatchSession, read_watch_calibration
 from wearcap.sensors.watches import watch_gaps
 
-VERSION = {"trajectory": 2, "watches": 1, "headset": 1}
+VERSION = {"trajectory": 3, "watches": 1, "headset": 1}
 """Versions of the conversions, increased when the same source and settings yield another recording."""
 Numbers = Sequence[float | int]
 
@@ -46,6 +48,7 @@ Numbers = Sequence[float | int]
 class TrajectorySettings:
     """How a trajectory becomes a head's path in metres, z up; None: from the file's content."""
 
+    unit: str | float | int = "auto"
     up: str = "auto"
     axes: str = "auto"
     time_unit: str | None = None
@@ -76,16 +79,28 @@ class TrajectorySettings:
         """T_head_device: the given one, else the nominal one of glasses and headsets."""
         return pose_of(self.T_head_device, "T_head_device") or T_HEAD_DEVICE
 
+    def conventions(self) -> Conventions:
+        """What is stated of the file. Raises WearcapError for unknown names, and for both unit and scale."""
+        if self.scale is not None and self.unit != AUTO:
+            what = f"unit={self.unit} and scale={self.scale}"
+            raise WearcapError(what, expected="one of them: unit=cm is scale=0.01", fix="Leave one out.")
+        return Conventions(unit=self.unit, up=self.up, axes=self.axes)
+
+    def cloud(self, read: TrajectoryFile) -> PointCloud | None:
+        """Points in the trajectory's world and unit, its origin taken off."""
+        return None if self.points is None else read_cloud(self.points, read.origin)
+
     def evidence(self, read: TrajectoryFile, up: Tensor | None) -> SceneEvidence:
         """What is known of scale and vertical; times of the config count from the first pose."""
         start_s = read.trajectory.timestamps[0].item()
         standing = None if self.standing is None else _times(self.standing, 2, "standing", start_s)
         walks = tuple((*_times(walk[:2], 2, "walks", start_s), float(walk[2])) for walk in self.walks or ())
         imu = None if self.head_imu is None else read_head_imu(self.head_imu)
-        scale = self.scale if self.scale is not None else 1.0 if read.metric else None
-        points = None if self.points is None else read_cloud(self.points).points_world
+        stated = self.conventions().unit_m or self.scale
+        scale = stated if stated is not None else 1.0 if read.metric else None
+        cloud = self.cloud(read)
         return SceneEvidence(
-            points,
+            None if cloud is None else cloud.points_world,
             standing,
             None if self.camera_height_m is None else float(self.camera_height_m),
             imu,
@@ -113,19 +128,20 @@ def read_head_imu(path: str | Path) -> ImuStream:
     return replace(read_watch_log(path, WRISTS[0]), joint="head")
 
 
-def read_cloud(path: str | Path) -> PointCloud:
-    """Points of a .ply, .pcd, MPS' semi-dense points, or a table with columns x, y, z.
+def read_cloud(path: str | Path, origin: Float64[Tensor, "3"] | None = None) -> PointCloud:
+    """Points of a .ply, .pcd, MPS' semi-dense points, or a table with columns x, y, z; `origin` is taken off in float64.
 
     Raises WearcapError for any other file.
     """
+    off = (0.0, 0.0, 0.0) if origin is None else origin.tolist()
     suffixes = {suffix.lower() for suffix in Path(path).suffixes}
     if ".ply" in suffixes or ".pcd" in suffixes:
-        return PointCloud(torch.from_numpy((read_ply if ".ply" in suffixes else read_pcd)(path).points).float())
+        return PointCloud(torch.from_numpy((read_ply if ".ply" in suffixes else read_pcd)(path, off).points))
     header = read_header(path)
     if "px_world" in header:
-        return read_points(path)
+        return read_points(path, origin=off)
     table = read_columns(path, ["x", "y", "z"])
-    columns = {name: table[name] for name in "xyz"}
+    columns = {name: table[name] - shift for name, shift in zip("xyz", off)}
     check_finite(columns, path)
     return PointCloud(torch.stack([torch.from_numpy(column) for column in columns.values()], 1).float())
 
@@ -140,10 +156,9 @@ def read_path(file: Path, name: str, about: dict[str, str], settings: Trajectory
     unit, fps = settings.time_unit, settings.fps
     read = read_trajectory_file(file, unit, None if fps is None else float(fps))
     head, alignment, note = head_of(read, settings, str(file))
-    points = None
-    if settings.points is not None:
-        cloud = read_cloud(settings.points)
-        points = replace(cloud, points_world=alignment.points(cloud.points_world))
+    cloud = settings.cloud(read)
+    points = None if cloud is None else replace(cloud, points_world=alignment.points(cloud.points_world))
+    origin = origin_of(read, alignment)
     floor = None
     if settings.camera_height_m is not None:
         floor = FloorTrack(head.timestamps[:1], torch.zeros(1))
@@ -151,7 +166,15 @@ def read_path(file: Path, name: str, about: dict[str, str], settings: Trajectory
     skeleton = settings.skeleton()
     if skeleton is None:
         note += "; height not given: taken from how high the head is carried, where the floor is known"
-    return Recording(name, head, camera=camera, points=points, floor=floor, skeleton=skeleton, note=note, **about)
+    about = {**about, "note": note}
+    return Recording(name, head, camera=camera, points=points, floor=floor, skeleton=skeleton, origin=origin, **about)
+
+
+def origin_of(read: TrajectoryFile, alignment: SlamAlignment) -> Float64[Tensor, "3"] | None:
+    """What brings positions of the aligned world back to the file's (m, z up): `Recording.origin`."""
+    if read.origin is None:
+        return None
+    return alignment.scale * alignment.R_world_slam @ read.origin - alignment.t_world_slam
 
 
 def head_of(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tuple[HeadStream, SlamAlignment, str]:
@@ -171,22 +194,22 @@ def head_of(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> t
     head = HeadStream(track.timestamps, track.R_world_body, track.t_world_body, mount.R, mount.t)
     unit = "in metres" if alignment.scale == 1 else f"a unit is {alignment.scale:.4g} m"
     notes = [f"{read.format}, times in {read.time_unit}", vertical, f"the device has {axes}'s axes", unit]
-    return head, alignment, "; ".join([*notes, *([outliers] if outliers else [])])
+    return head, alignment, "; ".join([*notes, *read.notes, *([outliers] if outliers else [])])
 
 
 def _axes(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tuple[str, Tensor | None, str]:
     """(the device's axes, rotation to a world with z up, how it is known); None where scene or sensor will tell."""
-    given = settings.axes if settings.axes != "auto" or not read.of_camera else "camera"
+    stated = settings.conventions()
+    require_choice(stated.axes, (AUTO, *DEVICES), f"axes={stated.axes} of a trajectory")
+    given = stated.axes if stated.axes != AUTO or not read.of_camera else "camera"
     if settings.head_imu is not None or (settings.points and settings.standing and settings.camera_height_m):
-        if given not in ("auto", *DEVICES):
-            raise WearcapError(f"axes={given!r}", expected=f"one of auto, {', '.join(DEVICES)}")
         device = "camera" if given == "auto" else given
         return device, None, f"vertical by the {'head sensor' if settings.head_imu is not None else 'floor'}"
     try:
-        axes = device_axes(read.trajectory, settings.up, given, where)
+        axes = device_axes(read.trajectory, stated.up, given, where, read.usual)
     except WearcapError:
         up = -read.trajectory.R_world_body[:, :, 1].double().mean(0)
-        if settings.up != "auto" or given != "camera" or up.norm() < UPRIGHT:
+        if stated.up != AUTO or given != "camera" or up.norm() < UPRIGHT:
             raise
         # Structure from motion has an arbitrary world: a worn camera is upright on average.
         R = swing_between(up / up.norm(), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
@@ -195,7 +218,7 @@ def _axes(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tup
             R,
             "vertical by the camera's mean tilt, some degrees off (better: head_imu=, or points= of the floor)",
         )
-    return axes.device, WORLDS[axes.up], f"{axes.up} is up (the device is upright by {axes.upright:.2f})"
+    return axes.device, WORLDS[axes.up], f"{axes.up} is up (upright by {axes.upright:.2f}; {axes.evidence})"
 
 
 def _camera(settings: TrajectorySettings, head: HeadStream) -> CameraStream | None:
@@ -264,8 +287,8 @@ def _watches(camera: Path, name: str, about: dict[str, str], settings: "WatchesS
             "(wearcap calibrate steps=watches)"
         )
     if recording.head is None:
-        head, _, note = head_of(read, way, str(camera))
-        recording = replace(recording, head=head)
+        head, alignment, note = head_of(read, way, str(camera))
+        recording = replace(recording, head=head, origin=origin_of(read, alignment))
         notes.insert(0, note)
     assert recording.head is not None
     fix = "Calibrate their clocks (wearcap calibrate steps=watches … swings=[…]), or take the logs of one session."
@@ -308,6 +331,7 @@ def watches_tasks(
 class HeadsetSettings:
     """How a headset's log is read, and who wore it; "auto" and None: from the file's content."""
 
+    unit: str | float | int = "auto"
     axes: str = "auto"
     quaternion: str = "auto"
     hands: str = "auto"
@@ -317,7 +341,8 @@ class HeadsetSettings:
 
     def read(self, path: Path, name: str, about: dict[str, str]) -> Recording:
         """Head, wrists and floor of a log."""
-        log = read_headset_log(path, self.axes, self.quaternion, self.hands, self.time_unit)
+        how = Conventions(unit=self.unit, axes=self.axes, quaternion=self.quaternion, hands=self.hands)
+        log = read_headset_log(path, how.axes, how.quaternion, how.hands, self.time_unit)
         mount = pose_of(self.T_head_device, "T_head_device") or T_HEAD_DEVICE
         head = HeadStream(log.head.timestamps, log.head.R_world_body, log.head.t_world_body, mount.R, mount.t)
         notes = [

@@ -4,6 +4,7 @@ A convention is the rotation, or for left-handed ones the reflection, that takes
 y left, z up. World and device share it, so a pose is turned on both sides: R = M R' Mᵀ, t = M t'.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -28,8 +29,15 @@ WORLDS = {
     "z": torch.eye(3),
     "y": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
     "-y": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "-z": torch.diag(torch.tensor([1.0, -1.0, -1.0])),
+    "x": torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+    "-x": torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]]),
 }
-"""Rotations of a right-handed world into one with z up, by the axis that is up; x stays x."""
+"""Rotations of a right-handed world into one with z up, by the axis that is up; x stays x where it is level."""
+USUAL_WORLDS = ("z", "y", "-y")
+"""Worlds that files have which do not say so."""
+MARGIN = 0.15
+"""Least lead in evidence (the unit is an upright device) of the axes that are taken without asking."""
 WALKING_M_S = 0.4
 _SEEN_S = 2.0
 _AHEAD_M = 0.05
@@ -44,32 +52,59 @@ class DeviceAxes:
     device: str
     upright: float
     """Mean component of the device's up axis along the world's."""
+    margin: float = math.inf
+    """Lead in evidence over the next pair of axes; infinite where there is none."""
+    by_format: bool = False
+    """Whether the format's usual axes were taken, since the lead is below `MARGIN`."""
+
+    @property
+    def evidence(self) -> str:
+        """How the axes are known, in words."""
+        lead = "stated" if math.isinf(self.margin) else f"ahead of other axes by {self.margin:.2f}"
+        return "as the format usually has them; the path does not show them" if self.by_format else lead
 
 
-def device_axes(track: Trajectory, up: str = "auto", device: str = "auto", where: str = "") -> DeviceAxes:
-    """Axes of a worn device's path; those that are "auto" follow from which axis stays upright, and where it goes.
+def device_axes(
+    track: Trajectory, up: str = "auto", device: str = "auto", where: str = "", usual: tuple[str, str] | None = None
+) -> DeviceAxes:
+    """Axes of a worn device's path; those that are "auto" follow from the path.
 
-    Of conventions that fit alike, the one whose vertical the path moves least along is taken, and where the device's
-    forward axis agrees best with the walk. Raises WearcapError for other names, and when nothing stays upright.
+    Evidence is which axis of the device stays upright, that the path is level, that the wearer walks ahead, and does
+    not look up on average. Where it does not decide, the format's `usual` (up, device) does. Raises WearcapError for
+    other names, when nothing stays upright, and, with the candidates, where nothing decides.
     """
     for name, value, allowed in (("up", up, WORLDS), ("axes", device, DEVICES)):
         if value not in ("auto", *allowed):
             raise WearcapError(f"{name}={value!r}", expected=f"one of auto, {', '.join(allowed)}")
-    R, spread = track.R_world_body.double(), track.t_world_body.double().std(0, unbiased=False)
-    candidates = []
-    for world, R_up in WORLDS.items():
-        for name, axes in DEVICES.items():
-            if up not in ("auto", world) or device not in ("auto", name):
-                continue
-            upright = (R_up[2].double() @ R.mean(0) @ axes.double()[2]).item()
-            flat = 1 - (spread @ R_up[2].double().abs() / spread.norm().clamp_min(1e-9)).item()
-            candidates.append((upright + 0.3 * flat + 0.2 * _ahead(track, R_up, axes), upright, world, name))
-    _, upright, world, name = max(candidates)
-    if upright < UPRIGHT and "auto" in (up, device):
+    worlds = USUAL_WORLDS if up == "auto" else (up,)
+    pairs = [(world, name) for world in worlds for name in DEVICES if device in ("auto", name)]
+    scored = sorted(((*_evidence(track, world, name), world, name) for world, name in pairs), reverse=True)
+    best, upright, world, name = scored[0]
+    if upright < UPRIGHT and len(pairs) > 1:
         what = f"no axis of the device stays upright (the best, {name} in a world with {world} up, by {upright:.2f})"
         fix = "Say what is up in the world, and which axes the device has: up=z|y|-y axes=camera|head|openxr."
         raise WearcapError(what, where, f"{UPRIGHT} or more, as worn devices have it", fix)
-    return DeviceAxes(world, name, upright)
+    margin = best - scored[1][0] if len(pairs) > 1 else math.inf
+    rivals = [row for row in scored if best - row[0] < MARGIN and row[1] >= UPRIGHT]
+    if len(rivals) < 2:
+        return DeviceAxes(world, name, upright, margin)
+    for _, upright, world, name in rivals:
+        if (world, name) == usual:
+            return DeviceAxes(world, name, upright, margin, by_format=True)
+    choices = " or ".join(f"axes={name} up={world}" for _, _, world, name in rivals)
+    what = f"{len(rivals)} readings of its axes fit alike (within {best - rivals[-1][0]:.2f})"
+    fix = f"Say which: {choices}. Two seconds of walking ahead would show it."
+    raise WearcapError(what, where, f"one that leads by {MARGIN}", fix)
+
+
+def _evidence(track: Trajectory, world: str, device: str) -> tuple[float, float]:
+    """(evidence for a pair of axes, upright: mean component of the device's up axis along the world's)."""
+    R_up, axes = WORLDS[world].double(), DEVICES[device].double()
+    spread = track.t_world_body.double().std(0, unbiased=False)
+    vertical = R_up[2] @ track.R_world_body.double().mean(0) @ axes.mT
+    upright, looks_up = vertical[2].item(), max(vertical[0].item(), 0.0)
+    level = 1 - (spread @ R_up[2].abs() / spread.norm().clamp_min(1e-9)).item()
+    return upright + 0.3 * level + 0.2 * _ahead(track, R_up, axes) - 0.2 * looks_up, upright
 
 
 def to_head_axes(track: Trajectory, axes: DeviceAxes) -> Trajectory:
@@ -81,13 +116,13 @@ def to_head_axes(track: Trajectory, axes: DeviceAxes) -> Trajectory:
 
 def _ahead(track: Trajectory, R_up: Tensor, axes: Tensor) -> float:
     """Mean cosine between the device's forward axis and the walk, -1 … 1; 0 where there is hardly a walk."""
-    velocity = linear_velocity(track).double() @ R_up.double().mT
+    velocity = linear_velocity(track).double() @ R_up.mT
     speed = velocity[:, :2].norm(dim=-1)
     walking = speed > WALKING_M_S
     step = track.timestamps.diff().median().item() if len(track) > 1 else 0.0
     if walking.sum() * step < _SEEN_S:
         return 0.0
-    forward = (R_up.double() @ track.R_world_body.double() @ axes.double().mT)[walking][:, :2, 0]
+    forward = (R_up @ track.R_world_body.double() @ axes.mT)[walking][:, :2, 0]
     return (
         (torch.nn.functional.normalize(forward, dim=-1) * velocity[walking, :2] / speed[walking, None])
         .sum(-1)

@@ -4,13 +4,15 @@ TUM: lines of `timestamp tx ty tz qx qy qz qw`. EuRoC: CSV of `#timestamp [ns], 
 follow; a header that names its columns decides their order. COLMAP: images.txt or images.bin, poses of the world in the
 camera. hloc: lines of `name qw qx qy qz tx ty tz`, likewise. DROID-SLAM: arrays (.npy, .npz) of `tx ty tz qx qy qz qw`;
 poses.npy of a reconstruction's folder holds the world in the camera, with tstamps.npy beside. MPS: closed-loop CSV.
-KITTI: 12 numbers a line, the first three rows of the camera's matrix in the world, times in times.txt beside.
+KITTI: 12 numbers a line, the first three rows of the camera's matrix in the world, times in times.txt beside; with a
+time first, or whole matrices by row or column (ARKit). transforms.json, Record3D's metadata.json: `camera_frames.py`.
 
 Times are checked before anything is made of them: the unit follows from the step between rows (a header's unit and
 seconds since 1970 decide where two are possible), and nothing that is spread over a longer time than its rows can
 cover is accepted. So whoever resamples a trajectory gets at most ten times its rows.
 """
 
+import math
 import os
 import re
 from array import array
@@ -30,9 +32,11 @@ from wearcap.boundary.texts import numbered_lines
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
 from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.formats.camera_frames import NAMES, is_camera_frames, read_camera_frames
 from wearcap.io.formats.colmap import read_image_poses
-from wearcap.io.formats.csv_table import read_columns
+from wearcap.io.formats.csv_table import read_columns, read_header
 from wearcap.io.formats.poses import (
+    NORM_TOLERANCE,
     are_rotations,
     check_finite,
     checked_trajectory,
@@ -53,10 +57,11 @@ _EPOCH_S = 9e8, 4.2e9
 _MATRIX_WITHIN = 0.02
 _FRAMES = 1e6
 """Whole numbers below are frame numbers (nine hours at 30 Hz), larger ones times."""
-FORMATS = "TUM, EuRoC, COLMAP's images, hloc's poses, DROID-SLAM's arrays, MPS' closed loop, KITTI"
+FORMATS = "TUM, EuRoC, COLMAP's images, hloc's poses, DROID-SLAM's arrays, MPS' closed loop, KITTI, transforms.json"
 _FIX = "Lines of `timestamp tx ty tz qx qy qz qw` (TUM) are the simplest."
 _SLOTS = {"time", "x", "y", "z", "qw", "qx", "qy", "qz"}
-_MPS = "tracking_timestamp_us", "tx_world_device"
+_MPS = "tracking_timestamp_us", ("tx_world_device", "tx_odometry_device")
+_FIRST_CAMERA = "-y", "camera"
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,8 @@ class TrajectoryFile:
     """Place in the file's world and unit that is the trajectory's origin, where coordinates are a map's; None: 0."""
     notes: tuple[str, ...] = ()
     """What was mended, with counts."""
+    usual: tuple[str, str] | None = None
+    """The format's usual axes, up and the device's, for a path that does not show them (`device_axes`)."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +98,7 @@ class _Table:
     """Whether poses are those of the world in the body."""
     of_camera: bool = False
     metric: bool = True
+    usual: tuple[str, str] | None = None
     name: Callable[[int], str] = row_name
 
 
@@ -128,7 +136,8 @@ def read_trajectory_file(path: str | Path, time_unit: str | None = None, fps: fl
     check_span(seconds, path, table.name)
     if origin is not None:
         notes.append(f"coordinates are a map's: {origin.tolist()} is taken off as the origin")
-    return TrajectoryFile(trajectory, table.format, unit, table.of_camera, table.metric, origin, tuple(notes))
+    about = table.format, unit, table.of_camera, table.metric
+    return TrajectoryFile(trajectory, *about, origin, tuple(notes), table.usual)
 
 
 def trajectory_format(path: str | Path) -> str | None:
@@ -142,23 +151,25 @@ def trajectory_format(path: str | Path) -> str | None:
     if begin.startswith((b"\x93NUMPY", b"PK")) or path.name == "images.bin":
         return "COLMAP" if path.name == "images.bin" else "DROID-SLAM" if path.suffix == ".npy" else None
     try:
-        return _kind(_first_lines(path))[0]
+        return "NeRF" if is_camera_frames(path) else _kind(_first_lines(path))[0]
     except WearcapError:
         return None
 
 
 _IN_FOLDERS = (
-    *("images.bin", "images.txt", "sparse/0/images.bin", "sparse/0/images.txt", "poses.npy"),
+    *(f"{part}images.{kind}" for part in ("", "sparse/0/", "sparse/", "colmap/sparse/0/") for kind in ("bin", "txt")),
+    *("poses.npy", *NAMES),
     *(f"{part}closed_loop_trajectory.csv{packed}" for part in ("", "slam/") for packed in ("", ".gz", ".xz")),
     *("mav0/state_groundtruth_estimate0/data.csv", "state_groundtruth_estimate0/data.csv", "data.csv"),
-    *("trajectory.txt", "traj.txt", "poses.txt"),
+    *("trajectory.txt", "traj.txt", "poses.txt", "open_loop_trajectory.csv"),
 )
 """Files of a folder that hold its trajectory, the first that is there."""
 
 
 def trajectory_file(folder: str | Path) -> Path | None:
     """The file in a folder that holds its trajectory, by the formats' usual names; None where there is none."""
-    return next((path for name in _IN_FOLDERS if (path := Path(folder) / name).is_file()), None)
+    files = (path for name in _IN_FOLDERS if (path := Path(folder) / name).is_file())
+    return next((path for path in files if path.suffix != ".json" or is_camera_frames(path)), None)
 
 
 def _file_of(path: Path) -> Path:
@@ -166,8 +177,10 @@ def _file_of(path: Path) -> Path:
         return path
     found = trajectory_file(path)
     if found is None:
-        expected = ", ".join(_IN_FOLDERS[:5]) + ", …"
-        raise WearcapError("a folder without a trajectory", path, expected, "Give its file.")
+        expected = "images.bin or images.txt (also in sparse/0), poses.npy, transforms.json, trajectory.txt, …"
+        model = any((path / part / f"cameras.{kind}").is_file() for part in ("", "sparse/0") for kind in ("bin", "txt"))
+        what = "a model of COLMAP without its images' poses" if model else "a folder without a trajectory"
+        raise WearcapError(what, path, expected, "Give its file.")
     return found
 
 
@@ -183,6 +196,9 @@ def _read(path: Path) -> _Table:
         return _droid_archive(path)
     if path.name == "images.bin":
         return _from_images(path)
+    if is_camera_frames(path):
+        record3d, rows = read_camera_frames(path)
+        return replace(_of_pictures("Record3D" if record3d else "NeRF", rows, path), metric=record3d)
     first = _first_lines(path)
     kind, header = _kind(first)
     if kind is None:
@@ -232,7 +248,7 @@ def _kind(first: Sequence[tuple[int, str]]) -> tuple[str | None, dict[str, int] 
     for _, line in first:
         words = _words(line.lstrip("#").strip())
         comment = line.startswith("#")
-        if _MPS[0] in words and _MPS[1] in words:
+        if _MPS[0] in words and set(_MPS[1]) & set(words):
             return "MPS", None
         if comment or not any(map(_number, words)):
             slots = _slots(words)
@@ -241,13 +257,13 @@ def _kind(first: Sequence[tuple[int, str]]) -> tuple[str | None, dict[str, int] 
             header = slots or header
             continue
         numbers = sum(map(_number, words))
-        if header is not None and numbers == len(words) > max(header.values()):
+        if header is not None and len(words) > max(header.values()) and _number(words[header["time"]]):
             return "EuRoC" if "," in line else "TUM", header
         if not _number(words[0]) and len(words) == 8 and numbers == 7:
             return "hloc", None
         if len(words) >= 10 and "," not in line and all(map(_number, words[:9])) and not _number(words[9]):
             return "COLMAP", None
-        if len(words) == 12 and numbers == 12 and "," not in line:
+        if len(words) == numbers and ((numbers == 12 and "," not in line) or _is_matrix(words)):
             return "KITTI", None
         if len(words) == 8 and "," not in line:
             return "TUM", None
@@ -266,7 +282,10 @@ _ALIASES = {
 
 def _slots(words: Sequence[str]) -> dict[str, int] | None:
     """Columns of a header that names time, position and quaternion; None for any other line."""
-    plain = [re.sub(r"\[[^\[\]]*\]|\([^()]*\)|[^a-z]", "", word.lower()) for word in words]
+    if [word.lower() for word in words[:3]] == ["timestamp(s)", "q", "p"]:  # OpenVINS' state
+        return {"time": 0} | {name: place for place, name in enumerate(("qx", "qy", "qz", "qw", "x", "y", "z"), 1)}
+    names = [re.sub(r"^.*\.(position|orientation)\.", r"\1", word.lower()) for word in words]
+    plain = [re.sub(r"\[[^\[\]]*\]|\([^()]*\)|[^a-z]", "", name) for name in names]
     plain = [re.sub(r"^(time|timestamp)(?:ns|us|ms|sec|seconds|s)$", r"\1", word) for word in plain]
     found = {}
     for slot, names in _ALIASES.items():
@@ -286,25 +305,41 @@ def _named_columns(path: Path, kind: str, header: dict[str, int] | None) -> _Tab
     places = [slots[name] for name in ("time", "x", "y", "z", "qw", "qx", "qy", "qz")]
     exact = header is None and kind == "TUM"
     expected = "timestamp tx ty tz qx qy qz qw" if exact else "timestamp, x, y, z, qw, qx, qy, qz in every line"
-    values, lines, unit = array("d"), array("l"), None
+    values, lines, unit, heading, state = array("d"), array("l"), None, "", -1
     for number, line in numbered_lines(path):
         text = line.split("#")[0].strip()
-        if not text:
-            unit = unit or _unit_of(line)
-            continue
-        words = _words(text)
-        if not values and not any(map(_number, words)):
-            unit = unit or _unit_of(line)  # a header without #
+        words = _words(text or line.lstrip("# \t"))
+        if not text or (not values and not any(map(_number, words))):  # a comment, or a header without #
+            unit, heading = unit or _unit_of(line), heading or line.lower()
+            state = next((place for place, word in enumerate(words) if word.lower() in _STATES), state)
             continue
         if len(words) != 8 if exact else len(words) <= max(places):
             raise WearcapError(f"line {number} has {len(words)} fields", path, expected)
         try:
-            values.extend([float(words[place]) for place in places])
+            values.extend([float(words[place] or "nan") for place in places])
         except ValueError as error:
             raise WearcapError(f"line {number}: {error}"[:200], path, expected) from error
+        if 0 <= state < len(words) and words[state].lower() in _LOST:
+            values[-1] = math.nan
         lines.append(number)
     table = np.asarray(values).reshape(-1, 8)
-    return _Table(kind, table[:, 0], table[:, 1:4], table[:, 4:], unit, name=_by_line(lines))
+    if exact and not _units(table[:, 4:]) and _units(table[:, [1, 2, 3, 5]]):
+        table = table[:, [0, 6, 7, 4, 5, 1, 2, 3]]  # ARCore's recorders put the quaternion, scalar last, first
+    usual = next((axes for word, axes in _USUAL if word in heading), None)
+    if usual is None and len(table) and np.abs(table[0, 1:] - [0, 0, 0, 1, 0, 0, 0]).max() < 1e-6:
+        usual = None if re.search(r"\bx\b", heading) else _FIRST_CAMERA
+    return _Table(kind, table[:, 0], table[:, 1:4], table[:, 4:], unit, usual=usual, name=_by_line(lines))
+
+
+_STATES = ("tracking_state", "trackingstate", "tracking state", "state", "status")
+_LOST = ("lost", "notavailable", "not_available", "not available", "unavailable", "paused", "stopped")
+_USUAL = (("tracker_confidence", ("y", "openxr")), ("pose.pose.position", ("z", "head")))
+"""Words in the headers of RealSense's T265 and of odometry in ROS bags, and their axes."""
+
+
+def _units(quat: np.ndarray) -> bool:
+    """Whether all are unit quaternions."""
+    return bool((np.abs(np.linalg.norm(quat, axis=1) - 1) < NORM_TOLERANCE).all())
 
 
 def _by_line(lines: Sequence[int]) -> Callable[[int], str]:
@@ -329,7 +364,15 @@ def _refuse(first: Sequence[tuple[int, str]], path: Path) -> None:
     raise WearcapError(what, path, FORMATS, _FIX)
 
 
+def require_closed_loop(header: Sequence[str], path: str | Path) -> None:
+    """Raise WearcapError for MPS' open-loop trajectory, which drifts and has no world."""
+    if "tx_odometry_device" in header:
+        what = "MPS' open-loop trajectory: odometry that drifts, begins anew in each session and shares no world with points"
+        raise WearcapError(what, path, "closed_loop_trajectory.csv", "Use that file of the same MPS output (SLAM).")
+
+
 def _mps(path: Path) -> _Table:
+    require_closed_loop(read_header(path), path)
     columns = [f"{part}_world_device" for part in ("tx", "ty", "tz", "qw", "qx", "qy", "qz")]
     table = read_columns(path, [_MPS[0], *columns])
     pose = np.stack([table[name] for name in columns], 1)
@@ -340,17 +383,35 @@ def _after_header(row: int) -> str:
     return f"line {row + 2}"
 
 
+def _is_matrix(words: Sequence[str]) -> bool:
+    """Whether numbers are [R | t] after a time, or a whole 4×4 matrix, by row or column, which a time may precede."""
+    values = np.array([float(word) for word in words[len(words) % 4 :]])
+    if len(words) == 13:
+        R = torch.from_numpy(values.reshape(3, 4)[:, :3])
+        return bool(are_rotations(R, _MATRIX_WITHIN))
+    return len(words) in (16, 17) and any(np.array_equal(last, [0, 0, 0, 1]) for last in (values[12:], values[3::4]))
+
+
 def _kitti(path: Path) -> _Table:
-    values, lines = array("d"), array("l")
+    """Rows of [R | t] or of 4×4 matrices; those by column are ARKit's, whose camera looks along -z in a world with y up."""
+    values, lines, width = array("d"), array("l"), 0
     for number, line in numbered_lines(path):
-        words = line.split("#")[0].split()
-        if words and (len(words) != 12 or not all(map(_number, words))):
-            raise WearcapError(f"line {number} has {len(words)} fields", path, "12 numbers in every line")
+        text = line.split("#")[0].strip()
+        words = _words(text) if text else []
+        width = width or len(words)
+        if words and (len(words) != width or not all(map(_number, words))):
+            raise WearcapError(f"line {number} has {len(words)} fields", path, f"{width} numbers in every line")
         if words:
             values.extend(map(float, words))
             lines.append(number)
-    matrices = np.asarray(values).reshape(-1, 3, 4)
-    return _of_matrices("KITTI", matrices, _times_beside(path), path, _by_line(lines))
+    table = np.asarray(values).reshape(-1, width)
+    times = table[:, 0].copy() if width % 4 else _times_beside(path)
+    matrices = table[:, width % 4 :].reshape(len(table), -1, 4)
+    by_column = width >= 16 and not (matrices[:, 3] == [0, 0, 0, 1]).all()
+    if by_column:
+        matrices = matrices.swapaxes(1, 2)
+    read = _of_matrices("ARKit" if by_column else "KITTI", matrices[:, :3], times, path, _by_line(lines))
+    return replace(read, of_camera=False, usual=("y", "openxr"), metric=True) if by_column else read
 
 
 # --- names of pictures as times ------------------------------------------------------------------------------------
