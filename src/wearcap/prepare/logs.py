@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor
@@ -53,7 +54,7 @@ class TrajectorySettings:
     axes: str = "auto"
     time_unit: str | None = None
     fps: float | int | None = None
-    scale: float | int | None = None
+    unit: str | float | int = AUTO
     T_head_device: Numbers | None = None
     height: float | int | None = None
     points: str | None = None
@@ -79,15 +80,8 @@ class TrajectorySettings:
         """T_head_device: the given one, else the nominal one of glasses and headsets."""
         return pose_of(self.T_head_device, "T_head_device") or T_HEAD_DEVICE
 
-    def conventions(self) -> Conventions:
-        """What is stated of the file. Raises WearcapError for unknown names, and for both unit and scale."""
-        if self.scale is not None and self.unit != AUTO:
-            what = f"unit={self.unit} and scale={self.scale}"
-            raise WearcapError(what, expected="one of them: unit=cm is scale=0.01", fix="Leave one out.")
-        return Conventions(unit=self.unit, up=self.up, axes=self.axes)
-
     def cloud(self, read: TrajectoryFile) -> PointCloud | None:
-        """Points in the trajectory's world and unit, its origin taken off."""
+        """The points in the trajectory's world, from which its origin is taken off, too."""
         return None if self.points is None else read_cloud(self.points, read.origin)
 
     def evidence(self, read: TrajectoryFile, up: Tensor | None) -> SceneEvidence:
@@ -96,8 +90,8 @@ class TrajectorySettings:
         standing = None if self.standing is None else _times(self.standing, 2, "standing", start_s)
         walks = tuple((*_times(walk[:2], 2, "walks", start_s), float(walk[2])) for walk in self.walks or ())
         imu = None if self.head_imu is None else read_head_imu(self.head_imu)
-        stated = self.conventions().unit_m or self.scale
-        scale = stated if stated is not None else 1.0 if read.metric else None
+        unit_m = Conventions(unit=self.unit).unit_m
+        scale = unit_m if unit_m is not None else 1.0 if read.metric else None
         cloud = self.cloud(read)
         return SceneEvidence(
             None if cloud is None else cloud.points_world,
@@ -106,7 +100,7 @@ class TrajectorySettings:
             imu,
             pose_of(self.T_cam_imu, "T_cam_imu"),
             walks,
-            None if scale is None else float(scale),
+            scale,
             up,
         )
 
@@ -128,22 +122,24 @@ def read_head_imu(path: str | Path) -> ImuStream:
     return replace(read_watch_log(path, WRISTS[0]), joint="head")
 
 
-def read_cloud(path: str | Path, origin: Float64[Tensor, "3"] | None = None) -> PointCloud:
-    """Points of a .ply, .pcd, MPS' semi-dense points, or a table with columns x, y, z; `origin` is taken off in float64.
+def read_cloud(path: str | Path, origin: np.ndarray | None = None) -> PointCloud:
+    """Points of a .ply, .pcd, MPS' semi-dense points, or a table with columns x, y, z; `origin` is taken off them.
 
     Raises WearcapError for any other file.
     """
     off = (0.0, 0.0, 0.0) if origin is None else origin.tolist()
     suffixes = {suffix.lower() for suffix in Path(path).suffixes}
+    shift = np.zeros(3) if origin is None else origin
     if ".ply" in suffixes or ".pcd" in suffixes:
-        return PointCloud(torch.from_numpy((read_ply if ".ply" in suffixes else read_pcd)(path, off).points))
+        points = (read_ply if ".ply" in suffixes else read_pcd)(path).points
+        return PointCloud(torch.from_numpy(points.astype(np.float64) - shift).float())
     header = read_header(path)
     if "px_world" in header:
         return read_points(path, origin=off)
     table = read_columns(path, ["x", "y", "z"])
     columns = {name: table[name] - shift for name, shift in zip("xyz", off)}
     check_finite(columns, path)
-    return PointCloud(torch.stack([torch.from_numpy(column) for column in columns.values()], 1).float())
+    return PointCloud(torch.from_numpy(np.stack(list(columns.values()), 1) - shift).float())
 
 
 def read_path(file: Path, name: str, about: dict[str, str], settings: TrajectorySettings) -> Recording:
@@ -156,9 +152,12 @@ def read_path(file: Path, name: str, about: dict[str, str], settings: Trajectory
     unit, fps = settings.time_unit, settings.fps
     read = read_trajectory_file(file, unit, None if fps is None else float(fps))
     head, alignment, note = head_of(read, settings, str(file))
-    cloud = settings.cloud(read)
-    points = None if cloud is None else replace(cloud, points_world=alignment.points(cloud.points_world))
-    origin = origin_of(read, alignment)
+    points = settings.cloud(read)
+    if points is not None:
+        points = replace(points, points_world=alignment.points(points.points_world))
+    origin = None
+    if read.origin is not None:
+        origin = alignment.scale * alignment.R_world_slam.double() @ torch.from_numpy(read.origin)
     floor = None
     if settings.camera_height_m is not None:
         floor = FloorTrack(head.timestamps[:1], torch.zeros(1))
@@ -166,15 +165,9 @@ def read_path(file: Path, name: str, about: dict[str, str], settings: Trajectory
     skeleton = settings.skeleton()
     if skeleton is None:
         note += "; height not given: taken from how high the head is carried, where the floor is known"
-    about = {**about, "note": note}
-    return Recording(name, head, camera=camera, points=points, floor=floor, skeleton=skeleton, origin=origin, **about)
-
-
-def origin_of(read: TrajectoryFile, alignment: SlamAlignment) -> Float64[Tensor, "3"] | None:
-    """What brings positions of the aligned world back to the file's (m, z up): `Recording.origin`."""
-    if read.origin is None:
-        return None
-    return alignment.scale * alignment.R_world_slam @ read.origin - alignment.t_world_slam
+    return Recording(
+        name, head, camera=camera, points=points, floor=floor, skeleton=skeleton, origin=origin, note=note, **about
+    )
 
 
 def head_of(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tuple[HeadStream, SlamAlignment, str]:
@@ -189,7 +182,7 @@ def head_of(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> t
     evidence = settings.evidence(read, up)
     limits = float(settings.max_acceleration), float(settings.max_burst_s)
     alignment, clean, outliers = align_cleaned(slam, evidence.align, *limits)
-    track = to_head_axes(alignment.apply(clean), DeviceAxes("z", "camera", 1.0))
+    track = to_head_axes(alignment.apply(clean), DeviceAxes("z", "camera", 1.0, ""))
     mount = settings.mount()
     head = HeadStream(track.timestamps, track.R_world_body, track.t_world_body, mount.R, mount.t)
     unit = "in metres" if alignment.scale == 1 else f"a unit is {alignment.scale:.4g} m"
@@ -218,7 +211,7 @@ def _axes(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tup
             R,
             "vertical by the camera's mean tilt, some degrees off (better: head_imu=, or points= of the floor)",
         )
-    return axes.device, WORLDS[axes.up], f"{axes.up} is up (upright by {axes.upright:.2f}; {axes.evidence})"
+    return axes.device, WORLDS[axes.up], f"{axes.up} is up ({axes.known_by})"
 
 
 def _camera(settings: TrajectorySettings, head: HeadStream) -> CameraStream | None:

@@ -1,6 +1,6 @@
 """Aria Digital Twin (ADT) sequences: head trajectory, tracked body joints and objects from CSV and JSON files.
 
-The files' world mostly has y up (gravity along -y); here the axis that gravity shows to be up is turned to z.
+The files' world has y up (gravity along -y; sequences of version 1 may have z up); here it is turned to z up, x staying x.
 """
 
 from pathlib import Path
@@ -41,25 +41,21 @@ def read_adt(folder: str | Path) -> Recording:
     folder = Path(folder)
     if not is_adt(folder):
         raise WearcapError("no aria_trajectory.csv", folder, "an ADT sequence folder")
-    up = gravity_up(folder / "aria_trajectory.csv")
-    trajectory = read_closed_loop(folder / "aria_trajectory.csv")[0]
+    path = read_closed_loop(folder / "aria_trajectory.csv")
     skeletons = sorted(folder.glob("Skeleton_*.json"))
     metadata = folder / "metadata.json"
     return Recording(
         name=folder.resolve().name,
-        head=head_stream(trajectory, fps=None, where=folder),
-        cues=read_skeleton(skeletons[0], up) if skeletons else {},
-        object_motion=read_moving_objects(folder, up) if (folder / "scene_objects.csv").is_file() else {},
+        head=head_stream(path.trajectory, fps=None, where=folder),
+        cues=read_skeleton(skeletons[0], path.up) if skeletons else {},
+        object_motion=read_moving_objects(folder, path.up) if (folder / "scene_objects.csv").is_file() else {},
         location=str(read_json_object(metadata).get("scene", "")) if metadata.is_file() else "",
         source="Aria Digital Twin",
     )
 
 
 def read_skeleton(path: str | Path, up: str = "y") -> dict[str, Cue]:
-    """3D cues by joint name from `Skeleton_*.json` (120 Hz), the world's `up` axis turned to z.
-
-    Raises WearcapError for other joint counts or NaN.
-    """
+    """3D cues by joint name from `Skeleton_*.json` (120 Hz). Raises WearcapError for other joint counts or NaN."""
     with understood("not an ADT skeleton", path, "frames with timestamp_ns and joints"):
         frames = read_json_object(path)["frames"]
         times = np.array([frame["timestamp_ns"] for frame in frames], dtype=np.float64) * 1e-9

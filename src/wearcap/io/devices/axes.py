@@ -42,6 +42,9 @@ WALKING_M_S = 0.4
 _SEEN_S = 2.0
 _AHEAD_M = 0.05
 _AGREEMENT = 0.5
+CLEAR = 0.1
+"""Lead of the best reading of a path's axes from which it is taken."""
+_IDENTITY_RAD, _IDENTITY_M = 0.02, 0.01
 
 
 @dataclass(frozen=True)
@@ -52,16 +55,8 @@ class DeviceAxes:
     device: str
     upright: float
     """Mean component of the device's up axis along the world's."""
-    margin: float = math.inf
-    """Lead in evidence over the next pair of axes; infinite where there is none."""
-    by_format: bool = False
-    """Whether the format's usual axes were taken, since the lead is below `MARGIN`."""
-
-    @property
-    def evidence(self) -> str:
-        """How the axes are known, in words."""
-        lead = "stated" if math.isinf(self.margin) else f"ahead of other axes by {self.margin:.2f}"
-        return "as the format usually has them; the path does not show them" if self.by_format else lead
+    known_by: str
+    """Why these were taken, in a few words."""
 
 
 def device_axes(
@@ -69,42 +64,44 @@ def device_axes(
 ) -> DeviceAxes:
     """Axes of a worn device's path; those that are "auto" follow from the path.
 
-    Evidence is which axis of the device stays upright, that the path is level, that the wearer walks ahead, and does
-    not look up on average. Where it does not decide, the format's `usual` (up, device) does. Raises WearcapError for
-    other names, when nothing stays upright, and, with the candidates, where nothing decides.
+    Each convention scores by how upright the device is, how level its path, and how well its forward axis agrees with the
+    walk. Where the best leads by less than `CLEAR`, a path that begins with the identity is that of a SLAM, which writes
+    camera axes. Raises WearcapError for other names, when nothing stays upright, and where several fit alike.
     """
     for name, value, allowed in (("up", up, WORLDS), ("axes", device, DEVICES)):
         if value not in ("auto", *allowed):
             raise WearcapError(f"{name}={value!r}", expected=f"one of auto, {', '.join(allowed)}")
-    worlds = USUAL_WORLDS if up == "auto" else (up,)
-    pairs = [(world, name) for world in worlds for name in DEVICES if device in ("auto", name)]
-    scored = sorted(((*_evidence(track, world, name), world, name) for world, name in pairs), reverse=True)
-    best, upright, world, name = scored[0]
-    if upright < UPRIGHT and len(pairs) > 1:
+    R, spread = track.R_world_body.double(), track.t_world_body.double().std(0, unbiased=False)
+    candidates = []
+    for world, R_up in WORLDS.items():
+        for name, axes in DEVICES.items():
+            if up not in ("auto", world) or device not in ("auto", name):
+                continue
+            upright = (R_up[2].double() @ R.mean(0) @ axes.double()[2]).item()
+            flat = 1 - (spread @ R_up[2].double().abs() / spread.norm().clamp_min(1e-9)).item()
+            candidates.append((upright + 0.3 * flat + 0.2 * _ahead(track, R_up, axes), upright, world, name))
+    ranked = sorted(candidates, reverse=True)
+    score, upright, world, name = ranked[0]
+    if upright < UPRIGHT and "auto" in (up, device):
         what = f"no axis of the device stays upright (the best, {name} in a world with {world} up, by {upright:.2f})"
         fix = "Say what is up in the world, and which axes the device has: up=z|y|-y axes=camera|head|openxr."
         raise WearcapError(what, where, f"{UPRIGHT} or more, as worn devices have it", fix)
-    margin = best - scored[1][0] if len(pairs) > 1 else math.inf
-    rivals = [row for row in scored if best - row[0] < MARGIN and row[1] >= UPRIGHT]
-    if len(rivals) < 2:
-        return DeviceAxes(world, name, upright, margin)
-    for _, upright, world, name in rivals:
-        if (world, name) == usual:
-            return DeviceAxes(world, name, upright, margin, by_format=True)
-    choices = " or ".join(f"axes={name} up={world}" for _, _, world, name in rivals)
-    what = f"{len(rivals)} readings of its axes fit alike (within {best - rivals[-1][0]:.2f})"
-    fix = f"Say which: {choices}. Two seconds of walking ahead would show it."
-    raise WearcapError(what, where, f"one that leads by {MARGIN}", fix)
+    alike = [row for row in ranked if row[0] > score - CLEAR and row[1] > UPRIGHT]
+    if len(alike) < 2:
+        lead = f", {score - ranked[1][0]:.2f} better than any other reading" if len(ranked) > 1 else ""
+        return DeviceAxes(world, name, upright, f"the device is upright by {upright:.2f}{lead}")
+    slam = next((row for row in alike if row[2:] == ("-y", "camera")), None)
+    if slam is not None and _begins_at_identity(track):
+        return DeviceAxes("-y", "camera", slam[1], "it begins with the identity, as a camera's SLAM does")
+    listed = " or ".join(f"up={row[2]} axes={row[3]}" for row in alike)
+    raise WearcapError(
+        f"{len(alike)} readings of its axes fit alike", where, "one that fits best", f"Say which: {listed}."
+    )
 
 
-def _evidence(track: Trajectory, world: str, device: str) -> tuple[float, float]:
-    """(evidence for a pair of axes, upright: mean component of the device's up axis along the world's)."""
-    R_up, axes = WORLDS[world].double(), DEVICES[device].double()
-    spread = track.t_world_body.double().std(0, unbiased=False)
-    vertical = R_up[2] @ track.R_world_body.double().mean(0) @ axes.mT
-    upright, looks_up = vertical[2].item(), max(vertical[0].item(), 0.0)
-    level = 1 - (spread @ R_up[2].abs() / spread.norm().clamp_min(1e-9)).item()
-    return upright + 0.3 * level + 0.2 * _ahead(track, R_up, axes) - 0.2 * looks_up, upright
+def _begins_at_identity(track: Trajectory) -> bool:
+    turn = rotation.geodesic(track.R_world_body[0].double(), torch.eye(3, dtype=torch.float64)).item()
+    return turn < _IDENTITY_RAD and track.t_world_body[0].norm().item() < _IDENTITY_M
 
 
 def to_head_axes(track: Trajectory, axes: DeviceAxes) -> Trajectory:

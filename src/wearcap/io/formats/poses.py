@@ -51,50 +51,27 @@ def checked_trajectory(
     )
 
 
-def map_origin(translation: np.ndarray) -> Float64[Tensor, "3"] | None:
-    """Whole place amid positions that are a map's, which single precision would keep in steps of decimetres; else None.
+def tracked_in_order(
+    timestamps: np.ndarray, translation: np.ndarray, quat_wxyz: np.ndarray
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Rows that hold a pose, by time and each time once, and a sentence with a count on each kind that is left out.
 
-    A map's are farther than 1000 units from 0, and ten times as far as they are apart.
+    Rows without a pose are what systems write while tracking is lost: values that are not finite, or a quaternion of
+    zeros. Of rows of one time the first is kept.
     """
-    low, middle, high = np.quantile(translation, (0.05, 0.5, 0.95), axis=0)
-    far = np.linalg.norm(middle)
-    if far < MAP_UNITS or far < 10 * np.linalg.norm(high - low):
-        return None
-    return torch.from_numpy(middle.round())
-
-
-def sound_rows(
-    timestamps: np.ndarray,
-    translation: np.ndarray,
-    quat_wxyz: np.ndarray,
-    where: str | Path,
-    name: Callable[[int], str] = row_name,
-) -> tuple[np.ndarray, list[str]]:
-    """(rows that have a pose, in the order of their times, the first of equal times; what was mended, with counts).
-
-    NaN and zero quaternions mark lost tracking. Raises WearcapError where no pose is left, and where sorting would mix
-    two recordings, which lengthens the path.
-    """
-    check_finite({"timestamp": timestamps}, where, name)
-    lost = np.isnan(translation).any(1) | np.isnan(quat_wxyz).any(1) | (np.abs(quat_wxyz).max(1) < 1e-9)
-    rows, notes = np.flatnonzero(~lost), []
-    if not len(rows):
-        what = f"none of {len(lost)} rows has a pose: NaN or a zero quaternion in each"
-        raise WearcapError(what, where, "poses", "Tracking was lost throughout, or columns are mixed up.")
-    if lost.any():
-        notes.append(f"{int(lost.sum())} of {len(lost)} rows without a pose (lost tracking) are left out")
-    order = rows[np.argsort(timestamps[rows], kind="stable")]
-    late = np.flatnonzero(np.diff(timestamps[rows]) < 0)
-    if len(late):
-        written, sorted_ = (np.linalg.norm(np.diff(translation[at], axis=0), axis=1).sum() for at in (rows, order))
-        if sorted_ > 1.5 * written + 1e-6:
-            what = f"times start again at {name(int(rows[late[0] + 1]))}, and sorted rows jump to and fro"
-            raise WearcapError(what, where, "one recording", "Two recordings stand in one file: cut it there.")
-        notes.append(f"{len(late)} rows out of order are sorted by time")
-    again = np.r_[False, np.diff(timestamps[order]) == 0]
-    if again.any():
-        notes.append(f"{int(again.sum())} rows that repeat a time are dropped")
-    return order[~again], notes
+    seen = np.isfinite(translation).all(1) & np.isfinite(quat_wxyz).all(1) & (quat_wxyz != 0).any(1)
+    seen &= np.isfinite(timestamps)
+    rows = np.flatnonzero(seen)
+    times = timestamps[rows]
+    late = int((np.diff(times) < 0).sum())
+    order = np.argsort(times, kind="stable")
+    first = np.diff(times[order], prepend=-np.inf) > 0
+    counts = {
+        "rows without a pose (tracking lost) are left out": len(seen) - len(rows),
+        "rows that repeat a time are left out": int((~first).sum()),
+        "rows are earlier than the ones before them: all are sorted by time": late,
+    }
+    return rows[order][first], tuple(f"{count} {what}" for what, count in counts.items() if count)
 
 
 def check_finite(columns: dict[str, np.ndarray], where: str | Path, name: Callable[[int], str] = row_name) -> None:

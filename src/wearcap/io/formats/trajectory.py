@@ -24,7 +24,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float64
-from torch import Tensor
 
 from wearcap.boundary.arrays import read_npy, read_npz
 from wearcap.boundary.opening import open_bytes
@@ -34,16 +33,8 @@ from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matr
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.camera_frames import NAMES, is_camera_frames, read_camera_frames
 from wearcap.io.formats.colmap import read_image_poses
-from wearcap.io.formats.csv_table import read_columns, read_header
-from wearcap.io.formats.poses import (
-    NORM_TOLERANCE,
-    are_rotations,
-    check_finite,
-    checked_trajectory,
-    map_origin,
-    row_name,
-    sound_rows,
-)
+from wearcap.io.formats.csv_table import read_columns
+from wearcap.io.formats.poses import are_rotations, check_finite, checked_trajectory, row_name, tracked_in_order
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Seconds per unit of time."""
@@ -55,6 +46,8 @@ MAX_SPARSITY = 10.0
 _EPOCH_S = 9e8, 4.2e9
 """Seconds since 1970 of the years 1998 to 2103."""
 _MATRIX_WITHIN = 0.02
+_FAR, _FAR_FOR_EXTENT, _NOWHERE = 1e4, 20.0, 1e9
+"""Distance from zero from which places are a map's, in units and in extents of the path, and from which they are none."""
 _FRAMES = 1e6
 """Whole numbers below are frame numbers (nine hours at 30 Hz), larger ones times."""
 FORMATS = "TUM, EuRoC, COLMAP's images, hloc's poses, DROID-SLAM's arrays, MPS' closed loop, KITTI, transforms.json"
@@ -76,12 +69,10 @@ class TrajectoryFile:
     """Whether the format's poses are a camera's, with OpenCV's axes; otherwise the file does not name its axes."""
     metric: bool
     """Whether the format's unit of length is the metre; structure from motion and one camera's SLAM know no unit."""
-    origin: Float64[Tensor, "3"] | None = None
-    """Place in the file's world and unit that is the trajectory's origin, where coordinates are a map's; None: 0."""
+    origin: Float64[np.ndarray, "3"] | None = None
+    """What was taken off the positions (file's unit and axes), for maps' coordinates are beyond single precision."""
     notes: tuple[str, ...] = ()
-    """What was mended, with counts."""
-    usual: tuple[str, str] | None = None
-    """The format's usual axes, up and the device's, for a path that does not show them (`device_axes`)."""
+    """Sentences on rows that were sorted or left out."""
 
 
 @dataclass(frozen=True)
@@ -106,10 +97,15 @@ def read_trajectory(path: str | Path, time_unit: str | None = None, fps: float |
     """Trajectory in the file's own world and body axes (s; m where the format has metres).
 
     `time_unit` (s, ms, us, ns) overrides what the numbers say; `fps` is for files with frame numbers or no times.
-    Raises WearcapError for a file that is none of the formats or has no pose, rows that are infinite, quaternions far
-    from unit norm, two recordings in one file, and times that are no recording's.
+    Raises WearcapError for a file that is none of the formats or whose rows hold no pose, quaternions far from unit norm
+    (named by line), times that are no recording's, and positions at a map's coordinates.
     """
-    return read_trajectory_file(path, time_unit, fps).trajectory
+    read = read_trajectory_file(path, time_unit, fps)
+    if read.origin is not None:
+        what = f"positions at a map's coordinates, {read.origin.round(1).tolist()} from the origin"
+        fix = "Take the same offset off it and what shares its world."
+        raise WearcapError(what, path, "positions within kilometres of the origin", fix)
+    return read.trajectory
 
 
 def read_trajectory_file(path: str | Path, time_unit: str | None = None, fps: float | None = None) -> TrajectoryFile:
@@ -127,17 +123,33 @@ def read_trajectory_file(path: str | Path, time_unit: str | None = None, fps: fl
         raise WearcapError("no poses in the file", path, FORMATS)
     table, notes = _mended(table, path)
     if table.inverse:
-        table = _inverted(table, path)
+        table = _inverted(table)
     seconds, unit = _seconds(table, time_unit, fps, path)
-    check_finite({"translation": table.translation}, path, table.name)
-    origin = map_origin(table.translation)
-    place = table.translation if origin is None else table.translation - origin.numpy()
-    trajectory = checked_trajectory(seconds, place, table.quat_wxyz, path, table.name)
-    check_span(seconds, path, table.name)
+    rows, notes = tracked_in_order(seconds, table.translation, table.quat_wxyz)
+    if len(rows) < min(2, len(seconds)):
+        what = f"{len(rows)} poses in its {len(seconds)} rows; {'; '.join(notes)}"
+        raise WearcapError(what, path, "finite numbers, unit quaternions, and times that differ")
+    seconds, translation = seconds[rows], table.translation[rows].astype(np.float64)
+    origin = map_origin(translation)
     if origin is not None:
-        notes.append(f"coordinates are a map's: {origin.tolist()} is taken off as the origin")
-    about = table.format, unit, table.of_camera, table.metric
-    return TrajectoryFile(trajectory, *about, origin, tuple(notes), table.usual)
+        translation = translation - origin
+        listed = ", ".join(f"{value:.0f}" for value in origin)
+        notes += (f"positions are at a map's coordinates: ({listed}) is taken off, and kept as the origin",)
+
+    def name(row: int) -> str:
+        return table.name(int(rows[row]))
+
+    trajectory = checked_trajectory(seconds, translation, table.quat_wxyz[rows], path, name)
+    check_span(seconds, path, name)
+    return TrajectoryFile(trajectory, table.format, unit, table.of_camera, table.metric, origin, notes)
+
+
+def map_origin(translation: Float64[np.ndarray, "pose 3"]) -> Float64[np.ndarray, "3"] | None:
+    """Whole numbers near the first place, for places much farther from zero than from one another; None for others."""
+    extent = np.ptp(translation, axis=0).max()
+    if not max(_FAR, _FAR_FOR_EXTENT * extent) < np.linalg.norm(translation[0]) < _NOWHERE:
+        return None
+    return np.floor(translation[0])
 
 
 def trajectory_format(path: str | Path) -> str | None:
@@ -203,6 +215,9 @@ def _read(path: Path) -> _Table:
     kind, header = _kind(first)
     if kind is None:
         _refuse(first, path)
+    if kind == "open loop":
+        what, expected = "MPS' open-loop odometry, which drifts", "the closed loop, which is registered in one world"
+        raise WearcapError(what, path, expected, "Give closed_loop_trajectory.csv of the same output, or its folder.")
     if kind == "MPS":
         return _mps(path)
     if kind == "COLMAP":
@@ -250,6 +265,8 @@ def _kind(first: Sequence[tuple[int, str]]) -> tuple[str | None, dict[str, int] 
         comment = line.startswith("#")
         if _MPS[0] in words and set(_MPS[1]) & set(words):
             return "MPS", None
+        if "tx_odometry_device" in words:
+            return "open loop", None
         if comment or not any(map(_number, words)):
             slots = _slots(words)
             if slots is None and not comment:
@@ -568,9 +585,8 @@ def _mended(table: _Table, path: Path) -> tuple[_Table, list[str]]:
     return mended, notes
 
 
-def _inverted(table: _Table, path: Path) -> _Table:
+def _inverted(table: _Table) -> _Table:
     """The bodies' poses in the world, of those of the world in the body."""
-    check_finite({"translation": table.translation, "quaternion": table.quat_wxyz}, path, table.name)
     R = matrix_from_quat_wxyz(torch.from_numpy(np.ascontiguousarray(table.quat_wxyz))).numpy()
     center = -np.einsum("nji,nj->ni", R, table.translation)
     return replace(table, translation=center, quat_wxyz=table.quat_wxyz * np.array([1.0, -1, -1, -1]), inverse=False)
