@@ -11,11 +11,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float64
 from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS, Skeleton, skeleton_of_height
-from wearcap.errors import WearcapError, require_choice
+from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import swing_between
 from wearcap.geometry.trajectory import Trajectory
@@ -40,7 +39,7 @@ from wearcap.sensors.slam_alignment import SceneEvidence, align_cleaned, pose_of
 from wearcap.sensors.watch_calibration import WatchSession, read_watch_calibration
 from wearcap.sensors.watches import watch_gaps
 
-VERSION = {"trajectory": 3, "watches": 1, "headset": 1}
+VERSION = {"trajectory": 2, "watches": 1, "headset": 1}
 """Versions of the conversions, increased when the same source and settings yield another recording."""
 Numbers = Sequence[float | int]
 
@@ -49,7 +48,6 @@ Numbers = Sequence[float | int]
 class TrajectorySettings:
     """How a trajectory becomes a head's path in metres, z up; None: from the file's content."""
 
-    unit: str | float | int = "auto"
     up: str = "auto"
     axes: str = "auto"
     time_unit: str | None = None
@@ -127,7 +125,6 @@ def read_cloud(path: str | Path, origin: np.ndarray | None = None) -> PointCloud
 
     Raises WearcapError for any other file.
     """
-    off = (0.0, 0.0, 0.0) if origin is None else origin.tolist()
     suffixes = {suffix.lower() for suffix in Path(path).suffixes}
     shift = np.zeros(3) if origin is None else origin
     if ".ply" in suffixes or ".pcd" in suffixes:
@@ -135,9 +132,9 @@ def read_cloud(path: str | Path, origin: np.ndarray | None = None) -> PointCloud
         return PointCloud(torch.from_numpy(points.astype(np.float64) - shift).float())
     header = read_header(path)
     if "px_world" in header:
-        return read_points(path, origin=off)
+        return read_points(path)
     table = read_columns(path, ["x", "y", "z"])
-    columns = {name: table[name] - shift for name, shift in zip("xyz", off)}
+    columns = {name: table[name] for name in "xyz"}
     check_finite(columns, path)
     return PointCloud(torch.from_numpy(np.stack(list(columns.values()), 1) - shift).float())
 
@@ -192,17 +189,17 @@ def head_of(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> t
 
 def _axes(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tuple[str, Tensor | None, str]:
     """(the device's axes, rotation to a world with z up, how it is known); None where scene or sensor will tell."""
-    stated = settings.conventions()
-    require_choice(stated.axes, (AUTO, *DEVICES), f"axes={stated.axes} of a trajectory")
-    given = stated.axes if stated.axes != AUTO or not read.of_camera else "camera"
+    given = settings.axes if settings.axes != "auto" or not read.of_camera else "camera"
     if settings.head_imu is not None or (settings.points and settings.standing and settings.camera_height_m):
+        if given not in ("auto", *DEVICES):
+            raise WearcapError(f"axes={given!r}", expected=f"one of auto, {', '.join(DEVICES)}")
         device = "camera" if given == "auto" else given
         return device, None, f"vertical by the {'head sensor' if settings.head_imu is not None else 'floor'}"
     try:
-        axes = device_axes(read.trajectory, stated.up, given, where, read.usual)
+        axes = device_axes(read.trajectory, settings.up, given, where)
     except WearcapError:
         up = -read.trajectory.R_world_body[:, :, 1].double().mean(0)
-        if stated.up != AUTO or given != "camera" or up.norm() < UPRIGHT:
+        if settings.up != "auto" or given != "camera" or up.norm() < UPRIGHT:
             raise
         # Structure from motion has an arbitrary world: a worn camera is upright on average.
         R = swing_between(up / up.norm(), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
@@ -280,8 +277,8 @@ def _watches(camera: Path, name: str, about: dict[str, str], settings: "WatchesS
             "(wearcap calibrate steps=watches)"
         )
     if recording.head is None:
-        head, alignment, note = head_of(read, way, str(camera))
-        recording = replace(recording, head=head, origin=origin_of(read, alignment))
+        head, _, note = head_of(read, way, str(camera))
+        recording = replace(recording, head=head)
         notes.insert(0, note)
     assert recording.head is not None
     fix = "Calibrate their clocks (wearcap calibrate steps=watches … swings=[…]), or take the logs of one session."
@@ -324,7 +321,6 @@ def watches_tasks(
 class HeadsetSettings:
     """How a headset's log is read, and who wore it; "auto" and None: from the file's content."""
 
-    unit: str | float | int = "auto"
     axes: str = "auto"
     quaternion: str = "auto"
     hands: str = "auto"
@@ -334,8 +330,7 @@ class HeadsetSettings:
 
     def read(self, path: Path, name: str, about: dict[str, str]) -> Recording:
         """Head, wrists and floor of a log."""
-        how = Conventions(unit=self.unit, axes=self.axes, quaternion=self.quaternion, hands=self.hands)
-        log = read_headset_log(path, how.axes, how.quaternion, how.hands, self.time_unit)
+        log = read_headset_log(path, self.axes, self.quaternion, self.hands, self.time_unit)
         mount = pose_of(self.T_head_device, "T_head_device") or T_HEAD_DEVICE
         head = HeadStream(log.head.timestamps, log.head.R_world_body, log.head.t_world_body, mount.R, mount.t)
         notes = [

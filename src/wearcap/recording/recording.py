@@ -187,8 +187,6 @@ class Recording:
     license: str = ""
     note: str = ""
     """What was detected or assumed when the recording was made, in a sentence."""
-    origin: Float64[Tensor, "3"] | None = None
-    """What was taken off coordinates of a map (m): a place in the source's world, with z up, is t + origin."""
     session: str | None = None
     """Recordings of several wearers with the same session share clock and world."""
 

@@ -13,7 +13,7 @@ from wearcap.boundary.texts import read_json_object
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.devices.aria_mps import gravity_up, head_stream, read_closed_loop, turn_up
+from wearcap.io.devices.aria_mps import head_stream, read_closed_loop, turn_up
 from wearcap.io.formats.csv_table import read_columns
 from wearcap.io.formats.poses import check_finite, check_rising, checked_trajectory
 from wearcap.recording import Cue, Recording

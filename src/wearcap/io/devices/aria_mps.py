@@ -5,7 +5,6 @@ Frames: `aria` is MPS's own device frame (on Gen 1 glasses the left SLAM camera)
 (x forward, y left, z up), the frame of a `HeadStream`.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,12 +13,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.errors import WearcapError, require_choice
+from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
 from wearcap.io.formats.csv_table import iter_columns, read_columns, read_header
 from wearcap.io.formats.poses import check_finite, checked_trajectory
-from wearcap.io.formats.trajectory import require_closed_loop
 from wearcap.recording import HeadStream, PointCloud, Recording
 
 MAX_INV_DIST_STD, MAX_DIST_STD = 0.005, 0.01
@@ -102,32 +100,13 @@ def read_closed_loop(path: str | Path) -> ClosedLoop:
     return ClosedLoop(turned, torch.tensor(table[quality], dtype=torch.float32), up)
 
 
-def gravity_up(path: str | Path) -> str:
-    """The world's up axis of a closed-loop trajectory by its gravity, a key of `WORLDS`."""
-    table = read_columns(path, _gravity_columns(read_header(path)))
-    return _up_against(np.array([column.mean() for column in table.values()]), path)
-
-
-def _gravity_columns(header: Sequence[str]) -> list[str]:
-    return [f"gravity_{axis}{'' if 'gravity_x' in header else '_world'}" for axis in "xyz"]
-
-
-def _up_against(gravity: np.ndarray, path: str | Path) -> str:
-    """The world's axis against a mean gravity (m/s²), a key of `WORLDS`."""
-    length = np.linalg.norm(gravity)
-    if not 9.7 < length < 9.9:
-        raise WearcapError(f"gravity is {length:.2f} m/s² long", path, "9.81 m/s²")
-    axis = int(np.abs(gravity).argmax())
-    if abs(gravity[axis]) < 0.99 * length:
-        what = f"gravity {gravity.round(2).tolist()} is along no axis of the world"
-        raise WearcapError(what, path, "one axis up", "Rotate the world.")
-    return ("-" if gravity[axis] > 0 else "") + "xyz"[axis]
-
-
 def turn_up(up: str) -> Float[Tensor, "3 3"]:
-    """Rotation of a right-handed world whose `up` axis is a key of `WORLDS` into one with z up."""
-    require_choice(up, WORLDS, f"up={up}")
-    return WORLDS[up]
+    """Rotation of a right-handed world whose `up` axis is "y" or "z" into one with z up (x stays x)."""
+    if up not in ("y", "z"):
+        raise WearcapError(f"up axis {up!r}", expected="'y' or 'z'")
+    if up == "z":
+        return torch.eye(3)
+    return torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def head_stream(
@@ -151,18 +130,16 @@ def head_stream(
     return HeadStream(trajectory.timestamps, T_world_device.R, T_world_device.t, T_HEAD_DEVICE.R, T_HEAD_DEVICE.t)
 
 
-def read_points(
-    path: str | Path, observations: str | Path | None = None, origin: Sequence[float] = (0.0, 0.0, 0.0)
-) -> PointCloud:
+def read_points(path: str | Path, observations: str | Path | None = None) -> PointCloud:
     """Reliable semi-dense points; their confidence is 1 - inv_dist_std / `MAX_INV_DIST_STD` (our choice), 0 … 1.
 
     `observations` is the file of observation times (`semidense_observations.csv`, tens of millions of rows, read in
-    chunks): `first_seen` comes from it, and points without an observation are dropped. `origin` is taken off in float64.
+    chunks): `first_seen` comes from it, and points without an observation are dropped.
     Raises WearcapError for missing columns or NaN positions, and for the observations of another recording.
     """
     position = [f"p{axis}_world" for axis in "xyz"]
     table = read_columns(path, [*position, "inv_dist_std", "dist_std"], whole=["uid"] if observations else [])
-    points = np.stack([table[name] - off for name, off in zip(position, origin)], 1)
+    points = np.stack([table[name] for name in position], 1)
     check_finite({"position": points}, path)
     keep = (table["inv_dist_std"] < MAX_INV_DIST_STD) & (table["dist_std"] < MAX_DIST_STD)
     first_seen = None
@@ -206,8 +183,7 @@ def read_mps(folder: str | Path, *, fps: float | None = 60.0, T_aria_cpf: Rigid 
     path = find_mps_file(folder, _TRAJECTORY)
     if path is None:
         what = "no closed_loop_trajectory.csv (plain, .gz or .xz)"
-        fix = "An open-loop trajectory alone is odometry that drifts: request MPS' SLAM."
-        raise WearcapError(what, folder, "the output folder of Aria's MPS", fix)
+        raise WearcapError(what, folder, "the output folder of Aria's MPS")
     head = head_stream(read_closed_loop(path)[0], fps=fps, T_aria_cpf=T_aria_cpf, where=path)
     return Recording(name=Path(folder).resolve().name, head=head, points=read_mps_points(folder), source="Aria MPS")
 

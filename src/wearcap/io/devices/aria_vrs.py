@@ -98,16 +98,6 @@ def extract_video(
     return CameraStream(times[first:stop], camera, T_head_cam.R, T_head_cam.t, video=name)
 
 
-def refused_vrs(path: str | Path) -> WearcapError:
-    """Error for a VRS recording in the place of a recording: it holds sensors' data, and no poses."""
-    what = "a VRS recording holds pictures and inertial data, but no poses"
-    fix = (
-        "Have Meta's machine perception services (MPS) compute its trajectory (closed_loop_trajectory.csv, "
-        'semidense_points.csv.gz) and give that folder; pictures and calibration of a VRS need `pip install "wearcap[aria]"`.'
-    )
-    return WearcapError(what, path, "the output folder of Aria's MPS", fix)
-
-
 def _open(path: str | Path):
     """Data provider of projectaria-tools. Raises WearcapError that names what is missing."""
     if data_provider is None:

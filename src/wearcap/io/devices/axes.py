@@ -4,7 +4,6 @@ A convention is the rotation, or for left-handed ones the reflection, that takes
 y left, z up. World and device share it, so a pose is turned on both sides: R = M R' Mᵀ, t = M t'.
 """
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -29,15 +28,8 @@ WORLDS = {
     "z": torch.eye(3),
     "y": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
     "-y": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
-    "-z": torch.diag(torch.tensor([1.0, -1.0, -1.0])),
-    "x": torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
-    "-x": torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]]),
 }
-"""Rotations of a right-handed world into one with z up, by the axis that is up; x stays x where it is level."""
-USUAL_WORLDS = ("z", "y", "-y")
-"""Worlds that files have which do not say so."""
-MARGIN = 0.15
-"""Least lead in evidence (the unit is an upright device) of the axes that are taken without asking."""
+"""Rotations of a right-handed world into one with z up, by the axis that is up; x stays x."""
 WALKING_M_S = 0.4
 _SEEN_S = 2.0
 _AHEAD_M = 0.05
@@ -59,10 +51,8 @@ class DeviceAxes:
     """Why these were taken, in a few words."""
 
 
-def device_axes(
-    track: Trajectory, up: str = "auto", device: str = "auto", where: str = "", usual: tuple[str, str] | None = None
-) -> DeviceAxes:
-    """Axes of a worn device's path; those that are "auto" follow from the path.
+def device_axes(track: Trajectory, up: str = "auto", device: str = "auto", where: str = "") -> DeviceAxes:
+    """Axes of a worn device's path; those that are "auto" follow from which axis stays upright, and where it goes.
 
     Each convention scores by how upright the device is, how level its path, and how well its forward axis agrees with the
     walk. Where the best leads by less than `CLEAR`, a path that begins with the identity is that of a SLAM, which writes
@@ -113,13 +103,13 @@ def to_head_axes(track: Trajectory, axes: DeviceAxes) -> Trajectory:
 
 def _ahead(track: Trajectory, R_up: Tensor, axes: Tensor) -> float:
     """Mean cosine between the device's forward axis and the walk, -1 … 1; 0 where there is hardly a walk."""
-    velocity = linear_velocity(track).double() @ R_up.mT
+    velocity = linear_velocity(track).double() @ R_up.double().mT
     speed = velocity[:, :2].norm(dim=-1)
     walking = speed > WALKING_M_S
     step = track.timestamps.diff().median().item() if len(track) > 1 else 0.0
     if walking.sum() * step < _SEEN_S:
         return 0.0
-    forward = (R_up @ track.R_world_body.double() @ axes.mT)[walking][:, :2, 0]
+    forward = (R_up.double() @ track.R_world_body.double() @ axes.double().mT)[walking][:, :2, 0]
     return (
         (torch.nn.functional.normalize(forward, dim=-1) * velocity[walking, :2] / speed[walking, None])
         .sum(-1)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wearcap.errors import WearcapError
@@ -15,9 +15,6 @@ from wearcap.geometry.trajectory import Trajectory
 
 NORM_TOLERANCE = 0.02
 """Largest deviation of a quaternion's norm from 1: text files round, but a mixed-up column is far off."""
-
-MAP_UNITS = 1000.0
-"""Distance from 0 (units of length) from which positions may be a map's."""
 
 
 def row_name(row: int) -> str:

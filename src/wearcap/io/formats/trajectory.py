@@ -4,20 +4,18 @@ TUM: lines of `timestamp tx ty tz qx qy qz qw`. EuRoC: CSV of `#timestamp [ns], 
 follow; a header that names its columns decides their order. COLMAP: images.txt or images.bin, poses of the world in the
 camera. hloc: lines of `name qw qx qy qz tx ty tz`, likewise. DROID-SLAM: arrays (.npy, .npz) of `tx ty tz qx qy qz qw`;
 poses.npy of a reconstruction's folder holds the world in the camera, with tstamps.npy beside. MPS: closed-loop CSV.
-KITTI: 12 numbers a line, the first three rows of the camera's matrix in the world, times in times.txt beside; with a
-time first, or whole matrices by row or column (ARKit). transforms.json, Record3D's metadata.json: `camera_frames.py`.
+KITTI: 12 numbers a line, the first three rows of the camera's matrix in the world, times in times.txt beside.
 
 Times are checked before anything is made of them: the unit follows from the step between rows (a header's unit and
 seconds since 1970 decide where two are possible), and nothing that is spread over a longer time than its rows can
 cover is accepted. So whoever resamples a trajectory gets at most ten times its rows.
 """
 
-import math
 import os
 import re
 from array import array
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
 
@@ -31,7 +29,6 @@ from wearcap.boundary.texts import numbered_lines
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.formats.camera_frames import NAMES, is_camera_frames, read_camera_frames
 from wearcap.io.formats.colmap import read_image_poses
 from wearcap.io.formats.csv_table import read_columns
 from wearcap.io.formats.poses import are_rotations, check_finite, checked_trajectory, row_name, tracked_in_order
@@ -50,11 +47,10 @@ _FAR, _FAR_FOR_EXTENT, _NOWHERE = 1e4, 20.0, 1e9
 """Distance from zero from which places are a map's, in units and in extents of the path, and from which they are none."""
 _FRAMES = 1e6
 """Whole numbers below are frame numbers (nine hours at 30 Hz), larger ones times."""
-FORMATS = "TUM, EuRoC, COLMAP's images, hloc's poses, DROID-SLAM's arrays, MPS' closed loop, KITTI, transforms.json"
+FORMATS = "TUM, EuRoC, COLMAP's images, hloc's poses, DROID-SLAM's arrays, MPS' closed loop, KITTI"
 _FIX = "Lines of `timestamp tx ty tz qx qy qz qw` (TUM) are the simplest."
 _SLOTS = {"time", "x", "y", "z", "qw", "qx", "qy", "qz"}
-_MPS = "tracking_timestamp_us", ("tx_world_device", "tx_odometry_device")
-_FIRST_CAMERA = "-y", "camera"
+_MPS = "tracking_timestamp_us", "tx_world_device"
 
 
 @dataclass(frozen=True)
@@ -89,7 +85,6 @@ class _Table:
     """Whether poses are those of the world in the body."""
     of_camera: bool = False
     metric: bool = True
-    usual: tuple[str, str] | None = None
     name: Callable[[int], str] = row_name
 
 
@@ -109,10 +104,7 @@ def read_trajectory(path: str | Path, time_unit: str | None = None, fps: float |
 
 
 def read_trajectory_file(path: str | Path, time_unit: str | None = None, fps: float | None = None) -> TrajectoryFile:
-    """A trajectory with its format and unit of time; raises as `read_trajectory` does.
-
-    Rows are sorted by time; repeated ones and those without a pose (lost tracking) are left out, which notes count.
-    """
+    """A trajectory with its format and unit of time; raises as `read_trajectory` does."""
     if time_unit not in (None, *UNITS):
         raise WearcapError(f"time_unit={time_unit!r}", expected=f"one of {', '.join(UNITS)}")
     if fps is not None and not 0 < fps < 2000:
@@ -121,7 +113,6 @@ def read_trajectory_file(path: str | Path, time_unit: str | None = None, fps: fl
     table = _read(path)
     if not len(table.translation):
         raise WearcapError("no poses in the file", path, FORMATS)
-    table, notes = _mended(table, path)
     if table.inverse:
         table = _inverted(table)
     seconds, unit = _seconds(table, time_unit, fps, path)
@@ -163,25 +154,23 @@ def trajectory_format(path: str | Path) -> str | None:
     if begin.startswith((b"\x93NUMPY", b"PK")) or path.name == "images.bin":
         return "COLMAP" if path.name == "images.bin" else "DROID-SLAM" if path.suffix == ".npy" else None
     try:
-        return "NeRF" if is_camera_frames(path) else _kind(_first_lines(path))[0]
+        return _kind(_first_lines(path))[0]
     except WearcapError:
         return None
 
 
 _IN_FOLDERS = (
-    *(f"{part}images.{kind}" for part in ("", "sparse/0/", "sparse/", "colmap/sparse/0/") for kind in ("bin", "txt")),
-    *("poses.npy", *NAMES),
+    *("images.bin", "images.txt", "sparse/0/images.bin", "sparse/0/images.txt", "poses.npy"),
     *(f"{part}closed_loop_trajectory.csv{packed}" for part in ("", "slam/") for packed in ("", ".gz", ".xz")),
     *("mav0/state_groundtruth_estimate0/data.csv", "state_groundtruth_estimate0/data.csv", "data.csv"),
-    *("trajectory.txt", "traj.txt", "poses.txt", "open_loop_trajectory.csv"),
+    *("trajectory.txt", "traj.txt", "poses.txt"),
 )
 """Files of a folder that hold its trajectory, the first that is there."""
 
 
 def trajectory_file(folder: str | Path) -> Path | None:
     """The file in a folder that holds its trajectory, by the formats' usual names; None where there is none."""
-    files = (path for name in _IN_FOLDERS if (path := Path(folder) / name).is_file())
-    return next((path for path in files if path.suffix != ".json" or is_camera_frames(path)), None)
+    return next((path for name in _IN_FOLDERS if (path := Path(folder) / name).is_file()), None)
 
 
 def _file_of(path: Path) -> Path:
@@ -189,10 +178,8 @@ def _file_of(path: Path) -> Path:
         return path
     found = trajectory_file(path)
     if found is None:
-        expected = "images.bin or images.txt (also in sparse/0), poses.npy, transforms.json, trajectory.txt, …"
-        model = any((path / part / f"cameras.{kind}").is_file() for part in ("", "sparse/0") for kind in ("bin", "txt"))
-        what = "a model of COLMAP without its images' poses" if model else "a folder without a trajectory"
-        raise WearcapError(what, path, expected, "Give its file.")
+        expected = ", ".join(_IN_FOLDERS[:5]) + ", …"
+        raise WearcapError("a folder without a trajectory", path, expected, "Give its file.")
     return found
 
 
@@ -208,9 +195,6 @@ def _read(path: Path) -> _Table:
         return _droid_archive(path)
     if path.name == "images.bin":
         return _from_images(path)
-    if is_camera_frames(path):
-        record3d, rows = read_camera_frames(path)
-        return replace(_of_pictures("Record3D" if record3d else "NeRF", rows, path), metric=record3d)
     first = _first_lines(path)
     kind, header = _kind(first)
     if kind is None:
@@ -263,7 +247,7 @@ def _kind(first: Sequence[tuple[int, str]]) -> tuple[str | None, dict[str, int] 
     for _, line in first:
         words = _words(line.lstrip("#").strip())
         comment = line.startswith("#")
-        if _MPS[0] in words and set(_MPS[1]) & set(words):
+        if _MPS[0] in words and _MPS[1] in words:
             return "MPS", None
         if "tx_odometry_device" in words:
             return "open loop", None
@@ -274,13 +258,13 @@ def _kind(first: Sequence[tuple[int, str]]) -> tuple[str | None, dict[str, int] 
             header = slots or header
             continue
         numbers = sum(map(_number, words))
-        if header is not None and len(words) > max(header.values()) and _number(words[header["time"]]):
+        if header is not None and numbers == len(words) > max(header.values()):
             return "EuRoC" if "," in line else "TUM", header
         if not _number(words[0]) and len(words) == 8 and numbers == 7:
             return "hloc", None
         if len(words) >= 10 and "," not in line and all(map(_number, words[:9])) and not _number(words[9]):
             return "COLMAP", None
-        if len(words) == numbers and ((numbers == 12 and "," not in line) or _is_matrix(words)):
+        if len(words) == 12 and numbers == 12 and "," not in line:
             return "KITTI", None
         if len(words) == 8 and "," not in line:
             return "TUM", None
@@ -299,10 +283,7 @@ _ALIASES = {
 
 def _slots(words: Sequence[str]) -> dict[str, int] | None:
     """Columns of a header that names time, position and quaternion; None for any other line."""
-    if [word.lower() for word in words[:3]] == ["timestamp(s)", "q", "p"]:  # OpenVINS' state
-        return {"time": 0} | {name: place for place, name in enumerate(("qx", "qy", "qz", "qw", "x", "y", "z"), 1)}
-    names = [re.sub(r"^.*\.(position|orientation)\.", r"\1", word.lower()) for word in words]
-    plain = [re.sub(r"\[[^\[\]]*\]|\([^()]*\)|[^a-z]", "", name) for name in names]
+    plain = [re.sub(r"\[[^\[\]]*\]|\([^()]*\)|[^a-z]", "", word.lower()) for word in words]
     plain = [re.sub(r"^(time|timestamp)(?:ns|us|ms|sec|seconds|s)$", r"\1", word) for word in plain]
     found = {}
     for slot, names in _ALIASES.items():
@@ -322,41 +303,25 @@ def _named_columns(path: Path, kind: str, header: dict[str, int] | None) -> _Tab
     places = [slots[name] for name in ("time", "x", "y", "z", "qw", "qx", "qy", "qz")]
     exact = header is None and kind == "TUM"
     expected = "timestamp tx ty tz qx qy qz qw" if exact else "timestamp, x, y, z, qw, qx, qy, qz in every line"
-    values, lines, unit, heading, state = array("d"), array("l"), None, "", -1
+    values, lines, unit = array("d"), array("l"), None
     for number, line in numbered_lines(path):
         text = line.split("#")[0].strip()
-        words = _words(text or line.lstrip("# \t"))
-        if not text or (not values and not any(map(_number, words))):  # a comment, or a header without #
-            unit, heading = unit or _unit_of(line), heading or line.lower()
-            state = next((place for place, word in enumerate(words) if word.lower() in _STATES), state)
+        if not text:
+            unit = unit or _unit_of(line)
+            continue
+        words = _words(text)
+        if not values and not any(map(_number, words)):
+            unit = unit or _unit_of(line)  # a header without #
             continue
         if len(words) != 8 if exact else len(words) <= max(places):
             raise WearcapError(f"line {number} has {len(words)} fields", path, expected)
         try:
-            values.extend([float(words[place] or "nan") for place in places])
+            values.extend([float(words[place]) for place in places])
         except ValueError as error:
             raise WearcapError(f"line {number}: {error}"[:200], path, expected) from error
-        if 0 <= state < len(words) and words[state].lower() in _LOST:
-            values[-1] = math.nan
         lines.append(number)
     table = np.asarray(values).reshape(-1, 8)
-    if exact and not _units(table[:, 4:]) and _units(table[:, [1, 2, 3, 5]]):
-        table = table[:, [0, 6, 7, 4, 5, 1, 2, 3]]  # ARCore's recorders put the quaternion, scalar last, first
-    usual = next((axes for word, axes in _USUAL if word in heading), None)
-    if usual is None and len(table) and np.abs(table[0, 1:] - [0, 0, 0, 1, 0, 0, 0]).max() < 1e-6:
-        usual = None if re.search(r"\bx\b", heading) else _FIRST_CAMERA
-    return _Table(kind, table[:, 0], table[:, 1:4], table[:, 4:], unit, usual=usual, name=_by_line(lines))
-
-
-_STATES = ("tracking_state", "trackingstate", "tracking state", "state", "status")
-_LOST = ("lost", "notavailable", "not_available", "not available", "unavailable", "paused", "stopped")
-_USUAL = (("tracker_confidence", ("y", "openxr")), ("pose.pose.position", ("z", "head")))
-"""Words in the headers of RealSense's T265 and of odometry in ROS bags, and their axes."""
-
-
-def _units(quat: np.ndarray) -> bool:
-    """Whether all are unit quaternions."""
-    return bool((np.abs(np.linalg.norm(quat, axis=1) - 1) < NORM_TOLERANCE).all())
+    return _Table(kind, table[:, 0], table[:, 1:4], table[:, 4:], unit, name=_by_line(lines))
 
 
 def _by_line(lines: Sequence[int]) -> Callable[[int], str]:
@@ -381,15 +346,7 @@ def _refuse(first: Sequence[tuple[int, str]], path: Path) -> None:
     raise WearcapError(what, path, FORMATS, _FIX)
 
 
-def require_closed_loop(header: Sequence[str], path: str | Path) -> None:
-    """Raise WearcapError for MPS' open-loop trajectory, which drifts and has no world."""
-    if "tx_odometry_device" in header:
-        what = "MPS' open-loop trajectory: odometry that drifts, begins anew in each session and shares no world with points"
-        raise WearcapError(what, path, "closed_loop_trajectory.csv", "Use that file of the same MPS output (SLAM).")
-
-
 def _mps(path: Path) -> _Table:
-    require_closed_loop(read_header(path), path)
     columns = [f"{part}_world_device" for part in ("tx", "ty", "tz", "qw", "qx", "qy", "qz")]
     table = read_columns(path, [_MPS[0], *columns])
     pose = np.stack([table[name] for name in columns], 1)
@@ -400,35 +357,17 @@ def _after_header(row: int) -> str:
     return f"line {row + 2}"
 
 
-def _is_matrix(words: Sequence[str]) -> bool:
-    """Whether numbers are [R | t] after a time, or a whole 4×4 matrix, by row or column, which a time may precede."""
-    values = np.array([float(word) for word in words[len(words) % 4 :]])
-    if len(words) == 13:
-        R = torch.from_numpy(values.reshape(3, 4)[:, :3])
-        return bool(are_rotations(R, _MATRIX_WITHIN))
-    return len(words) in (16, 17) and any(np.array_equal(last, [0, 0, 0, 1]) for last in (values[12:], values[3::4]))
-
-
 def _kitti(path: Path) -> _Table:
-    """Rows of [R | t] or of 4×4 matrices; those by column are ARKit's, whose camera looks along -z in a world with y up."""
-    values, lines, width = array("d"), array("l"), 0
+    values, lines = array("d"), array("l")
     for number, line in numbered_lines(path):
-        text = line.split("#")[0].strip()
-        words = _words(text) if text else []
-        width = width or len(words)
-        if words and (len(words) != width or not all(map(_number, words))):
-            raise WearcapError(f"line {number} has {len(words)} fields", path, f"{width} numbers in every line")
+        words = line.split("#")[0].split()
+        if words and (len(words) != 12 or not all(map(_number, words))):
+            raise WearcapError(f"line {number} has {len(words)} fields", path, "12 numbers in every line")
         if words:
             values.extend(map(float, words))
             lines.append(number)
-    table = np.asarray(values).reshape(-1, width)
-    times = table[:, 0].copy() if width % 4 else _times_beside(path)
-    matrices = table[:, width % 4 :].reshape(len(table), -1, 4)
-    by_column = width >= 16 and not (matrices[:, 3] == [0, 0, 0, 1]).all()
-    if by_column:
-        matrices = matrices.swapaxes(1, 2)
-    read = _of_matrices("ARKit" if by_column else "KITTI", matrices[:, :3], times, path, _by_line(lines))
-    return replace(read, of_camera=False, usual=("y", "openxr"), metric=True) if by_column else read
+    matrices = np.asarray(values).reshape(-1, 3, 4)
+    return _of_matrices("KITTI", matrices, _times_beside(path), path, _by_line(lines))
 
 
 # --- names of pictures as times ------------------------------------------------------------------------------------
@@ -567,29 +506,15 @@ def _same_length(times: np.ndarray | None, count: int, path: Path) -> None:
         raise WearcapError(f"{len(times)} times of {count} poses", path, "one time for each pose")
 
 
-# --- rows and times ------------------------------------------------------------------------------------------------
-
-
-def _mended(table: _Table, path: Path) -> tuple[_Table, list[str]]:
-    """Rows that have a pose in the order of their times, and notes on what was left out or sorted."""
-    times = np.arange(len(table.translation), dtype=np.float64) if table.times is None else table.times
-    rows, notes = sound_rows(times, table.translation, table.quat_wxyz, path, table.name)
-    mended = replace(
-        table,
-        times=None if table.times is None and len(rows) == len(times) else times[rows],
-        unit="frames" if table.times is None else table.unit,
-        translation=table.translation[rows],
-        quat_wxyz=table.quat_wxyz[rows],
-        name=lambda row: table.name(int(rows[row])),
-    )
-    return mended, notes
+# --- times ---------------------------------------------------------------------------------------------------------
 
 
 def _inverted(table: _Table) -> _Table:
     """The bodies' poses in the world, of those of the world in the body."""
     R = matrix_from_quat_wxyz(torch.from_numpy(np.ascontiguousarray(table.quat_wxyz))).numpy()
     center = -np.einsum("nji,nj->ni", R, table.translation)
-    return replace(table, translation=center, quat_wxyz=table.quat_wxyz * np.array([1.0, -1, -1, -1]), inverse=False)
+    quat = table.quat_wxyz * np.array([1.0, -1.0, -1.0, -1.0])
+    return _Table(table.format, table.times, center, quat, table.unit, False, table.of_camera, table.metric, table.name)
 
 
 def _seconds(table: _Table, time_unit: str | None, fps: float | None, path: Path) -> tuple[np.ndarray, str]:
