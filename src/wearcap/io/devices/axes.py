@@ -41,6 +41,8 @@ _AHEAD_M = 0.05
 _AGREEMENT = 0.5
 CLEAR = 0.1
 """Lead of the best reading of a path's axes from which it is taken."""
+_PATH_M = 0.5
+"""Spread of a path from which it counts in full that it is level; a standing wearer's head moves less, in any direction."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,8 @@ def device_axes(
             R_up = WORLDS[world]
             upright = (R_up[2].double() @ R.mean(0) @ axes.double()[2]).item()
             flat = 1 - (spread @ R_up[2].double().abs() / spread.norm().clamp_min(1e-9)).item()
-            candidates.append((upright + 0.3 * flat + 0.2 * _ahead(track, R_up, axes), upright, world, name))
+            level = 0.3 * flat * min(1.0, spread.norm().item() / _PATH_M)
+            candidates.append((upright + level + 0.2 * _ahead(track, R_up, axes), upright, world, name))
     ranked = sorted(candidates, reverse=True)
     score, upright, world, name = ranked[0]
     if upright < UPRIGHT and "auto" in (up, device):

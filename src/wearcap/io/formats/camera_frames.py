@@ -38,6 +38,8 @@ def read_camera_frames(path: str | Path) -> tuple[bool, Iterator[tuple[str, tupl
         if record3d:
             table = np.array(content["poses"], dtype=np.float64).reshape(-1, 7)
             rate = float(content.get("fps", 60.0))
+            if not rate > 0:
+                raise ValueError(f"fps {rate}")
             times = content.get("frameTimestamps") or (np.arange(len(table)) / rate).tolist()
             names, t = [f"{float(time):.6f}" for time in times], table[:, 4:]
             R = Rotation.from_quat(table[:, :4]).as_matrix()
