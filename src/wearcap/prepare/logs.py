@@ -28,6 +28,7 @@ from wearcap.io.formats.camera_json import read_camera
 from wearcap.io.formats.csv_table import read_columns, read_header
 from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply
+from wearcap.io.formats.pose_columns import FIRST_CAMERA
 from wearcap.io.formats.poses import check_finite
 from wearcap.io.formats.trajectory import TrajectoryFile, read_trajectory_file, trajectory_file, trajectory_format
 from wearcap.io.formats.video import video_info
@@ -214,7 +215,10 @@ def _axes(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tup
             R,
             "vertical by the camera's mean tilt, some degrees off (better: head_imu=, or points= of the floor)",
         )
-    return axes.device, WORLDS[axes.up], f"{axes.up} is up ({axes.known_by})"
+    level = (
+        ", as level as its first camera was held" if read.usual == FIRST_CAMERA and axes.up == FIRST_CAMERA[0] else ""
+    )
+    return axes.device, WORLDS[axes.up], f"{axes.up} is up{level} ({axes.known_by})"
 
 
 def _camera(settings: TrajectorySettings, head: HeadStream) -> CameraStream | None:

@@ -80,9 +80,10 @@ def quaternion_first(table: np.ndarray) -> np.ndarray:
 
     Some recorders (ARCore's) put the quaternion, scalar last, before the place; the one with unit norm in all rows shows.
     """
-    norms = [np.linalg.norm(table[:, places], axis=1) for places in ([4, 5, 6, 7], [1, 2, 3, 5])]
-    usual, first = (bool((np.abs(norm - 1) < NORM_TOLERANCE).all()) for norm in norms)
-    return table[:, [0, 6, 7, 4, 5, 1, 2, 3]] if first and not usual else table
+    for places, order in (([4, 5, 6, 7], range(8)), ([1, 2, 3, 5], [0, 6, 7, 4, 5, 1, 2, 3])):
+        if np.allclose(np.square(table[:, places].clip(-2, 2)).sum(1), 1.0, rtol=0, atol=2 * NORM_TOLERANCE):
+            return table[:, order]
+    return table
 
 
 def usual_axes(heading: str, first: np.ndarray) -> tuple[str, str] | None:
