@@ -83,7 +83,8 @@ def load_trajectory(path: Path, how: Conventions) -> Loaded:
 def load_headset(path: Path, how: Conventions) -> Loaded:
     """A headset's log, or the folder of a session of one."""
     how.only("unit", "axes", "quaternion", "hands", "time_unit", where=path)
-    settings = HeadsetSettings(how.axes, how.quaternion, how.hands, None if how.time_unit == AUTO else how.time_unit)
+    time_unit = None if how.time_unit == AUTO else how.time_unit
+    settings = HeadsetSettings(how.unit, how.axes, how.quaternion, how.hands, time_unit)
     recording = settings.read(path, path.resolve().name.split(".")[0], {})
     check = Check("headset's log")
     findings = [check.ok(f"head and {len(recording.tracked)} hands", recording.note)]
