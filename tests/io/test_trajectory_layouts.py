@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 import short_walk
 from short_walk import CAMERA_IN_HEAD, lines, numbers, quat_xyzw
 from wearcap.errors import WearcapError
-from wearcap.io.devices.aria_vrs import refused_vrs
 from wearcap.io.devices.axes import device_axes
 from wearcap.io.formats.trajectory import read_trajectory, read_trajectory_file, trajectory_file, trajectory_format
 from wearcap.prepare.logs import TrajectorySettings, head_of, origin_of, read_cloud
@@ -336,8 +335,3 @@ def test_damaged_transforms_are_refused(tmp_path, content, message):
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     with pytest.raises(WearcapError, match=message):
         read_trajectory(tmp_path / "transforms.json")
-
-
-def test_odometry_of_mps_and_vrs_say_what_to_use():
-    assert "closed_loop_trajectory.csv" in str(refused_vrs("a.vrs"))
-    assert "wearcap[aria]" in str(refused_vrs("a.vrs"))

@@ -98,13 +98,6 @@ def extract_video(
     return CameraStream(times[first:stop], camera, T_head_cam.R, T_head_cam.t, video=name)
 
 
-def refused_vrs(path: str | Path) -> WearcapError:
-    """Error for a VRS file where poses are wanted: it holds pictures and inertial data alone."""
-    fix = "Request MPS for it, and give the folder with closed_loop_trajectory.csv that MPS returns. Pictures and "
-    fix += 'calibration of a VRS are read with `pip install "wearcap[aria]"`.'
-    return WearcapError("a VRS file holds raw sensors, and no poses", path, "the output of Project Aria's MPS", fix)
-
-
 def _open(path: str | Path):
     """Data provider of projectaria-tools. Raises WearcapError that names what is missing."""
     if data_provider is None:

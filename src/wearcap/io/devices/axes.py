@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from wearcap.errors import WearcapError
-from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory, linear_velocity
 
 OPENXR = torch.tensor([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -38,8 +37,6 @@ _USUAL_WORLDS = ("z", "y", "-y")
 """Those of files that do not say which they have."""
 WALKING_M_S = 0.4
 _SEEN_S = 2.0
-_AHEAD_M = 0.05
-_AGREEMENT = 0.5
 CLEAR = 0.1
 """Lead of the best reading of a path's axes from which it is taken."""
 _PATH_M = 0.5

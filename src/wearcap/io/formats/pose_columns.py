@@ -20,8 +20,9 @@ _ALIASES = {
     **{f"q{axis}": (f"q{axis}", f"quat{axis}", f"rot{axis}", f"orientation{axis}", f"qrs{axis}") for axis in "wxyz"},
 }
 _OPENVINS = ["timestamp(s)", "q", "p"]
-_STATES = ("tracking_state", "trackingstate", "tracking state", "state", "status")
-_LOST = ("lost", "notavailable", "not_available", "not available", "unavailable", "paused", "stopped")
+STATES = "tracking_state", "trackingstate", "tracking state", "state", "status"
+LOST = "lost", "notavailable", "not_available", "not available", "unavailable", "paused", "stopped"
+"""Columns that hold the state of tracking, and its values in rows without a pose."""
 _USUAL = (("tracker_confidence", ("y", "openxr")), ("pose.pose.position", ("z", "head")))
 """Words in the headers of RealSense's T265 and of odometry in ROS bags, and their axes: up, and the device's."""
 
@@ -63,16 +64,6 @@ def unit_of(header: str) -> str | None:
     first = re.split(r"[,\s]\s*(?=[a-z])", header.lower().lstrip("# \t"), maxsplit=1)[0]
     found = re.search(r"(?:\[|\(|_)(ns|us|µs|ms|s|sec)\b", first)
     return {"µs": "us", "sec": "s"}.get(found[1], found[1]) if found else None
-
-
-def state_place(words: Sequence[str]) -> int | None:
-    """Column of the tracking's state in a header."""
-    return next((place for place, word in enumerate(words) if word.lower() in _STATES), None)
-
-
-def is_lost(word: str) -> bool:
-    """Whether a tracking's state means that a row has no pose."""
-    return word.lower() in _LOST
 
 
 def quaternion_first(table: np.ndarray) -> np.ndarray:

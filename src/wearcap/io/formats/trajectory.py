@@ -36,14 +36,14 @@ from wearcap.io.formats.colmap import read_image_poses
 from wearcap.io.formats.csv_table import read_columns
 from wearcap.io.formats.pose_columns import (
     EUROC,
+    LOST,
     MATRIX_WITHIN,
+    STATES,
     TUM,
-    is_lost,
     is_matrix,
     is_number,
     places_of,
     quaternion_first,
-    state_place,
     unit_of,
     usual_axes,
     words_of,
@@ -308,7 +308,7 @@ def _named_columns(path: Path, kind: str, header: dict[str, int] | None) -> _Tab
         words = words_of(text or line.lstrip("# \t"))
         if not text or (not values and not any(map(is_number, words))):  # a comment, or a header without #
             unit, heading = unit or unit_of(line), heading or line.lower()
-            state = state_place(words) if state is None else state
+            state = next((place for place, word in enumerate(words) if word.lower() in STATES), state)
             continue
         if len(words) != 8 if exact else len(words) <= max(places):
             raise WearcapError(f"line {number} has {len(words)} fields", path, expected)
@@ -316,7 +316,7 @@ def _named_columns(path: Path, kind: str, header: dict[str, int] | None) -> _Tab
             values.extend([float(words[place] or "nan") for place in places])
         except ValueError as error:
             raise WearcapError(f"line {number}: {error}"[:200], path, expected) from error
-        if state is not None and state < len(words) and is_lost(words[state]):
+        if state is not None and state < len(words) and words[state].lower() in LOST:
             values[-1] = math.nan
         lines.append(number)
     table = np.asarray(values).reshape(-1, 8)
