@@ -7,17 +7,13 @@ y left, z up. World and device share it, so a pose is turned on both sides: R = 
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.errors import WearcapError
-from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory, linear_velocity
 
 OPENXR = torch.tensor([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 UNITY = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-CONVENTIONS = {"unity": UNITY, "openxr": OPENXR, "steamvr": OPENXR}
-"""x right, y up; z forward and left-handed in Unity, z backward and right-handed in OpenXR and SteamVR."""
 UPRIGHT = 0.7
 """Least mean component of a worn device's up axis along the world's."""
 CAMERA = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -32,8 +28,6 @@ WORLDS = {
 """Rotations of a right-handed world into one with z up, by the axis that is up; x stays x."""
 WALKING_M_S = 0.4
 _SEEN_S = 2.0
-_AHEAD_M = 0.05
-_AGREEMENT = 0.5
 
 
 @dataclass(frozen=True)
@@ -94,60 +88,3 @@ def _ahead(track: Trajectory, R_up: Tensor, axes: Tensor) -> float:
         .mean()
         .item()
     )
-
-
-def turned(track: Trajectory, convention: str) -> Trajectory:
-    """A path of a named convention in wearcap's axes, world and device alike."""
-    M = CONVENTIONS[convention].to(track.R_world_body)
-    return Trajectory(track.timestamps, M @ track.R_world_body @ M.mT, track.t_world_body @ M.mT)
-
-
-def detected_convention(head: Trajectory, hands: dict[str, Trajectory], where: str) -> tuple[str, str]:
-    """(convention, evidence) of a headset's poses with y up, by where it walks and where the hands are held.
-
-    OpenXR and SteamVR have the same axes. Raises WearcapError when y is not up, and when neither shows forward.
-    """
-    upright = head.R_world_body[:, 1, 1].double().mean().item()
-    if upright < UPRIGHT:
-        what = f"the headset's y axis points {upright:.2f} up on average"
-        fix = "Check the order of the quaternion (quaternion=xyzw|wxyz), and that y is the world's up axis."
-        raise WearcapError(what, where, f"{UPRIGHT} or more", fix)
-    velocity, forward = linear_velocity(head).double()[:, [0, 2]], head.R_world_body[:, [0, 2], 2].double()
-    speed = velocity.norm(dim=-1)
-    walking = speed > WALKING_M_S
-    step = head.timestamps.diff().median().item()
-    if walking.sum() * step >= _SEEN_S:
-        facing = torch.nn.functional.normalize(forward[walking], dim=-1)
-        along = (facing * velocity[walking] / speed[walking, None]).sum(-1).mean().item()
-        if abs(along) > _AGREEMENT:
-            name = "unity" if along > 0 else "openxr"
-            return name, f"walks along its {'+' if along > 0 else '-'}z axis (agreement {abs(along):.2f})"
-    ahead = [_in_front(head, hand) for hand in hands.values() if len(hand) > 1]
-    mean = sum(ahead) / len(ahead) if ahead else 0.0
-    if abs(mean) > _AHEAD_M:
-        name = "unity" if mean > 0 else "openxr"
-        return name, f"hands are held {100 * abs(mean):.0f} cm along its {'+' if mean > 0 else '-'}z axis"
-    what = "neither a walk nor the hands show which way the headset looks"
-    raise WearcapError(what, where, "2 s of walking ahead", "Say which axes the log has: axes=unity|openxr|steamvr.")
-
-
-def _in_front(head: Trajectory, hand: Trajectory) -> float:
-    """Median distance (m) of a hand along the headset's horizontal z axis."""
-    near = torch.searchsorted(head.timestamps, hand.timestamps).clamp(max=len(head) - 1)
-    z = torch.nn.functional.normalize(head.R_world_body[near][:, [0, 2], 2].double(), dim=-1)
-    return ((hand.t_world_body - head.t_world_body[near])[:, [0, 2]].double() * z).sum(-1).median().item()
-
-
-def wrist_of_hand(R_world_hand: Float[Tensor, "time 3 3"], joint: str, kind: str) -> Float[Tensor, "time 3 3"]:
-    """Rotation of a wrist joint from a hand pose in wearcap's axes (x forward, y left, z up of the device).
-
-    "wrist" is OpenXR's hand joint: forward along the fingers, up out of the hand's back. "grip" is a held controller:
-    forward along the fist from little finger to thumb, up along the fingers, x right out of the left hand's back and
-    into the right palm. A wrist joint's own axes are the world's in a T-pose that faces x, palms down.
-    """
-    side = 1.0 if joint.startswith("left") else -1.0
-    if kind == "wrist":
-        R_joint_hand = rotation.about_axis("z", torch.tensor(side * torch.pi / 2))
-    else:  # device axes in a T-pose: forward = x, up (fingers) = ± y, left = ∓ z
-        R_joint_hand = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, side], [0.0, -side, 0.0]])
-    return R_world_hand @ R_joint_hand.to(R_world_hand).mT

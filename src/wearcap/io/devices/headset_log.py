@@ -11,7 +11,7 @@ import math
 import re
 from array import array
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -24,16 +24,12 @@ from wearcap.boundary.limits import LIMITS
 from wearcap.boundary.opening import open_bytes, understood
 from wearcap.boundary.texts import numbered_lines, parse_json, read_json
 from wearcap.errors import WearcapError
-from wearcap.geometry.rotation import matrix_from_quat_wxyz
-from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.devices.axes import CONVENTIONS, detected_convention, turned, wrist_of_hand
-from wearcap.io.formats.poses import check_finite, checked_trajectory
+from wearcap.io.conventions import HANDS, ORDERS, Conventions
+from wearcap.io.devices.headset_axes import CONVENTIONS, HeadsetLog, in_our_axes
+from wearcap.io.devices.headset_tables import RawPoses
+from wearcap.io.formats.poses import are_rotations, check_finite, checked_trajectory
 from wearcap.io.formats.trajectory import UNITS, check_span, time_unit_of
 
-PALM_M = 0.08
-"""Distance (m) of a held controller's origin, the palm's middle, from the wrist (nominal)."""
-ORDERS = ("xyzw", "wxyz")
-HANDS = ("wrist", "grip")
 _DEVICES = {
     "head": {"head", "hmd", "headset", "camera", "centereye", "eye", "view", "viewer"},
     "left_wrist": {"left", "l", "lefthand", "leftcontroller", "leftwrist", "lhand"},
@@ -69,20 +65,6 @@ _OTHER = {
 }
 _UNIT_WORDS = {"s": "s", "sec": "s", "seconds": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"}
 _MAX_COLUMNS = LIMITS["log"].items
-
-
-@dataclass(frozen=True)
-class HeadsetLog:
-    """Paths of a headset and of the wearer's wrists in wearcap's axes, and how the log was understood."""
-
-    head: Trajectory
-    wrists: dict[str, Trajectory]
-    """By joint; those that the log has."""
-    axes: str
-    floor: bool
-    """Whether the world's origin lies on the floor, as the head's height shows."""
-    notes: tuple[str, ...]
-    """What was detected or left out, a sentence each."""
 
 
 @dataclass
@@ -137,8 +119,8 @@ def read_headset_log(
     times, tables, numbers = _tables(rows, names[time_name], devices, where, path)
     check_finite({"time": times}, path, lambda row: f"{where} {numbers[row]}")
     unit = time_unit or time_unit_of(times, _unit_of(time_name), path)
-    order, notes = _order(tables["head"], devices["head"], quaternion)
-    poses: dict[str, Trajectory] = {}
+    notes: list[str] = []
+    poses: dict[str, RawPoses] = {}
     for joint, table in tables.items():
         seen = _seen(table)
         lost = int((~seen).sum())
@@ -149,9 +131,10 @@ def read_headset_log(
         if seen.sum() < 2 and joint != "head":
             continue
         kept = np.flatnonzero(seen)
-        poses[joint] = _path(table[seen], times[seen] * UNITS[unit], order, path, f"{where} ", numbers[kept])
-    check_span(poses["head"].timestamps.numpy(), path, lambda row: f"pose {row + 1} of the head")
-    return _in_our_axes(poses, devices, axes, hands, f"times in {unit}", notes, path)
+        poses[joint] = _path(table[seen], times[seen] * UNITS[unit], devices[joint], path, f"{where} ", numbers[kept])
+    check_span(poses["head"].seconds, path, lambda row: f"pose {row + 1} of the head")
+    log = in_our_axes(poses, Conventions(axes=axes, quaternion=quaternion, hands=hands), str(path))
+    return replace(log, notes=(f"times in {unit}", *notes, *log.notes))
 
 
 def is_headset_log(path: str | Path) -> bool:
@@ -361,75 +344,19 @@ def _seen(table: np.ndarray) -> np.ndarray:
     return finite & ~lost & (np.abs(np.linalg.norm(table[:, 3:], axis=1)) > 0.5)
 
 
-def _order(head: np.ndarray, columns: _Columns, quaternion: str) -> tuple[str, list[str]]:
-    """Order of the quaternions and a note; in unnamed ones, that in which the head is more upright."""
-    if columns.as_matrix:
-        return "matrix", ["poses as matrices"]
-    if "x" in columns.quaternion:
-        return "xyzw", []
-    if quaternion != "auto":
-        return quaternion, [f"quaternions {quaternion} as given"]
-    if written := next((order for order in ORDERS if order in columns.words), None):
-        return written, [f"quaternions {written} as named"]
-    values = head[_seen(head)][:, 3:]
-    values = values / np.linalg.norm(values, axis=1, keepdims=True).clip(1e-9)
-    upright = {}
-    for order in ORDERS:
-        x, z = (values[:, order.index(axis)] for axis in "xz")
-        upright[order] = float((1 - 2 * (x**2 + z**2)).mean()) if len(values) else 0.0
-    best = max(ORDERS, key=lambda order: upright[order])
-    return best, [f"quaternions {best} (the head is upright by {upright[best]:.2f}, else {min(upright.values()):.2f})"]
-
-
 def _path(
-    table: np.ndarray, seconds: np.ndarray, order: str, path: Path, label: str, numbers: np.ndarray
-) -> Trajectory:
-    """A device's path in the log's own axes; rows are named by their numbers."""
-    if order == "matrix":
-        rows = torch.from_numpy(table.reshape(-1, 3, 4))
-        U, _, V = torch.linalg.svd(rows[:, :, :3])
-        R = U @ V
-        if (torch.linalg.det(R) < 0).any() or ((R - rows[:, :, :3]).abs() > 0.05).any():
+    table: np.ndarray, seconds: np.ndarray, columns: _Columns, path: Path, label: str, numbers: np.ndarray
+) -> RawPoses:
+    """A device's path as it stands in the log; rows are named by their numbers."""
+    name = lambda row: f"{label}{numbers[row]}"  # noqa: E731
+    kind = "wrist" if "wrist" in columns.words else None
+    if columns.as_matrix:
+        rows = table.reshape(-1, 3, 4)
+        checked_trajectory(seconds, rows[:, :, 3], np.tile([1.0, 0.0, 0.0, 0.0], (len(table), 1)), path, name)
+        if not are_rotations(torch.tensor(rows[:, :, :3]), 0.1).all():
             raise WearcapError("matrices that are no rotations", path, "rows of [R | t], orthogonal within 5 %")
-        unit = np.tile([1.0, 0.0, 0.0, 0.0], (len(table), 1))
-        checked = checked_trajectory(seconds, table[:, 3::4], unit, path, lambda row: f"{label}{numbers[row]}")
-        return Trajectory(checked.timestamps, R.float(), checked.t_world_body)
-    quat = table[:, 3:][:, [order.index(axis) for axis in "wxyz"]]
-    track = checked_trajectory(seconds, table[:, :3], quat, path, lambda row: f"{label}{numbers[row]}")
-    return Trajectory(track.timestamps, matrix_from_quat_wxyz(torch.tensor(quat)).float(), track.t_world_body)
-
-
-def _in_our_axes(
-    poses: dict[str, Trajectory],
-    devices: dict[str, _Columns],
-    axes: str,
-    hands: str,
-    about: str,
-    notes: list[str],
-    path: Path,
-) -> HeadsetLog:
-    """Everything in wearcap's axes, hands as wrists, with the notes on what was detected."""
-    held = {joint: track for joint, track in poses.items() if joint != "head"}
-    if axes == "auto":
-        axes, evidence = detected_convention(poses["head"], held, str(path))
-        other = " (SteamVR's are the same)" if axes == "openxr" else ""
-        notes.insert(
-            0, f"axes {axes}{other}: it {evidence}" if "walk" in evidence else f"axes {axes}{other}: {evidence}"
-        )
-    else:
-        notes.insert(0, f"axes {axes} as given")
-    head, wrists = turned(poses["head"], axes), {}
-    for joint, track in held.items():
-        kind = hands if hands != "auto" else "wrist" if "wrist" in devices[joint].words else "grip"
-        moved = turned(track, axes)
-        R = wrist_of_hand(moved.R_world_body, joint, kind)
-        t = moved.t_world_body - (PALM_M * moved.R_world_body[:, :, 2] if kind == "grip" else 0.0)
-        wrists[joint] = Trajectory(moved.timestamps, R, t)
-        notes.append(f"{joint} from {'the hand joint' if kind == 'wrist' else 'the controller (grip pose)'}")
-    height = float(np.percentile(head.t_world_body[:, 2].numpy(), 90))
-    floor = 0.9 < height < 2.2
-    if floor:
-        notes.append(f"the origin is on the floor (head {height:.2f} m above it)")
-    else:
-        notes.append(f"the origin is not on the floor (head at {height:.2f} m), whose height stays unknown")
-    return HeadsetLog(head, wrists, axes, floor, (about, *notes))
+        return RawPoses(seconds, rows[:, :, 3], rows[:, :, :3], None, kind)
+    checked_trajectory(seconds, table[:, :3], table[:, 3:], path, name)
+    named = next((order for order in ORDERS if order in columns.words), None)
+    order = "xyzw" if "x" in columns.quaternion else named
+    return RawPoses(seconds, table[:, :3], table[:, 3:], order, kind)

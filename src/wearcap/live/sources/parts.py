@@ -10,7 +10,7 @@ from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS
 from wearcap.geometry.rigid import Rigid
-from wearcap.io.devices.axes import CONVENTIONS
+from wearcap.io.devices.headset_axes import CONVENTIONS
 from wearcap.live.packets import CAMERA, HEAD, SUIT
 from wearcap.sensors.packets import MAX_POSITION_M, NOT_A_ROTATION, NOT_FINITE, rotation_fault, values_fault
 
