@@ -27,7 +27,6 @@ import test_store  # noqa: E402
 from wearcap.body.skeleton import xsens23  # noqa: E402
 from wearcap.boundary import arrays, tensors, texts  # noqa: E402
 from wearcap.boundary.own import trusting  # noqa: E402
-from wearcap.doctor.examine import examine  # noqa: E402
 from wearcap.errors import WearcapError  # noqa: E402
 from wearcap.export.files import load_exported, sidecar_path, write_exports  # noqa: E402
 from wearcap.files import sha256_of  # noqa: E402
@@ -37,6 +36,7 @@ from wearcap.live.sources import source_of  # noqa: E402
 from wearcap.localization.visual_map import VisualMap  # noqa: E402
 from wearcap.models import checkpoint, weights  # noqa: E402
 from wearcap.prepare.foreign_conventions import read_mapping  # noqa: E402
+from wearcap.reading import examine  # noqa: E402
 from wearcap.reading.any_file import read  # noqa: E402
 from wearcap.recording import PointCloud, Recording, RecordingStore  # noqa: E402
 from wearcap.recording.store import RecordingFile, save_recording  # noqa: E402

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,6 +18,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import swing_between
 from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.conventions import AUTO, Conventions
 from wearcap.io.devices.aria_mps import T_HEAD_DEVICE, head_stream, is_mps_folder, read_mps, read_points
 from wearcap.io.devices.axes import CAMERA, DEVICES, UPRIGHT, WORLDS, DeviceAxes, device_axes, to_head_axes
 from wearcap.io.devices.headset_log import is_headset_log, read_headset_log
@@ -50,7 +52,7 @@ class TrajectorySettings:
     axes: str = "auto"
     time_unit: str | None = None
     fps: float | int | None = None
-    scale: float | int | None = None
+    unit: str | float | int = AUTO
     T_head_device: Numbers | None = None
     height: float | int | None = None
     points: str | None = None
@@ -76,22 +78,27 @@ class TrajectorySettings:
         """T_head_device: the given one, else the nominal one of glasses and headsets."""
         return pose_of(self.T_head_device, "T_head_device") or T_HEAD_DEVICE
 
+    def cloud(self, read: TrajectoryFile) -> PointCloud | None:
+        """The points in the trajectory's world, from which its origin is taken off, too."""
+        return None if self.points is None else read_cloud(self.points, read.origin)
+
     def evidence(self, read: TrajectoryFile, up: Tensor | None) -> SceneEvidence:
         """What is known of scale and vertical; times of the config count from the first pose."""
         start_s = read.trajectory.timestamps[0].item()
         standing = None if self.standing is None else _times(self.standing, 2, "standing", start_s)
         walks = tuple((*_times(walk[:2], 2, "walks", start_s), float(walk[2])) for walk in self.walks or ())
         imu = None if self.head_imu is None else read_head_imu(self.head_imu)
-        scale = self.scale if self.scale is not None else 1.0 if read.metric else None
-        points = None if self.points is None else read_cloud(self.points).points_world
+        unit_m = Conventions(unit=self.unit).unit_m
+        scale = unit_m if unit_m is not None else 1.0 if read.metric else None
+        cloud = self.cloud(read)
         return SceneEvidence(
-            points,
+            None if cloud is None else cloud.points_world,
             standing,
             None if self.camera_height_m is None else float(self.camera_height_m),
             imu,
             pose_of(self.T_cam_imu, "T_cam_imu"),
             walks,
-            None if scale is None else float(scale),
+            scale,
             up,
         )
 
@@ -113,21 +120,23 @@ def read_head_imu(path: str | Path) -> ImuStream:
     return replace(read_watch_log(path, WRISTS[0]), joint="head")
 
 
-def read_cloud(path: str | Path) -> PointCloud:
-    """Points of a .ply, .pcd, MPS' semi-dense points, or a table with columns x, y, z.
+def read_cloud(path: str | Path, origin: np.ndarray | None = None) -> PointCloud:
+    """Points of a .ply, .pcd, MPS' semi-dense points, or a table with columns x, y, z; `origin` is taken off them.
 
     Raises WearcapError for any other file.
     """
     suffixes = {suffix.lower() for suffix in Path(path).suffixes}
+    shift = np.zeros(3) if origin is None else origin
     if ".ply" in suffixes or ".pcd" in suffixes:
-        return PointCloud(torch.from_numpy((read_ply if ".ply" in suffixes else read_pcd)(path).points).float())
+        points = (read_ply if ".ply" in suffixes else read_pcd)(path).points
+        return PointCloud(torch.from_numpy(points.astype(np.float64) - shift).float())
     header = read_header(path)
     if "px_world" in header:
         return read_points(path)
     table = read_columns(path, ["x", "y", "z"])
     columns = {name: table[name] for name in "xyz"}
     check_finite(columns, path)
-    return PointCloud(torch.stack([torch.from_numpy(column) for column in columns.values()], 1).float())
+    return PointCloud(torch.from_numpy(np.stack(list(columns.values()), 1) - shift).float())
 
 
 def read_path(file: Path, name: str, about: dict[str, str], settings: TrajectorySettings) -> Recording:
@@ -140,10 +149,12 @@ def read_path(file: Path, name: str, about: dict[str, str], settings: Trajectory
     unit, fps = settings.time_unit, settings.fps
     read = read_trajectory_file(file, unit, None if fps is None else float(fps))
     head, alignment, note = head_of(read, settings, str(file))
-    points = None
-    if settings.points is not None:
-        cloud = read_cloud(settings.points)
-        points = replace(cloud, points_world=alignment.points(cloud.points_world))
+    points = settings.cloud(read)
+    if points is not None:
+        points = replace(points, points_world=alignment.points(points.points_world))
+    origin = None
+    if read.origin is not None:
+        origin = alignment.scale * alignment.R_world_slam.double() @ torch.from_numpy(read.origin)
     floor = None
     if settings.camera_height_m is not None:
         floor = FloorTrack(head.timestamps[:1], torch.zeros(1))
@@ -151,7 +162,9 @@ def read_path(file: Path, name: str, about: dict[str, str], settings: Trajectory
     skeleton = settings.skeleton()
     if skeleton is None:
         note += "; height not given: taken from how high the head is carried, where the floor is known"
-    return Recording(name, head, camera=camera, points=points, floor=floor, skeleton=skeleton, note=note, **about)
+    return Recording(
+        name, head, camera=camera, points=points, floor=floor, skeleton=skeleton, origin=origin, note=note, **about
+    )
 
 
 def head_of(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tuple[HeadStream, SlamAlignment, str]:
@@ -166,12 +179,12 @@ def head_of(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> t
     evidence = settings.evidence(read, up)
     limits = float(settings.max_acceleration), float(settings.max_burst_s)
     alignment, clean, outliers = align_cleaned(slam, evidence.align, *limits)
-    track = to_head_axes(alignment.apply(clean), DeviceAxes("z", "camera", 1.0))
+    track = to_head_axes(alignment.apply(clean), DeviceAxes("z", "camera", 1.0, ""))
     mount = settings.mount()
     head = HeadStream(track.timestamps, track.R_world_body, track.t_world_body, mount.R, mount.t)
     unit = "in metres" if alignment.scale == 1 else f"a unit is {alignment.scale:.4g} m"
     notes = [f"{read.format}, times in {read.time_unit}", vertical, f"the device has {axes}'s axes", unit]
-    return head, alignment, "; ".join([*notes, *([outliers] if outliers else [])])
+    return head, alignment, "; ".join([*notes, *read.notes, *([outliers] if outliers else [])])
 
 
 def _axes(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tuple[str, Tensor | None, str]:
@@ -195,7 +208,7 @@ def _axes(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tup
             R,
             "vertical by the camera's mean tilt, some degrees off (better: head_imu=, or points= of the floor)",
         )
-    return axes.device, WORLDS[axes.up], f"{axes.up} is up (the device is upright by {axes.upright:.2f})"
+    return axes.device, WORLDS[axes.up], f"{axes.up} is up ({axes.known_by})"
 
 
 def _camera(settings: TrajectorySettings, head: HeadStream) -> CameraStream | None:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory, linear_velocity
 
 OPENXR = torch.tensor([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -28,6 +29,9 @@ WORLDS = {
 """Rotations of a right-handed world into one with z up, by the axis that is up; x stays x."""
 WALKING_M_S = 0.4
 _SEEN_S = 2.0
+CLEAR = 0.1
+"""Lead of the best reading of a path's axes from which it is taken."""
+_IDENTITY_RAD, _IDENTITY_M = 0.02, 0.01
 
 
 @dataclass(frozen=True)
@@ -38,13 +42,16 @@ class DeviceAxes:
     device: str
     upright: float
     """Mean component of the device's up axis along the world's."""
+    known_by: str
+    """Why these were taken, in a few words."""
 
 
 def device_axes(track: Trajectory, up: str = "auto", device: str = "auto", where: str = "") -> DeviceAxes:
     """Axes of a worn device's path; those that are "auto" follow from which axis stays upright, and where it goes.
 
-    Of conventions that fit alike, the one whose vertical the path moves least along is taken, and where the device's
-    forward axis agrees best with the walk. Raises WearcapError for other names, and when nothing stays upright.
+    Each convention scores by how upright the device is, how level its path, and how well its forward axis agrees with the
+    walk. Where the best leads by less than `CLEAR`, a path that begins with the identity is that of a SLAM, which writes
+    camera axes. Raises WearcapError for other names, when nothing stays upright, and where several fit alike.
     """
     for name, value, allowed in (("up", up, WORLDS), ("axes", device, DEVICES)):
         if value not in ("auto", *allowed):
@@ -58,12 +65,28 @@ def device_axes(track: Trajectory, up: str = "auto", device: str = "auto", where
             upright = (R_up[2].double() @ R.mean(0) @ axes.double()[2]).item()
             flat = 1 - (spread @ R_up[2].double().abs() / spread.norm().clamp_min(1e-9)).item()
             candidates.append((upright + 0.3 * flat + 0.2 * _ahead(track, R_up, axes), upright, world, name))
-    _, upright, world, name = max(candidates)
+    ranked = sorted(candidates, reverse=True)
+    score, upright, world, name = ranked[0]
     if upright < UPRIGHT and "auto" in (up, device):
         what = f"no axis of the device stays upright (the best, {name} in a world with {world} up, by {upright:.2f})"
         fix = "Say what is up in the world, and which axes the device has: up=z|y|-y axes=camera|head|openxr."
         raise WearcapError(what, where, f"{UPRIGHT} or more, as worn devices have it", fix)
-    return DeviceAxes(world, name, upright)
+    alike = [row for row in ranked if row[0] > score - CLEAR and row[1] > UPRIGHT]
+    if len(alike) < 2:
+        lead = f", {score - ranked[1][0]:.2f} better than any other reading" if len(ranked) > 1 else ""
+        return DeviceAxes(world, name, upright, f"the device is upright by {upright:.2f}{lead}")
+    slam = next((row for row in alike if row[2:] == ("-y", "camera")), None)
+    if slam is not None and _begins_at_identity(track):
+        return DeviceAxes("-y", "camera", slam[1], "it begins with the identity, as a camera's SLAM does")
+    listed = " or ".join(f"up={row[2]} axes={row[3]}" for row in alike)
+    raise WearcapError(
+        f"{len(alike)} readings of its axes fit alike", where, "one that fits best", f"Say which: {listed}."
+    )
+
+
+def _begins_at_identity(track: Trajectory) -> bool:
+    turn = rotation.geodesic(track.R_world_body[0].double(), torch.eye(3, dtype=torch.float64)).item()
+    return turn < _IDENTITY_RAD and track.t_world_body[0].norm().item() < _IDENTITY_M
 
 
 def to_head_axes(track: Trajectory, axes: DeviceAxes) -> Trajectory:

@@ -18,7 +18,7 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.conventions import AUTO, ORDERS, UNITS_M, Conventions
+from wearcap.io.conventions import AUTO, CHOICES, UNITS_M, Conventions
 from wearcap.io.devices.axes import CAMERA, OPENXR, UNITY
 from wearcap.io.devices.headset_tables import RawPoses
 
@@ -121,17 +121,17 @@ def walks_ahead(wearer: Wearer) -> tuple[float, str]:
         return 0.0, ""
     along = ((velocity * wearer.heading[k:-k]).sum(1) / speed.clip(1e-9))[walking].mean()
     walked = walking.sum() * np.median(seconds) / (2 * k)
-    return 4 * min(1.0, walked / 4) * along, f"walks ahead {along:.2f}"
+    return 1.5 * min(1.0, walked / 4) * along, f"walks ahead {along:.2f}"
 
 
 def looks_down(wearer: Wearer) -> tuple[float, str]:
-    """Heads look down rather than up: a mean pitch of 10 ± 15°, in nats against its opposite; beyond 45° no more."""
+    """Heads look down rather than up: a mean pitch of 10 ± 12°, against its opposite; beyond 43° no more."""
     down = np.degrees(np.arcsin(-wearer.R[:, 2, 0].clip(-1, 1))).mean()
-    return float(np.clip(10 * down / 15**2, -2, 2)), f"looks {'down' if down > 0 else 'up'} {abs(down):.0f}°"
+    return float(np.clip(10 * down / 12**2, -3, 3)), f"looks {'down' if down > 0 else 'up'} {abs(down):.0f}°"
 
 
 def turns_on_a_neck(wearer: Wearer) -> tuple[float, str]:
-    """A headset sits before the axis on which it turns, 0.1 ± 0.06 m.
+    """A headset sits before the axis on which it turns, 0.1 ± 0.065 m.
 
     The lever r (m) is fitted to second differences over a quarter of a second, in which steady walking vanishes:
     Δ²t = Δ²R r; it counts as turned to the mean pitch, and as well as it is determined.
@@ -144,7 +144,7 @@ def turns_on_a_neck(wearer: Wearer) -> tuple[float, str]:
     scatter = np.linalg.inv(square) * ((moves - turns @ lever) ** 2).mean() * 4 * k
     ahead = wearer.R[:, 2, 2].mean() * np.eye(3)[0] - wearer.R[:, 2, 0].mean() * np.eye(3)[2]
     ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
-    before, variance = float(ahead @ lever), float(ahead @ scatter @ ahead) + 0.06**2 + 0.05**2
+    before, variance = float(ahead @ lever), float(ahead @ scatter @ ahead) + 0.065**2
     return 0.1 * float(np.clip(before, -0.2, 0.2)) / variance, f"turns {100 * before:.0f} cm behind the eyes"
 
 
@@ -161,12 +161,12 @@ def hands_on_their_sides(wearer: Wearer) -> tuple[float, str]:
 
 
 def hands_ahead(wearer: Wearer) -> tuple[float, str]:
-    """Hands are held ahead of the neck rather than behind: 0.15 ± 0.25 m, in nats against the opposite."""
+    """Hands are held ahead of the neck rather than behind: 0.15 ± 0.24 m, against the opposite."""
     ahead = [float(np.median(offset[:, 0])) for _, offset in _from_neck(wearer)]
     if not ahead:
         return 0.0, ""
     mean = sum(ahead) / len(ahead)
-    score = sum(0.15 * float(np.clip(x, -0.4, 0.4)) / 0.25**2 for x in ahead)
+    score = sum(0.15 * float(np.clip(x, -0.4, 0.4)) / 0.24**2 for x in ahead)
     return score, f"hands {100 * abs(mean):.0f} cm {'ahead' if mean > 0 else 'behind'}"
 
 
@@ -224,7 +224,9 @@ def in_our_axes(poses: dict[str, RawPoses], how: Conventions, where: str, conven
     """
     kinds = {joint: how.hands if how.hands != AUTO else raw.kind or "grip" for joint, raw in poses.items()}
     known = how.quaternion if how.quaternion != AUTO else poses["head"].order
-    orders = (known or ORDERS[0],) if known or poses["head"].rotation.ndim == 3 else ORDERS
+    orders = (
+        (known or CHOICES["quaternion"][0],) if known or poses["head"].rotation.ndim == 3 else CHOICES["quaternion"]
+    )
     turned = {order: {joint: _matrices(raw, order) for joint, raw in poses.items()} for order in orders}
     unit, about_unit = (how.unit_m, [f"unit {how.unit} as given"]) if how.unit_m else _unit(poses, turned, where)
     paths = {joint: unit * raw.position for joint, raw in poses.items()}

@@ -372,15 +372,18 @@ def longest_path(skeleton: Skeleton) -> float:
     return longest
 
 
-def write_bvh(motion: Motion, path: str | Path, unit_m: float | int = 0.01) -> None:
+def write_bvh(
+    motion: Motion, path: str | Path, unit_m: float | int = 0.01, origin: Float[Tensor, "3"] | None = None
+) -> None:
     """Write a motion as BVH: y up, body facing +z at rest, ZYX channels in degrees, by default in centimetres.
 
     The farthest site of each leaf joint becomes its End Site. A gap in time is filled with the nearest frame, for BVH
-    has one frame rate. Raises WearcapError when there is nothing to write or it is not finite.
+    has one frame rate; `origin` (m) is added to all places. Raises WearcapError when there is nothing to write or it is not finite.
     """
     frames, fps = even_frames(motion)
     R = _R_FILE_WORLD @ motion.R_parent_joint[frames].double() @ _R_FILE_WORLD.T
-    root = motion.t_world_root[frames].double() @ _R_FILE_WORLD.T / unit_m
+    placed = motion.t_world_root[frames].double() + (0.0 if origin is None else origin)
+    root = placed @ _R_FILE_WORLD.T / unit_m
     if not (R.isfinite().all() and root.isfinite().all()):
         raise WearcapError("the motion holds NaN or infinite values", path, "finite poses")
     # R = Rz · Ry · Rx; at gimbal lock x is zero.
