@@ -70,8 +70,8 @@ class Wearer:
     seconds: np.ndarray
     R: np.ndarray
     t: np.ndarray
-    hands: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]
-    """(rows, R, t)."""
+    hands: dict[str, tuple[np.ndarray, np.ndarray | None, np.ndarray]]
+    """(rows, R, t); R of OpenXR's hand joints, ahead along the fingers; None for what a fist holds."""
     base: int
     """Rows in a quarter of a second."""
 
@@ -138,7 +138,11 @@ def turns_on_a_neck(wearer: Wearer) -> tuple[float, str]:
     """
     k = wearer.base
     second = lambda x: x[2 * k :] - 2 * x[k:-k] + x[: -2 * k]  # noqa: E731
-    turns, moves = second(wearer.R).reshape(-1, 3), second(wearer.t).reshape(-1)
+    span = wearer.seconds[2 * k :] - wearer.seconds[: -2 * k]
+    whole = span < 1.5 * np.median(span) if len(span) else span > 0  # not across gaps
+    turns, moves = second(wearer.R)[whole].reshape(-1, 3), second(wearer.t)[whole].reshape(-1)
+    if not len(moves):
+        return 0.0, ""
     square = turns.T @ turns + 1e-6 * np.eye(3)
     lever = np.linalg.solve(square, turns.T @ moves)
     scatter = np.linalg.inv(square) * ((moves - turns @ lever) ** 2).mean() * 4 * k
@@ -305,7 +309,7 @@ def _wearer(
     step = float(np.median(np.diff(head.seconds)))
     thin = max(1, int(1 / 30 / step))
     seconds, hands = head.seconds[::thin], {}
-    for joint in poses.keys() - {"head"}:
+    for joint in (joint for joint in poses if joint != "head"):
         rows = (_rows(head, poses[joint])[::thin] // thin).clip(max=len(seconds) - 1)
         R = M @ turned[joint][::thin] @ M.T if kinds[joint] == "wrist" else None
         hands[joint] = rows, R, paths[joint][::thin] @ M.T
