@@ -32,7 +32,7 @@ DETECTED = ("openxr", "unity", "unreal", "head")
 """Conventions that are told apart; OpenXR's stands for SteamVR's."""
 PALM_M = 0.08
 """Distance (m) of a held controller's origin, the palm's middle, from the wrist (nominal)."""
-MARGIN = 2.0
+MARGIN = 2.5
 """Least difference (nats) from the second best reading."""
 FORMAT_NATS = 4.0
 """What it is worth (nats) that a file's format fixes the convention."""
@@ -46,7 +46,7 @@ FASTEST_M_S = 5.0
 WALKING_M_S = 0.4
 NECK_M = (-0.1, 0.0, -0.1)
 """The place about which a head turns, from its headset, in the head's axes."""
-_BASE_S = 0.25
+_BASE_S = 0.17
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Wearer:
     hands: dict[str, tuple[np.ndarray, np.ndarray | None, np.ndarray]]
     """(rows, R, t); R of OpenXR's hand joints, ahead along the fingers; None for what a fist holds."""
     base: int
-    """Rows in a quarter of a second."""
+    """Rows in a sixth of a second."""
 
     @property
     def heading(self) -> np.ndarray:
@@ -81,6 +81,15 @@ class Wearer:
         left = self.R[:, :2, 1]
         left = left / np.linalg.norm(left, axis=1, keepdims=True).clip(1e-9)
         return np.stack([left[:, 1], -left[:, 0]], 1)
+
+    @property
+    def walk(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Horizontal velocities (m/s) of the rows but `base` at each end, where they are walking, and its seconds."""
+        k = self.base
+        seconds = self.seconds[2 * k :] - self.seconds[: -2 * k]
+        velocity = (self.t[2 * k :] - self.t[: -2 * k])[:, :2] / seconds[:, None]
+        walking = np.linalg.norm(velocity, axis=1) > WALKING_M_S
+        return velocity, walking, float(walking.sum() * np.median(np.diff(self.seconds)))
 
 
 Term = Callable[[Wearer], tuple[float, str]]
@@ -93,7 +102,7 @@ def upright(wearer: Wearer) -> tuple[float, str]:
 
 
 def turns_about_up(wearer: Wearer) -> tuple[float, str]:
-    """Heads turn about the vertical more than about any other axis: its share of squared turns of a quarter second."""
+    """Heads turn about the vertical more than about any other axis: its share of squared turns of a sixth of a second."""
     step = wearer.R[wearer.base :] @ wearer.R[: -wearer.base].swapaxes(1, 2)
     turn = (
         np.stack([step[:, 2, 1] - step[:, 1, 2], step[:, 0, 2] - step[:, 2, 0], step[:, 1, 0] - step[:, 0, 1]], 1) / 2
@@ -112,16 +121,12 @@ def stays_level(wearer: Wearer) -> tuple[float, str]:
 
 def walks_ahead(wearer: Wearer) -> tuple[float, str]:
     """Walking is forward: mean cosine between heading and velocity, in full from 4 s of walking on."""
-    k = wearer.base
-    seconds = wearer.seconds[2 * k :] - wearer.seconds[: -2 * k]
-    velocity = (wearer.t[2 * k :] - wearer.t[: -2 * k])[:, :2] / seconds[:, None]
-    speed = np.linalg.norm(velocity, axis=1)
-    walking = speed > WALKING_M_S
+    velocity, walking, seconds = wearer.walk
     if not walking.any():
         return 0.0, ""
-    along = ((velocity * wearer.heading[k:-k]).sum(1) / speed.clip(1e-9))[walking].mean()
-    walked = walking.sum() * np.median(seconds) / (2 * k)
-    return 1.5 * min(1.0, walked / 4) * along, f"walks ahead {along:.2f}"
+    heading = wearer.heading[wearer.base : -wearer.base]
+    along = ((velocity * heading).sum(1) / np.linalg.norm(velocity, axis=1).clip(1e-9))[walking].mean()
+    return 1.5 * min(1.0, seconds / 4) * along, f"walks ahead {along:.2f}"
 
 
 def looks_down(wearer: Wearer) -> tuple[float, str]:
@@ -133,14 +138,12 @@ def looks_down(wearer: Wearer) -> tuple[float, str]:
 def turns_on_a_neck(wearer: Wearer) -> tuple[float, str]:
     """A headset sits before the axis on which it turns, 0.1 ± 0.065 m.
 
-    The lever r (m) is fitted to second differences over a quarter of a second, in which steady walking vanishes:
-    Δ²t = Δ²R r; it counts as turned to the mean pitch, and as well as it is determined.
+    The lever r (m) is fitted to second differences, Δ²t = Δ²R r, while nobody walks, since the steps of a walk and the
+    nods against them look like another one. It counts as turned to the mean pitch, and as well as it is determined.
     """
-    k = wearer.base
-    second = lambda x: x[2 * k :] - 2 * x[k:-k] + x[: -2 * k]  # noqa: E731
-    span = wearer.seconds[2 * k :] - wearer.seconds[: -2 * k]
-    whole = span < 1.5 * np.median(span) if len(span) else span > 0  # not across gaps
-    turns, moves = second(wearer.R)[whole].reshape(-1, 3), second(wearer.t)[whole].reshape(-1)
+    k, standing = wearer.base, ~wearer.walk[1]
+    second = [(x[2 * k :] - 2 * x[k:-k] + x[: -2 * k])[standing] for x in (wearer.R, wearer.t)]
+    turns, moves = second[0].reshape(-1, 3), second[1].reshape(-1)
     if not len(moves):
         return 0.0, ""
     square = turns.T @ turns + 1e-6 * np.eye(3)
@@ -149,7 +152,8 @@ def turns_on_a_neck(wearer: Wearer) -> tuple[float, str]:
     ahead = wearer.R[:, 2, 2].mean() * np.eye(3)[0] - wearer.R[:, 2, 0].mean() * np.eye(3)[2]
     ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
     before, variance = float(ahead @ lever), float(ahead @ scatter @ ahead) + 0.065**2
-    return 0.1 * float(np.clip(before, -0.2, 0.2)) / variance, f"turns {100 * before:.0f} cm behind the eyes"
+    score = 0.1 * float(np.clip(before, -0.2, 0.2)) / variance
+    return score, f"turns {100 * before:.0f} cm behind the eyes" if abs(score) > 0.5 else ""
 
 
 def hands_on_their_sides(wearer: Wearer) -> tuple[float, str]:
@@ -272,7 +276,8 @@ def _unit(poses: dict[str, RawPoses], turned: dict[str, dict[str, np.ndarray]], 
     up = max((R["head"][:, axis, axis].mean(), axis) for R in turned.values() for axis in (1, 2))[1]
     height = float(np.percentile(head.position[:, up], 90))
     steps = np.linalg.norm(np.diff(head.position, axis=0), axis=1) / np.diff(head.seconds).clip(1e-6)
-    far = [np.linalg.norm(raw.position - head.position[_rows(head, raw)], axis=1) for raw in poses.values()][1:]
+    hands = [raw for joint, raw in poses.items() if joint != "head"]
+    far = [np.linalg.norm(raw.position - head.position[_rows(head, raw)], axis=1) for raw in hands]
     reach = float(np.median(np.concatenate(far))) if far else None
     scores = {}
     for name in ("m", "cm", "mm"):
