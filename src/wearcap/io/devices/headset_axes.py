@@ -157,15 +157,14 @@ def turns_on_a_neck(wearer: Wearer) -> tuple[float, str]:
 
 
 def hands_on_their_sides(wearer: Wearer) -> tuple[float, str]:
-    """The left hand is left of the neck, the right one right of it: 0.2 ± 0.25 m; and below the eyes: 0.5 ± 0.3 m."""
-    score, beside = 0.0, 0.0
+    """The left hand is left of the neck, the right one right of it, 0.2 ± 0.2 m; both hang below it, 0.4 ± 0.3 m."""
+    score, beside = 0.0, []
     for joint, offset in _from_neck(wearer):
-        side = np.median(offset[:, 1]) * (1 if joint.startswith("left") else -1)
-        score -= min(4.0, 0.5 * ((side - 0.2) / 0.25) ** 2) + min(
-            4.0, 0.5 * ((np.median(offset[:, 2]) + 0.4) / 0.3) ** 2
-        )
-        beside += side / len(wearer.hands)
-    return score, f"hands {100 * beside:.0f} cm on their sides" if wearer.hands else ""
+        left, up = np.median(offset[:, 1:], axis=0)
+        beside.append(left if joint.startswith("left") else -left)
+        score -= min(4.0, ((beside[-1] - 0.2) / 0.2) ** 2 / 2) + min(4.0, ((up + 0.4) / 0.3) ** 2 / 2)
+    mean = sum(beside) / max(len(beside), 1)
+    return score, f"hands {100 * abs(mean):.0f} cm on their {'sides' if mean > 0 else 'other sides'}" if beside else ""
 
 
 def hands_ahead(wearer: Wearer) -> tuple[float, str]:
@@ -353,9 +352,9 @@ def _best(readings: dict[tuple[str, str], Wearer], known: str | None, where: str
 
 def _in_axes(seconds: np.ndarray, R: np.ndarray, t: np.ndarray, name: str) -> Trajectory:
     """A path (m) of a named convention in wearcap's axes, world and device alike."""
-    M = CONVENTIONS[name].double()
-    turned = M @ torch.tensor(R, dtype=torch.float64) @ M.mT
-    return Trajectory(torch.tensor(seconds), turned.float(), (torch.tensor(t) @ M.mT).float())
+    M = CONVENTIONS[name].double().numpy()
+    turned = torch.tensor(M @ R @ M.T, dtype=torch.float32)
+    return Trajectory(torch.tensor(seconds), turned, torch.tensor(t @ M.T, dtype=torch.float32))
 
 
 def _as_wrist(track: Trajectory, joint: str, kind: str) -> Trajectory:
