@@ -32,7 +32,7 @@ POSTURES = {
 PER_UNIT = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 
 
-def wearer(posture: str, seconds: float = 12.0, fps: float = 60.0):
+def wearer(posture: str, seconds: float = 12.0, fps: float = 30.0):
     """Times (s), and {joint: (rotations, places in m)} of somebody whose head turns on a neck; x ahead, y left, z up."""
     pitch, (ahead, aside, below), walks = POSTURES[posture]
     time = np.arange(int(seconds * fps)) / fps
@@ -40,12 +40,7 @@ def wearer(posture: str, seconds: float = 12.0, fps: float = 60.0):
     step = np.stack([np.cos(course), np.sin(course)], 1) * 1.1 * walks / fps
     neck = np.concatenate([np.cumsum(step, 0), 1.52 + 0.015 * walks * np.sin(11 * time)[:, None]], 1)
     turn = np.stack(
-        [
-            course + 0.4 * np.sin(1.3 * time),
-            np.radians(pitch) + 0.12 * np.sin(2.1 * time),
-            0.05 * np.sin(1.7 * time),
-        ],
-        1,
+        [course + 0.4 * np.sin(1.3 * time), np.radians(pitch) + 0.12 * np.sin(2.1 * time), 0.05 * np.sin(1.7 * time)], 1
     )
     head, body = Rotation.from_euler("ZYX", turn), Rotation.from_euler("z", course[:, None])
     poses = {"head": (head.as_matrix(), neck + head.apply([0.1, 0.0, 0.1]))}
@@ -74,23 +69,20 @@ def assert_is(found: HeadsetLog, poses, convention: str) -> None:
     off = Rotation.from_matrix(np.swapaxes(found.head.R_world_body.double().numpy(), 1, 2) @ R).magnitude()
     assert np.degrees(off.max()) < 0.1
     for joint, wrist in found.wrists.items():
-        assert np.linalg.norm(wrist.t_world_body.numpy() - poses[joint][1], axis=1).max() == pytest.approx(0.08, abs=1e-3)
+        assert np.linalg.norm(wrist.t_world_body.numpy() - poses[joint][1], axis=1).max() == pytest.approx(
+            0.08, abs=1e-3
+        )
 
 
 @pytest.mark.parametrize("posture", POSTURES)
 @pytest.mark.parametrize("convention", TO_OURS)
 @pytest.mark.parametrize("unit", PER_UNIT)
 @pytest.mark.parametrize("order", ["xyzw", "wxyz"])
-def test_every_reading_is_right_or_asked(posture, convention, unit, order):
-    """Neither order, axes nor unit are named; only who stands with the hands behind the back may be asked."""
+def test_every_posture_in_every_writing(posture, convention, unit, order):
+    """Neither order, axes nor unit are named."""
     time, poses = wearer(posture)
     raw = written(time, poses, convention, order, unit)
-    try:
-        found = in_our_axes(raw, Conventions(), "log")
-    except WearcapError as error:
-        assert posture == "standing, behind"
-        assert f"axes={convention}" in str(error) or f"|{convention}" in str(error)
-        found = in_our_axes(raw, Conventions(axes=convention, quaternion=order), "log")
+    found = in_our_axes(raw, Conventions(), "log")
     assert_is(found, poses, convention)
     notes = "\n".join(found.notes)
     assert f"axes {convention}" in notes
@@ -127,7 +119,7 @@ def test_a_recentred_origin_has_no_height():
 
 def test_what_the_format_fixes_decides_where_habits_do_not():
     """Head alone, standing without a turn: nothing shows what is ahead, and all candidates are named."""
-    time, poses = wearer("standing")
+    time = np.arange(300) / 60
     still = {"head": (np.tile(np.eye(3), (len(time), 1, 1)), np.tile([0.0, 0.0, 1.6], (len(time), 1)))}
     raw = written(time, still, "unity", "xyzw", "m", named=True)
     with pytest.raises(WearcapError, match="not certain: .*Say which: axes=.*openxr.*unity"):
@@ -138,7 +130,7 @@ def test_what_the_format_fixes_decides_where_habits_do_not():
 def test_hand_joints_show_the_elbows():
     """Hands that hang behind the back of somebody who stands and looks ahead: fingers point down, not up."""
     time, poses = wearer("standing, behind")
-    R, t = poses["head"]
+    R = poses["head"][0]
     level = Rotation.from_euler("z", np.arctan2(R[:, 1, 0], R[:, 0, 0])[:, None])
     poses["head"] = level.as_matrix(), np.tile([0.0, 0.0, 1.62], (len(time), 1))
     down = (level * Rotation.from_euler("y", 80, degrees=True)).as_matrix()
@@ -164,7 +156,7 @@ def test_a_head_on_its_side_is_refused():
 
 def of_players(path):
     """Head (eyes 10 cm before and 8 cm above its joint) and wrists of a BVH by SciPy: x ahead, y left, z up."""
-    words = lzma.open(path, "rt").read().split()
+    words = lzma.decompress(path.read_bytes()).decode().split()
     begin, names, parents, offsets, open_joints, channels = words.index("MOTION"), [], [], [], [], []
     for k, word in enumerate(words[:begin]):
         if word in ("ROOT", "JOINT"):
@@ -194,16 +186,26 @@ def of_players(path):
     return np.arange(len(numbers)) * float(words[begin + 5]), found
 
 
+CROSSED = {"beatsaber_8", "beatsaber_11", "jobsimulator_9"}
+"""Clips in which the hands are less than 8 cm apart sideways, in the median: left and right look alike."""
+
+
 @pytest.mark.real
 def test_players_of_games(real_data):
     """16 clips of 2 to 3 minutes, of fights, dances and work with the hands: each is read in the axes it is written in."""
     clips = sorted((real_data / "fubot_vr" / "trials").glob("*.bvh.xz"))
     assert len(clips) == 16
-    for k, path in enumerate(clips):
+    asked = set()
+    for path in clips:
         time, poses = of_players(path)
-        convention, order, unit = (list(some)[k % len(some)] for some in (TO_OURS, ("wxyz", "xyzw"), PER_UNIT))
-        found = in_our_axes(written(time, poses, convention, order, unit), Conventions(), path.name)
-        assert_is(found, poses, convention)
+        for convention, order, unit in zip(TO_OURS, ("wxyz", "xyzw") * 2, ("m", "cm", "mm", "m"), strict=True):
+            try:
+                found = in_our_axes(written(time, poses, convention, order, unit), Conventions(), path.name)
+            except WearcapError:
+                asked.add((path.name.split(".")[0], convention))
+            else:
+                assert_is(found, poses, convention)
+    assert asked <= {(name, axes) for name in CROSSED for axes in ("unreal", "head")}
 
 
 @pytest.mark.real
