@@ -140,10 +140,10 @@ def hands_on_their_sides(wearer: Wearer) -> tuple[float, str]:
 
 
 def hands_ahead(wearer: Wearer) -> tuple[float, str]:
-    """Hands are held ahead of the neck rather than behind: 0.15 ± 0.24 m, against the opposite."""
+    """Hands are held ahead of the neck rather than behind: 0.15 ± 0.22 m, against the opposite."""
     ahead = [float(np.median(place[:, 0])) for place, _ in wearer.hands.values()]
     mean = sum(ahead) / max(len(ahead), 1)
-    score = sum(0.15 * float(np.clip(x, -0.4, 0.4)) / 0.24**2 for x in ahead)
+    score = sum(0.15 * float(np.clip(x, -0.4, 0.4)) / 0.22**2 for x in ahead)
     return score, f"hands {100 * abs(mean):.0f} cm {'ahead' if mean > 0 else 'behind'}" if ahead else ""
 
 
