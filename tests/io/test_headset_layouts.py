@@ -2,84 +2,30 @@
 
 import json
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 import short_walk
+from headset_tables import (
+    POSES,
+    SIDES,
+    TIME,
+    R,
+    T,
+    all_seven,
+    compare,
+    csv,
+    euler_angles,
+    matrices,
+    names_of,
+    seven,
+    texts,
+    write,
+)
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import Conventions
 from wearcap.io.devices.headset_log import is_headset_log, is_headset_session, read_headset_log, read_raw_poses
-
-TIME, R, T = short_walk.walk()
-POSES = short_walk.headset_poses(TIME, R, T, "unity", "grip")
-SIDES = {"head": "head", "left_wrist": "left", "right_wrist": "right"}
-
-
-def write(path: Path, text: str) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
-    return path
-
-
-def texts(*parts, digits=7) -> list[list[str]]:
-    """Columns of texts or numbers side by side, as rows of texts."""
-    columns = [part if isinstance(part, list) else np.asarray(part).reshape(len(part), -1).tolist() for part in parts]
-    shown = [
-        [[value] if isinstance(value, str) else [f"{number:.{digits}f}" for number in value] for value in column]
-        for column in columns
-    ]
-    return [[field for column in shown for field in column[row]] for row in range(len(shown[0]))]
-
-
-def csv(path: Path, names: str, *parts, between=",", digits=7) -> Path:
-    rows = [between.join(row) for row in texts(*parts, digits=digits)]
-    return write(path, "\n".join([names, *rows]) + "\n")
-
-
-def names_of(pattern: str, devices=("head", "left", "right")) -> str:
-    """A header: "{d}_pos_x … {d}_rot_w" of each device."""
-    axes = [pattern.format(d=device, q="pos", a=axis) for device in ("{0}",) for axis in "xyz"]
-    axes += [pattern.format(d="{0}", q="rot", a=axis) for axis in "xyzw"]
-    return ",".join(name.replace("{0}", device) for device in devices for name in axes)
-
-
-def seven(device: str, scale=1.0) -> np.ndarray:
-    turn, at = POSES[device]
-    return np.concatenate([at * scale, short_walk.quat_xyzw(turn)], 1)
-
-
-def all_seven(scale=1.0) -> np.ndarray:
-    return np.concatenate([seven(device, scale) for device in POSES], 1)
-
-
-def matrices(device: str) -> np.ndarray:
-    turn, at = POSES[device]
-    return np.concatenate([np.concatenate([turn, at[:, :, None]], 2), np.tile([[[0.0, 0, 0, 1]]], (len(at), 1, 1))], 1)
-
-
-def compare(path: Path, start: float | None = TIME[0], scale=1.0, within=2e-6, late=1e-3, turned=0.02, devices=SIDES):
-    """Raw poses as they were written: positions within rounding, times to 1 ms (their difference where no start is known)."""
-    poses, convention, notes = read_raw_poses(path, None)
-    assert set(poses) == set(devices)
-    for joint, device in devices.items():
-        pose, (turn, at) = poses[joint], POSES[device]
-        expected = TIME - TIME[0] + (pose.seconds[0] if start is None else start)
-        assert len(pose.seconds) == len(TIME)
-        assert np.abs(pose.seconds - expected).max() < late
-        assert np.abs(pose.position - at * scale).max() < within * scale
-        found = (
-            Rotation.from_quat(
-                pose.rotation[:, ["wxyz".index(axis) for axis in "xyzw"]] if pose.order == "wxyz" else pose.rotation
-            )
-            if pose.rotation.ndim == 2
-            else Rotation.from_matrix(pose.rotation)
-        )
-        assert np.degrees((found.inv() * Rotation.from_matrix(turn)).magnitude()).max() < turned
-    return poses, convention, notes
-
 
 # --- layouts -------------------------------------------------------------------------------------------------------
 
@@ -184,7 +130,7 @@ def vision_pro(folder):
         }
         for k, moment in enumerate(TIME.tolist())
     ]
-    return write(folder / "a.json", json.dumps(frames)), {}
+    return write(folder / "a.json", json.dumps(frames)), {"devices": {"head": "head"}}
 
 
 def flat_columns(folder):
@@ -262,11 +208,6 @@ def long_json(folder):
     return write(folder / "a.jsonl", "\n".join(lines)), {}
 
 
-def euler_angles(device: str) -> np.ndarray:
-    """Unity's degrees, 0 to 360: about z first, then x, then y."""
-    return np.degrees(Rotation.from_matrix(POSES[device][0]).as_euler("YXZ"))[:, [1, 0, 2]] % 360
-
-
 def euler(folder):
     names = "Frame,Time," + ",".join(
         f"{d}_{q}_{a}" for d in ("HMD", "L_ctrl", "R_ctrl") for q in ("Pos", "Rot") for a in "xyz"
@@ -289,7 +230,7 @@ def session(folder):
     return folder / "s", {"late": 1e-6}
 
 
-def replay(folder):
+def replay(folder, modifiers="", practice=0.0, speed=1.0):
     """Beat Saber's: players' names stay out."""
 
     def text(value):
@@ -299,12 +240,19 @@ def replay(folder):
         map(text, ["1", "1.29", "0", "7656", "A. Nonymous", "steam", "OpenVR", "Index", "Knuckles", "ab", "Söng"])
     )
     content = struct.pack("<IBB", 0x442D3D69, 1, 0) + info + text("me") + text("Expert") + struct.pack("<i", 5)
-    content += text("Standard") + text("") + text("") + struct.pack("<f?4f", 18, False, 1.7, 0, 0, 1)
+    content += text("Standard") + text("") + text(modifiers) + struct.pack("<f?4f", 18, False, 1.7, 0, 0, practice)
     content += struct.pack("<Bi", 1, len(TIME))
     for k, moment in enumerate(TIME - TIME[0]):
-        content += struct.pack("<fi21f", moment, 90, *all_seven()[k])
+        content += struct.pack("<fi21f", moment * speed, 90, *all_seven()[k])
     (folder / "a.bsor").write_bytes(content + struct.pack("<Bi", 2, 0))
     return folder / "a.bsor", {"start": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("modifiers", "practice", "speed"), [("GN,FS", 0.0, 1.2), ("SS", 0.0, 0.85), ("", 0.5, 0.5), ("NF", 1.0, 1.0)]
+)
+def test_a_replay_in_the_songs_time(tmp_path, modifiers, practice, speed):
+    compare(replay(tmp_path, modifiers, practice, speed)[0], 0.0)
 
 
 LAYOUTS = [
@@ -324,11 +272,16 @@ LAYOUTS = [
 LAYOUTS += [long_form, long_json, euler, session, replay]
 
 
+FIXED = {hololens: "openxr", webxr: "openxr", vision_pro: "openxr", euler: "unity", replay: "unity"}
+"""Conventions by recorder; of other logs they follow from the poses."""
+
+
 @pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.__name__)
 def test_layouts(tmp_path, layout):
     path, how = layout(tmp_path)
     assert is_headset_session(path) if path.is_dir() else is_headset_log(path)
-    _, _, notes = compare(path, **how)
+    _, convention, notes = compare(path, **how)
+    assert convention == FIXED.get(layout)
     assert "Nonymous" not in str(notes)
 
 
@@ -346,9 +299,20 @@ def test_unreals_rotators(tmp_path):
         T * 100,
         *(np.degrees(a) for a in (pitch, yaw, roll)),
     )
-    poses, convention, _ = read_raw_poses(path, None)
+    poses, convention, notes = read_raw_poses(path)
+    assert "pitch, yaw and roll in degrees as Unreal's" in notes
     assert convention == "unreal"
     assert np.abs(poses["head"].rotation - np.stack([x, y, z], 2)).max() < 1e-6
+
+
+def test_unitys_angles_by_the_names_of_unreal(tmp_path):
+    """Pitch, yaw, roll in Unity's axes: read so where the axes are stated, else the question is put."""
+    angles = euler_angles("head")
+    path = csv(tmp_path / "a.csv", "time,HMD_x,HMD_y,HMD_z,HMD_pitch,HMD_yaw,HMD_roll", TIME, POSES["head"][1], angles)
+    with pytest.raises(WearcapError, match="y seems to be up"):
+        read_headset_log(path)
+    found = read_headset_log(path, Conventions(axes="unity"))
+    assert max(short_walk.apart(found.head, TIME, R, T)) < 0.02
 
 
 def test_trials_of_a_session_are_one_recording_with_a_gap(tmp_path):
@@ -364,7 +328,7 @@ def test_trials_of_a_session_are_one_recording_with_a_gap(tmp_path):
             )
     write(tmp_path / "S001" / "trial_results.csv", "experiment,ppid,trial_num\nwalk,A. Nonymous,1\n")
     assert is_headset_session(tmp_path / "S001")
-    poses, convention, notes = read_raw_poses(tmp_path / "S001", None)
+    poses, convention, notes = read_raw_poses(tmp_path / "S001")
     kept = np.r_[0:cut, cut + 60 : len(TIME)]
     assert convention == "unity"
     assert "2 trials of a UXF session in one recording" in notes
@@ -375,163 +339,6 @@ def test_trials_of_a_session_are_one_recording_with_a_gap(tmp_path):
     assert len(log.head) == len(kept)
 
 
-# --- times ---------------------------------------------------------------------------------------------------------
-
-WHEN = np.datetime64("2024-05-03T23:59:57.000000")
-"""Midnight passes after 3 s."""
-EPOCH = (WHEN - np.datetime64("1970-01-01")) / np.timedelta64(1, "s")
-
-
-def stamps(shape) -> list[str]:
-    moments = WHEN + np.round((TIME - TIME[0]) * 1e6).astype("timedelta64[us]")
-    return [shape(str(moment)) for moment in moments]
-
-
-@pytest.mark.parametrize(
-    ("shape", "start"),
-    [
-        (lambda text: text, EPOCH),
-        (lambda text: text.replace("T", " "), EPOCH),
-        (lambda text: text + "0+02:00", EPOCH - 7200),
-        (lambda text: text.replace(".000000", "") + "Z", EPOCH),
-        (lambda text: text[11:23], 86397.0),
-        (lambda text: text[11:23].replace(".", ":"), 86397.0),
-        (lambda text: text[11:23].replace(".", ","), 86397.0),
-        (
-            lambda text: (
-                f"5/3/2024 {'11' if text[11] == '2' else '12'}{text[13:23]} {'PM' if text[11] == '2' else 'AM'}"
-            ),
-            86397.0,
-        ),
-    ],
-)
-def test_clock_times_and_dates_run_past_midnight(tmp_path, shape, start):
-    path = csv(
-        tmp_path / "a.csv",
-        "timestamp;" + names_of("{d}_{q}_{a}").replace(",", ";"),
-        stamps(shape),
-        all_seven(),
-        between=";",
-    )
-    compare(path, start, late=1.1e-3)
-
-
-@pytest.mark.parametrize(
-    ("name", "ticks", "start"),
-    [
-        ("ticks", 621355968000000000 + round(EPOCH * 1e7), EPOCH),
-        ("time", 621355968000000000 + round(EPOCH * 1e7), EPOCH),
-        ("FileTime", 116444736000000000 + round(EPOCH * 1e7), EPOCH),
-        ("ticks", 5_000_000_000, 500.0),
-    ],
-)
-def test_ticks_of_100_ns(tmp_path, name, ticks, start):
-    times = [str(ticks + round((moment - TIME[0]) * 1e7)) for moment in TIME]
-    compare(csv(tmp_path / "a.csv", f"{name},{names_of('{d}_{q}_{a}')}", times, all_seven()), start)
-
-
-@pytest.mark.parametrize("factor", [1.0, 1e3, 1e6, 1e9])
-def test_units_of_an_epoch(tmp_path, factor):
-    times = [
-        str(round((EPOCH + moment - TIME[0]) * factor, 6 if factor == 1 else 0)).removesuffix(".0") for moment in TIME
-    ]
-    compare(csv(tmp_path / "a.csv", f"unix_time,{names_of('{d}_{q}_{a}')}", times, all_seven()), EPOCH, late=1.1e-3)
-
-
-@pytest.mark.parametrize("tick", [1.0, 0.1])
-def test_a_coarse_clock_keeps_the_rate(tmp_path, tick):
-    """Times cut to whole ticks: all poses stay, in even steps."""
-    times = np.floor(TIME / tick + 1e-6) * tick
-    path = csv(tmp_path / "a.csv", f"time,{names_of('{d}_{q}_{a}')}", times, all_seven())
-    _, _, notes = compare(path, late=0.04)
-    assert any("coarse clock" in note for note in notes)
-
-
-def test_repeated_and_unsorted_rows(tmp_path):
-    """BOXRR's three rows of equal times at the start are one; rows in any order are sorted; both are said with their number."""
-    path = csv(tmp_path / "a.csv", f"time,{names_of('{d}_{q}_{a}')}", TIME, all_seven())
-    head, *rows = path.read_text().splitlines()
-    moved = rows[0].replace(",0.", ",0.0", 1)
-    write(path, "\n".join([head, rows[0], moved, moved, *rows[1:]]))
-    assert "head: 2 rows repeat a time and were dropped" in compare(path)[2]
-    swapped = [rows[k] for k in (1, 0, *range(2, 100), 101, 100, *range(102, len(rows)))]
-    write(path, "\n".join([head, *swapped]))
-    assert "head: 2 rows lay before their predecessors and were sorted" in compare(path)[2]
-
-
-def test_two_recordings_in_one_table(tmp_path):
-    there = np.concatenate([all_seven(), all_seven() + np.tile([1.0, 0, 0, 0, 0, 0, 0], 3)])
-    path = csv(tmp_path / "a.csv", f"time,{names_of('{d}_{q}_{a}')}", np.concatenate([TIME, TIME + 1e-3]), there)
-    with pytest.raises(WearcapError, match=f"line {len(TIME) + 2}: times go back"):
-        read_raw_poses(path, None)
-
-
-# --- tracking ------------------------------------------------------------------------------------------------------
-
-NOTHING = ["nan,nan,nan,nan,nan,nan,nan", ",,,,,,", "0,0,0,0,0,0,0", "0,0,0,0,0,0,1"]
-
-
-def with_lost(path: Path, device: int, lost, text: str) -> Path:
-    """The table with fields of a device replaced in some rows."""
-    csv(path, f"time,{names_of('{d}_{q}_{a}')}", TIME, all_seven())
-    rows = path.read_text().splitlines()
-    for k in lost:
-        fields = rows[k + 1].split(",")
-        fields[1 + 7 * device : 8 + 7 * device] = text.split(",")
-        rows[k + 1] = ",".join(fields)
-    return write(path, "\n".join(rows))
-
-
-@pytest.mark.parametrize("text", NOTHING)
-def test_short_gaps_of_the_head_are_interpolated(tmp_path, text):
-    path = with_lost(tmp_path / "a.csv", 0, range(50, 60), text)
-    notes = compare(path, within=0.03, turned=3.0)[2]
-    assert "head is not tracked in 10 of 240 rows" in notes
-    assert "10 of them, in gaps of at most 1 s, were interpolated" in notes
-
-
-def test_long_gaps_of_the_head_stay(tmp_path):
-    poses, _, _ = read_raw_poses(with_lost(tmp_path / "a.csv", 0, range(50, 90), NOTHING[0]), None)
-    assert np.array_equal(poses["head"].seconds.round(6), np.delete(TIME, range(50, 90)).round(6))
-
-
-def test_a_hand_that_freezes_is_lost(tmp_path):
-    """The last pose repeated while the head moves; a pause of everything is no loss."""
-    last = ",".join(f"{value:.7f}" for value in seven("left")[99])
-    poses, _, notes = read_raw_poses(with_lost(tmp_path / "a.csv", 1, range(100, 140), last), None)
-    assert len(poses["left_wrist"].seconds) == len(TIME) - 40
-    assert "left_wrist repeats its last pose in 40 rows, where it counts as lost" in notes
-    still = np.repeat(all_seven()[:1], len(TIME), 0)
-    poses, _, _ = read_raw_poses(csv(tmp_path / "b.csv", f"time,{names_of('{d}_{q}_{a}')}", TIME, still), None)
-    assert len(poses["left_wrist"].seconds) == len(TIME)
-
-
-@pytest.mark.parametrize(
-    ("lost", "kept", "message"),
-    [
-        (range(60), slice(60, None), "the first 2.0 s are left out: right_wrist is not tracked in them"),
-        (range(180, 240), slice(0, 180), "the last 2.0 s are left out: right_wrist is not tracked in them"),
-        (range(180), None, "right_wrist is left out: it is tracked over 2.0 of 8.0 s only"),
-        (range(240), None, "right_wrist is left out: it is tracked over 0.0 of 8.0 s only"),
-    ],
-)
-def test_a_hand_that_is_tracked_late(tmp_path, lost, kept, message):
-    poses, _, notes = read_raw_poses(with_lost(tmp_path / "a.csv", 2, lost, NOTHING[2]), None)
-    assert message in notes
-    assert ("right_wrist" in poses) == (kept is not None)
-    assert np.array_equal(poses["head"].seconds.round(6), TIME[kept or slice(None)].round(6))
-    assert len(poses["left_wrist"].seconds) == len(poses["head"].seconds)
-
-
-def test_flags_of_tracking(tmp_path):
-    flags = ["False" if k < 20 else "True" for k in range(len(TIME))]
-    names = names_of("{d}_{q}_{a}").replace("left_pos_x", "left_isTracked,left_pos_x")
-    path = csv(tmp_path / "a.csv", f"time,{names}", TIME, seven("head"), flags, seven("left"), seven("right"))
-    poses, _, notes = read_raw_poses(path, None)
-    assert "left_wrist is not tracked in 20 of 240 rows" in notes
-    assert poses["left_wrist"].seconds[0] == pytest.approx(poses["head"].seconds[0])
-
-
 # --- what is no log ------------------------------------------------------------------------------------------------
 
 
@@ -540,7 +347,7 @@ def test_a_replay_cut_short(tmp_path, size):
     whole, _ = replay(tmp_path)
     (tmp_path / "cut.bsor").write_bytes(whole.read_bytes()[:size])
     with pytest.raises(WearcapError):
-        read_raw_poses(tmp_path / "cut.bsor", None)
+        read_raw_poses(tmp_path / "cut.bsor")
 
 
 @pytest.mark.parametrize("count", [2**31 - 1, -1])
@@ -549,14 +356,14 @@ def test_a_replay_with_a_wrong_count(tmp_path, count):
     at = content.index(struct.pack("<Bi", 1, len(TIME)))
     (tmp_path / "a.bsor").write_bytes(content[:at] + struct.pack("<Bi", 1, count) + content[at + 5 :])
     with pytest.raises(WearcapError, match="frames"):
-        read_raw_poses(tmp_path / "a.bsor", None)
+        read_raw_poses(tmp_path / "a.bsor")
 
 
 def test_angles_that_may_be_radians(tmp_path):
     parts = [part for device in POSES for part in (POSES[device][1], np.radians(euler_angles(device)))]
     names = "time," + ",".join(f"{d}_{q}_{a}" for d in POSES for q in ("pos", "rot") for a in "xyz")
     with pytest.raises(WearcapError, match="may be radians"):
-        read_raw_poses(csv(tmp_path / "a.csv", names, TIME, *parts), None)
+        read_raw_poses(csv(tmp_path / "a.csv", names, TIME, *parts))
 
 
 def test_folders_that_are_no_sessions(tmp_path):
@@ -576,7 +383,7 @@ def test_folders_that_are_no_sessions(tmp_path):
 @pytest.mark.parametrize("name", ["J_hs_clock.csv", "J_hs_iso.csv", "J_hs_ticks.csv", "J_hs_euler.csv"])
 def test_field_logs_agree_with_each_other(real_data, name):
     """One walk at 72 Hz in four layouts."""
-    poses, _, _ = read_raw_poses(real_data / "field" / name, None)
+    poses, _, _ = read_raw_poses(real_data / "field" / name)
     head = poses["head"]
     assert len(head.seconds) == 899
     assert np.abs(head.seconds - head.seconds[0] - np.arange(899) / 72).max() < 1.1e-3
@@ -586,9 +393,9 @@ def test_field_logs_agree_with_each_other(real_data, name):
 @pytest.mark.real
 @pytest.mark.parametrize("name", ["S_unity_euler.csv", "S_uxf_session", "K_quest_session", "R_right_hand_late.csv"])
 def test_field_sessions(real_data, name):
-    poses, convention, notes = read_raw_poses(real_data / "field" / name, None)
+    poses, convention, notes = read_raw_poses(real_data / "field" / name)
     assert set(poses) == set(SIDES)
-    assert convention == ("unity" if "uxf" in name else None)
+    assert convention == ("unity" if name.startswith("S") else None)
     assert len(poses["head"].seconds) == {"K": 1080, "R": 420, "S": 720}[name[0]]
     assert any("5.0 s are left out" in note for note in notes) == name.startswith("R")
     assert "P01" not in str(notes)

@@ -169,6 +169,7 @@ def test_the_axes_of_a_seated_player_follow_from_the_hands(tmp_path):
             "time,head_pos_x,head_pos_y,head_pos_z,head_rot_x,head_rot_y,head_rot_z,head_rot_w\n0,1,2,3,0,0,0,1\n0,1,2,3,0,0,0,1\n",
             "no two tracked poses",
         ),
+        ("time,device,px,py,pz,qx,qy,qz,qw\n,HMD,1,2,3,0,0,0,1\n1,left,1,2,3,0,0,0,1\n", "no rows of the head"),
         ("[1, 2]", "no frames"),
         ('{"frames": 3}', "no frames"),
     ],
@@ -178,4 +179,4 @@ def test_defects(tmp_path, text, message):
     with pytest.raises(WearcapError, match=message):
         read_headset_log(tmp_path / "a.csv")
     if text:
-        assert is_headset_log(tmp_path / "a.csv") == ("time,head" in text)
+        assert is_headset_log(tmp_path / "a.csv") == ("time,head" in text or "HMD" in text)

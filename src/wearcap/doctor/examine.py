@@ -130,7 +130,7 @@ def require_sound(recording: Recording, found: Sequence[Finding] = ()) -> None:
         if finding.severity == "error":
             evidence = f" ({finding.evidence})" if finding.evidence else ""
             what = f"the doctor finds, {finding.check}: {finding.what}{evidence}"
-            raise WearcapError(what, recording.name, fix=f"{finding.fix} check=false goes on all the same.".strip())
+            raise WearcapError(what, fix=f"{finding.fix} check=false goes on all the same.".strip())
 
 
 def is_empty(recording: Recording) -> bool:

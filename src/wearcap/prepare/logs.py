@@ -321,16 +321,18 @@ def watches_tasks(
 class HeadsetSettings:
     """How a headset's log is read, and who wore it; "auto" and None: from the file's content."""
 
-    axes: str = "auto"
-    quaternion: str = "auto"
-    hands: str = "auto"
+    unit: str | float | int = AUTO
+    axes: str = AUTO
+    quaternion: str = AUTO
+    hands: str = AUTO
     time_unit: str | None = None
     T_head_device: Numbers | None = None
     height: float | int | None = None
 
     def read(self, path: Path, name: str, about: dict[str, str]) -> Recording:
         """Head, wrists and floor of a log."""
-        log = read_headset_log(path, self.axes, self.quaternion, self.hands, self.time_unit)
+        how = Conventions(unit=self.unit, axes=self.axes, quaternion=self.quaternion, hands=self.hands)
+        log = read_headset_log(path, how, self.time_unit)
         mount = pose_of(self.T_head_device, "T_head_device") or T_HEAD_DEVICE
         head = HeadStream(log.head.timestamps, log.head.R_world_body, log.head.t_world_body, mount.R, mount.t)
         notes = [

@@ -14,7 +14,7 @@ from wearcap.errors import WearcapError
 from wearcap.io.conventions import AUTO, Conventions
 from wearcap.io.devices.aria_mps import find_mps_file, head_stream, read_closed_loop, read_mps
 from wearcap.io.devices.headset_log import is_headset_log
-from wearcap.io.devices.watch_log import is_watch_log, read_inertial_log, read_watch_log
+from wearcap.io.devices.watch_log import is_watch_log, read_inertial_log, read_watch, sensor_files
 from wearcap.io.formats.csv_table import read_header
 from wearcap.io.formats.trajectory import trajectory_format
 from wearcap.prepare.logs import HeadsetSettings, TrajectorySettings, read_path
@@ -83,7 +83,8 @@ def load_trajectory(path: Path, how: Conventions) -> Loaded:
 def load_headset(path: Path, how: Conventions) -> Loaded:
     """A headset's log, or the folder of a session of one."""
     how.only("unit", "axes", "quaternion", "hands", "time_unit", where=path)
-    settings = HeadsetSettings(how.axes, how.quaternion, how.hands, None if how.time_unit == AUTO else how.time_unit)
+    time_unit = None if how.time_unit == AUTO else how.time_unit
+    settings = HeadsetSettings(how.unit, how.axes, how.quaternion, how.hands, time_unit)
     recording = settings.read(path, path.resolve().name.split(".")[0], {})
     check = Check("headset's log")
     findings = [check.ok(f"head and {len(recording.tracked)} hands", recording.note)]
@@ -133,13 +134,14 @@ def _side(path: Path) -> str | None:
 
 
 def _read_watch(path: Path, joint: str) -> tuple[ImuStream, Finding]:
-    inertial = not {"quaternionW", "motionQuaternionW(R)"} & set(read_header(path))
-    stream = read_inertial_log(path, joint) if inertial else read_watch_log(path, joint)
+    inertial = "Accelerometer X (g)" in read_header(path) or path.name == "Quaternion.csv"
+    stream, notes = (read_inertial_log(path, joint), []) if inertial else read_watch(path, joint)
     names = {"R_world_imu": "attitude", "acc_imu": "acceleration", "gyro_imu": "turn rate"}
     has = [word for name, word in names.items() if getattr(stream, name) is not None]
     missing = [word for name, word in names.items() if getattr(stream, name) is None]
     kind = "x-IMU3's log" if inertial else "a watch's log"
-    evidence = f"{len(stream.timestamps)} samples, {(stream.timestamps[-1] - stream.timestamps[0]).item():.1f} s"
+    span = (stream.timestamps[-1] - stream.timestamps[0]).item()
+    evidence = "; ".join([f"{len(stream.timestamps)} samples, {span:.1f} s", *notes])
     check = Check(f"log {path.name}")
     what = f"{kind} with {', '.join(has)}"
     if missing:
@@ -172,7 +174,7 @@ def log_files(folder: Path) -> dict[Path, str]:
                 kind = log_kind(path)
             except WearcapError:
                 continue
-            if kind is not None and not (path.name == "Quaternion.csv" and path.with_name("Inertial.csv").is_file()):
+            if kind is not None and not (kind == "watch" and sensor_files(path)[0] != path):
                 found[path] = kind
     return found
 

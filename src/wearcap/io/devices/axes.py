@@ -14,7 +14,11 @@ from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory, linear_velocity
 
 OPENXR = torch.tensor([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""Axes of OpenXR and SteamVR (x right, y up, z back) in the head's."""
 UNITY = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""Unity's left-handed axes: x right, y up, z forward."""
+UNREAL = torch.diag(torch.tensor([1.0, -1.0, 1.0]))
+"""Unreal's left-handed axes: x forward, y right, z up."""
 UPRIGHT = 0.7
 """Least mean component of a worn device's up axis along the world's."""
 CAMERA = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -29,6 +33,8 @@ WORLDS = {
 """Rotations of a right-handed world into one with z up, by the axis that is up; x stays x."""
 WALKING_M_S = 0.4
 _SEEN_S = 2.0
+_AHEAD_M = 0.05
+_AGREEMENT = 0.5
 CLEAR = 0.1
 """Lead of the best reading of a path's axes from which it is taken."""
 _IDENTITY_RAD, _IDENTITY_M = 0.02, 0.01

@@ -18,15 +18,14 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.conventions import AUTO, CHOICES, UNITS_M, Conventions
-from wearcap.io.devices.axes import CAMERA, OPENXR, UNITY
+from wearcap.io.devices.axes import CAMERA, OPENXR, UNITY, UNREAL
 from wearcap.io.devices.headset_tables import RawPoses
 
-UNREAL = torch.diag(torch.tensor([1.0, -1.0, 1.0]))
 CONVENTIONS = {
     "unity": UNITY, "openxr": OPENXR, "steamvr": OPENXR, "unreal": UNREAL, "head": torch.eye(3), "camera": CAMERA
 }  # fmt: skip
-"""x right, y up in Unity (z forward, left-handed) and in OpenXR and SteamVR (z backward); x forward, y right, z up in
-Unreal (left-handed). "head" has wearcap's own axes, "camera" OpenCV's."""
+"""Rotations, or reflections of left-handed axes, to x forward, y left, z up. World and device share them, so a pose is
+turned on both sides: R = M R' Mᵀ, t = M t'."""
 DETECTED = ("openxr", "unity", "unreal", "head")
 """Conventions that are told apart; OpenXR's stands for SteamVR's."""
 PALM_M = 0.08

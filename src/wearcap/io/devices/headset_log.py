@@ -12,9 +12,9 @@ import numpy as np
 
 from wearcap.boundary.opening import open_bytes
 from wearcap.errors import WearcapError
-from wearcap.io.conventions import Conventions
+from wearcap.io.conventions import AUTO, Conventions
 from wearcap.io.devices.headset_axes import PALM_M, HeadsetLog, in_our_axes
-from wearcap.io.devices.headset_poses import raw_poses
+from wearcap.io.devices.headset_poses import ARKIT, UNITY_ANGLES, UNREAL_ANGLES, raw_poses
 from wearcap.io.devices.headset_tables import (
     DeviceRows,
     PoseColumns,
@@ -31,6 +31,9 @@ __all__ = ["PALM_M", "HeadsetLog", "is_headset_log", "is_headset_session", "read
 _TABLES = {".csv", ".tsv", ".txt", ".json", ".jsonl"}
 _MOST_FILES = 2000
 _DETECTED = Conventions()
+_AXES_OF_NAMES = (({"hololens"}, "openxr"), ({"viewer", "orientation"}, "openxr"), (ARKIT, "openxr"))
+"""Conventions that a recorder fixes, by words of its columns: HoloLens2ForCV's, WebXR's, visionOS'."""
+_AXES_OF_ANGLES = {UNITY_ANGLES: ("unity", "openxr", "steamvr"), UNREAL_ANGLES: ("unreal",)}
 _TRIAL = re.compile(r"(?i)_?(?:t|trial_?)\d+$")
 
 
@@ -40,12 +43,18 @@ def read_headset_log(path: str | Path, how: Conventions = _DETECTED, time_unit: 
     Trials of a session are one recording, with gaps between them. Raises WearcapError for a file without a headset's
     poses and times, numbers that are none, and where nothing in the log determines a convention.
     """
-    poses, convention, notes = read_raw_poses(Path(path), time_unit)
+    poses, convention, notes = read_raw_poses(Path(path), time_unit, how.axes)
     log = in_our_axes(poses, how, str(path), convention)
+    for angles, allowed in _AXES_OF_ANGLES.items():
+        if angles in notes and log.axes not in allowed:
+            fix = "Say which axes the log has (axes=unity|unreal|openxr), or log quaternions."
+            raise WearcapError(f"{angles}, but axes {log.axes}", path, f"axes {', '.join(allowed)}", fix)
     return replace(log, notes=(*notes, *log.notes))
 
 
-def read_raw_poses(path: Path, time_unit: str | None) -> tuple[dict[str, RawPoses], str | None, list[str]]:
+def read_raw_poses(
+    path: Path, time_unit: str | None = None, axes: str = AUTO
+) -> tuple[dict[str, RawPoses], str | None, list[str]]:
     """Poses of a log as they stand there, the axes that its format fixes, and notes. Raises as `read_headset_log` does."""
     if time_unit not in (None, *UNITS):
         raise WearcapError(f"time_unit={time_unit!r}", expected=f"one of {', '.join(UNITS)}")
@@ -62,9 +71,10 @@ def read_raw_poses(path: Path, time_unit: str | None) -> tuple[dict[str, RawPose
         rows, convention, time_unit = _replay(path), "unity", "s"
     else:
         rows = read_rows(path)
-        convention = "unreal" if rows["head"].columns.form == "rotator" else None
-    poses, said = raw_poses(rows, time_unit, path)
-    return poses, convention, said + notes
+        convention = next((axes for words, axes in _AXES_OF_NAMES if words <= rows["head"].columns.words), None)
+    poses, mended = raw_poses(rows, time_unit, axes, path)
+    usual = next((allowed[0] for angles, allowed in _AXES_OF_ANGLES.items() if angles in mended), None)
+    return poses, convention or usual, mended + notes
 
 
 def is_headset_log(path: str | Path) -> bool:

@@ -12,6 +12,10 @@ from wearcap.io.devices.headset_times import grain, in_seconds, rising
 from wearcap.io.formats.trajectory import check_span
 
 _KINDS = {"wrist": {"wrist"}, "grip": {"grip", "controller", "ctrl", "leftcontroller", "rightcontroller", "saber"}}
+ARKIT = {"origin", "from", "anchor"}
+"""Words of visionOS' anchors; those of hands have axes of their own."""
+UNITY_ANGLES = "Euler angles in degrees, about z, x and y in turn as Unity's"
+UNREAL_ANGLES = "pitch, yaw and roll in degrees as Unreal's"
 FILLED_S = 1.0
 """Longest gap in the head's tracking that is interpolated."""
 LATE_S = 0.5
@@ -24,16 +28,23 @@ _TOLERANCE = 0.02, 0.1
 """Largest deviations from rotations: of a quaternion's norm from 1, and of a matrix times its transpose."""
 
 
-def raw_poses(rows: dict[str, DeviceRows], time_unit: str | None, path: Path) -> tuple[dict[str, RawPoses], list[str]]:
+def raw_poses(
+    rows: dict[str, DeviceRows], time_unit: str | None, axes: str, path: Path
+) -> tuple[dict[str, RawPoses], list[str]]:
     """Poses of the devices over the time in which all of them are tracked, and notes of what was mended.
 
+    The stated `axes` decide what Euler angles mean: x, y, z are Unity's unless Unreal's are stated, and pitch, yaw, roll
+    Unreal's unless Unity's are.
     Raises WearcapError for times that are none, for a head without two poses, and for rotations that are none.
     """
     clock, poses = _clock(rows, time_unit, path), dict[str, RawPoses]()
     notes, shared = [f"times {_seconds(rows['head'], clock, time_unit, path)[1]} ({clock})"], None
-    _check_degrees(rows, path)
+    notes += _angles(rows, axes, path)
     for joint, table in sorted(rows.items()):  # the head first
-        position, rotation = _parts(table, path)
+        if joint != "head" and table.columns.words >= ARKIT:
+            notes.append(f"{joint} is left out: visionOS' hand anchors have axes of their own")
+            continue
+        position, rotation = _parts(table, axes, path)
         seen, times = _seen(position, rotation), table.clocks[clock]
         if shared is None or not np.array_equal(times, rows["head"].clocks[clock], equal_nan=True):
             seconds, shown = _seconds(table, clock, time_unit, path)[0], np.where(seen[:, None], position, np.nan)
@@ -49,8 +60,8 @@ def raw_poses(rows: dict[str, DeviceRows], time_unit: str | None, path: Path) ->
         pose = RawPoses(seconds, position[kept], rotation[kept], table.columns.order, kind)
         notes += _tracked(pose, seen, joint, poses)
         poses[joint] = _of_rows(pose, seen)
-    if len(poses["head"].seconds) < 2:
-        raise WearcapError("no two tracked poses of the headset", path, "positions and rotations")
+        if len(poses["head"].seconds) < 2:
+            raise WearcapError("no two tracked poses of the headset", path, "positions and rotations")
     check_span(poses["head"].seconds, path, lambda row: f"pose {row + 1} of the head")
     return _together(poses, notes), notes
 
@@ -87,16 +98,32 @@ def _clock(rows: dict[str, DeviceRows], time_unit: str | None, path: Path) -> st
 # --- poses ---------------------------------------------------------------------------------------------------------
 
 
-def _check_degrees(rows: dict[str, DeviceRows], path: Path) -> None:
-    """Raise WearcapError for Euler angles that may be radians."""
+def _unreal(form: str, axes: str) -> bool:
+    return axes == "unreal" or (form == "rotator" and axes != "unity")
+
+
+def _angles(rows: dict[str, DeviceRows], axes: str, path: Path) -> list[str]:
+    """A note on Euler angles, if there are any. Raises WearcapError for those that may be radians, and for
+    Unreal's where the head is not above the hands along z, or without hands does not move least along it."""
     tables = [table for table in rows.values() if table.columns.form in ("euler", "rotator")]
-    widest = max((float(np.nanmax(np.abs(table.values[:, 3:]), initial=0.0)) for table in tables), default=360.0)
+    if not tables:
+        return []
+    widest = max(float(np.nanmax(np.abs(table.values[:, 3:]), initial=0.0)) for table in tables)
     if widest <= 2 * np.pi and not any(table.columns.words & {"deg", "degrees"} for table in tables):
         what = f"Euler angles of at most {widest:.2f}, which may be radians in any order"
         raise WearcapError(what, path, "quaternions, or degrees as Unity and Unreal write them", "Log quaternions.")
+    if not _unreal(tables[0].columns.form, axes):
+        return [UNITY_ANGLES]
+    head, *hands = [table.values[np.isfinite(table.values).all(1), :3] for _, table in sorted(rows.items())]
+    below = [head.mean(0) - hand.mean(0) for hand in hands if len(hand)] if len(head) else []
+    up = np.abs(np.mean(below, 0)) if below else -np.std(head, 0) if len(head) else np.zeros(3)
+    if axes != "unreal" and up.argmax() != 2:
+        what = f"pitch, yaw and roll where {'xyz'[up.argmax()]} seems to be up, as it is not in Unreal's axes"
+        raise WearcapError(what, path, "axes of known angles", "Say whose they are: axes=unreal|unity.")
+    return [UNREAL_ANGLES]
 
 
-def _parts(table: DeviceRows, path: Path) -> tuple[np.ndarray, np.ndarray]:
+def _parts(table: DeviceRows, axes: str, path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Positions (n, 3) and rotations, (n, 4) or (n, 3, 3); NaN in rows without numbers.
 
     Unity applies Euler angles about z, x and y in turn. Unreal's pitch and roll turn against its y and x axes.
@@ -115,9 +142,12 @@ def _parts(table: DeviceRows, path: Path) -> tuple[np.ndarray, np.ndarray]:
     R = np.full((len(values), 3, 3), np.nan)
     whole = np.isfinite(values).all(1)
     first, second, third = values[whole, 3:].T
-    turns = ("YXZ", (second, first, third)) if form == "euler" else ("ZYX", (second, -first, -third))
+    turns, angles = "YXZ", (second, first, third)
+    if _unreal(form, axes):
+        pitch, yaw, roll = (first, second, third) if form == "rotator" else (second, third, first)
+        turns, angles = "ZYX", (yaw, -pitch, -roll)
     if whole.any():
-        R[whole] = Rotation.from_euler(turns[0], np.stack(turns[1], 1), degrees=True).as_matrix()
+        R[whole] = Rotation.from_euler(turns, np.stack(angles, 1), degrees=True).as_matrix()
     return values[:, :3], R
 
 
@@ -126,7 +156,7 @@ def _seen(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     turn = rotation.reshape(len(rotation), -1)
     finite = np.isfinite(position).all(1) & np.isfinite(turn).all(1)
     nothing = np.linalg.norm(turn, axis=1) < 0.5
-    still = np.abs(turn).max(1) == 1 if turn.shape[1] == 4 else (turn == np.eye(3).ravel()).all(1)
+    still = np.abs(turn).max(1) > 0.9999 if turn.shape[1] == 4 else (turn == np.eye(3).ravel()).all(1)
     return finite & ~nothing & ~((position == 0).all(1) & still)
 
 

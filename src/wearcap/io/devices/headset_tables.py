@@ -13,7 +13,7 @@ from array import array
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import chain, islice, pairwise
+from itertools import chain, islice, pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from wearcap.io.devices.headset_times import moment
 _DEVICES = {
     "left_wrist": {"left", "l", "lefthand", "leftcontroller", "leftwrist", "lhand"},
     "right_wrist": {"right", "r", "righthand", "rightcontroller", "rightwrist", "rhand"},
-    "head": {"head", "h", "hmd", "headset", "camera", "centereye", "eye", "view", "viewer", "deviceanchor"},
+    "head": {"head", "hmd", "headset", "camera", "centereye", "eye", "view", "viewer", "deviceanchor"},
 }
 _POSITION = {"pose", "pos", "position", "p", "loc", "location", "translation", "trans", "t", "origin"}
 _ROTATION = {"rot", "rotation", "quat", "quaternion", "orientation", "orient", "q", "ori"}
@@ -91,6 +91,9 @@ class PoseColumns:
     """Places of flags that are false where the device is lost."""
 
 
+_Layout = tuple[dict[str, Any], Any, dict[str, PoseColumns]]
+
+
 @dataclass(frozen=True)
 class DeviceRows:
     """A device's rows of a file: its numbers as they are laid out, and each column of times."""
@@ -108,16 +111,6 @@ class DeviceRows:
     """What a message calls a row."""
 
 
-@dataclass(frozen=True)
-class _Layout:
-    """What the columns of a file are: places of times by name, of the device's name, and each device's columns."""
-
-    clocks: dict[str, Any]
-    label: Any
-    devices: dict[str, PoseColumns]
-    """By joint; "" where a column names the device."""
-
-
 def read_rows(path: Path, device: str | None = None) -> dict[str, DeviceRows]:
     """Rows of each device in a file; a session's file whose columns name no device holds the `device` that is given.
 
@@ -125,16 +118,16 @@ def read_rows(path: Path, device: str | None = None) -> dict[str, DeviceRows]:
     """
     rows, where = _rows(path)
     names, begin = next(rows), list(islice(rows, _LOOKED_AT))
-    layout = _layout(names, [row for _, row in begin], path, device)
+    clocks, label, devices = _layout(names, [row for _, row in begin], path, device)
     numbers, kinds, texts = array("q"), list[str](), set[str]()
-    times = {name: array("d") for name in layout.clocks}
-    values = {joint: array("d") for joint in layout.devices}
+    times = {name: array("d") for name in clocks}
+    values = {joint: array("d") for joint in devices}
     for number, row in chain(begin, rows):
         read = row.get if isinstance(row, dict) else row.__getitem__
         kind, about = "", f"{where} {number}"
-        if layout.label is not None and (kind := device_named(parts_of(str(read(layout.label))))) is None:
+        if label is not None and (kind := device_named(parts_of(str(read(label))))) is None:
             continue
-        moments = [moment(read(place), about, path) for place in layout.clocks.values()]
+        moments = [moment(read(place), about, path) for place in clocks.values()]
         if all(math.isnan(time) for time, _ in moments):
             continue  # a frame of another kind
         for (name, column), (time, text) in zip(times.items(), moments):
@@ -142,21 +135,21 @@ def read_rows(path: Path, device: str | None = None) -> dict[str, DeviceRows]:
             texts |= {name} if text else set()
         numbers.append(number)
         kinds.append(kind)
-        for joint, columns in layout.devices.items():
+        for joint, columns in devices.items():
             lost = any(str(read(place)).strip().lower() in _FALSE for place in columns.tracked)
             found = [math.nan if lost else _value(read(place), joint or kind, about, path) for place in columns.places]
             values[joint].extend(found)
-    if not numbers:
-        raise WearcapError("a header, but no rows", path, "a row for each frame")
-    devices = {}
-    for joint, columns in layout.devices.items():
+    if not numbers or (label is not None and "head" not in kinds):
+        raise WearcapError("a header, but no rows of the head with times", path, "a row for each frame")
+    tables = {}
+    for joint, columns in devices.items():
         table = np.asarray(values[joint]).reshape(len(numbers), -1)
         for kind in dict.fromkeys(kinds):
-            kept = np.asarray([one == kind for one in kinds])
-            clocks = {name: np.asarray(column)[kept] for name, column in times.items()}
-            rows_of = DeviceRows(columns, table[kept], clocks, frozenset(texts), np.asarray(numbers)[kept], where)
-            devices[joint or kind] = rows_of
-    return devices
+            kept = np.asarray(kinds) == kind
+            moments = {name: np.asarray(column)[kept] for name, column in times.items()}
+            rows_of = DeviceRows(columns, table[kept], moments, frozenset(texts), np.asarray(numbers)[kept], where)
+            tables[joint or kind] = rows_of
+    return tables
 
 
 def has_poses(path: Path, device: str | None = None) -> bool:
@@ -165,7 +158,7 @@ def has_poses(path: Path, device: str | None = None) -> bool:
     try:
         rows, _ = _rows(path)
         names = next(rows)
-        with suppress(WearcapError):  # a damaged row is said when the file is read
+        with suppress(WearcapError):  # a damaged row is an error when the file is read
             begin += (row for _, row in islice(rows, _LOOKED_AT))
         _layout(names, begin, path, device)
     except (WearcapError, StopIteration):
@@ -210,27 +203,29 @@ def _csv_rows(path: Path) -> Iterator[Any]:
         names = [name.strip() for name in next(csv.reader([header[1]], delimiter=separator))]
     if len(names) >= _HOLOLENS and re.fullmatch(r"\d+", names[0]):
         names, lines = _hololens_names(len(names)), chain([header], lines)
-    begin = [(number, _fields(line, separator)) for number, line in islice(lines, _LOOKED_AT)]
+    fields = ((number, _fields(line, separator, path, number)) for number, line in lines)
+    begin = list(islice(fields, _LOOKED_AT))
     sizes = [
         max((len(_vector(row[place])) for _, row in begin if place < len(row)), default=0)
         for place in range(len(names))
     ]
     spread = [f"{name}.{k}" if size else name for name, size in zip(names, sizes) for k in range(max(size, 1))]
     yield {name: place for place, name in enumerate(spread[:_MAX_COLUMNS])}
-    for number, row in chain(begin, ((number, _fields(line, separator)) for number, line in lines)):
+    for number, row in chain(begin, fields):
         if len(row) < len(names):
             raise WearcapError(f"line {number} has {len(row)} fields", path, f"{len(names)}, as the header")
         if any(sizes):
-            parts = ((_vector(text) or [""] * size) if size else [text] for text, size in zip(row, sizes))
-            row = [text for part in parts for text in part]
+            parts = ((_vector(text), size) if size else ([text], 1) for text, size in zip(row, sizes))
+            row = [text for part, size in parts for text in (part if len(part) == size else [""] * size)]
         yield number, row
 
 
-def _fields(line: str, separator: str) -> list[str]:
+def _fields(line: str, separator: str, path: Path, number: int) -> list[str]:
     """Fields of a line; a vector in brackets is one."""
     if "(" in line or '"' in line or "[" in line:
         quoted = re.sub(r'"?[(\[]([^()\[\]]*)[)\]]"?', r'"\1"', line.rstrip("\r\n"))
-        return next(csv.reader([quoted], delimiter=separator, skipinitialspace=True))
+        with understood(f"line {number} is no row of fields", path, errors=csv.Error):
+            return next(csv.reader([quoted], delimiter=separator, skipinitialspace=True))
     return line.rstrip("\r\n").split(separator)
 
 
@@ -244,7 +239,7 @@ def _vector(text: str) -> list[str]:
 
 def _hololens_names(count: int) -> list[str]:
     """Names of the columns of head_hand_eye.csv, which has no header: times of Windows, and matrices by rows."""
-    names, joints = ["filetime", *(f"head_m_{k}" for k in range(16))], 26 * 16
+    names, joints = ["filetime", *(f"hololens_head_m_{k}" for k in range(16))], 26 * 16
     for side in ("left", "right"):  # the second joint is the wrist
         names.append(f"{side}_available")
         names += [f"{side}_wrist_m_{k - 16}" if 16 <= k < 32 else "" for k in range(joints)]
@@ -312,7 +307,10 @@ def _flat(value: Any, key: str = "", depth: int = 0) -> dict[str, Any]:
 
 
 def _layout(names: dict[str, Any], begin: Sequence[Any], where: Path, device: str | None) -> _Layout:
-    """What the columns are, by their names and by some rows; a head with poses, or the `device`'s, is required."""
+    """Places of times by name, of the device's name in a table of the long form, and each device's columns.
+
+    They follow from names and some rows; poses of the head, or of the `device`, are required.
+    """
     groups: dict[str, dict[tuple[str, str], dict[str, Any]]] = {joint: {} for joint in ("head", *WRISTS, "")}
     clocks, labels = {}, []
     for name, place in names.items():
@@ -340,7 +338,7 @@ def _layout(names: dict[str, Any], begin: Sequence[Any], where: Path, device: st
         shown = ", ".join(list(names)[:8])
         expected = "time, head_pos_x … z, head_rot_x … w, and the same for left and right"
         raise WearcapError(f"{what} among the columns {shown}"[:300], where, expected)
-    return _Layout(clocks, label, devices)
+    return clocks, label, devices
 
 
 def _quantity(name: str, parts: list[str]) -> tuple[str, str, str] | None:
@@ -363,10 +361,8 @@ def _quantity(name: str, parts: list[str]) -> tuple[str, str, str] | None:
         return "matrix", " ".join(before), str(number)
     if last not in ("x", "y", "z", "w") and not numbered:
         return None
-    turned = words & _ROTATION or "r" in parts[1:-1]
-    kind = (
-        "euler" if words & _EULER else "rotation" if turned else "position" if words & _POSITION or not numbered else ""
-    )
+    kinds = {"euler": words & _EULER, "rotation": words & _ROTATION, "position": words & _POSITION or not numbered}
+    kind = next((kind for kind, named in kinds.items() if named), None)
     return (kind, " ".join(before), last) if kind else None
 
 
@@ -374,22 +370,17 @@ def _pose_columns(groups: dict[tuple[str, str], dict[str, Any]]) -> PoseColumns 
     """The first whole pose among a device's columns, grouped by their quantity and the other words of their names."""
 
     def first(quantity: str, *components: Iterable[str]) -> tuple[list[Any], str, bool] | None:
-        for wanted in map(list, components):
-            for (kind, prefix), places in groups.items():
-                if (
-                    kind == quantity
-                    and set(wanted) <= set(places)
-                    and (quantity == "position" or len(wanted) == len(places))
-                ):
-                    return [places[name] for name in wanted], prefix, wanted[0] == "x"
+        for wanted, ((kind, prefix), places) in product(map(list, components), groups.items()):
+            whole = set(wanted) <= set(places) if quantity == "position" else set(wanted) == set(places)
+            if kind == quantity and whole:
+                return [places[name] for name in wanted], prefix, wanted[0] == "x"
         return None
 
     tracked = tuple(place for (kind, _), places in groups.items() if kind == "tracked" for place in places.values())
     numbers = [str(number) for number in range(16)]
-    if found := first("matrix", numbers, numbers[:12]):
-        return PoseColumns("matrix", tuple(found[0]), frozenset(found[1].split()), None, tracked)
-    if found := first("position", "0123456"):
-        return PoseColumns("quaternion", tuple(found[0]), frozenset(found[1].split()), None, tracked)
+    for form, sought in {"matrix": ("matrix", numbers, numbers[:12]), "quaternion": ("position", numbers[:7])}.items():
+        if found := first(*sought):
+            return PoseColumns(form, tuple(found[0]), frozenset(found[1].split()), None, tracked)
     position = first("position", "xyz", "012")
     forms = {
         "quaternion": ("rotation", "xyzw", "0123"),

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from wearcap.boundary.opening import understood
 from wearcap.errors import WearcapError
 from wearcap.io.formats.trajectory import UNITS, time_unit_of
 
@@ -33,16 +34,12 @@ def moment(value: Any, label: str, path: Path) -> tuple[float, bool]:
     text = value.strip() if isinstance(value, str) else value
     if text is None or text == "":
         return math.nan, False
-    try:
+    with understood(f"{label}: {str(value)[:30]!r} is no time", path, "numbers, clock times or dates"):
+        if isinstance(text, str) and (found := _CLOCK.fullmatch(text)) and (found[4] or found[7] or found[8]):
+            return _seconds(found), True
         if isinstance(text, bool):
             raise ValueError
         return float(text.replace(",", ".") if isinstance(text, str) else text), False
-    except (TypeError, ValueError, OverflowError) as error:
-        found = _CLOCK.fullmatch(text) if isinstance(text, str) else None
-        if found is None or (found[4] is None and not (found[7] or found[8])):
-            what = f"{label}: {str(value)[:30]!r} of time is no number"
-            raise WearcapError(what, path, "numbers, clock times or dates") from error
-        return _seconds(found), True
 
 
 def _seconds(found: re.Match[str]) -> float:
@@ -68,7 +65,7 @@ def in_seconds(times: np.ndarray, name: str, texts: bool, time_unit: str | None,
         return times + 86400.0 * np.cumsum(np.diff(times, prepend=times[:1]) < -_HALF_DAY_S), "as clock times"
     if time_unit is None:
         for kind, (least, most, epoch) in _TICKS.items():
-            if least < np.median(times) < most:
+            if least < np.nanmedian(times) < most:
                 return (times - epoch) * _TICK_S, f"in {kind}"
         if "ticks" in name.lower():
             return times * _TICK_S, "in ticks of 100 ns"
@@ -105,7 +102,8 @@ def rising(
         notes.append(f"{timeless} rows without a time were left out")
     falls = int((np.diff(seconds[np.sort(order)]) < 0).sum())
     if falls:
-        ways = [np.nansum(np.abs(np.diff(values[rows_of], axis=0))) for rows_of in (np.sort(order), order)]
+        seen = order[np.isfinite(values[order]).all(1)]
+        ways = [np.abs(np.diff(values[rows_of], axis=0)).sum() for rows_of in (np.sort(seen), seen)]
         if ways[1] > ways[0] + 1e-9:
             back = rows[int(np.argmax(np.diff(seconds) < 0)) + 1]
             what = f"{about} {back}: times go back, and sorted rows jump to and fro"
