@@ -25,8 +25,7 @@ from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
 from wearcap.io.devices.aria_mps import T_HEAD_DEVICE
-from wearcap.io.devices.headset_axes import wrist_of_hand
-from wearcap.io.devices.headset_log import PALM_M
+from wearcap.io.devices.headset_axes import PALM_M, wrist_of_hand
 
 MAX_SEATS, MAX_JOINTS, MAX_NOTES = 64, 256, 100
 """Most seats, joints and notes of a file."""
