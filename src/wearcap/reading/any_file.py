@@ -24,7 +24,7 @@ from wearcap.io.devices.headset_log import is_headset_log, is_headset_session
 from wearcap.io.formats.motion_npz import motion_files, read_motion, read_sections
 from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply
-from wearcap.io.formats.trajectory import trajectory_file
+from wearcap.io.formats.trajectory import trajectory_file, trajectory_format
 from wearcap.prepare.foreign import read_foreign_motion
 from wearcap.prepare.suits import read_suit
 from wearcap.reading.kits import Loaded, is_kit, load_headset, load_kit, load_log, load_mps, load_trajectory
@@ -106,6 +106,8 @@ def _load_foreign(path: Path, how: Conventions) -> Loaded:
 
 
 def _load_json(path: Path, how: Conventions) -> Loaded:
+    if trajectory_format(path):
+        return load_trajectory(path, how)
     return load_log(path, how) if is_headset_log(path) else Loaded(*read_environment_file(path))
 
 
