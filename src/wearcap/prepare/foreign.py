@@ -20,7 +20,7 @@ from wearcap.body.retarget import fit_offsets, retarget
 from wearcap.body.skeleton import xsens23
 from wearcap.boundary.opening import placed
 from wearcap.errors import WearcapError
-from wearcap.io.conventions import AUTO, Conventions
+from wearcap.io.conventions import AUTO, DETECTED, Conventions
 from wearcap.io.formats.bvh import axes_rotation
 from wearcap.prepare.foreign_conventions import (
     Mapping,
@@ -38,6 +38,11 @@ from wearcap.recording.motion import Motion
 
 LEAST_STRAIGHT = 0.12
 """Straightness that a clip's straightest frame has where joints' axes that follow from it are not in doubt."""
+
+_CROUCHED = (
+    "Nobody stands straight in it (straightness {:.2f} of 1), so that the axes of its joints are uncertain, the head's by "
+    "up to 50°: read it in a folder of the same skeleton's clips."
+)
 
 
 @dataclass(frozen=True)
@@ -104,18 +109,17 @@ def read_foreign_motion(
     asf: Path | None = None,
     levels: Levels | None = None,
     siblings: Sequence[Take] = (),
-    how: Conventions | None = None,
+    how: Conventions = DETECTED,
 ) -> ForeignMotion:
     """Read a .bvh, or an .amc with `asf` or the skeleton file beside it (plain, .xz or .gz), onto xsens23.
 
-    `mapping` (a YAML file with any of joints, unit, up, forward) overrides what is detected, and `how` both; `levels` replaces what the
-    file itself shows of how head and feet are level. Conventions and joints' axes follow from the file's frames and from
+    `mapping` (a YAML file with any of joints, unit, up, forward) overrides what is detected, and `how` both; `levels`
+    replaces what the file itself shows of how head and feet are level. Conventions and joints' axes follow from the file's frames and from
     those of `siblings`, clips of the same skeleton. Raises WearcapError for a file that is damaged or holds no body
     with head, arms and legs, saying what is missing.
     """
     path = Path(path)
     given = mapping if isinstance(mapping, Mapping) else Mapping() if mapping is None else read_mapping(mapping)
-    how = how or Conventions()
     given = replace(given, unit_m=how.unit_m or given.unit_m, up=given.up if how.up == AUTO else how.up)
     own = read_take(path, amc_fps, asf)
     take = _joined(own, siblings)
@@ -138,14 +142,9 @@ def read_foreign_motion(
     if not (motion.R_parent_joint.isfinite().all() and motion.t_world_root.isfinite().all()):
         raise WearcapError("no skeleton can be fitted to its joints", path, "joints apart from one another")
     roles = joint_roles(found)
-    stated = [f"{name}={value}" for name in ("unit", "up") if (value := getattr(how, name)) != AUTO]
-    notes = (*take.notes, *(f"Stated: {each}." for each in stated))
+    notes = [*take.notes, *(f"Stated: {n}={v}." for n in ("unit", "up") if (v := getattr(how, n)) != AUTO)]
     if odd and (straight := straightness(take.t, found).max().item()) < LEAST_STRAIGHT:
-        note = f"Nobody stands straight in it (straightness {straight:.2f} of 1), so that the axes of its joints are"
-        notes = (
-            *notes,
-            f"{note} uncertain, the head's by up to 50°: read it in a folder of the same skeleton's clips.",
-        )
+        notes.append(_CROUCHED.format(straight))
     with_others = f" and that of {len(siblings)} clips beside it" if siblings else ""
     report = ForeignReport(
         path.name,
@@ -159,7 +158,7 @@ def read_foreign_motion(
         "the bind pose" if odd == "" else f"the motion{with_others}, for in the bind pose {odd}",
         {ours: take.names[joint] for ours, joint in roles.items()},
         _residuals(motion, {name: t_world[: len(motion), joint] for name, joint in roles.items()}),
-        notes,
+        tuple(notes),
     )
     return ForeignMotion(replace(motion, provenance={"source": path.name, "format": take.format}), report)
 

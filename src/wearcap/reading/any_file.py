@@ -99,7 +99,7 @@ def _load_stored(path: Path) -> Loaded:
 def _load_foreign(path: Path, how: Conventions) -> Loaded:
     """A motion file of any origin on our skeleton; the note says what was detected."""
     how.only("unit", "up", where=path)
-    found = read_foreign_motion(path)
+    found = read_foreign_motion(path, how=how)
     motion, name = found.motion, path.name.split(".")[0]
     recording = Recording(name, motion=motion, skeleton=motion.skeleton, note=found.report.summary())
     return Loaded(recording, [Check("file").ok("a body was found", " ".join(found.report.lines()))])
