@@ -133,13 +133,16 @@ def read_foreign_motion(
         motion = _fitted(tree, take.timestamps)
     naming = convention(take.names)
     if levels is None:  # CMU's head frames are those of markers, in whatever format
-        levels = levels_in([motion], head_trusted=R_ours_rest is not None and not naming.startswith("CMU"))
+        levels = levels_in(
+            [motion.sliced(len(own.t), len(motion)) if siblings else motion],
+            head_trusted=R_ours_rest is not None and not naming.startswith("CMU"),
+        )
     motion = with_levels(motion, levels).sliced(0, len(own.t))
     if not (motion.R_parent_joint.isfinite().all() and motion.t_world_root.isfinite().all()):
         raise WearcapError("no skeleton can be fitted to its joints", path, "joints apart from one another")
     roles = joint_roles(found)
     stated = [f"{name}={value}" for name in ("unit", "up") if (value := getattr(how, name)) != AUTO]
-    notes = (*take.notes, *(f"Stated: {each}." for each in stated))
+    notes = (*take.notes, *([f"Stated: {', '.join(stated)}."] if stated else []))
     if odd and (straight := straightness(take.t, found).max().item()) < LEAST_STRAIGHT:
         note = f"Nobody stands straight in it (straightness {straight:.2f} of 1), so that the axes of its joints are"
         notes = (
