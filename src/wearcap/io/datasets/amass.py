@@ -19,6 +19,7 @@ from wearcap.boundary.arrays import open_archive, read_npz, require
 from wearcap.errors import WearcapError, require_choice
 from wearcap.files import atomic_path
 from wearcap.geometry import rotation
+from wearcap.io.formats.bvh import axes_rotation
 from wearcap.io.formats.motion_npz import even_frames, nominal_fps
 from wearcap.io.formats.smpl import A, shape_from_arrays, smpl_motion
 from wearcap.recording import Motion, Recording
@@ -30,15 +31,9 @@ PELVIS_SMPLX = (0.0031, -0.3514, 0.0120)
 _RATES = ("mocap_framerate", "mocap_frame_rate")
 _KEYS = ("trans", "poses", "root_orient", "pose_body", "betas", "gender", "surface_model_type", *_RATES)
 _SMPLX_BODY = 66
-_SIGNS = {"": 1.0, "-": -1.0}
-_TURNS = {
-    sign + "xyz"[k]: torch.eye(3)[[k - 2, k - 1, k]] * torch.tensor([[1.0], [factor], [factor]])
-    for sign, factor in _SIGNS.items()
-    for k in range(3)
-}
+_TURNS = {up: axes_rotation(Path(), up, "xyz"["zxy".index(up[-1])]).float() for up in ("x", "y", "z", "-x", "-y", "-z")}
 """Rotations of worlds into ours, by their axis that points up."""
 _CAMERAS = re.compile("cam|points3d|intrinsic|extrinsic|focal|image|[cw]2[cw]|hwf", re.IGNORECASE)
-_MOST = 0.8
 _LYING_M = 0.35
 """Greatest height of the pelvis of somebody who lies."""
 
@@ -87,17 +82,19 @@ def read_amass(path: str | Path, up: str = "auto") -> Recording:
 
 def _require_motion(arrays: dict[str, np.ndarray], path: Path) -> None:
     """Raise WearcapError with the arrays that are missing, and what a file without them looks like."""
-    needed = {"'poses'": ("poses", "pose_body"), "'trans'": ("trans",), "a frame rate, 'mocap_framerate'": _RATES}
+    needed = {"'poses'": ("poses", "pose_body"), "'trans'": ("trans",), "frame rate 'mocap_framerate'": _RATES}
     missing = [name for name, keys in needed.items() if not any(key in arrays for key in keys)]
     if not missing:
         return
     with open_archive(path, "arrays", "arrays saved by NumPy") as (archive, _):
         names = sorted(name.removesuffix(".npy") for name in archive.namelist())
-    poses = arrays.get("poses", np.zeros((0, 0)))
-    cameras = poses.ndim == 3 or poses.shape[-1:] in ((7,), (12,), (16,), (17,)) or any(map(_CAMERAS.match, names))
-    kind = "cameras of an SfM or NeRF model: those with their poses are a trajectory" if cameras else "a shape.npz"
-    what = f"it has no {', no '.join(missing)}, but {', '.join(names)[:200]}"
-    raise WearcapError(what, path, "a motion file of AMASS", f"It looks like {kind}: leave it out.")
+    shape = arrays["poses"].shape if "poses" in arrays else ()
+    if len(shape) == 3 or shape[1:] in ((12,), (16,), (17,)) or any(map(_CAMERAS.match, names)):
+        fix = "It looks like cameras of an SfM or NeRF model: leave it out."
+    else:
+        fix = "" if shape else "shape.npz files beside the motions hold none: leave them out."
+    what = f"no {', no '.join(missing)}, but {', '.join(names)[:200]}"
+    raise WearcapError(what, path, "a motion file of AMASS", fix)
 
 
 def _standing_axis(motion: Motion) -> str:
@@ -108,11 +105,10 @@ def _standing_axis(motion: Motion) -> str:
     t = motion.T_world_joint.t
     feet = t[:, motion.skeleton.indices("left_ankle", "right_ankle", "left_foot", "right_foot")]
     body = t[:, motion.skeleton.index("head")] - feet.mean(1)
-    low = (t[:, 0, 2] > 0) & (t[:, 0, 2] < _LYING_M)
+    lies = ((t[:, 0, 2] > 0) & (t[:, 0, 2] < _LYING_M)).float().mean() > 0.8
     for up, R in _TURNS.items():
-        along = body @ R[2] > 0.8 * body.norm(dim=-1)
-        sole = (feet @ R[2]).amin(-1).median().item()
-        if along.float().mean() > _MOST and -0.35 < sole < 0.15 and low.float().mean() < _MOST:
+        stands = (body @ R[2] > 0.8 * body.norm(dim=-1)).float().mean() > 0.8
+        if stands and not lies and (feet @ R[2]).amin(-1).median().abs() < 0.35:
             return up
     return "z"
 
@@ -122,12 +118,11 @@ def _turned(motion: Motion, up: str, t_template_pelvis: Sequence[float]) -> Moti
 
     Who turned a file of AMASS into such axes often turned `trans` alone, without J₀: the feet on the ground show it.
     """
-    R_up = _TURNS[up]
+    R_up, J0 = _TURNS[up], torch.tensor(t_template_pelvis)
     R = torch.cat([R_up @ motion.R_parent_joint[:, :1], motion.R_parent_joint[:, 1:]], 1)
-    turned = replace(motion, R_parent_joint=R, t_world_root=motion.t_world_root @ R_up.T)
-    J0 = torch.tensor(t_template_pelvis)
-    whole = replace(turned, t_world_root=turned.t_world_root + J0 - R_up @ J0)
-    return min(turned, whole, key=lambda motion: motion.T_world_joint.t[..., 2].amin(-1).median().abs())
+    roots = (motion.t_world_root @ R_up.T + shift for shift in (torch.zeros(3), J0 - R_up @ J0))
+    both = (replace(motion, R_parent_joint=R, t_world_root=root) for root in roots)
+    return min(both, key=lambda motion: motion.T_world_joint.t[..., 2].amin(-1).median().abs())
 
 
 def write_amass(
