@@ -152,7 +152,7 @@ def test_the_axis_that_is_up_is_seen_and_turned(tmp_path, up, whole):
     t, R_pelvis = recording.motion.t_world_root.numpy(), recording.motion.R_parent_joint[:, 0].numpy()
     np.testing.assert_allclose(R_pelvis, heading.as_matrix() @ R, atol=1e-6)
     np.testing.assert_allclose(np.diff(t, axis=0), heading.apply(np.diff(pelvis, axis=0)), atol=1e-6)
-    np.testing.assert_allclose(t[:, 2], pelvis[:, 2], atol=1e-5 if up in ("y", "z", "-y") else 0.03)
+    np.testing.assert_allclose(t[:, 2], pelvis[:, 2], atol=1e-5 if up in ("y", "z", "-y") else 0.035)
     stated = read_amass(tmp_path / "a.npz", up=up)
     assert torch.equal(stated.motion.t_world_root, recording.motion.t_world_root)
     assert stated.note == ""

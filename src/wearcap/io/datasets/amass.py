@@ -116,13 +116,13 @@ def _standing_axis(motion: Motion) -> str:
 def _turned(motion: Motion, up: str, t_template_pelvis: Sequence[float]) -> Motion:
     """A motion of a world with another `up` axis in one with z up.
 
-    Who turned a file of AMASS into such axes often turned `trans` alone, without J₀: the feet on the ground show it.
+    Who turned a file of AMASS into such axes often turned `trans` alone, without J₀: feet off the ground by decimetres show it.
     """
     R_up, J0 = _TURNS[up], torch.tensor(t_template_pelvis)
     R = torch.cat([R_up @ motion.R_parent_joint[:, :1], motion.R_parent_joint[:, 1:]], 1)
     roots = (motion.t_world_root @ R_up.T + shift for shift in (torch.zeros(3), J0 - R_up @ J0))
     both = (replace(motion, R_parent_joint=R, t_world_root=root) for root in roots)
-    return min(both, key=lambda motion: motion.T_world_joint.t[..., 2].amin(-1).median().abs())
+    return min(both, key=lambda motion: round(abs(motion.T_world_joint.t[..., 2].amin(-1).median().item()), 1))
 
 
 def write_amass(
