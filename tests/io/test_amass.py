@@ -199,14 +199,14 @@ CAMERAS = {
 @pytest.mark.parametrize("kind", CAMERAS)
 def test_cameras_are_no_motion(tmp_path, kind):
     np.savez(tmp_path / "a.npz", **CAMERAS[kind])
-    with pytest.raises(WearcapError, match="no 'trans', no frame rate.*SfM or NeRF") as caught:
+    with pytest.raises(WearcapError, match="no trans, no frame rate.*SfM or NeRF") as caught:
         read_amass(tmp_path / "a.npz")
     assert all(name in str(caught.value) for name in CAMERAS[kind])
 
 
 FAULTS = {
     "shape file": ({"poses": None, "trans": None}, "shape.npz"),
-    "no translation": ({"trans": None}, "'trans'"),
+    "no translation": ({"trans": None}, "holds no trans"),
     "no rate": ({"mocap_framerate": None}, "frame rate"),
     "rate 0": ({"mocap_framerate": np.array(0.0)}, "frame rate of 0"),
     "rate nan": ({"mocap_framerate": np.array(np.nan)}, "frame rate of nan"),

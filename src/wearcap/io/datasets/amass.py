@@ -82,7 +82,7 @@ def read_amass(path: str | Path, up: str = "auto") -> Recording:
 
 def _require_motion(arrays: dict[str, np.ndarray], path: Path) -> None:
     """Raise WearcapError with the arrays that are missing, and what a file without them looks like."""
-    needed = {"'poses'": ("poses", "pose_body"), "'trans'": ("trans",), "frame rate 'mocap_framerate'": _RATES}
+    needed = {"poses": ("poses", "pose_body"), "trans": ("trans",), "frame rate (mocap_framerate)": _RATES}
     missing = [name for name, keys in needed.items() if not any(key in arrays for key in keys)]
     if not missing:
         return
@@ -93,7 +93,7 @@ def _require_motion(arrays: dict[str, np.ndarray], path: Path) -> None:
         fix = "It looks like cameras of an SfM or NeRF model: leave it out."
     else:
         fix = "" if shape else "shape.npz files beside the motions hold none: leave them out."
-    what = f"no {', no '.join(missing)}, but {', '.join(names)[:200]}"
+    what = f"holds no {', no '.join(missing)}, but {', '.join(names)[:200]}"
     raise WearcapError(what, path, "a motion file of AMASS", fix)
 
 
