@@ -26,6 +26,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from wearcap.cli.verbs import conf_dir
 from wearcap.errors import WearcapError, nearest
 from wearcap.files import resource
 from wearcap.models.checkpoint import read_checkpoint
@@ -35,11 +36,6 @@ from wearcap.recording.store import MANIFEST, dataset_folder
 from wearcap.runtime.needs import Need
 from wearcap.runtime.system import CaptureInput, System, training_of
 from wearcap.spread import Spread
-
-
-def conf_dir() -> Path:
-    """The checkout's `conf/` when the package is imported from one, else the copy that the wheel carries."""
-    return resource("conf", "conf")
 
 
 def splits_dir() -> Path:
@@ -54,7 +50,7 @@ def compose(config_name: str, overrides: Iterable[str] = ()) -> DictConfig:
     """
     overrides = list(overrides)
     with explained(config_name, overrides):
-        return _compose(config_name, overrides)
+        return _compose(config_name, [*map(readable, overrides)])
 
 
 def with_pipeline(arguments: list[str]) -> list[str]:
@@ -113,9 +109,20 @@ def _given(arguments: list[str]) -> dict[str, Any]:
     given: dict[str, Any] = {}
     for argument in arguments:
         with suppress(HydraException):  # its complaint comes when the config is composed
-            override = OverridesParser.create().parse_override(argument)
+            override = OverridesParser.create().parse_override(readable(argument))
             given[override.key_or_group] = override
     return given
+
+
+def readable(argument: str) -> str:
+    """An override with its value quoted if Hydra cannot read it plain: a path with brackets, an address, a pattern."""
+    key, equals, value = argument.partition("=")
+    if not equals or argument[0] == "-" or value[:1] in tuple("[{'\""):
+        return argument
+    with suppress(HydraException):
+        OverridesParser.create().parse_override(argument)
+        return argument
+    return f"{key}='{value.replace(chr(92), chr(92) * 2).replace(chr(39), chr(92) + chr(39))}'"
 
 
 def hydra_main(config_name: str, task: Callable[[DictConfig], Any], arguments: list[str]) -> None:
@@ -128,7 +135,7 @@ def hydra_main(config_name: str, task: Callable[[DictConfig], Any], arguments: l
     with explained(config_name, arguments):
         # Hydra reads sys.argv, and with HYDRA_FULL_ERROR it raises errors instead of exiting.
         before, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
-        sys.argv = [sys.argv[0], *arguments]
+        sys.argv = [sys.argv[0], *map(readable, arguments)]
         os.environ["HYDRA_FULL_ERROR"] = "1"
         try:
             application(guarded)()

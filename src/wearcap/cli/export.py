@@ -7,8 +7,6 @@ from wearcap.cli.conf import hydra_main, load_pipeline, with_pipeline
 from wearcap.export.files import ExportReport, write_exports
 from wearcap.models.checkpoint import load_trained, share_checkpoint
 
-HELP = "export a network: wearcap export checkpoint=… format=onnx|pt2|safetensors"
-
 
 def run(config: DictConfig) -> dict[str, ExportReport]:
     """Export the networks with their sidecar; prints the errors against eager and both latencies.

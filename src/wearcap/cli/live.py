@@ -37,7 +37,6 @@ from wearcap.viewer.guard import LOOPBACK
 MAX_MESSAGES = 20
 """Different messages of libraries that are shown."""
 HANDS = ("grip", "wrist", "joint")
-HELP = "capture while people move: wearcap live system=hmd2 source=vmc://:39540 to=vmc://127.0.0.1:39539 view=true"
 
 
 def run(config: DictConfig) -> dict[str, Any]:

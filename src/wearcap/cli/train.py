@@ -29,8 +29,6 @@ from wearcap.training.run import (
     run_to_continue,
 )
 
-HELP = "train a model: wearcap train experiment=motion_diffusion_head data=cmu"
-
 
 def train(config: DictConfig) -> float:
     """Train the config's model; returns the last validation loss (which a sweep minimises).
