@@ -161,13 +161,13 @@ def _help_of_config(command: str, files: Sequence[Path]) -> str:
     texts = [file.read_text(encoding="utf-8") for file in files]
     rows, others = [], []
     for text in texts:
-        rows += _groups(text)
         shown = True
         for block in text.split("\nhydra:")[0].split("\n\n"):
             settings = _settings(block)
             rows += [(key, note) for key, note in settings if note] if shown else []
             others += [key.split("=")[0] for key, note in settings if not (shown and note)]
             shown = shown and not settings
+        rows += _groups(text)
     more = [f"Also {', '.join(others)}: see {files[0]}."] if others else []
     return page(_about(texts[0]), command, rows, more)
 
@@ -185,7 +185,7 @@ def _settings(block: str) -> list[tuple[str, str]]:
     """(key=value, its comment) of the settings at the top level of a block of YAML; comments go on in lines of their own."""
     found: list[tuple[str, str]] = []
     for line in block.splitlines():
-        if (match := re.match(r"(\w+): *(.*?)(?: +# (.*))?$", line)) and match[1] not in ("defaults", "tasks", "name"):
+        if (match := re.match(r"(\w+): *(.*?)(?: +# (.*))?$", line)) and match[1] not in ("defaults", "tasks"):
             plain = re.fullmatch(r"[\w.:/-]+|\[.*\]", match[2]) and match[2] != "null"
             value = match[2].replace(" ", "") if plain else "…"
             found.append((f"{match[1]}={value}", match[3] or ""))
