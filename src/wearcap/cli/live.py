@@ -41,6 +41,9 @@ HANDS = ("grip", "wrist", "joint")
 
 def run(config: DictConfig) -> dict[str, Any]:
     """Capture until interrupted, or until a replay has ended; returns the report."""
+    if not (_listed(config.to) or config.view or config.record):
+        fix = "Give to=ADDRESS, view=true (a page in the browser) or record=FOLDER."
+        raise WearcapError("nothing leaves: no sink, no page, no record", fix=fix)
     threads = config.threads or max(1, (os.cpu_count() or 2) // 2)
     if threads < 1:
         raise WearcapError(f"threads={threads}", expected="1 or more")

@@ -6,7 +6,7 @@ from pathlib import Path
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from wearcap.cli.conf import compose, explained, splits_dir
+from wearcap.cli.conf import compose, explained, require_writable, splits_dir
 from wearcap.cli.verbs import sources
 from wearcap.doctor import require_sound
 from wearcap.errors import WearcapError, nearest
@@ -59,6 +59,7 @@ def main(arguments: list[str]) -> None:
     with explained("prepare", overrides):
         config = compose("prepare", overrides)
         OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # a missing value raises here
+        require_writable(config.output, "output")
         report = run(config)
     if report.failed:
         sys.exit(1)
