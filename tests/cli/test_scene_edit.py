@@ -41,8 +41,8 @@ def test_a_folder_or_a_file_opens_with_what_was_made_before(tmp_path, pages, cap
     assert "open http://127.0.0.1:" in printed
     assert str(tmp_path / "environment.json") in printed
     assert pages[0].current == "crate"
-    scene.main(
-        ["edit", str(tmp_path / "pointcloud.ply"), "--environment", str(tmp_path / "other.json"), "--port", "18420"]
+    scene_edit.main(
+        [str(tmp_path / "pointcloud.ply"), "--environment", str(tmp_path / "other.json"), "--port", "18420"]
     )
     assert pages[1].file == tmp_path / "other.json"
     assert pages[1].current is None

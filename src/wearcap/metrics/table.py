@@ -57,8 +57,6 @@ class Summary:
     seeds: int
 
     def __str__(self) -> str:
-        if math.isnan(self.mean):
-            return "–"
         digits = decimals(self.mean)
         return f"{self.mean:.{digits}f}" if self.std is None else f"{self.mean:.{digits}f} ± {self.std:.{digits}f}"
 
@@ -208,7 +206,10 @@ def _cells(methods: Scores, metrics: Columns | None) -> list[list[str]]:
     columns = list(metrics or next(iter(methods.values())))
     headings = list(metrics.values()) if isinstance(metrics, Mapping) else columns
     lines = [
-        [method, *(str(scores[metric]) if metric in scores else "–" for metric in columns)]
+        [
+            method,
+            *(str(each) if (each := scores.get(metric)) and not math.isnan(each.mean) else "–" for metric in columns),
+        ]
         for method, scores in methods.items()
     ]
     return [["method", *headings], *lines]
