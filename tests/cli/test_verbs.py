@@ -47,7 +47,7 @@ def test_the_first_word_needs_no_key(verb, key):
     assert overrides(verb, ["a walk (2).bvh", "--video", "false"]) == [f"{key}=a walk (2).bvh", "video=false"]
 
 
-@pytest.mark.parametrize("path", ["a walk (2).bvh", "it's", "a,b.bvh", "C:\\x\\(1).bvh", "vmc://:39540?wearer=a"])
+@pytest.mark.parametrize("path", ["a walk (2).bvh", "it's", "C:\\x\\(1).bvh", "vmc://:39540?wearer=a"])
 def test_a_path_needs_no_quotes(path):
     assert compose("capture", [f"recording={path}"]).recording == path
     assert readable("seeds=[0,1") == "seeds=[0,1", "a list that does not end is an error"

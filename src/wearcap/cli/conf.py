@@ -125,7 +125,8 @@ def readable(argument: str) -> str:
     with suppress(HydraException):
         OverridesParser.create().parse_override(argument)
         return argument
-    return f"{key}='{value.replace(chr(92), chr(92) * 2).replace(chr(39), chr(92) + chr(39))}'"
+    quoted = value.replace("'", "\\'")
+    return f"{key}='{quoted}'"
 
 
 def hydra_main(config_name: str, task: Callable[[DictConfig], Any], arguments: list[str]) -> None:

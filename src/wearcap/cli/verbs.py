@@ -122,7 +122,7 @@ def _names(action: argparse.Action) -> Sequence[str]:
 
 def page(about: Iterable[str], command: str, rows: Iterable[tuple[str, str]], after: Iterable[str] = ()) -> str:
     """A page of help: what the command does, how it is called, its settings with a text for each, and more lines."""
-    lines = [*_wrapped(about), "", f"usage: {command} key=value …     (--key value does the same)", ""]
+    lines = [*_wrapped(about), "", f"usage: {command} key=value … or --key value …", ""]
     for setting, text in rows:
         width = max(24, len(setting) + 4)
         lines += textwrap.wrap(text, COLUMNS, initial_indent=f"  {setting:{width - 2}}", subsequent_indent=" " * 24)
