@@ -154,10 +154,7 @@ def _validated(checkpoints: Sequence[str], system: System) -> str:
     """The data set that a checkpoint was validated on. Raises WearcapError where that is not one data set."""
     if not checkpoints or system.joins_checkpoints:
         raise WearcapError("dataset has no value", fix="Give it on the command line: dataset=DIR.")
-    folder = trained_on(checkpoints[0])[1]
-    if not Path(folder).is_dir():
-        raise WearcapError("the checkpoint's own data set is not here", folder, fix="Give another: dataset=DIR.")
-    return folder
+    return trained_on(checkpoints[0])[1]
 
 
 class _Scoring:
