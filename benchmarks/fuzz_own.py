@@ -27,16 +27,17 @@ import test_store  # noqa: E402
 from wearcap.body.skeleton import xsens23  # noqa: E402
 from wearcap.boundary import arrays, tensors, texts  # noqa: E402
 from wearcap.boundary.own import trusting  # noqa: E402
-from wearcap.doctor.examine import examine  # noqa: E402
 from wearcap.errors import WearcapError  # noqa: E402
 from wearcap.export.files import load_exported, sidecar_path, write_exports  # noqa: E402
 from wearcap.files import sha256_of  # noqa: E402
+from wearcap.io.conventions import Conventions  # noqa: E402
 from wearcap.io.formats import video  # noqa: E402
 from wearcap.live.setup import Setup, head_seat, read_setup, write_setup  # noqa: E402
 from wearcap.live.sources import source_of  # noqa: E402
 from wearcap.localization.visual_map import VisualMap  # noqa: E402
 from wearcap.models import checkpoint, weights  # noqa: E402
 from wearcap.prepare.foreign_conventions import read_mapping  # noqa: E402
+from wearcap.reading import examine  # noqa: E402
 from wearcap.reading.any_file import read  # noqa: E402
 from wearcap.recording import PointCloud, Recording, RecordingStore  # noqa: E402
 from wearcap.recording.store import RecordingFile, save_recording  # noqa: E402
@@ -235,6 +236,6 @@ OWN: dict[str, Reader] = {
     "doctor_recording": _made("r.safetensors", lambda path: save_recording(_tiny("r"), path), examine),
     "doctor_map": _made("map.safetensors", lambda path: test_doctor_scene.small_map(3, 5).save(path), examine),
     "doctor_data_set": Reader(_data_set, examine),
-    "any_file": _one("t.txt", fuzz_files.TUM, read),
+    "any_file": _one("t.txt", fuzz_files.TUM, lambda path: read(path, Conventions(up="z", axes="head"))),
 }
 """Readers by name."""

@@ -100,11 +100,27 @@ class Convention:
     bind_first: bool = False
     """The bind pose as the first frame, which the reader leaves out."""
     parents: dict[str, str] = field(default_factory=dict)
-    """Joints that hang on another joint than in `BODY`."""
+    """Joints whose parent is another than in `BODY`."""
+    extra: tuple[tuple[str, str, tuple[float, float, float]], ...] = ()
+    """Further rigid joints, of the left side (fingers, rolls …): name, parent, place in it (m); both sides get them."""
+    orders: dict[str, str] = field(default_factory=dict)
+    """Rotation orders of some joints."""
+    shifts: bool = False
+    """Position channels of children are shifts from OFFSET."""
+    offset: tuple[float, float, float] | None = None
+    """OFFSET (file units) of the joint that travels, wherever it was when the skeleton was made."""
+    still: bool = False
+    """The root above the hips stays at the origin."""
+    channels: str = "XYZ"
+    """Order of the position channels."""
+    rotations_first: bool = False
+    style: tuple[tuple[str, str], ...] = ()
+    """Replacements in the text: braces, white space, line ends."""
 
     def name(self, joint: str) -> str:
+        """The file's name of a joint; further joints keep theirs."""
         side, _, part = joint.rpartition("_") if joint.startswith(("left", "right")) else ("", "", joint)
-        return self.names[part].replace("{s}", self.sides[side == "right"])
+        return self.names.get(part, f"{{s}}{part}").replace("{s}", self.sides[side == "right"])
 
 
 def _frames(convention: Convention, joints: list[str], parents: dict[str, str]) -> dict[str, np.ndarray]:
@@ -136,19 +152,27 @@ def _euler(R: np.ndarray, order: str) -> np.ndarray:
     return np.degrees(np.stack([first, second, third], -1))
 
 
-def write(path: Path, convention: Convention, R: dict, p: dict, fps: float = 60.0) -> None:
-    """Write a motion (world rotations and places by joint) as BVH of a convention."""
+def write(path: Path, convention: Convention, R: dict, p: dict, fps: float = 60.0) -> dict[str, np.ndarray]:
+    """Write a motion (world rotations and places by joint) as BVH of a convention.
+
+    Returns what its numbers mean: the joints' places (file units) by the file's names.
+    """
+    R, p = dict(R), dict(p)
     joints, parents = [name for name in NAMES if name.split("_")[-1] in convention.names], {}
-    for joint in joints:
+    for joint, above, offset in [*convention.extra, *_mirrored(convention.extra)]:
+        joints.append(joint)
+        parents[joint], R[joint], p[joint] = above, R[above], p[above] + R[above] @ np.array(offset)
+    for joint in [joint for joint in joints if joint in PARENTS]:
         above = convention.parents.get(joint, PARENTS[joint])
         while above and above not in joints:
             above = PARENTS[above]
         parents[joint] = above
-    R, p = dict(R), dict(p)
     if convention.ground:
         joints, parents = ["ground", *joints], {"ground": "", **parents, "pelvis": "ground"}
         yaw = np.arctan2(R["pelvis"][:, 1, 0], R["pelvis"][:, 0, 0])
         R["ground"], p["ground"] = turn("z", yaw), p["pelvis"] * np.array([1.0, 1, 0])
+        if convention.still:
+            R["ground"], p["ground"] = np.tile(np.eye(3), (len(yaw), 1, 1)), np.zeros((len(yaw), 3))
     B = _frames(convention, joints, parents)
     M, scale = convention.axes, 1 / convention.unit_m
     world = {joint: M @ R[joint] @ B[joint] for joint in joints}
@@ -159,18 +183,30 @@ def write(path: Path, convention: Convention, R: dict, p: dict, fps: float = 60.
         step = (p[joint] - (p[above] if above else 0)) @ M.T * scale
         place[joint] = (np.swapaxes(world[above], -1, -2) @ step[..., None])[..., 0] if above else step
     label = {joint: convention.ground if joint == "ground" else convention.name(joint) for joint in joints}
-    columns, lines = [], ["HIERARCHY"]
+    columns, lines, stands = [], ["HIERARCHY"], {}
 
     def block(joint: str, depth: int) -> None:
         pad = "\t" * depth
         moves = convention.places or not parents[joint] or joint == "pelvis"
         zero = convention.rest == "zero" or not parents[joint]
         offset = np.zeros(3) if zero else place[joint].mean(0)
-        channels = [f"{axis}position" for axis in "XYZ"] * moves + [f"{axis}rotation" for axis in convention.order]
+        if convention.offset and joint == "pelvis":
+            offset = np.array(convention.offset)
+        order = convention.orders.get(joint.split("_")[-1], convention.order)
+        here = [place[joint][:, ["XYZ".index(axis) for axis in convention.channels]]] * moves
+        if convention.shifts and parents[joint]:
+            here = [block - offset[["XYZ".index(axis) for axis in convention.channels]] for block in here]
+        parts = [([f"{axis}position" for axis in convention.channels] * moves, here)]
+        parts.append(([f"{axis}rotation" for axis in order], [_euler(local[joint], order)]))
+        parts = parts[::-1] if convention.rotations_first else parts
+        channels = parts[0][0] + parts[1][0]
         lines.extend([f"{pad}{'JOINT' if depth else 'ROOT'} {label[joint]}", pad + "{"])
         lines.append(pad + "\tOFFSET {:.6f} {:.6f} {:.6f}".format(*offset))
         lines.append(f"{pad}\tCHANNELS {len(channels)} {' '.join(channels)}")
-        columns.append(np.concatenate([place[joint]] * moves + [_euler(local[joint], convention.order)], -1))
+        columns.append(np.concatenate(parts[0][1] + parts[1][1], -1))
+        above = parents[joint]
+        step = place[joint] if moves else offset
+        stands[joint] = stands[above] + (world[above] @ step[..., None])[..., 0] if above else step
         below = [child for child in joints if parents[child] == joint]
         for child in below:
             block(child, depth + 1)
@@ -189,7 +225,11 @@ def write(path: Path, convention: Convention, R: dict, p: dict, fps: float = 60.
         table = np.concatenate([bind, table])
     lines += ["MOTION", f"Frames: {len(table)}", f"Frame Time: {1 / fps:.7f}"]
     lines += [" ".join(f"{value:.6f}" for value in row) for row in table]
-    path.write_text("\n".join(lines) + "\n")
+    text = "\n".join(lines) + "\n"
+    for old, new in convention.style:
+        text = text.replace(old, new)
+    path.write_bytes(text.encode())
+    return {label[joint]: places for joint, places in stands.items()}
 
 
 def _names(text: str) -> dict[str, str]:

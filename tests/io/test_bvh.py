@@ -1,6 +1,7 @@
 """BVH: any hierarchy and channel order, units and axes, round trip, hostile files, fuzz."""
 
 import dataclasses
+import re
 import warnings
 
 import numpy as np
@@ -13,7 +14,7 @@ from hostile import fuzz, mutated
 from wearcap.body.skeleton import Site, Skeleton, xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.formats.bvh import read_bvh, write_bvh
+from wearcap.io.formats.bvh import read_bvh, read_bvh_content, write_bvh
 from wearcap.recording import Motion
 
 BVH = """HIERARCHY
@@ -119,9 +120,9 @@ def test_axes_and_units_are_the_callers(tmp_path):
 
 def test_position_channels_of_children_replace_or_add_to_the_offset(tmp_path):
     whole = read_bvh(save(tmp_path, TEXT), check=False)
-    added = read_bvh(
-        save(tmp_path, TEXT.replace(" 0 -90 0 ", " 0 0 0 ").replace("OFFSET 0 0 0 ", "OFFSET 0 -90 0 ")), check=False
-    )
+    shifts = TEXT.replace(" 0 -90 0 ", " 0 0 0 ").replace("OFFSET 0 0 0 ", "OFFSET 0 -90 0 ")
+    with pytest.warns(UserWarning, match="of 1 joints are read as shifts"):
+        added = read_bvh(save(tmp_path, shifts), check=False)
     torch.testing.assert_close(whole.skeleton.t_parent_joint, added.skeleton.t_parent_joint)
     stretched = TEXT.replace("45 -55 65 0 -90 0", "45 -55 65 0 -95 0")
     with pytest.warns(UserWarning, match="LeftToe.*0.050 m"):
@@ -206,15 +207,23 @@ FAULTS = {
     "no motion": (BVH.split("MOTION")[0], "MOTION"),
     "unclosed": (TEXT.replace("}\nMOTION", "MOTION"), "no complete HIERARCHY"),
     "truncated hierarchy": (TEXT[:300], "broken|complete"),
-    "truncated row": (TEXT[:-9], "line 39.*15 values"),
-    "missing row": (TEXT[: TEXT.rindex("\n", 0, -1) + 1], "2 frames.*3 frames"),
+    "short row": (TEXT.replace("45 -55 65 ", "45 -55 "), "line 38.*18 values.*19"),
+    "cut in its only row": (TEXT[: TEXT.index("91 2 3") - 22], "line 37.*1[0-9] values.*19"),
+    "no frames": (
+        TEXT.split("Frames: 3")[0] + "Frames: 0\nFrame Time: .01\n\n",
+        "no frames.*a row of numbers.*export it",
+    ),
     "nan": (TEXT.replace("45 -55", "nan -55"), "line 38.*'nan'"),
     "missing channel": (TEXT.replace("CHANNELS 1 Yrotation", "CHANNELS 2 Yrotation"), "CHANNELS 2"),
     "unknown channel": (TEXT.replace("CHANNELS 1 Yrotation", "CHANNELS 1 Wrotation"), "line 18.*wrotation"),
     "wrong count": (TEXT.replace("CHANNELS 1 Yrotation", "CHANNELS 2 Yrotation Xrotation"), "line 37.*19 values"),
-    "huge count": (TEXT.replace("Frames: 3", "Frames: 99999999999999"), "3 frames"),
+    "commas and points": (TEXT.replace("45 -55", "4,5 -5.5"), "line 38.*'4,5'"),
+    "commas between values": (TEXT.replace("45 -55", "45,-55"), "line 38.*'45,-55'"),
     "huge channels": (TEXT.replace("CHANNELS 0", "CHANNELS 99999999999"), "CHANNELS 9999"),
     "no frame rate": (TEXT.replace(".0083333", "0"), "frame time"),
+    "time or rate": (TEXT.replace(".0083333", "60"), "milliseconds or a rate.*Time: 0.06'.*Time: 0.0166667'"),
+    "television's rate": (TEXT.replace(".0083333", "29.97"), "milliseconds or a rate"),
+    "frame time in microseconds": (TEXT.replace(".0083333", "8333.3"), "frame time 8333"),
     "two roots": (TEXT.replace("JOINT Spine", "ROOT Spine"), "line 15.*ROOT"),
     "same name": (TEXT.replace("JOINT Head", "JOINT Spine"), "share a name"),
     "bad offset": (TEXT.replace("OFFSET 0 40 0", "OFFSET 0 40"), "line 21.*CHANNELS"),
@@ -234,6 +243,35 @@ def test_deep_nesting_is_refused_without_recursion(tmp_path):
     text = "HIERARCHY\nROOT a {\n" + "".join(f"JOINT j{k} {{\n" for k in range(5000)) + "}" * 5001 + "\nMOTION\n"
     with pytest.raises(WearcapError, match="more than"):
         read_bvh(save(tmp_path, text))
+
+
+LAST = TEXT.rindex("92 3 4")
+MENDED = {
+    "more rows than its header says": (TEXT.replace("Frames: 3", "Frames: 2"), 3, "says 2 frames, its rows are 3"),
+    "fewer rows": (TEXT.replace("Frames: 3", "Frames: 99999999999999"), 3, "says 99999999999999 frames, its rows are 3"),
+    "cut between rows": (TEXT[:LAST], 2, "says 3 frames, its rows are 2"),
+    "cut in a row": (TEXT[:-9], 2, "cut off after 15 of 19 values"),
+    "cut in a number": (TEXT.replace("Frames: 3", "Frames: 5").rstrip()[:-1] + "-", 2, "cut off after 19 of 19 values"),
+    "comments": ("// made by hand\n# v2\n" + TEXT.replace("MOTION\n", "MOTION\n# 120 Hz\n"), 3, "comments: 3"),
+    "decimal commas": (TEXT.replace(".0083333", "0,0083333").replace("OFFSET 10 -5 1", "OFFSET 10,0 -5,0 1,0")
+                       .replace(" -50 ", " -50,0 ").replace("\n91 ", "\n9,1E1 "), 3, "read as points: 4"),
+    "frame time in milliseconds": (TEXT.replace(".0083333", "8.3333"), 3, "8.3333, is read as milliseconds: 120 Hz"),
+    "whole milliseconds": (TEXT.replace(".0083333", "8"), 3, "8, is read as milliseconds: 125 Hz"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", MENDED)
+def test_what_is_certain_is_read_and_noted(tmp_path, fault):
+    text, frames, note = MENDED[fault]
+    plain = read_bvh_content(save(tmp_path, TEXT))
+    assert plain.notes == ()
+    content = read_bvh_content(save(tmp_path, text))
+    assert any(note in line for line in content.notes), content.notes
+    assert content.step_s == pytest.approx(1 / 125 if "125" in note else 1 / 120, rel=1e-4)
+    torch.testing.assert_close(content.R_parent_joint, plain.R_parent_joint[:frames])
+    torch.testing.assert_close(content.t_parent_joint, plain.t_parent_joint[:frames])
+    with pytest.warns(UserWarning, match=re.escape(note)):
+        read_bvh(tmp_path / "t.bvh", check=False)
 
 
 @fuzz

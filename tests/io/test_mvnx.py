@@ -59,10 +59,38 @@ def test_dropped_frames_and_packed_files(tmp_path):
         read_mvnx(tmp_path / "t.mvnx.gz")
 
 
+@pytest.mark.parametrize(
+    ("times", "note", "expected"),
+    [
+        (lambda k: 1000 * k / 240, "span 3.317 s, but its frame times 0.829 s.*240 Hz", lambda k: k / 240),
+        (lambda k: 1000 * (k + (k >= 50) * 30) / 60, "3.817 s: the times", lambda k: (k + (k >= 50) * 30) / 60),
+        (lambda k: 1000 * k / 60, "", lambda k: k / 60),
+        (lambda k: 0, "span 0 s, are no rising", lambda k: k / 60),
+        (lambda k: 20 * (k % 7), "no rising milliseconds", lambda k: k / 60),
+        (lambda k: 1e6 * k / 60, "span 3317 s, are no rising milliseconds", lambda k: k / 60),
+    ],
+    ids=["another rate", "a gap", "as stated", "no times", "times that fall", "microseconds"],
+)
+def test_frame_times_win_over_the_stated_rate(tmp_path, times, note, expected):
+    text = mvnx(sample(200)).replace('frameRate="240"', 'frameRate="60"')
+    text = re.sub(r'time="\d+" index="(\d+)"', lambda m: f'time="{times(int(m[1])):.0f}" index="{m[1]}"', text)
+    recording = read_mvnx(save(tmp_path, text))
+    assert re.search(note, recording.note)
+    assert bool(recording.note) == bool(note)
+    expected = torch.tensor([expected(k) for k in range(200)], dtype=torch.float64)
+    torch.testing.assert_close(recording.motion.timestamps, expected, atol=6e-4, rtol=0)
+
+
+@pytest.mark.real
+def test_a_real_take_with_a_wrong_rate(real_data):
+    recording = read_mvnx(real_data / "field" / "M_rate_contradicts_times.mvnx")
+    times = torch.arange(40, dtype=torch.float64) / 60
+    torch.testing.assert_close(recording.motion.timestamps, times)
+    torch.testing.assert_close(recording.imu["head"].timestamps, times)
+    assert "stated 240 Hz" in recording.note
+
+
 def test_doubtful_files_warn(tmp_path):
-    long = sample(200)
-    with pytest.warns(UserWarning, match="frame rate is believed"):
-        read_mvnx(save(tmp_path, mvnx(long).replace('frameRate="240"', 'frameRate="60"')))
     text = mvnx(sample())
     position = text.index("<position>", text.index('index="3"')) + len("<position>")
     stretched = text[:position] + "9 " + text[text.index(" ", position) + 1 :]

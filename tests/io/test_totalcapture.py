@@ -9,7 +9,6 @@ from totalcapture_files import vicon, write_totalcapture
 
 from hostile import fuzz, mutated
 from wearcap.cli.main import run_verb
-from wearcap.doctor.examine import examine
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.datasets.totalcapture import (
@@ -22,6 +21,7 @@ from wearcap.io.datasets.totalcapture import (
     read_vicon,
     totalcapture_files,
 )
+from wearcap.reading import examine
 from wearcap.recording.store import RecordingStore
 from wearcap.sensors.watches import watches_at
 

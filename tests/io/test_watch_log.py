@@ -94,10 +94,8 @@ def test_bad_logs_are_refused(tmp_path):
         with pytest.raises(WearcapError, match=match):
             read_watch_log(path, "right_wrist")
 
-    refused([*lines[:5], lines[6], lines[5], *lines[7:]], "time does not grow at line 7")
-    refused(lines[:2], "1 rows")
+    refused(lines[:2], "1 rows with numbers")
     refused([lines[0], *lines[1::5]], "10.0 rows a second")
-    refused([*lines[:3], lines[3].rpartition(",")[0] + ",nan", *lines[4:]], "quaternion of row 2 is not finite")
     fields = lines[1].split(",")
     refused([lines[0], ",".join([*fields[:-1], "0.9"]), *lines[2:]], "attitude of length")
     refused(["time,x,y", "1,2,3"], "not a watch's motion log")
@@ -156,8 +154,8 @@ def test_a_sensor_without_attitude_is_read_by_the_doctor_alone(tmp_path):
     path = x_imu(moved(), tmp_path)
     (tmp_path / "Quaternion.csv").unlink()
     assert read_inertial_log(path, "left_wrist").R_world_imu is None
-    with pytest.raises(WearcapError, match="without orientation.*Quaternion.csv"):
+    with pytest.raises(WearcapError, match="without attitude.*other files beside"):
         read_watch_log(path, "left_wrist")
     other = x_imu(replace(moved(), R_world_imu=rotation.about_axis("x", torch.full((120,), 2.0))), tmp_path)
-    with pytest.raises(WearcapError, match="upright by the attitude"):
+    with pytest.raises(WearcapError, match="the attitude turns gravity .* upright"):
         read_inertial_log(other, "left_wrist")

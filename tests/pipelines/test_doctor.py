@@ -12,12 +12,13 @@ import torch
 from walking_person import MOUNT, sound_recording
 from wearcap.body.skeleton import xsens23
 from wearcap.cli.doctor import main
-from wearcap.doctor import Finding, Report, examine
+from wearcap.doctor import Finding, Report
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.poses import write_tum
+from wearcap.reading import examine
 from wearcap.recording import CameraStream, PointCloud, Recording, RecordingStore
 from wearcap.recording.store import save_recording
 from wearcap.sensors.imu import ImuNoise, synthesize_imu
@@ -470,7 +471,7 @@ def test_nothing_to_examine(tmp_path):
     with pytest.raises(WearcapError, match="no such file"):
         examine(tmp_path / "absent")
     (tmp_path / "notes.docx").write_text("hello")
-    with pytest.raises(WearcapError, match="does not know"):
+    with pytest.raises(WearcapError, match="not a kind of file that holds a recording"):
         examine(tmp_path / "notes.docx")
 
 

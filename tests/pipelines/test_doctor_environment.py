@@ -9,9 +9,10 @@ import torch
 
 from boxes import box_mesh
 from wearcap.cli.main import run_verb
-from wearcap.doctor import Finding, examine
+from wearcap.doctor import Finding
 from wearcap.doctor.places import _check_environment
 from wearcap.io.formats.environment import write_environment
+from wearcap.reading import examine
 from wearcap.scene.objects import Environment, Freedom, SceneObject
 
 

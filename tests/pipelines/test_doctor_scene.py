@@ -11,7 +11,7 @@ from PIL import Image
 from small_scene import LEVEL, inverted, room_cloud, write_room
 
 from walking_person import sound_recording
-from wearcap.doctor import Finding, examine
+from wearcap.doctor import Finding
 from wearcap.doctor.body import check_contact_prob
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
@@ -19,6 +19,7 @@ from wearcap.geometry.rotation import about_axis
 from wearcap.io.formats.camera_json import write_photos
 from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.localization.visual_map import Observations, VisualMap, _Landmarks
+from wearcap.reading import examine
 from wearcap.recording import CameraStream, Localization, Recording, RecordingStore
 
 CAMERA = Camera("opencv", 64, 48, 40.0, 40.0, 31.5, 23.5, (0.0, 0.0, 0.0, 0.0))

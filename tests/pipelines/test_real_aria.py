@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 
 from small_hmd2 import hmd2_of
 from wearcap.body.skeleton import xsens23
-from wearcap.doctor import examine
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
@@ -21,6 +20,7 @@ from wearcap.io.datasets.adt import read_adt
 from wearcap.io.devices.aria_mps import read_closed_loop, read_mps
 from wearcap.metrics.scores import cue_errors_cm
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
+from wearcap.reading import examine
 from wearcap.recording import HeadStream, Motion, PointCloud, Recording
 from wearcap.scene.floor import estimate_floor
 from wearcap.scene.voxels import VoxelGrid, VoxelMap, voxelize
@@ -148,7 +148,7 @@ def test_true_joints_lie_on_the_wearers_arm_in_the_real_frames(real_data):
     """Head pose, skeleton and camera model of three files meet in a picture: elbow to wrist runs along a black sleeve."""
     folder = real_data / "aria_adt_sample"
     cues = read_adt(folder / "raw").cues
-    T_world_aria = read_closed_loop(folder / "raw" / "aria_trajectory.csv", up="y")[0]
+    T_world_aria = read_closed_loop(folder / "raw" / "aria_trajectory.csv")[0]
     meta = json.loads((folder / "extracted" / "meta.json").read_text())
     about = meta["cameras"]["camera-slam-left"]
     focal, cx, cy, *lens = about["projection_params"]

@@ -2,7 +2,7 @@
 
 `R_ours = R_file · C` with one constant C per joint. Where the file's bind pose is a standing person, C follows from it
 alone; else (bones along each joint's own x, zero rest) from the motion: C is the mean rotation from the joint's own
-frame to the frame that bones and the axes of bent knees and elbows span.
+frame to the frame that bones and the axes of bent knees and elbows span, for trunk and head while the body is straight.
 """
 
 from collections.abc import Sequence
@@ -21,6 +21,8 @@ SIDES = ("left", "right")
 LIMBS = {"leg": ("hip", "knee", "ankle"), "arm": ("shoulder", "elbow", "wrist")}
 _BENT = 0.26
 """Sine of the bend (15°) from which a knee or an elbow shows its axis."""
+_STRAIGHT = 0.8
+"""Cosine of the largest turn (37°) of a standing bind pose's trunk and shoulders."""
 _SNAP_DEG = 20
 """Bind poses that stand this near to the file's axes are taken to stand along them."""
 
@@ -73,6 +75,13 @@ def standing_rotation(
             return None, "its arms are crossed or raised"
     if p[found.head][2] - p[legs[0][0]][2] < 0.5 * (p[legs[0][0]] - p[legs[0][2]]).norm():
         return None, "its head is not above its hips"
+    trunk = p[[arm[0] for arm in arms]].mean(0) - p[[leg[0] for leg in legs]].mean(0)
+    shoulders = p[arms[0][0]] - p[arms[1][0]]
+    if trunk[2] < _STRAIGHT * trunk.norm() or shoulders[1] < _STRAIGHT * shoulders.norm():
+        return None, "its trunk is bent or turned"
+    feet = [p[toe] - p[found.limb[f"{side}_leg"][2]] for side, toe in found.toe.items()]
+    if any(foot[0] < 0.3 * foot[:2].norm() for foot in feet):
+        return None, "its feet do not point ahead"
     return R.T, ""
 
 
@@ -156,15 +165,34 @@ def _kept(parents: Sequence[int], found: BodyJoints) -> tuple[list[int], list[in
     return kept, above
 
 
+def straightness(t: Float[Tensor, "time joint 3"], found: BodyJoints) -> Float[Tensor, "time"]:
+    """How nearly each frame is the T-pose but for its arms: 1 for stretched legs along the trunk, and hips, shoulders
+    and feet that face one way; 0 for a crouch, a stride or a fighter's stance.
+    """
+    hips, shoulders = ([found.limb[f"{side}_{part}"][0] for side in SIDES] for part in LIMBS)
+    knees, ankles = ([found.limb[f"{side}_leg"][k] for side in SIDES] for k in (1, 2))
+    cosine = torch.nn.functional.cosine_similarity
+    up = t[:, shoulders].mean(1) - t[:, hips].mean(1)
+    across, of_shoulders = (t[:, left] - t[:, right] for left, right in (hips, shoulders))
+    down = t[:, ankles].mean(1) - t[:, hips].mean(1)
+    legs = ((t[:, knees] - t[:, hips]).norm(dim=-1) + (t[:, ankles] - t[:, knees]).norm(dim=-1)).mean(1)
+    straight = (-cosine(up, down, dim=-1)).clamp_min(0) ** 16 * (down.norm(dim=-1) / legs.clamp_min(1e-9)) ** 32
+    straight = straight * cosine(across, of_shoulders, dim=-1).clamp_min(0) ** 32
+    ahead = torch.linalg.cross(across, up)
+    for side, toe in found.toe.items():
+        foot = t[:, toe] - t[:, found.limb[f"{side}_leg"][2]]
+        foot = foot - (foot * up).sum(-1, keepdim=True) * up / (up * up).sum(-1, keepdim=True).clamp_min(1e-9)
+        straight = straight * cosine(ahead, foot, dim=-1).clamp_min(0) ** 16
+    return straight
+
+
 def _frames_in_motion(
     parents: Sequence[int], t: Float[Tensor, "time joint 3"], found: BodyJoints, kept: list[int], above: list[int]
 ) -> list[tuple[Tensor, Tensor]]:
     """Per kept joint: the frame that the T-pose's would take in each frame of the motion, and how sure it is."""
     hips, shoulders = ([found.limb[f"{side}_{part}"][0] for side in SIDES] for part in LIMBS)
     spine_up = t[:, shoulders].mean(1) - t[:, hips].mean(1)
-    # Pelvis and spine are at rest where the thighs run on along the trunk, as in standing and walking.
-    thighs = t[:, [found.limb[f"{side}_leg"][1] for side in SIDES]].mean(1) - t[:, hips].mean(1)
-    sure = (-torch.nn.functional.cosine_similarity(spine_up, thighs, dim=-1)).clamp_min(0) ** 4 + 1e-4
+    sure = straightness(t, found) + 1e-6
     pelvis = _frame(1, t[:, hips[0]] - t[:, hips[1]], 2, spine_up)
     chest = _frame(1, t[:, shoulders[0]] - t[:, shoulders[1]], 2, spine_up)
     trunk = [joint for joint in kept if joint in ancestors(parents, found.head)]
@@ -173,7 +201,7 @@ def _frames_in_motion(
         share = min(1.0, 1.5 * k / max(len(trunk) - 1, 1))
         known[joint] = (_nearest((1 - share) * pelvis + share * chest), sure)
     known[kept[0]] = (pelvis, sure)
-    known[found.head] = (chest, torch.ones_like(sure))  # a head turns to both sides, but not in any one posture
+    known[found.head] = (chest, sure)  # a head turns to both sides, but who stands straight looks ahead
     for side, sign in zip(SIDES, (1.0, -1.0)):
         hip, knee, ankle = found.limb[f"{side}_leg"]
         thigh, shin = t[:, knee] - t[:, hip], t[:, ankle] - t[:, knee]
@@ -216,6 +244,6 @@ def _hinged(
         if weight.sum() > 0.05 * max(5, len(weight) ** 0.5):
             frames[joint] = (_frame(along[0], along[1] * bone, hinge[0], hinge[1] * axis), weight)
         else:
-            swung = swing_between(along[1] * trunk[..., along[0]], along[1] * bone) @ trunk
+            swung = swing_between(trunk[..., along[0]], along[1] * bone) @ trunk
             frames[joint] = (swung, torch.ones_like(weight))
     return frames

@@ -18,6 +18,9 @@ from wearcap.body.skeleton import xsens23
 from wearcap.body.smpl_body import betas_of, smpl_body, template_pelvis
 from wearcap.cli.capture_all import capture_all, is_dataset
 from wearcap.cli.conf import hydra_main, load_pipeline, with_pipeline, with_pipeline_of_content
+from wearcap.cli.stated import stated
+from wearcap.doctor import require_sound
+from wearcap.doctor.agreement import SCAN_FILE
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.io.datasets.amass import write_amass
@@ -27,7 +30,7 @@ from wearcap.io.formats.motion_npz import write_motion
 from wearcap.io.formats.scene_folder import cloud_file, read_scan
 from wearcap.io.formats.smpl import read_smpl
 from wearcap.io.saving import on_skeleton, write_smplh
-from wearcap.reading import read
+from wearcap.reading import load, read
 from wearcap.recording import Motion, Recording
 from wearcap.recording.store import dataset_folder
 from wearcap.runtime.system import CaptureInput, StageOptions, System
@@ -60,7 +63,13 @@ def captured(config: Any, system: System) -> Motion | None:
     if config.samples < 1:
         raise WearcapError(f"samples={config.samples}", expected="at least 1")
     body = None if config.skeleton is None else skeleton_of(read(config.skeleton))
-    recording, stature = with_stature(read(config.recording), xsens23(), config.height, body)
+    how = stated(config if isinstance(config, DictConfig) else vars(config))
+    loaded = load(config.recording, how)
+    if config.check:  # a scene that is given stands in for the recording's own
+        require_sound(
+            loaded.recording, [found for found in loaded.findings if not (config.scene and found.check == SCAN_FILE)]
+        )
+    recording, stature = with_stature(loaded.recording, xsens23(), config.height, body)
     dataset = dataset_folder(config.recording)
     if stature is None:
         show(f"height unknown, {xsens23().stature:.2f} m assumed: give height=… (m)")
@@ -87,13 +96,15 @@ def captured(config: Any, system: System) -> Motion | None:
         if config.checkpoint is not None:
             motion.provenance.update(checkpoint=str(config.checkpoint))
         motion.provenance.update(recording=str(config.recording))
+        if recording.origin is not None:
+            motion.provenance.update(origin=" ".join(map(str, recording.origin.tolist())))
         _write(motion, recording, environment, folder, config)
     return motion
 
 
 def _write(motion: Motion, recording: Recording, environment: Environment | None, folder: Path, config: Any) -> None:
     write_motion(motion, folder / "motion.npz")
-    write_bvh(motion, folder / "motion.bvh")
+    write_bvh(motion, folder / "motion.bvh", origin=recording.origin if config.map_coordinates else None)
     shown, body = motion, anny_body(motion.skeleton, recording.shape or None) if config.body is True else None
     if isinstance(config.body, str):
         shown, body, betas, pelvis = _on_smpl(motion, recording, config.body)

@@ -30,7 +30,9 @@ Capture = Callable[[Any, System], Motion | None]
 """Captures the one recording of a config and writes its files. The config's values are plain: names of recordings, in
 which OmegaConf would resolve `${…}`, are no values of its own."""
 
-WITHOUT_EFFECT = ("recording", "split", "output", "jobs", "backend", "scheduler", "overwrite", "paths", "cache", "live")
+WITHOUT_EFFECT = (
+    *("recording", "split", "output", "jobs", "backend", "scheduler", "overwrite", "paths", "cache", "live", "check"),
+)
 """Settings that do not change what is captured of a recording."""
 
 

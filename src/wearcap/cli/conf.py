@@ -28,6 +28,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from wearcap.cli.stated import stated
 from wearcap.cli.verbs import conf_dir
 from wearcap.errors import WearcapError, nearest
 from wearcap.files import resource
@@ -91,7 +92,8 @@ def with_pipeline_of_content(arguments: list[str]) -> list[str]:
     where = str(getattr(value := given["recording"].value(), "text", value))
     if (Path(where) / MANIFEST).is_file() and len(RecordingStore.open(where).names()) != 1:
         return arguments
-    source, lacks = CaptureInput.in_dataset(read(where), dataset_folder(where)), {}
+    how = stated({name: getattr(value := each.value(), "text", value) for name, each in given.items()})
+    source, lacks = CaptureInput.in_dataset(read(where, how), dataset_folder(where)), {}
     for name in compose("capture", ["recording=none"]).by_content:
         made = instantiate(compose("capture", ["recording=none", f"pipeline={name}"]).pipeline, _convert_="all")
         needs = made.needs() if isinstance(made, System) else made.func.required

@@ -14,8 +14,10 @@ from rich.table import Table
 from rich.text import Text
 
 from wearcap.cli.conf import compose
-from wearcap.doctor import Report, examine
+from wearcap.cli.stated import add_conventions, stated
+from wearcap.doctor import Report
 from wearcap.doctor.preflight import preflight
+from wearcap.reading import examine
 from wearcap.runtime.system import System
 
 HELP = "report what a recording holds, what looks wrong in it, and how to fix it"
@@ -35,12 +37,14 @@ def main(arguments: list[str]) -> None:
         metavar="PIPELINE",
         help="or for=PIPELINE: what does hps, ireplica, hmd2, mocap_every or echo lack?",
     )
+    add_conventions(parser)
     parser.add_argument("--json", action="store_true", help="print the findings as JSON")
     parser.add_argument("--quiet", action="store_true", help="leave out what is sound")
     options = parser.parse_args([f"--{word}" if word.startswith("for=") else word for word in arguments])
     check = None if options.pipeline is None else _preflight(options.pipeline)
+    how = stated(vars(options))
     if options.json:
-        report = examine(options.path, preflight=check)
+        report = examine(options.path, preflight=check, how=how)
         findings = {name: [asdict(finding) for finding in found] for name, found in report.findings.items()}
         content = {"source": report.source, "sound": report.sound, "findings": findings}
         print(json.dumps(content, indent=1, ensure_ascii=False))
@@ -49,7 +53,7 @@ def main(arguments: list[str]) -> None:
         with Progress(console=Console(stderr=True), transient=True) as progress:
             task = progress.add_task("examining", total=None)
             report = examine(
-                options.path, lambda done, total: progress.update(task, completed=done, total=total), check
+                options.path, lambda done, total: progress.update(task, completed=done, total=total), check, how
             )
         console.print(_table(report, options.quiet))
         counts = {severity: len(report.of_severity(severity)) for severity in ("error", "warning", "note")}

@@ -11,6 +11,7 @@ from rich import get_console
 from rich import print as show
 
 from wearcap.cli.conf import hydra_main, load_systems, spread_of, trained_on, with_pipeline
+from wearcap.cli.stated import stated
 from wearcap.errors import WearcapError
 from wearcap.evaluation.baselines import BASELINES
 from wearcap.evaluation.breakdown import (
@@ -140,7 +141,7 @@ def _chosen(config: DictConfig, checkpoints: Sequence[str], system: System) -> t
     if config.recording is None:
         store = RecordingStore.open(config.dataset or _validated(checkpoints, system))
         return store, store.names(config.split)
-    recording, folder = read(config.recording), dataset_folder(config.recording)
+    recording, folder = read(config.recording, stated(config)), dataset_folder(config.recording)
     if recording.motion is None:
         expected = "a recording with a true motion beside its sensors"
         raise WearcapError("nothing to score against", config.recording, expected, "Capture it instead.")
@@ -151,10 +152,14 @@ def _chosen(config: DictConfig, checkpoints: Sequence[str], system: System) -> t
 
 
 def _validated(checkpoints: Sequence[str], system: System) -> str:
-    """The data set that a checkpoint was validated on. Raises WearcapError where that is not one data set."""
+    """The data set that a checkpoint was validated on. Raises WearcapError where that is not one data set, or not here."""
+    fix = "Give dataset=DIR, or recording=FILE."
     if not checkpoints or system.joins_checkpoints:
-        raise WearcapError("dataset has no value", fix="Give it on the command line: dataset=DIR.")
-    return trained_on(checkpoints[0])[1]
+        raise WearcapError("dataset has no value", fix=fix)
+    folder = trained_on(checkpoints[0])[1]
+    if not (Path(folder) / MANIFEST).is_file():
+        raise WearcapError("the data set that this checkpoint was validated on is not here", folder, fix=fix)
+    return folder
 
 
 class _Scoring:
@@ -204,6 +209,7 @@ class _Scoring:
             scene=config.scene,
             metres_per_unit=config.metres_per_unit,
             cache=None if config.cache is None else Path(config.cache),
+            check=config.check,
             measure=measure,
         )
         notes = Path(config.output).with_suffix(".finished") / title.replace(" ", "_")

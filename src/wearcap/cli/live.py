@@ -18,6 +18,7 @@ from rich import print as show
 from rich.markup import escape
 
 from wearcap.cli.conf import compose, hydra_main, load_pipeline
+from wearcap.cli.stated import stated
 from wearcap.errors import WearcapError, nearest, require_choice
 from wearcap.files import write_text
 from wearcap.live.capture import LiveCapture, report_text
@@ -36,7 +37,8 @@ from wearcap.viewer.guard import LOOPBACK
 
 MAX_MESSAGES = 20
 """Different messages of libraries that are shown."""
-HANDS = ("grip", "wrist", "joint")
+HANDS = ("auto", "grip", "wrist", "joint")
+"""What tracked hands are; those of streams are held controllers where nothing is stated."""
 
 
 def run(config: DictConfig) -> dict[str, Any]:
@@ -51,7 +53,8 @@ def run(config: DictConfig) -> dict[str, Any]:
     system = load_pipeline(config.checkpoint, config.pipeline, config.device, shared=True)
     place = None
     if config.recording is not None:
-        recording, folder = read(config.recording), dataset_folder(config.recording)
+        how = {**config, "hands": "auto"} if config.hands == "joint" else config
+        recording, folder = read(config.recording, stated(how), config.check), dataset_folder(config.recording)
         place = CaptureInput.in_dataset(recording, folder, config.scene, config.metres_per_unit)
     require_choice(config.hands, HANDS, f"hands={config.hands}")
     sources, setup = _sources(config, system, place)
@@ -65,7 +68,8 @@ def run(config: DictConfig) -> dict[str, Any]:
         source=place,
         setup=setup,
         height_m=config.height,
-        hands="joint" if "replay" in _listed(config.source) else config.hands,  # a recording has the wrists themselves
+        # a recording has the wrists themselves
+        hands="joint" if "replay" in _listed(config.source) else "grip" if config.hands == "auto" else config.hands,
         guided=config.guided,
         setup_file=setup_file,
         seed=config.seed,

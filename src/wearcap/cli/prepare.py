@@ -26,7 +26,7 @@ def run(config: DictConfig) -> Report:
         splits = Splits.read(listed if listed.is_file() else Path(config.splits))
         tasks = instantiate(config.tasks, _convert_="all", _partial_=True)(splits=splits)
         options = {key: config[key] for key in ("jobs", "backend", "scheduler", "overwrite")}
-        inspect = require_sound if config.get("check") else None
+        inspect = require_sound if config.check else None
         report = prepare(tasks, config.output, **options, inspect=inspect)
     _show_report(report, RecordingStore.open(config.output))
     return report

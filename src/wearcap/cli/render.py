@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from wearcap.cli.stated import stated
 from wearcap.cli.verbs import Arguments
 from wearcap.cli.view import add_recording, read_motions
 from wearcap.errors import WearcapError
@@ -14,7 +15,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--start", type=float, default=0.0, help="from this second of the recording on")
     parser.add_argument("--stop", type=float, help="up to this second")
     parser.add_argument("--frames", type=int, default=12, help="pictures in a contact sheet (default 12)")
-    parser.add_argument("--fps", type=float, default=30.0, help="frame rate of a video (default 30)")
+    parser.add_argument("--video-fps", type=float, default=30.0, help="frame rate of a video (default 30)")
     parser.add_argument("--size", default="", help="WIDTHxHEIGHT of a panel in pixels, such as 480x400")
     parser.add_argument("--sticks", action="store_true", help="bones instead of a body surface")
     parser.add_argument("--environment", help="objects to draw (default: what the recording names)")
@@ -27,7 +28,7 @@ def main(arguments: list[str]) -> None:
     from wearcap.viewer.page_layers import with_objects
     from wearcap.viewer.picture import contact_sheet, draw_head_path, save_png, shared_frames, write_video
 
-    recording = read(options.recording)
+    recording = read(options.recording, stated(vars(options)))
     out = options.out or Path(f"{recording.name}.png")
     if out.suffix not in (".png", ".mp4"):
         what = f"cannot draw a {out.suffix or 'file without an ending'}"
@@ -47,7 +48,7 @@ def main(arguments: list[str]) -> None:
         body = None if options.sticks else anny_body(skeleton, recording.shape or None)
         shown = size | {"body": body, "environment": environment}
         if out.suffix == ".mp4":
-            write_video(out, motions, fps=options.fps, **shown)
+            write_video(out, motions, fps=options.video_fps, **shown)
         else:
             save_png(out, contact_sheet(motions, shared_frames(motions, options.frames), **shown))
     print(f"wrote {out}")

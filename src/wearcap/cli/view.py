@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wearcap.cli.main import add_page
+from wearcap.cli.stated import add_conventions, stated
 from wearcap.cli.verbs import Arguments
 from wearcap.errors import WearcapError
 
@@ -39,6 +40,7 @@ def add_recording(parser: Arguments, purpose: str) -> None:
     """Add the recording and the option `--motion FILE …`, whose files `read_motions` reads."""
     parser.add_argument("recording", help="DATASET/NAME, or any file or folder that holds a recording")
     text = f"captured motions (.npz that `wearcap capture` wrote) to {purpose}"
+    add_conventions(parser)
     parser.add_argument("--motion", nargs="+", action="extend", default=[], metavar="FILE", help=text)
 
 
@@ -54,7 +56,7 @@ def main(arguments: list[str]) -> None:
     from wearcap.runtime.system import CaptureInput
     from wearcap.viewer.page import Page
 
-    recording, folder = read(options.recording), dataset_folder(options.recording)
+    recording, folder = read(options.recording, stated(vars(options))), dataset_folder(options.recording)
     captures = read_motions(options.motion)
     if recording.motion is None and recording.suit is not None:
         captures = {"suit": recording.suit} | captures

@@ -1,10 +1,10 @@
 """The doctor: reports the content of a recording, likely problems, and how to fix them.
 
-Open `examine.py` first, which also reads what is examined; `streams.py` (with the measurements that all share), `body.py`,
+Open `examine.py` first; `streams.py` (with the measurements that all share), `body.py`,
 `agreement.py` and `places.py` check it; `report.py` holds checks, findings and their report.
 """
 
-from wearcap.doctor.examine import examine, examine_recording, require_sound
+from wearcap.doctor.examine import examine_recording, require_sound
 from wearcap.doctor.report import Finding, Report
 
-__all__ = ["Finding", "Report", "examine", "examine_recording", "require_sound"]
+__all__ = ["Finding", "Report", "examine_recording", "require_sound"]

@@ -14,13 +14,28 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, angular_velocity, interpolate, outlier_mask, resample, smooth
 from wearcap.io.formats.video import video_info
-from wearcap.recording import CameraStream, Cue, HeadStream, ImuStream, Localization, Motion, PointCloud, Recording
+from wearcap.recording import (
+    CameraStream,
+    Cue,
+    FloorTrack,
+    HeadStream,
+    ImuStream,
+    Localization,
+    Motion,
+    PointCloud,
+    Recording,
+)
 from wearcap.scene.floor import estimate_floor
 from wearcap.sensors.claps import detect_claps
 from wearcap.sensors.imu import GRAVITY, mean_filter
 from wearcap.sensors.initialization import MAX_SPEED
 
 LONG_OUTAGE_S = 30.0
+REACH_M = (0.05, 1.3)
+"""Range of the usual distance (m) between head and hand."""
+SCAN_FILE = "scene: file"
+HEAD_M = (0.2, 2.6)
+"""Range of the head's height (m) above the floor, from lying to standing."""
 _ACC_UNITS = {"g": GRAVITY, "milli-g": GRAVITY / 1000, "cm/s²": 0.01}
 
 
@@ -83,6 +98,34 @@ def check_head_cue(head: HeadStream, cue: Cue) -> Finding:
         fix = "They are in different worlds, on different clocks, or of different people."
         return check.error("the tracked head does not ride with the device", evidence, fix)
     return check.ok("the tracked head rides with the device", evidence)
+
+
+def check_hand(joint: str, hand: Trajectory, head: HeadStream) -> Finding:
+    """A tracked hand is on the head's clock and within an arm's reach of it."""
+    check = Check(f"{joint}: reach")
+    inside = (hand.timestamps >= head.timestamps[0]) & (hand.timestamps <= head.timestamps[-1])
+    if not inside.any():
+        evidence = f"{hand.timestamps[0]:.2f} … {hand.timestamps[-1]:.2f} s"
+        return check.error("shares no time with the head", evidence, "Bring both to one clock.")
+    t_head = interpolate(head.timestamps, head.t_world_device.double(), hand.timestamps[inside])
+    usual = quantile((hand.t_world_body[inside].double() - t_head).norm(dim=-1), 0.5)
+    evidence = f"half of the time within {usual:.3g} m of the head"
+    if not REACH_M[0] < usual < REACH_M[1]:
+        fix = "Say the unit of length (unit=cm, mm …), or take head and hands of one session."
+        return check.error("out of an arm's reach" if usual > 1 else "lies in the head", evidence, fix)
+    return check.ok("within an arm's reach", evidence)
+
+
+def check_carried(head: HeadStream, floor: FloorTrack) -> list[Finding]:
+    """The head is at the height of a person's above a known floor; the list is empty if so."""
+    times = head.timestamps.clamp(floor.timestamps[0].item(), floor.timestamps[-1].item())
+    height = head.t_world_device[:, 2].double() - interpolate(floor.timestamps, floor.height.double(), times)
+    usual = quantile(height, 0.9)
+    if HEAD_M[0] < usual < HEAD_M[1]:
+        return []
+    fix = "Check the unit of length (unit=cm, mm …) and the floor's height."
+    evidence = f"{usual:.3g} m above it (90 % of the time less)"
+    return [Check("head: height").error("the head is at no person's height above the floor", evidence, fix)]
 
 
 def check_points(points: PointCloud, head: HeadStream | None) -> list[Finding]:
@@ -230,8 +273,8 @@ def check_files(recording: Recording, root: Path) -> list[Finding]:
             else:
                 findings.append(check.ok("fits its calibration", f"{video.frames} frames of {width}x{height}"))
     if recording.scene and not (root / recording.scene).is_file():
-        fix = "Put it there, or prepare the data set again."
-        findings.append(Check("scene: file").error("the scan is missing", str(root / recording.scene), fix))
+        fix = "Put it there, or prepare the data set again; capture takes another: scene=FOLDER."
+        findings.append(Check(SCAN_FILE).error("the scan is missing", str(root / recording.scene), fix))
     return findings
 
 
@@ -248,9 +291,13 @@ def check_imu(stream: str, imu: ImuStream, joint: Trajectory | None) -> list[Fin
     if has_error(findings):
         return findings
     if imu.acc_imu is not None:
-        # Specific force is 9.81 m/s² upwards on average.
-        check, usual = Check(f"{stream}: accelerometer"), quantile(imu.acc_imu.norm(dim=-1), 0.5)
-        evidence = f"median length {usual:.4g} m/s²"
+        # Specific force is 9.81 m/s² upwards on average; its length is more while the sensor is swung about.
+        check, lengths, up = Check(f"{stream}: accelerometer"), [quantile(imu.acc_imu.norm(dim=-1), 0.5)], None
+        if imu.R_world_imu is not None:
+            up = (imu.R_world_imu.double() @ imu.acc_imu.double()[..., None])[..., 0].mean(0) / GRAVITY
+            lengths.append(GRAVITY * up.norm().item())
+        usual = min(lengths, key=lambda length: abs(math.log(max(length, 1e-9) / GRAVITY)))
+        evidence = f"{'median' if usual == lengths[0] else 'mean in world axes'} {usual:.4g} m/s² long"
         if not 0.8 * GRAVITY < usual < 1.25 * GRAVITY:
             off = {name: abs(math.log(max(usual, 1e-9) * unit / GRAVITY)) for name, unit in _ACC_UNITS.items()}
             unit = min(off, key=lambda name: off[name])
@@ -258,10 +305,9 @@ def check_imu(stream: str, imu: ImuStream, joint: Trajectory | None) -> list[Fin
             if off[unit] < 0.25:
                 what, fix = f"is in {unit}, not m/s²", f"Multiply by {_ACC_UNITS[unit]:.5g}."
             findings.append(check.error(what, evidence, fix))
-        elif imu.R_world_imu is None:
+        elif up is None:
             findings.append(check.ok("measures gravity", evidence))
         else:
-            up = (imu.R_world_imu.double() @ imu.acc_imu.double()[..., None])[..., 0].mean(0) / GRAVITY
             evidence += f", points along ({', '.join(f'{v:+.2f}' for v in up.tolist())}) of the world"
             what = "gravity does not point along z"
             fix = "The sensor's orientation is in another world, or its axes are exchanged."

@@ -1,8 +1,11 @@
 """A body's motion: size, up axis, sides, knees, joint rotations, feet on the floor, foot contacts."""
 
 import math
+from functools import partial
 
 import torch
+from jaxtyping import Float64
+from torch import Tensor
 
 from wearcap.body.kinematics import site_positions
 from wearcap.body.landmarks import Landmarks, landmarks
@@ -48,6 +51,8 @@ def check_motion(stream: str, motion: Motion, floor: FloorTrack | None) -> list[
     except WearcapError as error:
         return [*findings, Check(f"{stream}: skeleton").note("limbs are not recognised by name", str(error))]
     findings += _check_posture(stream, motion, parts)
+    if len(motion) > 1 and not has_error(findings):
+        findings += _check_axes(Check(f"{stream}: joints' axes"), motion, parts)
     return findings if has_error(findings) else [*findings, *_check_feet(stream, motion, root, parts, floor)]
 
 
@@ -86,7 +91,7 @@ def _check_posture(stream: str, motion: Motion, parts: Landmarks) -> list[Findin
     evidence = "from feet to head: (" + ", ".join(f"{v:+.2f}" for v in mean.tolist()) + ") of the world, on average"
     if mean[2] < 0.5:
         name = axis_name(mean)
-        if mean.abs().max() > 0.8:
+        if mean.abs().max() > 0.8 and not _lies(position, mean):
             fix = f"Read it with up='{name.lstrip('+')}', or turn the world so."
             return [check.error(f"the body stands along {name}", evidence, fix)]
         fix = "Lying, crawling and handstands look like this too."
@@ -113,6 +118,53 @@ def _check_posture(stream: str, motion: Motion, parts: Landmarks) -> list[Findin
         fix = "Check joint axes and rotation order."
         findings.append(Check(f"{stream}: knees").warning("knees bend forwards", ", ".join(bad), fix))
     return findings
+
+
+def _lies(position: Float64[Tensor, "time joint 3"], along: Float64[Tensor, "3"]) -> bool:
+    """Whether the ground that a body keeps to is at z = 0 and not at 0 along the axis from its feet to its head."""
+    k = int(along.abs().argmax())
+    heights = (position[..., 2].amin(1), (position[..., k] * along[k].sign()).amin(1))
+    on_ground, stands = (quantile(h, 0.05) > -0.25 and quantile(h, 0.95) < 0.25 for h in heights)
+    return on_ground and not stands
+
+
+def _check_axes(check: Check, motion: Motion, parts: Landmarks) -> list[Finding]:
+    """Pelvis, trunk and head are upright and face where the body does, in frames in which it stands.
+
+    A head may look down; hips and shoulders show where pelvis and trunk face, and all three the way while it walks on.
+    """
+    T, root = motion.T_world_joint, Trajectory(motion.timestamps, motion.R_parent_joint[:, 0], motion.t_world_root)
+    t, unit = T.t.double(), partial(torch.nn.functional.normalize, dim=-1)
+    (hip, knee, ankle), (shoulder, *_) = (
+        t[:, [[parts.limb[f"{side}_{part}"][k] for side in ("left", "right")] for k in range(3)]].unbind(1)
+        for part in ("leg", "arm")
+    )
+    legs = ((hip - knee).norm(dim=-1) + (knee - ankle).norm(dim=-1)).mean(1)
+    upward = (unit(shoulder.mean(1) - hip.mean(1)), unit(t[:, parts.head] - shoulder.mean(1)))
+    stands = ((hip - ankle).mean(1)[:, 2] > 0.85 * legs) & (upward[0][:, 2] > 0.95) & (upward[1][:, 2] > 0.8)
+    if stands.sum() < 10:
+        return []
+    across = [unit(pair[:, 0] - pair[:, 1]) for pair in (hip, shoulder)]
+    way = unit(linear_velocity(root).double() * torch.tensor([1.0, 1.0, 0.0]))
+    ahead = torch.linalg.cross(across[0], upward[0])
+    walks = stands & (linear_velocity(root).norm(dim=-1) > 0.5) & ((ahead * way).sum(-1) > 0.9)
+    evidence, severity = [], 0
+    limits = (("pelvis", parts.root, 0.8, 0.5), ("trunk", parts.spine[-1], 0.8, 0.5), ("head", parts.head, 0.3, 0.3))
+    for name, joint, least_up, least_ahead in limits:
+        R = T.R[:, joint].double()
+        up, aside = R[stands, 2, 2].mean().item(), R[stands, 2, 1].mean().abs().item()
+        if joint != parts.head:
+            faces = (R[..., 1] * across[joint != parts.root]).sum(-1)[stands].mean().item()
+        else:
+            faces = quantile((R[walks, :, 0] * way[walks]).sum(-1), 0.5) if walks.sum() >= 10 else 1.0
+        if up < least_up + 0.05 or aside > 0.5 or faces < least_ahead + 0.15:
+            evidence.append(f"{name} up by {up:.2f}, ahead by {faces:.2f} of 1")
+            severity = max(severity, 2 if up < least_up or aside > 0.6 or faces < least_ahead else 1)
+    if not severity:
+        return [check.ok("pelvis, trunk and head are upright and ahead", f"in {int(stands.sum())} frames that stand")]
+    fix = "The axes of its joints are not x ahead, z up: read the file that they come from, with its skeleton's other clips."
+    finding = (check.warning, check.error)[severity - 1]
+    return [finding("joints' axes are not the body's", f"while it stands, {'; '.join(evidence)}", fix)]
 
 
 def _check_feet(

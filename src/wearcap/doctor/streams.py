@@ -75,7 +75,8 @@ FASTEST_M_S = 12.0
 """Highest running speed (m/s); a faster frame is a jump, a faster recording is in the wrong unit."""
 UPRIGHT = 0.7
 """Least mean z component of a head's or pelvis' own z axis in a recording of daily life."""
-_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "CMU's units": 0.0254 / 0.45}
+_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2}
+"""Units of devices; those of bodies follow from their bones."""
 
 
 def check_clock(stream: str, timestamps: Float64[Tensor, "time"]) -> list[Finding]:
@@ -200,7 +201,7 @@ def check_speed(stream: str, track: Trajectory) -> list[Finding]:
     evidence = f"90 % of frames below {usual:.3g} m/s, path {path:.4g} m"
     if usual > FASTEST_M_S:
         unit = min(_UNITS, key=lambda name: abs(math.log(usual * _UNITS[name] / 1.2)))
-        fix = f"In {unit} it would be {usual * _UNITS[unit]:.2f} m/s: multiply positions by {_UNITS[unit]:.4g}."
+        fix = f"In {unit} it would be {usual * _UNITS[unit]:.2f} m/s: unit={_UNITS[unit]:.4g} says so."
         return [check.error("positions are not in metres", evidence, fix)]
     if len(speed) > 2 and track.timestamps[-1] - track.timestamps[0] > 10 and path < 0.01:
         return [check.warning("nothing moves", evidence, "Check the unit, and that this stream recorded at all.")]

@@ -23,6 +23,7 @@ from rich.table import Table
 
 import wearcap
 from wearcap.boundary.texts import read_json
+from wearcap.doctor import require_sound
 from wearcap.errors import WearcapError
 from wearcap.evaluation.evaluate import Measure, evaluate
 from wearcap.files import remembered_sha256, write_text
@@ -219,13 +220,17 @@ def scored(
     scene: str | Path | None = None,
     metres_per_unit: float | None = None,
     cache: Path | None = None,
+    check: bool = False,
     measure: Measure | None = None,
 ) -> list[Outcome]:
     """Outcomes of some recordings that are captured with every seed and scored; seconds are shared out by frames.
 
-    Raises WearcapError as `evaluate` does.
+    Raises WearcapError as `evaluate` does, and with `check` for a recording in which the doctor finds an error.
     """
-    store, made = RecordingStore.open(root), loaded(key, system)
+    store = RecordingStore.open(root)
+    for name in names if check else ():
+        require_sound(store.load(name))
+    made = loaded(key, system)
     begin = time.perf_counter()
     found = evaluate(made, store, names, seeds, batch_size, measure, scene, metres_per_unit, StageOptions(cache))
     rows: dict[str, list[Row]] = {name: [] for name in names}

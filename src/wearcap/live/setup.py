@@ -25,7 +25,7 @@ from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
 from wearcap.io.devices.aria_mps import T_HEAD_DEVICE
-from wearcap.io.devices.axes import wrist_of_hand
+from wearcap.io.devices.headset_axes import wrist_of_hand
 from wearcap.io.devices.headset_log import PALM_M
 
 MAX_SEATS, MAX_JOINTS, MAX_NOTES = 64, 256, 100

@@ -4,19 +4,23 @@ The body is found by names or by its tree, unit and up axis by its size and by h
 bones' lengths, repeats the rotations, and is fitted to the places of the file's joints in every frame.
 """
 
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body.foreign_tree import ForeignTree, foreign_tree, joint_roles, standing_rotation
+from wearcap.body.foreign_tree import ForeignTree, foreign_tree, joint_roles, standing_rotation, straightness
 from wearcap.body.joint_matching import convention
 from wearcap.body.position_fit import fit_positions
 from wearcap.body.retarget import fit_offsets, retarget
 from wearcap.body.skeleton import xsens23
 from wearcap.boundary.opening import placed
 from wearcap.errors import WearcapError
+from wearcap.io.conventions import AUTO, Conventions
 from wearcap.io.formats.bvh import axes_rotation
 from wearcap.prepare.foreign_conventions import (
     Mapping,
@@ -28,9 +32,12 @@ from wearcap.prepare.foreign_conventions import (
     with_thorax,
     with_toes,
 )
-from wearcap.prepare.foreign_files import read_take
+from wearcap.prepare.foreign_files import Take, read_take
 from wearcap.prepare.levels import Levels, levels_in, with_levels
 from wearcap.recording.motion import Motion
+
+LEAST_STRAIGHT = 0.12
+"""Straightness that a clip's straightest frame has where joints' axes that follow from it are not in doubt."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +84,7 @@ class ForeignReport:
         frames = self.frames.split(",")[0]
         return (
             f"names {self.convention}, {self.unit}, {self.up} up, frames from {frames}; {1000 * mean:.1f} mm from the "
-            f"file's joints (worst {1000 * worst:.1f})"
+            f"file's joints (worst {1000 * worst:.1f})" + "".join(f"; {note}" for note in self.notes)
         )
 
 
@@ -96,16 +103,22 @@ def read_foreign_motion(
     amc_fps: float | int = 120,
     asf: Path | None = None,
     levels: Levels | None = None,
+    siblings: Sequence[Take] = (),
+    how: Conventions | None = None,
 ) -> ForeignMotion:
     """Read a .bvh, or an .amc with `asf` or the skeleton file beside it (plain, .xz or .gz), onto xsens23.
 
-    `mapping` (a YAML file with any of joints, unit, up, forward) overrides what is detected; `levels` replaces what the
-    file itself shows of how head and feet are level. Raises WearcapError for a file that is damaged or holds no body
+    `mapping` (a YAML file with any of joints, unit, up, forward) overrides what is detected, and `how` both; `levels` replaces what the
+    file itself shows of how head and feet are level. Conventions and joints' axes follow from the file's frames and from
+    those of `siblings`, clips of the same skeleton. Raises WearcapError for a file that is damaged or holds no body
     with head, arms and legs, saying what is missing.
     """
     path = Path(path)
     given = mapping if isinstance(mapping, Mapping) else Mapping() if mapping is None else read_mapping(mapping)
-    take = read_take(path, amc_fps, asf)
+    how = how or Conventions()
+    given = replace(given, unit_m=how.unit_m or given.unit_m, up=given.up if how.up == AUTO else how.up)
+    own = read_take(path, amc_fps, asf)
+    take = _joined(own, siblings)
     found, found_by = find_body(take, given, path)
     take, found = with_toes(take, found)
     take = take.mirrored() if is_mirrored(take, found) else take
@@ -121,10 +134,19 @@ def read_foreign_motion(
     naming = convention(take.names)
     if levels is None:  # CMU's head frames are those of markers, in whatever format
         levels = levels_in([motion], head_trusted=R_ours_rest is not None and not naming.startswith("CMU"))
-    motion = with_levels(motion, levels)
+    motion = with_levels(motion, levels).sliced(0, len(own.t))
     if not (motion.R_parent_joint.isfinite().all() and motion.t_world_root.isfinite().all()):
         raise WearcapError("no skeleton can be fitted to its joints", path, "joints apart from one another")
     roles = joint_roles(found)
+    stated = [f"{name}={value}" for name in ("unit", "up") if (value := getattr(how, name)) != AUTO]
+    notes = (*take.notes, *(f"Stated: {each}." for each in stated))
+    if odd and (straight := straightness(take.t, found).max().item()) < LEAST_STRAIGHT:
+        note = f"Nobody stands straight in it (straightness {straight:.2f} of 1), so that the axes of its joints are"
+        notes = (
+            *notes,
+            f"{note} uncertain, the head's by up to 50°: read it in a folder of the same skeleton's clips.",
+        )
+    with_others = f" and that of {len(siblings)} clips beside it" if siblings else ""
     report = ForeignReport(
         path.name,
         naming,
@@ -134,12 +156,35 @@ def read_foreign_motion(
         height_m,
         up,
         f"{forward} is ahead in the bind pose" if odd == "" else f"{forward} is our x",
-        "the bind pose" if odd == "" else f"the motion, for in the bind pose {odd}",
+        "the bind pose" if odd == "" else f"the motion{with_others}, for in the bind pose {odd}",
         {ours: take.names[joint] for ours, joint in roles.items()},
-        _residuals(motion, {name: t_world[:, joint] for name, joint in roles.items()}),
-        take.notes,
+        _residuals(motion, {name: t_world[: len(motion), joint] for name, joint in roles.items()}),
+        notes,
     )
     return ForeignMotion(replace(motion, provenance={"source": path.name, "format": take.format}), report)
+
+
+def _joined(take: Take, siblings: Sequence[Take]) -> Take:
+    """The take, followed by its siblings' frames."""
+    for other in siblings:
+        times = other.timestamps + take.timestamps[-1] + 1  # a second between them
+        pairs = ((take.R, other.R), (take.t, other.t), (take.timestamps, times))
+        R, t, timestamps = (torch.cat(pair) for pair in pairs)
+        take = replace(take, R=R, t=t, timestamps=timestamps)
+    return take
+
+
+def straightest(files: Sequence[Path], mapping: Mapping, count: int, frames: int) -> tuple[Take, ...]:
+    """The `count` clips in which most stand straight, thinned to about `frames` frames each; unreadable ones left out."""
+    takes: list[tuple[float, Take]] = []
+    for file in files:
+        with suppress(WearcapError):  # reported where the file itself is read
+            take = read_take(file, amc_fps=120)
+            thin = slice(None, None, max(1, len(take.t) // frames))
+            whole, found = with_toes(take, find_body(take, mapping, file)[0])
+            straight = straightness(whole.t[thin], found).sum().item()
+            takes.append((straight, replace(take, R=take.R[thin], t=take.t[thin], timestamps=take.timestamps[thin])))
+    return tuple(take for _, take in sorted(takes, key=lambda row: -row[0])[:count])
 
 
 def _fitted(tree: ForeignTree, timestamps: Float[Tensor, "time"]) -> Motion:

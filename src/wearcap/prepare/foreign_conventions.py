@@ -24,6 +24,8 @@ AXES = ("x", "y", "z", "-x", "-y", "-z")
 ROLES = ("head", *(f"{side}_{name}" for side in SIDES for names in LIMBS.values() for name in names),
          *(f"{side}_toe" for side in SIDES))  # fmt: skip
 """Joints that a mapping may name."""
+_GROUND_M = 0.25
+"""Height (m) within which a body's lowest joint is at the ground."""
 LOST_THORAX_M = 0.1168
 """Length of the bone that cgspeed's BVH conversions of CMU dropped between thorax and neck or shoulders."""
 
@@ -145,7 +147,7 @@ def find_unit(take: Take, found: BodyJoints, mapping: Mapping, path: Path) -> tu
     likely = [(name, UNITS_M[name]) for name in LIKELY_UNITS]
     if mapping.unit_m is not None or take.unit_m is not None:
         unit_m = mapping.unit_m or take.unit_m or 1.0
-        name = "as the mapping says" if mapping.unit_m else "as the format says"
+        name = "as stated" if mapping.unit_m else "as the format says"
     else:
         usual = [row for row in likely if USUAL_HEIGHT_M[0] <= height * row[1] <= USUAL_HEIGHT_M[1]]
         name, unit_m = (usual or sorted(likely, key=lambda row: abs(torch.tensor(height * row[1] / 1.7).log().item())))[
@@ -194,19 +196,21 @@ def find_axes(
     """The file's axes that point up, and along our x.
 
     Up is where heads are above feet, and where the lowest joint stays on one floor. A body that stands along another
-    axis than its bind pose is believed only if it stands: one that lies is within 0.8 m of the bind pose's ground.
+    axis than its bind pose's, or than y where that pose does not stand, is believed only if it stands: one that lies has
+    its ground at 0 along the usual axis, and none there along its own.
     """
     ankles = take.t[:, [found.limb[f"{side}_leg"][2] for side in SIDES]].mean(1)
     upward = torch.nn.functional.normalize(take.t[:, found.head] - ankles, dim=-1).mean(0)
     thin = take.t[:: max(1, len(take.t) // 1000), [found.head, *(j for triple in found.limb.values() for j in triple)]]
     floors = torch.cat([thin.amin(1), -thin.amax(1)], -1) * unit_m  # along x, y, z, -x, -y, -z
-    wander = floors.quantile(0.95, 0) - floors.quantile(0.05, 0)
-    up = AXES[int((torch.cat([upward, -upward]) - wander).argmax())]
+    low, high = floors.quantile(0.05, 0), floors.quantile(0.95, 0)
+    up = AXES[int((torch.cat([upward, -upward]) - (high - low)).argmax())]
+    grounded = {axis for k, axis in enumerate(AXES) if low[k] > -_GROUND_M and high[k] < _GROUND_M}
     bind = None if R_ours_rest is None else _axis(R_ours_rest[2])
-    if bind is not None and bind != up:
-        heights = take.t[..., "xyz".index(bind[-1])] * (-1 if bind[0] == "-" else 1) * unit_m
-        if heights.amax() < 0.8 and heights.amin() > -0.3:
-            up = bind
+    usual = bind or "y"
+    highest = -floors[:, (AXES.index(usual) + 3) % 6].amin()
+    if usual != up and usual in grounded and (up not in grounded or (bind is not None and highest < 0.8)):
+        up = usual
     up = mapping.up or take.up or up
     if mapping.forward is not None:
         return up, mapping.forward

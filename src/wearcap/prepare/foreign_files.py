@@ -95,9 +95,10 @@ def _read_bvh(path: Path) -> Take:
             rest = torch.cat([rest, place[None]])
     joints, eye = len(content.names), torch.eye(3, dtype=R.dtype)
     R = torch.cat([R, eye.expand(len(R), len(names) - joints, 3, 3)], 1)
-    notes = ()
+    notes = content.notes
     if _begins_with_a_leap(R[:4, 1:]):
-        R, t, notes = R[1:], t[1:], ("The first frame, a pose far from the motion that follows, is left out.",)
+        R, t = R[1:], t[1:]
+        notes = ("The first frame, a pose far from the motion that follows, is left out.", *notes)
     skeleton = Skeleton("file", tuple(str(k) for k in range(len(names))), tuple(parents), rest.float())
     world = forward_kinematics(skeleton, R.contiguous(), t[:, 0].contiguous(), t.contiguous())
     rest[0] = 0

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,9 +18,10 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import swing_between
 from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.conventions import AUTO, Conventions
 from wearcap.io.devices.aria_mps import T_HEAD_DEVICE, head_stream, is_mps_folder, read_mps, read_points
 from wearcap.io.devices.axes import CAMERA, DEVICES, UPRIGHT, WORLDS, DeviceAxes, device_axes, to_head_axes
-from wearcap.io.devices.headset_log import is_headset_log, read_headset_log
+from wearcap.io.devices.headset_log import is_headset_log, is_headset_session, read_headset_log
 from wearcap.io.devices.watch_log import read_inertial_log, read_watch_log
 from wearcap.io.formats.camera_json import read_camera
 from wearcap.io.formats.csv_table import read_columns, read_header
@@ -50,7 +52,7 @@ class TrajectorySettings:
     axes: str = "auto"
     time_unit: str | None = None
     fps: float | int | None = None
-    scale: float | int | None = None
+    unit: str | float | int = AUTO
     T_head_device: Numbers | None = None
     height: float | int | None = None
     points: str | None = None
@@ -76,22 +78,27 @@ class TrajectorySettings:
         """T_head_device: the given one, else the nominal one of glasses and headsets."""
         return pose_of(self.T_head_device, "T_head_device") or T_HEAD_DEVICE
 
+    def cloud(self, read: TrajectoryFile) -> PointCloud | None:
+        """The points in the trajectory's world, from which its origin is taken off, too."""
+        return None if self.points is None else read_cloud(self.points, read.origin)
+
     def evidence(self, read: TrajectoryFile, up: Tensor | None) -> SceneEvidence:
         """What is known of scale and vertical; times of the config count from the first pose."""
         start_s = read.trajectory.timestamps[0].item()
         standing = None if self.standing is None else _times(self.standing, 2, "standing", start_s)
         walks = tuple((*_times(walk[:2], 2, "walks", start_s), float(walk[2])) for walk in self.walks or ())
         imu = None if self.head_imu is None else read_head_imu(self.head_imu)
-        scale = self.scale if self.scale is not None else 1.0 if read.metric else None
-        points = None if self.points is None else read_cloud(self.points).points_world
+        unit_m = Conventions(unit=self.unit).unit_m
+        scale = unit_m if unit_m is not None else 1.0 if read.metric else None
+        cloud = self.cloud(read)
         return SceneEvidence(
-            points,
+            None if cloud is None else cloud.points_world,
             standing,
             None if self.camera_height_m is None else float(self.camera_height_m),
             imu,
             pose_of(self.T_cam_imu, "T_cam_imu"),
             walks,
-            None if scale is None else float(scale),
+            scale,
             up,
         )
 
@@ -113,21 +120,23 @@ def read_head_imu(path: str | Path) -> ImuStream:
     return replace(read_watch_log(path, WRISTS[0]), joint="head")
 
 
-def read_cloud(path: str | Path) -> PointCloud:
-    """Points of a .ply, .pcd, MPS' semi-dense points, or a table with columns x, y, z.
+def read_cloud(path: str | Path, origin: np.ndarray | None = None) -> PointCloud:
+    """Points of a .ply, .pcd, MPS' semi-dense points, or a table with columns x, y, z; `origin` is taken off them.
 
     Raises WearcapError for any other file.
     """
     suffixes = {suffix.lower() for suffix in Path(path).suffixes}
+    shift = np.zeros(3) if origin is None else origin
     if ".ply" in suffixes or ".pcd" in suffixes:
-        return PointCloud(torch.from_numpy((read_ply if ".ply" in suffixes else read_pcd)(path).points).float())
+        points = (read_ply if ".ply" in suffixes else read_pcd)(path).points
+        return PointCloud(torch.from_numpy(points.astype(np.float64) - shift).float())
     header = read_header(path)
     if "px_world" in header:
         return read_points(path)
     table = read_columns(path, ["x", "y", "z"])
     columns = {name: table[name] for name in "xyz"}
     check_finite(columns, path)
-    return PointCloud(torch.stack([torch.from_numpy(column) for column in columns.values()], 1).float())
+    return PointCloud(torch.from_numpy(np.stack(list(columns.values()), 1) - shift).float())
 
 
 def read_path(file: Path, name: str, about: dict[str, str], settings: TrajectorySettings) -> Recording:
@@ -140,10 +149,12 @@ def read_path(file: Path, name: str, about: dict[str, str], settings: Trajectory
     unit, fps = settings.time_unit, settings.fps
     read = read_trajectory_file(file, unit, None if fps is None else float(fps))
     head, alignment, note = head_of(read, settings, str(file))
-    points = None
-    if settings.points is not None:
-        cloud = read_cloud(settings.points)
-        points = replace(cloud, points_world=alignment.points(cloud.points_world))
+    points = settings.cloud(read)
+    if points is not None:
+        points = replace(points, points_world=alignment.points(points.points_world))
+    origin = None
+    if read.origin is not None:
+        origin = alignment.scale * alignment.R_world_slam.double() @ torch.from_numpy(read.origin)
     floor = None
     if settings.camera_height_m is not None:
         floor = FloorTrack(head.timestamps[:1], torch.zeros(1))
@@ -151,7 +162,9 @@ def read_path(file: Path, name: str, about: dict[str, str], settings: Trajectory
     skeleton = settings.skeleton()
     if skeleton is None:
         note += "; height not given: taken from how high the head is carried, where the floor is known"
-    return Recording(name, head, camera=camera, points=points, floor=floor, skeleton=skeleton, note=note, **about)
+    return Recording(
+        name, head, camera=camera, points=points, floor=floor, skeleton=skeleton, origin=origin, note=note, **about
+    )
 
 
 def head_of(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tuple[HeadStream, SlamAlignment, str]:
@@ -166,12 +179,12 @@ def head_of(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> t
     evidence = settings.evidence(read, up)
     limits = float(settings.max_acceleration), float(settings.max_burst_s)
     alignment, clean, outliers = align_cleaned(slam, evidence.align, *limits)
-    track = to_head_axes(alignment.apply(clean), DeviceAxes("z", "camera", 1.0))
+    track = to_head_axes(alignment.apply(clean), DeviceAxes("z", "camera", 1.0, ""))
     mount = settings.mount()
     head = HeadStream(track.timestamps, track.R_world_body, track.t_world_body, mount.R, mount.t)
     unit = "in metres" if alignment.scale == 1 else f"a unit is {alignment.scale:.4g} m"
     notes = [f"{read.format}, times in {read.time_unit}", vertical, f"the device has {axes}'s axes", unit]
-    return head, alignment, "; ".join([*notes, *([outliers] if outliers else [])])
+    return head, alignment, "; ".join([*notes, *read.notes, *([outliers] if outliers else [])])
 
 
 def _axes(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tuple[str, Tensor | None, str]:
@@ -195,7 +208,7 @@ def _axes(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tup
             R,
             "vertical by the camera's mean tilt, some degrees off (better: head_imu=, or points= of the floor)",
         )
-    return axes.device, WORLDS[axes.up], f"{axes.up} is up (the device is upright by {axes.upright:.2f})"
+    return axes.device, WORLDS[axes.up], f"{axes.up} is up ({axes.known_by})"
 
 
 def _camera(settings: TrajectorySettings, head: HeadStream) -> CameraStream | None:
@@ -308,16 +321,18 @@ def watches_tasks(
 class HeadsetSettings:
     """How a headset's log is read, and who wore it; "auto" and None: from the file's content."""
 
-    axes: str = "auto"
-    quaternion: str = "auto"
-    hands: str = "auto"
+    unit: str | float | int = AUTO
+    axes: str = AUTO
+    quaternion: str = AUTO
+    hands: str = AUTO
     time_unit: str | None = None
     T_head_device: Numbers | None = None
     height: float | int | None = None
 
     def read(self, path: Path, name: str, about: dict[str, str]) -> Recording:
         """Head, wrists and floor of a log."""
-        log = read_headset_log(path, self.axes, self.quaternion, self.hands, self.time_unit)
+        how = Conventions(unit=self.unit, axes=self.axes, quaternion=self.quaternion, hands=self.hands)
+        log = read_headset_log(path, how, self.time_unit)
         mount = pose_of(self.T_head_device, "T_head_device") or T_HEAD_DEVICE
         head = HeadStream(log.head.timestamps, log.head.R_world_body, log.head.t_world_body, mount.R, mount.t)
         notes = [
@@ -350,14 +365,25 @@ def headset_tasks(
     source = Path(source)
     if not source.exists():
         raise WearcapError("no such file or folder", where=source, fix="Give it as source=FILE or source=DIR.")
-    kinds = (".csv", ".json", ".jsonl", ".txt")
+    kinds = (".csv", ".tsv", ".json", ".jsonl", ".txt", ".bsor")
     found = [source]
-    if source.is_dir():
-        files = [path for path in sorted(source.rglob("*")) if path.is_file() and set(path.suffixes) & set(kinds)]
-        found = [path for path in files if is_headset_log(path)]
+    if source.is_dir() and not is_headset_session(source):
+        there = sorted(source.rglob("*"))
+        found = [path for path in there if path.is_dir() and path.name != "trackers" and is_headset_session(path)]
+        files = [path for path in there if path.is_file() and set(path.suffixes) & set(kinds)]
+        found += [path for path in files if not set(path.parents) & set(found) and is_headset_log(path)]
     if not found:
         raise WearcapError("no headset's log in this folder", source, "CSV or JSON with time, head_pos_x, …")
     return [_task("headset", path, _headset, splits, subject, license, settings) for path in found]
+
+
+def log_name(path: Path) -> str:
+    """A recording's name: its file's or folder's, or that of the folder above a usual one; replays are named after players."""
+    if path.suffix.lower() == ".bsor":
+        return f"replay_{content_hash(path)[:8]}"
+    name = path.resolve().name.split(".")[0] if path.is_file() else path.resolve().name
+    usual = ("images", "data", "poses", "trajectory", "closed_loop_trajectory", "trackers")
+    return path.resolve().parent.name if name in usual else name
 
 
 def _task(
@@ -371,11 +397,13 @@ def _task(
     files: Sequence[Path] = (),
 ) -> Task:
     """A task that is hashed by its files and settings, and named after its file or folder."""
-    name = path.resolve().name if path.is_dir() else path.name.split(".")[0]
-    if name in ("images", "data", "poses", "trajectory", "closed_loop_trajectory"):
-        name = path.resolve().parent.name
+    name = log_name(path)
     read = [path] if path.is_file() else [file for file in sorted(path.rglob("*")) if file.is_file()]
     small = [file for file in (*read, *files) if file.stat().st_size < 1 << 30]
     key = content_hash(kind, name, subject, license, asdict(settings), VERSION[kind], *small)
-    about = {"subject": subject, "license": license, "source": f"{kind} {path.name}"}
+    about = {
+        "subject": subject,
+        "license": license,
+        "source": f"{kind} {path.name if path.suffix != '.bsor' else name}",
+    }
     return Task(name or kind, partial(make, path, name or kind, about, settings), splits.of(subject), key)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import cache, partial
+from itertools import takewhile
 from pathlib import Path
 
 from wearcap.boundary.opening import understood
@@ -14,19 +15,21 @@ from wearcap.boundary.texts import numbered_lines
 from wearcap.errors import WearcapError, nearest
 from wearcap.io.datasets.amass import read_amass
 from wearcap.prepare.engine import NOTE, Splits, Task, content_hash, source_folder
-from wearcap.prepare.foreign import read_foreign_motion
+from wearcap.prepare.foreign import read_foreign_motion, straightest
 from wearcap.prepare.foreign_conventions import Mapping, read_mapping
-from wearcap.prepare.foreign_files import asf_beside
+from wearcap.prepare.foreign_files import Take, asf_beside
 from wearcap.prepare.levels import Levels, levels_in
 from wearcap.prepare.mocap import About, MocapSettings, mocap_recording
 from wearcap.recording.recording import Recording
 
-CMU_VERSION, BVH_VERSION, AMASS_VERSION = 3, 1, 2
+CMU_VERSION, BVH_VERSION, AMASS_VERSION = 3, 2, 2
 """Versions of the conversions, increased when the same source and settings yield another recording."""
 
 MOTION_SUFFIXES = (".amc", ".amc.xz", ".amc.gz", ".bvh", ".bvh.xz", ".bvh.gz")
 LEVEL_TRIALS = 6
 """Number of a subject's trials from which the tilts of head and feet are estimated."""
+SIBLINGS, SIBLING_FRAMES = 24, 150
+"""Number of a subject's BVH files that are looked through for `LEVEL_TRIALS` straight ones, and of frames used of each."""
 
 NO_MOTION = ("shape.npz", "stagei.npz")
 """Name suffixes of AMASS's files that hold no motion."""
@@ -43,11 +46,12 @@ def _foreign_recording(
 ) -> Recording:
     """One file of motion, fitted to its joints; what was detected is kept in the motion's provenance as `conventions`.
 
-    The tilts of head and feet are estimated from `same_subject`, trials of the same subject and skeleton file. Raises
-    WearcapError for an AMC file without a skeleton.
+    The tilts of head and feet, and a BVH file's axes, are estimated from `same_subject`, trials of the same subject.
+    Raises WearcapError for an AMC file without a skeleton.
     """
     levels = None if asf is None else _levels(asf, same_subject, amc_fps)
-    read = read_foreign_motion(file, mapping, amc_fps=amc_fps, asf=asf, levels=levels)
+    siblings = _siblings(same_subject, tuple(mapping.joints.items())) if asf is None else ()
+    read = read_foreign_motion(file, mapping, amc_fps=amc_fps, asf=asf, levels=levels, siblings=siblings)
     recording = mocap_recording(read.motion, about, settings)
     assert recording.motion is not None
     known = recording.motion.provenance
@@ -66,6 +70,12 @@ def _levels(asf: Path, files: tuple[Path, ...], amc_fps: float | int) -> Levels 
             read = read_foreign_motion(file, amc_fps=amc_fps, asf=asf, levels=Levels(None, {}))
             motions.append(read.motion)
     return levels_in(motions) if motions else None
+
+
+@cache
+def _siblings(files: tuple[Path, ...], joints: tuple[tuple[str, str], ...]) -> tuple[Take, ...]:
+    """A subject's clips in which people stand straight."""
+    return straightest(files, Mapping(dict(joints)), LEVEL_TRIALS, SIBLING_FRAMES)
 
 
 def cmu_tasks(
@@ -158,23 +168,35 @@ def _motion_tasks(
     version: int,
 ) -> list[Task]:
     skeletons: dict[str, Path | None] = {}
-    same: dict[tuple[str, Path | None], list[Path]] = {}
+    groups: dict[str, tuple[str, Path | str | None]] = {}
+    same: dict[tuple[str, Path | str | None], list[Path]] = {}
     for name, path in trials.items():
-        skeletons[name] = None
-        if ".amc" in path.name.lower():
-            with suppress(WearcapError):  # raised again by the trial's own task
-                skeletons[name] = asf_beside(path)
-        same.setdefault((abouts[name].subject, skeletons[name]), []).append(path)
+        skeletons[name], skeleton = None, None
+        with suppress(WearcapError):  # raised again by the trial's own task
+            is_amc = ".amc" in path.name.lower()
+            skeletons[name] = asf_beside(path) if is_amc else None
+            skeleton = skeletons[name] if is_amc else _hierarchy(path)
+        groups[name] = (abouts[name].subject, skeleton)
+        same.setdefault(groups[name], []).append(path)
+    spread = {
+        group: tuple(files[:: -(-len(files) // (SIBLINGS if isinstance(group[1], str) else LEVEL_TRIALS))])
+        for group, files in same.items()
+    }
+    digests = {group: content_hash(*files) for group, files in spread.items()}
     tasks = []
     for name, path in trials.items():
         asf, about = skeletons[name], abouts[name]
-        others = same[about.subject, asf]
-        spread = tuple(others[:: -(-len(others) // LEVEL_TRIALS)]) if asf is not None else ()
-        make = partial(_foreign_recording, path, asf, about, amc_fps, mapping, settings, spread)
-        described = [asdict(about), asdict(settings), asdict(mapping), amc_fps, version]
-        sources = [path] if asf is None else [path, asf, *spread]
+        make = partial(_foreign_recording, path, asf, about, amc_fps, mapping, settings, spread[groups[name]])
+        described = [asdict(about), asdict(settings), asdict(mapping), amc_fps, version, digests[groups[name]]]
+        sources = [path] if asf is None else [path, asf]
         tasks.append(Task(name, make, splits.of(about.subject), content_hash(*described, *sources)))
     return tasks
+
+
+def _hierarchy(path: Path) -> str:
+    """Digest of a BVH file's joints and OFFSETs but for the root's place: equal for clips of one skeleton."""
+    lines = takewhile(lambda line: line.upper() != "MOTION", (line.strip() for _, line in numbered_lines(path)))
+    return content_hash("\n".join(lines).partition("CHANNELS")[2])
 
 
 def _subjects(source: Path, trials: dict[str, Path], subject: str | None) -> dict[str, str]:

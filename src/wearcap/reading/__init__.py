@@ -1,8 +1,10 @@
-"""Any file as a recording: prepared recordings, suits, motion capture, device folders and logs, recognised by content.
+"""Whatever a user has, read and examined.
 
-`any_file.py` has `read`; `stature.py` says whose body it is where the file does not.
+Open `any_file.py` first: the one table of readers by suffix and content; `kits.py` reads the logs of one session, and
+`examine.py` reports on everything in a path.
 """
 
-from wearcap.reading.any_file import read
+from wearcap.reading.any_file import load, read
+from wearcap.reading.examine import examine
 
-__all__ = ["read"]
+__all__ = ["examine", "load", "read"]

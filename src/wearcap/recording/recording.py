@@ -174,6 +174,8 @@ class Recording:
     interactions: Interactions | None = None
     floor: FloorTrack | None = None
     intervals: Intervals | None = None
+    origin: Float64[Tensor, "3"] | None = None
+    """What was taken off all positions (m): a map's coordinates are those here plus it; None where nothing was."""
     # about
     skeleton: Skeleton | None = None
     shape: dict[str, float] = field(default_factory=dict)

@@ -299,7 +299,8 @@ def load_recording(where: str | Path) -> Recording:
         raise WearcapError(what, path, f"one of them, such as {path / names[0] if names else path / 'NAME'}")
     if (path.parent / MANIFEST).is_file():
         return RecordingStore.open(path.parent).load(path.name)
-    raise WearcapError("no recording here", path, "DATASET/NAME or a .safetensors file that `wearcap prepare` wrote")
+    what = "no recording here" if path.exists() else "there is no such file, folder or recording"
+    raise WearcapError(what, path, "DATASET/NAME, or any file or folder that holds a recording")
 
 
 def dataset_folder(where: str | Path) -> Path:

@@ -11,11 +11,14 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.trajectory import Trajectory
+from wearcap.geometry.trajectory import Trajectory, linear_velocity
 from wearcap.recording.recording import ImuStream
 from wearcap.sensors.camera_alignment import SlamAlignment
 from wearcap.sensors.monocular_slam import by_floor, by_head_imu, clean_track, scale_by_walks
 from wearcap.sensors.stillness import Stretch, during
+
+MOST_DROPPED = 0.25
+"""Share of poses that may be outliers; more is no head's path."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ class SceneEvidence:
             scale_std = None
         if R is None or scale is None or not 0 < scale < 1e6:
             what = "the vertical" if R is None else "the unit of length"
-            fix = "Give points=PLY standing=[from,to] camera_height_m=METRES, head_imu=CSV, or scale=METRES_PER_UNIT."
+            fix = "Give unit=METRES; or find it: wearcap prepare trajectory with head_imu=, walks=, or points= and standing=."
             raise WearcapError(f"{what} of the camera's SLAM stays unknown", fix=fix)
         R = R.double()
         placed = scale * slam.t_world_body.double() @ R.mT
@@ -112,11 +115,19 @@ def align_cleaned(
 ) -> tuple[SlamAlignment, Trajectory, str]:
     """(alignment, the SLAM's path without outliers, a sentence on them).
 
-    Outliers are known in metres: a first alignment gives the unit, and is repeated without them.
+    Outliers are known in metres: a first alignment gives the unit, and is repeated without them. Raises WearcapError as
+    `align` does, and where most poses would be outliers: the unit is another one, or the times are.
     """
     first = align(slam)
     clean, kept, jumps = clean_track(slam, max_acceleration / first.scale, max_burst_s)
     dropped = int((~kept).sum())
+    if dropped > MOST_DROPPED * len(kept):
+        speed = first.scale * linear_velocity(slam).norm(dim=-1).median().item()
+        fix = "Say the unit of length and of times, such as unit=0.01 for centimetres, time_unit=ms."
+        what = (
+            f"{dropped} of {len(kept)} poses accelerate as no head does; half of them are faster than {speed:.3g} m/s"
+        )
+        raise WearcapError(what, expected="a head's path in metres and seconds", fix=fix)
     notes = [f"{dropped} outliers of {len(kept)} camera poses removed"] if dropped else []
     if len(jumps):
         notes.append(f"{len(jumps)} jumps of the SLAM to another place stay, the first at {jumps[0].item():.2f} s")

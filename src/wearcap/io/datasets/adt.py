@@ -1,6 +1,6 @@
 """Aria Digital Twin (ADT) sequences: head trajectory, tracked body joints and objects from CSV and JSON files.
 
-The files' world has y up (gravity along -y); here it is turned to z up, x staying x.
+The files' world has y up (gravity along -y; sequences of version 1 may have z up); here it is turned to z up, x staying x.
 """
 
 from pathlib import Path
@@ -41,20 +41,20 @@ def read_adt(folder: str | Path) -> Recording:
     folder = Path(folder)
     if not is_adt(folder):
         raise WearcapError("no aria_trajectory.csv", folder, "an ADT sequence folder")
-    trajectory = read_closed_loop(folder / "aria_trajectory.csv", up="y")[0]
+    path = read_closed_loop(folder / "aria_trajectory.csv")
     skeletons = sorted(folder.glob("Skeleton_*.json"))
     metadata = folder / "metadata.json"
     return Recording(
         name=folder.resolve().name,
-        head=head_stream(trajectory, fps=None, where=folder),
-        cues=read_skeleton(skeletons[0]) if skeletons else {},
-        object_motion=read_moving_objects(folder) if (folder / "scene_objects.csv").is_file() else {},
+        head=head_stream(path.trajectory, fps=None, where=folder),
+        cues=read_skeleton(skeletons[0], path.up) if skeletons else {},
+        object_motion=read_moving_objects(folder, path.up) if (folder / "scene_objects.csv").is_file() else {},
         location=str(read_json_object(metadata).get("scene", "")) if metadata.is_file() else "",
         source="Aria Digital Twin",
     )
 
 
-def read_skeleton(path: str | Path) -> dict[str, Cue]:
+def read_skeleton(path: str | Path, up: str = "y") -> dict[str, Cue]:
     """3D cues by joint name from `Skeleton_*.json` (120 Hz). Raises WearcapError for other joint counts or NaN."""
     with understood("not an ADT skeleton", path, "frames with timestamp_ns and joints"):
         frames = read_json_object(path)["frames"]
@@ -64,12 +64,12 @@ def read_skeleton(path: str | Path) -> dict[str, Cue]:
         raise WearcapError(f"joints of shape {joints.shape}", path, f"(frames, {_JOINTS}, 3)")
     check_finite({"joints": joints}, path)
     check_rising(times, path)
-    world = torch.tensor(joints, dtype=torch.float32) @ turn_up("y").T
+    world = torch.tensor(joints, dtype=torch.float32) @ turn_up(up).T
     timestamps, sure = torch.from_numpy(times), torch.ones(len(times))
     return {name: Cue(timestamps, name, world[:, row], sure) for name, row in _BODY.items()}
 
 
-def read_moving_objects(folder: str | Path) -> dict[str, Trajectory]:
+def read_moving_objects(folder: str | Path, up: str = "y") -> dict[str, Trajectory]:
     """Poses of the objects that move, in the z-up world, from instances.json, 3d_bounding_box.csv and scene_objects.csv.
 
     Raises WearcapError for missing or malformed files; objects without a pose or box are left out, as are those with a
@@ -99,7 +99,7 @@ def read_moving_objects(folder: str | Path) -> dict[str, Trajectory]:
         last = 1 if timeless else len(rows)
         table = np.stack([poses[axis][rows] for axis in axes], 1)[:last]
         track = checked_trajectory(times[:last], table[:, :3], table[:, 3:], path)
-        T_world_obj = Rigid(turn_up("y"), torch.zeros(3)) @ track.T_world_body
+        T_world_obj = Rigid(turn_up(up), torch.zeros(3)) @ track.T_world_body
         if about.get("motion_type") == "dynamic" and not timeless:
             found[str(about.get("instance_name", name))] = Trajectory(track.timestamps, T_world_obj.R, T_world_obj.t)
     return found

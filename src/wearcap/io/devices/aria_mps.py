@@ -6,6 +6,7 @@ Frames: `aria` is MPS's own device frame (on Gen 1 glasses the left SLAM camera)
 """
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,7 +16,7 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
-from wearcap.io.formats.csv_table import iter_columns, read_columns
+from wearcap.io.formats.csv_table import iter_columns, read_columns, read_header
 from wearcap.io.formats.poses import check_finite, checked_trajectory
 from wearcap.recording import HeadStream, PointCloud, Recording
 
@@ -50,18 +51,29 @@ def nominal_T_aria_cpf() -> Rigid:
     return T_cpf_aria.inverse().to(torch.float32)
 
 
-def read_closed_loop(path: str | Path, *, up: str = "z") -> tuple[Trajectory, Float[Tensor, "time"]]:
-    """Read `closed_loop_trajectory.csv` (plain, .gz, .xz), the world's axis `up` ("z"; ADT: "y") turned to z.
+class ClosedLoop(NamedTuple):
+    """A closed-loop trajectory in a world with z up."""
 
-    Gives the poses of the `aria` frame, and MPS' quality score of each, 0 … 1.
+    trajectory: Trajectory
+    """Poses of the `aria` frame."""
+    quality: Float[Tensor, "time"]
+    """MPS' score of each pose, 0 … 1."""
+    up: str
+    """The file's own axis that is up, by its gravity: "z", or "y" (ADT)."""
 
-    Raises WearcapError for missing columns, NaN, unsorted times, quaternions far from unit norm, gravity that does
-    not point against `up`, and several unconnected world frames.
+
+def read_closed_loop(path: str | Path) -> ClosedLoop:
+    """Read `closed_loop_trajectory.csv` (plain, .gz, .xz), the world's axis that its gravity shows to be up turned to z.
+
+    Raises WearcapError for missing columns, NaN, unsorted times, quaternions far from unit norm, gravity that points
+    along neither -y nor -z, and several unconnected world frames.
     """
+    header = read_header(path)
     pose = [f"{part}_world_device" for part in ("tx", "ty", "tz", "qw", "qx", "qy", "qz")]
     velocity = [f"device_linear_velocity_{axis}_device" for axis in "xyz"]
     spin = [f"angular_velocity_{axis}_device" for axis in "xyz"]
-    gravity = [f"gravity_{axis}_world" for axis in "xyz"]
+    old = "gravity_x" in header and "gravity_x_world" not in header  # before MPS 1.0
+    gravity = [f"gravity_{axis}" if old else f"gravity_{axis}_world" for axis in "xyz"]
     time, quality = "tracking_timestamp_us", "quality_score"
     table = read_columns(path, [time, *pose, *velocity, *spin, *gravity, quality], text=["graph_uid"])
     columns = {
@@ -78,14 +90,14 @@ def read_closed_loop(path: str | Path, *, up: str = "z") -> tuple[Trajectory, Fl
     if not 9.7 < length < 9.9:
         raise WearcapError(f"gravity is {length:.2f} m/s² long", path, "9.81 m/s²")
     upward = -mean / length
-    if upward["xyz".index(up)] < 0.99:
-        axis = "xyz"[int(np.abs(upward).argmax())]
-        sign = "-" if upward["xyz".index(axis)] < 0 else "+"
-        fix = "Read it with up='y'." if (axis, sign) == ("y", "+") else "Rotate the world, or fix gravity's sign."
-        raise WearcapError(f"gravity {mean.round(2).tolist()} shows that {sign}{axis} is up", path, f"+{up} up", fix)
+    up = "xyz"[int(upward.argmax())]
+    if up == "x" or upward.max() < 0.99:
+        fix = "Rotate the world, or fix gravity's sign."
+        raise WearcapError(f"gravity points along {mean.round(2).tolist()}", path, "-z, or -y", fix)
     trajectory = checked_trajectory(table[time] * 1e-6, columns["pose"][:, :3], columns["pose"][:, 3:], path)
     T_turned = Rigid(turn_up(up), torch.zeros(3)) @ trajectory.T_world_body
-    return Trajectory(trajectory.timestamps, T_turned.R, T_turned.t), torch.tensor(table[quality], dtype=torch.float32)
+    turned = Trajectory(trajectory.timestamps, T_turned.R, T_turned.t)
+    return ClosedLoop(turned, torch.tensor(table[quality], dtype=torch.float32), up)
 
 
 def turn_up(up: str) -> Float[Tensor, "3 3"]:

@@ -1,435 +1,131 @@
-"""Logs of headsets (OpenXR applications, Unity, SteamVR): poses of the head and of two hands or controllers, as CSV or JSON.
+"""Logs of headsets (OpenXR applications, Unity, SteamVR): poses of the head and of two hands or controllers.
 
-Names of columns are taken apart ("head_pos_x", "headPosX", "HMD.position.x", "LeftController Rotation W"): a device (head,
-left or right), a quantity (position, quaternion, matrix) and a component. JSON is an object or a list of frames, or one
-object a line; nested keys become such names, and arrays of 3, 4, 12 or 16 numbers their components. Rows in which a hand
-is not tracked (empty, null, or all zero) are left out of its path.
+A log is a CSV or JSON file, a replay of Beat Saber, or a session's folder with a file per device (UXF's with one per
+tracker and trial, too). Rows in which a hand is not tracked are left out of its path. Who wore it is not read.
 """
 
-import csv
-import math
 import re
-from array import array
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
-from itertools import islice
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
 
-from wearcap.body.skeleton import WRISTS
-from wearcap.boundary.limits import LIMITS
-from wearcap.boundary.opening import open_bytes, understood
-from wearcap.boundary.texts import numbered_lines, parse_json, read_json
+from wearcap.boundary.opening import open_bytes
 from wearcap.errors import WearcapError
-from wearcap.geometry.rotation import matrix_from_quat_wxyz
-from wearcap.geometry.trajectory import Trajectory
-from wearcap.io.devices.axes import CONVENTIONS, detected_convention, turned, wrist_of_hand
-from wearcap.io.formats.poses import check_finite, checked_trajectory
-from wearcap.io.formats.trajectory import UNITS, check_span, time_unit_of
+from wearcap.io.conventions import AUTO, Conventions
+from wearcap.io.devices.headset_axes import PALM_M, HeadsetLog, in_our_axes
+from wearcap.io.devices.headset_poses import ARKIT, UNITY_ANGLES, UNREAL_ANGLES, raw_poses
+from wearcap.io.devices.headset_tables import (
+    DeviceRows,
+    PoseColumns,
+    RawPoses,
+    device_named,
+    has_poses,
+    parts_of,
+    read_rows,
+)
+from wearcap.io.formats.bsor import is_bsor, read_bsor
+from wearcap.io.formats.trajectory import UNITS
 
-PALM_M = 0.08
-"""Distance (m) of a held controller's origin, the palm's middle, from the wrist (nominal)."""
-ORDERS = ("xyzw", "wxyz")
-HANDS = ("wrist", "grip")
-_DEVICES = {
-    "head": {"head", "hmd", "headset", "camera", "centereye", "eye", "view", "viewer"},
-    "left_wrist": {"left", "l", "lefthand", "leftcontroller", "leftwrist", "lhand"},
-    "right_wrist": {"right", "r", "righthand", "rightcontroller", "rightwrist", "rhand"},
-}
-_POSITION = {"pos", "position", "p", "loc", "location", "translation", "trans", "t", "origin"}
-_ROTATION = {"rot", "rotation", "quat", "quaternion", "orientation", "orient", "q", "ori"}
-_MATRIX = {"matrix", "mat", "m", "transform"}
-_TIME = {
-    "time",
-    "timestamp",
-    "timestamps",
-    "t",
-    "ts",
-    "seconds",
-    "sec",
-    "elapsed",
-    "predicteddisplaytime",
-    "displaytime",
-}
-_OTHER = {
-    "velocity",
-    "vel",
-    "angular",
-    "acceleration",
-    "acc",
-    "accel",
-    "euler",
-    "gaze",
-    "joystick",
-    "thumbstick",
-    "trigger",
-}
-_UNIT_WORDS = {"s": "s", "sec": "s", "seconds": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"}
-_MAX_COLUMNS = LIMITS["log"].items
+__all__ = ["PALM_M", "HeadsetLog", "is_headset_log", "is_headset_session", "read_headset_log"]
+_TABLES = {".csv", ".tsv", ".txt", ".json", ".jsonl"}
+_MOST_FILES = 2000
+_DETECTED = Conventions()
+_AXES_OF_NAMES = (({"hololens"}, "openxr"), ({"viewer", "orientation"}, "openxr"), (ARKIT, "openxr"))
+"""Conventions that a recorder fixes, by words of its columns: HoloLens2ForCV's, WebXR's, visionOS'."""
+_AXES_OF_ANGLES = {UNITY_ANGLES: ("unity", "openxr", "steamvr"), UNREAL_ANGLES: ("unreal",)}
+_TRIAL = re.compile(r"(?i)_?(?:t|trial_?)\d+$")
 
 
-@dataclass(frozen=True)
-class HeadsetLog:
-    """Paths of a headset and of the wearer's wrists in wearcap's axes, and how the log was understood."""
+def read_headset_log(path: str | Path, how: Conventions = _DETECTED, time_unit: str | None = None) -> HeadsetLog:
+    """A headset's log; what `how` states of its conventions, and `time_unit` (s, ms, us, ns), override what is detected.
 
-    head: Trajectory
-    wrists: dict[str, Trajectory]
-    """By joint; those that the log has."""
-    axes: str
-    floor: bool
-    """Whether the world's origin lies on the floor, as the head's height shows."""
-    notes: tuple[str, ...]
-    """What was detected or left out, a sentence each."""
-
-
-@dataclass
-class _Columns:
-    """Places of a device's numbers: of position and quaternion, or of a matrix' rows."""
-
-    position: dict[str, Any] = field(default_factory=dict)
-    quaternion: dict[str, Any] = field(default_factory=dict)
-    matrix: dict[int, Any] = field(default_factory=dict)
-    words: set[str] = field(default_factory=set)
-
-    @property
-    def complete(self) -> bool:
-        named = set(self.quaternion) in (set("xyzw"), set("0123"))
-        return (set(self.position) == set("xyz") and named) or self.as_matrix
-
-    @property
-    def as_matrix(self) -> bool:
-        """Whether the pose is given as rows of [R | t]."""
-        return set(self.matrix) in (set(range(12)), set(range(16)))
-
-    def places(self) -> list[Any]:
-        if self.as_matrix:
-            return [self.matrix[number] for number in sorted(self.matrix)][:12]
-        numbered = all(name.isdecimal() for name in self.quaternion)
-        names = "0123" if numbered else "xyzw"
-        return [*(self.position[name] for name in "xyz"), *(self.quaternion[name] for name in names)]
-
-
-def read_headset_log(
-    path: str | Path, axes: str = "auto", quaternion: str = "auto", hands: str = "auto", time_unit: str | None = None
-) -> HeadsetLog:
-    """A headset's log; `axes` (unity, openxr, steamvr), the `quaternion`'s order (xyzw, wxyz), what the `hands`' poses
-    are (wrist: OpenXR's hand joint; grip: a controller's), and `time_unit` (s, ms, us, ns) override what is detected.
-
-    Raises WearcapError for a file without a headset's poses and times, numbers that are none, rows of the head that
-    repeat or go back in time (named by line), and where nothing in the log determines a convention.
+    Trials of a session are one recording, with gaps between them. Raises WearcapError for a file without a headset's
+    poses and times, numbers that are none, and where nothing in the log determines a convention.
     """
-    for name, value, allowed in (
-        ("axes", axes, CONVENTIONS),
-        ("quaternion", quaternion, ORDERS),
-        ("hands", hands, HANDS),
-    ):
-        if value not in ("auto", *allowed):
-            raise WearcapError(f"{name}={value!r}", expected=f"one of auto, {', '.join(allowed)}")
+    poses, convention, notes = read_raw_poses(Path(path), time_unit, how.axes)
+    log = in_our_axes(poses, how, str(path), convention)
+    for angles, allowed in _AXES_OF_ANGLES.items():
+        if angles in notes and log.axes not in allowed:
+            fix = "Say which axes the log has (axes=unity|unreal|openxr), or log quaternions."
+            raise WearcapError(f"{angles}, but axes {log.axes}", path, f"axes {', '.join(allowed)}", fix)
+    return replace(log, notes=(*notes, *log.notes))
+
+
+def read_raw_poses(
+    path: Path, time_unit: str | None = None, axes: str = AUTO
+) -> tuple[dict[str, RawPoses], str | None, list[str]]:
+    """Poses of a log as they stand there, the axes that its format fixes, and notes. Raises as `read_headset_log` does."""
     if time_unit not in (None, *UNITS):
         raise WearcapError(f"time_unit={time_unit!r}", expected=f"one of {', '.join(UNITS)}")
-    path = Path(path)
-    rows, where = _rows(path)
-    names = next(rows)
-    time_name, devices = _devices(names, path)
-    times, tables, numbers = _tables(rows, names[time_name], devices, where, path)
-    check_finite({"time": times}, path, lambda row: f"{where} {numbers[row]}")
-    unit = time_unit or time_unit_of(times, _unit_of(time_name), path)
-    order, notes = _order(tables["head"], devices["head"], quaternion)
-    poses: dict[str, Trajectory] = {}
-    for joint, table in tables.items():
-        seen = _seen(table)
-        lost = int((~seen).sum())
-        if joint == "head" and not seen.any():
-            raise WearcapError("no tracked pose of the headset", path, "positions and quaternions")
-        if lost:
-            notes.append(f"{joint} is not tracked in {lost} of {len(seen)} rows")
-        if seen.sum() < 2 and joint != "head":
-            continue
-        kept = np.flatnonzero(seen)
-        poses[joint] = _path(table[seen], times[seen] * UNITS[unit], order, path, f"{where} ", numbers[kept])
-    check_span(poses["head"].timestamps.numpy(), path, lambda row: f"pose {row + 1} of the head")
-    return _in_our_axes(poses, devices, axes, hands, f"times in {unit}", notes, path)
+    convention, notes = None, []
+    if path.is_dir():
+        files, by_trials = _session(path)
+        if "head" not in files:
+            raise WearcapError("no session of a headset", path, "a file per device: head, left, right")
+        rows = {joint: _joined([read_rows(file, joint)[joint] for file in files[joint]], path) for joint in files}
+        if by_trials:
+            convention, count = "unity", len(files["head"])
+            notes = [f"{count} trials of a UXF session in one recording" if count > 1 else "a trial of a UXF session"]
+    elif is_bsor(path):
+        rows, convention, time_unit = _replay(path), "unity", "s"
+    else:
+        rows = read_rows(path)
+        convention = next((axes for words, axes in _AXES_OF_NAMES if words <= rows["head"].columns.words), None)
+    poses, mended = raw_poses(rows, time_unit, axes, path)
+    usual = next((allowed[0] for angles, allowed in _AXES_OF_ANGLES.items() if angles in mended), None)
+    return poses, convention or usual, mended + notes
 
 
 def is_headset_log(path: str | Path) -> bool:
-    """Whether a CSV or JSON file names a headset's poses and times; raises WearcapError only for one that cannot be opened."""
+    """Whether a file names a headset's poses and times; raises WearcapError only for one that cannot be opened."""
     with open_bytes(path) as file:
         begin = file.read(1 << 12)
-    if b"\0" in begin:
-        return False
-    try:
-        rows, _ = _rows(Path(path))
-        _devices(next(rows), path)
-    except (WearcapError, StopIteration):
-        return False
-    return True
+    return is_bsor(Path(path)) if b"\0" in begin else has_poses(Path(path))
 
 
-# --- rows and names ------------------------------------------------------------------------------------------------
+def is_headset_session(folder: str | Path) -> bool:
+    """Whether a folder holds a session of a headset: a file per device, of the head at least."""
+    return Path(folder).is_dir() and "head" in _session(Path(folder))[0]
 
 
-def _rows(path: Path) -> tuple[Iterator[Any], str]:
-    """First the names of the columns, then (number, row by place) of each row; and what a message calls a row."""
-    first = next((line.lstrip() for _, line in numbered_lines(path) if line.strip()), "")
-    if first.startswith(("{", "[")):
-        return _json_rows(path, first), "frame"
-    return _csv_rows(path), "line"
+def _session(folder: Path) -> tuple[dict[str, list[Path]], bool]:
+    """Files of each device in the order of their trials, and whether they are UXF's; none where two claim one device."""
+    trackers = folder / "trackers"
+    files: dict[str, list[Path]] = {}
+    for file in sorted((trackers if trackers.is_dir() else folder).iterdir())[:_MOST_FILES]:
+        joint = device_named(parts_of(_TRIAL.sub("", file.name.split(".")[0])))
+        if joint and file.is_file() and set(file.suffixes) & _TABLES and has_poses(file, joint):
+            files.setdefault(joint, []).append(file)
+    trials = all(_TRIAL.search(file.name.split(".")[0]) for of in files.values() for file in of)
+    if not trials and any(len(of) > 1 for of in files.values()):
+        return {}, False
+    return dict(sorted(files.items())), bool(files) and trials
 
 
-def _csv_rows(path: Path) -> Iterator[Any]:
-    lines = ((number, line) for number, line in numbered_lines(path) if line.strip() and not line.startswith("#"))
-    header = next(lines, None)
-    if header is None:
-        raise WearcapError("no rows", path, "a header line with column names")
-    separator = max(",;\t", key=header[1].count)
-    with understood("a header that is no row of names", path, errors=csv.Error):
-        names = [name.strip() for name in next(csv.reader([header[1]], delimiter=separator))][:_MAX_COLUMNS]
-    yield {name: place for place, name in enumerate(names)}
-    for number, line in lines:
-        row = line.rstrip("\r\n").split(separator)
-        if len(row) < len(names):
-            raise WearcapError(f"line {number} has {len(row)} fields", path, f"{len(names)}, as the header")
-        yield number, row
+def _joined(parts: list[DeviceRows], path: Path) -> DeviceRows:
+    """Rows of trials one after the other; the columns of times that all of them have."""
+    first = parts[0]
+    if any(part.values.shape[1] != first.values.shape[1] for part in parts):
+        raise WearcapError("trials of different columns", path, "the same columns in each")
+    return replace(
+        first,
+        values=np.concatenate([part.values for part in parts]),
+        clocks={
+            name: np.concatenate([part.clocks[name] for part in parts])
+            for name in first.clocks
+            if all(name in part.clocks for part in parts)
+        },
+        rows=np.concatenate([part.rows for part in parts]),
+    )
 
 
-def _json_rows(path: Path, first: str) -> Iterator[Any]:
-    """Frames of a JSON list, of the longest list of objects in an object, or of one object a line."""
-    by_line = first.startswith("{") and first.rstrip().endswith("}") and _several(path)
-    frames: Iterable[Any]
-    if by_line:
-        frames = (parse_json(line, f"{path}, line {number}") for number, line in numbered_lines(path) if line.strip())
-    else:
-        content = read_json(path)
-        if isinstance(content, dict):
-            lists = [value for value in content.values() if isinstance(value, list)]
-            content = max(lists, key=len, default=[])
-        frames = content if isinstance(content, list) else []
-    iterator = iter(frames)
-    begin = list(islice(iterator, 50))
-    if not begin or not all(isinstance(frame, dict) for frame in begin):
-        raise WearcapError("no frames", path, "a list of objects with the poses of a headset")
-    names: dict[str, None] = {}
-    for frame in begin:
-        names |= dict.fromkeys(_flat(frame))
-    yield {name: name for name in names}
-    number = 0
-    for frames in (begin, iterator):
-        for frame in frames:
-            number += 1
-            if not isinstance(frame, dict):
-                raise WearcapError(f"frame {number} is a {type(frame).__name__}", path, "an object with poses")
-            yield number, _flat(frame)
-
-
-def _several(path: Path) -> bool:
-    return sum(1 for _ in islice((1 for _, line in numbered_lines(path) if line.strip()), 2)) > 1
-
-
-def _flat(value: Any, key: str = "", depth: int = 0) -> dict[str, Any]:
-    """Numbers of nested objects and short arrays by dotted name; the arrays' places are their last part."""
-    if depth > 8:
-        return {}
-    if isinstance(value, list):
-        value = dict(enumerate(value)) if len(value) in (3, 4, 12, 16) else {}
-    if not isinstance(value, dict):
-        return {key: value}
-    found: dict[str, Any] = {}
-    for name, item in value.items():
-        found |= _flat(item, f"{key}.{name}" if key else str(name), depth + 1)
-        if len(found) > _MAX_COLUMNS:
-            break
-    return found
-
-
-def _parts(name: str) -> list[str]:
-    """Lower-case words and numbers of a column's name; a unit in brackets is left out."""
-    plain = re.sub(r"[\[(][^\[\]()]*[\])]", " ", name)
-    split = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", plain)
-    return [word.lower() for word in re.findall(r"[A-Za-zµ]+|\d+", split)]
-
-
-def _devices(names: dict[str, Any], where: str | Path) -> tuple[str, dict[str, _Columns]]:
-    """Name of the column of time, and each device's columns by joint; a head with a pose is required."""
-    found = {joint: _Columns() for joint in ("head", *WRISTS)}
-    times: list[tuple[int, str]] = []
-    for name in names:
-        parts = _parts(name)
-        device = _device_of(parts)
-        if device is None:
-            if set(parts) & _TIME:
-                times.append((len(parts), name))
-            continue
-        _sort_in(found[device], name, names[name], parts)
-    missing = [joint for joint, columns in found.items() if not columns.complete]
-    if "head" in missing or not times:
-        what = "no column of time" if "head" not in missing else "no pose of a headset"
-        shown = ", ".join(list(names)[:8])
-        expected = "time, head_pos_x … z, head_rot_x … w, and the same for left and right"
-        raise WearcapError(f"{what} among the columns {shown}"[:300], where, expected)
-    return min(times)[1], {joint: columns for joint, columns in found.items() if joint not in missing}
-
-
-def _device_of(parts: Sequence[str]) -> str | None:
-    for joint, words in (("left_wrist", _DEVICES["left_wrist"]), ("right_wrist", _DEVICES["right_wrist"])):
-        if set(parts[:-1]) & words:
-            return None if "eye" in parts else joint
-    return "head" if set(parts[:-1]) & _DEVICES["head"] else None
-
-
-def _sort_in(columns: _Columns, name: str, place: Any, parts: list[str]) -> None:
-    """Enter a column under its quantity and component."""
-    words, last = set(parts[:-1]), parts[-1]
-    if words & _OTHER:
-        return
-    joints = {"thumb", "index", "middle", "ring", "little", "pinky", "palm", "tip", "metacarpal", "elbow"}
-    if words & joints:
-        return
-    glued = re.fullmatch(r"(pos|position|p|rot|rotation|quat|q|m)([xyzw]|\d\d?)", last)
-    if glued:
-        words, last = words | {glued[1]}, glued[2]
-    if words & _MATRIX and last.isdecimal():
-        number = (
-            4 * int(last[0]) + int(last[1])
-            if len(last) == 2 and name.lower().rstrip().endswith("m" + last)
-            else int(last)
-        )
-        columns.matrix.setdefault(number, place)
-    elif last in ("x", "y", "z", "w") or last.isdecimal():
-        axis = last if not last.isdecimal() else ("xyz"[int(last)] if int(last) < 3 else "")
-        if words & _ROTATION or last == "w":
-            columns.quaternion.setdefault(last, place)
-        elif (words & _POSITION or last in "xyz") and axis:
-            columns.position.setdefault(axis, place)
-    columns.words |= set(parts)
-
-
-def _unit_of(name: str) -> str | None:
-    """Unit that a column's name gives, in brackets or as its last word."""
-    found = re.search(r"[\[(]\s*(\w+)\s*[\])]", name)
-    words = _parts(name)
-    return _UNIT_WORDS.get(found[1].lower()) if found else _UNIT_WORDS.get(words[-1]) if len(words) > 1 else None
-
-
-# --- numbers -------------------------------------------------------------------------------------------------------
-
-
-def _tables(
-    rows: Iterator[Any], time_place: Any, devices: dict[str, _Columns], where: str, path: Path
-) -> tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]:
-    """Times, each device's numbers, and the rows' numbers; what is missing is NaN, a row without time is left out."""
-    places = {joint: columns.places() for joint, columns in devices.items()}
-    times, numbers, values = array("d"), array("q"), {joint: array("d") for joint in devices}
-    for number, row in rows:
-        read = row.get if isinstance(row, dict) else row.__getitem__
-        label = f"{where} {number}"
-        time = _value(read(time_place), "time", label, path)
-        if math.isnan(time) and isinstance(row, dict):
-            continue  # a frame of another kind
-        times.append(time)
-        numbers.append(number)
-        for joint, wanted in places.items():
-            values[joint].extend([_value(read(place), joint, label, path) for place in wanted])
-    if not times:
-        raise WearcapError("a header, but no rows", path, "a row for each frame")
-    tables = {joint: np.asarray(column).reshape(len(times), -1) for joint, column in values.items()}
-    return np.asarray(times), tables, np.asarray(numbers)
-
-
-def _value(value: Any, name: str, label: str, path: Path) -> float:
-    """A field as a number; empty ones are NaN."""
-    if isinstance(value, str):
-        value = value.strip()
-    if value is None or value == "":
-        return math.nan
-    try:
-        if isinstance(value, bool):
-            raise ValueError
-        return float(value)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise WearcapError(f"{label}: {str(value)[:30]!r} of {name} is no number", path, "numbers") from error
-
-
-def _seen(table: np.ndarray) -> np.ndarray:
-    """Rows with a pose: finite, and not the zeros that runtimes write for what they do not see."""
-    finite = (np.abs(table) < 1e6).all(1)
-    if table.shape[1] == 12:
-        return finite & (np.abs(np.linalg.norm(table.reshape(-1, 3, 4)[:, :, 0], axis=1) - 1) < 0.5)
-    lost = (table[:, :3] == 0).all(1) & (np.isclose(np.abs(table[:, 3:]).max(1), 1) | (table[:, 3:] == 0).all(1))
-    return finite & ~lost & (np.abs(np.linalg.norm(table[:, 3:], axis=1)) > 0.5)
-
-
-def _order(head: np.ndarray, columns: _Columns, quaternion: str) -> tuple[str, list[str]]:
-    """Order of the quaternions and a note; in unnamed ones, that in which the head is more upright."""
-    if columns.as_matrix:
-        return "matrix", ["poses as matrices"]
-    if "x" in columns.quaternion:
-        return "xyzw", []
-    if quaternion != "auto":
-        return quaternion, [f"quaternions {quaternion} as given"]
-    if written := next((order for order in ORDERS if order in columns.words), None):
-        return written, [f"quaternions {written} as named"]
-    values = head[_seen(head)][:, 3:]
-    values = values / np.linalg.norm(values, axis=1, keepdims=True).clip(1e-9)
-    upright = {}
-    for order in ORDERS:
-        x, z = (values[:, order.index(axis)] for axis in "xz")
-        upright[order] = float((1 - 2 * (x**2 + z**2)).mean()) if len(values) else 0.0
-    best = max(ORDERS, key=lambda order: upright[order])
-    return best, [f"quaternions {best} (the head is upright by {upright[best]:.2f}, else {min(upright.values()):.2f})"]
-
-
-def _path(
-    table: np.ndarray, seconds: np.ndarray, order: str, path: Path, label: str, numbers: np.ndarray
-) -> Trajectory:
-    """A device's path in the log's own axes; rows are named by their numbers."""
-    if order == "matrix":
-        rows = torch.from_numpy(table.reshape(-1, 3, 4))
-        U, _, V = torch.linalg.svd(rows[:, :, :3])
-        R = U @ V
-        if (torch.linalg.det(R) < 0).any() or ((R - rows[:, :, :3]).abs() > 0.05).any():
-            raise WearcapError("matrices that are no rotations", path, "rows of [R | t], orthogonal within 5 %")
-        unit = np.tile([1.0, 0.0, 0.0, 0.0], (len(table), 1))
-        checked = checked_trajectory(seconds, table[:, 3::4], unit, path, lambda row: f"{label}{numbers[row]}")
-        return Trajectory(checked.timestamps, R.float(), checked.t_world_body)
-    quat = table[:, 3:][:, [order.index(axis) for axis in "wxyz"]]
-    track = checked_trajectory(seconds, table[:, :3], quat, path, lambda row: f"{label}{numbers[row]}")
-    return Trajectory(track.timestamps, matrix_from_quat_wxyz(torch.tensor(quat)).float(), track.t_world_body)
-
-
-def _in_our_axes(
-    poses: dict[str, Trajectory],
-    devices: dict[str, _Columns],
-    axes: str,
-    hands: str,
-    about: str,
-    notes: list[str],
-    path: Path,
-) -> HeadsetLog:
-    """Everything in wearcap's axes, hands as wrists, with the notes on what was detected."""
-    held = {joint: track for joint, track in poses.items() if joint != "head"}
-    if axes == "auto":
-        axes, evidence = detected_convention(poses["head"], held, str(path))
-        other = " (SteamVR's are the same)" if axes == "openxr" else ""
-        notes.insert(
-            0, f"axes {axes}{other}: it {evidence}" if "walk" in evidence else f"axes {axes}{other}: {evidence}"
-        )
-    else:
-        notes.insert(0, f"axes {axes} as given")
-    head, wrists = turned(poses["head"], axes), {}
-    for joint, track in held.items():
-        kind = hands if hands != "auto" else "wrist" if "wrist" in devices[joint].words else "grip"
-        moved = turned(track, axes)
-        R = wrist_of_hand(moved.R_world_body, joint, kind)
-        t = moved.t_world_body - (PALM_M * moved.R_world_body[:, :, 2] if kind == "grip" else 0.0)
-        wrists[joint] = Trajectory(moved.timestamps, R, t)
-        notes.append(f"{joint} from {'the hand joint' if kind == 'wrist' else 'the controller (grip pose)'}")
-    height = float(np.percentile(head.t_world_body[:, 2].numpy(), 90))
-    floor = 0.9 < height < 2.2
-    if floor:
-        notes.append(f"the origin is on the floor (head {height:.2f} m above it)")
-    else:
-        notes.append(f"the origin is not on the floor (head at {height:.2f} m), whose height stays unknown")
-    return HeadsetLog(head, wrists, axes, floor, (about, *notes))
+def _replay(path: Path) -> dict[str, DeviceRows]:
+    """Rows of head and sabers."""
+    seconds, poses = read_bsor(path)
+    columns = PoseColumns("quaternion", (), frozenset({"saber"}), "xyzw")
+    clocks, rows = {"time": seconds}, np.arange(1, len(seconds) + 1)
+    return {
+        joint: DeviceRows(columns, poses[:, k], clocks, frozenset(), rows, "frame")
+        for k, joint in enumerate(("head", "left_wrist", "right_wrist"))
+    }

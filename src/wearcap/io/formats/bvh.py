@@ -1,21 +1,23 @@
 """BVH (Biovision hierarchy): any hierarchy and channel order in; Y-up with ZYX channels out.
 
 A joint's rotation is the product of its rotation channels in the file's order (the first one outermost), acting on the
-bind pose given by the OFFSETs. Position channels replace a joint's OFFSET, as Blender reads them. A body that is no
-person's size or lies down is refused with the setting that would mend it.
+bind pose given by the OFFSETs. Position channels replace a joint's OFFSET, as Blender reads them, or shift it, as the
+values show. A body that is no person's size or lies down is refused with the setting that would mend it.
 """
 
 import math
+import re
 import warnings
 from array import array
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import chain, islice, pairwise
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wearcap.body.skeleton import Site, Skeleton
@@ -31,6 +33,9 @@ _CHANNELS = {f"{axis}{kind}": (kind[0], axis) for axis in "xyz" for kind in ("po
 MAX_JOINTS = LIMITS["bvh"].items
 _MAX_WORDS = 64
 """Most words of a joint's name."""
+_DECIMAL_COMMA = re.compile(r"(?<=\d),(?=\d)")
+_LONGEST_STEP_S = 4.0
+"""A longer time step is in milliseconds (at most 250 Hz): in no motion do four seconds pass between frames."""
 _END_SITE = -1
 """Index that marks an End Site among the open blocks."""
 _END_SITES = {
@@ -160,33 +165,67 @@ class _Hierarchy:
         self.open.append(len(self.joints) - 1)
 
 
+def _plain(lines: Iterator[tuple[int, str]], mended: Counter[str]) -> Iterator[tuple[int, str]]:
+    """Lines without comments, and with points for decimal commas; `mended` counts both, by the note that says so."""
+    for number, line in lines:
+        if line.lstrip().startswith(("#", "//")):
+            mended["Lines that are comments: {}."] += 1
+        elif "." not in line and (pointed := _DECIMAL_COMMA.sub(".", line)) != line:
+            mended["Lines whose decimal commas are read as points: {}."] += 1
+            yield number, pointed
+        elif line.strip():
+            yield number, line
+
+
 def _parse_motion(
     path: Path, lines: Iterator[tuple[int, str]], motion_line: int, channels: int
-) -> tuple[float, np.ndarray]:
-    """Time step (s) and values "time channel"."""
-    lines = ((number, line) for number, line in lines if line.strip())
+) -> tuple[float, np.ndarray, list[str]]:
+    """Time step (s), values "time channel", and what was mended: the rows say how many frames there are."""
     try:
         (_, first), (line, second) = next(lines), next(lines)
         count = int(first.lower().split("frames:")[1])
-        step_s = float(second.lower().split("frame time:")[1])
+        step = float(second.lower().split("frame time:")[1])
     except (ValueError, IndexError, StopIteration) as error:
         raise WearcapError("no 'Frames:' and 'Frame Time:' below MOTION", at_line(path, motion_line)) from error
-    if not 1e-5 <= step_s <= 10:
-        raise WearcapError(f"frame time {step_s} s", at_line(path, line), "seconds per frame, above 0")
-    values, odd, rows = array("d"), None, 0
-    for number, text in lines:
-        words = text.split()
-        rows += 1
-        values.extend(finite_floats(words, at_line(path, number)))
-        if len(words) != channels and odd is None:
-            expected = f"{channels}, one per channel of the hierarchy"
-            odd = WearcapError(f"{len(words)} values", where=at_line(path, number), expected=expected)
-        if len(values) > count * channels:
+    values, odd, notes = array("d"), None, []
+    for (number, text), (following, _) in pairwise(chain(lines, [(0, "")])):
+        words, where = text.split(), at_line(path, number)
+        cut = len(words) < channels or (len(values) < (count - 1) * channels and not text.endswith("\n"))
+        if cut and not following and values and odd is None:
+            notes.append(f"The last row is cut off after {len(words)} of {channels} values and left out.")
             break
-    if len(values) != count * channels or not values:
-        expected = f"{count} frames, as in the file's header (at least one)"
-        raise odd or WearcapError(f"{rows} frames", where=path, expected=expected)
-    return step_s, np.asarray(values).reshape(count, channels)
+        values.extend(finite_floats(words, where))
+        if len(words) != channels and odd is None:
+            odd = WearcapError(f"{len(words)} values", where, f"{channels}, one per channel of the hierarchy")
+    if odd is not None and len(values) != count * channels:
+        raise odd
+    if not values:
+        fix = "It holds a skeleton alone: export it again with its motion."
+        raise WearcapError("no frames", path, "a row of numbers for each frame, below 'Frame Time:'", fix)
+    table = np.asarray(values).reshape(-1, channels)
+    if len(table) != count:
+        notes.append(f"Its header says {count} frames, its rows are {len(table)}: the rows are believed.")
+    step_s, note = _seconds(step, at_line(path, line))
+    return step_s, table, notes + note
+
+
+def _seconds(step: float, where: str) -> tuple[float, list[str]]:
+    """A time step in seconds, and the note on one that can only be milliseconds.
+
+    Raises WearcapError for a step that is none, and for one that may as well be a frame rate.
+    """
+    if not 1e-5 <= step <= 1000:
+        raise WearcapError(f"frame time {step} s", where, "seconds per frame, above 0")
+    if step <= _LONGEST_STEP_S:
+        return step, []
+    # Usual rates are multiples of 5 or 12, or those of television, slower by 1001/1000.
+    near = [round(rate) for rate in (step, 1.001 * step) if abs(rate - round(rate)) < 0.005]
+    if any(rate % 5 == 0 or rate % 12 == 0 for rate in near):
+        fix = f"Write 'Frame Time: {step / 1000:.6g}' for {step:g} ms, or 'Frame Time: {1 / step:.6g}' for {step:g} Hz."
+        raise WearcapError(
+            f"a frame time of {step:g}, which is milliseconds or a rate", where, "seconds per frame", fix
+        )
+    return step / 1000, [f"Its frame time, {step:g}, is read as milliseconds: {1000 / step:.4g} Hz."]
 
 
 @dataclass(frozen=True)
@@ -203,15 +242,21 @@ class BvhContent:
     t_parent_joint: Float[Tensor, "time joint 3"]
     """Places in the parent's frame (the root's in the world), of position channels where a joint has them."""
     step_s: float
+    notes: tuple[str, ...] = ()
+    """What was mended in it, in sentences."""
 
 
 def read_bvh_content(path: str | Path) -> BvhContent:
     """Read a .bvh file (plain, .gz or .xz) as it stands. Raises WearcapError naming file and line."""
     path = Path(path)
-    lines = numbered_lines(path)
+    mended: Counter[str] = Counter()
+    lines = _plain(numbered_lines(path), mended)
     joints, motion_line = _Hierarchy.read(path, lines)
-    step_s, values = _parse_motion(path, lines, motion_line, sum(len(joint.channels) for joint in joints))
-    t, R = _channels(joints, values)
+    step_s, values, notes = _parse_motion(path, lines, motion_line, sum(len(joint.channels) for joint in joints))
+    t, R, shifts = _channels(joints, values)
+    notes += [note.format(count) for note, count in mended.items()]
+    if shifts:
+        notes.append(f"Position channels of {shifts} joints are read as shifts from their OFFSETs.")
     ends = ((None if joint.end is None else (joint.end[0], joint.end[1], joint.end[2])) for joint in joints)
     return BvhContent(
         tuple(joint.name for joint in joints),
@@ -221,6 +266,7 @@ def read_bvh_content(path: str | Path) -> BvhContent:
         R,
         t,
         step_s,
+        tuple(notes),
     )
 
 
@@ -236,6 +282,8 @@ def read_bvh(
     path = Path(path)
     R_world_file = axes_rotation(path, up, forward)
     content = read_bvh_content(path)
+    for note in content.notes:
+        warnings.warn(f"{path}: {note}", stacklevel=2)
     bones = _bones(path, content, float(unit_m))
     to_world = float(unit_m) * R_world_file.T
     skeleton = Skeleton("bvh", content.names, content.parents, (bones @ to_world).float(), _sites(content, to_world))
@@ -268,10 +316,10 @@ def axes_rotation(path: Path, up: str, forward: str) -> Tensor:
 
 def _channels(
     joints: list[_Joint], values: np.ndarray
-) -> tuple[Float[Tensor, "time joint 3"], Float[Tensor, "time joint 3 3"]]:
-    """Places in the parents' frames (file units) and rotations.
+) -> tuple[Float[Tensor, "time joint 3"], Float[Tensor, "time joint 3 3"], int]:
+    """Places in the parents' frames (file units), rotations, and the number of joints whose positions are shifts.
 
-    Some writers give children displacements from OFFSET, near zero, instead of the whole offset: they are added to it.
+    Some writers give children shifts from OFFSET, near zero, instead of the whole offset: they are added to it.
     """
     columns = torch.from_numpy(values)
     starts = np.cumsum([0, *(len(joint.channels) for joint in joints)]).tolist()
@@ -285,17 +333,28 @@ def _channels(
                 moved.add(k)
         by_order.setdefault("".join(axis for kind, axis in joint.channels if kind == "r"), []).append(k)
     children = sorted(moved - {0})
-    if children:
-        median = t[:, children].median(0).values
-        rest = torch.tensor([joints[k].offset for k in children], dtype=torch.float64)
-        if (median - rest).norm(dim=-1).sum() > median.norm(dim=-1).sum():
-            t[:, children] += rest
+    rest = t.new_tensor([joints[k].offset for k in children]).reshape(-1, 3)
+    shifted = _are_shifts(t[:, children], rest)
+    t[:, children] += rest * shifted[:, None]
     R = torch.eye(3, dtype=torch.float64).repeat(len(values), len(joints), 1, 1)
     for order, members in by_order.items():
         for axis in order:
             index = [starts[k] + joints[k].channels.index(("r", axis)) for k in members]
             R[:, members] = R[:, members] @ about_axis(axis, columns[:, index] * (math.pi / 180))
-    return t, R
+    return t, R, int(shifted.sum())
+
+
+def _are_shifts(values: Float[Tensor, "time joint 3"], rest: Float[Tensor, "joint 3"]) -> Bool[Tensor, "joint"]:
+    """Whether joints' position channels are shifts, near zero, from their OFFSETs `rest` rather than near these.
+
+    Each axis on which one is clearly nearer votes. A joint whose axes disagree, as of hips far from their OFFSET, or do
+    not vote, follows the others.
+    """
+    median = values.median(0).values
+    room = (values - median).abs().mean(0) + 0.02 * rest.abs() + 1e-9
+    for_shift = (((median - rest).abs() + room) / (median.abs() + room)).log()
+    votes = (for_shift > 1).any(-1).int() - (for_shift < -1).any(-1).int()
+    return torch.where(votes == 0, votes.sum(), votes) > 0
 
 
 def _bones(path: Path, content: BvhContent, unit_m: float) -> Float[Tensor, "joint 3"]:
@@ -372,15 +431,18 @@ def longest_path(skeleton: Skeleton) -> float:
     return longest
 
 
-def write_bvh(motion: Motion, path: str | Path, unit_m: float | int = 0.01) -> None:
+def write_bvh(
+    motion: Motion, path: str | Path, unit_m: float | int = 0.01, origin: Float[Tensor, "3"] | None = None
+) -> None:
     """Write a motion as BVH: y up, body facing +z at rest, ZYX channels in degrees, by default in centimetres.
 
     The farthest site of each leaf joint becomes its End Site. A gap in time is filled with the nearest frame, for BVH
-    has one frame rate. Raises WearcapError when there is nothing to write or it is not finite.
+    has one frame rate; `origin` (m) is added to all places. Raises WearcapError when there is nothing to write or it is not finite.
     """
     frames, fps = even_frames(motion)
     R = _R_FILE_WORLD @ motion.R_parent_joint[frames].double() @ _R_FILE_WORLD.T
-    root = motion.t_world_root[frames].double() @ _R_FILE_WORLD.T / unit_m
+    placed = motion.t_world_root[frames].double() + (0.0 if origin is None else origin)
+    root = placed @ _R_FILE_WORLD.T / unit_m
     if not (R.isfinite().all() and root.isfinite().all()):
         raise WearcapError("the motion holds NaN or infinite values", path, "finite poses")
     # R = Rz · Ry · Rx; at gimbal lock x is zero.

@@ -1,11 +1,17 @@
-"""Columns of numbers from a CSV file with a header line, plain or compressed (.gz, .xz)."""
+"""Columns of numbers from a CSV file with a header line, plain or compressed (.gz, .xz).
+
+Semicolons and tabs separate fields, too, then with decimal points or commas; lines about the recording may stand above
+the header ("// Update Rate: 100.0Hz", "sep=;", "DeviceTag:,DOT 1").
+"""
 
 import csv
 import difflib
 import io
+import re
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +20,10 @@ import numpy as np
 from wearcap.boundary.opening import open_bytes, understood
 from wearcap.boundary.texts import bounded_lines
 from wearcap.errors import WearcapError
+
+_ABOUT = re.compile(r'\s*(//|sep=|©|"?[\w ]+"?:[\s,;]|$)')
+"""Beginnings of lines that stand above a header, of which there are at most `_MAX_ABOUT`."""
+_MAX_ABOUT = 64
 
 
 @contextmanager
@@ -24,7 +34,7 @@ def open_text(path: str | Path, kind: str = "table") -> Iterator[Iterator[str]]:
     only while reading inside the `with` block are named too.
     """
     with understood("not a text file", path, "UTF-8 text", errors=UnicodeDecodeError), open_bytes(path, kind) as file:
-        lines = bounded_lines(io.TextIOWrapper(file, "utf-8", newline=""), path, kind)
+        lines = bounded_lines(io.TextIOWrapper(file, "utf-8-sig", newline=""), path, kind)
         yield (line for _, line in lines)
 
 
@@ -35,13 +45,29 @@ def load_rows(lines: Iterable[str], what: str, where: str | Path, expected: str 
         return np.loadtxt(lines, **options)
 
 
-def read_header(path: str | Path) -> list[str]:
-    """Column names of the first line. Raises WearcapError when the file is empty."""
+def read_layout(path: str | Path) -> tuple[list[str], list[str], str]:
+    """(lines above the header, column names, delimiter). Raises WearcapError for an empty file, and commas of two kinds."""
+    about, header, row, delimiter = list[str](), list[str](), list[str](), ","
     with open_text(path) as file:
-        header = [name.strip() for name in next(csv.reader(file), [])]
+        for line in file:
+            if len(about) < _MAX_ABOUT and _ABOUT.match(line):
+                about.append(line.strip())
+                continue
+            delimiter = max(",;\t", key=line.count)
+            header, row = (next(csv.reader([text], delimiter=delimiter), []) for text in (line, next(file, "")))
+            break
     if not any(header):
         raise WearcapError("the file is empty", path, "a header line with column names")
-    return header
+    if delimiter == "," and len(row) > len(header) and all(row[: 2 * len(header)]):
+        what = f"{len(row)} fields below a header of {len(header)}"
+        fix = "Are decimal commas written between commas? Export with decimal points, or semicolons between fields."
+        raise WearcapError(what, path, "a field for each column", fix)
+    return about, [name.strip() for name in header], delimiter
+
+
+def read_header(path: str | Path) -> list[str]:
+    """Column names. Raises WearcapError as `read_layout` does."""
+    return read_layout(path)[1]
 
 
 def read_columns(
@@ -64,7 +90,7 @@ def iter_columns(
     rows: int | None = 1_000_000,
 ) -> Iterator[dict[str, np.ndarray]]:
     """As `read_columns`, but at most `rows` lines at a time, for files larger than memory."""
-    header = read_header(path)
+    about, header, delimiter = read_layout(path)
     wanted = [*columns, *text, *whole]
     for name in wanted:
         if name not in header:
@@ -74,15 +100,17 @@ def iter_columns(
     kinds = dict.fromkeys(columns, "f8") | dict.fromkeys(text, "S64") | dict.fromkeys(whole, "i8")
     done = 0
     with open_text(path, "table" if rows is None else "streamed table") as file:
-        next(file)
+        lines = islice(file, len(about) + 1, None)
+        if delimiter != ",":
+            lines = (_plain(line, delimiter) for line in lines)
         while True:
             table = load_rows(
-                file,
+                lines,
                 f"not a table of numbers; rows count from {f'row {done}' if done else 'after the header'}",
                 path,
-                f"{len(header)} comma-separated fields in every line",
+                f"{len(header)} fields with {delimiter!r} between in every line",
                 dtype=np.dtype(list(kinds.items())),
-                delimiter=",",
+                delimiter=delimiter,
                 usecols=[header.index(name) for name in kinds],
                 comments=None,
                 ndmin=1,
@@ -95,3 +123,9 @@ def iter_columns(
             done += len(table)
             if rows is None or len(table) < rows:
                 return
+
+
+def _plain(line: str, delimiter: str) -> str:
+    """A line of a table without commas between its fields: with decimal points, and NaN where a field is empty."""
+    fields = line.rstrip("\r\n").replace(",", ".").split(delimiter)
+    return delimiter.join(field.strip() or "nan" for field in fields)

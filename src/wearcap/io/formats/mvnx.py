@@ -14,7 +14,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import torch
 from defusedxml.ElementTree import iterparse
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.body.kinematics import local_rotations
@@ -151,7 +151,8 @@ def read_mvnx(path: str | Path) -> Recording:
     and the sensors as `imu` streams named by their joint.
 
     Raises WearcapError naming file and line or frame for damaged XML, document types and entities, missing segments,
-    wrong counts, NaN, and quaternions that are not of unit length. Warns when bones change length or times disagree.
+    wrong counts, NaN, and quaternions that are not of unit length. Warns when bones change length; `note` says where
+    frame times contradict the rate.
     """
     file = _File(Path(path))
     with (
@@ -206,7 +207,7 @@ def _recording(file: _File) -> Recording:
         raise WearcapError("no subject with a frame rate", file.path, '<subject frameRate="60">')
     if not file.index:
         raise WearcapError("no frames of motion", file.path, 'frames of type "normal"')
-    timestamps = _timestamps(file)
+    timestamps, note = _timestamps(file)
     skeleton, rows = xsens23(), [file.segments.index(_LABEL_OF[name]) for name in xsens23().joint_names]
     R_world = matrix_from_quat_wxyz(_quaternions(file, "orientation"))[:, rows].double()
     t_world = file.column("position", 3)[:, rows]
@@ -240,23 +241,34 @@ def _recording(file: _File) -> Recording:
         joint: ImuStream(timestamps, joint, **{name: part[:, k].contiguous() for name, part in parts.items()})
         for k, joint in known
     }
-    return Recording(file.path.name.split(".")[0], motion=motion, skeleton=skeleton, imu=imu, source="Xsens MVNX")
+    name = file.path.name.split(".")[0]
+    return Recording(name, motion=motion, skeleton=skeleton, imu=imu, source="Xsens MVNX", note=note)
 
 
-def _timestamps(file: _File) -> Tensor:
-    """Timestamps (s) from the frame numbers, which unlike the times are not rounded to milliseconds."""
+def _timestamps(file: _File) -> tuple[Float64[Tensor, "time"], str]:
+    """Timestamps (s), and a note where frame times contradict the stated rate: then the times win.
+
+    Otherwise they come from the frame numbers, which unlike the times are not rounded to milliseconds.
+    """
     index = torch.tensor(file.index, dtype=torch.float64)
     if not (index.diff() > 0).all():
         raise WearcapError("frame numbers repeat or fall", file.path, "rising `index`")
-    timestamps = (index - index[0]) / file.fps
-    span_s = (file.time_ms[-1] - file.time_ms[0]) / 1000
-    if np.isfinite(span_s) and abs(span_s - timestamps[-1].item()) > 0.01 * span_s + 0.05:
-        warnings.warn(
-            f"{file.path}: frame times span {span_s:.3f} s, but {len(index)} frames at {file.fps:g} Hz span "
-            f"{timestamps[-1]:.3f} s; the frame rate is believed",
-            stacklevel=4,
+    index, times = index - index[0], torch.tensor(file.time_ms, dtype=torch.float64) / 1000
+    times, by_rate = times - times[0], index / file.fps
+    span_s = times[-1].item()
+    if not abs(span_s - by_rate[-1].item()) > 0.01 * span_s + 0.05:  # also where a time is missing
+        return by_rate, ""
+    stated = f"{len(index)} frames at its stated {file.fps:g} Hz span {by_rate[-1]:.3f} s"
+    rate = index[-1].item() / span_s if span_s > 0 else 0.0
+    if not (1 <= rate <= 2000 and (times.diff() > 0).all()):
+        return (
+            by_rate,
+            f"{stated}; its frame times, which span {span_s:.4g} s, are no rising milliseconds and are ignored.",
         )
-    return timestamps
+    if (index / rate - times).abs().max() < 0.002:  # even, but for their rounding: as is the rate
+        rate = round(rate) if abs(rate - round(rate)) <= rate * 0.001 / span_s else rate
+        times = index / rate
+    return times, f"{stated}, but its frame times {span_s:.3f} s: the times are believed, {rate:.4g} Hz."
 
 
 def _quaternions(file: _File, name: str) -> Float[Tensor, "time segment 4"]:

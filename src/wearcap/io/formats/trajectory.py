@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float64
 
 from wearcap.boundary.arrays import read_npy, read_npz
 from wearcap.boundary.opening import open_bytes
@@ -30,7 +31,7 @@ from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matr
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.colmap import read_image_poses
 from wearcap.io.formats.csv_table import read_columns
-from wearcap.io.formats.poses import are_rotations, check_finite, checked_trajectory, row_name
+from wearcap.io.formats.poses import are_rotations, check_finite, checked_trajectory, row_name, tracked_in_order
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Seconds per unit of time."""
@@ -42,6 +43,8 @@ MAX_SPARSITY = 10.0
 _EPOCH_S = 9e8, 4.2e9
 """Seconds since 1970 of the years 1998 to 2103."""
 _MATRIX_WITHIN = 0.02
+_FAR, _FAR_FOR_EXTENT, _NOWHERE = 1e4, 20.0, 1e9
+"""Distance from zero from which places are a map's, in units and in extents of the path, and from which they are none."""
 _FRAMES = 1e6
 """Whole numbers below are frame numbers (nine hours at 30 Hz), larger ones times."""
 FORMATS = "TUM, EuRoC, COLMAP's images, hloc's poses, DROID-SLAM's arrays, MPS' closed loop, KITTI"
@@ -62,6 +65,10 @@ class TrajectoryFile:
     """Whether the format's poses are a camera's, with OpenCV's axes; otherwise the file does not name its axes."""
     metric: bool
     """Whether the format's unit of length is the metre; structure from motion and one camera's SLAM know no unit."""
+    origin: Float64[np.ndarray, "3"] | None = None
+    """What was taken off the positions (file's unit and axes), for maps' coordinates are beyond single precision."""
+    notes: tuple[str, ...] = ()
+    """Sentences on rows that were sorted or left out."""
 
 
 @dataclass(frozen=True)
@@ -85,10 +92,15 @@ def read_trajectory(path: str | Path, time_unit: str | None = None, fps: float |
     """Trajectory in the file's own world and body axes (s; m where the format has metres).
 
     `time_unit` (s, ms, us, ns) overrides what the numbers say; `fps` is for files with frame numbers or no times.
-    Raises WearcapError for a file that is none of the formats, rows that are NaN, doubled or unsorted (named by line),
-    quaternions far from unit norm, and times that are no recording's.
+    Raises WearcapError for a file that is none of the formats or whose rows hold no pose, quaternions far from unit norm
+    (named by line), times that are no recording's, and positions at a map's coordinates.
     """
-    return read_trajectory_file(path, time_unit, fps).trajectory
+    read = read_trajectory_file(path, time_unit, fps)
+    if read.origin is not None:
+        what = f"positions at a map's coordinates, {read.origin.round(1).tolist()} from the origin"
+        fix = "Take the same offset off it and what shares its world."
+        raise WearcapError(what, path, "positions within kilometres of the origin", fix)
+    return read.trajectory
 
 
 def read_trajectory_file(path: str | Path, time_unit: str | None = None, fps: float | None = None) -> TrajectoryFile:
@@ -102,11 +114,33 @@ def read_trajectory_file(path: str | Path, time_unit: str | None = None, fps: fl
     if not len(table.translation):
         raise WearcapError("no poses in the file", path, FORMATS)
     if table.inverse:
-        table = _inverted(table, path)
+        table = _inverted(table)
     seconds, unit = _seconds(table, time_unit, fps, path)
-    trajectory = checked_trajectory(seconds, table.translation, table.quat_wxyz, path, table.name)
-    check_span(seconds, path, table.name)
-    return TrajectoryFile(trajectory, table.format, unit, table.of_camera, table.metric)
+    rows, notes = tracked_in_order(seconds, table.translation, table.quat_wxyz)
+    if len(rows) < min(2, len(seconds)):
+        what = f"{len(rows)} poses in its {len(seconds)} rows; {'; '.join(notes)}"
+        raise WearcapError(what, path, "finite numbers, unit quaternions, and times that differ")
+    seconds, translation = seconds[rows], table.translation[rows].astype(np.float64)
+    origin = map_origin(translation)
+    if origin is not None:
+        translation = translation - origin
+        listed = ", ".join(f"{value:.0f}" for value in origin)
+        notes += (f"positions are at a map's coordinates: ({listed}) is taken off, and kept as the origin",)
+
+    def name(row: int) -> str:
+        return table.name(int(rows[row]))
+
+    trajectory = checked_trajectory(seconds, translation, table.quat_wxyz[rows], path, name)
+    check_span(seconds, path, name)
+    return TrajectoryFile(trajectory, table.format, unit, table.of_camera, table.metric, origin, notes)
+
+
+def map_origin(translation: Float64[np.ndarray, "pose 3"]) -> Float64[np.ndarray, "3"] | None:
+    """Whole numbers near the first place, for places much farther from zero than from one another; None for others."""
+    extent = np.ptp(translation, axis=0).max()
+    if not max(_FAR, _FAR_FOR_EXTENT * extent) < np.linalg.norm(translation[0]) < _NOWHERE:
+        return None
+    return np.floor(translation[0])
 
 
 def trajectory_format(path: str | Path) -> str | None:
@@ -165,6 +199,9 @@ def _read(path: Path) -> _Table:
     kind, header = _kind(first)
     if kind is None:
         _refuse(first, path)
+    if kind == "open loop":
+        what, expected = "MPS' open-loop odometry, which drifts", "the closed loop, which is registered in one world"
+        raise WearcapError(what, path, expected, "Give closed_loop_trajectory.csv of the same output, or its folder.")
     if kind == "MPS":
         return _mps(path)
     if kind == "COLMAP":
@@ -212,6 +249,8 @@ def _kind(first: Sequence[tuple[int, str]]) -> tuple[str | None, dict[str, int] 
         comment = line.startswith("#")
         if _MPS[0] in words and _MPS[1] in words:
             return "MPS", None
+        if "tx_odometry_device" in words:
+            return "open loop", None
         if comment or not any(map(_number, words)):
             slots = _slots(words)
             if slots is None and not comment:
@@ -470,9 +509,8 @@ def _same_length(times: np.ndarray | None, count: int, path: Path) -> None:
 # --- times ---------------------------------------------------------------------------------------------------------
 
 
-def _inverted(table: _Table, path: Path) -> _Table:
+def _inverted(table: _Table) -> _Table:
     """The bodies' poses in the world, of those of the world in the body."""
-    check_finite({"translation": table.translation, "quaternion": table.quat_wxyz}, path, table.name)
     R = matrix_from_quat_wxyz(torch.from_numpy(np.ascontiguousarray(table.quat_wxyz))).numpy()
     center = -np.einsum("nji,nj->ni", R, table.translation)
     quat = table.quat_wxyz * np.array([1.0, -1.0, -1.0, -1.0])
@@ -487,7 +525,6 @@ def _seconds(table: _Table, time_unit: str | None, fps: float | None, path: Path
             what = "frame numbers instead of times" if times is not None else "poses without times"
             raise WearcapError(what, path, "times of the poses", "Give the video's rate: fps=30.")
         return (np.arange(count) if times is None else times) / fps, "frames"
-    check_finite({"timestamp": times}, path, table.name)
     unit = time_unit or time_unit_of(times, table.unit, path)
     # Whole nanoseconds since 1970 are beyond a float's 53 bits; what is lost is below a microsecond.
     return times * UNITS[unit], unit

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS
 from wearcap.geometry.rigid import Rigid
-from wearcap.io.devices.axes import CONVENTIONS
+from wearcap.io.devices.axes import OPENXR
+from wearcap.io.devices.headset_axes import CONVENTIONS
 from wearcap.live.packets import CAMERA, HEAD, SUIT
 from wearcap.sensors.packets import MAX_POSITION_M, NOT_A_ROTATION, NOT_FINITE, rotation_fault, values_fault
 
@@ -22,7 +23,7 @@ FORGOTTEN_S = 60.0
 """A name that was silent for so long makes room for another."""
 UNIT_TOLERANCE = 0.02
 """Tolerance of a quaternion's length."""
-AXES = {"wearcap": torch.eye(3), **CONVENTIONS}
+AXES = {"wearcap": torch.eye(3), "steamvr": OPENXR, **CONVENTIONS}
 """Rotations or reflections into wearcap's axes (x forward, y left, z up), by name."""
 _OTHER_PARTS = re.compile("foot|feet|ankle|toe|knee|leg|thigh|hip|elbow|arm(?!and)|shoulder|chest|waist|eye|ear")
 

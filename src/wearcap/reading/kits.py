@@ -1,20 +1,24 @@
-"""A wearer's own logs, known by their content: watches' and other inertial logs, trajectories, headsets'; and kits of them."""
+"""Logs of a wearer's own devices, known by their content: watches' and other inertial logs, trajectories, headsets'; Aria's
+MPS; and kits, the folders that hold the logs of one session."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
-
-import torch
+from typing import NamedTuple
 
 from wearcap.body.skeleton import WRISTS
+from wearcap.boundary.texts import read_json_object
 from wearcap.doctor.report import Check, Finding, refusal
+from wearcap.doctor.streams import check_clock
 from wearcap.errors import WearcapError
-from wearcap.io.devices.aria_mps import head_stream, read_closed_loop
-from wearcap.io.devices.axes import device_axes, to_head_axes
-from wearcap.io.devices.headset_log import is_headset_log, read_headset_log
-from wearcap.io.devices.watch_log import is_watch_log, read_inertial_log, read_watch_log
+from wearcap.io.conventions import AUTO, Conventions
+from wearcap.io.devices.aria_mps import find_mps_file, head_stream, read_closed_loop, read_mps
+from wearcap.io.devices.headset_log import is_headset_log
+from wearcap.io.devices.watch_log import is_watch_log, read_inertial_log, read_watch, sensor_files
 from wearcap.io.formats.csv_table import read_header
-from wearcap.io.formats.trajectory import TrajectoryFile, read_trajectory_file, trajectory_format
-from wearcap.recording import FloorTrack, HeadStream, Recording
+from wearcap.io.formats.trajectory import trajectory_format
+from wearcap.prepare.logs import HeadsetSettings, TrajectorySettings, log_name, read_path
+from wearcap.recording import Recording
 from wearcap.recording.recording import ImuStream
 from wearcap.sensors.watches import watch_gaps
 
@@ -22,14 +26,22 @@ _SIDES = {
     "left_wrist": re.compile(r"(^|[^a-z])(left|l|links)([^a-z]|$)"),
     "right_wrist": re.compile(r"(^|[^a-z])(right|r|rechts)([^a-z]|$)"),
 }
-_TABLES = {".csv", ".txt", ".tum", ".log", ".json", ".jsonl", ".npy"}
+_TABLES = {".csv", ".tsv", ".txt", ".tum", ".log", ".json", ".jsonl", ".npy", ".bsor"}
 _MOST = 200
 """Most files of a folder that are looked into."""
-Loaded = tuple[Recording, list[Finding]]
+
+
+class Loaded(NamedTuple):
+    """A recording, and its reader's findings."""
+
+    recording: Recording
+    findings: list[Finding]
 
 
 def log_kind(path: Path) -> str | None:
     """ "watch", "headset" or "trajectory"; None for any other file. Raises WearcapError for one that cannot be opened."""
+    if path.suffix.lower() == ".bsor":
+        return "headset"
     if path.suffix == ".npy":
         return "trajectory" if trajectory_format(path) else None
     if not {".json", ".jsonl"} & set(path.suffixes) and is_watch_log(path):
@@ -39,39 +51,79 @@ def log_kind(path: Path) -> str | None:
     return "trajectory" if trajectory_format(path) else None
 
 
-def read_table(path: Path) -> Loaded:
-    """A log of any kind. Raises WearcapError for a table that is none, with what the doctor knows."""
+def load_log(path: Path, how: Conventions) -> Loaded:
+    """A watch's or headset's log, or a trajectory of any format, by content; what was detected is the recording's note.
+
+    Raises WearcapError for a table that is none of them, with the formats that are known.
+    """
     kind = log_kind(path)
     if kind == "watch":
-        return _watch(path)
-    if kind == "headset":
-        return _headset(path)
-    if "aria_trajectory" in path.name or (kind == "trajectory" and trajectory_format(path) == "MPS"):
-        track = read_closed_loop(path, up="y" if "aria_trajectory" in path.name else "z")[0]
-        return Recording(name=path.name, head=head_stream(track, fps=None), source="Aria MPS"), []
-    return as_head(read_trajectory_file(path), path.name)
+        how.only(where=path)
+        return _load_watch(path)
+    return load_headset(path, how) if kind == "headset" else load_trajectory(path, how)
 
 
-def as_head(read: TrajectoryFile, name: str) -> Loaded:
-    """A trajectory as a head stream, its axes as they seem to be."""
-    what = f"{read.format}, {len(read.trajectory)} poses, times in {read.time_unit}"
-    findings = [Check("trajectory").ok(what, "" if read.metric else "its unit of length is not known")]
-    track, check = read.trajectory, Check("head: axes")
-    evidence = "a trajectory file does not name its axes"
-    try:
-        axes = device_axes(track, device="camera" if read.of_camera else "auto", where=name)
-    except WearcapError:
-        fix = "x forward, y left, z up is assumed; say which axes it has: wearcap prepare trajectory up=… axes=…"
-        findings.append(check.note("taken as the head's own pose", evidence, fix))
+def load_trajectory(path: Path, how: Conventions) -> Loaded:
+    """A head's path of any format, also from a folder of COLMAP's or DROID-SLAM's."""
+    name = path.resolve().name.split(".")[0]
+    if "aria_trajectory" in path.name or (path.is_file() and trajectory_format(path) == "MPS"):
+        how.only(where=path)
+        track = read_closed_loop(path).trajectory
+        return Loaded(Recording(name, head=head_stream(track, fps=None), source="Aria MPS"), [])
+    how.only("unit", "up", "axes", "time_unit", "fps", where=path)
+    settings = TrajectorySettings(
+        how.up,
+        how.axes,
+        None if how.time_unit == AUTO else how.time_unit,
+        None if how.fps == AUTO else float(how.fps),
+        how.unit,
+    )
+    recording = read_path(path, name, {}, settings)
+    return Loaded(recording, [Check("trajectory").ok("read", recording.note)])
+
+
+def load_headset(path: Path, how: Conventions) -> Loaded:
+    """A headset's log, or the folder of a session of one."""
+    how.only("unit", "axes", "quaternion", "hands", "time_unit", where=path)
+    time_unit = None if how.time_unit == AUTO else how.time_unit
+    settings = HeadsetSettings(how.unit, how.axes, how.quaternion, how.hands, time_unit)
+    recording = settings.read(path, log_name(path), {})
+    check = Check("headset's log")
+    findings = [check.ok(f"head and {len(recording.tracked)} hands", recording.note)]
+    if not recording.tracked:
+        findings.append(check.note("no hands", "the head alone", "Log both controllers or hands for ECHO."))
+    return Loaded(recording, findings)
+
+
+def load_mps(folder: Path) -> Loaded:
+    """An MPS folder at 60 Hz, with findings about the raw file's clock, its quality score and the service's own report."""
+    path = find_mps_file(folder, ("closed_loop_trajectory.csv",))
+    assert path is not None, "is_mps_folder has seen it"
+    track, scores, _ = read_closed_loop(path)
+    findings = check_clock("closed-loop file", track.timestamps)
+    quality = scores.median().item()
+    low = (scores < 0.5).float().mean().item()
+    check, evidence = Check("closed-loop file: quality"), f"median score {quality:.2f}, {100 * low:.0f} % below 0.5"
+    if low > 0.1:
+        findings.append(check.warning("MPS trusts its poses little", evidence))
     else:
-        track = to_head_axes(track, axes)
-        words = f"{axes.up} is up, the device has {axes.device}'s axes"
-        findings.append(check.note(f"detected: {words}", f"upright by {axes.upright:.2f}; {evidence}"))
-    if not read.metric:
-        fix = "Give scale=METRES, or points, head_imu or walks (wearcap prepare trajectory)."
-        findings.append(Check("head: unit").note("metres are assumed", f"{read.format} knows no unit", fix))
-    head = HeadStream(track.timestamps, track.R_world_body, track.t_world_body, torch.eye(3), torch.zeros(3))
-    return Recording(name=name, head=head), findings
+        findings.append(check.ok("MPS trusts its poses", evidence))
+    findings.append(Check("closed-loop file: gravity").ok("points along -z", "9.81 m/s²"))
+    recording = read_mps(folder)
+    check, path = Check("MPS summary"), find_mps_file(folder, ("summary.json",))
+    if path is None:
+        return Loaded(recording, findings)
+    try:
+        parts = read_json_object(path)
+    except WearcapError as error:
+        return Loaded(recording, [*findings, check.warning("cannot be read", str(error))])
+    states = {name: part.get("status", "SUCCESS") for name, part in parts.items() if isinstance(part, dict)}
+    failed = [name for name, state in states.items() if state != "SUCCESS"]
+    if failed:
+        found = check.error("MPS reports failures", ", ".join(failed), "Request MPS again.")
+    else:
+        found = check.ok("MPS reports success", ", ".join(name for name in parts if name != "version"))
+    return Loaded(recording, [*findings, found])
 
 
 def _side(path: Path) -> str | None:
@@ -84,13 +136,14 @@ def _side(path: Path) -> str | None:
 
 
 def _read_watch(path: Path, joint: str) -> tuple[ImuStream, Finding]:
-    inertial = not {"quaternionW", "motionQuaternionW(R)"} & set(read_header(path))
-    stream = read_inertial_log(path, joint) if inertial else read_watch_log(path, joint)
+    inertial = "Accelerometer X (g)" in read_header(path) or path.name == "Quaternion.csv"
+    stream, notes = (read_inertial_log(path, joint), []) if inertial else read_watch(path, joint)
     names = {"R_world_imu": "attitude", "acc_imu": "acceleration", "gyro_imu": "turn rate"}
     has = [word for name, word in names.items() if getattr(stream, name) is not None]
     missing = [word for name, word in names.items() if getattr(stream, name) is None]
     kind = "x-IMU3's log" if inertial else "a watch's log"
-    evidence = f"{len(stream.timestamps)} samples, {(stream.timestamps[-1] - stream.timestamps[0]).item():.1f} s"
+    span = (stream.timestamps[-1] - stream.timestamps[0]).item()
+    evidence = "; ".join([f"{len(stream.timestamps)} samples, {span:.1f} s", *notes])
     check = Check(f"log {path.name}")
     what = f"{kind} with {', '.join(has)}"
     if missing:
@@ -100,25 +153,15 @@ def _read_watch(path: Path, joint: str) -> tuple[ImuStream, Finding]:
     return stream, check.ok(what, evidence)
 
 
-def _watch(path: Path) -> Loaded:
+def _load_watch(path: Path) -> Loaded:
+    """One watch's log; the wrist that it was worn on is in its name, or its folder's."""
     joint = _side(path)
     stream, found = _read_watch(path, joint or WRISTS[0])
     findings = [found]
     if joint is None:
         fix = "Put left or right into the file's name."
         findings.append(Check("worn on").note("the left wrist is assumed", "its name tells no side", fix))
-    return Recording(name=path.name, imu={stream.joint: stream}), findings
-
-
-def _headset(path: Path) -> Loaded:
-    log = read_headset_log(path)
-    check = Check("headset's log")
-    findings = [check.ok(f"head and {len(log.wrists)} hands", "; ".join(log.notes))]
-    if not log.wrists:
-        findings.append(check.note("no hands", "the head alone", "Log both controllers or hands for ECHO."))
-    head = HeadStream(log.head.timestamps, log.head.R_world_body, log.head.t_world_body, torch.eye(3), torch.zeros(3))
-    floor = FloorTrack(head.timestamps[:1], torch.zeros(1)) if log.floor else None
-    return Recording(name=path.name, head=head, tracked=log.wrists, floor=floor), findings
+    return Loaded(Recording(path.name.split(".")[0], imu={stream.joint: stream}), findings)
 
 
 # --- kits ----------------------------------------------------------------------------------------------------------
@@ -133,7 +176,7 @@ def log_files(folder: Path) -> dict[Path, str]:
                 kind = log_kind(path)
             except WearcapError:
                 continue
-            if kind is not None and not (path.name == "Quaternion.csv" and path.with_name("Inertial.csv").is_file()):
+            if kind is not None and not (kind == "watch" and sensor_files(path)[0] != path):
                 found[path] = kind
     return found
 
@@ -144,7 +187,7 @@ def is_kit(folder: Path) -> bool:
     return "watch" in kinds or kinds.count("headset") == 1
 
 
-def read_kit(folder: Path) -> Loaded:
+def load_kit(folder: Path, how: Conventions) -> Loaded:
     """The logs of one session in one recording: two watches and a trajectory, or a headset's log.
 
     What cannot be read, is missing or stands beside is a finding.
@@ -166,9 +209,9 @@ def read_kit(folder: Path) -> Loaded:
                 what = "a second path of the head"
                 findings.append(Check(f"log {path.name}").warning(what, "it is left out", "Move it to another folder."))
                 continue
-            read, found = read_table(path)
+            read, found = load_log(path, how)
             findings += found
-            parts = Recording(parts.name, head=read.head, imu=parts.imu, tracked=read.tracked, floor=read.floor)
+            parts = replace(read, name=parts.name, imu=parts.imu)
         except WearcapError as error:
             findings.append(refusal(error, f"log {path.name}"))
     if parts.imu and parts.head is None:
@@ -177,7 +220,7 @@ def read_kit(folder: Path) -> Loaded:
     if parts.head is not None:
         for gap in watch_gaps(parts.imu, parts.head.timestamps):
             findings.append(Check("watches").warning("silent for a while", gap))
-    return parts, findings
+    return Loaded(parts, findings)
 
 
 def _sides(watches: list[Path], findings: list[Finding]) -> dict[Path, str]:
