@@ -24,7 +24,8 @@ def test_a_config_verbs_help_is_one_screen(arguments):
 
 
 @pytest.mark.parametrize(
-    "arguments", [[], ["capture"], ["prepare", "cmu"], ["view"], ["render"], ["annotate"], ["scene", "edit"]]
+    "arguments",
+    [[], ["capture"], ["prepare", "cmu"], ["view"], ["render"], ["annotate"], ["doctor"], ["scene", "edit"]],
 )
 def test_help_imports_nothing_heavy(arguments):
     code = "import sys; from wearcap.cli.main import main\ntry: main(sys.argv[1:])\nfinally: "
