@@ -212,7 +212,7 @@ def affordable_precision(precision: str, accelerator: str) -> str:
 def require_accelerator(accelerator: str) -> None:
     """Raise WearcapError for `trainer.accelerator` gpu or cuda where there is no GPU."""
     if accelerator in ("gpu", "cuda") and not torch.accelerator.is_available():
-        what, fix = f"trainer.accelerator={accelerator}, but there is no GPU here", "Give trainer.accelerator=cpu."
+        what, fix = f"trainer.accelerator={accelerator}, but there is no GPU here", "Give trainer=default."
         raise WearcapError(what, fix=fix)
 
 
