@@ -166,7 +166,7 @@ def test_a_recording_of_fifteen_minutes_is_scored_whole():
     assert table.evaluate_motion(truth, truth)["mpjpe_cm"] == 0
 
 
-@pytest.mark.parametrize("draw", [table.rich_table, table.fitting_lines])
+@pytest.mark.parametrize("draw", [table.rich_table, table.rich_lines])
 def test_a_table_fits_the_terminal(draw):
     """Nothing is cut: what does not fit stands in a second table."""
     names = [f"metric_{number}_cm" for number in range(9)]

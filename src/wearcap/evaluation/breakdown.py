@@ -8,7 +8,7 @@ from rich.console import Group
 from rich.table import Table
 
 from wearcap.metrics.position import PARTS
-from wearcap.metrics.table import RATIOS, TRUTH, Row, Scores, Summary, aggregate, fitting_lines
+from wearcap.metrics.table import RATIOS, TRUTH, Row, Scores, Summary, aggregate, rich_lines
 
 UNNAMED = "unnamed"
 """Activity of recordings that do not name any."""
@@ -66,7 +66,7 @@ def part_table(title: str, scores: Scores) -> Table | Group:
                 means[method][name] = Summary(each[metric].mean - each[f"{TRUTH}{metric}"].mean, None, 1)
     of_truth = [f"{' and '.join(columns[name] for name in shares)} of the truth's"] if shares else []
     about = "; ".join([*([unit] if unit else []), *of_truth])
-    return fitting_lines(f"{title} ({about})" if about else title, means, columns)
+    return rich_lines(f"{title} ({about})" if about else title, means, columns)
 
 
 def activity_table(title: str, activities: Scores, counts: Mapping[str, int]) -> Table | Group:

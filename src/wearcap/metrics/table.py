@@ -228,7 +228,7 @@ def rich_table(title: str, methods: Scores, metrics: Columns | None = None) -> T
     return _fitting(title, ["", *header[1:]], lines)
 
 
-def fitting_lines(title: str, methods: Scores, metrics: Columns | None = None) -> Table | Group:
+def rich_lines(title: str, methods: Scores, metrics: Columns | None = None) -> Table | Group:
     """One line per method, one column per metric; several tables if these are too many for `WIDTH`."""
     header, *lines = _cells(methods, metrics)
     by_metric = zip(header[1:], *(line[1:] for line in lines))
@@ -257,17 +257,6 @@ def _fitting(title: str, names: list[str], columns: list[list[str]]) -> Table | 
             table.add_row(*map(escape, row))
         tables.append(table)
     return tables[0] if len(tables) == 1 else Group(*tables)
-
-
-def rich_lines(title: str, methods: Scores, metrics: Columns | None = None) -> Table:
-    """The same with one line per method, one column per metric."""
-    table = Table(title=title)
-    header, *lines = _cells(methods, metrics)
-    for number, heading in enumerate(["", *header[1:]]):
-        table.add_column(heading, justify="right" if number else "left", no_wrap=not number)
-    for line in lines:
-        table.add_row(*map(escape, line))
-    return table
 
 
 def write_scores(
