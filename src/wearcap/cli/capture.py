@@ -39,8 +39,6 @@ from wearcap.tracking.stature import skeleton_of, with_stature
 from wearcap.viewer.page_layers import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png, write_video
 
-HELP = "turn recordings into motion: wearcap capture recording=DATASET/NAME or DATASET, checkpoint=… or pipeline=hps"
-
 
 def run(config: DictConfig) -> Motion | None:
     """Capture one recording, or all of a data set, or follow one that still grows (`live`)."""

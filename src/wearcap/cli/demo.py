@@ -27,7 +27,7 @@ def main(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     out, data, checkpoint = (options.output, options.output / "data", options.output / "train/checkpoints/last.ckpt")
     started = time.monotonic()
-    _step("Simulated wearers", prepare.main, ["simulated", "preset=demo", f"output={data}"])
+    _step("Simulated wearers", prepare.main, ["simulated", "preset=quick", f"output={data}"])
     training = [
         "experiment=motion_diffusion_head",
         f"data.sources.simulated.root={data}",
