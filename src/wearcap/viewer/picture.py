@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import cycle
 from pathlib import Path
 
 import av
@@ -25,13 +26,14 @@ from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 from wearcap.geometry.camera import Camera
-from wearcap.geometry.mesh import Mesh, capsules, checker_floor
+from wearcap.geometry.mesh import Mesh, capsules
 from wearcap.geometry.render import Light, Splats, render
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording.motion import HANDS, Motion
 from wearcap.recording.recording import Recording
 from wearcap.scene.objects import Environment
 from wearcap.viewer.camera_path import KEY_S, azimuths, smoothed
+from wearcap.viewer.ground import Ground
 from wearcap.viewer.page_layers import by_height, lit_points, posed_meshes, stick_body
 
 PALETTE = np.array([[0.45, 0.55, 0.66], [0.86, 0.55, 0.30], [0.44, 0.62, 0.42], [0.62, 0.45, 0.62]])
@@ -61,7 +63,7 @@ class _Actor:
     motion: Motion
     body: BodyModel
     color: Float[np.ndarray, "3"]
-    floor_z: float
+    ground: Ground
     environment: Environment | None = None
     """Objects that are drawn at the poses of the motion's `object_motion`."""
 
@@ -122,13 +124,11 @@ def _actors(
     """One actor per motion, in sticks unless a body is given for them all. Raises WearcapError for none."""
     if not motions:
         raise WearcapError("no motion to draw", expected="at least one")
-    shown = []
-    for number, (label, motion) in enumerate(motions.items()):
-        lowest = motion.T_world_joint.t[..., 2].amin(1)
-        floor_z = float(torch.quantile(lowest[:: max(1, len(lowest) // 5000)], 0.05)) - 0.02
-        color = PALETTE[number % len(PALETTE)]
-        shown.append(_Actor(label, motion, body or stick_body(motion.skeleton), color, floor_z, environment))
-    return shown
+    ground = Ground.of(next(iter(motions.values())))
+    return [
+        _Actor(label, motion, body or stick_body(motion.skeleton), color, ground, environment)
+        for (label, motion), color in zip(motions.items(), cycle(PALETTE))
+    ]
 
 
 def _looking(
@@ -157,9 +157,9 @@ def _panel(
     """One actor at one frame, on a chequered floor, seen in the direction of an azimuth (rad)."""
     direction, focal = (math.cos(azimuth), math.sin(azimuth), TILT), 1.75 * min(size[1], size[0] * 1.3)
     camera, T_world_cam = _looking(direction, target, distance, size, focal)
-    ground = np.array([target[0], target[1], actor.floor_z])
-    stage = checker_floor(ground, 3.0, 0.5, TILES, np.array(SKY))
-    below = (float(target[0]), float(target[1]), float(ground[2]))
+    time = actor.motion.timestamps[frame].item()
+    stage = actor.ground.mesh(target, time, TILES, np.array(SKY))
+    below = (float(target[0]), float(target[1]), actor.ground.below(target, time))
     light = Light(to_light=(0.55, -0.35, 1.0), shadow_center=below, shadow_radius=1.6)
     objects = [_visible(mesh, camera, T_world_cam, distance - CUT_AWAY_M) for mesh in actor.objects(frame)]
     meshes = [*actor.meshes(frame), *(mesh for mesh in objects if mesh is not None), stage]
