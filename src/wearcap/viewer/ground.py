@@ -18,7 +18,7 @@ LEVEL_M = 0.10
 """Ground whose footfalls differ less in height (m, without the highest and lowest 5 %) is drawn level."""
 NEAREST = 64
 """Number of footfalls, those nearest in time, that the ground around a person goes through."""
-SIDEWAYS, NEAR_M = 0.25, 0.04
+SIDEWAYS, NEAR_M = 0.5, 0.06
 """Weight of distances across the walking direction, in which stairs and slopes go on as they are, and the distance (m)
 within which a footfall alone decides."""
 STRIDE_S, WALKED_M = 0.6, 0.4

@@ -41,8 +41,10 @@ PALETTE = np.array([[0.45, 0.55, 0.66], [0.86, 0.55, 0.30], [0.44, 0.62, 0.42], 
 
 CONTACT_COLOR = np.array([0.80, 0.18, 0.12])
 HOLD_COLOR = np.array([0.20, 0.62, 0.25])
-TILES = np.array([[0.90, 0.90, 0.89], [0.80, 0.81, 0.82]])
+TILES = np.array([[0.85, 0.85, 0.84], [0.73, 0.74, 0.75]])
 SKY = (0.965, 0.97, 0.975)
+RIM = np.array(SKY) / 1.081
+"""Colour at the rim of the ground, which the light makes that of the sky."""
 VIEW_RAD, TILT, DISTANCE_M = math.atan2(0.78, -0.62), -0.30, 4.2
 """Azimuth of the direction in which the camera looks, from the front left at someone facing +x, its vertical part beside a
 horizontal part of 1, and the camera's distance from the person."""
@@ -158,7 +160,7 @@ def _panel(
     direction, focal = (math.cos(azimuth), math.sin(azimuth), TILT), 1.75 * min(size[1], size[0] * 1.3)
     camera, T_world_cam = _looking(direction, target, distance, size, focal)
     time = actor.motion.timestamps[frame].item()
-    stage = actor.ground.mesh(target, time, TILES, np.array(SKY))
+    stage = actor.ground.mesh(target, time, TILES, RIM)
     below = (float(target[0]), float(target[1]), actor.ground.below(target, time))
     light = Light(to_light=(0.55, -0.35, 1.0), shadow_center=below, shadow_radius=1.6)
     objects = [_visible(mesh, camera, T_world_cam, distance - CUT_AWAY_M) for mesh in actor.objects(frame)]
