@@ -1,6 +1,7 @@
 """The ground that a person walks on, for pictures: through the places where the feet stood, level where they are."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Self
 
 import numpy as np
@@ -9,13 +10,16 @@ from jaxtyping import Float
 
 from wearcap.body.kinematics import site_positions
 from wearcap.body.skeleton import FOOT_PATCHES
+from wearcap.geometry.compiled import compiled
 from wearcap.geometry.mesh import Mesh, checker_floor
 from wearcap.geometry.trajectory import nearest_frames
 from wearcap.recording.motion import Motion
 from wearcap.sensors.contacts import contacts_from_motion
 
 LEVEL_M = 0.10
-"""Ground whose footfalls differ less in height (m, without the highest and lowest 5 %) is drawn level."""
+"""Ground whose footfalls differ less in height (m, without the highest and lowest 5 %) is level throughout."""
+SAME_M = 0.02
+"""Where the nearest footfalls differ less in height (m), the ground is drawn level."""
 NEAREST = 64
 """Number of footfalls, those nearest in time, that the ground around a person goes through."""
 SIDEWAYS, NEAR_M = 0.5, 0.06
@@ -23,15 +27,14 @@ SIDEWAYS, NEAR_M = 0.5, 0.06
 within which a footfall alone decides."""
 STRIDE_S, WALKED_M = 0.6, 0.4
 """Half the time (s) over which the walking direction is taken, and the way (m) from which on it counts fully."""
-HALF_M, TILE_M, CELLS = 3.0, 0.5, 5
+HALF_M, TILE_M, CELLS = 3.0, 0.5, 4
 """Half the side of the drawn ground, the side of its tiles (m), and the number of cells along a tile that is not level."""
 
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """Heights of the ground by the footfalls of a motion; without any it is level at `level`."""
+    """Heights of the ground by the footfalls of a motion: one alone where it is level throughout."""
 
-    level: float
     places: Float[np.ndarray, "footfall 3"]
     times: Float[np.ndarray, "footfall"]
     across: Float[np.ndarray, "footfall 2"]
@@ -44,35 +47,48 @@ class Ground:
         if not len(places):
             lowest = motion.T_world_joint.t[..., 2].amin(1)
             lowest = float(torch.quantile(lowest[:: max(1, len(lowest) // 5000)], 0.05))
-            return cls(lowest - 0.02, places, times, places[:, :2])
+            return cls(np.array([[0.0, 0.0, lowest - 0.02]]), np.zeros(1), np.zeros((1, 2)))
         low, level, high = np.quantile(places[:, 2], [0.05, 0.5, 0.95])
         if high - low < LEVEL_M:
-            return cls(float(level), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2)))
+            return cls(np.array([[0.0, 0.0, level]]), np.zeros(1), np.zeros((1, 2)))
         frames = [nearest_frames(motion.timestamps, torch.from_numpy(times + s)) for s in (-STRIDE_S, STRIDE_S)]
         x, y = (motion.t_world_root[frames[1]] - motion.t_world_root[frames[0]])[:, :2].double().numpy().T
         across = np.stack([-y, x], -1) / np.hypot(x, y).clip(WALKED_M)[:, None]
-        return cls(float(level), places, times, across)
+        return cls(places, times, across)
 
     def mesh(
         self, center: Float[np.ndarray, "3"], time: float, colors: Float[np.ndarray, "2 3"], rim: Float[np.ndarray, "3"]
     ) -> Mesh:
         """Chequered ground around a point (m) at a time (s) of the motion, in the colour `rim` at its rim."""
-        if not len(self.places):
-            return checker_floor(np.array([*center[:2], self.level]), HALF_M, TILE_M, colors, rim)
-        near = np.argsort(np.abs(self.times - time))[:NEAREST]
-        return checker_floor(center, HALF_M, TILE_M, colors, rim, CELLS, lambda xy: self._heights(xy, near))
+        near = self._near(time)
+        if np.ptp(self.places[near, 2]) < SAME_M:
+            level = np.array([*center[:2], self.places[near, 2].mean()])
+            return checker_floor(level, HALF_M, TILE_M, colors, rim)
+        heights = partial(_heights, places=self.places[near], across=self.across[near])
+        return checker_floor(center, HALF_M, TILE_M, colors, rim, CELLS, heights)
 
     def below(self, point: Float[np.ndarray, "3"], time: float) -> float:
         """Height (m) of the ground below a point at a time (s)."""
-        near = np.argsort(np.abs(self.times - time))[:NEAREST]
-        return float(self._heights(point[None, :2], near)[0]) if len(near) else self.level
+        near = self._near(time)
+        return float(_heights(point[None, :2], self.places[near], self.across[near])[0])
 
-    def _heights(self, xy: Float[np.ndarray, "point 2"], near: np.ndarray) -> Float[np.ndarray, "point"]:
-        """Means of the footfalls' heights, weighted by the inverse fourth power of the distance."""
-        apart = xy[:, None] - self.places[near, :2]
-        square = (apart**2).sum(-1) - (1 - SIDEWAYS**2) * (apart * self.across[near]).sum(-1) ** 2
-        weight = (square + NEAR_M**2) ** -2
-        return weight @ self.places[near, 2] / weight.sum(1)
+    def _near(self, time: float) -> np.ndarray:
+        return np.argsort(np.abs(self.times - time))[:NEAREST]
+
+
+@compiled
+def _heights(xy, places, across):
+    """Means of the footfalls' heights, weighted by the inverse fourth power of their distances from each point."""
+    height = np.empty(len(xy))
+    for point in range(len(xy)):
+        total, weights = 0.0, 0.0
+        for fall in range(len(places)):
+            x, y = xy[point, 0] - places[fall, 0], xy[point, 1] - places[fall, 1]
+            aside = x * across[fall, 0] + y * across[fall, 1]
+            weight = (x * x + y * y - (1 - SIDEWAYS**2) * aside * aside + NEAR_M**2) ** -2
+            total, weights = total + weight * places[fall, 2], weights + weight
+        height[point] = total / weights
+    return height
 
 
 def _footfalls(motion: Motion) -> tuple[Float[np.ndarray, "footfall 3"], Float[np.ndarray, "footfall"]]:
