@@ -2,17 +2,15 @@
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Self
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from wearcap.body.kinematics import site_positions
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.geometry.compiled import compiled
 from wearcap.geometry.mesh import Mesh, checker_floor
-from wearcap.geometry.trajectory import nearest_frames
 from wearcap.recording.motion import Motion
 from wearcap.sensors.contacts import contacts_from_motion
 
@@ -41,20 +39,17 @@ class Ground:
     """Unit vectors across the walking direction, shorter where the person hardly walks."""
 
     @classmethod
-    def of(cls, motion: Motion) -> Self:
+    def of(cls, motion: Motion) -> "Ground":
         """The ground below a motion, by its contacts or, without them, by where its feet stand still."""
-        places, times = _footfalls(motion)
-        if not len(places):
-            lowest = motion.T_world_joint.t[..., 2].amin(1)
-            lowest = float(torch.quantile(lowest[:: max(1, len(lowest) // 5000)], 0.05))
-            return cls(np.array([[0.0, 0.0, lowest - 0.02]]), np.zeros(1), np.zeros((1, 2)))
-        low, level, high = np.quantile(places[:, 2], [0.05, 0.5, 0.95])
+        frames, places = _footfalls(motion)
+        low, level, high = np.quantile(places[:, 2], [0.05, 0.5, 0.95]) if len(places) else [_lowest(motion)] * 3
         if high - low < LEVEL_M:
             return cls(np.array([[0.0, 0.0, level]]), np.zeros(1), np.zeros((1, 2)))
-        frames = [nearest_frames(motion.timestamps, torch.from_numpy(times + s)) for s in (-STRIDE_S, STRIDE_S)]
-        x, y = (motion.t_world_root[frames[1]] - motion.t_world_root[frames[0]])[:, :2].double().numpy().T
-        across = np.stack([-y, x], -1) / np.hypot(x, y).clip(WALKED_M)[:, None]
-        return cls(places, times, across)
+        stride, root = round(STRIDE_S * motion.fps), motion.t_world_root.double().numpy()
+        walked = root[(frames + stride).clip(max=len(root) - 1)] - root[(frames - stride).clip(min=0)]
+        across = np.stack([-walked[:, 1], walked[:, 0]], -1)
+        across /= np.linalg.norm(across, axis=1, keepdims=True).clip(WALKED_M)
+        return cls(places, motion.timestamps.numpy()[frames], across)
 
     def mesh(
         self, center: Float[np.ndarray, "3"], time: float, colors: Float[np.ndarray, "2 3"], rim: Float[np.ndarray, "3"]
@@ -91,19 +86,17 @@ def _heights(xy, places, across):
     return height
 
 
-def _footfalls(motion: Motion) -> tuple[Float[np.ndarray, "footfall 3"], Float[np.ndarray, "footfall"]]:
-    """Mean place (m) and time (s) of each contact of each heel and toe tip; none for skeletons without these sites."""
+def _footfalls(motion: Motion) -> tuple[Int[np.ndarray, "footfall"], Float[np.ndarray, "footfall 3"]]:
+    """Middle frame and place (m) of each contact of each heel and toe tip; none for skeletons without these sites."""
     if not set(FOOT_PATCHES) <= set(motion.skeleton.sites) or len(motion) < 3:
-        return np.zeros((0, 3)), np.zeros(0)
+        return np.zeros(0, int), np.zeros((0, 3))
     contact = contacts_from_motion(motion) if motion.contact_prob is None else motion.contact_prob > 0.5
-    places = site_positions(motion.skeleton, motion.T_world_joint, FOOT_PATCHES).double().numpy()
-    samples = np.concatenate([places, np.broadcast_to(motion.timestamps[:, None, None], (*places.shape[:2], 1))], -1)
-    samples, contact = samples.transpose(1, 0, 2).reshape(-1, 4), contact.T.numpy()
-    starts = np.diff(contact, axis=1, prepend=False)
-    starts = (starts & contact).reshape(-1)[contact.reshape(-1)]
-    samples = samples[contact.reshape(-1)]
-    first = np.flatnonzero(starts)
-    if not len(first):
-        return np.zeros((0, 3)), np.zeros(0)
-    falls = np.add.reduceat(samples, first) / np.diff(first, append=len(samples))[:, None]
-    return falls[:, :3], falls[:, 3]
+    edges = np.diff(contact.T.numpy().astype(int), axis=1, prepend=0, append=0)
+    (patch, start), (_, stop) = np.nonzero(edges > 0), np.nonzero(edges < 0)
+    middle = (start + stop - 1) // 2
+    return middle, site_positions(motion.skeleton, motion.T_world_joint, FOOT_PATCHES).double().numpy()[middle, patch]
+
+
+def _lowest(motion: Motion) -> float:
+    lowest = motion.T_world_joint.t[..., 2].amin(1)
+    return float(torch.quantile(lowest[:: max(1, len(lowest) // 5000)], 0.05)) - 0.02
