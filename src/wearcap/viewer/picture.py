@@ -167,7 +167,7 @@ def _panel(
     camera, T_world_cam = _looking(direction, target, distance, size, focal)
     time = actor.motion.timestamps[frame].item()
     stage = actor.ground.mesh(target, time, TILES, RIM)
-    below = (float(target[0]), float(target[1]), actor.ground.below(target, time))
+    below = (float(target[0]), float(target[1]), float(actor.ground.heights(target[None, :2], time)[0]))
     light = Light(to_light=(0.55, -0.35, 1.0), shadow_center=below, shadow_radius=1.6)
     objects = [_visible(mesh, camera, T_world_cam, distance - CUT_AWAY_M) for mesh in actor.objects(frame)]
     meshes = [*actor.meshes(frame), *(mesh for mesh in objects if mesh is not None), stage]
