@@ -10,7 +10,7 @@ from textwrap import wrap
 from wearcap.body.anny_body import anny_body
 from wearcap.cli import capture, evaluate, export, prepare, train
 from wearcap.io.formats.motion_npz import read_motion
-from wearcap.recording import Motion, Recording, RecordingStore
+from wearcap.recording import Motion, RecordingStore
 from wearcap.viewer.picture import contact_sheet, save_png, shared_frames
 
 SHARED = "hmd2"
@@ -21,7 +21,7 @@ HELP = "prepare simulated data, train, evaluate, capture and export in minutes"
 def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser("wearcap demo", description=HELP)
     parser.add_argument("--output", type=Path, default=Path("outputs/demo"), help="folder for everything")
-    parser.add_argument("--steps", type=int, default=100, help="training steps")
+    parser.add_argument("--steps", type=int, default=80, help="training steps")
     options = parser.parse_args(arguments)
     out, data, trained = options.output, options.output / "data", options.output / "train/checkpoints/last.ckpt"
     started = time.monotonic()
@@ -39,31 +39,31 @@ def main(arguments: list[str]) -> None:
     _step("Training, shortly", train.main, training)
     store = RecordingStore.open(data)
     name = next(name for name in store.names("test") if re.fullmatch(r"[\w-]+", name))  # a value of the config
-    titles = {f"{options.steps} steps": trained, f"checkpoint {SHARED}": SHARED}
-    motions, folders = {}, (out / "trained", out / "shared")
-    for (title, checkpoint), folder in zip(titles.items(), folders):
-        taken = [f"checkpoint={checkpoint}", f"recording={data}/{name}", f"hydra.run.dir={folder}"]
-        _step(f"Capture: {title}", capture.main, [*taken, f"video={'10' if checkpoint == SHARED else 'false'}"])
-        motions[title] = read_motion(folder / "motion.npz")
+    motions: dict[str, Motion] = {}
+    for label, checkpoint, video in (
+        (f"checkpoint {SHARED}", SHARED, "10"),
+        (f"{options.steps} steps", trained, "false"),
+    ):
+        folder = out / label.replace(" ", "_")
+        taken = [f"checkpoint={checkpoint}", f"recording={data}/{name}", f"hydra.run.dir={folder}", f"video={video}"]
+        _step(f"Capture, {label}", capture.main, taken)
+        motions[label] = read_motion(folder / "motion.npz")
     table = [f"checkpoint={SHARED}", f"dataset={data}", f"hydra.run.dir={out}/evaluate", "seeds=[0]", "baselines=false"]
     _step(f"Evaluation: checkpoint {SHARED}", evaluate.main, [*table, f"output={out}/table.json"])
     exported = [f"checkpoint={trained}", f"hydra.run.dir={out}/export", f"output={out}/denoiser.onnx"]
     _step("Export", export.main, exported)
-    _picture(out / "demo.png", store.load(name), dict(reversed(motions.items())))
-    print(f"\nDone in {(time.monotonic() - started) / 60:.1f} minutes. Look first at")
-    print(f"  {out / 'demo.png'}\n      the truth, the checkpoint {SHARED}, and {options.steps} steps of training")
-    print(f"  {folders[1] / 'motion.mp4'}\n      ten seconds of it, moving; motion.glb beside it opens in Blender")
-    print(f"  {out / 'table.json'}\n      how far joints are from the truth, in cm")
-    print(f"In the browser:\n  {_wrapped(f'wearcap view {data}/{name} --motion {folders[1]}/motion.npz')}")
-
-
-def _picture(path: Path, recording: Recording, captures: dict[str, Motion]) -> None:
-    """The recording's true motion above the captures, as people."""
-    assert recording.motion is not None
-    motions = {"truth": recording.motion} | captures
-    body = anny_body(recording.motion.skeleton, recording.shape or None)
-    frames = shared_frames(motions, 6)
-    save_png(path, contact_sheet(motions, frames, size=(280, 320), body=body, distance=3.6))
+    truth, shared = store.load(name), out / f"checkpoint_{SHARED}"
+    assert truth.motion is not None
+    shown, body = {"truth": truth.motion} | motions, anny_body(truth.motion.skeleton, truth.shape or None)
+    frames = shared_frames(shown, 6)
+    save_png(out / "demo.png", contact_sheet(shown, frames, size=(280, 320), body=body, distance=3.6))
+    print(
+        f"\nDone in {(time.monotonic() - started) / 60:.1f} minutes. Look first at\n"
+        f"  {out / 'demo.png'}\n      the truth, the checkpoint {SHARED}, and {options.steps} steps of training\n"
+        f"  {shared / 'motion.mp4'}\n      ten seconds of it, moving; motion.glb beside it opens in Blender\n"
+        f"  {out / 'table.json'}\n      how far joints are from the truth, in cm\n"
+        f"or in the browser:\n  {_wrapped(f'wearcap view {data}/{name} --motion {shared}/motion.npz')}"
+    )
 
 
 def _step(title: str, verb: Callable[[list[str]], None], arguments: list[str]) -> None:

@@ -334,14 +334,11 @@ def write_video(
 
 def _with_progress(pictures: Iterator[np.ndarray], total: int, about: str) -> Iterator[np.ndarray]:
     """The pictures, with a bar on stderr or, where that is no terminal, a line every `LINE_S` seconds."""
-    console = Console(stderr=True)
-    if console.is_terminal:
-        yield from track(pictures, about, total, console=console, transient=True)
-        return
-    shown_at = monotonic()
-    for number, picture in enumerate(pictures, 1):
+    console, shown_at = Console(stderr=True), monotonic()
+    bar = track(pictures, about, total, console=console, transient=True, disable=not console.is_terminal)
+    for number, picture in enumerate(bar, 1):
         yield picture
-        if monotonic() - shown_at > LINE_S:
+        if not console.is_terminal and monotonic() - shown_at > LINE_S:
             print(f"{about}: {number} of {total} pictures", file=sys.stderr, flush=True)
             shown_at = monotonic()
 
