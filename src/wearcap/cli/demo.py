@@ -56,7 +56,7 @@ def main(arguments: list[str]) -> None:
     assert truth.motion is not None
     shown, body = {"truth": truth.motion} | motions, anny_body(truth.motion.skeleton, truth.shape or None)
     frames = shared_frames(shown, 6)
-    save_png(out / "demo.png", contact_sheet(shown, frames, size=(280, 320), body=body, distance=3.6))
+    save_png(out / "demo.png", contact_sheet(shown, frames, size=(280, 320), body=body, distance=3.9))
     print(
         f"\nDone in {(time.monotonic() - started) / 60:.1f} minutes. Look first at\n"
         f"  {out / 'demo.png'}\n      the truth, the checkpoint {SHARED}, and {options.steps} steps of training\n"
