@@ -75,6 +75,7 @@ A_POSE = {"left_shoulder": -0.9, "left_elbow": -0.9, "left_wrist": -0.9, "left_h
           "left_ankle": 0.0, "right_shoulder": 0.9, "right_elbow": 0.9, "right_wrist": 0.9, "right_hip": -0.12,
           "right_knee": -0.12, "right_ankle": 0.0}  # fmt: skip
 """Turn about the forward axis (rad) in the bind pose."""
+UPPER = ("spine", "spine2", "chest", "neck", "head", "collar", "shoulder", "elbow", "wrist")
 Y_UP = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
 """World (x forward, z up) to a file with y up that faces z."""
 Z_UP = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
@@ -91,7 +92,7 @@ class Convention:
     unit_m: float = 0.01
     axes: np.ndarray = field(default_factory=lambda: Y_UP)
     rest: str = "t"
-    """"t", "a", "own x" (bones along each joint's own x) or "zero" (OFFSETs of zero)."""
+    """"t", "a", "own x" (bones along each joint's own x), "bent trunk" (own x above the pelvis) or "zero" OFFSETs."""
     ground: str = ""
     """Name of a root on the ground above the hips."""
     places: bool = False
@@ -132,7 +133,9 @@ def _frames(convention: Convention, joints: list[str], parents: dict[str, str]) 
             continue
         if convention.rest == "a":
             frames[joint] = turn("x", A_POSE.get(joint, 0.0)).T @ convention.axes.T
-        elif convention.rest in ("own x", "zero"):
+        elif convention.rest in ("own x", "zero") or (
+            convention.rest == "bent trunk" and joint.split("_")[-1] in UPPER
+        ):
             child = next((c for c in joints if parents[c] == joint and c in OFFSETS), None)
             bone = OFFSETS[child] if child else np.array(SIDED_ENDS.get(joint, (0.1, 0, 0)))
             x = bone / max(np.linalg.norm(bone), 1e-9)

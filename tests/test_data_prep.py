@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from wearcap.cli.conf import compose, splits_dir
-from wearcap.cli.prepare import sources, usage
+from wearcap.cli.verbs import help_of, sources
 from wearcap.prepare import Splits
 
 DATA_PREP = Path(__file__).parents[1] / "data_prep"
@@ -15,7 +15,7 @@ PAGE = (DATA_PREP / "README.md").read_text(encoding="utf-8")
 
 @pytest.mark.parametrize("source", sources())
 def test_the_page_tells_what_a_source_needs(source):
-    assert f"\n  {source} " in usage()
+    assert f"\n  {source} " in help_of("prepare", [])
     row = next((line for line in PAGE.splitlines() if line.startswith(f"| `{source}` |")), "")
     cells = [cell.strip() for cell in row.strip("|").split("|")]
     assert len(cells) == 6, f"no complete row for {source} in data_prep/README.md"

@@ -1,15 +1,16 @@
 """The commands of README.md and docs/: their verbs exist, their overrides compose, their arguments parse."""
 
-import importlib
+import re
 import shlex
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
 from wearcap.cli import main as cli
 from wearcap.cli.conf import compose, conf_dir
 from wearcap.cli.live import with_system
-from wearcap.errors import WearcapError
+from wearcap.cli.verbs import VERBS, overrides
 
 ROOT = Path(__file__).parents[1]
 HYDRA_VERBS = ("train", "evaluate", "capture", "export")
@@ -30,14 +31,18 @@ COMMANDS = [(page.name, line) for page in PAGES for line in commands(page.read_t
 
 
 def composes(config: str, arguments: list[str]) -> None:
-    """Overrides compose; of a sweep's values each first one, and what the reader fills in (…) is left out."""
+    """Overrides compose, and all values are there; of a sweep's values each first one, and what the reader fills in (…)
+    is left out."""
     sweep = "-m" in arguments
     overrides = [argument for argument in arguments if "=" in argument and "…" not in argument]
-    compose(config, [o.split(",")[0] if sweep and "[" not in o else o for o in overrides])
+    made = compose(config, [o.split(",")[0] if sweep and "[" not in o else o for o in overrides])
+    if config == "prepare":
+        OmegaConf.to_container(made, resolve=True, throw_on_missing=True)
 
 
 @pytest.mark.parametrize(("page", "line"), COMMANDS, ids=[f"{page}: {line}" for page, line in COMMANDS])
 def test_a_command_of_the_pages_is_understood(page, line, tmp_path, monkeypatch):
+    """In a clean folder, up to the first input that is not there, and nothing is left."""
     monkeypatch.chdir(tmp_path)
     first, verb, *arguments = shlex.split(line)
     if first == "make":
@@ -46,16 +51,47 @@ def test_a_command_of_the_pages_is_understood(page, line, tmp_path, monkeypatch)
     if first == "python":
         assert (ROOT / verb).is_file()
         verb = verb.removesuffix(".py")
-    assert verb in cli.VERBS
+    assert verb in VERBS
+    given = overrides(verb, arguments)
     if verb in HYDRA_VERBS:
-        composes(verb, arguments)
+        composes(verb, given)
     elif verb == "live":
-        composes("live", with_system(arguments))
+        composes("live", with_system(given))
     elif verb == "prepare":
-        composes("prepare", [f"prepare={arguments[0]}", *arguments[1:]])
+        composes("prepare", [f"prepare={given[0]}", *given[1:]])
     elif verb != "demo":
-        with pytest.raises(WearcapError):  # the recording is not there; what does not parse ends in SystemExit
-            importlib.import_module(f"wearcap.cli.{verb}").main(arguments)
+        assert cli.run_verb(verb, arguments) == cli.USER_ERROR  # the recording is not there
+    assert not list(tmp_path.iterdir())
+
+
+BROUGHT = {"own", "seen_hands", "echo"}
+"""Data sets in `datasets/` that the reader brings."""
+
+
+def test_a_page_makes_its_data_sets_before_it_uses_them():
+    made_by: dict[str, list[tuple[str, int]]] = {}
+    for number, (page, line) in enumerate(COMMANDS):
+        words = shlex.split(line)
+        if words[:2] == ["wearcap", "prepare"]:
+            output = next((w for w in words if w.startswith("output=")), f"output=datasets/{words[2]}")
+            made_by.setdefault(output.removeprefix("output=datasets/"), []).append((page, number))
+    for number, (page, line) in enumerate(COMMANDS):
+        used = set(re.findall(r"(?<!output=)datasets/(\w+)", line)) - BROUGHT
+        for name in used:
+            assert name in made_by, f"{page}: {line}: no page makes datasets/{name}"
+            here = [place for of, place in made_by[name] if of == page]
+            assert not here or min(here) <= number, f"{page}: {line}: datasets/{name} is made further down"
+
+
+@pytest.mark.slow
+def test_the_first_commands_of_live_run_as_written(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    lines = [line for page, line in COMMANDS if page == "live.md"]
+    first = next(number for number, line in enumerate(lines) if " prepare " in line)
+    for line, more in zip(lines[first : first + 2], ([], ["seconds=2"])):
+        _, verb, *arguments = shlex.split(line)
+        assert cli.run_verb(verb, [*arguments, *more]) == 0
+    assert "frames, latency" in capfd.readouterr().out
 
 
 def test_the_pages_name_the_main_commands():

@@ -144,7 +144,7 @@ def test_the_guide_prints_the_steps_and_where_the_logs_have_them(made, files, tm
     given = arguments(made, files, tmp_path)
     for key in ("board", "tpose", "marks", "standing"):
         del given[key]
-    calibrate(given, "--guide")
+    calibrate(given, "guide=true")
     printed = capsys.readouterr().out
     assert "1. Lay both watches on the board" in printed
     assert "5. Swing" in printed

@@ -32,7 +32,7 @@ def arguments(data: Path, out: Path, *more: str) -> list[str]:
 
 
 def capturing(data: Path, out: Path, *more: str) -> None:
-    capture.main(arguments(data, out, f"recording={data}/walk", "body=false", "video_seconds=0.2", *more))
+    capture.main(arguments(data, out, f"recording={data}/walk", "body=false", "video=0.2", *more))
 
 
 def test_a_recording_becomes_files_and_a_report(data, tmp_path, capfd):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from wearcap.cli import scene
+from wearcap.cli import scene_edit
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.io.formats.environment import write_environment
@@ -36,13 +36,13 @@ def pages(monkeypatch):
 def test_a_folder_or_a_file_opens_with_what_was_made_before(tmp_path, pages, capsys):
     a_floor(tmp_path)
     write_environment(an_environment(1.0), tmp_path / "environment.json")
-    scene.main(["edit", str(tmp_path), "--port", "18420"])
+    scene_edit.main([str(tmp_path), "--port", "18420"])
     printed = capsys.readouterr().out
     assert "open http://127.0.0.1:" in printed
     assert str(tmp_path / "environment.json") in printed
     assert pages[0].current == "crate"
-    scene.main(
-        ["edit", str(tmp_path / "pointcloud.ply"), "--environment", str(tmp_path / "other.json"), "--port", "18420"]
+    scene_edit.main(
+        [str(tmp_path / "pointcloud.ply"), "--environment", str(tmp_path / "other.json"), "--port", "18420"]
     )
     assert pages[1].file == tmp_path / "other.json"
     assert pages[1].current is None
@@ -51,10 +51,10 @@ def test_a_folder_or_a_file_opens_with_what_was_made_before(tmp_path, pages, cap
 
 def test_a_scan_in_millimetres(tmp_path, pages):
     a_floor(tmp_path, 1000.0)
-    scene.main(["edit", str(tmp_path), "--metres-per-unit", "0.001", "--port", "18420"])
+    scene_edit.main([str(tmp_path), "--metres-per-unit", "0.001", "--port", "18420"])
     assert pages[0].editing.scan.points.max() == pytest.approx(2.95)
     with pytest.raises(WearcapError, match="millimetres"):
-        scene.main(["edit", str(tmp_path)])
+        scene_edit.main([str(tmp_path)])
 
 
 def test_what_is_wrong_is_printed(tmp_path, pages):
@@ -64,23 +64,23 @@ def test_what_is_wrong_is_printed(tmp_path, pages):
         ([str(tmp_path), "--port", "0"], "1 to 65535"),
     ):
         with pytest.raises(WearcapError, match=match):
-            scene.main(["edit", *arguments])
+            scene_edit.main([*arguments])
     a_floor(tmp_path)
     with pytest.raises(WearcapError, match=r"a \.json file"):
-        scene.main(["edit", str(tmp_path), "--environment", str(tmp_path / "map.ply")])
+        scene_edit.main([str(tmp_path), "--environment", str(tmp_path / "map.ply")])
     write_environment(an_environment(50.0), tmp_path / "environment.json")
     with pytest.raises(WearcapError, match=r"environment\.json: the object 'crate' stands .* outside the scan"):
-        scene.main(["edit", str(tmp_path)])
+        scene_edit.main([str(tmp_path)])
     (tmp_path / "environment.json").write_text("{")
     with pytest.raises(WearcapError, match=r"environment\.json"):
-        scene.main(["edit", str(tmp_path)])
+        scene_edit.main([str(tmp_path)])
     assert not pages
 
 
 def test_help_tells_of_every_option(capsys):
     with pytest.raises(SystemExit) as ended:
-        scene.main(["edit", "--help"])
+        scene_edit.main(["--help"])
     assert ended.value.code == 0
     printed = capsys.readouterr().out
-    for word in ("scene", "--environment", "--metres-per-unit", "--port", "--host"):
+    for word in ("scene", "environment=", "metres_per_unit=", "port=", "host="):
         assert word in printed

@@ -65,10 +65,10 @@ def test_wrong_settings_are_refused():
 
 def test_presets_say_how_much_they_make():
     minutes = {}
-    for preset in ("demo", "standard"):
+    for preset in ("quick", "standard"):
         config = compose("prepare", ["prepare=simulated", f"preset={preset}"])
         minutes[preset] = sum(config.recordings.values()) * config.duration_s / 60
-    assert minutes == {"demo": 6, "standard": 300}
+    assert minutes == {"quick": 6, "standard": 300}
 
 
 def test_splits_that_disagree_with_the_simulator_are_refused(tmp_path):

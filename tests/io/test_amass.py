@@ -118,9 +118,95 @@ def test_what_is_no_smpl_motion_is_refused(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+LEVELS = {"x": [[0, 1, 0], [0, 0, 1], [1, 0, 0]], "y": [[0, 0, 1], [1, 0, 0], [0, 1, 0]], "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+          "-y": [[1, 0, 0], [0, 0, 1], [0, -1, 0]], "-x": [[0, 1, 0], [0, 0, -1], [-1, 0, 0]]}  # fmt: skip
+"""Rows: a file's axes in the world with z up, by what is up in the file."""
+
+
+def walker(up: str, whole: bool = True) -> tuple[dict, np.ndarray, np.ndarray]:
+    """A walk over 3 m in a file with an up axis: its arrays, the pelvis' places and rotations in a world with z up.
+
+    Not `whole`: `trans` alone was turned, without the template's pelvis.
+    """
+    s = np.linspace(0, 1, 60)
+    to_file = Rotation.from_matrix(LEVELS[up]).inv()
+    stands = Rotation.from_matrix([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    R = Rotation.from_euler("z", 0.3 + s[:, None]) * stands
+    pelvis = np.stack([3 * s, 0.2 * s - 1, 0.94 + 0.02 * np.sin(9 * s)], -1)
+    poses = np.zeros((60, 156))
+    poses[:, :3] = (to_file * R).as_rotvec()
+    poses[:, [3, 6]] = np.stack([np.sin(9 * s), -np.sin(9 * s)], -1) * 0.4
+    trans = to_file.apply(pelvis) - PELVIS_SMPLH if whole else to_file.apply(pelvis - np.array(PELVIS_SMPLH))
+    return smplh_file(60, poses=poses, trans=trans), pelvis, (R * stands.inv()).as_matrix()
+
+
+@pytest.mark.parametrize("whole", [True, False], ids=["turned", "trans turned alone"])
+@pytest.mark.parametrize("up", LEVELS)
+def test_the_axis_that_is_up_is_seen_and_turned(tmp_path, up, whole):
+    arrays, pelvis, R = walker(up, whole)
+    np.savez(tmp_path / "a.npz", **arrays)
+    recording = read_amass(tmp_path / "a.npz")
+    assert (f"Its {up} axis points up" in recording.note) == (up != "z")
+    heading = Rotation.from_matrix(recording.motion.R_parent_joint[0, 0].double().numpy() @ R[0].T)
+    assert np.abs(heading.as_rotvec()[:2]).max() < 1e-6  # a turn about the vertical
+    t, R_pelvis = recording.motion.t_world_root.numpy(), recording.motion.R_parent_joint[:, 0].numpy()
+    np.testing.assert_allclose(R_pelvis, heading.as_matrix() @ R, atol=1e-6)
+    np.testing.assert_allclose(np.diff(t, axis=0), heading.apply(np.diff(pelvis, axis=0)), atol=1e-6)
+    np.testing.assert_allclose(t[:, 2], pelvis[:, 2], atol=1e-5 if up in ("y", "z", "-y") else 0.035)
+    stated = read_amass(tmp_path / "a.npz", up=up)
+    assert torch.equal(stated.motion.t_world_root, recording.motion.t_world_root)
+    assert stated.note == ""
+    with pytest.raises(WearcapError, match="up=w"):
+        read_amass(tmp_path / "a.npz", up="w")
+
+
+@pytest.mark.parametrize("feet_at", [-0.9, 0.0, 2.0])
+@pytest.mark.parametrize("crawls", [False, True])
+def test_who_lies_or_crawls_throughout_keeps_z(tmp_path, feet_at, crawls):
+    s = np.linspace(0, 1, 60)
+    poses = np.zeros((60, 156))  # SMPL's own axes: the body along y, its front along z
+    poses[:, :3] = [0, 0.1, 0] if not crawls else Rotation.from_euler("yx", [np.pi, -0.2]).as_rotvec()
+    if crawls:
+        poses[:, [3, 6]], poses[:, [12, 15]] = -1.3, 1.3
+    y = feet_at + 0.9 + (0.6 * s if crawls else 0 * s)
+    trans = np.stack([0 * s, y, (0.5 if crawls else 0.12) + 0 * s], -1) - PELVIS_SMPLH
+    np.savez(tmp_path / "a.npz", **smplh_file(60, poses=poses, trans=trans))
+    recording = read_amass(tmp_path / "a.npz")
+    assert recording.note == ""
+    np.testing.assert_allclose(recording.motion.t_world_root.numpy(), trans + PELVIS_SMPLH, atol=1e-6)
+
+
+@pytest.mark.real
+def test_a_walk_with_y_up(real_data):
+    recording = read_amass(real_data / "field" / "E_amass_y_up.npz")
+    arrays = np.load(real_data / "field" / "E_amass_y_up.npz")
+    assert "y axis points up" in recording.note
+    t = recording.motion.t_world_root.numpy()
+    np.testing.assert_allclose(np.ptp(t[:, :2], axis=0).max(), np.ptp(arrays["trans"], axis=0).max(), atol=1e-4)
+    assert t[:, 2] == pytest.approx(arrays["trans"][:, 1] + PELVIS_SMPLH[2], abs=1e-5)
+    places = recording.motion.T_world_joint.t
+    assert (places[:, recording.motion.skeleton.index("head"), 2] > 1.4).all()
+
+
+CAMERAS = {
+    "LLFF": {"poses": np.zeros((9, 3, 5)), "bds": np.zeros((9, 2))},
+    "rows of 17": {"poses": np.zeros((9, 17))},
+    "COLMAP": {"cameras": np.zeros((1, 4)), "points3D": np.zeros((50, 3))},
+    "NeRF": {"images": np.zeros((2, 4, 4, 3)), "poses": np.zeros((2, 4, 4)), "focal": np.array(500.0)},
+}
+
+
+@pytest.mark.parametrize("kind", CAMERAS)
+def test_cameras_are_no_motion(tmp_path, kind):
+    np.savez(tmp_path / "a.npz", **CAMERAS[kind])
+    with pytest.raises(WearcapError, match="no trans, no frame rate.*SfM or NeRF") as caught:
+        read_amass(tmp_path / "a.npz")
+    assert all(name in str(caught.value) for name in CAMERAS[kind])
+
+
 FAULTS = {
     "shape file": ({"poses": None, "trans": None}, "shape.npz"),
-    "no translation": ({"trans": None}, "'trans'"),
+    "no translation": ({"trans": None}, "holds no trans"),
     "no rate": ({"mocap_framerate": None}, "frame rate"),
     "rate 0": ({"mocap_framerate": np.array(0.0)}, "frame rate of 0"),
     "rate nan": ({"mocap_framerate": np.array(np.nan)}, "frame rate of nan"),

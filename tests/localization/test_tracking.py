@@ -97,7 +97,7 @@ def test_what_cannot_be_tracked_is_named(tmp_path, mapped):
     with pytest.raises(WearcapError, match="calibration for 640x480"):
         track_pictures(tmp_path / "six", tmp_path / "d", SETTINGS, Camera.pinhole(640, 480, 60), quiet)
     with pytest.raises(WearcapError, match="fps=0"):
-        verb.main([str(tmp_path / "six"), "settings.fps=0", f"paths.outputs={tmp_path}"])
+        verb.main([f"source={tmp_path / 'six'}", "settings.fps=0", f"paths.outputs={tmp_path}"])
     with pytest.raises(WearcapError, match="nothing to track"):
         verb.main([f"paths.outputs={tmp_path}"])
 
@@ -115,11 +115,14 @@ def test_from_a_finished_model(tmp_path, monkeypatch, capsys):
     names = write_pictures(tmp_path / "in put", 12)
     points = write_model(tmp_path / "model", names, missing=(4, 5), error_px=1.5)
     out = tmp_path / "o"
-    verb.main(
-        ["--from-model", str(tmp_path / "model"), f"output={out}", "settings.fps=10", f"paths.outputs={tmp_path}"]
-    )
+    verb.main([f"from_model={tmp_path / 'model'}", f"output={out}", "settings.fps=10", f"paths.outputs={tmp_path}"])
     assert "10 of 10 pictures placed" in capsys.readouterr().out
-    arguments = ["--from-model", str(tmp_path / "model"), str(tmp_path / "in put"), f"output={out}", "settings.fps=10"]
+    arguments = [
+        f"from_model={tmp_path / 'model'}",
+        f"source={tmp_path / 'in put'}",
+        f"output={out}",
+        "settings.fps=10",
+    ]
     verb.main([*arguments, f"paths.outputs={tmp_path}"])
     assert "scale and axes are arbitrary" in " ".join(capsys.readouterr().out.split())
     report = json.loads((out / "report.json").read_text())
@@ -137,14 +140,14 @@ def test_a_model_of_other_pictures_or_of_several_cameras_is_refused(tmp_path):
     names = write_pictures(tmp_path / "in", 6)
     write_model(tmp_path / "model", [f"x{name}" for name in names])
     with pytest.raises(WearcapError, match="places none of 6 pictures"):
-        verb.main(["--from-model", str(tmp_path / "model"), str(tmp_path / "in"), f"paths.outputs={tmp_path}"])
+        verb.main([f"from_model={tmp_path / 'model'}", f"source={tmp_path / 'in'}", f"paths.outputs={tmp_path}"])
     write_model(tmp_path / "model", names)
     cameras = tmp_path / "model/cameras.txt"
     cameras.write_text(cameras.read_text() + f"2 PINHOLE {WIDTH} {HEIGHT} 99 99 80 60\n")
     images = tmp_path / "model/images.txt"
     images.write_text(images.read_text().replace(" 1 p003.jpg", " 2 p003.jpg"))
     with pytest.raises(WearcapError, match="2 cameras"):
-        verb.main(["--from-model", str(tmp_path / "model"), f"paths.outputs={tmp_path}"])
+        verb.main([f"from_model={tmp_path / 'model'}", f"paths.outputs={tmp_path}"])
 
 
 def test_cameras_as_colmap_writes_them():
@@ -183,7 +186,7 @@ def test_real_photos_are_tracked(real_data, tmp_path):
     camera = next(iter(truth.values())).camera
     write_camera(camera, tmp_path / "camera.json")
     arguments = [
-        str(tmp_path / "in"),
+        f"source={tmp_path / 'in'}",
         f"camera={tmp_path / 'camera.json'}",
         f"output={tmp_path / 'out'}",
         "settings.mapping.max_keypoints=2048",

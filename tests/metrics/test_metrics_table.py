@@ -1,14 +1,17 @@
 """Scores of whole motions, their aggregation, and the tables."""
 
+import io
 import json
 import math
 from dataclasses import replace
 
 import pytest
 import torch
+from rich.console import Console
 
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
 from wearcap.errors import WearcapError
+from wearcap.evaluation.breakdown import part_table
 from wearcap.geometry import rotation
 from wearcap.metrics import physics, table
 from wearcap.metrics.table import Row, Summary
@@ -161,3 +164,28 @@ def test_tables_are_written(tmp_path):
 def test_a_recording_of_fifteen_minutes_is_scored_whole():
     truth = wobbling(frames=54_000)
     assert table.evaluate_motion(truth, truth)["mpjpe_cm"] == 0
+
+
+@pytest.mark.parametrize("draw", [table.rich_table, table.rich_lines])
+def test_a_table_fits_the_terminal(draw):
+    """Nothing is cut: what does not fit stands in a second table."""
+    names = [f"metric_{number}_cm" for number in range(9)]
+    methods = {f"method {k}": {name: Summary(12.25 + k, 1.5, 3) for name in names} for k in range(9)}
+    console = Console(width=80, file=io.StringIO())
+    console.print(draw("scores", methods))
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "…" not in text
+    assert text.count("± 1.50") == 81
+    assert max(map(len, text.splitlines())) <= 80
+
+
+def test_a_ratio_to_a_truth_of_almost_0_is_none():
+    row = Row("a", 0, 10, {"mpjpe_cm": 4.0, "foot_skate_cm_s": 2.5, "truth_foot_skate_cm_s": 0.001})
+    scores = table.aggregate([row])
+    assert math.isnan(scores["skate_ratio"].mean)
+    console = Console(width=80, file=io.StringIO())
+    console.print(part_table("parts", {"ours": scores}))
+    text = " ".join(console.file.getvalue().split())  # type: ignore[attr-defined]
+    assert "beyond" in text
+    assert "2.50" in text
+    assert "2500" not in text

@@ -92,7 +92,7 @@ def test_a_suit_becomes_files_without_a_camera(bare_take, tmp_path, monkeypatch)
     take = bare_take
     monkeypatch.chdir(tmp_path)
     out = tmp_path / "out"
-    command = ["capture", f"recording={take}", f"hydra.run.dir={out}", "video_seconds=0.1"]
+    command = ["capture", f"recording={take}", f"hydra.run.dir={out}", "video=0.1"]
     assert exit_code(command) == 0
     names = {"motion.npz", "motion.bvh", "motion.glb", "motion.mp4", "motion_smplh.npz"}
     assert {path.name for path in out.glob("motion*")} == names

@@ -137,3 +137,55 @@ def test_videos_drawn_by_several_threads_have_their_frames_in_order():
     from wearcap.viewer.picture import _in_parallel
 
     assert [int(x[0]) for x in _in_parallel(lambda t: np.array([t]), [float(k) for k in range(50)])] == list(range(50))
+
+
+def test_an_interrupted_video_leaves_nothing_and_progress_is_printed_without_a_terminal(tmp_path, monkeypatch, capfd):
+    from wearcap.viewer import picture
+
+    drawn = picture.captioned
+
+    def interrupted(image, text):
+        if capfd.readouterr().err.count("of 60 pictures"):
+            raise KeyboardInterrupt
+        return drawn(image, text)
+
+    monkeypatch.setattr(picture, "captioned", interrupted)
+    monkeypatch.setattr(picture, "LINE_S", 0.0)
+    with pytest.raises(KeyboardInterrupt):
+        write_video(tmp_path / "v.mp4", {"a": swaying_motion(120)}, size=(64, 64))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_body_is_only_shown_where_a_motion_has_its_joints():
+    from wearcap.body.anny_body import anny_body
+    from wearcap.body.skeletons import smpl24
+    from wearcap.viewer.picture import _actors
+
+    motion = swaying_motion(10)
+    other = replace(
+        motion,
+        skeleton=smpl24(),
+        R_parent_joint=torch.eye(3).expand(10, 24, 3, 3),
+        contact_prob=None,
+        body_contact_prob=None,
+    )
+    people, sticks = _actors({"a": motion, "b": other}, anny_body(motion.skeleton))
+    assert people.body.skeleton.joint_names == motion.skeleton.joint_names
+    assert sticks.body.skeleton.joint_names == other.skeleton.joint_names
+
+
+@pytest.mark.parametrize(
+    ("video", "seconds"), [("auto", 60.0), (True, np.inf), (False, 0.0), (None, 0.0), (10, 10.0), (1, 1.0), (0.2, 0.2)]
+)
+def test_how_much_of_a_capture_is_filmed(video, seconds):
+    from wearcap.cli.capture import _filmed_s
+
+    assert _filmed_s(video) == seconds
+
+
+@pytest.mark.parametrize("video", ["some", -1, np.inf, np.nan])
+def test_what_video_takes_is_stated(video):
+    from wearcap.cli.capture import _filmed_s
+
+    with pytest.raises(WearcapError, match="auto"):
+        _filmed_s(video)

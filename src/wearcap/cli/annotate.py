@@ -1,13 +1,12 @@
 """`wearcap annotate`: mark in the browser when each hand holds something, beside the video, and export the labels."""
 
-import argparse
 import webbrowser
 from pathlib import Path
 
 from wearcap.cli.main import add_page
+from wearcap.cli.verbs import Arguments
 from wearcap.errors import WearcapError
 
-HELP = "mark hand contacts in the browser: wearcap annotate DATASET/NAME [--video FILE]"
 _DESCRIPTION = """Mark in the browser when each hand holds something: video beside the 3D pose, a click on a hand
 starts and ends a contact. Labels are saved as you work, to OUTPUT/NAME.contacts.json, and taken up again next time.
 `wearcap annotate export --help` writes them as H-contact's JSON."""
@@ -18,7 +17,7 @@ _OUTPUT = "folder of the labels (default: outputs/annotate/DATASET's name)"
 def main(arguments: list[str]) -> None:
     if arguments[:1] == ["export"]:
         return _export(arguments[1:])
-    parser = argparse.ArgumentParser(prog="wearcap annotate", description=_DESCRIPTION)
+    parser = Arguments(prog="wearcap annotate", description=_DESCRIPTION)
     parser.add_argument("recording", help=_RECORDING)
     parser.add_argument("--output", type=Path, help=_OUTPUT)
     parser.add_argument("--video", type=Path, help="video to show (default: that of the recording's camera)")
@@ -66,7 +65,7 @@ def main(arguments: list[str]) -> None:
 
 
 def _export(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(
+    parser = Arguments(
         prog="wearcap annotate export",
         description="Write annotated labels as H-contact's JSON: "
         '{"contacts": {"left_hand": [[start, end], …], "right_hand": […]}} in seconds on the recording\'s clock; '

@@ -42,10 +42,6 @@ from wearcap.sensors.watch_calibration import (
     write_watch_calibration,
 )
 
-HELP = (
-    "camera intrinsics from a checkerboard: wearcap calibrate source=VIDEO columns=9 rows=6 square_m=0.025; "
-    "watches: wearcap calibrate steps=watches left=LEFT.csv right=RIGHT.csv --guide"
-)
 ENOUGH = 0.6
 """Coverage below which a hint is printed."""
 
@@ -300,7 +296,6 @@ def _guide(config: DictConfig, session: WatchSession) -> None:
 
 def main(arguments: list[str]) -> None:
     if any(argument.startswith("steps=") for argument in arguments):
-        arguments = ["guide=true" if argument == "--guide" else argument for argument in arguments]
         hydra_main("calibrate_watches", run_watches, arguments)
     else:
         hydra_main("calibrate", run, arguments)

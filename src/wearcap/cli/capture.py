@@ -1,6 +1,7 @@
 """`wearcap capture`: a recording goes in; motion files and a video come out."""
 
 import json
+import math
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -34,12 +35,9 @@ from wearcap.reading import load, read
 from wearcap.recording import Motion, Recording
 from wearcap.recording.store import dataset_folder
 from wearcap.runtime.system import CaptureInput, StageOptions, System
-from wearcap.scene.objects import Environment
 from wearcap.tracking.stature import skeleton_of, with_stature
 from wearcap.viewer.page_layers import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png, write_video
-
-HELP = "turn recordings into motion: wearcap capture recording=DATASET/NAME or DATASET, checkpoint=… or pipeline=hps"
 
 
 def run(config: DictConfig) -> Motion | None:
@@ -62,6 +60,7 @@ def captured(config: Any, system: System) -> Motion | None:
     folder = Path(config.output)
     if config.samples < 1:
         raise WearcapError(f"samples={config.samples}", expected="at least 1")
+    filmed_s = _filmed_s(config.video)
     body = None if config.skeleton is None else skeleton_of(read(config.skeleton))
     how = stated(config if isinstance(config, DictConfig) else vars(config))
     loaded = load(config.recording, how)
@@ -84,25 +83,30 @@ def captured(config: Any, system: System) -> Motion | None:
     if report is not None:
         write_text(folder / "report.json", json.dumps(report, indent=1) + "\n")
     if motion is not None:
-        environment = None if motion.object_motion is None else system.objects(source)
-        if len(captures) > 1:  # sample-0.npz, …, and samples.png: the variety from one input (thesis Fig. 6.6)
-            motions = [each.motion for each in captures if each.motion is not None]
-            draws = {f"sample {number}": draw for number, draw in enumerate(motions)}
-            for label, draw in draws.items():
-                write_motion(draw, folder / f"{label.replace(' ', '-')}.npz")
-            truth, body = with_objects(recording, environment), anny_body(motion.skeleton, recording.shape or None)
-            shown = ({} if truth is None else {"truth": truth}) | draws
-            save_png(folder / "samples.png", contact_sheet(shown, body=body, environment=environment))
         if config.checkpoint is not None:
             motion.provenance.update(checkpoint=str(config.checkpoint))
         motion.provenance.update(recording=str(config.recording))
         if recording.origin is not None:
             motion.provenance.update(origin=" ".join(map(str, recording.origin.tolist())))
-        _write(motion, recording, environment, folder, config)
+        _write(motion, recording, folder, config)
+        environment = None if motion.object_motion is None else system.objects(source)
+        truth = with_objects(recording, environment)
+        shown = {} if truth is None else {"truth": truth}
+        if len(captures) > 1:  # sample-0.npz, …, and samples.png: the variety from one input (thesis Fig. 6.6)
+            motions = [each.motion for each in captures if each.motion is not None]
+            draws = {f"sample {number}": draw for number, draw in enumerate(motions)}
+            for label, draw in draws.items():
+                write_motion(draw, folder / f"{label.replace(' ', '-')}.npz")
+            body = anny_body(motion.skeleton, recording.shape or None)
+            save_png(folder / "samples.png", contact_sheet(shown | draws, body=body, environment=environment))
+        if filmed_s:
+            body = anny_body(motion.skeleton, recording.shape or None) if config.body else None
+            shown |= {"capture": motion}
+            write_video(folder / "motion.mp4", shown, body=body, environment=environment, max_seconds=filmed_s)
     return motion
 
 
-def _write(motion: Motion, recording: Recording, environment: Environment | None, folder: Path, config: Any) -> None:
+def _write(motion: Motion, recording: Recording, folder: Path, config: Any) -> None:
     write_motion(motion, folder / "motion.npz")
     write_bvh(motion, folder / "motion.bvh", origin=recording.origin if config.map_coordinates else None)
     shown, body = motion, anny_body(motion.skeleton, recording.shape or None) if config.body is True else None
@@ -113,11 +117,17 @@ def _write(motion: Motion, recording: Recording, environment: Environment | None
     elif config.smpl:
         write_smplh(motion, folder / "motion_smplh.npz")
     write_glb(shown, folder / "motion.glb", body=body)
-    if config.video:
-        truth = with_objects(recording, environment)
-        shown = {"truth": truth} if truth is not None else {}
-        shown, seconds = shown | {"capture": motion}, config.video_seconds
-        write_video(folder / "motion.mp4", shown, environment=environment, max_seconds=seconds)
+
+
+def _filmed_s(video: Any) -> float:
+    """Longest duration (s) of the video, 0 for none. Raises WearcapError for what `video=` does not take."""
+    if isinstance(video, bool) or video is None:
+        return math.inf if video else 0.0
+    if isinstance(video, int | float) and 0 <= video < math.inf:
+        return float(video)
+    if video != "auto":
+        raise WearcapError(f"video={video}", expected="auto (the first minute), true, false, or seconds: video=10")
+    return 60.0
 
 
 def _on_smpl(

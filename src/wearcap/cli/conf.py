@@ -3,6 +3,7 @@
 import functools
 import os
 import re
+import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+import torch
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -27,8 +29,10 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from wearcap.cli.stated import stated
+from wearcap.cli.verbs import conf_dir
 from wearcap.errors import WearcapError, nearest
 from wearcap.files import resource
+from wearcap.locks import LOCK
 from wearcap.models.checkpoint import read_checkpoint
 from wearcap.reading import read
 from wearcap.recording import RecordingStore
@@ -36,11 +40,6 @@ from wearcap.recording.store import MANIFEST, dataset_folder
 from wearcap.runtime.needs import Need
 from wearcap.runtime.system import CaptureInput, System, training_of
 from wearcap.spread import Spread
-
-
-def conf_dir() -> Path:
-    """The checkout's `conf/` when the package is imported from one, else the copy that the wheel carries."""
-    return resource("conf", "conf")
 
 
 def splits_dir() -> Path:
@@ -55,7 +54,7 @@ def compose(config_name: str, overrides: Iterable[str] = ()) -> DictConfig:
     """
     overrides = list(overrides)
     with explained(config_name, overrides):
-        return _compose(config_name, overrides)
+        return _compose(config_name, [*map(readable, overrides)])
 
 
 def with_pipeline(arguments: list[str]) -> list[str]:
@@ -115,9 +114,21 @@ def _given(arguments: list[str]) -> dict[str, Any]:
     given: dict[str, Any] = {}
     for argument in arguments:
         with suppress(HydraException):  # its complaint comes when the config is composed
-            override = OverridesParser.create().parse_override(argument)
+            override = OverridesParser.create().parse_override(readable(argument))
             given[override.key_or_group] = override
     return given
+
+
+def readable(argument: str) -> str:
+    """An override with its value quoted if Hydra cannot read it plain: a path with brackets, an address, a pattern."""
+    key, equals, value = argument.partition("=")
+    if not equals or argument[0] == "-" or value[:1] in tuple("[{'\""):
+        return argument
+    with suppress(HydraException):
+        OverridesParser.create().parse_override(argument)
+        return argument
+    quoted = value.replace("'", "\\'")
+    return f"{key}='{quoted}'"
 
 
 def hydra_main(config_name: str, task: Callable[[DictConfig], Any], arguments: list[str]) -> None:
@@ -130,7 +141,7 @@ def hydra_main(config_name: str, task: Callable[[DictConfig], Any], arguments: l
     with explained(config_name, arguments):
         # Hydra reads sys.argv, and with HYDRA_FULL_ERROR it raises errors instead of exiting.
         before, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
-        sys.argv = [sys.argv[0], *arguments]
+        sys.argv = [sys.argv[0], *map(readable, arguments)]
         os.environ["HYDRA_FULL_ERROR"] = "1"
         try:
             application(guarded)()
@@ -158,11 +169,49 @@ class _Guarded:
 
     def __call__(self, config: DictConfig) -> Any:
         try:
+            _require_usable(config)
             return self.task(config)
         except (WearcapError, HydraException, OmegaConfBaseException) as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise
             self.refused = error
+            _remove_unused(Path(HydraConfig.get().runtime.output_dir), config)
+
+
+def _require_usable(config: DictConfig) -> None:
+    """Raise WearcapError, before anything is computed, for a device that is not here and for outputs that cannot be written."""
+    if config.get("device") is not None:
+        try:
+            torch.empty(0, device=config.device)
+        except (RuntimeError, AssertionError) as error:
+            reason = str(error).splitlines()[0].split(". ")[0]
+            raise WearcapError(f"device={config.device} is not here ({reason})", fix="Give device=cpu.") from error
+    for key in ("output", "record", "report"):
+        if isinstance(path := config.get(key), str):
+            require_writable(path, key)
+
+
+def require_writable(path: str | Path, key: str) -> None:
+    """Raise WearcapError if neither a file nor, where the path has no suffix, a folder can be written at a path."""
+    path = Path(path).absolute()
+    place = next(each for each in (path, *path.parents) if os.path.lexists(each))
+    if place.is_file() and (place != path or not path.suffix):
+        raise WearcapError(f"{key}={path}, but a file is in the way", place, fix=f"Give another {key}=….")
+    if not os.access(place, os.W_OK):
+        raise WearcapError(f"{key}={path} cannot be written", place, fix=f"Give another {key}=….")
+
+
+def _remove_unused(run: Path, config: DictConfig) -> None:
+    """Remove a refused run's folder, and those above it up to `paths.outputs`, if nothing but Hydra's own files lies in it."""
+    own = [*run.glob("*.log"), run / LOCK, run / ".hydra"]
+    if set(run.iterdir()) - set(own):
+        return
+    for path in own:
+        shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+    top = Path(OmegaConf.select(config, "paths.outputs", default=run)).absolute()
+    with suppress(OSError):  # others have theirs there
+        for folder in (run, *(each for each in run.parents if each.is_relative_to(top))):
+            folder.rmdir()
 
 
 def _compose(config_name: str, overrides: list[str]) -> DictConfig:
@@ -230,6 +279,9 @@ def _explanation(error: Exception, config_name: str, arguments: list[str]) -> We
     rest = [a for a in arguments if "=" in a and not a.startswith("-") and wrong not in a and "," not in a]
     with suppress(HydraException, OmegaConfBaseException):
         valid |= set(_dotted(_compose(config_name, rest)))
+    if wrong.startswith("presets."):
+        presets = sorted({key.split(".")[1] for key in valid if key.startswith("presets.")})
+        return WearcapError(f"no preset {wrong.split('.')[1]!r}", expected=f"preset={' or preset='.join(presets)}")
     return WearcapError(f"config {config_name!r} has no key {wrong!r}", fix=nearest(wrong, valid))
 
 

@@ -1,91 +1,27 @@
 """`wearcap doctor`: examine recordings and report problems and how to fix them."""
 
-import argparse
-import json
 import sys
-from collections.abc import Callable
-from dataclasses import asdict
-from functools import partial
 
-from hydra.utils import instantiate
-from rich.console import Console
-from rich.progress import Progress
-from rich.table import Table
-from rich.text import Text
-
-from wearcap.cli.conf import compose
-from wearcap.cli.stated import add_conventions, stated
-from wearcap.doctor import Report
-from wearcap.doctor.preflight import preflight
-from wearcap.reading import examine
-from wearcap.runtime.system import System
-
-HELP = "report what a recording holds, what looks wrong in it, and how to fix it"
-_COLOR = {"ok": "green", "note": "cyan", "warning": "yellow", "error": "bold red"}
+from wearcap.cli.stated import add_conventions
+from wearcap.cli.verbs import VERBS, Arguments
 
 
 def main(arguments: list[str]) -> None:
     """Exit code 1 when errors were found, else 0."""
-    parser = argparse.ArgumentParser(prog="wearcap doctor", description=HELP)
+    parser = Arguments(prog="wearcap doctor", description=VERBS["doctor"])
     parser.add_argument(
         "path",
         help="data set folder, DATASET/NAME, recording file, Aria MPS folder, scene folder, environment.json, motion capture file or folder, watch log, trajectory, headset log, or a folder with such logs of one session",
     )
     parser.add_argument(
-        "--for",
-        dest="pipeline",
-        metavar="PIPELINE",
-        help="or for=PIPELINE: what does hps, ireplica, hmd2, mocap_every or echo lack?",
+        "--for", dest="pipeline", metavar="PIPELINE", help="what does hps, ireplica, hmd2, mocap_every or echo lack?"
     )
     add_conventions(parser)
     parser.add_argument("--json", action="store_true", help="print the findings as JSON")
     parser.add_argument("--quiet", action="store_true", help="leave out what is sound")
-    options = parser.parse_args([f"--{word}" if word.startswith("for=") else word for word in arguments])
-    check = None if options.pipeline is None else _preflight(options.pipeline)
-    how = stated(vars(options))
-    if options.json:
-        report = examine(options.path, preflight=check, how=how)
-        findings = {name: [asdict(finding) for finding in found] for name, found in report.findings.items()}
-        content = {"source": report.source, "sound": report.sound, "findings": findings}
-        print(json.dumps(content, indent=1, ensure_ascii=False))
-    else:
-        console = Console()
-        with Progress(console=Console(stderr=True), transient=True) as progress:
-            task = progress.add_task("examining", total=None)
-            report = examine(
-                options.path, lambda done, total: progress.update(task, completed=done, total=total), check, how
-            )
-        console.print(_table(report, options.quiet))
-        counts = {severity: len(report.of_severity(severity)) for severity in ("error", "warning", "note")}
-        listed = ", ".join(f"{count} {severity}{'s' if count != 1 else ''}" for severity, count in counts.items())
-        verdict = "[green]sound[/]" if report.sound else "[bold red]not sound[/]"
-        count = len(report.findings)
-        console.print(f"{count} recording{'s' if count != 1 else ''}: {verdict} ({listed})")
-    if not report.sound:
+    options = parser.parse_args(arguments)
+
+    from wearcap.cli.doctor_report import examined
+
+    if not examined(options).sound:
         sys.exit(1)
-
-
-def _preflight(name: str) -> Callable:
-    """The check of what a pipeline, by its config's name, needs; its network is not loaded."""
-    made = instantiate(compose("capture", ["recording=none", f"pipeline={name}"]).pipeline, _convert_="all")
-    needs = made.needs() if isinstance(made, System) else made.func.required
-    return partial(preflight, name=name, needs=needs)
-
-
-def _table(report: Report, quiet: bool) -> Table:
-    """One row per finding: the check, the result, the evidence, the fix, and the recordings concerned."""
-    table = Table(title=report.source, title_justify="left")
-    for column in ("", "check", "finding"):
-        table.add_column(column, no_wrap=column == "")
-    several = len(report.findings) > 1
-    for finding, names in report.grouped():
-        if quiet and finding.severity == "ok":
-            continue
-        color = _COLOR[finding.severity]
-        cell = Text(finding.what, style=color if finding.severity != "ok" else "")
-        cell.append(f"\n{finding.evidence}" if finding.evidence else "", style="dim")
-        cell.append(f"\n→ {finding.fix}" if finding.fix else "", style="bold")
-        if several:
-            cell.append(f"\n{len(names)}: {', '.join(names[:3])}{' …' if len(names) > 3 else ''}", style="italic")
-        table.add_row(Text(finding.severity, style=color), Text(finding.check), cell)
-    return table

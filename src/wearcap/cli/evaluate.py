@@ -50,7 +50,6 @@ from wearcap.viewer.picture import contact_sheet, save_png
 OURS = "wearcap"
 """Name of the evaluated checkpoint's method in the table."""
 
-HELP = "score a checkpoint: wearcap evaluate checkpoint=… [dataset=DIR] [split=test], or pipeline=hps dataset=DIR"
 
 LISTED = 30
 """Most recordings that are shown one by one, if none failed; table.csv has them all."""

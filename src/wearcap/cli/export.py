@@ -7,8 +7,6 @@ from wearcap.cli.conf import hydra_main, load_pipeline, with_pipeline
 from wearcap.export.files import ExportReport, write_exports
 from wearcap.models.checkpoint import load_trained, share_checkpoint
 
-HELP = "export a network: wearcap export checkpoint=… format=onnx|pt2|safetensors"
-
 
 def run(config: DictConfig) -> dict[str, ExportReport]:
     """Export the networks with their sidecar; prints the errors against eager and both latencies.
@@ -26,7 +24,10 @@ def run(config: DictConfig) -> dict[str, ExportReport]:
         exports = load_pipeline(config.checkpoint, config.pipeline, "cpu").exports()
     reports = write_exports(exports, config.output, config.format)
     for name, report in reports.items():
-        show(f"exported {name}: {report.path}\n{report}")
+        show(
+            f"exported {name}: {report.path}, {report.bytes / 1e6:.1f} MB of {report.format}, which differs from PyTorch by at "
+            f"most {report.max_abs_error:.1g} and takes {report.latency_ms:.1f} ms (PyTorch {report.eager_latency_ms:.1f} ms)"
+        )
     return reports
 
 

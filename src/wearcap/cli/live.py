@@ -39,11 +39,13 @@ MAX_MESSAGES = 20
 """Different messages of libraries that are shown."""
 HANDS = ("auto", "grip", "wrist", "joint")
 """What tracked hands are; those of streams are held controllers where nothing is stated."""
-HELP = "capture while people move: wearcap live system=hmd2 source=vmc://:39540 to=vmc://127.0.0.1:39539 view=true"
 
 
 def run(config: DictConfig) -> dict[str, Any]:
     """Capture until interrupted, or until a replay has ended; returns the report."""
+    if not (_listed(config.to) or config.view or config.record):
+        fix = "Give to=ADDRESS, view=true (a page in the browser) or record=FOLDER."
+        raise WearcapError("nothing leaves: no sink, no page, no record", fix=fix)
     threads = config.threads or max(1, (os.cpu_count() or 2) // 2)
     if threads < 1:
         raise WearcapError(f"threads={threads}", expected="1 or more")

@@ -1,19 +1,19 @@
 """`wearcap VERB …`: finds the verb's module, runs it, and turns errors that users can fix into one message."""
 
-import argparse
 import errno
 import importlib
 import os
+import re
 import sys
 import traceback
+from argparse import ArgumentParser
 
 from wearcap import __version__
 from wearcap.boundary.limits import VARIABLE, gib_bytes
 from wearcap.boundary.own import trusting
+from wearcap.cli.verbs import VERBS, conf_dir, help_of, overrides
 from wearcap.errors import WearcapError, nearest
 
-VERBS = "train evaluate capture live export prepare view render annotate scene calibrate track doctor demo".split()  # noqa: SIM905
-"""Verbs in the order of the help, each a module."""
 USER_ERROR, INTERRUPTED = 2, 130
 
 
@@ -22,25 +22,35 @@ def usage() -> str:
     lines = [
         "wearcap: motion capture from what a person wears.",
         "",
-        "usage: wearcap [--debug] [--max-file-gib N] VERB [arguments] [trust=true]     wearcap VERB --help     wearcap --version",
+        "usage: wearcap VERB key=value …     wearcap VERB --help     wearcap --version",
         "",
-        *(f"  {verb:10} {importlib.import_module(f'wearcap.cli.{verb}').HELP}" for verb in VERBS),
+        *(f"  {verb:10} {line}" for verb, line in VERBS.items()),
         "",
-        "--debug shows the traceback of an error.",
-        "trust=true opens .ckpt and .pt2 files from elsewhere, which can run code: for files that are your own.",
-        "--max-file-gib N reads files of up to N GiB once unpacked, however tightly packed: for files that you trust.",
+        "debug=true shows the traceback of an error.",
+        "trust=true opens .ckpt and .pt2 files from elsewhere, which can run code: for",
+        "files that are your own. max_file_gib=N reads files of up to N GiB once",
+        "unpacked, however tightly packed: for files that you trust.",
+        "All settings go as key=value or as --key value, as you like.",
     ]
     return "\n".join(lines)
 
 
 def run_verb(verb: str, arguments: list[str]) -> int:
     """Run one verb and return the exit code; errors that a user can fix become one message on stderr."""
-    debug = "--debug" in arguments
-    trust = "trust=true" in arguments
-    arguments = [argument for argument in arguments if argument not in ("--debug", "trust=true")]
+    debug, trust = (bool({f"{key}=true", f"--{key}"} & set(arguments)) for key in ("debug", "trust"))
+    own = {"debug", "trust"}  # of every verb
+    arguments = [word for word in arguments if word.removesuffix("=true").removesuffix("=false").lstrip("-") not in own]
     try:
+        if {"--help", "-h"} & set(arguments) and (text := help_of(verb, arguments)):
+            print(text)
+            return 0
+        module = verb
+        if verb == "scene" and arguments[:1] == ["edit"]:
+            module, arguments = "scene_edit", arguments[1:]
+        elif (conf_dir() / f"{verb}.yaml").is_file():
+            arguments = overrides(verb, arguments)
         with trusting(trust):
-            importlib.import_module(f"wearcap.cli.{verb}").main(arguments)
+            importlib.import_module(f"wearcap.cli.{module}").main(arguments)
         return 0
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
@@ -75,7 +85,7 @@ def port_number(text: str) -> int:
     return number
 
 
-def add_page(parser: argparse.ArgumentParser, port: int, host: bool = False) -> None:
+def add_page(parser: ArgumentParser, port: int, host: bool = False) -> None:
     """Add the options `--port`, and `--host` if the page can be served to other machines."""
     text = f"port of the page (default {port}, else the next free)"
     parser.add_argument("--port", type=port_number, default=port, help=text)
@@ -88,18 +98,18 @@ def main(arguments: list[str] | None = None) -> None:
     """The console command. Exits with 0, 2 (an error that a user can fix) or 130 (interrupted)."""
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
-        option = "--max-file-gib"
-        place = next((i for i, word in enumerate(arguments) if word.split("=")[0] == option), None)
+        option = re.compile(r"--max[-_]file[-_]gib(=|$)|max_file_gib=")
+        place = next((i for i, word in enumerate(arguments) if option.match(word)), None)
         if place is not None:  # the limit of file sizes, for worker processes too
             word, *rest = arguments[place:]
             value = word.partition("=")[2] if "=" in word else rest.pop(0) if rest else ""
-            gib_bytes(value, option)
+            gib_bytes(value, "max_file_gib")
             os.environ[VARIABLE] = value
             arguments = arguments[:place] + rest
     except WearcapError as error:
         print(f"wearcap: {error}", file=sys.stderr)
         sys.exit(USER_ERROR)
-    verb = next((argument for argument in arguments if not argument.startswith("-")), None)
+    verb = next((word for word in arguments if not word.startswith("-") and word != "debug=true"), None)
     if arguments[:1] == ["--version"]:
         print(f"wearcap {__version__}")
     elif verb is None or arguments[0] in ("--help", "-h"):

@@ -1,19 +1,17 @@
 """`wearcap prepare SOURCE`: make a data set of recordings."""
 
-import re
 import sys
 from pathlib import Path
 
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from wearcap.cli.conf import compose, conf_dir, explained, nearest, splits_dir
+from wearcap.cli.conf import compose, explained, require_writable, splits_dir
+from wearcap.cli.verbs import sources
 from wearcap.doctor import require_sound
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, nearest
 from wearcap.prepare.engine import Report, Splits, prepare
 from wearcap.recording.store import SPLITS, RecordingStore
-
-HELP = "make a data set: wearcap prepare simulated, wearcap prepare cmu source=DIR"
 
 
 def run(config: DictConfig) -> Report:
@@ -50,50 +48,18 @@ def _show_report(report: Report, store: RecordingStore) -> None:
         print(f"  {split:5} {len(entries):4} recordings, {subjects:3} subjects, {minutes:7.1f} min")
 
 
-def sources() -> dict[str, Path]:
-    """Sources by name: the configs of `conf/prepare/`."""
-    return {path.stem: path for path in sorted((conf_dir() / "prepare").glob("*.yaml"))}
-
-
-def usage() -> str:
-    """Help text that lists the sources."""
-    lines = ["usage: wearcap prepare SOURCE [key=value …]     wearcap prepare SOURCE --help", ""]
-    for name, path in sources().items():
-        notes = re.findall(r"^# (?!@)(.*)", path.read_text(encoding="utf-8"), re.MULTILINE)
-        lines.append(f"  {name:10} {notes[0]}")
-    return "\n".join([*lines, "", _shared_settings()])
-
-
 def main(arguments: list[str]) -> None:
     """Exits with 1 when a recording could not be made."""
     source = next((argument for argument in arguments if "=" not in argument and argument[0] != "-"), None)
-    help_wanted = bool({"--help", "-h"} & set(arguments))
     if source is None:
-        print(usage())
-        if not help_wanted:
-            raise WearcapError("no source given", expected=f"one of {', '.join(sources())}")
-    elif source not in sources():
+        raise WearcapError("no source given", expected=f"one of {', '.join(sources())}")
+    if source not in sources():
         raise WearcapError(f"no source {source!r}", fix=nearest(source, sources()))
-    elif help_wanted:
-        print(sources()[source].read_text(encoding="utf-8"))
-        print(_shared_settings())
-    else:
-        overrides = [f"prepare={source}", *(_plain_pattern(argument) for argument in arguments if argument != source)]
-        with explained("prepare", overrides):
-            config = compose("prepare", overrides)
-            OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # a missing value raises here
-            report = run(config)
-        if report.failed:
-            sys.exit(1)
-
-
-def _plain_pattern(argument: str) -> str:
-    """A `subject=` in the quotes that a regular expression needs, unless it has them."""
-    key, _, value = argument.partition("=")
-    bare = key == "subject" and "(" in value and value[0] not in "'\""
-    return f"{key}='{value}'" if bare else argument
-
-
-def _shared_settings() -> str:
-    """Settings of every source, as the config has them."""
-    return (conf_dir() / "prepare.yaml").read_text(encoding="utf-8").split("\n\n")[1]
+    overrides = [f"prepare={source}", *(argument for argument in arguments if argument != source)]
+    with explained("prepare", overrides):
+        config = compose("prepare", overrides)
+        OmegaConf.to_container(config, resolve=True, throw_on_missing=True)  # a missing value raises here
+        require_writable(config.output, "output")
+        report = run(config)
+    if report.failed:
+        sys.exit(1)

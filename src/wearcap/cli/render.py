@@ -1,25 +1,15 @@
 """`wearcap render`: a recording as a contact sheet or a video, on a machine without a screen."""
 
-import argparse
 from pathlib import Path
 
-from rich import print as show
-
-from wearcap.body.anny_body import anny_body
 from wearcap.cli.stated import stated
+from wearcap.cli.verbs import Arguments
 from wearcap.cli.view import add_recording, read_motions
 from wearcap.errors import WearcapError
-from wearcap.reading import read
-from wearcap.recording.store import dataset_folder
-from wearcap.runtime.system import CaptureInput
-from wearcap.viewer.page_layers import with_objects
-from wearcap.viewer.picture import contact_sheet, draw_head_path, save_png, shared_frames, write_video
-
-HELP = "pictures without a screen: wearcap render DATASET/NAME --out sheet.png|motion.mp4"
 
 
 def main(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="wearcap render", description="Draw a recording to a PNG or an MP4.")
+    parser = Arguments(prog="wearcap render", description="Draw a recording to a PNG or an MP4.")
     add_recording(parser, "draw with it")
     parser.add_argument("--out", type=Path, help=".png for a contact sheet, .mp4 for a video (default: NAME.png)")
     parser.add_argument("--start", type=float, default=0.0, help="from this second of the recording on")
@@ -30,6 +20,14 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--sticks", action="store_true", help="bones instead of a body surface")
     parser.add_argument("--environment", help="objects to draw (default: what the recording names)")
     options = parser.parse_args(arguments)
+
+    from wearcap.body.anny_body import anny_body
+    from wearcap.reading import read
+    from wearcap.recording.store import dataset_folder
+    from wearcap.runtime.system import CaptureInput
+    from wearcap.viewer.page_layers import with_objects
+    from wearcap.viewer.picture import contact_sheet, draw_head_path, save_png, shared_frames, write_video
+
     recording = read(options.recording, stated(vars(options)))
     out = options.out or Path(f"{recording.name}.png")
     if out.suffix not in (".png", ".mp4"):
@@ -53,7 +51,7 @@ def main(arguments: list[str]) -> None:
             write_video(out, motions, fps=options.video_fps, **shown)
         else:
             save_png(out, contact_sheet(motions, shared_frames(motions, options.frames), **shown))
-    show(f"wrote {out}")
+    print(f"wrote {out}")
 
 
 def _size(text: str) -> tuple[int, int]:

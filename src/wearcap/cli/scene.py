@@ -1,11 +1,6 @@
-"""`wearcap scene`: a scanned or photographed scene goes in; the map that cameras are localised in comes out.
+"""`wearcap scene`: a scanned or photographed scene goes in; the map that cameras are localised in comes out."""
 
-`wearcap scene edit` opens the page that makes an interactive environment of it.
-"""
-
-import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from hydra.utils import instantiate
@@ -16,7 +11,6 @@ from rich.progress import track
 from rich.table import Table
 
 from wearcap.cli.conf import hydra_main
-from wearcap.cli.main import add_page
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.formats.colmap import Tracks
@@ -26,8 +20,6 @@ from wearcap.localization.localizer import Localizer
 from wearcap.localization.map_builder import build_map, extended
 from wearcap.localization.visual_map import VisualMap
 from wearcap.scene.scan import Photo, Scan
-
-HELP = "the visual map of a scene: wearcap scene scene=FOLDER output=map.safetensors; its objects: wearcap scene edit FOLDER"
 
 
 def run(config: DictConfig) -> VisualMap:
@@ -98,39 +90,5 @@ def _check(localizer: Localizer, photos: Sequence[Photo]) -> None:
     show("")
 
 
-def edit(arguments: list[str]) -> None:
-    """`wearcap scene edit`: the page on which objects are cut out of a scan and their degrees of freedom are set."""
-    parser = argparse.ArgumentParser(
-        prog="wearcap scene edit",
-        description="Make an interactive environment of a scan, in the browser: cut objects out, set how they "
-        "move, try it. It saves automatically; opened again, it continues.",
-    )
-    parser.add_argument("scene", help="the scene's folder with pointcloud.ply, or a .ply or .pcd file")
-    parser.add_argument(
-        "--environment", help="the file to make or to go on with (default: environment.json beside the scan)"
-    )
-    parser.add_argument("--metres-per-unit", type=float, help="of a scan in another unit (0.001 for millimetres)")
-    add_page(parser, 8080, host=True)
-    options = parser.parse_args(arguments)
-
-    from wearcap.io.formats.environment import FILE_NAME
-    from wearcap.io.formats.scene_folder import cloud_file, read_scan
-    from wearcap.viewer.object_editor import ObjectEditor
-
-    cloud = cloud_file(options.scene)
-    file = Path(options.environment) if options.environment else cloud.parent / FILE_NAME
-    if file.is_dir():
-        file /= FILE_NAME
-    if file.suffix != ".json":
-        raise WearcapError("an environment is a .json file", where=file, expected="environment.json or a folder")
-    scan = read_scan(cloud, metres_per_unit=options.metres_per_unit)
-    page = ObjectEditor(scan, file, title=cloud.parent.resolve().name, host=options.host, port=options.port)
-    print(f"{cloud}: open {page.url} (Ctrl+C ends; objects are saved in {file})")
-    page.serve()
-
-
 def main(arguments: list[str]) -> None:
-    if arguments[:1] == ["edit"]:
-        edit(arguments[1:])
-    else:
-        hydra_main("scene", run, arguments)
+    hydra_main("scene", run, arguments)

@@ -14,10 +14,6 @@ from wearcap.io.formats.camera_json import read_camera
 from wearcap.io.formats.colmap import read_colmap
 from wearcap.localization.tracking import Pictures, Track, track_pictures
 
-HELP = "a camera's path and points from its video: wearcap track VIDEO, or wearcap track --from-model COLMAP_MODEL"
-_WITH_VALUE = ("--cfg", "-c", "--info", "-i", "--package", "-p", "--config-name", "-cn", "--config-dir", "-cd")
-"""Hydra's options that take a value."""
-
 
 def run(config: DictConfig) -> Track:
     """Track the config's source, or take the path from a COLMAP model, and write the result."""
@@ -58,24 +54,5 @@ def _show_report(found: Track, output: Path) -> None:
     show(f"trajectory.txt, points.ply, camera.json, report.json: {output}")
 
 
-def overrides(arguments: list[str]) -> list[str]:
-    """Arguments with `VIDEO` and `--from-model DIR` replaced by config overrides; Hydra's own options stay."""
-    given, rest = [], iter(arguments)
-    for argument in rest:
-        if argument == "--from-model":
-            given.append(f"from_model={_quoted(next(rest, ''))}")
-        elif argument in _WITH_VALUE:
-            given += [argument, next(rest, "")]
-        elif argument.startswith("-") or "=" in argument:
-            given.append(argument)
-        else:
-            given.append(f"source={_quoted(argument)}")
-    return given
-
-
-def _quoted(path: str) -> str:
-    return "'" + path.replace("\\", "\\\\").replace("'", "\\'") + "'"
-
-
 def main(arguments: list[str]) -> None:
-    hydra_main("track", run, overrides(arguments))
+    hydra_main("track", run, arguments)

@@ -1,5 +1,6 @@
 """`wearcap train`: compose a config, instantiate it, fit."""
 
+import logging
 import warnings
 from contextlib import nullcontext
 from pathlib import Path
@@ -8,6 +9,7 @@ import lightning
 from hydra.utils import instantiate
 from lightning.pytorch.callbacks import Callback, EarlyStopping
 from lightning.pytorch.utilities import rank_zero_only
+from lightning_utilities.core import rank_zero
 from omegaconf import DictConfig, OmegaConf
 from rich import print as show
 
@@ -25,11 +27,10 @@ from wearcap.training.run import (
     keep_freed_memory,
     last_checkpoint,
     record_run,
+    require_accelerator,
     resume_path,
     run_to_continue,
 )
-
-HELP = "train a model: wearcap train experiment=motion_diffusion_head data=cmu"
 
 
 def train(config: DictConfig) -> float:
@@ -38,6 +39,7 @@ def train(config: DictConfig) -> float:
     Raises WearcapError when another process trains in the run's folder, and for settings that exclude each other.
     """
     run = Path(config.paths.run)
+    require_accelerator(str(config.trainer.accelerator))
     with folder_lock(run, "train") if rank_zero_only.rank == 0 else nullcontext():
         lightning.seed_everything(config.seed, workers=True, verbose=False)
         keep_freed_memory()
@@ -45,11 +47,11 @@ def train(config: DictConfig) -> float:
         # Each run has its own folder; users cannot fix Lightning's internal deprecations.
         warnings.filterwarnings("ignore", "Experiment logs directory")
         warnings.filterwarnings("ignore", ".*LeafSpec")
+        rank_zero.log.addFilter(_no_advertisement)
         record = OmegaConf.to_yaml(config, resolve=True)
         resume = resume_path(config.resume, run, record)
         if resume and config.init and config.resume != "auto":
             raise WearcapError(f"resume={resume} and init={config.init}", expected="one of them")
-        record_run(run, record)
         data, system = instantiate(config.data, _convert_="all"), instantiate(config.model, _convert_="all")
         if config.test and system.system is None:
             raise WearcapError(f"test=true, but no pipeline captures with {type(system).__name__}", fix="Leave it out.")
@@ -57,6 +59,7 @@ def train(config: DictConfig) -> float:
         precision = affordable_precision(str(config.trainer.precision), str(config.trainer.accelerator))
         more = {"callbacks": _callbacks(config), "logger": loggers or False, "plugins": [RunCheckpointIO(run)]}
         trainer: lightning.Trainer = instantiate(config.trainer, precision=precision, **more)
+        record_run(run, record)
         start = f", going on from {resume}" if resume else f", from the weights of {config.init}" if config.init else ""
         show(f"[bold]{config.name}[/bold] in {run}{start}")
         if precision != str(config.trainer.precision):
@@ -71,6 +74,11 @@ def train(config: DictConfig) -> float:
             if config.test:
                 _test(config, run, str(trainer.strategy.root_device))
         return float(trainer.callback_metrics.get("val/loss", float("nan")))
+
+
+def _no_advertisement(record: logging.LogRecord) -> bool:
+    """Whether a message of Lightning is none of its tips to install other products."""
+    return "💡 Tip:" not in record.getMessage()
 
 
 def _name_embeddings(config: DictConfig) -> None:

@@ -1,25 +1,28 @@
 """`wearcap view`: a recording and motions captured from it, in the browser."""
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from wearcap.cli.main import add_page
 from wearcap.cli.stated import add_conventions, stated
+from wearcap.cli.verbs import Arguments
 from wearcap.errors import WearcapError
-from wearcap.io.formats.motion_npz import read_motion
-from wearcap.recording.motion import Motion
 
-HELP = "show a recording in the browser: wearcap view DATASET/NAME [--motion motion.npz …]"
+if TYPE_CHECKING:
+    from wearcap.recording.motion import Motion
+
 RESERVED = ("truth", "over", "beside")
 """Names that the page and the pictures use for other purposes."""
 
 
-def read_motions(paths: Sequence[str]) -> dict[str, Motion]:
+def read_motions(paths: Sequence[str]) -> "dict[str, Motion]":
     """Motions by name: a single file is "capture"; several have their file names, prefixed by folders if these agree.
 
     Raises WearcapError for a file that is given twice, and as `read_motion` does.
     """
+    from wearcap.io.formats.motion_npz import read_motion
+
     if len(paths) == 1:
         return {"capture": read_motion(paths[0])}
     files = [Path(path).resolve() for path in paths]
@@ -33,7 +36,7 @@ def read_motions(paths: Sequence[str]) -> dict[str, Motion]:
     return {label: read_motion(file) for label, file in zip(labels, files, strict=True)}
 
 
-def add_recording(parser: argparse.ArgumentParser, purpose: str) -> None:
+def add_recording(parser: Arguments, purpose: str) -> None:
     """Add the recording and the option `--motion FILE …`, whose files `read_motions` reads."""
     parser.add_argument("recording", help="DATASET/NAME, or any file or folder that holds a recording")
     text = f"captured motions (.npz that `wearcap capture` wrote) to {purpose}"
@@ -42,7 +45,7 @@ def add_recording(parser: argparse.ArgumentParser, purpose: str) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="wearcap view", description="Show a recording in the browser.")
+    parser = Arguments(prog="wearcap view", description="Show a recording in the browser.")
     add_recording(parser, "show with it; several stand side by side")
     add_page(parser, 8080, host=True)
     parser.add_argument("--environment", help="objects to show (default: what the recording names)")

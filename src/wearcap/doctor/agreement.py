@@ -428,7 +428,7 @@ def _acceleration(check: Check, acc_world: Tensor, joint: Trajectory, timestamps
     evidence = f"{scale:.2g} × the motion's, correlation {agreement:.2f}"
     if quantile(expected.norm(dim=-1), 0.9) < 0.5:
         return check.ok("hardly any to compare", evidence)
-    if agreement < -0.5:
+    if agreement < -0.5 and scale < -0.5:
         return check.error("has the opposite sign", evidence, "Negate it.")
     if agreement < 0.4:
         fix = "Check its axes, its world's heading and its clock."

@@ -75,6 +75,8 @@ FASTEST_M_S = 12.0
 """Highest running speed (m/s); a faster frame is a jump, a faster recording is in the wrong unit."""
 UPRIGHT = 0.7
 """Least mean z component of a head's or pelvis' own z axis in a recording of daily life."""
+LOOKS_DOWN = 0.2
+"""Least upright component of a head that looks down: by up to 78° on average."""
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2}
 """Units of devices; those of bodies follow from their bones."""
 
@@ -226,6 +228,9 @@ def _check_upright(stream: str, track: Trajectory) -> Finding:
     evidence = f"its z axis points along ({listed}) of the world, on average"
     if up_world[2] > UPRIGHT:
         return check.ok("z is up", evidence)
+    if up_body[2] > LOOKS_DOWN and up_body[1].abs() < 0.25 and up_body[0] < 0:  # the left axis stays level
+        down = math.degrees(math.atan2(-up_body[0].item(), up_body[2].item()))
+        return check.note(f"looks down by {down:.0f}° on average", evidence, "If it did not, turn the device's axes.")
     spread = track.t_world_body.double().std(0)
     least, second = spread.argsort()[:2].tolist()
     # People move along the floor: the axis along which they clearly move least is vertical.

@@ -4,10 +4,11 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 
+from rich.console import Group
 from rich.table import Table
 
 from wearcap.metrics.position import PARTS
-from wearcap.metrics.table import RATIOS, Row, Scores, Summary, aggregate, rich_lines
+from wearcap.metrics.table import RATIOS, TRUTH, Row, Scores, Summary, aggregate, rich_lines
 
 UNNAMED = "unnamed"
 """Activity of recordings that do not name any."""
@@ -45,27 +46,37 @@ def error_columns(scores: Mapping[str, Summary]) -> dict[str, str]:
     return {metric: heading for metric, heading in columns.items() if metric in scores}
 
 
-def part_table(title: str, scores: Scores) -> Table:
+def part_table(title: str, scores: Scores) -> Table | Group:
     """Mean errors of methods, or of activities, by part of the body; the title gives the unit."""
     columns = error_columns(next(iter(scores.values())))
     unit = next((metric.rpartition("_")[2] for metric in columns if "_pe_" in metric), "")
-    shares = [heading for metric, heading in columns.items() if metric in RATIOS]
-    about = "; ".join([*([unit] if unit else []), *([f"{' and '.join(shares)} of the truth's"] if shares else [])])
     means = {
         name: {metric: Summary(each[metric].mean, None, 1) for metric in columns if metric in each}
         for name, each in scores.items()
     }
+    shares = [name for name in columns if name in RATIOS]
+    for name in [
+        name for name in shares if any(math.isnan(each[name].mean) for each in means.values() if name in each)
+    ]:
+        metric = RATIOS[name]  # of a truth that is almost 0: the difference
+        columns[name] += " beyond the truth's"
+        shares.remove(name)
+        for method, each in scores.items():
+            if {metric, f"{TRUTH}{metric}"} <= set(each):
+                means[method][name] = Summary(each[metric].mean - each[f"{TRUTH}{metric}"].mean, None, 1)
+    of_truth = [f"{' and '.join(columns[name] for name in shares)} of the truth's"] if shares else []
+    about = "; ".join([*([unit] if unit else []), *of_truth])
     return rich_lines(f"{title} ({about})" if about else title, means, columns)
 
 
-def activity_table(title: str, activities: Scores, counts: Mapping[str, int]) -> Table:
+def activity_table(title: str, activities: Scores, counts: Mapping[str, int]) -> Table | Group:
     """Errors of one method by activity, the worst first; `counts` of their recordings are shown beside the names."""
     main = next(iter(next(iter(activities.values()))))
     ranked = sorted(activities, key=lambda name: -activities[name][main].mean)
     return part_table(title, {f"{name} ({counts[name]})": activities[name] for name in ranked})
 
 
-def recording_table(title: str, rows: Iterable[Row], activity_of: Mapping[str, str]) -> Table:
+def recording_table(title: str, rows: Iterable[Row], activity_of: Mapping[str, str]) -> Table | Group:
     """The recordings of largest, median and least error of one method, by name."""
     rows = list(rows)
     shown = {

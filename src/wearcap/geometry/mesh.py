@@ -1,6 +1,6 @@
 """Triangle meshes as plain arrays, and primitives for pictures and simulated rooms."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -121,16 +121,26 @@ def checker_floor(
     tile: float,
     colors: Float[np.ndarray, "2 3"],
     edge_color: Float[np.ndarray, "3"],
+    cells: int = 1,
+    height: Callable[[Float[np.ndarray, "point 2"]], Float[np.ndarray, "point"]] | None = None,
 ) -> Mesh:
-    """A horizontal chequered square around a point (m), its tiles fixed in the world; it fades at the rim."""
-    first = np.floor((center[:2] - half_size) / tile).astype(int)
-    count = int(2 * half_size / tile) + 2
-    column, row = (grid.ravel() for grid in np.meshgrid(first[0] + np.arange(count), first[1] + np.arange(count)))
+    """A chequered square around a point (m), its tiles fixed in the world; it fades at the rim. It is horizontal, or of
+    the `height` (m) at the corners of the `cells` x `cells` parts of each tile."""
+    cell = tile / cells
+    first = cells * np.floor((center[:2] - half_size) / tile).astype(int)
+    count = cells * (int(2 * half_size / tile) + 2)
+    column, row = (grid.ravel() for grid in np.meshgrid(np.arange(count), np.arange(count)))
     corner = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    xy = tile * (np.stack([column, row], -1)[:, None] + corner)
+    nodes = np.stack([column, row], -1)[:, None] + corner
+    xy = cell * (first + nodes)
     fade = np.clip(np.linalg.norm(xy - center[:2], axis=-1) / half_size, 0, 1)[..., None] ** 2
-    color = colors[(column + row) % 2][:, None] * (1 - fade) + edge_color * fade
-    vertices = np.concatenate([xy, np.full((*xy.shape[:2], 1), center[2])], -1)
+    odd = ((first + nodes[:, 0]) // cells).sum(-1) % 2
+    color = colors[odd][:, None] * (1 - fade) + edge_color * fade
+    z = np.full(xy.shape[:2], center[2])
+    if height is not None:
+        grid = np.stack(np.meshgrid(*(cell * (start + np.arange(count + 1)) for start in first)), -1)
+        z = height(grid.reshape(-1, 2)).reshape(count + 1, count + 1)[nodes[..., 1], nodes[..., 0]]
+    vertices = np.concatenate([xy, z[..., None]], -1)
     quad = np.array([[0, 1, 2], [0, 2, 3]])
     faces = (4 * np.arange(len(xy))[:, None, None] + quad).reshape(-1, 3)
     return Mesh(

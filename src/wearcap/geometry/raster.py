@@ -5,6 +5,7 @@ a plane, so that interpolating it is exact), the height towards the light for or
 """
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -229,7 +230,7 @@ def draw_splats(blocks, pose, planes, lens, radius, metric, offset, nearness, in
     return projected
 
 
-@compiled
+@partial(compiled, inline="always")
 def _hit(rx, ry, rz, a, b, c, vertices, normals, smooth):
     """Where the ray through the camera's centre meets a triangle: barycentric weights of corners b and c, and the unit
     normal, the triangle's or between its corners', on the side that the ray meets: that side is lit."""
@@ -256,7 +257,7 @@ def _hit(rx, ry, rz, a, b, c, vertices, normals, smooth):
     return second, third, nx / length, ny / length, nz / length
 
 
-@compiled
+@partial(compiled, inline="always")
 def _key_visibility(x, y, z, axes, scale, shadow, high, low):
     """Part (0…1) of the key light that reaches a point: percentage-closer filtering over 4 x 4 texels."""
     size = len(shadow)
@@ -280,7 +281,7 @@ def _key_visibility(x, y, z, axes, scale, shadow, high, low):
     return lit / 9.0
 
 
-@compiled
+@partial(compiled, inline="always")
 def _contact_shade(x, y, z, axes, scale, contact, fade):
     """Fraction (0…1) of the sky occluded by geometry close above an upward surface: largest where they touch."""
     u = (axes[3, 0] * x + axes[3, 1] * y + axes[3, 2] * z + axes[3, 3]) * scale

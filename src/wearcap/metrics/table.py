@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Bool
+from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 from torch import Tensor
@@ -22,6 +23,10 @@ from wearcap.metrics import physics, position
 from wearcap.recording.motion import Motion
 
 MAX_DECIMALS = 6
+WIDTH = 80
+"""Characters of a terminal that tables fit."""
+LEAST_OF_TRUTH = 0.05
+"""A value of the truth (in the metric's unit) below which a ratio to it says nothing."""
 P95 = "p95_"
 """Beginning of the names of 95th percentiles, which the thesis averages over sequences (Table 6.6); all other metrics are
 averaged over frames."""
@@ -170,7 +175,7 @@ def aggregate(rows: list[Row]) -> dict[str, Summary]:
     for name, metric in RATIOS.items():
         if name not in by_metric and {metric, f"{TRUTH}{metric}"} <= set(by_metric):
             both = zip(by_metric[metric], by_metric[f"{TRUTH}{metric}"])
-            by_metric[name] = [value / true if true else math.nan for value, true in both]
+            by_metric[name] = [value / true if true >= LEAST_OF_TRUTH else math.nan for value, true in both]
     return {name: summarize(means) for name, means in by_metric.items()}
 
 
@@ -201,7 +206,10 @@ def _cells(methods: Scores, metrics: Columns | None) -> list[list[str]]:
     columns = list(metrics or next(iter(methods.values())))
     headings = list(metrics.values()) if isinstance(metrics, Mapping) else columns
     lines = [
-        [method, *(str(scores[metric]) if metric in scores else "–" for metric in columns)]
+        [
+            method,
+            *(str(each) if (each := scores.get(metric)) and not math.isnan(each.mean) else "–" for metric in columns),
+        ]
         for method, scores in methods.items()
     ]
     return [["method", *headings], *lines]
@@ -214,27 +222,41 @@ def markdown_table(methods: Scores, metrics: Columns | None = None) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in (header, rule, *lines))
 
 
-def rich_table(title: str, methods: Scores, metrics: Columns | None = None) -> Table:
-    """A table for a terminal: one line per metric, one column per method."""
-    table = Table(title=title)
+def rich_table(title: str, methods: Scores, metrics: Columns | None = None) -> Table | Group:
+    """A table for a terminal: one line per metric, one column per method; several if they are too many for `WIDTH`."""
     header, *lines = _cells(methods, metrics)
-    table.add_column("", no_wrap=True)
-    for line in lines:
-        table.add_column(line[0], justify="right")
-    for row in zip(header[1:], *(line[1:] for line in lines)):
-        table.add_row(*row)
-    return table
+    return _fitting(title, ["", *header[1:]], lines)
 
 
-def rich_lines(title: str, methods: Scores, metrics: Columns | None = None) -> Table:
-    """The same with one line per method, one column per metric."""
-    table = Table(title=title)
+def rich_lines(title: str, methods: Scores, metrics: Columns | None = None) -> Table | Group:
+    """One line per method, one column per metric; several tables if these are too many for `WIDTH`."""
     header, *lines = _cells(methods, metrics)
-    for number, heading in enumerate(["", *header[1:]]):
-        table.add_column(heading, justify="right" if number else "left", no_wrap=not number)
-    for line in lines:
-        table.add_row(*map(escape, line))
-    return table
+    by_metric = zip(header[1:], *(line[1:] for line in lines))
+    return _fitting(title, ["", *(line[0] for line in lines)], [list(each) for each in by_metric])
+
+
+def _fitting(title: str, names: list[str], columns: list[list[str]]) -> Table | Group:
+    """Columns, each a heading and its cells, beside the names of the lines, in tables that fit `WIDTH`."""
+    groups: list[list[list[str]]] = []
+    free = 0
+    for column in columns:
+        heading, *cells = column
+        width = max(map(len, [*heading.split(), *cells])) + 3
+        if not groups or width > free:
+            groups.append([])
+            free = WIDTH - max(map(len, names)) - 4
+        groups[-1].append(column)
+        free -= width
+    tables = []
+    for group in groups:
+        table = Table(title=None if tables else title)
+        table.add_column("", no_wrap=True)
+        for heading, *_ in group:
+            table.add_column(heading, justify="right")
+        for row in list(zip(names, *group))[1:]:
+            table.add_row(*map(escape, row))
+        tables.append(table)
+    return tables[0] if len(tables) == 1 else Group(*tables)
 
 
 def write_scores(

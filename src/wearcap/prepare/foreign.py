@@ -7,6 +7,7 @@ bones' lengths, repeats the rotations, and is fitted to the places of the file's
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import torch
@@ -20,7 +21,7 @@ from wearcap.body.retarget import fit_offsets, retarget
 from wearcap.body.skeleton import xsens23
 from wearcap.boundary.opening import placed
 from wearcap.errors import WearcapError
-from wearcap.io.conventions import AUTO, Conventions
+from wearcap.io.conventions import AUTO, DETECTED, Conventions
 from wearcap.io.formats.bvh import axes_rotation
 from wearcap.prepare.foreign_conventions import (
     Mapping,
@@ -38,6 +39,8 @@ from wearcap.recording.motion import Motion
 
 LEAST_STRAIGHT = 0.12
 """Straightness that a clip's straightest frame has where joints' axes that follow from it are not in doubt."""
+SIBLINGS, SIBLING_FRAMES = 6, 150
+"""Number of straight clips of a skeleton from which its joints' axes follow, and of frames used of each."""
 
 
 @dataclass(frozen=True)
@@ -104,18 +107,17 @@ def read_foreign_motion(
     asf: Path | None = None,
     levels: Levels | None = None,
     siblings: Sequence[Take] = (),
-    how: Conventions | None = None,
+    how: Conventions = DETECTED,
 ) -> ForeignMotion:
     """Read a .bvh, or an .amc with `asf` or the skeleton file beside it (plain, .xz or .gz), onto xsens23.
 
-    `mapping` (a YAML file with any of joints, unit, up, forward) overrides what is detected, and `how` both; `levels` replaces what the
-    file itself shows of how head and feet are level. Conventions and joints' axes follow from the file's frames and from
-    those of `siblings`, clips of the same skeleton. Raises WearcapError for a file that is damaged or holds no body
-    with head, arms and legs, saying what is missing.
+    `mapping` (a YAML file with any of joints, unit, up, forward) overrides what is detected, and `how` both; `levels`
+    replaces what the frames show of how head and feet are level. Conventions and joints' axes follow from the frames of
+    the file and of `siblings`, clips of the same skeleton. Raises WearcapError for a file that is damaged or holds no
+    body with head, arms and legs, saying what is missing.
     """
     path = Path(path)
     given = mapping if isinstance(mapping, Mapping) else Mapping() if mapping is None else read_mapping(mapping)
-    how = how or Conventions()
     given = replace(given, unit_m=how.unit_m or given.unit_m, up=given.up if how.up == AUTO else how.up)
     own = read_take(path, amc_fps, asf)
     take = _joined(own, siblings)
@@ -133,20 +135,14 @@ def read_foreign_motion(
         motion = _fitted(tree, take.timestamps)
     naming = convention(take.names)
     if levels is None:  # CMU's head frames are those of markers, in whatever format
-        levels = levels_in([motion], head_trusted=R_ours_rest is not None and not naming.startswith("CMU"))
+        shown = motion.sliced(len(own.t), len(motion)) if siblings else motion
+        levels = levels_in([shown], head_trusted=R_ours_rest is not None and not naming.startswith("CMU"))
     motion = with_levels(motion, levels).sliced(0, len(own.t))
     if not (motion.R_parent_joint.isfinite().all() and motion.t_world_root.isfinite().all()):
         raise WearcapError("no skeleton can be fitted to its joints", path, "joints apart from one another")
     roles = joint_roles(found)
-    stated = [f"{name}={value}" for name in ("unit", "up") if (value := getattr(how, name)) != AUTO]
-    notes = (*take.notes, *(f"Stated: {each}." for each in stated))
-    if odd and (straight := straightness(take.t, found).max().item()) < LEAST_STRAIGHT:
-        note = f"Nobody stands straight in it (straightness {straight:.2f} of 1), so that the axes of its joints are"
-        notes = (
-            *notes,
-            f"{note} uncertain, the head's by up to 50°: read it in a folder of the same skeleton's clips.",
-        )
-    with_others = f" and that of {len(siblings)} clips beside it" if siblings else ""
+    straight = straightness(take.t, found).max().item() if odd else 1.0
+    motion_of = f"the motion of {len(siblings)} clips" if siblings else "the motion"
     report = ForeignReport(
         path.name,
         naming,
@@ -156,10 +152,10 @@ def read_foreign_motion(
         height_m,
         up,
         f"{forward} is ahead in the bind pose" if odd == "" else f"{forward} is our x",
-        "the bind pose" if odd == "" else f"the motion{with_others}, for in the bind pose {odd}",
+        "the bind pose" if odd == "" else f"{motion_of}, for in the bind pose {odd}",
         {ours: take.names[joint] for ours, joint in roles.items()},
         _residuals(motion, {name: t_world[: len(motion), joint] for name, joint in roles.items()}),
-        notes,
+        _notes(take, straight, how),
     )
     return ForeignMotion(replace(motion, provenance={"source": path.name, "format": take.format}), report)
 
@@ -174,17 +170,34 @@ def _joined(take: Take, siblings: Sequence[Take]) -> Take:
     return take
 
 
-def straightest(files: Sequence[Path], mapping: Mapping, count: int, frames: int) -> tuple[Take, ...]:
-    """The `count` clips in which most stand straight, thinned to about `frames` frames each; unreadable ones left out."""
+@cache
+def straightest(files: tuple[Path, ...], joints: tuple[tuple[str, str], ...] = ()) -> tuple[Take, ...]:
+    """The clips in which people stand straightest, thinned, of BVH files of one skeleton; unreadable ones are left out.
+
+    `joints` are a mapping's.
+    """
     takes: list[tuple[float, Take]] = []
     for file in files:
         with suppress(WearcapError):  # reported where the file itself is read
             take = read_take(file, amc_fps=120)
-            thin = slice(None, None, max(1, len(take.t) // frames))
-            whole, found = with_toes(take, find_body(take, mapping, file)[0])
+            thin = slice(None, None, max(1, len(take.t) // SIBLING_FRAMES))
+            whole, found = with_toes(take, find_body(take, Mapping(dict(joints)), file)[0])
             straight = straightness(whole.t[thin], found).sum().item()
             takes.append((straight, replace(take, R=take.R[thin], t=take.t[thin], timestamps=take.timestamps[thin])))
-    return tuple(take for _, take in sorted(takes, key=lambda row: -row[0])[:count])
+    return tuple(take for _, take in sorted(takes, key=lambda row: -row[0])[:SIBLINGS])
+
+
+def _notes(take: Take, straight: float, how: Conventions) -> tuple[str, ...]:
+    """What the file's reading found odd, what is stated, and whether the axes of its joints are in doubt."""
+    notes = list(take.notes)
+    if stated := [f"{name}={value}" for name in ("unit", "up") if (value := getattr(how, name)) != AUTO]:
+        notes.append(f"Stated: {', '.join(stated)}.")
+    if straight < LEAST_STRAIGHT:
+        notes.append(
+            f"Nobody stands straight in it (straightness {straight:.2f} of 1): the axes of its joints are uncertain, the "
+            "head's by up to 50°. Read it in a folder with other clips of its skeleton."
+        )
+    return tuple(notes)
 
 
 def _fitted(tree: ForeignTree, timestamps: Float[Tensor, "time"]) -> Motion:

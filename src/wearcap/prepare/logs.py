@@ -11,22 +11,24 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float64
 from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS, Skeleton, skeleton_of_height
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, require_choice
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import swing_between
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.conventions import AUTO, Conventions
 from wearcap.io.devices.aria_mps import T_HEAD_DEVICE, head_stream, is_mps_folder, read_mps, read_points
 from wearcap.io.devices.axes import CAMERA, DEVICES, UPRIGHT, WORLDS, DeviceAxes, device_axes, to_head_axes
-from wearcap.io.devices.headset_log import is_headset_log, read_headset_log
+from wearcap.io.devices.headset_log import is_headset_log, is_headset_session, read_headset_log
 from wearcap.io.devices.watch_log import read_inertial_log, read_watch_log
 from wearcap.io.formats.camera_json import read_camera
 from wearcap.io.formats.csv_table import read_columns, read_header
 from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply
+from wearcap.io.formats.pose_columns import FIRST_CAMERA
 from wearcap.io.formats.poses import check_finite
 from wearcap.io.formats.trajectory import TrajectoryFile, read_trajectory_file, trajectory_file, trajectory_format
 from wearcap.io.formats.video import video_info
@@ -128,8 +130,8 @@ def read_cloud(path: str | Path, origin: np.ndarray | None = None) -> PointCloud
     suffixes = {suffix.lower() for suffix in Path(path).suffixes}
     shift = np.zeros(3) if origin is None else origin
     if ".ply" in suffixes or ".pcd" in suffixes:
-        points = (read_ply if ".ply" in suffixes else read_pcd)(path).points
-        return PointCloud(torch.from_numpy(points.astype(np.float64) - shift).float())
+        read = read_ply if ".ply" in suffixes else read_pcd
+        return PointCloud(torch.from_numpy(read(path, shift.tolist()).points))
     header = read_header(path)
     if "px_world" in header:
         return read_points(path)
@@ -152,9 +154,7 @@ def read_path(file: Path, name: str, about: dict[str, str], settings: Trajectory
     points = settings.cloud(read)
     if points is not None:
         points = replace(points, points_world=alignment.points(points.points_world))
-    origin = None
-    if read.origin is not None:
-        origin = alignment.scale * alignment.R_world_slam.double() @ torch.from_numpy(read.origin)
+    origin = origin_of(read, alignment)
     floor = None
     if settings.camera_height_m is not None:
         floor = FloorTrack(head.timestamps[:1], torch.zeros(1))
@@ -165,6 +165,13 @@ def read_path(file: Path, name: str, about: dict[str, str], settings: Trajectory
     return Recording(
         name, head, camera=camera, points=points, floor=floor, skeleton=skeleton, origin=origin, note=note, **about
     )
+
+
+def origin_of(read: TrajectoryFile, alignment: SlamAlignment) -> Float64[Tensor, "3"] | None:
+    """What brings places of the aligned world back to the map's (m, z up): `Recording.origin`."""
+    if read.origin is None:
+        return None
+    return alignment.scale * alignment.R_world_slam @ torch.from_numpy(read.origin) - alignment.t_world_slam
 
 
 def head_of(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tuple[HeadStream, SlamAlignment, str]:
@@ -189,17 +196,17 @@ def head_of(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> t
 
 def _axes(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tuple[str, Tensor | None, str]:
     """(the device's axes, rotation to a world with z up, how it is known); None where scene or sensor will tell."""
-    given = settings.axes if settings.axes != "auto" or not read.of_camera else "camera"
+    stated = Conventions(up=settings.up, axes=settings.axes)
+    require_choice(stated.axes, (AUTO, *DEVICES), f"a trajectory with axes={stated.axes}")
+    given = stated.axes if stated.axes != AUTO or not read.of_camera else "camera"
     if settings.head_imu is not None or (settings.points and settings.standing and settings.camera_height_m):
-        if given not in ("auto", *DEVICES):
-            raise WearcapError(f"axes={given!r}", expected=f"one of auto, {', '.join(DEVICES)}")
         device = "camera" if given == "auto" else given
         return device, None, f"vertical by the {'head sensor' if settings.head_imu is not None else 'floor'}"
     try:
-        axes = device_axes(read.trajectory, settings.up, given, where)
+        axes = device_axes(read.trajectory, stated.up, given, where, read.usual)
     except WearcapError:
         up = -read.trajectory.R_world_body[:, :, 1].double().mean(0)
-        if settings.up != "auto" or given != "camera" or up.norm() < UPRIGHT:
+        if stated.up != AUTO or given != "camera" or up.norm() < UPRIGHT:
             raise
         # Structure from motion has an arbitrary world: a worn camera is upright on average.
         R = swing_between(up / up.norm(), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
@@ -208,7 +215,10 @@ def _axes(read: TrajectoryFile, settings: TrajectorySettings, where: str) -> tup
             R,
             "vertical by the camera's mean tilt, some degrees off (better: head_imu=, or points= of the floor)",
         )
-    return axes.device, WORLDS[axes.up], f"{axes.up} is up ({axes.known_by})"
+    level = (
+        ", as level as its first camera was held" if read.usual == FIRST_CAMERA and axes.up == FIRST_CAMERA[0] else ""
+    )
+    return axes.device, WORLDS[axes.up], f"{axes.up} is up{level} ({axes.known_by})"
 
 
 def _camera(settings: TrajectorySettings, head: HeadStream) -> CameraStream | None:
@@ -277,8 +287,8 @@ def _watches(camera: Path, name: str, about: dict[str, str], settings: "WatchesS
             "(wearcap calibrate steps=watches)"
         )
     if recording.head is None:
-        head, _, note = head_of(read, way, str(camera))
-        recording = replace(recording, head=head)
+        head, alignment, note = head_of(read, way, str(camera))
+        recording = replace(recording, head=head, origin=origin_of(read, alignment))
         notes.insert(0, note)
     assert recording.head is not None
     fix = "Calibrate their clocks (wearcap calibrate steps=watches … swings=[…]), or take the logs of one session."
@@ -365,14 +375,25 @@ def headset_tasks(
     source = Path(source)
     if not source.exists():
         raise WearcapError("no such file or folder", where=source, fix="Give it as source=FILE or source=DIR.")
-    kinds = (".csv", ".json", ".jsonl", ".txt")
+    kinds = (".csv", ".tsv", ".json", ".jsonl", ".txt", ".bsor")
     found = [source]
-    if source.is_dir():
-        files = [path for path in sorted(source.rglob("*")) if path.is_file() and set(path.suffixes) & set(kinds)]
-        found = [path for path in files if is_headset_log(path)]
+    if source.is_dir() and not is_headset_session(source):
+        there = sorted(source.rglob("*"))
+        found = [path for path in there if path.is_dir() and path.name != "trackers" and is_headset_session(path)]
+        files = [path for path in there if path.is_file() and set(path.suffixes) & set(kinds)]
+        found += [path for path in files if not set(path.parents) & set(found) and is_headset_log(path)]
     if not found:
         raise WearcapError("no headset's log in this folder", source, "CSV or JSON with time, head_pos_x, …")
     return [_task("headset", path, _headset, splits, subject, license, settings) for path in found]
+
+
+def log_name(path: Path) -> str:
+    """A recording's name: its file's or folder's, or that of the folder above a usual one; replays are named after players."""
+    if path.suffix.lower() == ".bsor":
+        return f"replay_{content_hash(path)[:8]}"
+    name = path.resolve().name.split(".")[0] if path.is_file() else path.resolve().name
+    usual = ("images", "data", "poses", "trajectory", "closed_loop_trajectory", "trackers")
+    return path.resolve().parent.name if name in usual else name
 
 
 def _task(
@@ -386,11 +407,13 @@ def _task(
     files: Sequence[Path] = (),
 ) -> Task:
     """A task that is hashed by its files and settings, and named after its file or folder."""
-    name = path.resolve().name if path.is_dir() else path.name.split(".")[0]
-    if name in ("images", "data", "poses", "trajectory", "closed_loop_trajectory"):
-        name = path.resolve().parent.name
+    name = log_name(path)
     read = [path] if path.is_file() else [file for file in sorted(path.rglob("*")) if file.is_file()]
     small = [file for file in (*read, *files) if file.stat().st_size < 1 << 30]
     key = content_hash(kind, name, subject, license, asdict(settings), VERSION[kind], *small)
-    about = {"subject": subject, "license": license, "source": f"{kind} {path.name}"}
+    about = {
+        "subject": subject,
+        "license": license,
+        "source": f"{kind} {path.name if path.suffix != '.bsor' else name}",
+    }
     return Task(name or kind, partial(make, path, name or kind, about, settings), splits.of(subject), key)

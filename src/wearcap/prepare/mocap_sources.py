@@ -17,19 +17,19 @@ from wearcap.io.datasets.amass import read_amass
 from wearcap.prepare.engine import NOTE, Splits, Task, content_hash, source_folder
 from wearcap.prepare.foreign import read_foreign_motion, straightest
 from wearcap.prepare.foreign_conventions import Mapping, read_mapping
-from wearcap.prepare.foreign_files import Take, asf_beside
+from wearcap.prepare.foreign_files import asf_beside
 from wearcap.prepare.levels import Levels, levels_in
 from wearcap.prepare.mocap import About, MocapSettings, mocap_recording
 from wearcap.recording.recording import Recording
 
-CMU_VERSION, BVH_VERSION, AMASS_VERSION = 3, 2, 2
+CMU_VERSION, BVH_VERSION, AMASS_VERSION = 4, 2, 2
 """Versions of the conversions, increased when the same source and settings yield another recording."""
 
 MOTION_SUFFIXES = (".amc", ".amc.xz", ".amc.gz", ".bvh", ".bvh.xz", ".bvh.gz")
 LEVEL_TRIALS = 6
 """Number of a subject's trials from which the tilts of head and feet are estimated."""
-SIBLINGS, SIBLING_FRAMES = 24, 150
-"""Number of a subject's BVH files that are looked through for `LEVEL_TRIALS` straight ones, and of frames used of each."""
+AXES_TRIALS = 24
+"""Number of a subject's BVH files among which the straightest are sought."""
 
 NO_MOTION = ("shape.npz", "stagei.npz")
 """Name suffixes of AMASS's files that hold no motion."""
@@ -50,7 +50,7 @@ def _foreign_recording(
     Raises WearcapError for an AMC file without a skeleton.
     """
     levels = None if asf is None else _levels(asf, same_subject, amc_fps)
-    siblings = _siblings(same_subject, tuple(mapping.joints.items())) if asf is None else ()
+    siblings = straightest(same_subject, tuple(mapping.joints.items())) if asf is None and same_subject[1:] else ()
     read = read_foreign_motion(file, mapping, amc_fps=amc_fps, asf=asf, levels=levels, siblings=siblings)
     recording = mocap_recording(read.motion, about, settings)
     assert recording.motion is not None
@@ -70,12 +70,6 @@ def _levels(asf: Path, files: tuple[Path, ...], amc_fps: float | int) -> Levels 
             read = read_foreign_motion(file, amc_fps=amc_fps, asf=asf, levels=Levels(None, {}))
             motions.append(read.motion)
     return levels_in(motions) if motions else None
-
-
-@cache
-def _siblings(files: tuple[Path, ...], joints: tuple[tuple[str, str], ...]) -> tuple[Take, ...]:
-    """A subject's clips in which people stand straight."""
-    return straightest(files, Mapping(dict(joints)), LEVEL_TRIALS, SIBLING_FRAMES)
 
 
 def cmu_tasks(
@@ -167,25 +161,23 @@ def _motion_tasks(
     mapping: Mapping,
     version: int,
 ) -> list[Task]:
-    skeletons: dict[str, Path | None] = {}
     groups: dict[str, tuple[str, Path | str | None]] = {}
     same: dict[tuple[str, Path | str | None], list[Path]] = {}
     for name, path in trials.items():
-        skeletons[name], skeleton = None, None
+        skeleton = None
         with suppress(WearcapError):  # raised again by the trial's own task
-            is_amc = ".amc" in path.name.lower()
-            skeletons[name] = asf_beside(path) if is_amc else None
-            skeleton = skeletons[name] if is_amc else _hierarchy(path)
+            skeleton = asf_beside(path) if ".amc" in path.name.lower() else _hierarchy(path)
         groups[name] = (abouts[name].subject, skeleton)
         same.setdefault(groups[name], []).append(path)
     spread = {
-        group: tuple(files[:: -(-len(files) // (SIBLINGS if isinstance(group[1], str) else LEVEL_TRIALS))])
+        group: tuple(files[:: -(-len(files) // (LEVEL_TRIALS if isinstance(group[1], Path) else AXES_TRIALS))])
         for group, files in same.items()
     }
     digests = {group: content_hash(*files) for group, files in spread.items()}
     tasks = []
     for name, path in trials.items():
-        asf, about = skeletons[name], abouts[name]
+        about, skeleton = abouts[name], groups[name][1]
+        asf = skeleton if isinstance(skeleton, Path) else None
         make = partial(_foreign_recording, path, asf, about, amc_fps, mapping, settings, spread[groups[name]])
         described = [asdict(about), asdict(settings), asdict(mapping), amc_fps, version, digests[groups[name]]]
         sources = [path] if asf is None else [path, asf]

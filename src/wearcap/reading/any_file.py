@@ -20,14 +20,14 @@ from wearcap.io.datasets.amass import read_amass
 from wearcap.io.datasets.nymeria import is_nymeria, read_nymeria, read_xdata
 from wearcap.io.datasets.totalcapture import is_totalcapture, read_totalcapture, totalcapture_files
 from wearcap.io.devices.aria_mps import is_mps_folder
-from wearcap.io.devices.headset_log import is_headset_log
+from wearcap.io.devices.headset_log import is_headset_log, is_headset_session
 from wearcap.io.formats.motion_npz import motion_files, read_motion, read_sections
 from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply
-from wearcap.io.formats.trajectory import trajectory_file
+from wearcap.io.formats.trajectory import trajectory_file, trajectory_format
 from wearcap.prepare.foreign import read_foreign_motion
 from wearcap.prepare.suits import read_suit
-from wearcap.reading.kits import Loaded, is_kit, load_kit, load_log, load_mps, load_trajectory
+from wearcap.reading.kits import Loaded, is_kit, load_headset, load_kit, load_log, load_mps, load_trajectory
 from wearcap.recording import Motion, PointCloud, Recording, RecordingStore
 from wearcap.recording.store import MANIFEST, RecordingFile, load_recording
 
@@ -99,13 +99,15 @@ def _load_stored(path: Path) -> Loaded:
 def _load_foreign(path: Path, how: Conventions) -> Loaded:
     """A motion file of any origin on our skeleton; the note says what was detected."""
     how.only("unit", "up", where=path)
-    found = read_foreign_motion(path)
+    found = read_foreign_motion(path, how=how)
     motion, name = found.motion, path.name.split(".")[0]
     recording = Recording(name, motion=motion, skeleton=motion.skeleton, note=found.report.summary())
     return Loaded(recording, [Check("file").ok("a body was found", " ".join(found.report.lines()))])
 
 
 def _load_json(path: Path, how: Conventions) -> Loaded:
+    if trajectory_format(path):
+        return load_trajectory(path, how)
     return load_log(path, how) if is_headset_log(path) else Loaded(*read_environment_file(path))
 
 
@@ -160,6 +162,7 @@ FOLDERS: tuple[tuple[Callable[[Path], object], Read], ...] = (
     (is_totalcapture, _plain(_read_totalcapture)),
     (is_place, _plain(read_place)),
     (motion_files, _plain(_read_motion_folder)),
+    (is_headset_session, load_headset),
     (is_kit, load_kit),
     (trajectory_file, load_trajectory),
 )
@@ -171,7 +174,7 @@ FILES: dict[str, Read] = {
     ".npz": _load_npz,
     ".safetensors": _plain(_read_safetensors),
     ".json": _load_json,
-    **dict.fromkeys((".csv", ".txt", ".tum", ".log", ".jsonl", ".npy", ".bin"), load_log),
+    **dict.fromkeys((".csv", ".tsv", ".txt", ".tum", ".log", ".jsonl", ".npy", ".bin", ".bsor"), load_log),
     **dict.fromkeys((".ply", ".pcd"), _plain(_read_points)),
 }
 """Readers of files by suffix."""

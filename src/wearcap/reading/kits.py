@@ -17,7 +17,7 @@ from wearcap.io.devices.headset_log import is_headset_log
 from wearcap.io.devices.watch_log import is_watch_log, read_inertial_log, read_watch, sensor_files
 from wearcap.io.formats.csv_table import read_header
 from wearcap.io.formats.trajectory import trajectory_format
-from wearcap.prepare.logs import HeadsetSettings, TrajectorySettings, read_path
+from wearcap.prepare.logs import HeadsetSettings, TrajectorySettings, log_name, read_path
 from wearcap.recording import Recording
 from wearcap.recording.recording import ImuStream
 from wearcap.sensors.watches import watch_gaps
@@ -26,7 +26,7 @@ _SIDES = {
     "left_wrist": re.compile(r"(^|[^a-z])(left|l|links)([^a-z]|$)"),
     "right_wrist": re.compile(r"(^|[^a-z])(right|r|rechts)([^a-z]|$)"),
 }
-_TABLES = {".csv", ".txt", ".tum", ".log", ".json", ".jsonl", ".npy"}
+_TABLES = {".csv", ".tsv", ".txt", ".tum", ".log", ".json", ".jsonl", ".npy", ".bsor"}
 _MOST = 200
 """Most files of a folder that are looked into."""
 
@@ -40,6 +40,8 @@ class Loaded(NamedTuple):
 
 def log_kind(path: Path) -> str | None:
     """ "watch", "headset" or "trajectory"; None for any other file. Raises WearcapError for one that cannot be opened."""
+    if path.suffix.lower() == ".bsor":
+        return "headset"
     if path.suffix == ".npy":
         return "trajectory" if trajectory_format(path) else None
     if not {".json", ".jsonl"} & set(path.suffixes) and is_watch_log(path):
@@ -85,7 +87,7 @@ def load_headset(path: Path, how: Conventions) -> Loaded:
     how.only("unit", "axes", "quaternion", "hands", "time_unit", where=path)
     time_unit = None if how.time_unit == AUTO else how.time_unit
     settings = HeadsetSettings(how.unit, how.axes, how.quaternion, how.hands, time_unit)
-    recording = settings.read(path, path.resolve().name.split(".")[0], {})
+    recording = settings.read(path, log_name(path), {})
     check = Check("headset's log")
     findings = [check.ok(f"head and {len(recording.tracked)} hands", recording.note)]
     if not recording.tracked:

@@ -209,6 +209,13 @@ def affordable_precision(precision: str, accelerator: str) -> str:
     return "32-true"
 
 
+def require_accelerator(accelerator: str) -> None:
+    """Raise WearcapError for `trainer.accelerator` gpu or cuda where there is no GPU."""
+    if accelerator in ("gpu", "cuda") and not torch.accelerator.is_available():
+        what, fix = f"trainer.accelerator={accelerator}, but there is no GPU here", "Give trainer=default."
+        raise WearcapError(what, fix=fix)
+
+
 def computes_bfloat16() -> bool:
     """Whether this machine's CPU has instructions for bfloat16."""
     if platform.machine() in ("x86_64", "AMD64"):

@@ -2,14 +2,16 @@
 
 import math
 import os
+import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import cycle
 from pathlib import Path
+from time import monotonic
 
-import av
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -25,13 +27,15 @@ from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 from wearcap.geometry.camera import Camera
-from wearcap.geometry.mesh import Mesh, capsules, checker_floor
+from wearcap.geometry.mesh import Mesh, capsules
 from wearcap.geometry.render import Light, Splats, render
 from wearcap.geometry.rigid import Rigid
+from wearcap.io.formats.video import write_frames
 from wearcap.recording.motion import HANDS, Motion
 from wearcap.recording.recording import Recording
 from wearcap.scene.objects import Environment
 from wearcap.viewer.camera_path import KEY_S, azimuths, smoothed
+from wearcap.viewer.ground import Ground
 from wearcap.viewer.page_layers import by_height, lit_points, posed_meshes, stick_body
 
 PALETTE = np.array([[0.45, 0.55, 0.66], [0.86, 0.55, 0.30], [0.44, 0.62, 0.42], [0.62, 0.45, 0.62]])
@@ -39,8 +43,10 @@ PALETTE = np.array([[0.45, 0.55, 0.66], [0.86, 0.55, 0.30], [0.44, 0.62, 0.42], 
 
 CONTACT_COLOR = np.array([0.80, 0.18, 0.12])
 HOLD_COLOR = np.array([0.20, 0.62, 0.25])
-TILES = np.array([[0.90, 0.90, 0.89], [0.80, 0.81, 0.82]])
+TILES = np.array([[0.85, 0.85, 0.84], [0.73, 0.74, 0.75]])
 SKY = (0.965, 0.97, 0.975)
+RIM = np.array(SKY) / 1.081
+"""Colour at the rim of the ground, which the light makes that of the sky."""
 VIEW_RAD, TILT, DISTANCE_M = math.atan2(0.78, -0.62), -0.30, 4.2
 """Azimuth of the direction in which the camera looks, from the front left at someone facing +x, its vertical part beside a
 horizontal part of 1, and the camera's distance from the person."""
@@ -49,6 +55,8 @@ CUT_AWAY_M = 0.75
 """Objects that stand between the camera and the person, nearer to it by more than this (m), are not drawn."""
 LOOKS = 12
 """Number of viewing directions drawn along the path."""
+LINE_S = 10.0
+"""Time (s) between lines about a video's progress, without a terminal."""
 HEIGHT_COLORS = ((0.35, 0.45, 0.55), (0.80, 0.68, 0.45))
 """Colours (RGB) of points at the lowest and the highest height."""
 
@@ -61,7 +69,7 @@ class _Actor:
     motion: Motion
     body: BodyModel
     color: Float[np.ndarray, "3"]
-    floor_z: float
+    ground: Ground
     environment: Environment | None = None
     """Objects that are drawn at the poses of the motion's `object_motion`."""
 
@@ -119,15 +127,15 @@ class _Actor:
 def _actors(
     motions: dict[str, Motion], body: BodyModel | None = None, environment: Environment | None = None
 ) -> list[_Actor]:
-    """One actor per motion, in sticks unless a body is given for them all. Raises WearcapError for none."""
+    """One actor per motion, on the ground of the first, in sticks unless a body is given. Raises WearcapError for none."""
     if not motions:
         raise WearcapError("no motion to draw", expected="at least one")
+    ground = Ground.of(next(iter(motions.values())))
     shown = []
-    for number, (label, motion) in enumerate(motions.items()):
-        lowest = motion.T_world_joint.t[..., 2].amin(1)
-        floor_z = float(torch.quantile(lowest[:: max(1, len(lowest) // 5000)], 0.05)) - 0.02
-        color = PALETTE[number % len(PALETTE)]
-        shown.append(_Actor(label, motion, body or stick_body(motion.skeleton), color, floor_z, environment))
+    for (label, motion), color in zip(motions.items(), cycle(PALETTE)):
+        suits = body and body.skeleton.joint_names == motion.skeleton.joint_names
+        surface = body if body and suits else stick_body(motion.skeleton)
+        shown.append(_Actor(label, motion, surface, color, ground, environment))
     return shown
 
 
@@ -157,9 +165,9 @@ def _panel(
     """One actor at one frame, on a chequered floor, seen in the direction of an azimuth (rad)."""
     direction, focal = (math.cos(azimuth), math.sin(azimuth), TILT), 1.75 * min(size[1], size[0] * 1.3)
     camera, T_world_cam = _looking(direction, target, distance, size, focal)
-    ground = np.array([target[0], target[1], actor.floor_z])
-    stage = checker_floor(ground, 3.0, 0.5, TILES, np.array(SKY))
-    below = (float(target[0]), float(target[1]), float(ground[2]))
+    time = actor.motion.timestamps[frame].item()
+    stage = actor.ground.mesh(target, time, TILES, RIM)
+    below = (float(target[0]), float(target[1]), float(actor.ground.heights(target[None, :2], time)[0]))
     light = Light(to_light=(0.55, -0.35, 1.0), shadow_center=below, shadow_radius=1.6)
     objects = [_visible(mesh, camera, T_world_cam, distance - CUT_AWAY_M) for mesh in actor.objects(frame)]
     meshes = [*actor.meshes(frame), *(mesh for mesh in objects if mesh is not None), stage]
@@ -297,42 +305,42 @@ def write_video(
     size: tuple[int, int] = (480, 400),
     body: BodyModel | None = None,
     environment: Environment | None = None,
-    max_seconds: float | None = None,
+    max_seconds: float = math.inf,
 ) -> None:
     """Write panels of `size` (width, height) side by side, one per motion, on their shared clock.
 
     The camera follows the first motion. Raises WearcapError when the motions share no time, or for odd sizes.
     """
-    if size[0] % 2 or size[1] % 2 or fps <= 0:
-        raise WearcapError(f"a video of {size[0]}x{size[1]} at {fps} fps", expected="even sizes, a positive rate")
+    if fps <= 0:
+        raise WearcapError(f"a video at {fps} fps", expected="a positive rate")
     shown = _actors(motions, body, environment)
     start, stop = _shared_time(motions.values())
-    if max_seconds is not None:
-        stop = min(stop, start + max_seconds)
-    times = start + np.arange(int((stop - start) * fps) + 1) / fps
+    times = start + np.arange(int((min(stop, start + max_seconds) - start) * fps) + 1) / fps
     clocks = [actor.motion.timestamps.numpy() for actor in shown]
-    with atomic_path(path) as temporary, av.open(str(temporary), "w", format="mp4") as container:
-        codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"  # H.264 where PyAV was built with it
-        stream = container.add_stream(
-            codec, rate=round(fps), options={"preset": "veryfast"} if codec == "libx264" else {}
-        )
-        assert isinstance(stream, av.VideoStream)
-        stream.width, stream.height, stream.pix_fmt = size[0] * len(shown), size[1], "yuv420p"
-        keys = times[:: max(round(KEY_S * fps), 1)]
-        turned = shown[0].azimuths([int(np.abs(clocks[0] - time).argmin()) for time in keys], DISTANCE_M)
-        looks = dict(zip(times.tolist(), smoothed(turned, keys, times)))
+    keys = times[:: max(round(KEY_S * fps), 1)]
+    turned = shown[0].azimuths([int(np.abs(clocks[0] - time).argmin()) for time in keys], DISTANCE_M)
+    looks = dict(zip(times.tolist(), smoothed(turned, keys, times)))
 
-        def drawn(time: float) -> UInt8[np.ndarray, "height width 3"]:
-            frames = [int(np.abs(clock - time).argmin()) for clock in clocks]
-            target = _focus(shown[0].motion, frames[0])
-            look = {"supersample": 1, "azimuth": looks[time]}
-            images = [_panel(actor, frame, target, size, **look) for actor, frame in zip(shown, frames)]
-            return np.concatenate([np.asarray(captioned(image, actor.label)) for image, actor in zip(images, shown)], 1)
+    def drawn(time: float) -> UInt8[np.ndarray, "height width 3"]:
+        frames = [int(np.abs(clock - time).argmin()) for clock in clocks]
+        target = _focus(shown[0].motion, frames[0])
+        look = {"supersample": 1, "azimuth": looks[time]}
+        images = [_panel(actor, frame, target, size, **look) for actor, frame in zip(shown, frames)]
+        return np.concatenate([np.asarray(captioned(image, actor.label)) for image, actor in zip(images, shown)], 1)
 
-        about, console = f"video {Path(path).name}", Console(stderr=True)
-        for picture in track(_in_parallel(drawn, times.tolist()), about, len(times), console=console):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
-        container.mux(stream.encode(None))
+    pictures = _in_parallel(drawn, times.tolist())
+    write_frames(path, _with_progress(pictures, len(times), f"video {Path(path).name}"), fps, crf=23)
+
+
+def _with_progress(pictures: Iterator[np.ndarray], total: int, about: str) -> Iterator[np.ndarray]:
+    """The pictures, with a bar on stderr or, where that is no terminal, a line every `LINE_S` seconds."""
+    console, shown_at = Console(stderr=True), monotonic()
+    bar = track(pictures, about, total, console=console, transient=True, disable=not console.is_terminal)
+    for number, picture in enumerate(bar, 1):
+        yield picture
+        if not console.is_terminal and monotonic() - shown_at > LINE_S:
+            print(f"{about}: {number} of {total} pictures", file=sys.stderr, flush=True)
+            shown_at = monotonic()
 
 
 def _in_parallel(draw: Callable[[float], np.ndarray], times: Iterable[float]) -> Iterator[np.ndarray]:

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from wearcap.errors import WearcapError
-from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory, linear_velocity
 
 OPENXR = torch.tensor([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -29,15 +28,19 @@ WORLDS = {
     "z": torch.eye(3),
     "y": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
     "-y": torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "-z": torch.diag(torch.tensor([1.0, -1.0, -1.0])),
+    "x": torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+    "-x": torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]]),
 }
-"""Rotations of a right-handed world into one with z up, by the axis that is up; x stays x."""
+"""Rotations of a right-handed world into one with z up, by the axis that is up; x stays x where it is level."""
+_USUAL_WORLDS = ("z", "y", "-y")
+"""Those of files that do not say which they have."""
 WALKING_M_S = 0.4
 _SEEN_S = 2.0
-_AHEAD_M = 0.05
-_AGREEMENT = 0.5
 CLEAR = 0.1
 """Lead of the best reading of a path's axes from which it is taken."""
-_IDENTITY_RAD, _IDENTITY_M = 0.02, 0.01
+_PATH_M = 0.5
+"""Spread of a path from which it counts in full that it is level; a standing wearer's head moves less, in any direction."""
 
 
 @dataclass(frozen=True)
@@ -52,25 +55,29 @@ class DeviceAxes:
     """Why these were taken, in a few words."""
 
 
-def device_axes(track: Trajectory, up: str = "auto", device: str = "auto", where: str = "") -> DeviceAxes:
+def device_axes(
+    track: Trajectory, up: str = "auto", device: str = "auto", where: str = "", usual: tuple[str, str] | None = None
+) -> DeviceAxes:
     """Axes of a worn device's path; those that are "auto" follow from which axis stays upright, and where it goes.
 
     Each convention scores by how upright the device is, how level its path, and how well its forward axis agrees with the
-    walk. Where the best leads by less than `CLEAR`, a path that begins with the identity is that of a SLAM, which writes
-    camera axes. Raises WearcapError for other names, when nothing stays upright, and where several fit alike.
+    walk. Where the best leads by less than `CLEAR`, the format's `usual` axes (up, device) are taken. Raises WearcapError
+    for other names, when nothing stays upright, and where several fit alike.
     """
     for name, value, allowed in (("up", up, WORLDS), ("axes", device, DEVICES)):
         if value not in ("auto", *allowed):
             raise WearcapError(f"{name}={value!r}", expected=f"one of auto, {', '.join(allowed)}")
     R, spread = track.R_world_body.double(), track.t_world_body.double().std(0, unbiased=False)
     candidates = []
-    for world, R_up in WORLDS.items():
+    for world in _USUAL_WORLDS if up == "auto" else (up,):
         for name, axes in DEVICES.items():
-            if up not in ("auto", world) or device not in ("auto", name):
+            if device not in ("auto", name):
                 continue
+            R_up = WORLDS[world]
             upright = (R_up[2].double() @ R.mean(0) @ axes.double()[2]).item()
             flat = 1 - (spread @ R_up[2].double().abs() / spread.norm().clamp_min(1e-9)).item()
-            candidates.append((upright + 0.3 * flat + 0.2 * _ahead(track, R_up, axes), upright, world, name))
+            level = 0.3 * flat * min(1.0, spread.norm().item() / _PATH_M)
+            candidates.append((upright + level + 0.2 * _ahead(track, R_up, axes), upright, world, name))
     ranked = sorted(candidates, reverse=True)
     score, upright, world, name = ranked[0]
     if upright < UPRIGHT and "auto" in (up, device):
@@ -81,18 +88,13 @@ def device_axes(track: Trajectory, up: str = "auto", device: str = "auto", where
     if len(alike) < 2:
         lead = f", {score - ranked[1][0]:.2f} better than any other reading" if len(ranked) > 1 else ""
         return DeviceAxes(world, name, upright, f"the device is upright by {upright:.2f}{lead}")
-    slam = next((row for row in alike if row[2:] == ("-y", "camera")), None)
-    if slam is not None and _begins_at_identity(track):
-        return DeviceAxes("-y", "camera", slam[1], "it begins with the identity, as a camera's SLAM does")
+    for _, upright, world, name in alike:
+        if (world, name) == usual:
+            return DeviceAxes(world, name, upright, "as the format usually has it; the path does not show it")
     listed = " or ".join(f"up={row[2]} axes={row[3]}" for row in alike)
     raise WearcapError(
         f"{len(alike)} readings of its axes fit alike", where, "one that fits best", f"Say which: {listed}."
     )
-
-
-def _begins_at_identity(track: Trajectory) -> bool:
-    turn = rotation.geodesic(track.R_world_body[0].double(), torch.eye(3, dtype=torch.float64)).item()
-    return turn < _IDENTITY_RAD and track.t_world_body[0].norm().item() < _IDENTITY_M
 
 
 def to_head_axes(track: Trajectory, axes: DeviceAxes) -> Trajectory:

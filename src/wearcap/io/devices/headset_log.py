@@ -12,7 +12,7 @@ import numpy as np
 
 from wearcap.boundary.opening import open_bytes
 from wearcap.errors import WearcapError
-from wearcap.io.conventions import AUTO, Conventions
+from wearcap.io.conventions import AUTO, DETECTED, Conventions
 from wearcap.io.devices.headset_axes import PALM_M, HeadsetLog, in_our_axes
 from wearcap.io.devices.headset_poses import ARKIT, UNITY_ANGLES, UNREAL_ANGLES, raw_poses
 from wearcap.io.devices.headset_tables import (
@@ -30,14 +30,13 @@ from wearcap.io.formats.trajectory import UNITS
 __all__ = ["PALM_M", "HeadsetLog", "is_headset_log", "is_headset_session", "read_headset_log"]
 _TABLES = {".csv", ".tsv", ".txt", ".json", ".jsonl"}
 _MOST_FILES = 2000
-_DETECTED = Conventions()
 _AXES_OF_NAMES = (({"hololens"}, "openxr"), ({"viewer", "orientation"}, "openxr"), (ARKIT, "openxr"))
 """Conventions that a recorder fixes, by words of its columns: HoloLens2ForCV's, WebXR's, visionOS'."""
 _AXES_OF_ANGLES = {UNITY_ANGLES: ("unity", "openxr", "steamvr"), UNREAL_ANGLES: ("unreal",)}
 _TRIAL = re.compile(r"(?i)_?(?:t|trial_?)\d+$")
 
 
-def read_headset_log(path: str | Path, how: Conventions = _DETECTED, time_unit: str | None = None) -> HeadsetLog:
+def read_headset_log(path: str | Path, how: Conventions = DETECTED, time_unit: str | None = None) -> HeadsetLog:
     """A headset's log; what `how` states of its conventions, and `time_unit` (s, ms, us, ns), override what is detected.
 
     Trials of a session are one recording, with gaps between them. Raises WearcapError for a file without a headset's

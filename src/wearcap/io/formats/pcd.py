@@ -1,6 +1,7 @@
 """PCD point clouds (ASCII, binary, binary_compressed): x y z and, where there are any, colours."""
 
 import io
+from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 
@@ -18,10 +19,10 @@ _TYPES = {("F", 4): "<f4", ("F", 8): "<f8"} | {
 }
 
 
-def read_pcd(path: str | Path) -> Ply:
+def read_pcd(path: str | Path, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> Ply:
     """Points of a PCD file (in the file's unit and axes); points that are NaN, PCL's "no return", are left out.
 
-    Raises WearcapError when it is no PCD, is cut short, has no x y z, or its compressed data is damaged.
+    `origin` is taken off before they become float32. Raises WearcapError when it is no PCD, is cut short, has no x y z, or its compressed data is damaged.
     """
     data = read_bytes(path)
     header, body = _parse_header(data, path)
@@ -64,7 +65,7 @@ def read_pcd(path: str | Path) -> Ply:
     else:
         raise WearcapError(f"DATA {encoding}", path, "ascii, binary or binary_compressed")
     with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite and is dropped
-        points = np.stack([rows[axis] for axis in "xyz"], 1).astype(np.float32)
+        points = np.stack([(rows[axis] - off).astype(np.float32) for axis, off in zip("xyz", origin)], 1)
     valid = np.isfinite(points).all(1)
     colors = None
     for name in ("rgba", "rgb"):

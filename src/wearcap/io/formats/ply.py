@@ -3,7 +3,7 @@
 import io
 import warnings
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -77,8 +77,11 @@ class _Lists:
     lengths: np.ndarray
 
 
-def read_ply(path: str | Path) -> Ply:
-    """Read a PLY file. Raises WearcapError when it is no PLY, cut short, without x y z, or its numbers are NaN."""
+def read_ply(path: str | Path, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> Ply:
+    """Read a PLY file, `origin` taken off its vertices before they become float32.
+
+    Raises WearcapError when it is no PLY, cut short, without x y z, or its numbers are NaN.
+    """
     data = read_bytes(path)
     byte_order, elements, body = _parse_header(data, path)
     if byte_order == "=":
@@ -109,7 +112,7 @@ def read_ply(path: str | Path) -> Ply:
     if not {"x", "y", "z"} <= set(vertex):
         raise WearcapError("no vertices with x, y, z", path, "a PLY with `element vertex`")
     with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite and is refused below
-        points = np.stack([vertex[axis] for axis in "xyz"], 1).astype(np.float32)
+        points = np.stack([(vertex[axis] - off).astype(np.float32) for axis, off in zip("xyz", origin)], 1)
     if not np.isfinite(points).all():
         what = f"{int((~np.isfinite(points)).any(1).sum())} points are NaN or infinite"
         raise WearcapError(what, path, "finite coordinates")

@@ -4,18 +4,20 @@ TUM: lines of `timestamp tx ty tz qx qy qz qw`. EuRoC: CSV of `#timestamp [ns], 
 follow; a header that names its columns decides their order. COLMAP: images.txt or images.bin, poses of the world in the
 camera. hloc: lines of `name qw qx qy qz tx ty tz`, likewise. DROID-SLAM: arrays (.npy, .npz) of `tx ty tz qx qy qz qw`;
 poses.npy of a reconstruction's folder holds the world in the camera, with tstamps.npy beside. MPS: closed-loop CSV.
-KITTI: 12 numbers a line, the first three rows of the camera's matrix in the world, times in times.txt beside.
+KITTI: 12 numbers a line, the first three rows of the camera's matrix in the world, times in times.txt beside; with a
+time first, or 4×4 matrices by row or column (ARKit). transforms.json, Record3D's metadata.json: `camera_frames.py`.
 
 Times are checked before anything is made of them: the unit follows from the step between rows (a header's unit and
 seconds since 1970 decide where two are possible), and nothing that is spread over a longer time than its rows can
 cover is accepted. So whoever resamples a trajectory gets at most ten times its rows.
 """
 
+import math
 import os
 import re
 from array import array
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
 
@@ -29,8 +31,23 @@ from wearcap.boundary.texts import numbered_lines
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
 from wearcap.geometry.trajectory import Trajectory
+from wearcap.io.formats.camera_frames import NAMES, is_camera_frames, read_camera_frames
 from wearcap.io.formats.colmap import read_image_poses
 from wearcap.io.formats.csv_table import read_columns
+from wearcap.io.formats.pose_columns import (
+    EUROC,
+    LOST,
+    MATRIX_WITHIN,
+    STATES,
+    TUM,
+    is_matrix,
+    is_number,
+    places_of,
+    quaternion_first,
+    unit_of,
+    usual_axes,
+    words_of,
+)
 from wearcap.io.formats.poses import are_rotations, check_finite, checked_trajectory, row_name, tracked_in_order
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -42,14 +59,12 @@ MAX_SPARSITY = 10.0
 """Largest ratio of a file's span to what its rows cover at their median step."""
 _EPOCH_S = 9e8, 4.2e9
 """Seconds since 1970 of the years 1998 to 2103."""
-_MATRIX_WITHIN = 0.02
 _FAR, _FAR_FOR_EXTENT, _NOWHERE = 1e4, 20.0, 1e9
 """Distance from zero from which places are a map's, in units and in extents of the path, and from which they are none."""
 _FRAMES = 1e6
 """Whole numbers below are frame numbers (nine hours at 30 Hz), larger ones times."""
-FORMATS = "TUM, EuRoC, COLMAP's images, hloc's poses, DROID-SLAM's arrays, MPS' closed loop, KITTI"
+FORMATS = "TUM, EuRoC, COLMAP's images, hloc's poses, DROID-SLAM's arrays, MPS' closed loop, KITTI, transforms.json"
 _FIX = "Lines of `timestamp tx ty tz qx qy qz qw` (TUM) are the simplest."
-_SLOTS = {"time", "x", "y", "z", "qw", "qx", "qy", "qz"}
 _MPS = "tracking_timestamp_us", "tx_world_device"
 
 
@@ -69,6 +84,8 @@ class TrajectoryFile:
     """What was taken off the positions (file's unit and axes), for maps' coordinates are beyond single precision."""
     notes: tuple[str, ...] = ()
     """Sentences on rows that were sorted or left out."""
+    usual: tuple[str, str] | None = None
+    """The format's usual axes, up and the device's, for paths that do not show theirs."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +102,7 @@ class _Table:
     """Whether poses are those of the world in the body."""
     of_camera: bool = False
     metric: bool = True
+    usual: tuple[str, str] | None = None
     name: Callable[[int], str] = row_name
 
 
@@ -120,7 +138,7 @@ def read_trajectory_file(path: str | Path, time_unit: str | None = None, fps: fl
     if len(rows) < min(2, len(seconds)):
         what = f"{len(rows)} poses in its {len(seconds)} rows; {'; '.join(notes)}"
         raise WearcapError(what, path, "finite numbers, unit quaternions, and times that differ")
-    seconds, translation = seconds[rows], table.translation[rows].astype(np.float64)
+    written, seconds, translation = seconds, seconds[rows], table.translation[rows].astype(np.float64)
     origin = map_origin(translation)
     if origin is not None:
         translation = translation - origin
@@ -132,15 +150,26 @@ def read_trajectory_file(path: str | Path, time_unit: str | None = None, fps: fl
 
     trajectory = checked_trajectory(seconds, translation, table.quat_wxyz[rows], path, name)
     check_span(seconds, path, name)
-    return TrajectoryFile(trajectory, table.format, unit, table.of_camera, table.metric, origin, notes)
+    _require_one_recording(table, written, rows, path)
+    return TrajectoryFile(trajectory, table.format, unit, table.of_camera, table.metric, origin, notes, table.usual)
+
+
+def _require_one_recording(table: _Table, seconds: np.ndarray, rows: np.ndarray, path: Path) -> None:
+    """Raise WearcapError where sorted rows go to and fro between two paths, which is much longer than either."""
+    written = np.sort(rows)
+    lengths = [np.linalg.norm(np.diff(table.translation[at], axis=0), axis=1).sum() for at in (written, rows)]
+    if lengths[1] > 1.5 * lengths[0] + 1e-6:
+        again = int(written[1:][np.diff(seconds[written]) < 0][0])
+        what = f"times start again at {table.name(again)}, and in the order of times the path goes to and fro"
+        raise WearcapError(what, path, "one recording", "Two recordings stand in one file: cut it there.")
 
 
 def map_origin(translation: Float64[np.ndarray, "pose 3"]) -> Float64[np.ndarray, "3"] | None:
-    """Whole numbers near the first place, for places much farther from zero than from one another; None for others."""
-    extent = np.ptp(translation, axis=0).max()
-    if not max(_FAR, _FAR_FOR_EXTENT * extent) < np.linalg.norm(translation[0]) < _NOWHERE:
+    """Whole numbers amid places, for places much farther from zero than from one another; None for others."""
+    low, middle, high = np.quantile(translation, (0.05, 0.5, 0.95), axis=0)  # outliers may lie at zero
+    if not max(_FAR, _FAR_FOR_EXTENT * (high - low).max()) < np.abs(middle).max() < _NOWHERE:
         return None
-    return np.floor(translation[0])
+    return np.floor(middle)
 
 
 def trajectory_format(path: str | Path) -> str | None:
@@ -154,23 +183,25 @@ def trajectory_format(path: str | Path) -> str | None:
     if begin.startswith((b"\x93NUMPY", b"PK")) or path.name == "images.bin":
         return "COLMAP" if path.name == "images.bin" else "DROID-SLAM" if path.suffix == ".npy" else None
     try:
-        return _kind(_first_lines(path))[0]
+        return "NeRF" if is_camera_frames(path) else _kind(_first_lines(path))[0]
     except WearcapError:
         return None
 
 
 _IN_FOLDERS = (
-    *("images.bin", "images.txt", "sparse/0/images.bin", "sparse/0/images.txt", "poses.npy"),
+    *(f"{part}images.{kind}" for part in ("", "sparse/0/", "sparse/", "colmap/sparse/0/") for kind in ("bin", "txt")),
+    *("poses.npy", *NAMES),
     *(f"{part}closed_loop_trajectory.csv{packed}" for part in ("", "slam/") for packed in ("", ".gz", ".xz")),
     *("mav0/state_groundtruth_estimate0/data.csv", "state_groundtruth_estimate0/data.csv", "data.csv"),
-    *("trajectory.txt", "traj.txt", "poses.txt"),
+    *("trajectory.txt", "traj.txt", "poses.txt", "open_loop_trajectory.csv"),
 )
 """Files of a folder that hold its trajectory, the first that is there."""
 
 
 def trajectory_file(folder: str | Path) -> Path | None:
     """The file in a folder that holds its trajectory, by the formats' usual names; None where there is none."""
-    return next((path for name in _IN_FOLDERS if (path := Path(folder) / name).is_file()), None)
+    files = (path for name in _IN_FOLDERS if (path := Path(folder) / name).is_file())
+    return next((path for path in files if path.suffix != ".json" or is_camera_frames(path)), None)
 
 
 def _file_of(path: Path) -> Path:
@@ -178,7 +209,7 @@ def _file_of(path: Path) -> Path:
         return path
     found = trajectory_file(path)
     if found is None:
-        expected = ", ".join(_IN_FOLDERS[:5]) + ", …"
+        expected = "images.bin or images.txt (also in sparse/0), poses.npy, transforms.json, trajectory.txt, …"
         raise WearcapError("a folder without a trajectory", path, expected, "Give its file.")
     return found
 
@@ -195,6 +226,9 @@ def _read(path: Path) -> _Table:
         return _droid_archive(path)
     if path.name == "images.bin":
         return _from_images(path)
+    if is_camera_frames(path):
+        record3d, rows = read_camera_frames(path)
+        return replace(_of_pictures("Record3D" if record3d else "NeRF", rows, path), metric=record3d)
     first = _first_lines(path)
     kind, header = _kind(first)
     if kind is None:
@@ -229,110 +263,71 @@ def _first_lines(path: Path) -> list[tuple[int, str]]:
     return found
 
 
-def _words(line: str) -> list[str]:
-    return [word.strip() for word in line.split(",")] if "," in line else line.split()
-
-
-def _number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
 def _kind(first: Sequence[tuple[int, str]]) -> tuple[str | None, dict[str, int] | None]:
     """Format of a text by its first lines, and the places of its columns by name, where a header has them."""
     header = None
     for _, line in first:
-        words = _words(line.lstrip("#").strip())
+        words = words_of(line.lstrip("#").strip())
         comment = line.startswith("#")
         if _MPS[0] in words and _MPS[1] in words:
             return "MPS", None
         if "tx_odometry_device" in words:
             return "open loop", None
-        if comment or not any(map(_number, words)):
-            slots = _slots(words)
+        if comment or not any(map(is_number, words)):
+            slots = places_of(words)
             if slots is None and not comment:
                 return None, None
             header = slots or header
             continue
-        numbers = sum(map(_number, words))
-        if header is not None and numbers == len(words) > max(header.values()):
+        numbers = sum(map(is_number, words))
+        if header is not None and len(words) > max(header.values()) and is_number(words[header["time"]]):
             return "EuRoC" if "," in line else "TUM", header
-        if not _number(words[0]) and len(words) == 8 and numbers == 7:
+        if not is_number(words[0]) and len(words) == 8 and numbers == 7:
             return "hloc", None
-        if len(words) >= 10 and "," not in line and all(map(_number, words[:9])) and not _number(words[9]):
+        if len(words) >= 10 and "," not in line and all(map(is_number, words[:9])) and not is_number(words[9]):
             return "COLMAP", None
-        if len(words) == 12 and numbers == 12 and "," not in line:
+        if (len(words) == 12 and numbers == 12 and "," not in line) or is_matrix(words):
             return "KITTI", None
         if len(words) == 8 and "," not in line:
             return "TUM", None
-        if len(words) >= 8 and "," in line and _number(words[0]):
+        if len(words) >= 8 and "," in line and is_number(words[0]):
             return "EuRoC", None
         return None, None
     return None, None
 
 
-_ALIASES = {
-    "time": ("timestamp", "time", "t", "ts", "stamp", "timestamps"),
-    **{axis: (f"t{axis}", f"p{axis}", axis, f"pos{axis}", f"position{axis}", f"prsr{axis}") for axis in "xyz"},
-    **{f"q{axis}": (f"q{axis}", f"quat{axis}", f"rot{axis}", f"orientation{axis}", f"qrs{axis}") for axis in "wxyz"},
-}
-
-
-def _slots(words: Sequence[str]) -> dict[str, int] | None:
-    """Columns of a header that names time, position and quaternion; None for any other line."""
-    plain = [re.sub(r"\[[^\[\]]*\]|\([^()]*\)|[^a-z]", "", word.lower()) for word in words]
-    plain = [re.sub(r"^(time|timestamp)(?:ns|us|ms|sec|seconds|s)$", r"\1", word) for word in plain]
-    found = {}
-    for slot, names in _ALIASES.items():
-        place = next((plain.index(name) for name in names if name in plain), None)
-        if place is not None:
-            found[slot] = place
-    return found if found.keys() == _SLOTS else None
-
-
-_EUROC = {"time": 0, "x": 1, "y": 2, "z": 3, "qw": 4, "qx": 5, "qy": 6, "qz": 7}
-_TUM = {"time": 0, "x": 1, "y": 2, "z": 3, "qx": 4, "qy": 5, "qz": 6, "qw": 7}
-
-
 def _named_columns(path: Path, kind: str, header: dict[str, int] | None) -> _Table:
     """TUM's and EuRoC's lines of numbers, and those of any header."""
-    slots = header or (_EUROC if kind == "EuRoC" else _TUM)
+    slots = header or (EUROC if kind == "EuRoC" else TUM)
     places = [slots[name] for name in ("time", "x", "y", "z", "qw", "qx", "qy", "qz")]
     exact = header is None and kind == "TUM"
     expected = "timestamp tx ty tz qx qy qz qw" if exact else "timestamp, x, y, z, qw, qx, qy, qz in every line"
-    values, lines, unit = array("d"), array("l"), None
+    values, lines, unit, heading, state = array("d"), array("l"), None, "", None
     for number, line in numbered_lines(path):
         text = line.split("#")[0].strip()
-        if not text:
-            unit = unit or _unit_of(line)
-            continue
-        words = _words(text)
-        if not values and not any(map(_number, words)):
-            unit = unit or _unit_of(line)  # a header without #
+        words = words_of(text or line.lstrip("# \t"))
+        if not text or (not values and not any(map(is_number, words))):  # a comment, or a header without #
+            unit, heading = unit or unit_of(line), heading or line.lower()
+            state = next((place for place, word in enumerate(words) if word.lower() in STATES), state)
             continue
         if len(words) != 8 if exact else len(words) <= max(places):
             raise WearcapError(f"line {number} has {len(words)} fields", path, expected)
         try:
-            values.extend([float(words[place]) for place in places])
+            values.extend([float(words[place] or "nan") for place in places])
         except ValueError as error:
             raise WearcapError(f"line {number}: {error}"[:200], path, expected) from error
+        if state is not None and state < len(words) and words[state].lower() in LOST:
+            values[-1] = math.nan
         lines.append(number)
     table = np.asarray(values).reshape(-1, 8)
-    return _Table(kind, table[:, 0], table[:, 1:4], table[:, 4:], unit, name=_by_line(lines))
+    if exact:
+        table = quaternion_first(table)
+    usual = usual_axes(heading, table[0]) if len(table) else None
+    return _Table(kind, table[:, 0], table[:, 1:4], table[:, 4:], unit, usual=usual, name=_by_line(lines))
 
 
 def _by_line(lines: Sequence[int]) -> Callable[[int], str]:
     return lambda row: f"line {lines[row]}"
-
-
-def _unit_of(header: str) -> str | None:
-    """Unit of time that a header's first column names."""
-    first = re.split(r"[,\s]\s*(?=[a-z])", header.lower().lstrip("# \t"), maxsplit=1)[0]
-    found = re.search(r"(?:\[|\(|_)(ns|us|µs|ms|s|sec)\b", first)
-    return {"µs": "us", "sec": "s"}.get(found[1], found[1]) if found else None
 
 
 def _refuse(first: Sequence[tuple[int, str]], path: Path) -> None:
@@ -340,8 +335,8 @@ def _refuse(first: Sequence[tuple[int, str]], path: Path) -> None:
     rows = [(number, line) for number, line in first if not line.startswith("#")]
     if not rows:
         raise WearcapError("no poses in the file", path, FORMATS)
-    number, line = next(((n, text) for n, text in rows if any(map(_number, _words(text)))), rows[0])
-    words = _words(line)
+    number, line = next(((n, text) for n, text in rows if any(map(is_number, words_of(text)))), rows[0])
+    words = words_of(line)
     what = f"line {number} has {len(words)} fields, no pose of a known format" if len(words) < 8 else "not a trajectory"
     raise WearcapError(what, path, FORMATS, _FIX)
 
@@ -358,16 +353,24 @@ def _after_header(row: int) -> str:
 
 
 def _kitti(path: Path) -> _Table:
-    values, lines = array("d"), array("l")
+    """Rows of [R | t] or of 4×4 matrices; by column they are ARKit's, whose camera looks along -z in a world with y up."""
+    values, lines, width = array("d"), array("l"), 0
     for number, line in numbered_lines(path):
-        words = line.split("#")[0].split()
-        if words and (len(words) != 12 or not all(map(_number, words))):
-            raise WearcapError(f"line {number} has {len(words)} fields", path, "12 numbers in every line")
+        words = words_of(text) if (text := line.split("#")[0].strip()) else []
+        width = width or len(words)
+        if words and (len(words) != width or not all(map(is_number, words))):
+            raise WearcapError(f"line {number} has {len(words)} fields", path, f"{width} numbers in every line")
         if words:
             values.extend(map(float, words))
             lines.append(number)
-    matrices = np.asarray(values).reshape(-1, 3, 4)
-    return _of_matrices("KITTI", matrices, _times_beside(path), path, _by_line(lines))
+    table = np.asarray(values).reshape(-1, width)
+    times = table[:, 0].copy() if width % 4 else _times_beside(path)
+    matrices = table[:, width % 4 :].reshape(len(table), -1, 4)
+    by_column = width >= 16 and not (matrices[:, 3] == [0, 0, 0, 1]).all()
+    if by_column:
+        matrices = matrices.swapaxes(1, 2)
+    read = _of_matrices("ARKit" if by_column else "KITTI", matrices[:, :3], times, path, _by_line(lines))
+    return replace(read, of_camera=False, usual=("y", "openxr"), metric=True) if by_column else read
 
 
 # --- names of pictures as times ------------------------------------------------------------------------------------
@@ -383,7 +386,7 @@ def _hloc(path: Path) -> _Table:
     def rows() -> Iterator[tuple[str, tuple[float, ...]]]:
         for number, line in numbered_lines(path):
             words = line.split("#")[0].split()
-            if words and (len(words) != 8 or not all(map(_number, words[1:]))):
+            if words and (len(words) != 8 or not all(map(is_number, words[1:]))):
                 raise WearcapError(f"line {number} is no pose", path, "name qw qx qy qz tx ty tz")
             if words:
                 yield words[0], tuple(map(float, words[1:]))
@@ -473,7 +476,7 @@ def _of_matrices(
     matrices = matrices.astype(np.float64)
     check_finite({"matrix": matrices}, path, name)
     R = torch.from_numpy(np.ascontiguousarray(matrices[:, :, :3]))
-    bad = (~are_rotations(R, _MATRIX_WITHIN)).numpy()
+    bad = (~are_rotations(R, MATRIX_WITHIN)).numpy()
     if bad.any():
         what = f"{name(int(bad.argmax()))} is no rotation and translation ({int(bad.sum())} such rows)"
         raise WearcapError(what, path, "[R | t], three rows of four numbers")
@@ -513,8 +516,7 @@ def _inverted(table: _Table) -> _Table:
     """The bodies' poses in the world, of those of the world in the body."""
     R = matrix_from_quat_wxyz(torch.from_numpy(np.ascontiguousarray(table.quat_wxyz))).numpy()
     center = -np.einsum("nji,nj->ni", R, table.translation)
-    quat = table.quat_wxyz * np.array([1.0, -1.0, -1.0, -1.0])
-    return _Table(table.format, table.times, center, quat, table.unit, False, table.of_camera, table.metric, table.name)
+    return replace(table, translation=center, quat_wxyz=table.quat_wxyz * np.array([1, -1, -1, -1]), inverse=False)
 
 
 def _seconds(table: _Table, time_unit: str | None, fps: float | None, path: Path) -> tuple[np.ndarray, str]:
