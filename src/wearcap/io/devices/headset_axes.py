@@ -27,7 +27,7 @@ CONVENTIONS = {
 """Rotations, or reflections of left-handed axes, to x forward, y left, z up. World and device share them, so a pose is
 turned on both sides: R = M R' Mᵀ, t = M t'."""
 DETECTED = ("openxr", "unity", "unreal", "head")
-"""Conventions that are told apart; OpenXR's stands for SteamVR's."""
+"""Conventions that are looked for; OpenXR's stands for SteamVR's."""
 PALM_M = 0.08
 """Distance (m) of a held controller's origin, the palm's middle, from the wrist (nominal)."""
 MARGIN = 2.5
@@ -92,13 +92,13 @@ def stands(wearer: Wearer) -> tuple[float, str]:
 
 
 def walks_ahead(wearer: Wearer) -> tuple[float, str]:
-    """Walking is forward: mean cosine between heading and velocity, in full from 4 s of walking on."""
+    """Walking is forward: mean cosine between heading and velocity, in full from 6 s of walking on."""
     walking = wearer.walking
     if not walking.any():
         return 0.0, ""
     velocity, heading = wearer.velocity[walking], wearer.heading[wearer.base : -wearer.base][walking]
     along = ((velocity * heading).sum(1) / np.linalg.norm(velocity, axis=1)).mean()
-    return 1.5 * min(1.0, walking.sum() * wearer.step_s / 4) * along, f"walks ahead {along:.2f}"
+    return 1.5 * min(1.0, walking.sum() * wearer.step_s / 6) * along, f"walks ahead {along:.2f}"
 
 
 def looks_down(wearer: Wearer) -> tuple[float, str]:
