@@ -37,7 +37,7 @@ from wearcap.viewer.guard import LOOPBACK
 
 MAX_MESSAGES = 20
 """Different messages of libraries that are shown."""
-HANDS = ("auto", "grip", "wrist", "joint")
+HANDS = ("auto", "grip", "pointer", "wrist", "joint")
 """What tracked hands are; those of streams are held controllers where nothing is stated."""
 
 

@@ -11,10 +11,11 @@ CHOICES = {
     "up": ("x", "y", "z", "-x", "-y", "-z"),
     "axes": ("camera", "head", "openxr", "steamvr", "unity", "unreal"),
     "quaternion": ("xyzw", "wxyz"),
-    "hands": ("wrist", "grip"),
+    "hands": ("wrist", "grip", "pointer"),
     "time_unit": ("s", "ms", "us", "ns"),
 }
-"""What may be stated, beside numbers; of `hands`, wrist is OpenXR's hand joint and grip a held controller."""
+"""What may be stated, beside numbers; of `hands`, wrist is OpenXR's hand joint, grip its grip pose, and
+pointer a controller whose forward axis points along the arm."""
 
 
 @dataclass(frozen=True)

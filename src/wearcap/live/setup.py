@@ -25,7 +25,7 @@ from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
 from wearcap.io.devices.aria_mps import T_HEAD_DEVICE
-from wearcap.io.devices.headset_axes import PALM_M, wrist_of_hand
+from wearcap.io.devices.headset_axes import palm_of, wrist_of_hand
 
 MAX_SEATS, MAX_JOINTS, MAX_NOTES = 64, 256, 100
 """Most seats, joints and notes of a file."""
@@ -81,11 +81,11 @@ def head_seat() -> Seat:
 
 
 def hand_seat(joint: str, kind: str) -> Seat:
-    """Nominal seat of what the hand holds: "grip" (a controller), "wrist" (OpenXR's hand joint), "joint" (ours itself)."""
+    """Nominal seat of what the hand holds: "grip" or "pointer" (a controller), "wrist" (OpenXR's hand joint), "joint" (ours)."""
     if kind == "joint":
         return Seat(joint, torch.eye(3), torch.zeros(3))
     R_joint_hand = wrist_of_hand(torch.eye(3)[None], joint, kind)[0].mT.contiguous()
-    return Seat(joint, R_joint_hand, PALM_M * R_joint_hand[:, 2] if kind == "grip" else torch.zeros(3))
+    return Seat(joint, R_joint_hand, palm_of(joint, kind))
 
 
 def write_setup(setup: Setup, path: str | Path) -> None:

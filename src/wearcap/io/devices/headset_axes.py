@@ -30,6 +30,9 @@ DETECTED = ("openxr", "unity", "unreal", "head")
 """Conventions that are looked for; OpenXR's stands for SteamVR's."""
 PALM_M = 0.08
 """Distance (m) of a held controller's origin, the palm's middle, from the wrist (nominal)."""
+POINTS = 0.5
+"""Mean cosine with the arm from which a controller's forward axis is taken to point along it; grips have it across."""
+HELD = {"wrist": "the hand joint", "grip": "the controller (grip pose)", "pointer": "the controller (pointing pose)"}
 MARGIN = 2.5
 """Least difference (nats) from the second best reading."""
 FORMAT_NATS = 4.0
@@ -168,7 +171,7 @@ def in_our_axes(poses: dict[str, RawPoses], how: Conventions, where: str, conven
     What `how` states wins; `convention` is what the file's format fixes, which counts as `FORMAT_NATS` of evidence.
     Raises WearcapError, which names the candidates, where the evidence does not decide.
     """
-    kinds = {joint: how.hands if how.hands != AUTO else raw.kind or "grip" for joint, raw in poses.items()}
+    kinds = {joint: raw.kind if how.hands == AUTO else how.hands for joint, raw in poses.items()}
     stated, orders = how.quaternion != AUTO, CHOICES["quaternion"]
     known = how.quaternion if stated else poses["head"].order
     if known or poses["head"].rotation.ndim == 3:
@@ -184,13 +187,18 @@ def in_our_axes(poses: dict[str, RawPoses], how: Conventions, where: str, conven
         (axes, order), notes = _best(readings, expected, where)
     notes += [f"quaternions {known} as {'given' if stated else 'named'}"] if known else []
     tracks = {joint: _in_axes(raw, unit, turned[order][joint], axes) for joint, raw in poses.items()}
-    wrists = {joint: _as_wrist(track, joint, kinds[joint]) for joint, track in tracks.items() if joint != "head"}
-    held = {"wrist": "the hand joint", "grip": "the controller (grip pose)"}
-    height = float(np.percentile(tracks["head"].t_world_body[:, 2].numpy(), 90))
+    head, wrists = tracks.pop("head"), {}
+    for joint, track in tracks.items():
+        along = points_along_arm(head, track, joint)
+        kind = kinds[joint] or ("pointer" if along > POINTS else "grip")
+        R = wrist_of_hand(track.R_world_body, joint, kind)
+        wrists[joint] = Trajectory(track.timestamps, R, track.t_world_body - R @ palm_of(joint, kind))
+        shown = "" if kinds[joint] else f", which points {along:.2f} along the arm"
+        notes.append(f"{joint} from {HELD[kind]}{shown}")
+    height = float(np.percentile(head.t_world_body[:, 2].numpy(), 90))
     floor = FLOOR_M[0] < height < FLOOR_M[1]
     origin = f"the origin is {'' if floor else 'not '}on the floor (the head is {height:.2f} m above it)"
-    notes += [*about_unit, *(f"{joint} from {held[kinds[joint]]}" for joint in wrists), origin]
-    return HeadsetLog(tracks["head"], wrists, axes, floor, tuple(notes))
+    return HeadsetLog(head, wrists, axes, floor, (*notes, *about_unit, origin))
 
 
 def _matrices(raw: RawPoses, order: str) -> np.ndarray:
@@ -230,7 +238,7 @@ def _rows(head: RawPoses, raw: RawPoses) -> np.ndarray:
 
 
 def _wearer(
-    poses: dict[str, RawPoses], unit: float, turned: dict[str, np.ndarray], name: str, kinds: dict[str, str]
+    poses: dict[str, RawPoses], unit: float, turned: dict[str, np.ndarray], name: str, kinds: dict[str, str | None]
 ) -> Wearer:
     """A log read in a convention."""
     M, head, hands = CONVENTIONS[name].double().numpy(), poses["head"], {}
@@ -287,22 +295,37 @@ def _in_axes(raw: RawPoses, unit: float, R: np.ndarray, name: str) -> Trajectory
     return Trajectory(torch.tensor(raw.seconds), turned, t)
 
 
-def _as_wrist(track: Trajectory, joint: str, kind: str) -> Trajectory:
-    """The wrist's path of a hand's pose in wearcap's axes."""
-    t = track.t_world_body - (PALM_M * track.R_world_body[:, :, 2] if kind == "grip" else 0.0)
-    return Trajectory(track.timestamps, wrist_of_hand(track.R_world_body, joint, kind), t)
+def points_along_arm(head: Trajectory, hand: Trajectory, joint: str) -> float:
+    """Mean cosine between a hand's forward axis and the arm, from about the shoulder to the hand."""
+    near = torch.searchsorted(head.timestamps, hand.timestamps).clamp(max=len(head) - 1)
+    R_yaw = rotation.about_axis("z", rotation.yaw_of(head.R_world_body[near]))
+    shoulder = head.t_world_body[near] + R_yaw @ hand.t_world_body.new_tensor([-0.1, 0.18 * _side(joint), -0.25])
+    arm = torch.nn.functional.normalize(hand.t_world_body - shoulder, dim=-1)
+    return (hand.R_world_body[:, :, 0] * arm).sum(-1).mean().item()
 
 
 def wrist_of_hand(R_world_hand: Float[Tensor, "time 3 3"], joint: str, kind: str) -> Float[Tensor, "time 3 3"]:
     """Rotation of a wrist joint from a hand pose in wearcap's axes (x forward, y left, z up of the device).
 
-    "wrist" is OpenXR's hand joint: forward along the fingers, up out of the hand's back. "grip" is a held controller:
-    forward along the fist from little finger to thumb, up along the fingers, x right out of the left hand's back and
-    into the right palm. A wrist joint's own axes are the world's in a T-pose that faces x, palms down.
+    "wrist" is OpenXR's hand joint: forward along the fingers, up out of the hand's back. "grip" is OpenXR's grip pose:
+    forward along the fist from little finger to thumb, x right into the right palm and out of the left one, up to the
+    arm. "pointer" is a controller's own axes in many logs: forward along the arm, up on the thumb's side. A wrist joint's
+    own axes are the world's in a T-pose that faces x, palms down.
     """
-    side = 1.0 if joint.startswith("left") else -1.0
-    if kind == "wrist":
-        R_joint_hand = rotation.about_axis("z", torch.tensor(side * torch.pi / 2))
-    else:  # device axes in a T-pose: forward = x, up (fingers) = ± y, left = ∓ z
-        R_joint_hand = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, side], [0.0, -side, 0.0]])
-    return R_world_hand @ R_joint_hand.to(R_world_hand).mT
+    side = _side(joint)
+    forward, up = {
+        "wrist": ([0.0, side, 0.0], [0.0, 0.0, 1.0]),
+        "grip": ([1.0, 0.0, 0.0], [0.0, -side, 0.0]),
+        "pointer": ([0.0, side, 0.0], [1.0, 0.0, 0.0]),
+    }[kind]
+    x, z = R_world_hand.new_tensor(forward), R_world_hand.new_tensor(up)
+    return R_world_hand @ torch.stack([x, torch.linalg.cross(z, x), z])
+
+
+def palm_of(joint: str, kind: str) -> Float[Tensor, "3"]:
+    """Place (m) of a hand pose in the wrist joint's axes: the palm's middle, but for a hand joint."""
+    return torch.tensor([0.0, 0.0 if kind == "wrist" else PALM_M * _side(joint), 0.0])
+
+
+def _side(joint: str) -> float:
+    return 1.0 if joint.startswith("left") else -1.0

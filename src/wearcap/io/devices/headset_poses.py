@@ -11,7 +11,7 @@ from wearcap.io.devices.headset_tables import DeviceRows, RawPoses, parts_of
 from wearcap.io.devices.headset_times import grain, in_seconds, rising
 from wearcap.io.formats.trajectory import check_span
 
-_KINDS = {"wrist": {"wrist"}, "grip": {"grip", "controller", "ctrl", "leftcontroller", "rightcontroller", "saber"}}
+_KINDS = {"wrist": {"wrist"}, "grip": {"grip"}}
 ARKIT = {"origin", "from", "anchor"}
 """Words of visionOS' anchors; those of hands have axes of their own."""
 UNITY_ANGLES = "Euler angles in degrees, about z, x and y in turn as Unity's"
