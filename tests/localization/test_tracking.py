@@ -11,8 +11,8 @@ from PIL import Image
 from small_model import HEIGHT, WIDTH, camera_path, write_model, write_pictures
 
 from wearcap.cli import track as verb
-from wearcap.cli.verbs import overrides
 from wearcap.cli.main import run_verb
+from wearcap.cli.verbs import overrides
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
