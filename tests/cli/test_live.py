@@ -36,6 +36,8 @@ def test_an_unknown_system_and_a_replay_of_nothing_are_named():
     with pytest.raises(WearcapError, match="hmd2"):
         with_system(["system=hmd3"])
     with pytest.raises(WearcapError, match="recording="):
+        main(["system=hmd2", "source=replay", "record=none"])
+    with pytest.raises(WearcapError, match="nothing leaves.*view=true"):
         main(["system=hmd2", "source=replay"])
 
 
@@ -62,7 +64,7 @@ def test_a_replay_with_the_shared_checkpoint_is_recorded_and_reported(tmp_path: 
 def test_a_capture_ends_with_its_report_on_sigterm(tmp_path: Path):
     """Also where SIGINT is ignored, as in the background of a shell."""
     command = [sys.executable, "-m", "wearcap.cli.main", "live", "system=hmd2", "source=json://127.0.0.1:0"]
-    command += [f"report={tmp_path / 'report.json'}", f"hydra.run.dir={tmp_path}"]
+    command += [f"record={tmp_path / 'out'}", f"report={tmp_path / 'report.json'}", f"hydra.run.dir={tmp_path}"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None
     for line in process.stderr:

@@ -12,6 +12,7 @@ from small_model import HEIGHT, WIDTH, camera_path, write_model, write_pictures
 
 from wearcap.cli import track as verb
 from wearcap.cli.main import run_verb
+from wearcap.cli.verbs import overrides
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
@@ -164,14 +165,14 @@ def test_cameras_as_colmap_writes_them():
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["a b.mp4", "settings.fps=3"], ["source='a b.mp4'", "settings.fps=3"]),
-        (["--from-model", "it's"], ["from_model='it\\'s'"]),
-        (["--cfg", "job", "v.mp4"], ["--cfg", "job", "source='v.mp4'"]),
+        (["a b.mp4", "settings.fps=3"], ["source=a b.mp4", "settings.fps=3"]),
+        (["--from-model", "it's"], ["from_model=it's"]),
+        (["--cfg", "job", "v.mp4"], ["--cfg", "job", "source=v.mp4"]),
         (["--help"], ["--help"]),
     ],
 )
 def test_arguments_of_the_command(arguments, expected):
-    assert verb.overrides(arguments) == expected
+    assert overrides("track", arguments) == expected
 
 
 @pytest.mark.real

@@ -30,8 +30,8 @@ DETECTED = ("openxr", "unity", "unreal", "head")
 """Conventions that are looked for; OpenXR's stands for SteamVR's."""
 PALM_M = 0.08
 """Distance (m) of a held controller's origin, the palm's middle, from the wrist (nominal)."""
-POINTS = 0.5
-"""Mean cosine with the arm from which a controller's forward axis is taken to point along it; grips have it across."""
+POINTS = 0.25
+"""Least value of `points_along_arm` of a controller that points along the arm."""
 HELD = {"wrist": "the hand joint", "grip": "the controller (grip pose)", "pointer": "the controller (pointing pose)"}
 MARGIN = 2.5
 """Least difference (nats) from the second best reading."""
@@ -193,7 +193,7 @@ def in_our_axes(poses: dict[str, RawPoses], how: Conventions, where: str, conven
         kind = kinds[joint] or ("pointer" if along > POINTS else "grip")
         R = wrist_of_hand(track.R_world_body, joint, kind)
         wrists[joint] = Trajectory(track.timestamps, R, track.t_world_body - R @ palm_of(joint, kind))
-        shown = "" if kinds[joint] else f", which points {along:.2f} along the arm"
+        shown = "" if kinds[joint] else f", which points along the arm by {along:.2f}"
         notes.append(f"{joint} from {HELD[kind]}{shown}")
     height = float(np.percentile(head.t_world_body[:, 2].numpy(), 90))
     floor = FLOOR_M[0] < height < FLOOR_M[1]
@@ -296,12 +296,13 @@ def _in_axes(raw: RawPoses, unit: float, R: np.ndarray, name: str) -> Trajectory
 
 
 def points_along_arm(head: Trajectory, hand: Trajectory, joint: str) -> float:
-    """Mean cosine between a hand's forward axis and the arm, from about the shoulder to the hand."""
+    """How much more a hand's forward axis points along the arm (from about the shoulder) than its lower side does, which a
+    grip's does: the sum of mean cosines of its forward and its up axis."""
     near = torch.searchsorted(head.timestamps, hand.timestamps).clamp(max=len(head) - 1)
     R_yaw = rotation.about_axis("z", rotation.yaw_of(head.R_world_body[near]))
     shoulder = head.t_world_body[near] + R_yaw @ hand.t_world_body.new_tensor([-0.1, 0.18 * _side(joint), -0.25])
     arm = torch.nn.functional.normalize(hand.t_world_body - shoulder, dim=-1)
-    return (hand.R_world_body[:, :, 0] * arm).sum(-1).mean().item()
+    return ((hand.R_world_body[:, :, 0] + hand.R_world_body[:, :, 2]) * arm).sum(-1).mean().item()
 
 
 def wrist_of_hand(R_world_hand: Float[Tensor, "time 3 3"], joint: str, kind: str) -> Float[Tensor, "time 3 3"]:
