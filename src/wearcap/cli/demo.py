@@ -21,7 +21,7 @@ HELP = "prepare simulated data, train, evaluate, capture and export in minutes"
 def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser("wearcap demo", description=HELP)
     parser.add_argument("--output", type=Path, default=Path("outputs/demo"), help="folder for everything")
-    parser.add_argument("--steps", type=int, default=80, help="training steps")
+    parser.add_argument("--steps", type=int, default=160, help="training steps")
     options = parser.parse_args(arguments)
     out, data, trained = options.output, options.output / "data", options.output / "train/checkpoints/last.ckpt"
     started = time.monotonic()
