@@ -30,7 +30,7 @@ DETECTED = ("openxr", "unity", "unreal", "head")
 """Conventions that are looked for; OpenXR's stands for SteamVR's."""
 PALM_M = 0.08
 """Distance (m) of a held controller's origin, the palm's middle, from the wrist (nominal)."""
-POINTS = 0.25
+POINTS = 0.3
 """Least value of `points_along_arm` of a controller that points along the arm."""
 HELD = {"wrist": "the hand joint", "grip": "the controller (grip pose)", "pointer": "the controller (pointing pose)"}
 MARGIN = 2.5
