@@ -1,28 +1,29 @@
 """`wearcap demo`: the complete workflow on simulated data, from preparation to a captured motion, in minutes."""
 
-import argparse
 import re
 import time
 from collections.abc import Callable
 from pathlib import Path
 from textwrap import wrap
 
-from wearcap.body.anny_body import anny_body
-from wearcap.cli import capture, evaluate, export, prepare, train
-from wearcap.io.formats.motion_npz import read_motion
-from wearcap.recording import Motion, RecordingStore
-from wearcap.viewer.picture import contact_sheet, save_png, shared_frames
+from wearcap.cli.verbs import VERBS, Arguments
 
 SHARED = "hmd2"
 """Shared checkpoint that is shown beside the one that is trained."""
-HELP = "prepare simulated data, train, evaluate, capture and export in minutes"
 
 
 def main(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser("wearcap demo", description=HELP)
+    parser = Arguments("wearcap demo", description=VERBS["demo"])
     parser.add_argument("--output", type=Path, default=Path("outputs/demo"), help="folder for everything")
     parser.add_argument("--steps", type=int, default=160, help="training steps")
     options = parser.parse_args(arguments)
+
+    from wearcap.body.anny_body import anny_body
+    from wearcap.cli import capture, evaluate, export, prepare, train
+    from wearcap.io.formats.motion_npz import read_motion
+    from wearcap.recording import RecordingStore
+    from wearcap.viewer.picture import contact_sheet, save_png, shared_frames
+
     out, data, trained = options.output, options.output / "data", options.output / "train/checkpoints/last.ckpt"
     started = time.monotonic()
     _step("Simulated wearers", prepare.main, ["simulated", "preset=quick", f"output={data}"])
@@ -39,7 +40,7 @@ def main(arguments: list[str]) -> None:
     _step("Training, shortly", train.main, training)
     store = RecordingStore.open(data)
     name = next(name for name in store.names("test") if re.fullmatch(r"[\w-]+", name))  # a value of the config
-    motions: dict[str, Motion] = {}
+    motions = {}
     for label, checkpoint, video in (
         (f"checkpoint {SHARED}", SHARED, "10"),
         (f"{options.steps} steps", trained, "false"),
