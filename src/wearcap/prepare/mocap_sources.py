@@ -13,6 +13,7 @@ from pathlib import Path
 from wearcap.boundary.opening import understood
 from wearcap.boundary.texts import numbered_lines
 from wearcap.errors import WearcapError, nearest
+from wearcap.io.conventions import AUTO, Conventions
 from wearcap.io.datasets.amass import read_amass
 from wearcap.prepare.engine import NOTE, Splits, Task, content_hash, source_folder
 from wearcap.prepare.foreign import read_foreign_motion, straightest
@@ -22,7 +23,7 @@ from wearcap.prepare.levels import Levels, levels_in
 from wearcap.prepare.mocap import About, MocapSettings, mocap_recording
 from wearcap.recording.recording import Recording
 
-CMU_VERSION, BVH_VERSION, AMASS_VERSION = 4, 2, 2
+CMU_VERSION, BVH_VERSION, AMASS_VERSION = 4, 2, 3
 """Versions of the conversions, increased when the same source and settings yield another recording."""
 
 MOTION_SUFFIXES = (".amc", ".amc.xz", ".amc.gz", ".bvh", ".bvh.xz", ".bvh.gz")
@@ -111,12 +112,14 @@ def bvh_tasks(
     mapping: str | Path | None = None,
     subject: str | None = None,
     activity: str | None = None,
+    unit: str | float | int = AUTO,
+    up: str = AUTO,
 ) -> list[Task]:
     """One task per .bvh or .amc (also .xz, .gz) that `source` is or that lies anywhere below it, named by its path.
 
-    `mapping`, a YAML file, overrides what is detected of all files' conventions. `subject` and `activity` are each a
-    regular expression with one group, searched in the path below `source`; or "folder"; or one name for all. By default
-    the subject is the number of CMU's SUBJECT_TRIAL names, else the folder, and there is no activity.
+    `mapping`, a YAML file, overrides what is detected of all files' conventions, as `unit` and `up` do. `subject` and
+    `activity` are each a regular expression with one group, searched in the path below `source`; or "folder"; or one name
+    for all. By default the subject is the number of CMU's SUBJECT_TRIAL names, else the folder, and there is no activity.
     """
     source = Path(source)
     if source.is_file() and not source.name.lower().endswith(MOTION_SUFFIXES):
@@ -134,7 +137,8 @@ def bvh_tasks(
         name: "" if activity is None else _named(path, root, "activity", activity) for name, path in trials.items()
     }
     abouts = {name: About(name, subjects[name], "bvh", license, activities[name]) for name in trials}
-    given = Mapping() if mapping is None else read_mapping(mapping)
+    given, how = Mapping() if mapping is None else read_mapping(mapping), Conventions(unit=unit, up=up)
+    given = replace(given, unit_m=how.unit_m or given.unit_m, up=given.up if how.up == AUTO else how.up)
     return _motion_tasks(trials, abouts, splits, settings, amc_fps, given, BVH_VERSION)
 
 
@@ -234,16 +238,22 @@ def _named(path: Path, source: Path, what: str, rule: str) -> str:
     return match[1]
 
 
-def _amass(file: Path, about: About, settings: MocapSettings) -> Recording:
-    source = read_amass(file)
+def _amass(file: Path, about: About, settings: MocapSettings, up: str) -> Recording:
+    source = read_amass(file, up)
     assert source.motion is not None
-    return replace(mocap_recording(source.motion, about, settings), shape=source.shape)
+    return replace(mocap_recording(source.motion, about, settings), shape=source.shape, note=source.note)
 
 
 def amass_tasks(
-    source: str | Path, splits: Splits, settings: MocapSettings, license: str, subsets: Sequence[str] | None = None
+    source: str | Path,
+    splits: Splits,
+    settings: MocapSettings,
+    license: str,
+    subsets: Sequence[str] | None = None,
+    up: str = AUTO,
 ) -> list[Task]:
-    """One task per motion file below `source`, laid out DATASET/SUBJECT/MOTION.npz, of all data sets or of `subsets`.
+    """One task per motion file below `source`, laid out DATASET/SUBJECT/MOTION.npz, of all data sets or of `subsets`;
+    `up` is the axis that is up in all.
 
     A row of the split list that names a file (DATASET/SUBJECT/MOTION) takes precedence over its subject's. Raises
     WearcapError for a missing subset, and for a file that is not laid out so.
@@ -265,9 +275,9 @@ def amass_tasks(
             raise WearcapError("not below a data set's and a subject's folder", where=path, expected=expected)
         name, subject, file = "__".join(parts).replace(" ", "_"), "/".join(parts[:2]), "/".join(parts)
         about = About(name, subject, "amass", license)
-        key = content_hash(asdict(about), asdict(settings), AMASS_VERSION, path)
+        key = content_hash(asdict(about), asdict(settings), AMASS_VERSION, up, path)
         split = splits.of(file if file in by_file else subject)
-        tasks.append(Task(name, partial(_amass, path, about, settings), split, key))
+        tasks.append(Task(name, partial(_amass, path, about, settings, up), split, key))
     if not tasks:
         raise WearcapError("no motion files (.npz)", where=source, expected="AMASS as it unpacks")
     return tasks

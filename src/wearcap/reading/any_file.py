@@ -120,7 +120,7 @@ def _load_npz(path: Path, how: Conventions) -> Recording | Motion | Loaded:
     if read_npz(path, ("wearcap",)):
         return _plain(read_motion)(path, how)
     how.only("up", where=path)
-    return read_amass(path)
+    return read_amass(path, how.up)
 
 
 def _read_motion_folder(folder: Path) -> Recording:
