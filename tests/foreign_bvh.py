@@ -155,12 +155,8 @@ def _euler(R: np.ndarray, order: str) -> np.ndarray:
     return np.degrees(np.stack([first, second, third], -1))
 
 
-def write(path: Path, convention: Convention, R: dict, p: dict, fps: float = 60.0) -> dict[str, np.ndarray]:
-    """Write a motion (world rotations and places by joint) as BVH of a convention.
-
-    Returns what its numbers mean: the joints' places (file units) by the file's names.
-    """
-    R, p = dict(R), dict(p)
+def _tree(convention: Convention, R: dict, p: dict) -> tuple[list[str], dict[str, str]]:
+    """The file's joints and each one's parent; what only the file has is added to rotations and places."""
     joints, parents = [name for name in NAMES if name.split("_")[-1] in convention.names], {}
     for joint, above, offset in [*convention.extra, *_mirrored(convention.extra)]:
         joints.append(joint)
@@ -176,6 +172,16 @@ def write(path: Path, convention: Convention, R: dict, p: dict, fps: float = 60.
         R["ground"], p["ground"] = turn("z", yaw), p["pelvis"] * np.array([1.0, 1, 0])
         if convention.still:
             R["ground"], p["ground"] = np.tile(np.eye(3), (len(yaw), 1, 1)), np.zeros((len(yaw), 3))
+    return joints, parents
+
+
+def write(path: Path, convention: Convention, R: dict, p: dict, fps: float = 60.0) -> dict[str, np.ndarray]:
+    """Write a motion (world rotations and places by joint) as BVH of a convention.
+
+    Returns what its numbers mean: the joints' places (file units) by the file's names.
+    """
+    R, p = dict(R), dict(p)
+    joints, parents = _tree(convention, R, p)
     B = _frames(convention, joints, parents)
     M, scale = convention.axes, 1 / convention.unit_m
     world = {joint: M @ R[joint] @ B[joint] for joint in joints}
