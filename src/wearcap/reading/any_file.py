@@ -82,7 +82,8 @@ def unknown_kind(path: Path) -> WearcapError:
     fix = {
         ".c3d": "Markers have no skeleton yet: solve them, and give the BVH.",
         ".fbx": "Export it as BVH (Blender, MotionBuilder and Maya do), and give that.",
-        ".vrs": "A VRS file holds raw sensors: request Project Aria's MPS for it, and give the folder that MPS returns.",
+        ".vrs": "It holds raw sensors: request Project Aria's MPS for it, and give the folder that MPS returns; with the extra "
+        "wearcap[aria] the camera's pictures are taken from a data.vrs beside it.",
     }.get(path.suffix.lower(), "")
     return WearcapError("not a kind of file that holds a recording", path, ", ".join(FILES), fix)
 
