@@ -34,7 +34,7 @@ LONG_OUTAGE_S = 30.0
 REACH_M = (0.05, 1.3)
 """Range of the usual distance (m) between head and hand."""
 SCAN_FILE = "scene: file"
-HEAD_M = (0.2, 2.6)
+HEAD_M = (-0.1, 2.6)
 """Range of the head's height (m) above the floor, from lying to standing."""
 _ACC_UNITS = {"g": GRAVITY, "milli-g": GRAVITY / 1000, "cm/s²": 0.01}
 
