@@ -30,6 +30,7 @@ import test_egohoi  # noqa: E402
 import test_glb  # noqa: E402
 import test_hand_detections  # noqa: E402
 import test_hcontact  # noqa: E402
+import test_headset_layouts  # noqa: E402
 import test_mvnx  # noqa: E402
 import test_watch_log  # noqa: E402
 import totalcapture_files  # noqa: E402
@@ -54,10 +55,12 @@ from wearcap.io.datasets import (  # noqa: E402
     omomo,
     totalcapture,
 )
-from wearcap.io.devices import aria_mps, headset_log, watch_log  # noqa: E402
+from wearcap.io.devices import aria_mps, headset_log, headset_tables, watch_log  # noqa: E402
 from wearcap.io.formats import (  # noqa: E402
     asf_amc,
+    bsor,
     bvh,
+    camera_frames,
     camera_json,
     colmap,
     contact_labels,
@@ -98,6 +101,7 @@ FRAMES = 12
 """Of data sets whose files are long: short ones show the same faults sooner."""
 TUM = "".join(f"{0.1 * k:.1f} {k} 2 3 0 0 0 1\n" for k in range(12))
 EUROC = "#timestamp,p_x,p_y,p_z,q_w,q_x,q_y,q_z\n" + "".join(f"{10**9 * k},{k},0,0,1,0,0,0\n" for k in range(1, 9))
+NERF = json.dumps({"frames": [{"file_path": f"{k}.png", "transform_matrix": np.eye(4).tolist()} for k in range(6)]})
 _WATCH = '{"R_world_ref_wxyz": [1, 0, 0, 0], "R_joint_imu_wxyz": [1, 0, 0, 0], "board_still_deg": 0.1, "board_tilt_deg": 0.2, "pose_still_deg": 1}'
 _CLOCK = '{"camera_s": [1, 2], "watch_s": [3, 4], "swings": 9, "drift_s_per_hour": 0, "residual_s": 0, "std_s": 0.001}'
 WORN = f"""{{"watches": {{"left_wrist": {_WATCH}, "right_wrist": {_WATCH}}}, "clocks": {{"left_wrist": {_CLOCK}}},
@@ -438,6 +442,9 @@ READERS: dict[str, Reader] = {
         )
     },
     "headset_csv": _made("h.csv", _headset_csv, headset_log.read_headset_log),
+    "headset_tables": _made("h.csv", _headset_csv, headset_tables.read_rows),
+    "bsor": _made("a.bsor", lambda path: test_headset_layouts.replay(path.parent), bsor.read_bsor),
+    "camera_frames": _one("transforms.json", NERF, lambda path: list(camera_frames.read_camera_frames(path)[1])),
     "headset_json": _made("h.json", lambda path: _headset_json(path, json.dumps), headset_log.read_headset_log),
     "headset_lines": _made(
         "h.jsonl",

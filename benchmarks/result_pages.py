@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from rich.console import Group
 from rich.table import Table
 from tabling import UPSIDE_DOWN, cell
 
@@ -107,11 +108,13 @@ def summaries(scores: Mapping[str, Mapping[str, Any]]) -> dict[str, Summary]:
     }
 
 
-def grid_of(table: Table, about: Mapping[str, Any], spread: str = "") -> Grid:
-    """A terminal's table."""
-    columns = [[str(each).replace("nan", NONE) for each in column.cells] for column in table.columns]
-    heads = tuple(str(column.header) for column in table.columns)
-    return Grid(str(table.title), heads, [list(row) for row in zip(*columns)], origin(about, spread))
+def grid_of(table: Table | Group, about: Mapping[str, Any], spread: str = "") -> Grid:
+    """A terminal's table, or several beside whose first column the lines are the same."""
+    parts = [part for part in (table.renderables if isinstance(table, Group) else [table]) if isinstance(part, Table)]
+    whole = [column for k, part in enumerate(parts) for column in part.columns[min(k, 1) :]]
+    columns = [[str(each).replace("nan", NONE) for each in column.cells] for column in whole]
+    heads = tuple(str(column.header) for column in whole)
+    return Grid(str(parts[0].title), heads, [list(row) for row in zip(*columns)], origin(about, spread))
 
 
 TRAINING = {

@@ -158,7 +158,9 @@ def wrists(time, R, t) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     found = {}
     for side, sign in (("left", 1.0), ("right", -1.0)):
         swing = 0.5 * np.sin(3 * time + sign)
-        local = Rotation.from_euler("XYZ", np.stack([sign * -0.6 + 0.1 * swing, 0.5 * swing, sign * -1.2 + 0.5 * swing], 1))
+        local = Rotation.from_euler(
+            "XYZ", np.stack([sign * -0.6 + 0.1 * swing, 0.5 * swing, sign * -1.2 + 0.5 * swing], 1)
+        )
         at = np.stack([0.25 + 0.1 * swing, sign * 0.22 + 0 * swing, -0.55 + 0.05 * swing], 1)
         found[side] = (turn * local).as_matrix(), t + turn.apply(at)
     return found

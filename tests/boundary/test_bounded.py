@@ -143,9 +143,9 @@ def test_the_option_of_the_command_line(tmp_path, capsys, monkeypatch):
     assert os.environ[limits.VARIABLE] == "1"
     for wrong in (["--max-file-gib", "lots", "doctor"], ["--max-file-gib"]):
         assert exit_main(*wrong) == 2
-        assert "--max-file-gib: a limit of" in capsys.readouterr().err
+        assert "max_file_gib: a limit of" in capsys.readouterr().err
     exit_main("--help")
-    assert "--max-file-gib N reads files of up to N GiB" in capsys.readouterr().out
+    assert "max_file_gib=N reads files of up to N GiB" in capsys.readouterr().out
 
 
 def exit_main(*arguments: str) -> int:

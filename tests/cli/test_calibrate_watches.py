@@ -176,7 +176,7 @@ def test_the_guide_prints_the_steps_and_where_the_logs_have_them(made, files, tm
         ({"steps": "watch"}, "no steps 'watch'. Did you mean 'watches'"),
         ({"left": "none.csv"}, "none.csv"),
         ({"camera": "null"}, "marks, standing, swings without a camera"),
-        ({"recording": "nowhere/x"}, "nowhere/x: there is no such"),
+        ({"recording": "nowhere/x"}, "nowhere/x: no recording here"),
         ({"bord": "[1,2]"}, "Did you mean 'board'"),
     ],
 )

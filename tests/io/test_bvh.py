@@ -208,6 +208,8 @@ FAULTS = {
     "unclosed": (TEXT.replace("}\nMOTION", "MOTION"), "no complete HIERARCHY"),
     "truncated hierarchy": (TEXT[:300], "broken|complete"),
     "short row": (TEXT.replace("45 -55 65 ", "45 -55 "), "line 38.*18 values.*19"),
+    "cut in a row": (TEXT[:-9], "cut short: 15 of 19 values"),
+    "cut in a number": (TEXT.replace("Frames: 3", "Frames: 5").rstrip()[:-1] + "-", "cut short: 19 of 19 values"),
     "cut in its only row": (TEXT[: TEXT.index("91 2 3") - 22], "line 37.*1[0-9] values.*19"),
     "no frames": (
         TEXT.split("Frames: 3")[0] + "Frames: 0\nFrame Time: .01\n\n",
@@ -250,8 +252,6 @@ MENDED = {
     "more rows than its header says": (TEXT.replace("Frames: 3", "Frames: 2"), 3, "says 2 frames, its rows are 3"),
     "fewer rows": (TEXT.replace("Frames: 3", "Frames: 99999999999999"), 3, "says 99999999999999 frames, its rows are 3"),
     "cut between rows": (TEXT[:LAST], 2, "says 3 frames, its rows are 2"),
-    "cut in a row": (TEXT[:-9], 2, "cut off after 15 of 19 values"),
-    "cut in a number": (TEXT.replace("Frames: 3", "Frames: 5").rstrip()[:-1] + "-", 2, "cut off after 19 of 19 values"),
     "comments": ("// made by hand\n# v2\n" + TEXT.replace("MOTION\n", "MOTION\n# 120 Hz\n"), 3, "comments: 3"),
     "decimal commas": (TEXT.replace(".0083333", "0,0083333").replace("OFFSET 10 -5 1", "OFFSET 10,0 -5,0 1,0")
                        .replace(" -50 ", " -50,0 ").replace("\n91 ", "\n9,1E1 "), 3, "read as points: 4"),

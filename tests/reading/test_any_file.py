@@ -81,7 +81,7 @@ def test_other_files_get_one_line(tmp_path):
     (tmp_path / "a.docx").write_bytes(b"x")
     with pytest.raises(WearcapError, match="not a kind of file that holds a recording"):
         read(tmp_path / "a.docx")
-    with pytest.raises(WearcapError, match="there is no such file, folder or recording"):
+    with pytest.raises(WearcapError, match="no recording here: there is no such file"):
         read(tmp_path / "nothing.bvh")
     (tmp_path / "empty").mkdir()
     with pytest.raises(WearcapError, match="no recording here"):

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from omegaconf import DictConfig
 from rich import print as show
 from rich.console import Console
+from rich.markup import escape
 from torch import Tensor
 
 from wearcap.body.anny_body import anny_body
@@ -33,7 +34,7 @@ from wearcap.io.formats.smpl import read_smpl
 from wearcap.io.saving import on_skeleton, write_smplh
 from wearcap.reading import load, read
 from wearcap.recording import Motion, Recording
-from wearcap.recording.store import dataset_folder
+from wearcap.recording.store import MANIFEST, dataset_folder
 from wearcap.runtime.system import CaptureInput, StageOptions, System
 from wearcap.tracking.stature import skeleton_of, with_stature
 from wearcap.viewer.page_layers import with_objects
@@ -70,6 +71,8 @@ def captured(config: Any, system: System) -> Motion | None:
         )
     recording, stature = with_stature(loaded.recording, xsens23(), config.height, body)
     dataset = dataset_folder(config.recording)
+    if recording.note and not (dataset / MANIFEST).is_file():
+        show(f"read: {escape(recording.note)}")
     if stature is None:
         show(f"height unknown, {xsens23().stature:.2f} m assumed: give height=… (m)")
     elif stature.source != "skeleton":

@@ -31,7 +31,7 @@ from wearcap.live.source import Source
 from wearcap.live.sources import source_of
 from wearcap.live.sources.replay import ReplaySource
 from wearcap.reading import read
-from wearcap.recording.store import dataset_folder
+from wearcap.recording.store import MANIFEST, dataset_folder
 from wearcap.runtime.system import CaptureInput, System
 from wearcap.viewer.guard import LOOPBACK
 
@@ -55,6 +55,8 @@ def run(config: DictConfig) -> dict[str, Any]:
     if config.recording is not None:
         how = {**config, "hands": "auto"} if config.hands == "joint" else config
         recording, folder = read(config.recording, stated(how), config.check), dataset_folder(config.recording)
+        if recording.note and not (folder / MANIFEST).is_file():
+            _show(f"read: {recording.note}")
         place = CaptureInput.in_dataset(recording, folder, config.scene, config.metres_per_unit)
     require_choice(config.hands, HANDS, f"hands={config.hands}")
     sources, setup = _sources(config, system, place)

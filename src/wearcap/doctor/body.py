@@ -159,7 +159,7 @@ def _check_axes(check: Check, motion: Motion, parts: Landmarks) -> list[Finding]
             faces = quantile((R[walks, :, 0] * way[walks]).sum(-1), 0.5) if walks.sum() >= 10 else 1.0
         if up < least_up + 0.05 or aside > 0.5 or faces < least_ahead + 0.15:
             evidence.append(f"{name} up by {up:.2f}, ahead by {faces:.2f} of 1")
-            severity = max(severity, 2 if up < least_up or aside > 0.6 or faces < least_ahead else 1)
+            severity = max(severity, 2 if up < least_up or aside > 0.75 or faces < least_ahead else 1)
     if not severity:
         return [check.ok("pelvis, trunk and head are upright and ahead", f"in {int(stands.sum())} frames that stand")]
     fix = "The axes of its joints are not x ahead, z up: read the file that they come from, with its skeleton's other clips."

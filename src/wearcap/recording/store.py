@@ -299,7 +299,7 @@ def load_recording(where: str | Path) -> Recording:
         raise WearcapError(what, path, f"one of them, such as {path / names[0] if names else path / 'NAME'}")
     if (path.parent / MANIFEST).is_file():
         return RecordingStore.open(path.parent).load(path.name)
-    what = "no recording here" if path.exists() else "there is no such file, folder or recording"
+    what = "no recording here" + ("" if path.exists() else ": there is no such file or folder")
     raise WearcapError(what, path, "DATASET/NAME, or any file or folder that holds a recording")
 
 

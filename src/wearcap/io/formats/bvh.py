@@ -192,8 +192,8 @@ def _parse_motion(
         words, where = text.split(), at_line(path, number)
         cut = len(words) < channels or (len(values) < (count - 1) * channels and not text.endswith("\n"))
         if cut and not following and values and odd is None:
-            notes.append(f"The last row is cut off after {len(words)} of {channels} values and left out.")
-            break
+            fix = "Fetch it again; or delete its last row to read the others."
+            raise WearcapError(f"cut short: {len(words)} of {channels} values", where, "a whole last row", fix)
         values.extend(finite_floats(words, where))
         if len(words) != channels and odd is None:
             odd = WearcapError(f"{len(words)} values", where, f"{channels}, one per channel of the hierarchy")
