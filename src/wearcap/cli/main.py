@@ -38,8 +38,8 @@ def usage() -> str:
 def run_verb(verb: str, arguments: list[str]) -> int:
     """Run one verb and return the exit code; errors that a user can fix become one message on stderr."""
     debug, trust = (bool({f"{key}=true", f"--{key}"} & set(arguments)) for key in ("debug", "trust"))
-    own = {"debug", "trust"}  # of every verb
-    arguments = [word for word in arguments if word.removesuffix("=true").removesuffix("=false").lstrip("-") not in own]
+    own = re.compile(r"(--)?(debug|trust)=(true|false)|--(debug|trust)")  # of every verb
+    arguments = [word for word in arguments if not own.fullmatch(word)]
     try:
         if {"--help", "-h"} & set(arguments) and (text := help_of(verb, arguments)):
             print(text)
