@@ -15,7 +15,7 @@ SHARED = "hmd2"
 def main(arguments: list[str]) -> None:
     parser = Arguments("wearcap demo", description=VERBS["demo"])
     parser.add_argument("--output", type=Path, default=Path("outputs/demo"), help="folder for everything")
-    parser.add_argument("--steps", type=int, default=160, help="training steps")
+    parser.add_argument("--steps", type=int, default=400, help="training steps")
     options = parser.parse_args(arguments)
 
     from wearcap.body.anny_body import anny_body
