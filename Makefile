@@ -8,7 +8,7 @@ STAMP := $(VENV)/.wearcap-installed
 .PHONY: help install demo test test-real lint format lock clean
 
 help:
-	@echo "make demo       prepare simulated data, train, evaluate, capture, export (about 5 minutes on 2 cores)"
+	@echo "make demo       prepare simulated data, train, evaluate, capture, export (about 2 minutes on 2 quiet cores)"
 	@echo "make test       ruff, basedpyright, and every test that needs no GPU and no real recordings"
 	@echo "make test-real  the tests on real recordings (../shared/data, or WEARCAP_REAL_DATA)"
 	@echo "make format     let ruff mend what it can"
