@@ -18,24 +18,26 @@ def load(pipeline: str, *overrides: str, checkpoint=None, device: str = "cpu", t
         return load_pipeline(checkpoint, config.pipeline, device, shared=True)
 
 
-def read(path, height: float | None = None):
+def read(path, height: float | None = None, **stated):
     """The `recording.Recording` in any file or folder that holds one: a prepared recording, MVNX, BVH, AMASS, MPS, logs …
 
     `height` (m) is the wearer's; without it, and without a skeleton in the file, it follows from how high the head is
-    carried. Raises WearcapError for what cannot be read.
+    carried. `stated` is what the file's content need not decide: unit="cm", up="y", axes="unity" … (`io.conventions`).
+    Raises WearcapError for what cannot be read.
     """
-    return source(path, height).recording
+    return source(path, height, **stated).recording
 
 
-def source(path, height: float | None = None, scene=None):
+def source(path, height: float | None = None, scene=None, **stated):
     """The recording with its files (`runtime.system.CaptureInput`), for systems that use them: HPS its scan, iReplica its
     objects. `scene` is another scan, or its folder. Raises WearcapError as `read` does, and for a scene without a cloud.
     """
     from wearcap.body.skeleton import xsens23
+    from wearcap.io.conventions import Conventions
     from wearcap.reading import read as read_any
     from wearcap.recording.store import dataset_folder
     from wearcap.runtime.system import CaptureInput
     from wearcap.tracking.stature import with_stature
 
-    recording, _ = with_stature(read_any(path), xsens23(), height)
+    recording, _ = with_stature(read_any(path, Conventions(**stated)), xsens23(), height)
     return CaptureInput.in_dataset(recording, dataset_folder(path), scene)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import short_walk
+import wearcap
 from command_line import exit_code, files_in
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import Conventions
@@ -91,6 +92,9 @@ def test_what_a_format_fixes_cannot_be_stated(tmp_path):
         read(tmp_path / "walk.txt", Conventions(quaternion="wxyz"))
     with pytest.raises(WearcapError, match=r"axes=nonsense.*one of auto, camera, head, openxr"):
         Conventions(axes="nonsense")
+    small = wearcap.read(tmp_path / "walk.txt", unit="cm").head
+    assert small is not None
+    assert small.t_world_device.abs().max() < 0.2
     with pytest.raises(WearcapError, match="unit=0"):
         Conventions(unit=0)
 
