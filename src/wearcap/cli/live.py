@@ -9,6 +9,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -17,6 +18,7 @@ from omegaconf import DictConfig, ListConfig
 from rich import print as show
 from rich.markup import escape
 
+from wearcap.body.skeleton import xsens23
 from wearcap.cli.conf import compose, hydra_main, load_pipeline
 from wearcap.cli.stated import stated
 from wearcap.errors import WearcapError, nearest, require_choice
@@ -33,6 +35,7 @@ from wearcap.live.sources.replay import ReplaySource
 from wearcap.reading import read
 from wearcap.recording.store import MANIFEST, dataset_folder
 from wearcap.runtime.system import CaptureInput, System
+from wearcap.tracking.stature import with_stature
 from wearcap.viewer.guard import LOOPBACK
 
 MAX_MESSAGES = 20
@@ -57,6 +60,9 @@ def run(config: DictConfig) -> dict[str, Any]:
         recording, folder = read(config.recording, stated(how), config.check), dataset_folder(config.recording)
         if recording.note and not (folder / MANIFEST).is_file():
             _show(f"read: {recording.note}")
+        if float(config.speed) > 1:  # too fast for the first minute, which looks at the wearer in real time
+            recording, stature = with_stature(recording, xsens23(), config.height)
+            recording = recording if stature else replace(recording, skeleton=xsens23())
         place = CaptureInput.in_dataset(recording, folder, config.scene, config.metres_per_unit)
     require_choice(config.hands, HANDS, f"hands={config.hands}")
     sources, setup = _sources(config, system, place)
@@ -164,7 +170,7 @@ def _sources(config: DictConfig, system: System, place: CaptureInput | None) -> 
         objects = kind.of_objects(system, place)
         replay = ReplaySource(place.recording, kind, float(config.speed), objects=objects)
         sources.append(replay)
-        if config.height is None and not config.guided:
+        if (config.height is None or float(config.speed) > 1) and not config.guided:
             setup = setup or replay.setup
     if not sources:
         raise WearcapError("no source", expected="source=replay, or source=vmc://:39540 …")
