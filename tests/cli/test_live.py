@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+import short_walk
+from command_line import exit_code
 from wearcap.cli.conf import compose
 from wearcap.cli.live import main, with_system
 from wearcap.errors import WearcapError
@@ -74,3 +76,13 @@ def test_a_capture_ends_with_its_report_on_sigterm(tmp_path: Path):
     process.terminate()
     assert process.wait(60) == 0
     assert json.loads((tmp_path / "report.json").read_text())["wearers"] == {}
+
+
+def test_a_replay_as_fast_as_it_goes_needs_no_first_minute(tmp_path, monkeypatch, capfd):
+    """A wearer of unknown height: nobody could be looked at in real time."""
+    monkeypatch.chdir(tmp_path)
+    short_walk.tum(tmp_path / "walk.txt", *short_walk.walk(seconds=6))
+    assert (
+        exit_code(["live", "system=hmd2", "recording=walk.txt", "speed=inf", "record=rec", "report=report.json"]) == 0
+    )
+    assert json.loads((tmp_path / "report.json").read_text())["wearers"]["wearer"]["frames"] > 200
