@@ -227,18 +227,22 @@ def write(path: Path, convention: Convention, R: dict, p: dict, fps: float = 60.
         lines.append(pad + "}")
 
     block(joints[0], 0)
-    table = np.concatenate(columns, -1)
+    path.write_bytes(_text(convention, lines, np.concatenate(columns, -1), fps).encode())
+    return {label[joint]: places for joint, places in stands.items()}
+
+
+def _text(convention: Convention, lines: list[str], table: np.ndarray, fps: float) -> str:
+    """The file: its hierarchy's lines, and a row of numbers for each frame."""
     if convention.bind_first:
         bind = np.zeros((1, table.shape[1]))
         bind[0, :3] = table[0, :3]
         table = np.concatenate([bind, table])
-    lines += ["MOTION", f"Frames: {len(table)}", f"Frame Time: {1 / fps:.7f}"]
+    lines = [*lines, "MOTION", f"Frames: {len(table)}", f"Frame Time: {1 / fps:.7f}"]
     lines += [" ".join(f"{value:.6f}" for value in row) for row in table]
     text = "\n".join(lines) + "\n"
     for old, new in convention.style:
         text = text.replace(old, new)
-    path.write_bytes(text.encode())
-    return {label[joint]: places for joint, places in stands.items()}
+    return text
 
 
 def _names(text: str) -> dict[str, str]:
