@@ -1,0 +1,88 @@
+"""The knee while people walk and stand, beside that of healthy adults: what shows legs that are too long for their body."""
+
+from functools import cache
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.signal import find_peaks
+from torch import Tensor
+
+from wearcap.recording.motion import Motion
+
+POINTS = 101
+"""Points of a gait cycle."""
+HEEL_STRIKE = 0.27
+"""Share of the cycle from one peak of swing to the next at which the heel strikes: the peak lies at 73 % from it."""
+STANCE = slice(32, 73)
+"""Points of a cycle that are 5 to 45 % from heel strike, when the foot bears weight: people's knees are bent by 4 to 18°."""
+SPEED_M_S = (0.6, 1.9)
+"""Mean speed of a cycle that is walked."""
+_KNEE = ((0, 5, 12, 20, 30, 40, 50, 60, 70, 73, 80, 90, 97, 100), (5, 11, 18, 15, 8, 4, 10, 36, 60, 62, 55, 22, 4, 5))
+_CYCLE_S = (0.7, 1.7)
+_PEAK_DEG = 30.0
+"""Least flexion of a swing's peak, also of people who hardly lift their feet."""
+_LEVEL_M = 0.08
+"""Change of a foot's height from swing to swing, and of the pelvis from cycle to cycle, on level ground."""
+
+
+@cache
+def normal_knee_deg() -> Float[Tensor, "point"]:
+    """Flexion (degrees) from peak of swing to peak of swing of healthy adults on level ground (Perry & Burnfield; Winter)."""
+    share = (np.linspace(0, 1, POINTS) - HEEL_STRIKE) % 1.0
+    return torch.from_numpy(np.interp(100 * share, *_KNEE)).float()
+
+
+def knee_deg(motion: Motion) -> Float[Tensor, "time side"]:
+    """Flexion (degrees, 0 straight) of both knees, from the places of hip, knee and ankle."""
+    hip, knee, ankle = (
+        torch.stack([motion.joint(f"{side}_{name}").t for side in ("left", "right")], 1).double()
+        for name in ("hip", "knee", "ankle")
+    )
+    thigh, shank = knee - hip, ankle - knee
+    across = torch.linalg.cross(thigh, shank).norm(dim=-1)
+    return torch.atan2(across, (thigh * shank).sum(-1)).rad2deg().float()
+
+
+def knee_cycles(motion: Motion) -> list[Float[Tensor, "cycle point"]]:
+    """Flexion (degrees) of left and right knees over all cycles of straight, level walking, from peak of swing to peak."""
+    pelvis = motion.t_world_root.double().numpy()
+    times, flexion = motion.timestamps.numpy(), knee_deg(motion).numpy()
+    found = []
+    for k, side in enumerate(("left", "right")):
+        ankle, curves = motion.joint(f"{side}_ankle").t[:, 2].numpy(), []
+        peaks, _ = find_peaks(flexion[:, k], _PEAK_DEG, distance=max(round(0.45 * motion.fps), 1), prominence=15)
+        for start, stop in zip(peaks[:-1], peaks[1:]):
+            seconds, path = times[stop] - times[start], pelvis[start : stop + 1]
+            steps = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=-1)
+            gone = np.linalg.norm(path[-1, :2] - path[0, :2])
+            level = (
+                max(abs(ankle[stop] - ankle[start]), np.ptp(path[[0, -1], 2])) < _LEVEL_M and np.ptp(path[:, 2]) < 0.12
+            )
+            straight = gone > 0.9 * steps.sum()
+            if level and straight and _within(seconds, _CYCLE_S) and _within(gone / seconds, SPEED_M_S):
+                at = np.linspace(times[start], times[stop], POINTS)
+                curves.append(np.interp(at, times[start : stop + 1], flexion[start : stop + 1, k]))
+        found.append(torch.from_numpy(np.array(curves).reshape(-1, POINTS)).float())
+    return found
+
+
+def standing(motion: Motion) -> Bool[Tensor, "time"]:
+    """Frames in which somebody stands upright and quietly: both ankles and the pelvis are still, the trunk is upright."""
+    still = torch.zeros(len(motion), dtype=torch.bool)
+    if len(motion) < 3:
+        return still
+    names = ("left_ankle", "right_ankle", "pelvis", "head")
+    t = torch.stack([motion.joint(name).t for name in names], 1)
+    step_s = (motion.timestamps[2:] - motion.timestamps[:-2]).to(t)[:, None]
+    slow = ((t[2:] - t[:-2]).norm(dim=-1) / step_s < torch.tensor([0.1, 0.1, 0.15, 0.3])).all(1)
+    pelvis, trunk = t[:, 2], torch.nn.functional.normalize(t[:, 3] - t[:, 2], dim=-1)
+    legs = (pelvis - t[:, :2].mean(1)).norm(dim=-1)
+    apart = (t[:, 0] - t[:, 1])[:, :2].norm(dim=-1)
+    even = (t[:, 0, 2] - t[:, 1, 2]).abs() < 0.05
+    still[1:-1] = slow
+    return still & (trunk[:, 2] > 0.95) & (apart < 0.5 * legs) & even
+
+
+def _within(value: float, bounds: tuple[float, float]) -> bool:
+    return bounds[0] <= value <= bounds[1]
