@@ -1,6 +1,7 @@
 """The knee while people walk and stand, beside that of healthy adults: what shows legs that are too long for their body."""
 
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -52,15 +53,14 @@ def knee_cycles(motion: Motion) -> list[Float[Tensor, "cycle point"]]:
     for k, side in enumerate(("left", "right")):
         ankle, curves = motion.joint(f"{side}_ankle").t[:, 2].numpy(), []
         peaks, _ = find_peaks(flexion[:, k], _PEAK_DEG, distance=max(round(0.45 * motion.fps), 1), prominence=15)
-        for start, stop in zip(peaks[:-1], peaks[1:]):
+        for start, stop in pairwise(peaks.tolist()):
             seconds, path = times[stop] - times[start], pelvis[start : stop + 1]
             steps = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=-1)
             gone = np.linalg.norm(path[-1, :2] - path[0, :2])
-            level = (
-                max(abs(ankle[stop] - ankle[start]), np.ptp(path[[0, -1], 2])) < _LEVEL_M and np.ptp(path[:, 2]) < 0.12
-            )
+            level = max(abs(ankle[stop] - ankle[start]), abs(path[-1, 2] - path[0, 2])) < _LEVEL_M
             straight = gone > 0.9 * steps.sum()
-            if level and straight and _within(seconds, _CYCLE_S) and _within(gone / seconds, SPEED_M_S):
+            walked = _CYCLE_S[0] < seconds < _CYCLE_S[1] and SPEED_M_S[0] < gone / seconds < SPEED_M_S[1]
+            if level and straight and walked:
                 at = np.linspace(times[start], times[stop], POINTS)
                 curves.append(np.interp(at, times[start : stop + 1], flexion[start : stop + 1, k]))
         found.append(torch.from_numpy(np.array(curves).reshape(-1, POINTS)).float())
@@ -82,7 +82,3 @@ def standing(motion: Motion) -> Bool[Tensor, "time"]:
     even = (t[:, 0, 2] - t[:, 1, 2]).abs() < 0.05
     still[1:-1] = slow
     return still & (trunk[:, 2] > 0.95) & (apart < 0.5 * legs) & even
-
-
-def _within(value: float, bounds: tuple[float, float]) -> bool:
-    return bounds[0] <= value <= bounds[1]
