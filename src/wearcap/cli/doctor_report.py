@@ -16,6 +16,7 @@ from wearcap.cli.conf import compose
 from wearcap.cli.stated import stated
 from wearcap.doctor import Report
 from wearcap.doctor.preflight import preflight
+from wearcap.doctor.truth import FIGURES, known
 from wearcap.reading import examine
 from wearcap.runtime.system import System
 
@@ -29,7 +30,8 @@ def examined(options: argparse.Namespace) -> Report:
     if options.json:
         report = examine(options.path, preflight=check, how=how)
         findings = {name: [asdict(finding) for finding in found] for name, found in report.findings.items()}
-        content = {"source": report.source, "sound": report.sound, "findings": findings}
+        people = {subject: known(figures) for subject, figures in report.people.items()}
+        content = {"source": report.source, "sound": report.sound, "findings": findings, "people": people}
         print(json.dumps(content, indent=1, ensure_ascii=False))
     else:
         console = Console()
@@ -39,10 +41,12 @@ def examined(options: argparse.Namespace) -> Report:
                 options.path, lambda done, total: progress.update(task, completed=done, total=total), check, how
             )
         console.print(_table(report, options.quiet))
+        if report.people:
+            console.print(_people(report))
         counts = {severity: len(report.of_severity(severity)) for severity in ("error", "warning", "note")}
         listed = ", ".join(f"{count} {severity}{'s' if count != 1 else ''}" for severity, count in counts.items())
         verdict = "[green]sound[/]" if report.sound else "[bold red]not sound[/]"
-        count = len(report.findings)
+        count = report.recordings
         console.print(f"{count} recording{'s' if count != 1 else ''}: {verdict} ({listed})")
     return report
 
@@ -70,4 +74,15 @@ def _table(report: Report, quiet: bool) -> Table:
         if several:
             cell.append(f"\n{len(names)}: {', '.join(names[:3])}{' …' if len(names) > 3 else ''}", style="italic")
         table.add_row(Text(finding.severity, style=color), Text(finding.check), cell)
+    return table
+
+
+def _people(report: Report) -> Table:
+    """One row per person of a data set: its figures, those out of bounds in the color of warnings."""
+    table = Table("person", title="people", title_justify="left")
+    for figure in FIGURES:
+        table.add_column(figure.heading, justify="right")
+    for subject, person in report.people.items():
+        values = [(figure, getattr(person, figure.name)) for figure in FIGURES]
+        table.add_row(subject, *(Text(f.text(v), style=_COLOR["warning"] if f.excess(v) else "") for f, v in values))
     return table

@@ -1,10 +1,11 @@
 """The doctor's findings by recording, the worst first."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partialmethod
 
 from wearcap.errors import WearcapError
+from wearcap.metrics.truth import Truth
 
 SEVERITIES = ("ok", "note", "warning", "error")
 
@@ -58,10 +59,17 @@ def refusal(error: WearcapError, check: str = "reading") -> Finding:
 
 @dataclass(frozen=True)
 class Report:
-    """Findings of every examined recording."""
+    """Findings of every examined recording, and of every person of a data set ("person NAME")."""
 
     source: str
     findings: dict[str, tuple[Finding, ...]]
+    people: dict[str, Truth] = field(default_factory=dict)
+    """Figures of a data set's people."""
+
+    @property
+    def recordings(self) -> int:
+        """Number of recordings that were examined."""
+        return len(self.findings) - len(self.people)
 
     def of_severity(self, *severities: str) -> list[tuple[str, Finding]]:
         """(recording, finding) of these severities."""

@@ -1,0 +1,125 @@
+"""The truth of a data set by person: figures of a sample of each person's motion, against what people's bodies do."""
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from wearcap.doctor.report import Check, Finding
+from wearcap.metrics.truth import Truth, truth
+from wearcap.recording import Motion, Recording, RecordingStore
+from wearcap.recording.store import RecordingFile
+
+SAMPLE_S = 180.0
+"""Motion (s) that is looked at of each person."""
+CUT_S = 10.0
+"""Least length (s) of a cut out of one recording: a few cycles of walking, or somebody who stands."""
+_LEAST_FRAMES = 4
+_NEEDED = ("pelvis", "head", *(f"{side}_{name}" for side in ("left", "right") for name in ("hip", "knee", "ankle")))
+_LEGS = "Check the source's skeleton: legs too long for their hips crouch."
+_CONTACTS = "Check the frame rate and the contacts."
+_FLOOR = "Check the floor's height, and where the skeleton's soles lie."
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One of `Truth`'s figures: its heading, its digits, the bounds of what people do, and what is wrong beyond them."""
+
+    name: str
+    heading: str
+    digits: int = 0
+    low: float = -np.inf
+    high: float = np.inf
+    what: str = ""
+    fix: str = ""
+
+    def text(self, value: float) -> str:
+        """A value with the figure's digits, a dash for one that is not known."""
+        return "–" if np.isnan(value) else f"{value:.{self.digits}f}"
+
+    @property
+    def bounds(self) -> str:
+        """The bounds in words, "" where there are none."""
+        if np.isinf(self.low):
+            return "" if np.isinf(self.high) else f"≤ {self.high:g}"
+        return f"≥ {self.low:g}" if np.isinf(self.high) else f"{self.low:g} to {self.high:g}"
+
+    def excess(self, value: float) -> float:
+        """How far a value lies outside the bounds; 0 inside them, and for one that is not known."""
+        return float(np.nan_to_num(max(self.low - value, value - self.high, 0.0)))
+
+
+FIGURES = (
+    Figure("minutes", "min", 1),
+    Figure("cycles", "cycles"),
+    Figure("knee_rms_deg", "knee off normal °", 1, -np.inf, 9, "walks with knees unlike people's", _LEGS),
+    Figure("stance_deg", "stance knee °", 1, 2, 20, "walks on bent knees", _LEGS),
+    Figure("standing_deg", "standing knee °", 1, -np.inf, 15, "stands on bent knees", _LEGS),
+    Figure("curves_deg", "left − right °", 1, -np.inf, 10, "left and right knees walk differently", _LEGS),
+    Figure(
+        "bones_cm", "bones l − r cm", 1, -np.inf, 2, "bones differ left from right", "Check the measured bone lengths."
+    ),
+    Figure("sole_cm", "sole cm", 1, -1.5, 1.5, "planted soles are not on the floor", _FLOOR),
+    Figure("sole_low_cm", "5 % cm", 1, -4, np.inf, "planted soles are through the floor", _FLOOR),
+    Figure("sole_high_cm", "95 % cm", 1, -np.inf, 5, "planted soles are over the floor", _FLOOR),
+    Figure("skate_cm_s", "skate cm/s", 1, -np.inf, 20, "planted feet skate", _CONTACTS),
+    Figure("jumps", "jumps/min", 1, -np.inf, 0, "joints jump", "Cut or mend those frames."),
+    Figure("stature_m", "stature m", 2, 1.4, 2.1, "unusual stature", "Check the unit of length."),
+    Figure("leg", "leg", 3, 0.46, 0.52, "legs are unlike people's, for that stature", _LEGS),
+    Figure(
+        "eyes", "eyes", 3, 0.915, 0.955, "a device on the head is not at the eyes", "Check where the head's joint lies."
+    ),
+    Figure("pitch_deg", "pitch °", 0, -5, 25, "the head is tilted while walking", "Check the head's axes."),
+    Figure("pitch_spread_deg", "± °", 0),
+)
+"""What is reported of each person, in the order of the columns. Bounds: Perry & Burnfield; Drillis & Contini; Winter."""
+
+
+def people(store: RecordingStore, names: Iterable[str]) -> dict[str, Truth]:
+    """Figures of each person of these recordings of a data set from `SAMPLE_S` of motion; people without are left out."""
+    own: dict[str, list[str]] = {}
+    for name in names:
+        own.setdefault(store.entries[name].subject or "unnamed", []).append(name)
+    sampled = {subject: _sample(store, own[subject]) for subject in sorted(own)}
+    return {subject: truth(cuts) for subject, cuts in sampled.items() if cuts}
+
+
+def of_person(figures: Truth) -> list[Finding]:
+    """A warning for each figure of a person that is out of bounds."""
+    check, found = Check("truth"), []
+    for figure in FIGURES:
+        value = getattr(figures, figure.name)
+        if figure.excess(value):
+            evidence = f"{figure.heading}: {figure.text(value)}, people's {figure.bounds}"
+            found.append(check.warning(figure.what, evidence, figure.fix))
+    return found
+
+
+def known(figures: Truth) -> dict[str, float]:
+    """A person's figures by name, without those that are not known."""
+    return {name: value for name, value in asdict(figures).items() if np.isfinite(value)}
+
+
+def _sample(store: RecordingStore, names: list[str]) -> list[Recording]:
+    """At most `SAMPLE_S` of these recordings' motion, spread evenly over them, from the middle of each."""
+    if sum(store.entries[name].duration_s for name in names) > SAMPLE_S:
+        count = min(len(names), round(SAMPLE_S / CUT_S))
+        names = [names[k] for k in np.linspace(0, len(names) - 1, count).round().astype(int)]
+    cuts = [_cut(store.open_file(name), SAMPLE_S / len(names), name) for name in names]
+    return [cut for cut in cuts if cut is not None]
+
+
+def _cut(file: RecordingFile, seconds: float, name: str) -> Recording | None:
+    """The middle of a recording's motion, with contacts, floor and the head's device; None without motion or legs."""
+    skeleton = file.part("skeleton")
+    if "motion.timestamps" not in file.keys or skeleton is None or not all(joint in skeleton for joint in _NEEDED):
+        return None
+    times = file.tensor("motion.timestamps")
+    spare = max((times[-1] - times[0]).item() - seconds, 0.0) / 2
+    start, last = np.searchsorted(times.numpy(), [times[0].item() + spare, times[-1].item() - spare]).tolist()
+    stop = last + 1
+    if stop - start < _LEAST_FRAMES:
+        return None
+    rows = (file.window(f"motion.{key}", start, stop) for key in ("R_parent_joint", "t_world_root"))
+    parts = {part: file.part(part) for part in ("head", "contacts", "floor")}
+    return Recording(name, motion=Motion(times[start:stop], skeleton, *rows), **parts)
