@@ -22,6 +22,9 @@ from wearcap.runtime.system import System
 
 _COLOR = {"ok": "green", "note": "cyan", "warning": "yellow", "error": "bold red"}
 
+PEOPLE_WIDTH = 160
+"""Least width (characters) of the table of people: a narrower one would cut its figures."""
+
 
 def examined(options: argparse.Namespace) -> Report:
     """Examine what the options name, print the findings and return them."""
@@ -42,7 +45,7 @@ def examined(options: argparse.Namespace) -> Report:
             )
         console.print(_table(report, options.quiet))
         if report.people:
-            console.print(_people(report))
+            Console(width=max(console.width, PEOPLE_WIDTH)).print(_people(report))
         counts = {severity: len(report.of_severity(severity)) for severity in ("error", "warning", "note")}
         listed = ", ".join(f"{count} {severity}{'s' if count != 1 else ''}" for severity, count in counts.items())
         verdict = "[green]sound[/]" if report.sound else "[bold red]not sound[/]"

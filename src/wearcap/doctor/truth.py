@@ -102,8 +102,9 @@ def known(figures: Truth) -> dict[str, float]:
 
 def _sample(store: RecordingStore, names: list[str]) -> list[Recording]:
     """At most `SAMPLE_S` of these recordings' motion, spread evenly over them, from the middle of each."""
-    if sum(store.entries[name].duration_s for name in names) > SAMPLE_S:
-        count = min(len(names), round(SAMPLE_S / CUT_S))
+    mean = sum(store.entries[name].duration_s for name in names) / len(names)
+    if mean * len(names) > SAMPLE_S:
+        count = min(len(names), round(SAMPLE_S / min(mean, CUT_S)))
         names = [names[k] for k in np.linspace(0, len(names) - 1, count).round().astype(int)]
     cuts = [_cut(store.open_file(name), SAMPLE_S / len(names), name) for name in names]
     return [cut for cut in cuts if cut is not None]

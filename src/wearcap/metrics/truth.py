@@ -18,9 +18,12 @@ LEAST_CYCLES = 4
 """Cycles of walking below which a person's mean curve says nothing."""
 LEAST_S = 1.0
 """Time (s) of standing, or of walking in one recording, below which it says nothing."""
+SEATED_DEG = 60.0
+"""Knee from which somebody upright who keeps still sits."""
 ROOT_M_S, JOINT_M_S = 8.0, 15.0
 """Speeds that neither the pelvis nor any joint of a person reaches, as `prepare`'s limits have them."""
 _UPRIGHT = 0.9
+_LEVEL_M = 0.01
 _NAN = float("nan")
 
 
@@ -93,9 +96,10 @@ def _knees(motions: Sequence[Motion]) -> dict:
     """`Truth`'s figures of the knees."""
     left, right = (torch.cat(side) for side in zip(*(knee_cycles(motion) for motion in motions)))
     both = torch.cat([left, right])
-    still = [(standing(motion), motion) for motion in motions]
-    seconds = sum(int(mask.sum()) / motion.fps for mask, motion in still)
-    stood = torch.cat([knee_deg(motion)[mask].flatten() for mask, motion in still])
+    knees = [knee_deg(motion) for motion in motions]
+    stands = [standing(motion) & (knee < SEATED_DEG).all(1) for motion, knee in zip(motions, knees)]
+    seconds = sum(int(mask.sum()) / motion.fps for motion, mask in zip(motions, stands))
+    stood = torch.cat([knee[mask].flatten() for knee, mask in zip(knees, stands)])
     known, sides = len(both) >= LEAST_CYCLES, min(len(left), len(right)) >= LEAST_CYCLES
     return {
         "cycles": len(both),
@@ -107,12 +111,15 @@ def _knees(motions: Sequence[Motion]) -> dict:
 
 
 def _sole_heights(recording: Recording, motion: Motion) -> Float[Tensor, "patch"]:
-    """Heights (m) over the floor of all planted patches of the soles; none without contacts or floor."""
+    """Heights (m) over the floor of the soles' planted patches, where it is level for a second to either side; none
+    without contacts or floor."""
     contact, floor = _feet(recording, motion.timestamps), recording.floor
     if contact is None or floor is None or not set(FOOT_PATCHES) <= set(motion.skeleton.sites):
         return torch.zeros(0)
     patches = site_positions(motion.skeleton, motion.T_world_joint, FOOT_PATCHES)[..., 2]
-    return (patches - floor.height[_nearest(floor.timestamps, motion.timestamps)][:, None])[contact]
+    around = torch.stack([floor.height[_nearest(floor.timestamps, motion.timestamps + s)] for s in (-1.0, 0.0, 1.0)])
+    level = around.amax(0) - around.amin(0) < _LEVEL_M
+    return (patches - around[1][:, None])[contact & level[:, None]]
 
 
 def _skate_cm_s(pairs: Sequence[tuple[Recording, Motion]]) -> float:
