@@ -5,8 +5,10 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
+from math import isfinite
 
 from hydra.utils import instantiate
+from rich.box import SIMPLE
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
@@ -16,14 +18,11 @@ from wearcap.cli.conf import compose
 from wearcap.cli.stated import stated
 from wearcap.doctor import Report
 from wearcap.doctor.preflight import preflight
-from wearcap.doctor.truth import FIGURES, known
+from wearcap.doctor.truth import FIGURES
 from wearcap.reading import examine
 from wearcap.runtime.system import System
 
 _COLOR = {"ok": "green", "note": "cyan", "warning": "yellow", "error": "bold red"}
-
-PEOPLE_WIDTH = 160
-"""Least width (characters) of the table of people: a narrower one would cut its figures."""
 
 
 def examined(options: argparse.Namespace) -> Report:
@@ -33,7 +32,8 @@ def examined(options: argparse.Namespace) -> Report:
     if options.json:
         report = examine(options.path, preflight=check, how=how)
         findings = {name: [asdict(finding) for finding in found] for name, found in report.findings.items()}
-        people = {subject: known(figures) for subject, figures in report.people.items()}
+        known = {subject: asdict(person).items() for subject, person in report.people.items()}
+        people = {subject: {name: v for name, v in row if isfinite(v)} for subject, row in known.items()}
         content = {"source": report.source, "sound": report.sound, "findings": findings, "people": people}
         print(json.dumps(content, indent=1, ensure_ascii=False))
     else:
@@ -45,11 +45,11 @@ def examined(options: argparse.Namespace) -> Report:
             )
         console.print(_table(report, options.quiet))
         if report.people:
-            Console(width=max(console.width, PEOPLE_WIDTH)).print(_people(report))
+            Console(width=max(console.width, 180)).print(_people(report))
         counts = {severity: len(report.of_severity(severity)) for severity in ("error", "warning", "note")}
         listed = ", ".join(f"{count} {severity}{'s' if count != 1 else ''}" for severity, count in counts.items())
         verdict = "[green]sound[/]" if report.sound else "[bold red]not sound[/]"
-        count = report.recordings
+        count = len(report.findings) - len(report.people)
         console.print(f"{count} recording{'s' if count != 1 else ''}: {verdict} ({listed})")
     return report
 
@@ -82,10 +82,9 @@ def _table(report: Report, quiet: bool) -> Table:
 
 def _people(report: Report) -> Table:
     """One row per person of a data set: its figures, those out of bounds in the color of warnings."""
-    table = Table("person", title="people", title_justify="left")
-    for figure in FIGURES:
-        table.add_column(figure.heading, justify="right")
+    table = Table("person", *(figure.heading for figure in FIGURES), title="people", title_justify="left", box=SIMPLE)
+    table.columns[0].no_wrap = True
     for subject, person in report.people.items():
         values = [(figure, getattr(person, figure.name)) for figure in FIGURES]
-        table.add_row(subject, *(Text(f.text(v), style=_COLOR["warning"] if f.excess(v) else "") for f, v in values))
+        table.add_row(subject, *(Text(f.text(v), style=_COLOR["warning"] if f.is_odd(v) else "") for f, v in values))
     return table

@@ -66,11 +66,6 @@ class Report:
     people: dict[str, Truth] = field(default_factory=dict)
     """Figures of a data set's people."""
 
-    @property
-    def recordings(self) -> int:
-        """Number of recordings that were examined."""
-        return len(self.findings) - len(self.people)
-
     def of_severity(self, *severities: str) -> list[tuple[str, Finding]]:
         """(recording, finding) of these severities."""
         return [(name, f) for name, found in self.findings.items() for f in found if f.severity in severities]

@@ -1,23 +1,20 @@
 """The truth of a data set by person: figures of a sample of each person's motion, against what people's bodies do."""
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from math import inf
 
 import numpy as np
 
 from wearcap.doctor.report import Check, Finding
 from wearcap.metrics.truth import Truth, truth
 from wearcap.recording import Motion, Recording, RecordingStore
-from wearcap.recording.store import RecordingFile
 
-SAMPLE_S = 180.0
-"""Motion (s) that is looked at of each person."""
-CUT_S = 10.0
-"""Least length (s) of a cut out of one recording: a few cycles of walking, or somebody who stands."""
+SAMPLE_S, CUT_S = 180.0, 10.0
+"""Motion (s) that is looked at of each person, and least length of a cut of a recording that is longer."""
 _LEAST_FRAMES = 4
 _NEEDED = ("pelvis", "head", *(f"{side}_{name}" for side in ("left", "right") for name in ("hip", "knee", "ankle")))
 _LEGS = "Check the source's skeleton: legs too long for their hips crouch."
-_CONTACTS = "Check the frame rate and the contacts."
 _FLOOR = "Check the floor's height, and where the skeleton's soles lie."
 
 
@@ -28,8 +25,8 @@ class Figure:
     name: str
     heading: str
     digits: int = 0
-    low: float = -np.inf
-    high: float = np.inf
+    low: float = -inf
+    high: float = inf
     what: str = ""
     fix: str = ""
 
@@ -40,37 +37,35 @@ class Figure:
     @property
     def bounds(self) -> str:
         """The bounds in words, "" where there are none."""
-        if np.isinf(self.low):
-            return "" if np.isinf(self.high) else f"≤ {self.high:g}"
-        return f"≥ {self.low:g}" if np.isinf(self.high) else f"{self.low:g} to {self.high:g}"
+        if self.low == -inf:
+            return "" if self.high == inf else f"≤ {self.high:g}"
+        return f"≥ {self.low:g}" if self.high == inf else f"{self.low:g} to {self.high:g}"
 
-    def excess(self, value: float) -> float:
-        """How far a value lies outside the bounds; 0 inside them, and for one that is not known."""
-        return float(np.nan_to_num(max(self.low - value, value - self.high, 0.0)))
+    def is_odd(self, value: float) -> bool:
+        """Whether a value lies outside the bounds; one that is not known does not."""
+        return value < self.low or value > self.high
 
 
 FIGURES = (
     Figure("minutes", "min", 1),
     Figure("cycles", "cycles"),
-    Figure("knee_rms_deg", "knee off normal °", 1, -np.inf, 9, "walks with knees unlike people's", _LEGS),
+    Figure("knee_rms_deg", "knee off normal °", 1, -inf, 9, "walks with knees unlike people's", _LEGS),
     Figure("stance_deg", "stance knee °", 1, 2, 20, "walks on bent knees", _LEGS),
-    Figure("standing_deg", "standing knee °", 1, -np.inf, 15, "stands on bent knees", _LEGS),
-    Figure("curves_deg", "left − right °", 1, -np.inf, 10, "left and right knees walk differently", _LEGS),
-    Figure(
-        "bones_cm", "bones l − r cm", 1, -np.inf, 2, "bones differ left from right", "Check the measured bone lengths."
-    ),
+    Figure("standing_deg", "standing knee °", 1, -inf, 15, "stands on bent knees", _LEGS),
+    Figure("curves_deg", "left − right °", 1, -inf, 10, "left and right knees walk differently", _LEGS),
+    Figure("bones_cm", "left − right cm", 1, -inf, 2, "bones differ left from right", "Check the bones' lengths."),
     Figure("sole_cm", "sole cm", 1, -1.5, 1.5, "planted soles are not on the floor", _FLOOR),
-    Figure("sole_low_cm", "5 % cm", 1, -4, np.inf, "planted soles are through the floor", _FLOOR),
-    Figure("sole_high_cm", "95 % cm", 1, -np.inf, 5, "planted soles are over the floor", _FLOOR),
-    Figure("skate_cm_s", "skate cm/s", 1, -np.inf, 20, "planted feet skate", _CONTACTS),
-    Figure("jumps", "jumps/min", 1, -np.inf, 0, "joints jump", "Cut or mend those frames."),
+    Figure("sole_low_cm", "5 % cm", 1, -4, inf, "planted soles are through the floor", _FLOOR),
+    Figure("sole_high_cm", "95 % cm", 1, -inf, 5, "planted soles are over the floor", _FLOOR),
+    Figure("skate_cm_s", "skate cm/s", 1, -inf, 20, "planted feet skate", "Check the frame rate and the contacts."),
+    Figure("jumps_per_min", "jumps /min", 1, -inf, 0, "joints jump", "Cut or mend those frames."),
     Figure("stature_m", "stature m", 2, 1.4, 2.1, "unusual stature", "Check the unit of length."),
     Figure("leg", "leg", 3, 0.46, 0.52, "legs are unlike people's, for that stature", _LEGS),
     Figure(
-        "eyes", "eyes", 3, 0.915, 0.955, "a device on the head is not at the eyes", "Check where the head's joint lies."
+        "eyes", "eyes", 3, 0.915, 0.955, "the head's device is not at the eyes", "Check where the head's joint lies."
     ),
     Figure("pitch_deg", "pitch °", 0, -5, 25, "the head is tilted while walking", "Check the head's axes."),
-    Figure("pitch_spread_deg", "± °", 0),
+    Figure("pitch_spread_deg", "± °"),
 )
 """What is reported of each person, in the order of the columns. Bounds: Perry & Burnfield; Drillis & Contini; Winter."""
 
@@ -86,18 +81,9 @@ def people(store: RecordingStore, names: Iterable[str]) -> dict[str, Truth]:
 
 def of_person(figures: Truth) -> list[Finding]:
     """A warning for each figure of a person that is out of bounds."""
-    check, found = Check("truth"), []
-    for figure in FIGURES:
-        value = getattr(figures, figure.name)
-        if figure.excess(value):
-            evidence = f"{figure.heading}: {figure.text(value)}, people's {figure.bounds}"
-            found.append(check.warning(figure.what, evidence, figure.fix))
-    return found
-
-
-def known(figures: Truth) -> dict[str, float]:
-    """A person's figures by name, without those that are not known."""
-    return {name: value for name, value in asdict(figures).items() if np.isfinite(value)}
+    check, values = Check("truth"), vars(figures)
+    odd = [(figure, values[figure.name]) for figure in FIGURES if figure.is_odd(values[figure.name])]
+    return [check.warning(f.what, f"{f.heading}: {f.text(value)}, people's {f.bounds}", f.fix) for f, value in odd]
 
 
 def _sample(store: RecordingStore, names: list[str]) -> list[Recording]:
@@ -106,21 +92,21 @@ def _sample(store: RecordingStore, names: list[str]) -> list[Recording]:
     if mean * len(names) > SAMPLE_S:
         count = min(len(names), round(SAMPLE_S / min(mean, CUT_S)))
         names = [names[k] for k in np.linspace(0, len(names) - 1, count).round().astype(int)]
-    cuts = [_cut(store.open_file(name), SAMPLE_S / len(names), name) for name in names]
+    cuts = [_cut(store, name, SAMPLE_S / len(names)) for name in names]
     return [cut for cut in cuts if cut is not None]
 
 
-def _cut(file: RecordingFile, seconds: float, name: str) -> Recording | None:
+def _cut(store: RecordingStore, name: str, seconds: float) -> Recording | None:
     """The middle of a recording's motion, with contacts, floor and the head's device; None without motion or legs."""
+    file = store.open_file(name)
     skeleton = file.part("skeleton")
     if "motion.timestamps" not in file.keys or skeleton is None or not all(joint in skeleton for joint in _NEEDED):
         return None
     times = file.tensor("motion.timestamps")
     spare = max((times[-1] - times[0]).item() - seconds, 0.0) / 2
     start, last = np.searchsorted(times.numpy(), [times[0].item() + spare, times[-1].item() - spare]).tolist()
-    stop = last + 1
-    if stop - start < _LEAST_FRAMES:
+    if last - start < _LEAST_FRAMES:
         return None
-    rows = (file.window(f"motion.{key}", start, stop) for key in ("R_parent_joint", "t_world_root"))
+    rows = (file.window(f"motion.{key}", start, last + 1) for key in ("R_parent_joint", "t_world_root"))
     parts = {part: file.part(part) for part in ("head", "contacts", "floor")}
-    return Recording(name, motion=Motion(times[start:stop], skeleton, *rows), **parts)
+    return Recording(name, motion=Motion(times[start : last + 1], skeleton, *rows), **parts)
