@@ -7,18 +7,15 @@ Of each set (number of people) the median over persons, and in brackets the wors
 
 import argparse
 import json
-import math
-from dataclasses import asdict
 from pathlib import Path
 from statistics import median
 
-from tabling import finite
-
 from wearcap.doctor.truth import FIGURES, Figure, people
 from wearcap.files import write_text
-from wearcap.metrics.truth import Truth
 from wearcap.recording import RecordingStore
 
+People = dict[str, dict[str, float]]
+"""Figures by person and name."""
 TOTAL = ("minutes", "cycles")
 """Figures that are added up over persons."""
 
@@ -33,16 +30,15 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     sets = {root.name: _people(root, 3 if options.quick else None) for root in options.datasets}
     if options.people:
         rows = {
-            f"{name} {subject}": [figure.text(getattr(person, figure.name)) for figure in FIGURES]
+            f"{name} {subject}": [figure.text(person) for figure in FIGURES]
             for name, persons in sets.items()
             for subject, person in persons.items()
         }
     else:
         rows = {f"{name} ({len(persons)})": _of_set(persons) for name, persons in sets.items() if persons}
     print(markdown(rows))
-    found = {name: {subject: asdict(person) for subject, person in persons.items()} for name, persons in sets.items()}
     path = options.output / "truth.json"
-    write_text(path, json.dumps(finite({"about": about, "table": rows, "people": found}), indent=1) + "\n")
+    write_text(path, json.dumps({"about": about, "table": rows, "people": sets}, indent=1) + "\n")
     return path
 
 
@@ -54,29 +50,25 @@ def markdown(rows: dict[str, list[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def _people(root: Path, most: int | None) -> dict[str, Truth]:
+def _people(root: Path, most: int | None) -> People:
     """Figures of a set's people, of its first `most` recordings where that is given."""
     store = RecordingStore.open(root)
     return people(store, store.names()[:most])
 
 
-def _of_set(persons: dict[str, Truth]) -> list[str]:
+def _of_set(persons: People) -> list[str]:
     """The cells of one set: totals, and the median and the worst of each other figure."""
     cells = []
     for figure in FIGURES:
-        known = [value for person in persons.values() if math.isfinite(value := getattr(person, figure.name))]
-        if figure.name in TOTAL:
-            cells.append(figure.text(sum(known)))
-        elif not known:
-            cells.append(figure.text(math.nan))
-        else:
-            worst = max(known, key=lambda value: _oddity(figure, value))
-            cells.append(f"{figure.text(median(known))} ({figure.text(worst)})")
+        known = [person[figure.name] for person in persons.values() if figure.name in person]
+        shown = [sum(known)] if figure.name in TOTAL else []
+        if known and not shown:
+            shown = [median(known), max(known, key=lambda value: _oddity(figure, value))]
+        texts = [figure.text({figure.name: value}) for value in shown]
+        cells.append(f"{texts[0]} ({texts[1]})" if len(texts) > 1 else "".join(texts) or "–")
     return cells
 
 
 def _oddity(figure: Figure, value: float) -> float:
-    """How odd a value is: its distance from the middle of the bounds, or how near it comes to the one that there is."""
-    if math.isfinite(figure.low) and math.isfinite(figure.high):
-        return abs(value - (figure.low + figure.high) / 2)
-    return figure.low - value if math.isfinite(figure.low) else value
+    """How far a value is from 0, or from the middle of bounds that leave 0 out."""
+    return abs(value) if figure.low <= 0 <= figure.high else abs(value - (figure.low + figure.high) / 2)

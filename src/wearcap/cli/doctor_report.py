@@ -5,7 +5,6 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
-from math import isfinite
 
 from hydra.utils import instantiate
 from rich.box import SIMPLE
@@ -32,9 +31,7 @@ def examined(options: argparse.Namespace) -> Report:
     if options.json:
         report = examine(options.path, preflight=check, how=how)
         findings = {name: [asdict(finding) for finding in found] for name, found in report.findings.items()}
-        known = {subject: asdict(person).items() for subject, person in report.people.items()}
-        people = {subject: {name: v for name, v in row if isfinite(v)} for subject, row in known.items()}
-        content = {"source": report.source, "sound": report.sound, "findings": findings, "people": people}
+        content = {"source": report.source, "sound": report.sound, "findings": findings, "people": report.people}
         print(json.dumps(content, indent=1, ensure_ascii=False))
     else:
         console = Console()
@@ -85,6 +82,5 @@ def _people(report: Report) -> Table:
     table = Table("person", *(figure.heading for figure in FIGURES), title="people", title_justify="left", box=SIMPLE)
     table.columns[0].no_wrap = True
     for subject, person in report.people.items():
-        values = [(figure, getattr(person, figure.name)) for figure in FIGURES]
-        table.add_row(subject, *(Text(f.text(v), style=_COLOR["warning"] if f.is_odd(v) else "") for f, v in values))
+        table.add_row(subject, *(Text(f.text(person), style=_COLOR["warning"] * f.is_odd(person)) for f in FIGURES))
     return table

@@ -48,9 +48,8 @@ def _show_report(report: Report, store: RecordingStore) -> None:
         subjects = len({entry.subject for entry in entries})
         print(f"  {split:5} {len(entries):4} recordings, {subjects:3} subjects, {minutes:7.1f} min")
     fresh = {store.entries[name].subject for name in report.written}
-    for subject, person in people(
-        store, [name for name in sorted(ours) if store.entries[name].subject in fresh]
-    ).items():
+    names = sorted(name for name in ours if store.entries[name].subject in fresh)
+    for subject, person in people(store, names).items():
         if wrong := [f"{finding.what} ({finding.evidence})" for finding in of_person(person)]:
             print(f"warning: person {subject}: {'; '.join(wrong)}")
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from functools import partialmethod
 
 from wearcap.errors import WearcapError
-from wearcap.metrics.truth import Truth
 
 SEVERITIES = ("ok", "note", "warning", "error")
 
@@ -63,8 +62,8 @@ class Report:
 
     source: str
     findings: dict[str, tuple[Finding, ...]]
-    people: dict[str, Truth] = field(default_factory=dict)
-    """Figures of a data set's people."""
+    people: dict[str, dict[str, float]] = field(default_factory=dict)
+    """Figures of a data set's people (`metrics.truth`)."""
 
     def of_severity(self, *severities: str) -> list[tuple[str, Finding]]:
         """(recording, finding) of these severities."""

@@ -2,17 +2,17 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from math import inf
+from math import inf, isinf
 
 import numpy as np
 
 from wearcap.doctor.report import Check, Finding
-from wearcap.metrics.truth import Truth, truth
+from wearcap.metrics.truth import truth
 from wearcap.recording import Motion, Recording, RecordingStore
+from wearcap.recording.store import RecordingFile
 
 SAMPLE_S, CUT_S = 180.0, 10.0
 """Motion (s) that is looked at of each person, and least length of a cut of a recording that is longer."""
-_LEAST_FRAMES = 4
 _NEEDED = ("pelvis", "head", *(f"{side}_{name}" for side in ("left", "right") for name in ("hip", "knee", "ankle")))
 _LEGS = "Check the source's skeleton: legs too long for their hips crouch."
 _FLOOR = "Check the floor's height, and where the skeleton's soles lie."
@@ -20,7 +20,7 @@ _FLOOR = "Check the floor's height, and where the skeleton's soles lie."
 
 @dataclass(frozen=True)
 class Figure:
-    """One of `Truth`'s figures: its heading, its digits, the bounds of what people do, and what is wrong beyond them."""
+    """One of the figures of `truth`: its heading, its digits, the bounds of what people do, and what is wrong beyond them."""
 
     name: str
     heading: str
@@ -30,35 +30,33 @@ class Figure:
     what: str = ""
     fix: str = ""
 
-    def text(self, value: float) -> str:
-        """A value with the figure's digits, a dash for one that is not known."""
-        return "–" if np.isnan(value) else f"{value:.{self.digits}f}"
+    def text(self, figures: dict[str, float]) -> str:
+        """Its value among a person's figures, a dash for one that is not known."""
+        return f"{figures[self.name]:.{self.digits}f}" if self.name in figures else "–"
 
     @property
     def bounds(self) -> str:
         """The bounds in words, "" where there are none."""
-        if self.low == -inf:
-            return "" if self.high == inf else f"≤ {self.high:g}"
-        return f"≥ {self.low:g}" if self.high == inf else f"{self.low:g} to {self.high:g}"
+        return "" if isinf(self.low) else f"{self.low:g} to {self.high:g}"
 
-    def is_odd(self, value: float) -> bool:
-        """Whether a value lies outside the bounds; one that is not known does not."""
-        return value < self.low or value > self.high
+    def is_odd(self, figures: dict[str, float]) -> bool:
+        """Whether its value lies outside the bounds."""
+        return self.name in figures and not self.low <= figures[self.name] <= self.high
 
 
 FIGURES = (
     Figure("minutes", "min", 1),
     Figure("cycles", "cycles"),
-    Figure("knee_rms_deg", "knee off normal °", 1, -inf, 9, "walks with knees unlike people's", _LEGS),
+    Figure("knee_rms_deg", "knee off normal °", 1, 0, 9, "walks with knees unlike people's", _LEGS),
     Figure("stance_deg", "stance knee °", 1, 2, 20, "walks on bent knees", _LEGS),
-    Figure("standing_deg", "standing knee °", 1, -inf, 15, "stands on bent knees", _LEGS),
-    Figure("curves_deg", "left − right °", 1, -inf, 10, "left and right knees walk differently", _LEGS),
-    Figure("bones_cm", "left − right cm", 1, -inf, 2, "bones differ left from right", "Check the bones' lengths."),
+    Figure("standing_deg", "standing knee °", 1, 0, 15, "stands on bent knees", _LEGS),
+    Figure("curves_deg", "left − right °", 1, 0, 10, "left and right knees walk differently", _LEGS),
+    Figure("bones_cm", "left − right cm", 1, 0, 2, "bones differ left from right", "Check the bones' lengths."),
     Figure("sole_cm", "sole cm", 1, -1.5, 1.5, "planted soles are not on the floor", _FLOOR),
-    Figure("sole_low_cm", "5 % cm", 1, -4, inf, "planted soles are through the floor", _FLOOR),
-    Figure("sole_high_cm", "95 % cm", 1, -inf, 5, "planted soles are over the floor", _FLOOR),
-    Figure("skate_cm_s", "skate cm/s", 1, -inf, 20, "planted feet skate", "Check the frame rate and the contacts."),
-    Figure("jumps_per_min", "jumps /min", 1, -inf, 0, "joints jump", "Cut or mend those frames."),
+    Figure("sole_low_cm", "5 % cm", 1, -4, 5, "planted soles are through the floor", _FLOOR),
+    Figure("sole_high_cm", "95 % cm", 1, -4, 5, "planted soles are over the floor", _FLOOR),
+    Figure("skate_cm_s", "skate cm/s", 1, 0, 20, "planted feet skate", "Check the frame rate and the contacts."),
+    Figure("jumps_per_min", "jumps /min", 1, 0, 0, "joints jump", "Cut or mend those frames."),
     Figure("stature_m", "stature m", 2, 1.4, 2.1, "unusual stature", "Check the unit of length."),
     Figure("leg", "leg", 3, 0.46, 0.52, "legs are unlike people's, for that stature", _LEGS),
     Figure(
@@ -70,7 +68,7 @@ FIGURES = (
 """What is reported of each person, in the order of the columns. Bounds: Perry & Burnfield; Drillis & Contini; Winter."""
 
 
-def people(store: RecordingStore, names: Iterable[str]) -> dict[str, Truth]:
+def people(store: RecordingStore, names: Iterable[str]) -> dict[str, dict[str, float]]:
     """Figures of each person of these recordings of a data set from `SAMPLE_S` of motion; people without are left out."""
     own: dict[str, list[str]] = {}
     for name in names:
@@ -79,11 +77,10 @@ def people(store: RecordingStore, names: Iterable[str]) -> dict[str, Truth]:
     return {subject: truth(cuts) for subject, cuts in sampled.items() if cuts}
 
 
-def of_person(figures: Truth) -> list[Finding]:
+def of_person(figures: dict[str, float]) -> list[Finding]:
     """A warning for each figure of a person that is out of bounds."""
-    check, values = Check("truth"), vars(figures)
-    odd = [(figure, values[figure.name]) for figure in FIGURES if figure.is_odd(values[figure.name])]
-    return [check.warning(f.what, f"{f.heading}: {f.text(value)}, people's {f.bounds}", f.fix) for f, value in odd]
+    check, odd = Check("truth"), [figure for figure in FIGURES if figure.is_odd(figures)]
+    return [check.warning(f.what, f"{f.heading}: {f.text(figures)}, people's {f.bounds}", f.fix) for f in odd]
 
 
 def _sample(store: RecordingStore, names: list[str]) -> list[Recording]:
@@ -98,15 +95,18 @@ def _sample(store: RecordingStore, names: list[str]) -> list[Recording]:
 
 def _cut(store: RecordingStore, name: str, seconds: float) -> Recording | None:
     """The middle of a recording's motion, with contacts, floor and the head's device; None without motion or legs."""
-    file = store.open_file(name)
-    skeleton = file.part("skeleton")
-    if "motion.timestamps" not in file.keys or skeleton is None or not all(joint in skeleton for joint in _NEEDED):
+    file = RecordingFile(store.path_of(name), verify=False)
+    skeleton, key = file.part("skeleton"), "motion.timestamps"
+    if (
+        key not in file.keys
+        or file.length(key) < 4
+        or skeleton is None
+        or any(joint not in skeleton for joint in _NEEDED)
+    ):
         return None
-    times = file.tensor("motion.timestamps")
+    times = file.tensor(key)
     spare = max((times[-1] - times[0]).item() - seconds, 0.0) / 2
     start, last = np.searchsorted(times.numpy(), [times[0].item() + spare, times[-1].item() - spare]).tolist()
-    if last - start < _LEAST_FRAMES:
-        return None
-    rows = (file.window(f"motion.{key}", start, last + 1) for key in ("R_parent_joint", "t_world_root"))
+    rows = (file.window(f"motion.{name}", start, last + 1) for name in ("R_parent_joint", "t_world_root"))
     parts = {part: file.part(part) for part in ("head", "contacts", "floor")}
     return Recording(name, motion=Motion(times[start : last + 1], skeleton, *rows), **parts)

@@ -1,11 +1,12 @@
 """Figures that show whether recorded motion is that of a person: knees, soles, jumps, sides, proportions, the head's pitch."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from math import isfinite, nan
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import mse_loss, normalize
 
 from wearcap.body.kinematics import site_positions
 from wearcap.body.skeleton import FOOT_PATCHES
@@ -20,70 +21,40 @@ SEATED_DEG = 60.0
 """Knee from which somebody upright who keeps still sits."""
 ROOT_M_S, JOINT_M_S = 8.0, 15.0
 """Speeds that neither the pelvis nor any joint of a person reaches, as `prepare`'s limits have them."""
-_UPRIGHT, _LEVEL_M = 0.9, 0.01
-_NAN = float("nan")
 
 
-@dataclass(frozen=True)
-class Truth:
-    """Figures of one person's recordings; NaN where they hold nothing to measure.
+def truth(recordings: Sequence[Recording]) -> dict[str, float]:
+    """Figures of one person by name with unit, from recordings with `motion`; those with nothing to measure are absent.
 
     Knees: deviation (rms) of the mean curve over the walking cycle from healthy adults', median in stance and standing,
-    difference (rms) of the left curve from the right. Bones: largest difference of left from right. Soles: median and 5th
-    and 95th percentile of planted ones' heights, negative through the floor. Leg (thigh and shank) and eyes (the device on
-    the head, in the rest pose): shares of stature. Pitch: median and deviation over recordings of the head's mean while
-    walking, positive below the horizon.
+    difference (rms) of the left curve from the right. Bones: largest difference of left from right. Leg (thigh and shank)
+    and eyes (the device on the head, in the rest pose): shares of stature. Soles: percentiles of planted ones' heights,
+    negative through the floor. Pitch: median and deviation over recordings of the head's while walking, positive below
+    the horizon.
     """
-
-    minutes: float
-    cycles: int
-    knee_rms_deg: float
-    stance_deg: float
-    standing_deg: float
-    curves_deg: float
-    bones_cm: float
-    sole_cm: float
-    sole_low_cm: float
-    sole_high_cm: float
-    skate_cm_s: float
-    jumps_per_min: float
-    stature_m: float
-    leg: float
-    eyes: float
-    pitch_deg: float
-    pitch_spread_deg: float
-
-
-def truth(recordings: Sequence[Recording]) -> Truth:
-    """Figures of one person, from recordings with `motion`; contacts and a floor where they have them."""
     pairs = [(recording, recording.motion) for recording in recordings if recording.motion is not None]
     motions = [motion for _, motion in pairs]
     minutes = sum((motion.timestamps[-1] - motion.timestamps[0]).item() for motion in motions) / 60
-    bones_cm, stature_m, leg, eyes = torch.stack([_body(*pair) for pair in pairs]).nanmedian(0).values.tolist()
-    heights, skates = zip(*(_soles(*pair) for pair in pairs))
-    low, middle, high = _quantiles(100 * torch.cat(heights), 0.05, 0.5, 0.95)
+    bodies = torch.stack([_body(recording, motion) for recording, motion in pairs]).nanmedian(0).values
+    heights, skates = zip(*(_soles(recording, motion) for recording, motion in pairs))
+    soles = _quantiles(100 * torch.cat(heights), 0.05, 0.5, 0.95)
     skate, planted = torch.stack(skates).sum(0)
-    pitches = torch.stack([_walking_pitch_deg(motion) for motion in motions])
-    pitches = pitches[pitches.isfinite()]
-    return Truth(
-        minutes,
+    pitches = torch.cat([_walking_pitch_deg(motion) for motion in motions])
+    found = {
+        "minutes": minutes,
         **_knees(motions),
-        bones_cm=bones_cm,
-        sole_cm=middle,
-        sole_low_cm=low,
-        sole_high_cm=high,
-        skate_cm_s=(skate / planted).item(),
-        jumps_per_min=sum(_jumps(motion) for motion in motions) / minutes,
-        stature_m=stature_m,
-        leg=leg,
-        eyes=eyes,
-        pitch_deg=_quantiles(pitches, 0.5)[0],
-        pitch_spread_deg=pitches.std().item() if len(pitches) > 1 else _NAN,
-    )
+        **dict(zip(("bones_cm", "stature_m", "leg", "eyes"), bodies.tolist())),
+        **dict(zip(("sole_low_cm", "sole_cm", "sole_high_cm"), soles)),
+        "skate_cm_s": (skate / planted).item(),
+        "jumps_per_min": sum(_jumps(motion) for motion in motions) / minutes,
+        "pitch_deg": _quantiles(pitches, 0.5)[0],
+        "pitch_spread_deg": pitches.std().item() if len(pitches) > 1 else nan,
+    }
+    return {name: value for name, value in found.items() if isfinite(value)}
 
 
-def _knees(motions: Sequence[Motion]) -> dict:
-    """`Truth`'s figures of the knees."""
+def _knees(motions: Sequence[Motion]) -> dict[str, float]:
+    """The figures of cycles and knees."""
     left, right = (torch.cat(side) for side in zip(*(knee_cycles(motion) for motion in motions)))
     both, knees = torch.cat([left, right]), [knee_deg(motion) for motion in motions]
     stands = [standing(motion) & (knee < SEATED_DEG).all(1) for motion, knee in zip(motions, knees)]
@@ -92,10 +63,10 @@ def _knees(motions: Sequence[Motion]) -> dict:
     known, sides = len(both) >= LEAST_CYCLES, min(len(left), len(right)) >= LEAST_CYCLES
     return {
         "cycles": len(both),
-        "knee_rms_deg": _rms(both.mean(0) - normal_knee_deg()) if known else _NAN,
-        "stance_deg": both[:, STANCE].median().item() if known else _NAN,
-        "standing_deg": stood.median().item() if stood_s >= LEAST_S else _NAN,
-        "curves_deg": _rms(left.mean(0) - right.mean(0)) if sides else _NAN,
+        "knee_rms_deg": mse_loss(both.mean(0), normal_knee_deg()).sqrt().item() if known else nan,
+        "stance_deg": both[:, STANCE].median().item() if known else nan,
+        "standing_deg": stood.median().item() if stood_s >= LEAST_S else nan,
+        "curves_deg": mse_loss(left.mean(0), right.mean(0)).sqrt().item() if sides else nan,
     }
 
 
@@ -105,25 +76,24 @@ def _body(recording: Recording, motion: Motion) -> Float[Tensor, "4"]:
     bones = dict(zip(skeleton.joint_names, skeleton.t_parent_joint.norm(dim=-1).tolist()))
     uneven = max(abs(bones[name] - bones[name.replace("left", "right")]) for name in bones if name.startswith("left_"))
     leg = sum(bones[f"{side}_{joint}"] for side in ("left", "right") for joint in ("knee", "ankle")) / 2
-    eyes = _NAN if recording.head is None else skeleton.height_of("head") + recording.head.t_head_device[2].item()
+    eyes = nan if recording.head is None else skeleton.height_of("head") + recording.head.t_head_device[2].item()
     return torch.tensor([100 * uneven, skeleton.stature, leg / skeleton.stature, eyes / skeleton.stature])
 
 
 def _soles(recording: Recording, motion: Motion) -> tuple[Float[Tensor, "patch"], Float[Tensor, "2"]]:
     """Heights (m) over the floor of planted patches of the soles, where it is level for a second to either side; and
     skating (cm/s) times the number of steps in which a foot is planted, with that number."""
-    times, track, floor = motion.timestamps, recording.contacts, recording.floor
+    times, track, floor, heights = motion.timestamps, recording.contacts, recording.floor, torch.zeros(0)
     feet = None if track is None else track.feet
     if track is None or feet is None or not set(FOOT_PATCHES) <= set(motion.skeleton.sites):
-        return torch.zeros(0), torch.zeros(2)
+        return heights, torch.zeros(2)
     contact = feet[_nearest(track.timestamps, times)]
     planted = foot_contact(contact)
     skate = foot_skate_cm_s(foot_points(motion.skeleton, motion.T_world_joint), planted, motion.fps).nan_to_num()
     count = (planted[1:] & planted[:-1]).sum()
-    heights = torch.zeros(0)
     if floor is not None:
         around = torch.stack([floor.height[_nearest(floor.timestamps, times + shift)] for shift in (-1.0, 0.0, 1.0)])
-        level = around.amax(0) - around.amin(0) < _LEVEL_M
+        level = around.amax(0) - around.amin(0) < 0.01
         patches = site_positions(motion.skeleton, motion.T_world_joint, FOOT_PATCHES)[..., 2]
         heights = (patches - around[1][:, None])[contact & level[:, None]]
     return heights, torch.stack([skate * count, count])
@@ -140,20 +110,16 @@ def _jumps(motion: Motion) -> int:
     return int(((speed[:, 0] > ROOT_M_S) | (speed > JOINT_M_S).any(1)).sum())
 
 
-def _walking_pitch_deg(motion: Motion) -> Float[Tensor, ""]:
-    """Mean pitch (degrees below the horizon) of the head while it walks upright, NaN where it hardly does."""
+def _walking_pitch_deg(motion: Motion) -> Float[Tensor, "known"]:
+    """Mean pitch (degrees below the horizon) of the head while it walks upright; none where it hardly does."""
     span = round(motion.fps)
     gone = (motion.t_world_root[span:] - motion.t_world_root[:-span])[:, :2].norm(dim=-1)
     head, pelvis = (motion.joint(name)[span // 2 : span // 2 + len(gone)] for name in ("head", "pelvis"))
-    upright = torch.nn.functional.normalize(head.t - pelvis.t, dim=-1)[:, 2] > _UPRIGHT
+    upright = normalize(head.t - pelvis.t, dim=-1)[:, 2] > 0.9
     walks = (gone > SPEED_M_S[0]) & (gone < SPEED_M_S[1]) & upright
     pitch = (-head.R[walks, 2, 0]).clamp(-1, 1).asin().rad2deg().mean()
-    return pitch if walks.sum() >= LEAST_S * motion.fps else torch.tensor(_NAN)
-
-
-def _rms(values: Float[Tensor, "point"]) -> float:
-    return values.square().mean().sqrt().item()
+    return pitch[None][: int(walks.sum() >= LEAST_S * motion.fps)]
 
 
 def _quantiles(values: Float[Tensor, "value"], *shares: float) -> list[float]:
-    return values.quantile(torch.tensor(shares)).tolist() if len(values) else [_NAN] * len(shares)
+    return values.quantile(torch.tensor(shares)).tolist() if len(values) else [nan] * len(shares)

@@ -45,10 +45,10 @@ def examine(
             findings[name] = tuple(read if read and is_empty(recording) else [*read, *examine_recording(recording)])
         if progress:
             progress(done, len(found))
-    if not (Path(source) / MANIFEST).is_file():
-        return Report(str(source), findings)
-    sound = [name for name, found in findings.items() if not has_error(found)]
-    figures = people(RecordingStore.open(Path(source)), sound)
+    store = RecordingStore(source)
+    figures = people(
+        store, [name for name, found in findings.items() if name in store.entries and not has_error(found)]
+    )
     findings |= {f"person {subject}": tuple(of_person(person)) for subject, person in figures.items()}
     return Report(str(source), findings, figures)
 
