@@ -7,6 +7,7 @@ Of each set (number of people) the median over persons, and in brackets the wors
 
 import argparse
 import json
+from math import isfinite
 from pathlib import Path
 from statistics import median
 
@@ -45,7 +46,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
 def markdown(rows: dict[str, list[str]]) -> str:
     """A table of markdown whose columns are `FIGURES`."""
     head = ["", *(figure.heading for figure in FIGURES)]
-    bounds = ["people", *(figure.bounds for figure in FIGURES)]
+    bounds = ["people", *(f"{f.low:g} to {f.high:g}" * isfinite(f.low) for f in FIGURES)]
     lines = [head, ["---"] + ["--:"] * len(FIGURES), bounds, *([name, *cells] for name, cells in rows.items())]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 

@@ -1,14 +1,15 @@
 """The truth of a data set by person: figures of a sample of each person's motion, against what people's bodies do."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-from math import inf, isinf
+from dataclasses import dataclass, replace
+from math import inf
+from pathlib import Path
 
 import numpy as np
 
 from wearcap.doctor.report import Check, Finding
 from wearcap.metrics.truth import truth
-from wearcap.recording import Motion, Recording, RecordingStore
+from wearcap.recording import Recording, RecordingStore
 from wearcap.recording.store import RecordingFile
 
 SAMPLE_S, CUT_S = 180.0, 10.0
@@ -33,11 +34,6 @@ class Figure:
     def text(self, figures: dict[str, float]) -> str:
         """Its value among a person's figures, a dash for one that is not known."""
         return f"{figures[self.name]:.{self.digits}f}" if self.name in figures else "–"
-
-    @property
-    def bounds(self) -> str:
-        """The bounds in words, "" where there are none."""
-        return "" if isinf(self.low) else f"{self.low:g} to {self.high:g}"
 
     def is_odd(self, figures: dict[str, float]) -> bool:
         """Whether its value lies outside the bounds."""
@@ -80,7 +76,9 @@ def people(store: RecordingStore, names: Iterable[str]) -> dict[str, dict[str, f
 def of_person(figures: dict[str, float]) -> list[Finding]:
     """A warning for each figure of a person that is out of bounds."""
     check, odd = Check("truth"), [figure for figure in FIGURES if figure.is_odd(figures)]
-    return [check.warning(f.what, f"{f.heading}: {f.text(figures)}, people's {f.bounds}", f.fix) for f in odd]
+    return [
+        check.warning(f.what, f"{f.heading}: {f.text(figures)}, people's {f.low:g} to {f.high:g}", f.fix) for f in odd
+    ]
 
 
 def _sample(store: RecordingStore, names: list[str]) -> list[Recording]:
@@ -89,24 +87,15 @@ def _sample(store: RecordingStore, names: list[str]) -> list[Recording]:
     if mean * len(names) > SAMPLE_S:
         count = min(len(names), round(SAMPLE_S / min(mean, CUT_S)))
         names = [names[k] for k in np.linspace(0, len(names) - 1, count).round().astype(int)]
-    cuts = [_cut(store, name, SAMPLE_S / len(names)) for name in names]
+    cuts = [_cut(store.path_of(name), SAMPLE_S / len(names)) for name in names]
     return [cut for cut in cuts if cut is not None]
 
 
-def _cut(store: RecordingStore, name: str, seconds: float) -> Recording | None:
-    """The middle of a recording's motion, with contacts, floor and the head's device; None without motion or legs."""
-    file = RecordingFile(store.path_of(name), verify=False)
-    skeleton, key = file.part("skeleton"), "motion.timestamps"
-    if (
-        key not in file.keys
-        or file.length(key) < 4
-        or skeleton is None
-        or any(joint not in skeleton for joint in _NEEDED)
-    ):
+def _cut(path: Path, seconds: float) -> Recording | None:
+    """A recording with the middle of its motion; None without motion or legs. Only that part of the file is read."""
+    recording = RecordingFile(path, verify=False).load()
+    motion = recording.motion
+    if motion is None or len(motion) < 4 or any(joint not in motion.skeleton for joint in _NEEDED):
         return None
-    times = file.tensor(key)
-    spare = max((times[-1] - times[0]).item() - seconds, 0.0) / 2
-    start, last = np.searchsorted(times.numpy(), [times[0].item() + spare, times[-1].item() - spare]).tolist()
-    rows = (file.window(f"motion.{name}", start, last + 1) for name in ("R_parent_joint", "t_world_root"))
-    parts = {part: file.part(part) for part in ("head", "contacts", "floor")}
-    return Recording(name, motion=Motion(times[start : last + 1], skeleton, *rows), **parts)
+    spare = max((motion.timestamps[-1] - motion.timestamps[0]).item() - seconds, 0.0) / 2
+    return replace(recording, motion=motion.between(spare, spare + seconds))

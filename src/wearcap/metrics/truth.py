@@ -28,9 +28,8 @@ def truth(recordings: Sequence[Recording]) -> dict[str, float]:
 
     Knees: deviation (rms) of the mean curve over the walking cycle from healthy adults', median in stance and standing,
     difference (rms) of the left curve from the right. Bones: largest difference of left from right. Leg (thigh and shank)
-    and eyes (the device on the head, in the rest pose): shares of stature. Soles: percentiles of planted ones' heights,
-    negative through the floor. Pitch: median and deviation over recordings of the head's while walking, positive below
-    the horizon.
+    and eyes (the device on the head, in the rest pose): shares of stature. Soles: percentiles of planted ones' heights.
+    Pitch: median and deviation over recordings of the head's while walking, positive below the horizon.
     """
     pairs = [(recording, recording.motion) for recording in recordings if recording.motion is not None]
     motions = [motion for _, motion in pairs]
