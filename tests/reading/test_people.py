@@ -48,7 +48,7 @@ def test_people_without_a_body_are_left_out(store):
     assert SOLES not in {finding.what for finding in of_person(found["Anna"])}
     (soles,) = (finding for finding in of_person(found["Bert"]) if finding.what == SOLES)
     assert soles.severity == "warning"
-    assert soles.evidence == "sole cm: 3.0, people's -1.5 to 1.5"
+    assert soles.evidence == "sole cm: 3.0, people's -1.5…1.5"
 
 
 def test_a_sample_is_short_and_spread_over_the_recordings(store, monkeypatch):
@@ -92,7 +92,7 @@ def test_a_preparation_ends_with_warnings_on_people_whose_recordings_are_new(sto
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning")]
     assert len(lines) == 1
     assert lines[0].startswith("warning: person Bert: ")
-    assert f"{SOLES} (sole cm: 3.0, people's -1.5 to 1.5)" in lines[0]
+    assert f"{SOLES} (sole cm: 3.0, people's -1.5…1.5)" in lines[0]
     prepare._show_report(Report(current=["a1", "b1"]), store)
     assert "warning" not in capsys.readouterr().out
 

@@ -55,9 +55,7 @@ FIGURES = (
     Figure("jumps_per_min", "jumps /min", 1, 0, 0, "joints jump", "Cut or mend those frames."),
     Figure("stature_m", "stature m", 2, 1.4, 2.1, "unusual stature", "Check the unit of length."),
     Figure("leg", "leg", 3, 0.46, 0.52, "legs are unlike people's, for that stature", _LEGS),
-    Figure(
-        "eyes", "eyes", 3, 0.915, 0.955, "the head's device is not at the eyes", "Check where the head's joint lies."
-    ),
+    Figure("eyes", "eyes", 3, 0.915, 0.955, "the head's device is not at the eyes", "Check the head's joint."),
     Figure("pitch_deg", "pitch °", 0, -5, 25, "the head is tilted while walking", "Check the head's axes."),
     Figure("pitch_spread_deg", "± °"),
 )
@@ -76,18 +74,17 @@ def people(store: RecordingStore, names: Iterable[str]) -> dict[str, dict[str, f
 def of_person(figures: dict[str, float]) -> list[Finding]:
     """A warning for each figure of a person that is out of bounds."""
     check, odd = Check("truth"), [figure for figure in FIGURES if figure.is_odd(figures)]
-    return [
-        check.warning(f.what, f"{f.heading}: {f.text(figures)}, people's {f.low:g} to {f.high:g}", f.fix) for f in odd
-    ]
+    return [check.warning(f.what, f"{f.heading}: {f.text(figures)}, people's {f.low:g}…{f.high:g}", f.fix) for f in odd]
 
 
 def _sample(store: RecordingStore, names: list[str]) -> list[Recording]:
     """At most `SAMPLE_S` of these recordings' motion, spread evenly over them, from the middle of each."""
-    mean = sum(store.entries[name].duration_s for name in names) / len(names)
-    if mean * len(names) > SAMPLE_S:
-        count = min(len(names), round(SAMPLE_S / min(mean, CUT_S)))
+    total = sum(store.entries[name].duration_s for name in names)
+    if total > SAMPLE_S:
+        count = min(len(names), round(SAMPLE_S / min(total / len(names), CUT_S)))
         names = [names[k] for k in np.linspace(0, len(names) - 1, count).round().astype(int)]
-    cuts = [_cut(store.path_of(name), SAMPLE_S / len(names)) for name in names]
+    seconds = SAMPLE_S / len(names) if total > SAMPLE_S else SAMPLE_S
+    cuts = [_cut(store.path_of(name), seconds) for name in names]
     return [cut for cut in cuts if cut is not None]
 
 

@@ -73,7 +73,7 @@ def _body(recording: Recording, motion: Motion) -> Float[Tensor, "4"]:
     """Unevenness of the bones (cm), stature (m), and the shares in it of leg and eyes."""
     skeleton = motion.skeleton
     bones = dict(zip(skeleton.joint_names, skeleton.t_parent_joint.norm(dim=-1).tolist()))
-    uneven = max(abs(bones[name] - bones[name.replace("left", "right")]) for name in bones if name.startswith("left_"))
+    uneven = max(abs(bones[name] - bones.get(name.replace("left", "right"), bones[name])) for name in bones)
     leg = sum(bones[f"{side}_{joint}"] for side in ("left", "right") for joint in ("knee", "ankle")) / 2
     eyes = nan if recording.head is None else skeleton.height_of("head") + recording.head.t_head_device[2].item()
     return torch.tensor([100 * uneven, skeleton.stature, leg / skeleton.stature, eyes / skeleton.stature])
@@ -84,13 +84,13 @@ def _soles(recording: Recording, motion: Motion) -> tuple[Float[Tensor, "patch"]
     skating (cm/s) times the number of steps in which a foot is planted, with that number."""
     times, track, floor, heights = motion.timestamps, recording.contacts, recording.floor, torch.zeros(0)
     feet = None if track is None else track.feet
-    if track is None or feet is None or not set(FOOT_PATCHES) <= set(motion.skeleton.sites):
+    if track is None or feet is None or not len(feet) or not set(FOOT_PATCHES) <= set(motion.skeleton.sites):
         return heights, torch.zeros(2)
     contact = feet[_nearest(track.timestamps, times)]
     planted = foot_contact(contact)
     skate = foot_skate_cm_s(foot_points(motion.skeleton, motion.T_world_joint), planted, motion.fps).nan_to_num()
     count = (planted[1:] & planted[:-1]).sum()
-    if floor is not None:
+    if floor is not None and len(floor.height):
         around = torch.stack([floor.height[_nearest(floor.timestamps, times + shift)] for shift in (-1.0, 0.0, 1.0)])
         level = around.amax(0) - around.amin(0) < 0.01
         patches = site_positions(motion.skeleton, motion.T_world_joint, FOOT_PATCHES)[..., 2]
