@@ -43,9 +43,6 @@ class Hips:
     """Usual shift ahead and up (m), which is taken for people who neither walk nor stand."""
 
 
-KEPT = Hips(False, (0.0, 0.0))
-"""The hips of the file."""
-
 NO_MOTION = ("shape.npz", "stagei.npz")
 """Name suffixes of AMASS's files that hold no motion."""
 
@@ -142,12 +139,12 @@ def bvh_tasks(
     settings: MocapSettings,
     amc_fps: float | int,
     license: str,
+    hips: Hips,
     mapping: str | Path | None = None,
     subject: str | None = None,
     activity: str | None = None,
     unit: str | float | int = AUTO,
     up: str = AUTO,
-    hips: Hips = KEPT,
 ) -> list[Task]:
     """One task per .bvh or .amc (also .xz, .gz) that `source` is or that lies anywhere below it, named by its path.
 
