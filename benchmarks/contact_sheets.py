@@ -32,8 +32,8 @@ from wearcap.evaluation.evaluate import evaluate
 from wearcap.files import write_text
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.trajectory import interpolate_clamped
-from wearcap.metrics.gait import STANCE, knees_over, walking_cycles, walking_scores
+from wearcap.geometry.trajectory import interpolate_clamped, nearest_frames
+from wearcap.metrics.gait import STANCE, cycle_times, knees_over, walking_scores
 from wearcap.metrics.physics import foot_points
 from wearcap.metrics.table import Row
 from wearcap.reading import load
@@ -88,7 +88,7 @@ def walk(pipeline: System, file: Path) -> tuple[np.ndarray, dict[str, float]]:
     does not walk."""
     recording, stature = with_stature(load(file).recording, xsens23())
     motion = pipeline(CaptureInput.in_dataset(recording, dataset_folder(file)))
-    both = walking_cycles(motion)
+    both = cycle_times(motion)
     cycles, knees = torch.cat(both), torch.cat(knees_over(motion, both))[:, STANCE].mean(1)
     if not len(cycles):
         raise WearcapError(
@@ -104,16 +104,17 @@ def walk(pipeline: System, file: Path) -> tuple[np.ndarray, dict[str, float]]:
     return np.concatenate(bands), {name: round(float(value), 3) for name, value in figures.items()}
 
 
-def _from_aside(motion: Motion, cycle: Float64[Tensor, "2"]) -> np.ndarray:
+def _from_aside(motion: Motion, cycle: Float64[Tensor, "point"]) -> np.ndarray:
     """Frames of one cycle, seen from the walker's left or right."""
-    frames = torch.searchsorted(motion.timestamps, torch.linspace(*cycle.tolist(), COLUMNS).double()).tolist()
+    shown = cycle[torch.linspace(0, len(cycle) - 1, COLUMNS).long()]
+    frames = nearest_frames(motion.timestamps, shown).tolist()
     ahead = motion.t_world_root[frames[-1]] - motion.t_world_root[frames[0]]
     turn = torch.tensor(VIEW_RAD - math.pi / 2) - torch.atan2(ahead[1], ahead[0])
     turned = motion.moved(Rigid(rotation.about_axis("z", turn), torch.zeros(3)))
     return contact_sheet({"": turned}, frames, columns=COLUMNS, size=SIZE)
 
 
-def _toes_cm(motion: Motion, recording: Recording, cycles: Float64[Tensor, "cycle 2"]) -> dict[str, float]:
+def _toes_cm(motion: Motion, recording: Recording, cycles: Float64[Tensor, "cycle point"]) -> dict[str, float]:
     """Median, 5th and 95th percentile of the lower toe's height (cm) over the floor below the recording's points, over all
     frames in `cycles`; nothing of a recording without points."""
     if recording.points is None or recording.head is None:
@@ -122,7 +123,7 @@ def _toes_cm(motion: Motion, recording: Recording, cycles: Float64[Tensor, "cycl
     floor: Float[Tensor, "time"] = interpolate_clamped(recording.head.timestamps, below, motion.timestamps)
     toes = foot_points(motion.skeleton, motion.T_world_joint)[:, :, 1, 2].amin(1)
     times = motion.timestamps[:, None]
-    walked = ((times >= cycles[:, 0]) & (times <= cycles[:, 1])).any(1)
+    walked = ((times >= cycles[:, 0]) & (times <= cycles[:, -1])).any(1)
     low, middle, high = 100 * (toes - floor)[walked].quantile(torch.tensor([0.05, 0.5, 0.95]))
     return {"toe_cm": middle.item(), "toe_5_cm": low.item(), "toe_95_cm": high.item()}
 

@@ -6,14 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import torch
 
-from wearcap.body.skeleton import xsens23
+from normal_walk import walk
 from wearcap.errors import WearcapError
-from wearcap.geometry.rotation import about_axis
-from wearcap.metrics.gait import POINTS, normal_knee_deg
 from wearcap.models.checkpoint import read_checkpoint
-from wearcap.recording import Motion, RecordingStore
+from wearcap.recording import RecordingStore
 from wearcap_testing import benchmark, recording_of, small_dataset
 
 SMALL = [
@@ -30,16 +27,6 @@ def table(monkeypatch):
     return made
 
 
-def walk(bend_deg: float) -> Motion:
-    """Four seconds of a glide along x whose knees follow the normal curve plus a constant."""
-    times = torch.arange(240, dtype=torch.float64) / 60
-    R, skeleton = torch.eye(3).repeat(240, 23, 1, 1), xsens23()
-    for k, side in enumerate(("left", "right")):
-        at = (((times / 1.1 + 0.5 * k) % 1.0) * (POINTS - 1)).long()
-        R[:, skeleton.index(f"{side}_knee")] = about_axis("y", (normal_knee_deg()[at] + bend_deg).deg2rad())
-    return Motion(times, skeleton, R, torch.stack([1.2 * times, 0 * times, 0 * times + 0.9], -1).float())
-
-
 def given(table, tmp_path: Path, *more: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
     table.add_arguments(parser)
@@ -52,7 +39,9 @@ def given(table, tmp_path: Path, *more: str) -> argparse.Namespace:
 def sets(tmp_path) -> Path:
     for name in ("one", "two"):
         small_dataset(tmp_path / name)
-    RecordingStore(tmp_path / "strangers").add(recording_of(walk(10.0), "walker"), split="val", config_hash="test")
+    RecordingStore(tmp_path / "strangers").add(
+        recording_of(walk(10.0, seconds=4.0), "walker"), split="val", config_hash="test"
+    )
     return tmp_path
 
 
