@@ -68,10 +68,24 @@ def cycle_times(motion: Motion) -> list[Float64[Tensor, "cycle point"]]:
     return found
 
 
-def knee_cycles(motion: Motion) -> list[Float[Tensor, "cycle point"]]:
+def knees_over(motion: Motion, cycles: list[Float64[Tensor, "_ point"]]) -> list[Float[Tensor, "_ point"]]:
+    """Flexion (degrees) of left and right knees at the times of cycles, which may be another motion's on the same clock."""
+    return [interpolate_clamped(motion.timestamps, flexion, at) for flexion, at in zip(knee_deg(motion).T, cycles)]
+
+
+def knee_cycles(motion: Motion) -> list[Float[Tensor, "_ point"]]:
     """Flexion (degrees) of left and right knees over `cycle_times`, from peak of swing to peak of swing."""
-    sides = zip(knee_deg(motion).T, cycle_times(motion))
-    return [interpolate_clamped(motion.timestamps, flexion, times) for flexion, times in sides]
+    return knees_over(motion, cycle_times(motion))
+
+
+def walking_scores(motion: Motion, cycles: list[Float64[Tensor, "_ point"]]) -> dict[str, float]:
+    """`stance_knee_deg`, the median over cycles of the mean flexion in `STANCE`, and `knee_curve_rms_deg`, the deviation
+    of the mean curve from the normal one; none without a cycle."""
+    curves = torch.cat(knees_over(motion, cycles))
+    if not len(curves):
+        return {}
+    off = (curves.mean(0) - normal_knee_deg()).square().mean().sqrt()
+    return {"stance_knee_deg": curves[:, STANCE].mean(1).median().item(), "knee_curve_rms_deg": off.item()}
 
 
 def standing(motion: Motion) -> Bool[Tensor, "time"]:
