@@ -3,10 +3,10 @@
     python benchmarks/carried_heads.py --datasets datasets/cmu datasets/hdm05 [--split train] [--legs 0.98]
                                                             by person, as a table; with other legs on the same feet
 
-Data sets whose bones and floors are known. Three shares: of frames in which people walk upright on the floor, of frames in
-which they stand, and of floors: by how much the floor that `tracking.floor.floor_from_path` finds is too low. value: median
-share over people; baseline: `tracking.floor.CARRIED`, of which ratio is the multiple: heights and floors that follow from it
-are that much too large.
+Data sets whose bones and floors are known. The shares: of frames in which people walk upright on the floor; of frames in
+which they stand; of the highest tenth of both, which heights follow from (`tracking.stature`); and of floors, by how much the
+one that `tracking.floor.floor_from_path` finds is too low. value: median share over people; baseline: `tracking.floor.CARRIED`,
+of which ratio is the multiple: heights and floors that follow from it are that much too large.
 """
 
 import argparse
@@ -23,8 +23,9 @@ from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.metrics.gait import SPEED_M_S, standing
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.tracking.floor import CARRIED, UPRIGHT_WITHIN_S, floor_from_path
+from wearcap.tracking.stature import UPRIGHT
 
-KINDS = ("walking", "standing", "floors")
+KINDS = ("walking", "standing", "highest", "floors")
 LEAST_S = 1.0
 """Least time (s) of walking or standing of a person that counts."""
 STEP_M = 0.25
@@ -56,13 +57,15 @@ def shares(recording: Recording, legs: float = 1.0) -> dict[str, Float[np.ndarra
     rest_m = motion.skeleton.height_of("head") - (1 - legs) * (rest[of("left_hip")] - rest[of("left_ankle")])[2].item()
     floor = interpolate_clamped(track.timestamps, track.height, motion.timestamps)
     share = (motion.joint("head").t[:, 2] - floor) / rest_m
-    found = {"walking": share[walking(motion, floor)], "standing": share[standing(motion)]}
+    walks, stands = walking(motion, floor), standing(motion)
+    found = {"walking": share[walks], "standing": share[stands], "highest": share[walks | stands]}
+    found = {kind: value for kind, value in found.items() if len(value) > LEAST_S * motion.fps}
+    if "highest" in found:
+        found["highest"] = found["highest"].quantile(UPRIGHT)[None]
     if motion.timestamps[-1] - motion.timestamps[0] >= UPRIGHT_WITHIN_S / 3:
         below = floor_from_path(motion.timestamps, motion.joint("head").t, rest_m)
         found["floors"] = (1 + (below - floor) / rest_m).median()[None]
-    return {
-        kind: value.numpy() for kind, value in found.items() if kind == "floors" or len(value) > LEAST_S * motion.fps
-    }
+    return {kind: value.numpy() for kind, value in found.items()}
 
 
 def by_person(folder: Path, split: str | None, legs: float = 1.0) -> dict[str, dict[str, float]]:

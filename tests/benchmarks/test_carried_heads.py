@@ -27,10 +27,10 @@ def test_shares_by_person(tmp_path, monkeypatch):
     found = carried_heads.by_person(tmp_path / "set", None)
     assert found.keys() == PEOPLE.keys()
     for person, share in PEOPLE.items():
-        assert found[person] == {kind: pytest.approx(share, abs=0.007) for kind in carried_heads.KINDS}
+        assert found[person] == {kind: pytest.approx(share, abs=0.008) for kind in carried_heads.KINDS}
     shorter = carried_heads.by_person(tmp_path / "set", None, legs=0.9)
     assert shorter["anna"]["standing"] > found["anna"]["standing"] + 0.04
     monkeypatch.chdir(tmp_path)
     (tmp_path / "datasets").symlink_to(tmp_path)
     figures = carried_heads.measure(("set",))
-    assert [figure["value"] for figure in figures] == [pytest.approx(0.98, abs=0.007)] * 3
+    assert [figure["value"] for figure in figures] == [pytest.approx(0.98, abs=0.007)] * 4

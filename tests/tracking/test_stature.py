@@ -73,6 +73,7 @@ def test_doctor_and_capture_say_one_height_of_the_head_joint_and_not_of_the_devi
     recording = worn(walking(20), joint_of(height_m), down_deg=down_deg)
     fitted, stature = with_stature(recording, xsens23())
     assert stature.height_m == pytest.approx(height_m, abs=0.005)
+    assert fitted.skeleton is not None
     assert fitted.skeleton.stature == pytest.approx(height_m, abs=0.005)
     (finding,) = doctor(recording)
     assert (finding.severity, finding.what) == ("note", str(stature))
@@ -91,6 +92,7 @@ def test_a_floor_of_points_is_as_good():
 def test_what_is_given_comes_first():
     recording = worn(walking(20), joint_of(1.7))
     given, stature = with_stature(recording, xsens23(), 1.68)
+    assert given.skeleton is not None
     assert (str(stature), given.skeleton.stature) == ("1.68 m, as given", pytest.approx(1.68, abs=1e-4))
     own = replace(recording, skeleton=skeleton_of_height(1.6))
     assert str(with_stature(own, xsens23())[1]) == "1.60 m, of its skeleton"
@@ -160,4 +162,5 @@ def test_real_logs_of_somebody_at_a_desk(real_data, name):
 def test_the_real_aria_wearer_s_height_is_read_off_the_path(real_data):
     """The head is 1.50 m above the floor on this walk, so the wearer is not as tall as the default body."""
     recording = wearcap.read(real_data / "aria_mps")
+    assert recording.skeleton is not None
     assert recording.skeleton.stature == pytest.approx(1.65, abs=0.05)

@@ -99,8 +99,7 @@ def _check_height(recording: Recording) -> list[Finding]:
     own, check = skeleton_of(recording), Check("height")
     found = estimate_stature(recording, own or xsens23())
     if own is None and found.source != "unknown":
-        fix = "Give height=… (m) where it is known better." if found.known else "Give height=… (m)."
-        return [check.note(str(found), "no skeleton in the recording", fix)]
+        return [check.note(str(found), "no skeleton in the recording", "Give height=… (m) where it is known.")]
     if own is None or not found.known:
         return []
     evidence = f"{found}; the skeleton is {own.stature:.2f} m tall"

@@ -308,8 +308,8 @@ class FirstMinute:
     def _default_height(self, why: str = "") -> None:
         """Note that the default stands for the height; somebody who sits is the reason before any other."""
         why = why if self._source == "unknown" else f" ({UNKNOWN[self._source]})"
-        fix = "Give the height." if self.guided else "Give the height, or use the guided first minute."
-        self.notes.append(f"Height: the default of {self.skeleton.stature:.2f} m{why}. {fix}")
+        guide = "" if self.guided else ", or use the guided first minute"
+        self.notes.append(f"Height: the default of {self.skeleton.stature:.2f} m{why}. Give the height{guide}.")
 
     def _floor_below(self, head_m: float) -> float | None:
         """Floor height (m) that is believed below an upright head joint at `head_m`: the device's, that of last time, 0."""

@@ -24,14 +24,10 @@ POSTURE_M = 0.025
 """Deviation (m) of the height that remains on long recordings: posture, shoes, seat of the device, proportions."""
 HEIGHTS_M = (1.2, 2.2)
 """Heights that are believed."""
-SEATED_M = (1.4, 1.5)
-"""Heights of upright wearers at whose head somebody who sits has it (below), or may have it. Seats are 0.42 to 0.52 m high and
-eyes 0.68 to 0.87 m over them: as if 1.15 to 1.5 m tall people stood. Of adults few are below 1.45 m."""
-FLOOR_SEAT_M = 0.6
-"""Least height (m) of a head over the floor that is somebody's who sits."""
+SEATED_M = (0.6, 1.4, 1.5)
+"""Heights of standing people with heads as high as of people who sit: on the floor; at most; at most if they are tall."""
 WALK_M, WALK_S, WALKED_S = 0.8, 2.0, 2.5
-"""Who gets a head that far (m) within that time (s) walks, of which so much (s) is seen: leaning reaches half as far, and a
-tracker that starts anew seems to move for `WALK_S` only."""
+"""A head that moves that far (m) within that time (s), for that long (s), walks; trackers that start anew seem to for `WALK_S`."""
 UNKNOWN = {
     "seated": "seated: the height is not known",
     "seated?": "seated, or a small wearer who stays in one place? The height is not known",
@@ -58,7 +54,7 @@ class Stature:
         if not self.known:
             return f"{UNKNOWN[self.source]}, {self.height_m:.2f} m is assumed"
         if self.source == "head":
-            small = "; a child, or somebody who sits?" if self.height_m < SEATED_M[0] else ""
+            small = "; a child, or somebody who sits?" if self.height_m < SEATED_M[1] else ""
             return f"{self.height_m:.2f} ± {self.deviation_m:.2f} m, from how high the head is carried{small}"
         return f"{self.height_m:.2f} m, {'as given' if self.source == 'given' else 'of its skeleton'}"
 
@@ -102,7 +98,7 @@ def estimate_stature(recording: Recording, skeleton: Skeleton) -> Stature:
     pieces = (t_world_head[:, 2] - floor).split(max(round(UPRIGHT_WITHIN_S / step_s), 1))
     upright = torch.stack([piece.quantile(UPRIGHT) for piece in pieces if len(piece) * step_s >= LEAST_S])
     high = upright.quantile(0.75)  # in half of the half-minutes people may sit
-    if height_over(high.item(), skeleton) < SEATED_M[1]:
+    if height_over(high.item(), skeleton) < SEATED_M[2]:
         high = upright.max()  # or in all but one
     near = upright[(upright - high).abs() < 0.1]
     height_m = height_over(near.median().item(), skeleton)
@@ -124,20 +120,17 @@ def height_over(above_m: float, skeleton: Skeleton, carried: float = CARRIED) ->
 def source_of(
     height_m: float, timestamps: Float64[Tensor, "time"], t_world_head: Float[Tensor, "time 3"]
 ) -> Literal["head", "seated", "seated?", "unknown"]:
-    """What a head's path shows whose highest places are those of somebody `height_m` tall who is upright.
+    """Where the height comes from of a wearer who would be `height_m` tall if the head's path were upright.
 
-    "head" if such a person is upright there; a head that never walks, no higher than that of somebody who sits, shows no
-    height: "seated", or "seated?" where a small adult who stands still has it as high. Else "unknown".
+    A head that never walks, no higher than sitters', shows none: "seated", "seated?" where small adults stand as high.
     """
-    if height_m >= SEATED_M[1]:
+    if height_m >= SEATED_M[2]:
         return "head" if height_m <= HEIGHTS_M[1] else "unknown"
     later = torch.searchsorted(timestamps, timestamps + WALK_S).clamp(max=len(timestamps) - 1)
     far = (t_world_head[later] - t_world_head)[:, :2].norm(dim=-1) > WALK_M
     if far.sum() * timestamps.diff().median() > WALKED_S:
         return "head" if height_m >= HEIGHTS_M[0] else "unknown"
-    if height_m < FLOOR_SEAT_M:
-        return "unknown"
-    return "seated" if height_m < SEATED_M[0] else "seated?"
+    return "unknown" if height_m < SEATED_M[0] else "seated" if height_m < SEATED_M[1] else "seated?"
 
 
 def _floor_below(recording: Recording) -> Float[Tensor, "time"] | None:
