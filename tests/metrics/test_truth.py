@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_gait import walk
 
+from normal_walk import walk
 from walking_person import sound_recording
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
 from wearcap.geometry.rotation import about_axis

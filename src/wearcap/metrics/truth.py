@@ -10,6 +10,7 @@ from torch.nn.functional import mse_loss, normalize
 
 from wearcap.body.kinematics import site_positions
 from wearcap.body.skeleton import FOOT_PATCHES
+from wearcap.geometry.trajectory import interpolate_clamped, nearest_frames
 from wearcap.metrics.gait import SPEED_M_S, STANCE, knee_cycles, knee_deg, normal_knee_deg, standing
 from wearcap.metrics.physics import foot_contact, foot_points, foot_skate_cm_s
 from wearcap.recording.motion import Motion
@@ -63,7 +64,7 @@ def _knees(motions: Sequence[Motion]) -> dict[str, float]:
     return {
         "cycles": len(both),
         "knee_rms_deg": mse_loss(both.mean(0), normal_knee_deg()).sqrt().item() if known else nan,
-        "stance_deg": both[:, STANCE].median().item() if known else nan,
+        "stance_deg": both[:, STANCE].mean(1).median().item() if known else nan,
         "standing_deg": stood.median().item() if stood_s >= LEAST_S else nan,
         "curves_deg": mse_loss(left.mean(0), right.mean(0)).sqrt().item() if sides else nan,
     }
@@ -86,21 +87,16 @@ def _soles(recording: Recording, motion: Motion) -> tuple[Float[Tensor, "patch"]
     feet = None if track is None else track.feet
     if track is None or feet is None or not len(feet) or not set(FOOT_PATCHES) <= set(motion.skeleton.sites):
         return heights, torch.zeros(2)
-    contact = feet[_nearest(track.timestamps, times)]
+    contact = feet[nearest_frames(track.timestamps, times)]
     planted = foot_contact(contact)
     skate = foot_skate_cm_s(foot_points(motion.skeleton, motion.T_world_joint), planted, motion.fps).nan_to_num()
     count = (planted[1:] & planted[:-1]).sum()
     if floor is not None and len(floor.height):
-        around = torch.stack([floor.height[_nearest(floor.timestamps, times + shift)] for shift in (-1.0, 0.0, 1.0)])
+        around = interpolate_clamped(floor.timestamps, floor.height, times + torch.tensor([[-1.0], [0.0], [1.0]]))
         level = around.amax(0) - around.amin(0) < 0.01
         patches = site_positions(motion.skeleton, motion.T_world_joint, FOOT_PATCHES)[..., 2]
         heights = (patches - around[1][:, None])[contact & level[:, None]]
     return heights, torch.stack([skate * count, count])
-
-
-def _nearest(timestamps: Tensor, times: Tensor) -> Tensor:
-    """Row of a track at each time: that at it, or the next."""
-    return torch.searchsorted(timestamps, times).clamp(max=len(timestamps) - 1)
 
 
 def _jumps(motion: Motion) -> int:
