@@ -17,7 +17,7 @@ from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 
 LEAST_CYCLES, LEAST_S, SEATED_DEG = 4, 1.0, 60.0
-"""Cycles of walking, and time (s) of standing or walking, that show nothing yet if there are fewer; knee of somebody who sits."""
+"""Least cycles of walking, least time (s) of standing or of a recording's walking; knee of somebody who sits."""
 ROOT_M_S, JOINT_M_S = 8.0, 15.0
 """Speeds that neither the pelvis nor any joint of a person reaches, as `prepare`'s limits have them."""
 
