@@ -16,10 +16,8 @@ from wearcap.metrics.physics import foot_contact, foot_points, foot_skate_cm_s
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 
-LEAST_CYCLES, LEAST_S = 4, 1.0
-"""Cycles of walking, and time (s) of standing or of walking in a recording, below which they show nothing."""
-SEATED_DEG = 60.0
-"""Knee from which somebody upright who keeps still sits."""
+LEAST_CYCLES, LEAST_S, SEATED_DEG = 4, 1.0, 60.0
+"""Least cycles of walking, least time (s) of standing or of a recording's walking; knee of somebody who sits."""
 ROOT_M_S, JOINT_M_S = 8.0, 15.0
 """Speeds that neither the pelvis nor any joint of a person reaches, as `prepare`'s limits have them."""
 
