@@ -301,6 +301,8 @@ def arguments(experiment: str, data: str, people: str, run: Path, *more: str) ->
         f"data.sources.objects.root={data}",
         f"data.val_sources.objects.root={data}",
         f"data.sources.cmu.root={people}",
+        "data.sources.objects.weight=0.6",
+        "data.sources.cmu.weight=0.3",
         "people@data.sources=none",
         "debug=fast",
         f"hydra.run.dir={run}",

@@ -67,7 +67,6 @@ def places(data, tmp_path_factory) -> Path:
             "experiment=voxel_autoencoder",
             f"data.sources.simulated.root={data}",
             "data.sources.cmu=null",
-            "people@data.sources=none",
             f"hydra.run.dir={run}",
             "trainer.max_steps=2",
             f"paths.outputs={run.parent}",
