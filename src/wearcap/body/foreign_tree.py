@@ -6,7 +6,7 @@ frame to the frame that bones and the axes of bent knees and elbows span, for tr
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import roma
 import torch
@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.joint_matching import BodyJoints, ancestors, common_ancestor
+from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
 from wearcap.geometry.rotation import swing_between
 
@@ -36,6 +37,31 @@ class ForeignTree:
     t_world_root: Float[Tensor, "time 3"]
     positions: Float[Tensor, "time joint 3"]
     """World places of the joints, which the skeleton's constant bones need not repeat."""
+
+    @property
+    def R_world(self) -> Float[Tensor, "time joint 3 3"]:
+        """World rotations of the joints."""
+        return forward_kinematics(self.skeleton, self.R_parent_joint, self.t_world_root).R
+
+    def place(self, name: str) -> Float[Tensor, "time 3"]:
+        """World places of a joint."""
+        return self.positions[:, self.skeleton.index(name)]
+
+    def moved(self, moves: dict[int, tuple[int, tuple[float, float, float]]]) -> "ForeignTree":
+        """The tree with joints at other places: by joint, the joint in whose axes it is shifted, and the shift (m)."""
+        R, t = self.R_world, self.positions.clone()
+        for joint, (carrier, shift) in moves.items():
+            t[:, joint] += R[:, carrier] @ t.new_tensor(shift)
+        offsets = _offsets(R, t, self.skeleton.parents)
+        return replace(self, skeleton=replace(self.skeleton, t_parent_joint=offsets), positions=t)
+
+
+def _offsets(
+    R: Float[Tensor, "time joint 3 3"], t: Float[Tensor, "time joint 3"], parents: Sequence[int]
+) -> Float[Tensor, "joint 3"]:
+    """Usual place (m) of each joint in its parent's axes."""
+    above = [max(parent, 0) for parent in parents]
+    return (R[:, above].mT @ (t - t[:, above])[..., None])[..., 0].median(0).values.float()
 
 
 def joint_roles(found: BodyJoints) -> dict[str, int]:
@@ -133,10 +159,8 @@ def foreign_tree(
     R = R_world[:, kept] @ C
     t = positions[:, kept]
     above = [max(parent, 0) for parent in new_parents]
-    offsets = (R[:, above].mT @ (t - t[:, above])[..., None])[..., 0].median(0).values
-    skeleton = Skeleton(
-        name, tuple(names.get(joint, f"part{joint}") for joint in kept), tuple(new_parents), offsets.float()
-    )
+    labels = tuple(names.get(joint, f"part{joint}") for joint in kept)
+    skeleton = Skeleton(name, labels, tuple(new_parents), _offsets(R, t, new_parents))
     local = torch.cat([R[:, :1], R[:, above[1:]].mT @ R[:, 1:]], 1)
     return ForeignTree(skeleton, local, t[:, 0], t)
 

@@ -119,8 +119,15 @@ def _read_amc(path: Path, asf: Path, fps: float | int) -> Take:
     motion = read_amc(read_asf(asf), path, fps)
     skeleton = motion.skeleton
     world = forward_kinematics(skeleton, motion.R_parent_joint.double(), motion.t_world_root.double())
-    rest, names = skeleton.rest_joints.double(), skeleton.joint_names
-    return Take(names, skeleton.parents, rest, world.R, world.t, motion.timestamps, len(names), 1.0, "z", "amc")
+    rest, names, parents = skeleton.rest_joints.double(), skeleton.joint_names, skeleton.parents
+    R, t, joints = world.R, world.t, len(names)
+    if "crown" in skeleton.sites:  # the end of the head's bone
+        head = skeleton.index(skeleton.sites["crown"].joint)
+        end = rest.new_tensor(skeleton.sites["crown"].t_joint_site)
+        names, parents = (*names, f"{names[head]} (end)"), (*parents, head)
+        rest = torch.cat([rest, (rest[head] + end)[None]])
+        R, t = torch.cat([R, R[:, head, None]], 1), torch.cat([t, (t[:, head] + R[:, head] @ end)[:, None]], 1)
+    return Take(names, parents, rest, R, t, motion.timestamps, joints, 1.0, "z", "amc")
 
 
 def asf_beside(path: Path) -> Path:

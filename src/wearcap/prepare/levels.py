@@ -3,6 +3,7 @@
 Marker sets leave the head's frame pitched by 5…45°, and bind poses that stand on tiptoe or on heels tilt the soles.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -20,6 +21,8 @@ STILL_M_S = 0.12
 LOW_M = 0.03
 """Height above the usual lowest ankle within which a slow foot stands."""
 LEAST_FRAMES = 5
+WALK_M_S, WALK_S = (0.5, 3.5), 1.5
+"""Speed (m/s) of the pelvis over the floor of who walks or jogs, and time (s) from which that shows how a head looks."""
 _LARGEST_TILT = 0.6
 """Largest tilt (rad) of a sole that is taken for a frame's; more is a foot that does not stand."""
 _NOD = 0.35
@@ -39,10 +42,6 @@ def levels_in(motions: Sequence[Motion], head_trusted: bool = False) -> Levels:
 
     A trusted head frame is corrected only if it is clearly off.
     """
-    skeleton = motions[0].skeleton
-    face = head_level(skeleton, torch.cat([motion.R_parent_joint for motion in motions]))
-    if face is not None and head_trusted and face[2, 2] > torch.tensor(_NOD).cos():
-        face = None
     soles = {}
     for side in ("left", "right"):
         still = [_standing(motion, side) for motion in motions]
@@ -53,7 +52,34 @@ def levels_in(motions: Sequence[Motion], head_trusted: bool = False) -> Levels:
             direction = torch.nn.functional.normalize(up.median(0).values, dim=0)
             if direction[2] > torch.tensor(_LARGEST_TILT).cos():
                 soles[name] = swing_between(direction.new_tensor([0.0, 0.0, 1.0]), direction)
-    return Levels(face, soles)
+    return Levels(face_in(motions, head_trusted), soles)
+
+
+def face_in(motions: Sequence[Motion], trusted: bool = False) -> Float[Tensor, "3 3"] | None:
+    """Tilt of the head's frame in motions of one wearer, from their walking where they walk, else from upright frames.
+
+    A trusted frame is corrected only if it is clearly off.
+    """
+    face = walking_face(motions)
+    if face is None:
+        face = head_level(motions[0].skeleton, torch.cat([motion.R_parent_joint for motion in motions]))
+    return None if face is not None and trusted and face[2, 2] > math.cos(_NOD) else face
+
+
+def walking_face(motions: Sequence[Motion]) -> Float[Tensor, "3 3"] | None:
+    """Tilt of the head's frame in the frames in which the wearer walks; None where that is for less than `WALK_S`."""
+    walks, seconds = [], 0.0
+    for motion in motions:
+        step_s = (motion.timestamps[-1] - motion.timestamps[0]).item() / max(1, len(motion) - 1)
+        half = max(1, round(0.25 / max(step_s, 1e-3)))  # a mean over half a second, which sway does not move
+        if len(motion) <= 2 * half:
+            continue
+        path = motion.t_world_root[2 * half :, :2] - motion.t_world_root[: -2 * half, :2]
+        speed = path.norm(dim=-1) / (2 * half * step_s)
+        R = motion.R_parent_joint[half:-half][(speed > WALK_M_S[0]) & (speed < WALK_M_S[1])]
+        walks.append(R)
+        seconds += step_s * len(R)
+    return head_level(motions[0].skeleton, torch.cat(walks)) if seconds >= WALK_S else None
 
 
 def _standing(motion: Motion, side: str) -> Bool[Tensor, "time"]:
