@@ -6,16 +6,18 @@ axes moves it by R_j δ × (p − t_j) if b is j or hangs on it. A person's bone
 the normal equations have an arrow's form; the poses are eliminated frame by frame (Schur complement).
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import roma
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics
+from wearcap.body.landmarks import head_level
 from wearcap.body.position_fit import fit_positions
 from wearcap.body.skeleton import Skeleton, skeleton_of_height, xsens23
 from wearcap.errors import WearcapError
@@ -29,8 +31,8 @@ MARKER_M = 0.01
 _LOSS = Loss("cauchy", 0.05)
 """Markers farther off than 5 cm (swapped, or on clothes) lose their weight."""
 _SIDED = {
-    "FHD": ("head", "head", (0.10, 0.070, 0.125), (0.02, 0.01, 0.02)),
-    "BHD": ("head", "head", (-0.08, 0.065, 0.125), (0.02, 0.01, 0.02)),
+    "FHD": ("head", "head", (0.10, 0.070, 0.130), (0.03, 0.01, 0.02)),
+    "BHD": ("head", "head", (-0.08, 0.065, 0.120), (0.03, 0.01, 0.02)),
     "SHO": ("left_shoulder", "left_collar", (-0.005, -0.01, 0.055), (0.015, 0.02, 0.015)),
     "UPA": ("left_shoulder", "left_shoulder", (0.0, 0.15, 0.045), (0.05, 0.06, 0.03)),
     "ELB": ("left_elbow", "left_shoulder", (0.0, 0.0, 0.045), (0.01, 0.01, 0.01)),
@@ -40,18 +42,18 @@ _SIDED = {
     "FIN": ("left_wrist", "left_wrist", (0.01, 0.075, 0.018), (0.015, 0.015, 0.01)),
     "ASI": ("pelvis", "pelvis", (0.061, 0.120, 0.073), (0.02, 0.03, 0.015)),
     "PSI": ("pelvis", "pelvis", (-0.086, 0.048, 0.101), (0.015, 0.02, 0.015)),
-    "THI": ("left_hip", "left_hip", (0.0, 0.09, -0.25), (0.05, 0.03, 0.08)),
-    "KNE": ("left_knee", "left_hip", (0.0, 0.055, 0.0), (0.008, 0.01, 0.01)),
-    "TIB": ("left_knee", "left_knee", (0.0, 0.055, -0.22), (0.05, 0.03, 0.08)),
-    "ANK": ("left_ankle", "left_knee", (0.0, 0.042, 0.0), (0.008, 0.008, 0.008)),
-    "HEE": ("left_ankle", "left_ankle", (-0.065, 0.0, -0.035), (0.015, 0.015, 0.02)),
-    "TOE": ("left_toe", "left_ankle", (0.0, 0.0, 0.030), (0.02, 0.015, 0.01)),
+    "THI": ("left_hip", "left_hip", (0.01, 0.09, -0.16), (0.05, 0.03, 0.08)),
+    "KNE": ("left_knee", "left_hip", (0.0, 0.055, 0.02), (0.005, 0.01, 0.015)),
+    "TIB": ("left_knee", "left_knee", (-0.01, 0.06, -0.15), (0.05, 0.03, 0.08)),
+    "ANK": ("left_ankle", "left_knee", (0.0, 0.042, 0.0), (0.005, 0.008, 0.008)),
+    "HEE": ("left_ankle", "left_ankle", (-0.060, 0.0, -0.030), (0.015, 0.015, 0.008)),
+    "TOE": ("left_toe", "left_ankle", (0.0, 0.0, 0.035), (0.02, 0.015, 0.008)),
 }
 _MIDDLE = {
-    "C7": ("neck", "t8", (-0.060, 0.0, 0.015), (0.015, 0.005, 0.02)),
-    "CLAV": ("neck", "t8", (0.055, 0.0, -0.045), (0.015, 0.005, 0.02)),
-    "T10": ("neck", "t8", (-0.095, 0.0, -0.225), (0.02, 0.005, 0.04)),
-    "STRN": ("neck", "t8", (0.10, 0.0, -0.20), (0.03, 0.01, 0.04)),
+    "C7": ("neck", "t8", (-0.080, 0.0, 0.015), (0.015, 0.005, 0.02)),
+    "CLAV": ("neck", "t8", (0.075, 0.0, -0.025), (0.015, 0.005, 0.02)),
+    "T10": ("neck", "t8", (-0.10, 0.0, -0.225), (0.02, 0.005, 0.04)),
+    "STRN": ("neck", "t8", (0.15, 0.0, -0.20), (0.03, 0.01, 0.04)),
     "RBAK": ("neck", "t8", (-0.11, -0.09, -0.12), (0.03, 0.04, 0.04)),
     "SACR": ("pelvis", "pelvis", (-0.090, 0.0, 0.101), (0.015, 0.005, 0.015)),
 }
@@ -87,8 +89,12 @@ _PITCH_DEG = {
 }  # fmt: skip
 """Standard deviation (degrees) of joints' rotation vectors about x (forward), y (left) and z (up) in the T-pose: knees and
 elbows are hinges, of which elbows turn about the forearm, too."""
-_SHARED_DEG = {("l5", "l3"): 3.0, ("l3", "t12"): 3.0, ("t12", "t8"): 3.0, ("neck", "head"): 6.0}
+_SHARED_DEG = {("l5", "l3"): 3.0, ("l3", "t12"): 3.0, ("t12", "t8"): 3.0, ("neck", "head"): 12.0}
 """Standard deviation (degrees) of the difference of neighbours that share a bend."""
+_HINGES = (("left_knee", 1, 1.0), ("right_knee", 1, 1.0), ("left_elbow", 2, -1.0), ("right_elbow", 2, 1.0))
+"""Joints that bend to one side only: their axis, and the sign of flexion about it."""
+_STRETCHED_DEG = (5.0, 3.0)
+"""Flexion below which a hinge resists, and the standard deviation below it (degrees)."""
 EVIDENCE = 20.0
 """Number of independent frames that a person's frames are worth: errors of skin are the same in many of them."""
 _FRAMES, _TAPER = 192, 5
@@ -147,17 +153,17 @@ def fit_body(trials: Sequence[Markers], where: object = "markers") -> MarkerBody
             lacking = ", ".join(name for name in among.split() if name not in seen)
             raise WearcapError(f"too few markers of the {part}: no {lacking}", str(where), f"{least} of {among}")
     body = _nominal_body(tuple(name for name in MARKERS if name in seen), trials)
-    each = -(-_FRAMES // len(trials))
-    parts, poses = [], []
+    each, parts = -(-_FRAMES // len(trials)), []
     for trial in trials[:: -(-len(trials) // _FRAMES)]:
         whole = _seen(body, trial)
         frames = torch.linspace(0, len(whole.y) - 1, min(each, len(whole.y))).round().long()
         parts.append(_Seen(whole.y[frames], whole.weight[frames]))
-        poses.append(_start(body, parts[-1]))
     seen_frames = _Seen(torch.cat([part.y for part in parts]), torch.cat([part.weight for part in parts]))
-    R, t = (torch.cat(part) for part in zip(*poses))
+    body = _upright_body(body, seen_frames)
+    R, t = (torch.cat(part) for part in zip(*(_start(body, part) for part in parts)))
     R, t = _solve_poses(body, seen_frames, R, t)
-    return _solve_body(body, seen_frames, R, t)
+    body, R, t = _solve_body(body, seen_frames, R, t)
+    return _levelled(body, seen_frames, R, t)
 
 
 def fit_motion(body: MarkerBody, trial: Markers) -> tuple[Motion, Float[Tensor, "time marker"]]:
@@ -189,6 +195,50 @@ def _nominal_body(names: tuple[str, ...], trials: Sequence[Markers]) -> MarkerBo
     a, b = ([skeleton.index(row[k]) for row in rows] for k in (0, 1))
     offsets = torch.tensor([row[2] for row in rows], dtype=torch.float64) * high.item() / nominal
     return MarkerBody(skeleton, names, a, b, offsets)
+
+
+def _upright(body: MarkerBody, seen: _Seen) -> Bool[Tensor, "time"]:
+    """Frames in which the head is highest: people stand."""
+    head = [k for k, name in enumerate(body.names) if name[1:] in ("FHD", "BHD")]
+    height = seen.y[:, head, 2].mean(1)
+    there = (seen.weight[:, head] > 0).all(1)
+    return there & (height > height[there].quantile(0.9) - 0.03) if there.any() else there
+
+
+def _upright_body(body: MarkerBody, seen: _Seen) -> MarkerBody:
+    """The tables' body with its markers turned so that pelvis and trunk are level, on the median, while people stand."""
+    upright, offsets = _upright(body, seen), body.t_b_marker.clone()
+    for joint in body.skeleton.indices("pelvis", "t8"):
+        k = torch.tensor([marker for marker, b in enumerate(body.b) if b == joint])
+        frames = upright & (seen.weight[:, k] > 0).all(1)
+        if frames.any():
+            x = body.t_b_marker[k].expand(int(frames.sum()), -1, -1)
+            R, *_ = roma.rigid_points_registration(x, seen.y[frames][:, k])
+            offsets[k] = offsets[k] @ rotation.about_axis("y", _pitch(R)).T
+    return replace(body, t_b_marker=offsets)
+
+
+def _levelled(body: MarkerBody, seen: _Seen, R: Tensor, t: Tensor) -> MarkerBody:
+    """The body with the frames of head and feet, which carry nothing but markers, turned so that they are level while people stand."""
+    skeleton, offsets = body.skeleton, body.t_b_marker.clone()
+    T = forward_kinematics(skeleton, R, t)
+    upright, face = _upright(body, seen), head_level(skeleton, R.float())
+    level = {} if face is None else {skeleton.index("head"): face.double().T}
+    if upright.any():
+        level |= {
+            joint: rotation.about_axis("y", _pitch(T.R[upright, joint]))
+            for joint in skeleton.indices("left_ankle", "right_ankle")
+        }
+    for k, (a, b) in enumerate(zip(body.a, body.b)):
+        if b in level:
+            origin = skeleton.t_parent_joint[a].double() if a != b else torch.zeros(3, dtype=torch.float64)
+            offsets[k] = level[b] @ (origin + offsets[k]) - origin
+    return replace(body, t_b_marker=offsets)
+
+
+def _pitch(R: Float[Tensor, "time 3 3"]) -> Float[Tensor, ""]:
+    """Median angle (rad) by which x points down."""
+    return -R[:, 2, 0].clamp(-1, 1).asin().median()
 
 
 def _seen(body: MarkerBody, trial: Markers) -> _Seen:
@@ -277,6 +327,7 @@ class _Frames:
         for marker, joint in enumerate(body.b):
             above[marker, skeleton.ancestors(joint)] = True
         self.above = above
+        self.hinges = [3 * (skeleton.index(name) - 1) + axis for name, axis, _ in _HINGES]
 
     def subset(self, frames: Tensor) -> "_Frames":
         return _Frames(self.body, _Seen(self.seen.y[frames], self.seen.weight[frames]))
@@ -286,7 +337,14 @@ class _Frames:
         T = forward_kinematics(self.body.skeleton, R, t)
         residual = marker_residual(self.body.places(T.R, T.t), self.seen.y)
         theta = rotation.log(R[:, 1:]).flatten(1)
-        return self._robust(residual) + ((theta @ self.precision) * theta).sum(-1)
+        limits = self._overstretch(theta).square().sum(-1)
+        return self._robust(residual) + ((theta @ self.precision) * theta).sum(-1) + limits
+
+    def _overstretch(self, theta: Float[Tensor, "time component"]) -> Float[Tensor, "time hinge"]:
+        """How far knees and elbows are bent the wrong way, in standard deviations; 0 where they are not."""
+        sign = torch.tensor([row[2] for row in _HINGES]).to(theta)
+        least, std = torch.tensor(_STRETCHED_DEG).deg2rad().to(theta)
+        return sign * (sign * theta[:, self.hinges] - least).clamp_max(0.0) / std
 
     def _robust(self, residual: Tensor) -> Tensor:
         loss = 2 * _LOSS.delta / MARKER_M**2 * _LOSS(residual * MARKER_M)
@@ -311,7 +369,15 @@ class _Frames:
         pulled = torch.einsum("iac,tacd->tiad", D, inverse).flatten(2)  # D blockdiag(J⁻¹)
         both = inverse.mT @ pulled.unflatten(1, (free, 3))
         H[:, 6:, 6:] += both.reshape(count, 3 * free, 3 * free)
-        g[:, 6:] += (inverse.mT @ (theta.flatten(1) @ self.precision).unflatten(1, (free, 3))[..., None]).flatten(1)
+        pull = theta.flatten(1) @ self.precision
+        over, std = self._overstretch(theta.flatten(1)), math.radians(_STRETCHED_DEG[1])
+        pull[:, self.hinges] += over / std
+        g[:, 6:] += (inverse.mT @ pull.unflatten(1, (free, 3))[..., None]).flatten(1)
+        for k, component in enumerate(self.hinges):
+            joint, axis = divmod(component, 3)
+            row = inverse[:, joint, axis] * (over[:, k, None] != 0) / std
+            at = slice(6 + 3 * joint, 9 + 3 * joint)
+            H[:, at, at] += row[:, :, None] * row[:, None]
         return g, H, r, J, T.R, (root / MARKER_M)[..., 0]
 
 
@@ -362,7 +428,7 @@ def _solve_poses(body: MarkerBody, seen: _Seen, R: Tensor, t: Tensor, iterations
     return R, t
 
 
-def _solve_body(body: MarkerBody, seen: _Seen, R: Tensor, t: Tensor, iterations: int = 30) -> MarkerBody:
+def _solve_body(body: MarkerBody, seen: _Seen, R: Tensor, t: Tensor, iterations: int = 30) -> tuple[MarkerBody, Tensor, Tensor]:
     """Bones and offsets, with the poses of the frames: the shared unknowns' normal equations, poses eliminated."""
     base, nominal = body.skeleton, body.t_b_marker
     bones = torch.zeros(len(_BONES), len(base), 3, dtype=torch.float64)
@@ -405,7 +471,7 @@ def _solve_body(body: MarkerBody, seen: _Seen, R: Tensor, t: Tensor, iterations:
         fallen, x, R, t, energy, damping = (energy - new) / energy, x + dx, R_new, t_new, new, 0.2 * damping
         if fallen < 1e-4:
             break
-    return at(x)
+    return at(x), R, t
 
 
 def _shared_derivative(
