@@ -47,7 +47,9 @@ def marker_tasks(
     trials = {}
     for path in files:
         below = path.relative_to(source)
-        name = "__".join([*below.parent.parts, re.sub(r"\.trc(\.[gx]z)?$", "", path.name, flags=re.I)]).replace(" ", "_")
+        name = "__".join([*below.parent.parts, re.sub(r"\.trc(\.[gx]z)?$", "", path.name, flags=re.I)]).replace(
+            " ", "_"
+        )
         if name in trials:
             raise WearcapError(f"two files are called {name!r}: {trials[name][0]} and {path}", fix="Rename one.")
         folder = below.parent.as_posix() if below.parent.parts else source.resolve().name
@@ -65,7 +67,9 @@ def ui_prmd_tasks(source: str | Path, splits: Splits, settings: MocapSettings, l
             name = path.name.split(".")[0].replace("_positions", "")
             trials.append((path, About(name, found[0], "ui_prmd", license, found[1])))
     if not trials:
-        raise WearcapError("no trials of UI-PRMD", source, "files such as m01_s01_e01_positions.txt or m01_s01_e01.d2.npy.xz")
+        raise WearcapError(
+            "no trials of UI-PRMD", source, "files such as m01_s01_e01_positions.txt or m01_s01_e01.d2.npy.xz"
+        )
     return _tasks(trials, splits, settings, DETECTED)
 
 
@@ -73,7 +77,12 @@ def _named(below: Path, what: str, rule: str) -> str:
     """A file's subject or activity by a rule: a pattern with one group, or the name itself."""
     if "(" not in rule:
         return rule
-    with understood(f"{what}={rule}", below, f"a pattern with one group that finds the {what}", errors=(re.error, TypeError, IndexError)):
+    with understood(
+        f"{what}={rule}",
+        below,
+        f"a pattern with one group that finds the {what}",
+        errors=(re.error, TypeError, IndexError),
+    ):
         return re.search(rule, below.as_posix())[1]  # pyright: ignore[reportOptionalSubscript]
 
 
@@ -105,7 +114,9 @@ def _body(files: tuple[Path, ...], how: Conventions) -> MarkerBody:
         return fit_body(trials)
 
 
-def _recording(path: Path, about: About, settings: MocapSettings, how: Conventions, files: tuple[Path, ...]) -> Recording:
+def _recording(
+    path: Path, about: About, settings: MocapSettings, how: Conventions, files: tuple[Path, ...]
+) -> Recording:
     """One trial, fitted with its person's body; the provenance keeps how far the markers are from it."""
     markers = _read(path, how)
     with placed(path):
