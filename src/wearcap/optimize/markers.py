@@ -96,6 +96,7 @@ _STRAIGHT_DEG, _STRAIGHT_STD_DEG = 5.0, 3.0
 EVIDENCE = 20.0
 """Number of independent frames that a person's frames are worth: skin errs alike in many of them."""
 _FRAMES, _FADE = 192, 5
+_SOFT_M, _ANEW_M = 0.04, 0.02
 _NOD = math.radians(7.0)
 """Downward pitch of the head of people who stand, as in `body.landmarks`."""
 
@@ -156,9 +157,22 @@ def fit_body(trials: Sequence[Markers]) -> MarkerBody:
 
 
 def fit_motion(body: MarkerBody, trial: Markers) -> tuple[Motion, Float[Tensor, "time marker"]]:
-    """The motion of a person whose body is known, and the markers' distances (m) from it, NaN where not seen."""
+    """The motion of a person whose body is known, and the markers' distances (m) from it, NaN where not seen.
+
+    Markers of soft parts that sit elsewhere in this trial, by 2 cm on the mean, are taken to have been placed anew. Frames
+    that ended in a worse minimum than others start again from the next good one.
+    """
     seen = _seen(body, trial)
     R, t = _solve_poses(body, seen, *_start(body, seen))
+    R_world, _, places = body.places(R, t)
+    off = (R_world[:, body.b].mT @ (seen.y - places)[..., None])[..., 0]
+    mean = (off * seen.weight[..., None]).sum(0) / seen.weight.sum(0).clamp_min(1e-9)[:, None]
+    anew = torch.tensor([max(_ROWS[name][3]) >= _SOFT_M for name in body.names]) & (mean.norm(dim=-1) > _ANEW_M)
+    body = replace(body, t_b_marker=body.t_b_marker + mean * anew[:, None])
+    energy = _energy(body, seen, R, t)
+    good = (energy <= 2 * energy.median()).nonzero()[:, 0]
+    start = good[torch.searchsorted(good, torch.arange(len(t))).clamp_max(len(good) - 1)]
+    R, t = _solve_poses(body, seen, R[start], t[start])
     distance = (body.places(R, t)[2] - seen.y).norm(dim=-1).where(seen.weight > 0, torch.nan)
     return Motion(trial.timestamps, body.skeleton, R.float(), t.float()), distance.float()
 

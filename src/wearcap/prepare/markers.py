@@ -30,6 +30,7 @@ def marker_tasks(
     settings: MocapSettings,
     license: str,
     files: str,
+    origin: str,
     subject: str | None = None,
     activity: str | None = None,
     activities: dict[str, str] | None = None,
@@ -48,7 +49,7 @@ def marker_tasks(
         name = "__".join([*below.parent.parts, path.name.split(".")[0]]).replace(" ", "_")
         folder = below.parent.as_posix() if below.parent.parts else source.resolve().name
         who, what = _found(below, "subject", subject) or folder, _found(below, "activity", activity)
-        abouts[path] = About(name, who, splits.path.stem, license, (activities or {}).get(what, what))
+        abouts[path] = About(name, who, origin, license, (activities or {}).get(what, what))
         persons.setdefault(who, []).append(path)
     if not abouts:
         raise WearcapError(f"no files {files}", where=source, expected="marker files, plain or .xz or .gz")
@@ -70,10 +71,9 @@ def _found(below: Path, what: str, rule: str | None) -> str:
     if rule is None or "(" not in rule:
         return rule or ""
     with understood(
-        f"{what}={rule}", below, "a pattern with one group that is found in each path", errors=(re.error, ValueError)
+        f"{what}={rule}", below, "a pattern with a group, found in each path", errors=(re.error, LookupError)
     ):
-        (found,) = re.findall(rule, below.as_posix())
-        return found
+        return re.compile(rule).findall(below.as_posix())[-1]
 
 
 def _read(path: Path, how: Conventions) -> Markers:
