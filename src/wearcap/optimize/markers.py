@@ -170,9 +170,10 @@ def fit_motion(body: MarkerBody, trial: Markers) -> tuple[Motion, Float[Tensor, 
     anew = torch.tensor([max(_ROWS[name][3]) >= _SOFT_M for name in body.names]) & (mean.norm(dim=-1) > _ANEW_M)
     body = replace(body, t_b_marker=body.t_b_marker + mean * anew[:, None])
     energy = _energy(body, seen, R, t)
-    good = (energy <= 2 * energy.median()).nonzero()[:, 0]
-    start = good[torch.searchsorted(good, torch.arange(len(t))).clamp_max(len(good) - 1)]
-    R, t = _solve_poses(body, seen, R[start], t[start])
+    is_good = energy <= 2 * energy.median()
+    again, good = (~is_good | anew.any()).nonzero()[:, 0], is_good.nonzero()[:, 0]
+    start = good[torch.searchsorted(good, again).clamp_max(len(good) - 1)]
+    R[again], t[again] = _solve_poses(body, seen[again], R[start], t[start])
     distance = (body.places(R, t)[2] - seen.y).norm(dim=-1).where(seen.weight > 0, torch.nan)
     return Motion(trial.timestamps, body.skeleton, R.float(), t.float()), distance.float()
 
