@@ -330,6 +330,8 @@ def _solve_poses(body: MarkerBody, seen: _Seen, R: Tensor, t: Tensor) -> tuple[T
     R, t, active = R.clone(), t.clone(), torch.arange(len(t))
     energy, damping = _energy(body, seen, R, t), torch.full_like(t[:, 0], 1e-3)
     for _ in range(25):
+        if not len(active):
+            break
         part = seen[active]
         g, H, *_ = _model(body, part, R[active], t[active])
         step = torch.cholesky_solve(-g[..., None], _damped(H, damping[active]))[..., 0]
@@ -341,8 +343,6 @@ def _solve_poses(body: MarkerBody, seen: _Seen, R: Tensor, t: Tensor) -> tuple[T
         energy[chosen] -= fallen[better]
         damping[active] *= torch.where(better, 0.2, 8.0)
         active = active[(~better | (fallen > 1e-3 * energy[active])) & (damping[active] < 1e4)]
-        if not len(active):
-            break
     return R, t
 
 
