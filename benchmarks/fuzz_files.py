@@ -38,6 +38,7 @@ from PIL import Image  # noqa: E402
 
 import foreign_bvh  # noqa: E402
 import keypoint_files  # noqa: E402
+import marker_person  # noqa: E402
 import short_walk  # noqa: E402
 from wearcap.body.skeletons import smplh52  # noqa: E402
 from wearcap.boundary import arrays, pickles, texts  # noqa: E402
@@ -54,6 +55,7 @@ from wearcap.io.datasets import (  # noqa: E402
     nymeria,
     omomo,
     totalcapture,
+    ui_prmd,
 )
 from wearcap.io.devices import aria_mps, headset_log, headset_tables, watch_log  # noqa: E402
 from wearcap.io.formats import (  # noqa: E402
@@ -76,6 +78,7 @@ from wearcap.io.formats import (  # noqa: E402
     scene_folder,
     smpl,
     trajectory,
+    trc,
     video,
     wavefront,
 )
@@ -270,6 +273,11 @@ def _video(path: Path) -> None:
     video.write_frames(path, [np.full((32, 48, 3), 20 * k, np.uint8) for k in range(6)], 30.0)
 
 
+def _markers() -> trc.Markers:
+    places = torch.rand(5, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return trc.Markers(torch.arange(5, dtype=torch.float64) / 100, ("LASI", "RASI", "C7"), places)
+
+
 def _cues(path: Path) -> None:
     times = torch.arange(5, dtype=torch.float64) / 30
     keypoint_files.write_keypoints({"left_wrist": Cue(times, "left_wrist", torch.rand(5, 3), torch.ones(5))}, path)
@@ -453,9 +461,12 @@ READERS: dict[str, Reader] = {
     ),
     "x_imu": Reader(_x_imu, lambda folder: watch_log.read_inertial_log(folder / "Inertial.csv", "left_wrist")),
     "watch_calibration": _one("c.json", WORN, watch_calibration.read_watch_calibration),
+    "trc": _made("m.trc", lambda path: marker_person.write_trc(_markers(), path), trc.read_trc),
     "tum": _one("t.txt", TUM, trajectory.read_trajectory),
     "tum_gz": _one("t.txt.gz", gzip.compress(TUM.encode(), mtime=0), trajectory.read_trajectory),
     "tum_xz": _one("t.txt.xz", lzma.compress(TUM.encode()), trajectory.read_trajectory),
+    "ui_prmd": _one("m01_s01_e01.txt", "".join(",".join(["1.5"] * 117) + "\n" for _ in range(4)), ui_prmd.read_ui_prmd),
+    "ui_prmd_packed": _made("m.npy", lambda path: np.save(path, np.ones((6, 117), np.int32)), ui_prmd.read_ui_prmd),
     "image": _made("a.png", lambda path: _pictures(path.parent), video.read_image),
     "video_frames": _made("a.mp4", _video, lambda path: list(video.read_frames(path))),
     "video_info": _made("a.mp4", _video, video.video_info),
