@@ -30,38 +30,29 @@ MARKER_M = 0.01
 """Standard deviation (m) of a marker from its place on the body: skin slides over bone."""
 _LOSS = Loss("cauchy", 0.05)
 """Markers farther off than 5 cm, swapped ones and those on clothes, lose their weight."""
-_LEFT = {
-    "FHD": ("head", "head", (0.10, 0.07, 0.13), (0.03, 0.01, 0.02)),
-    "BHD": ("head", "head", (-0.08, 0.065, 0.12), (0.03, 0.01, 0.02)),
-    "SHO": ("left_shoulder", "left_collar", (-0.005, -0.01, 0.055), (0.015, 0.02, 0.015)),
-    "UPA": ("left_shoulder", "left_shoulder", (0.0, 0.15, 0.045), (0.05, 0.06, 0.03)),
-    "ELB": ("left_elbow", "left_shoulder", (0.0, 0.0, 0.045), (0.01, 0.01, 0.01)),
-    "FRM": ("left_elbow", "left_elbow", (0.0, 0.12, 0.03), (0.04, 0.05, 0.03)),
-    "WRA": ("left_wrist", "left_elbow", (0.032, 0.0, 0.01), (0.012, 0.01, 0.015)),
-    "WRB": ("left_wrist", "left_elbow", (-0.032, 0.0, 0.01), (0.012, 0.01, 0.015)),
-    "FIN": ("left_wrist", "left_wrist", (0.01, 0.075, 0.018), (0.015, 0.015, 0.01)),
-    "ASI": ("pelvis", "pelvis", (0.061, 0.12, 0.073), (0.02, 0.03, 0.015)),
-    "PSI": ("pelvis", "pelvis", (-0.086, 0.048, 0.101), (0.015, 0.02, 0.015)),
-    "THI": ("left_hip", "left_hip", (0.01, 0.09, -0.16), (0.05, 0.03, 0.08)),
-    "KNE": ("left_knee", "left_hip", (0.0, 0.055, 0.02), (0.005, 0.01, 0.015)),
-    "TIB": ("left_knee", "left_knee", (-0.01, 0.06, -0.15), (0.05, 0.03, 0.08)),
-    "ANK": ("left_ankle", "left_knee", (0.0, 0.042, 0.0), (0.005, 0.008, 0.008)),
-    "HEE": ("left_ankle", "left_ankle", (-0.06, 0.0, -0.03), (0.015, 0.015, 0.008)),
-    "TOE": ("left_toe", "left_ankle", (0.0, 0.0, 0.035), (0.02, 0.015, 0.008)),
-}
-_ROWS = {
-    "C7": ("neck", "t8", (-0.08, 0.0, 0.015), (0.015, 0.005, 0.02)),
-    "CLAV": ("neck", "t8", (0.075, 0.0, -0.025), (0.015, 0.005, 0.02)),
-    "T10": ("neck", "t8", (-0.10, 0.0, -0.225), (0.02, 0.005, 0.04)),
-    "STRN": ("neck", "t8", (0.15, 0.0, -0.20), (0.03, 0.01, 0.04)),
-    "RBAK": ("neck", "t8", (-0.11, -0.09, -0.12), (0.03, 0.04, 0.04)),
-    "SACR": ("pelvis", "pelvis", (-0.09, 0.0, 0.101), (0.015, 0.005, 0.015)),
-}
-for _name, (_a, _b, (_x, _y, _z), _std) in _LEFT.items():
-    _ROWS["L" + _name] = _a, _b, (_x, _y, _z), _std
-    _ROWS["R" + _name] = _a.replace("left", "right"), _b.replace("left", "right"), (_x, -_y, _z), _std
+_MM = {
+    "C7": ("neck", "t8", (-80, 0, 15), (15, 5, 20)), "CLAV": ("neck", "t8", (75, 0, -25), (15, 5, 20)),
+    "T10": ("neck", "t8", (-100, 0, -225), (20, 5, 40)), "STRN": ("neck", "t8", (150, 0, -200), (30, 10, 40)),
+    "RBAK": ("neck", "t8", (-110, -90, -120), (30, 40, 40)), "SACR": ("pelvis", "pelvis", (-90, 0, 101), (15, 5, 15)),
+}  # fmt: skip
+_SIDED_MM = {
+    "FHD": ("head", "head", (100, 70, 130), (30, 10, 20)), "BHD": ("head", "head", (-80, 65, 120), (30, 10, 20)),
+    "SHO": ("shoulder", "collar", (-5, -10, 55), (15, 20, 15)), "UPA": ("shoulder", "shoulder", (0, 150, 45), (50, 60, 30)),
+    "ELB": ("elbow", "shoulder", (0, 0, 45), (10, 10, 10)), "FRM": ("elbow", "elbow", (0, 120, 30), (40, 50, 30)),
+    "WRA": ("wrist", "elbow", (32, 0, 10), (12, 10, 15)), "WRB": ("wrist", "elbow", (-32, 0, 10), (12, 10, 15)),
+    "FIN": ("wrist", "wrist", (10, 75, 18), (15, 15, 10)), "ASI": ("pelvis", "pelvis", (61, 120, 73), (20, 30, 15)),
+    "PSI": ("pelvis", "pelvis", (-86, 48, 101), (15, 20, 15)), "THI": ("hip", "hip", (10, 90, -160), (50, 30, 80)),
+    "KNE": ("knee", "hip", (0, 55, 20), (5, 10, 15)), "TIB": ("knee", "knee", (-10, 60, -150), (50, 30, 80)),
+    "ANK": ("ankle", "knee", (0, 42, 0), (5, 8, 8)), "HEE": ("ankle", "ankle", (-60, 0, -30), (15, 15, 8)),
+    "TOE": ("toe", "ankle", (0, 0, 35), (20, 15, 8)),
+}  # fmt: skip
+for _side, _sign in (("left", 1), ("right", -1)):
+    for _name, (*_joints, (_x, _y, _z), _std) in _SIDED_MM.items():
+        _a, _b = (joint if joint in ("head", "pelvis") else f"{_side}_{joint}" for joint in _joints)
+        _MM[_side[0].upper() + _name] = _a, _b, (_x, _sign * _y, _z), _std
+_ROWS = {name: (a, b, [x / 1000 for x in o], [x / 1000 for x in std]) for name, (a, b, o, std) in _MM.items()}
 MARKERS = tuple(_ROWS)
-"""Plug-in-Gait's markers. A row: joints a and b, offset o and its standard deviation (m) at 1.75 m.
+"""Plug-in-Gait's markers. A row: joints a and b, offset o and its standard deviation (mm, `_ROWS`: m) at 1.75 m.
 
 Placed as Vicon's guide says, knees 9.5, ankles 7 and elbows 7.5 cm wide, the hip's joint below and behind the ASIS after
 Harrington et al. 2007 for a pelvis that is tilted by 11°.
@@ -184,9 +175,10 @@ def _nominal_body(names: tuple[str, ...], trials: Sequence[Markers]) -> MarkerBo
     for trial in trials:
         z, plain = trial.t_world_marker[..., 2], [plug_in_gait(name)[1:] for name in trial.names]
         head, foot = (z[:, [name in kind for name in plain]] for kind in (("FHD", "BHD"), ("HEE", "TOE")))
-        heights.append(head.nanmean(1) - foot.nan_to_num(torch.inf).amin(1))
+        lowest = torch.nn.functional.pad(foot.nan_to_num(torch.inf), (0, 1), value=torch.inf).amin(1)
+        heights.append(head.nanmean(1) - lowest)
     high = torch.cat(heights).nanquantile(0.9).item() + 0.045
-    scale = high / (base.height_of("head") + _LEFT["FHD"][2][2])
+    scale = high / (base.height_of("head") + _ROWS["LFHD"][2][2])
     a, b = (base.indices(*(_ROWS[name][k] for name in names)) for k in (0, 1))
     offsets = scale * torch.tensor([_ROWS[name][2] for name in names], dtype=torch.float64)
     return MarkerBody(base.scaled(scale), names, a, b, offsets)

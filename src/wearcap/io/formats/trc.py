@@ -44,7 +44,7 @@ def read_trc(path: str | Path, conventions: Conventions = DETECTED) -> Markers:
         elif number == 4:
             names = [field for field in fields[2:] if field]
         elif number > 5 and any(fields):
-            fields = (fields[1:] + [""] * 3 * len(names))[: 1 + 3 * len(names)]
+            fields = (fields[1:] + [""] * (1 + 3 * len(names)))[: 1 + 3 * len(names)]
             values.extend(finite_floats([field or "0" for field in fields], at_line(path, number)))
     if not (values and 0 < len(set(names)) == len(names) <= _MOST):
         raise WearcapError(f"{len(names)} names of markers and {len(values)} numbers", path, _EXPECTED)
