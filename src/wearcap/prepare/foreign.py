@@ -159,7 +159,7 @@ def read_foreign_motion(
         f"{forward} is ahead in the bind pose" if odd == "" else f"{forward} is our x",
         "the bind pose" if odd == "" else f"{motion_of}, for in the bind pose {odd}",
         {ours: take.names[joint] for ours, joint in roles.items()},
-        _residuals(motion, {name: tree.place(name)[: len(motion)] for name in roles}),
+        _residuals(motion, {name: tree.place(name)[: len(motion)] for name in roles if name in tree.skeleton}),
         _notes(take, straight, how),
     )
     return ForeignMotion(replace(motion, provenance={"source": path.name, "format": take.format}), report)
