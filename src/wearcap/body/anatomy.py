@@ -7,7 +7,6 @@ table by convention; stature follows from crown and ankles, and the base of the 
 
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
