@@ -45,16 +45,14 @@ those from its head's joint 0.465.
 """
 
 
-def crown_over_head(
-    R_head: Float[Tensor, "time 3 3"], head: Float[Tensor, "time 3"], ends: Float[Tensor, "time end 3"]
-) -> float | None:
+def crown_over_head(tree: ForeignTree, ends: Float[Tensor, "time end 3"]) -> float | None:
     """Height (m) of the crown over the head's joint, in the axes of a level head, from what the file has above it.
 
     None where no point above the joint may be a crown: noses, eyes, chains that end in the head.
     """
     if ends.shape[1] == 0:
         return None
-    place = ((ends - head[:, None]) @ R_head).median(0).values
+    place = ((ends - tree.place("head")[:, None]) @ tree.R_world[:, tree.skeleton.index("head")]).median(0).values
     x, y, z = place[place[:, 2].argmax()].tolist()
     if not (_END_M[0] <= z <= _END_M[1] and (x * x + y * y) ** 0.5 <= _END_SLOPE * z):
         return None

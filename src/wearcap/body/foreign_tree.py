@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from wearcap.body.joint_matching import BodyJoints, ancestors, common_ancestor
-from wearcap.body.kinematics import forward_kinematics, local_rotations
+from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import Skeleton
 from wearcap.geometry.rotation import swing_between
 
@@ -49,11 +49,12 @@ class ForeignTree:
 
     def turned(self, joint: int, R_joint: Float[Tensor, "3 3"]) -> "ForeignTree":
         """The tree with other axes of one joint, given in its own; no joint moves."""
-        R = self.R_world.clone()
-        R[:, joint] = R[:, joint] @ R_joint.to(R)
-        offsets = _offsets(R, self.positions, self.skeleton.parents)
-        skeleton = replace(self.skeleton, t_parent_joint=offsets)
-        return replace(self, skeleton=skeleton, R_parent_joint=local_rotations(skeleton, R))
+        turn, local, offsets = R_joint.double(), self.R_parent_joint.clone(), self.skeleton.t_parent_joint.clone()
+        local[:, joint] = local[:, joint] @ turn.to(local)
+        below = [child for child, parent in enumerate(self.skeleton.parents) if parent == joint]
+        local[:, below] = turn.T.to(local) @ local[:, below]
+        offsets[below] = offsets[below] @ turn.to(offsets)
+        return replace(self, skeleton=replace(self.skeleton, t_parent_joint=offsets), R_parent_joint=local)
 
     def moved(self, moves: dict[int, tuple[int, tuple[float, float, float]]]) -> "ForeignTree":
         """The tree with joints at other places: by joint, the joint in whose axes it is shifted, and the shift (m)."""

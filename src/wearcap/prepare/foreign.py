@@ -129,25 +129,21 @@ def read_foreign_motion(
     take = with_thorax(take, unit_m)
     R_ours_rest, odd = standing_rotation(take.rest, found)
     up, forward = find_axes(take, found, R_ours_rest, given, unit_m)
-    R_world_file = axes_rotation(path, up, forward)
+    R_world_file, naming = axes_rotation(path, up, forward), convention(take.names)
     t_world = take.t @ R_world_file.T * unit_m
-    naming = convention(take.names)
     with placed(path):
         tree = foreign_tree(path.name.split(".")[0], take.parents, R_world_file @ take.R, t_world, found, R_ours_rest)
         # CMU's head frames are those of markers, in whatever format.
         trusted = R_ours_rest is not None and not naming.startswith("CMU")
         tree = _levelled(tree, take.timestamps, len(own.t), trusted, levels)
-        ends = [joint for joint in range(len(take.parents)) if found.head in ancestors(take.parents, joint)[1:]]
-        head = tree.R_world[:, tree.skeleton.index("head")], tree.place("head")
-        tree = at_landmarks(tree, crown_over_head(*head, t_world[:, ends]), naming)
+        above_head = [joint for joint in range(len(take.parents)) if found.head in ancestors(take.parents, joint)[1:]]
+        tree = at_landmarks(tree, crown_over_head(tree, t_world[:, above_head]), naming)
         motion = _fitted(tree, take.timestamps)
-    shown = motion.sliced(len(own.t), len(motion)) if siblings else motion
-    soles = levels_in([shown]).R_joint_sole if levels is None else levels.R_joint_sole
-    motion = with_levels(motion, Levels(None, soles)).sliced(0, len(own.t))
+    shown = levels or levels_in([motion.sliced(len(own.t), len(motion)) if siblings else motion])
+    motion = with_levels(motion, Levels(None, shown.R_joint_sole)).sliced(0, len(own.t))
     if not (motion.R_parent_joint.isfinite().all() and motion.t_world_root.isfinite().all()):
         raise WearcapError("no skeleton can be fitted to its joints", path, "joints apart from one another")
-    roles = joint_roles(found)
-    straight = straightness(take.t, found).max().item() if odd else 1.0
+    roles, straight = joint_roles(found), straightness(take.t, found).max().item() if odd else 1.0
     motion_of = f"the motion of {len(siblings)} clips" if siblings else "the motion"
     report = ForeignReport(
         path.name,
