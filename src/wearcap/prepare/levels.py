@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from wearcap.body.foreign_tree import SIDES
 from wearcap.body.landmarks import head_level, upright_frames, with_head_face
 from wearcap.body.skeleton import Site, Skeleton
 from wearcap.geometry.rotation import swing_between
@@ -25,6 +26,8 @@ WALK_M_S, WALK_S = (0.5, 2.2), 1.5
 """Speed (m/s) of the pelvis over the floor of who walks, and time (s) from which that shows how a head looks."""
 _LARGEST_TILT = 0.6
 """Largest tilt (rad) of a sole that is taken for a frame's; more is a foot that does not stand."""
+_LEG_UPRIGHT = 0.97
+"""Cosine of the largest angle (14°) between the legs of who stands and the vertical."""
 _PELVIS_TILT = 0.14
 """Mean tilt (rad) of an upright person's pelvis from which its frame is taken to be tilted, not the person."""
 _NOD = 0.35
@@ -68,8 +71,13 @@ def face_in(motions: Sequence[Motion], trusted: bool = False) -> Float[Tensor, "
 
 
 def pelvis_in(motions: Sequence[Motion]) -> Float[Tensor, "3 3"] | None:
-    """Tilt of the pelvis' frame while the trunk is upright, where it is more than people's."""
-    R = upright_frames(motions[0].skeleton, torch.cat([motion.R_parent_joint for motion in motions]))
+    """Tilt of the pelvis' frame while trunk and both legs are upright, where it is more than people's."""
+    stands = []
+    for motion in motions:
+        legs = torch.stack([motion.joint(f"{side}_hip").t - motion.joint(f"{side}_ankle").t for side in SIDES])
+        stands.append((legs[..., 2] > _LEG_UPRIGHT * legs.norm(dim=-1)).all(0))
+    local = torch.cat([motion.R_parent_joint[frames] for motion, frames in zip(motions, stands)])
+    R = upright_frames(motions[0].skeleton, local)
     if len(R) < LEAST_FRAMES:
         return None
     up = torch.nn.functional.normalize(R[:, 0, 2].median(0).values, dim=0)
