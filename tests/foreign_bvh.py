@@ -17,7 +17,7 @@ BODY = (
     ("left_ankle", "left_knee", (0, 0, -0.40)), ("left_toe", "left_ankle", (0.15, 0, -0.06)),
 )  # fmt: skip
 """Joints of the T-pose, x forward, y left, z up (m); the right side is mirrored."""
-ENDS = {"head": (0.0, 0.0, 0.18), "left_wrist": (0.0, 0.17, 0.0), "left_toe": (0.07, 0.0, 0.0)}
+ENDS = {"head": (0.0, 0.0, 0.1894), "left_wrist": (0.0, 0.17, 0.0), "left_toe": (0.07, 0.0, 0.0)}
 
 
 def _mirrored(rows):

@@ -47,6 +47,15 @@ class ForeignTree:
         """World places of a joint."""
         return self.positions[:, self.skeleton.index(name)]
 
+    def turned(self, joint: int, R_joint: Float[Tensor, "3 3"]) -> "ForeignTree":
+        """The tree with other axes of one joint, given in its own; no joint moves."""
+        turn, local, offsets = R_joint.double(), self.R_parent_joint.clone(), self.skeleton.t_parent_joint.clone()
+        local[:, joint] = local[:, joint] @ turn.to(local)
+        below = [child for child, parent in enumerate(self.skeleton.parents) if parent == joint]
+        local[:, below] = turn.T.to(local) @ local[:, below]
+        offsets[below] = offsets[below] @ turn.to(offsets)
+        return replace(self, skeleton=replace(self.skeleton, t_parent_joint=offsets), R_parent_joint=local)
+
     def moved(self, moves: dict[int, tuple[int, tuple[float, float, float]]]) -> "ForeignTree":
         """The tree with joints at other places: by joint, the joint in whose axes it is shifted, and the shift (m)."""
         R, t = self.R_world, self.positions.clone()

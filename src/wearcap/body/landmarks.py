@@ -17,9 +17,10 @@ from wearcap.body.skeleton import Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import swing_between
 
+_SIDES = ("left", "right")
 _SPLAY = 0.17
 """Lateral angle (rad) of a bind pose's shins above which its feet are taken to be rolled with them."""
-_UPRIGHT = math.cos(math.radians(25))
+_UPRIGHT = math.cos(math.radians(15))
 _NATURAL_PITCH = math.radians(7)
 """Average downward pitch of the head of an upright person (ours)."""
 
@@ -45,13 +46,13 @@ def landmarks(skeleton: Skeleton) -> Landmarks:
     """Find the parts of the body. Raises WearcapError naming the limb that is not recognised."""
     found = joints_by_name(skeleton.joint_names, skeleton.parents, skeleton.name)
     head, limb, collar, toe, forearm = found.head, found.limb, {}, {}, {}
-    for side in ("left", "right"):
+    for side in _SIDES:
         below = [joint for joint, parent in enumerate(skeleton.parents) if parent == limb[f"{side}_leg"][2]]
         toe[side] = max(below, key=lambda joint: skeleton.t_parent_joint[joint, 0].item(), default=None)
         forearm[side] = skeleton.parents[limb[f"{side}_arm"][2]]
     above_head = skeleton.ancestors(head)
     top = next(j for j in skeleton.ancestors(limb["left_arm"][0]) if j in above_head)
-    for side in ("left", "right"):
+    for side in _SIDES:
         above = skeleton.parents[limb[f"{side}_arm"][0]]
         collar[side] = above if above not in above_head else None
     spine = skeleton.ancestors(top)[-2::-1]
@@ -109,21 +110,30 @@ def t_pose(skeleton: Skeleton) -> TPose:
     return TPose(marks, R_t, t)
 
 
+def upright_frames(
+    skeleton: Skeleton, R_parent_joint: Float[Tensor, "time joint 3 3"]
+) -> Float[Tensor, "frame joint 3 3"]:
+    """World rotations in the frames in which the line from hips to shoulders is within 15° of the vertical."""
+    marks = landmarks(skeleton)
+    T = forward_kinematics(skeleton, R_parent_joint, R_parent_joint.new_zeros(len(R_parent_joint), 3))
+    hips, shoulders = (T.t[:, [marks.limb[f"{side}_{part}"][0] for side in _SIDES]].mean(1) for part in ("leg", "arm"))
+    up = torch.nn.functional.normalize(shoulders - hips, dim=-1)[:, 2] > _UPRIGHT
+    return T.R[up]
+
+
 def head_level(
     skeleton: Skeleton, R_parent_joint: Float[Tensor, "time joint 3 3"], at_least: int = 30
 ) -> Float[Tensor, "3 3"] | None:
     """R_head_face: the constant tilt of the face in the head joint's axes, found from the upright frames.
 
-    Marker sets such as CMU's leave the head frame pitched by 5…45°, by subject. Over frames whose pelvis is
+    Marker sets such as CMU's leave the head frame pitched by 5…45°, by subject. Over frames whose trunk is
     upright, the face is taken to look 7° down in the median and not to lean sideways; heading is not touched.
     None if fewer than `at_least` frames are upright. For subjects with many motions, average the results.
     """
-    origin = R_parent_joint.new_zeros(len(R_parent_joint), 3)
-    R_world = forward_kinematics(skeleton, R_parent_joint, origin).R
-    upright = R_world[:, 0, 2, 2] > _UPRIGHT
-    if int(upright.sum()) < at_least:
+    R_world = upright_frames(skeleton, R_parent_joint)
+    if len(R_world) < at_least:
         return None
-    up_head = R_world[upright, skeleton.index("head")][:, 2, :].median(0).values
+    up_head = R_world[:, skeleton.index("head"), 2, :].median(0).values
     sin, cos = math.sin(_NATURAL_PITCH), math.cos(_NATURAL_PITCH)
     return swing_between(up_head.new_tensor([-sin, 0.0, cos]), up_head)
 

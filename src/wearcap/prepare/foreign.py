@@ -17,7 +17,6 @@ from torch import Tensor
 from wearcap.body.anatomy import at_landmarks, crown_over_head
 from wearcap.body.foreign_tree import ForeignTree, foreign_tree, joint_roles, standing_rotation, straightness
 from wearcap.body.joint_matching import ancestors, convention
-from wearcap.body.landmarks import with_head_face
 from wearcap.body.position_fit import fit_positions
 from wearcap.body.retarget import fit_offsets, retarget
 from wearcap.body.skeleton import xsens23
@@ -36,7 +35,7 @@ from wearcap.prepare.foreign_conventions import (
     with_toes,
 )
 from wearcap.prepare.foreign_files import Take, read_take
-from wearcap.prepare.levels import Levels, face_in, levels_in, walking_face, with_levels
+from wearcap.prepare.levels import Levels, face_in, levels_in, pelvis_in, walking_face, with_levels
 from wearcap.recording.motion import Motion
 
 LEAST_STRAIGHT = 0.12
@@ -130,23 +129,21 @@ def read_foreign_motion(
     take = with_thorax(take, unit_m)
     R_ours_rest, odd = standing_rotation(take.rest, found)
     up, forward = find_axes(take, found, R_ours_rest, given, unit_m)
-    R_world_file = axes_rotation(path, up, forward)
+    R_world_file, naming = axes_rotation(path, up, forward), convention(take.names)
     t_world = take.t @ R_world_file.T * unit_m
-    naming = convention(take.names)
     with placed(path):
         tree = foreign_tree(path.name.split(".")[0], take.parents, R_world_file @ take.R, t_world, found, R_ours_rest)
         # CMU's head frames are those of markers, in whatever format.
         trusted = R_ours_rest is not None and not naming.startswith("CMU")
-        face = _face(tree, take.timestamps, len(own.t), trusted, levels)
-        tree = _with_anatomy(tree, face, t_world[:, _above(take.parents, found.head)], naming)
+        tree = _levelled(tree, take.timestamps, len(own.t), trusted, levels)
+        above_head = [joint for joint in range(len(take.parents)) if found.head in ancestors(take.parents, joint)[1:]]
+        tree = at_landmarks(tree, crown_over_head(tree, t_world[:, above_head]), naming)
         motion = _fitted(tree, take.timestamps)
-    shown = motion.sliced(len(own.t), len(motion)) if siblings else motion
-    soles = levels_in([shown]).R_joint_sole if levels is None else levels.R_joint_sole
-    motion = with_levels(motion, Levels(None, soles)).sliced(0, len(own.t))
+    shown = levels or levels_in([motion.sliced(len(own.t), len(motion)) if siblings else motion])
+    motion = with_levels(motion, Levels(None, shown.R_joint_sole)).sliced(0, len(own.t))
     if not (motion.R_parent_joint.isfinite().all() and motion.t_world_root.isfinite().all()):
         raise WearcapError("no skeleton can be fitted to its joints", path, "joints apart from one another")
-    roles = joint_roles(found)
-    straight = straightness(take.t, found).max().item() if odd else 1.0
+    roles, straight = joint_roles(found), straightness(take.t, found).max().item() if odd else 1.0
     motion_of = f"the motion of {len(siblings)} clips" if siblings else "the motion"
     report = ForeignReport(
         path.name,
@@ -159,7 +156,7 @@ def read_foreign_motion(
         f"{forward} is ahead in the bind pose" if odd == "" else f"{forward} is our x",
         "the bind pose" if odd == "" else f"{motion_of}, for in the bind pose {odd}",
         {ours: take.names[joint] for ours, joint in roles.items()},
-        _residuals(motion, {name: tree.place(name)[: len(motion)] for name in roles}),
+        _residuals(motion, {name: tree.place(name)[: len(motion)] for name in roles if name in tree.skeleton}),
         _notes(take, straight, how),
     )
     return ForeignMotion(replace(motion, provenance={"source": path.name, "format": take.format}), report)
@@ -214,33 +211,23 @@ def _fitted(tree: ForeignTree, timestamps: Float[Tensor, "time"]) -> Motion:
     return Motion(timestamps.double(), target, R.float(), t.float())
 
 
-def _face(
+def _levelled(
     tree: ForeignTree, timestamps: Float[Tensor, "time"], own: int, trusted: bool, levels: Levels | None
-) -> Float[Tensor, "3 3"] | None:
-    """Tilt of the head's frame: that of the wearer's walking in the file (its first `own` frames), else the wearer's."""
-    if levels is not None and levels.R_head_face is None:
-        return None
-    motion = Motion(timestamps.double(), tree.skeleton, tree.R_parent_joint, tree.t_world_root)
-    shown = motion.sliced(0, own)
-    walks = None if trusted else walking_face([shown])
-    if walks is not None or levels is not None:
-        return walks if walks is not None else levels and levels.R_head_face
-    return face_in([motion.sliced(own, len(motion)) if len(motion) > own else shown], trusted)
-
-
-def _with_anatomy(
-    tree: ForeignTree, R_head_face: Float[Tensor, "3 3"] | None, ends: Float[Tensor, "time end 3"], naming: str
 ) -> ForeignTree:
-    """The tree with a level head and its joints at our landmarks; `ends` are places of what the file has in the head."""
-    if R_head_face is not None:
-        tree = replace(tree, R_parent_joint=with_head_face(tree.skeleton, tree.R_parent_joint, R_head_face))
-    R_head = tree.R_world[:, tree.skeleton.index("head")]
-    return at_landmarks(tree, crown_over_head(R_head, tree.place("head"), ends), naming)
+    """The tree with level axes of head and pelvis, by `levels` or as its frames beyond the file's `own` show them.
 
-
-def _above(parents: Sequence[int], head: int) -> list[int]:
-    """Joints and ends that move with the head."""
-    return [joint for joint in range(len(parents)) if head in ancestors(parents, joint)[1:]]
+    A head whose frame is not trusted is level where its wearer walks in the file itself.
+    """
+    motion = Motion(timestamps.double(), tree.skeleton, tree.R_parent_joint, tree.t_world_root)
+    of_file = motion.sliced(0, own)
+    shown = [motion.sliced(own, len(motion)) if len(motion) > own else of_file]
+    face = face_in(shown, trusted) if levels is None else levels.R_head_face
+    pelvis = pelvis_in(shown) if levels is None else levels.R_pelvis
+    if not trusted and face is not None:
+        walks = walking_face(of_file)
+        face = face if walks is None else walks
+    tree = tree if pelvis is None else tree.turned(0, pelvis)
+    return tree if face is None else tree.turned(tree.skeleton.index("head"), face)
 
 
 def _residuals(motion: Motion, goals: dict[str, Float[Tensor, "time 3"]]) -> dict[str, tuple[float, float]]:

@@ -11,7 +11,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from wearcap.body.landmarks import head_level, with_head_face
+from wearcap.body.foreign_tree import SIDES
+from wearcap.body.landmarks import head_level, upright_frames, with_head_face
 from wearcap.body.skeleton import Site, Skeleton
 from wearcap.geometry.rotation import swing_between
 from wearcap.recording.motion import Motion
@@ -21,20 +22,25 @@ STILL_M_S = 0.12
 LOW_M = 0.03
 """Height above the usual lowest ankle within which a slow foot stands."""
 LEAST_FRAMES = 5
-WALK_M_S, WALK_S = (0.5, 3.5), 1.5
-"""Speed (m/s) of the pelvis over the floor of who walks or jogs, and time (s) from which that shows how a head looks."""
+WALK_M_S, WALK_S = (0.5, 2.2), 1.5
+"""Speed (m/s) of the pelvis over the floor of who walks, and time (s) from which that shows how a head looks."""
 _LARGEST_TILT = 0.6
 """Largest tilt (rad) of a sole that is taken for a frame's; more is a foot that does not stand."""
+_LEG_UPRIGHT = 0.97
+"""Cosine of the largest angle (14°) between the legs of who stands and the vertical."""
+_PELVIS_TILT = 0.14
+"""Mean tilt (rad) of an upright person's pelvis from which its frame is taken to be tilted, not the person."""
 _NOD = 0.35
 """Tilt (rad) of an upright person's head from which the bind pose's frame of the head is doubted."""
 
 
 @dataclass(frozen=True)
 class Levels:
-    """Tilts of the captured frames: of the head, and of ankles and toes by joint; None or absent where not known."""
+    """Tilts of the captured frames: of head and pelvis, and of ankles and toes by joint; None or absent where level or not known."""
 
     R_head_face: Float[Tensor, "3 3"] | None
     R_joint_sole: dict[str, Float[Tensor, "3 3"]]
+    R_pelvis: Float[Tensor, "3 3"] | None = None
 
 
 def levels_in(motions: Sequence[Motion], head_trusted: bool = False) -> Levels:
@@ -52,34 +58,42 @@ def levels_in(motions: Sequence[Motion], head_trusted: bool = False) -> Levels:
             direction = torch.nn.functional.normalize(up.median(0).values, dim=0)
             if direction[2] > torch.tensor(_LARGEST_TILT).cos():
                 soles[name] = swing_between(direction.new_tensor([0.0, 0.0, 1.0]), direction)
-    return Levels(face_in(motions, head_trusted), soles)
+    return Levels(face_in(motions, head_trusted), soles, pelvis_in(motions))
 
 
 def face_in(motions: Sequence[Motion], trusted: bool = False) -> Float[Tensor, "3 3"] | None:
-    """Tilt of the head's frame in motions of one wearer, from their walking where they walk, else from upright frames.
+    """Tilt of the head's frame in the upright frames of motions of one wearer.
 
     A trusted frame is corrected only if it is clearly off.
     """
-    face = walking_face(motions)
-    if face is None:
-        face = head_level(motions[0].skeleton, torch.cat([motion.R_parent_joint for motion in motions]))
+    face = head_level(motions[0].skeleton, torch.cat([motion.R_parent_joint for motion in motions]))
     return None if face is not None and trusted and face[2, 2] > math.cos(_NOD) else face
 
 
-def walking_face(motions: Sequence[Motion]) -> Float[Tensor, "3 3"] | None:
-    """Tilt of the head's frame in the frames in which the wearer walks; None where that is for less than `WALK_S`."""
-    walks, seconds = [], 0.0
+def pelvis_in(motions: Sequence[Motion]) -> Float[Tensor, "3 3"] | None:
+    """Tilt of the pelvis' frame while trunk and both legs are upright, where it is more than people's."""
+    stands = []
     for motion in motions:
-        step_s = (motion.timestamps[-1] - motion.timestamps[0]).item() / max(1, len(motion) - 1)
-        half = max(1, round(0.25 / max(step_s, 1e-3)))  # a mean over half a second, which sway does not move
-        if len(motion) <= 2 * half:
-            continue
-        path = motion.t_world_root[2 * half :, :2] - motion.t_world_root[: -2 * half, :2]
-        speed = path.norm(dim=-1) / (2 * half * step_s)
-        R = motion.R_parent_joint[half:-half][(speed > WALK_M_S[0]) & (speed < WALK_M_S[1])]
-        walks.append(R)
-        seconds += step_s * len(R)
-    return head_level(motions[0].skeleton, torch.cat(walks)) if seconds >= WALK_S else None
+        legs = torch.stack([motion.joint(f"{side}_hip").t - motion.joint(f"{side}_ankle").t for side in SIDES])
+        stands.append((legs[..., 2] > _LEG_UPRIGHT * legs.norm(dim=-1)).all(0))
+    local = torch.cat([motion.R_parent_joint[frames] for motion, frames in zip(motions, stands)])
+    R = upright_frames(motions[0].skeleton, local)
+    if len(R) < LEAST_FRAMES:
+        return None
+    up = torch.nn.functional.normalize(R[:, 0, 2].median(0).values, dim=0)
+    return swing_between(up.new_tensor([0.0, 0.0, 1.0]), up) if up[2] < math.cos(_PELVIS_TILT) else None
+
+
+def walking_face(motion: Motion) -> Float[Tensor, "3 3"] | None:
+    """Tilt of the head's frame in the frames in which the wearer walks; None where that is for less than `WALK_S`."""
+    step_s = (motion.timestamps[-1] - motion.timestamps[0]).item() / max(1, len(motion) - 1)
+    half = max(1, round(0.25 / max(step_s, 1e-3)))  # a mean over half a second, which sway does not move
+    if len(motion) <= 2 * half:
+        return None
+    path = motion.t_world_root[2 * half :, :2] - motion.t_world_root[: -2 * half, :2]
+    speed = path.norm(dim=-1) / (2 * half * step_s)
+    R = motion.R_parent_joint[half:-half][(speed > WALK_M_S[0]) & (speed < WALK_M_S[1])]
+    return head_level(motion.skeleton, R) if len(R) * step_s >= WALK_S else None
 
 
 def _standing(motion: Motion, side: str) -> Bool[Tensor, "time"]:
