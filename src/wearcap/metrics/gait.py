@@ -24,6 +24,8 @@ _KNEE = ((0, 5, 12, 20, 30, 40, 50, 60, 70, 73, 80, 90, 97, 100), (5, 11, 18, 15
 _CYCLE_S = (0.7, 1.7)
 _PEAK_DEG = 30.0
 """Least flexion of a swing's peak, also of people who hardly lift their feet."""
+SEATED_DEG = 60.0
+"""Flexion from which somebody upright who keeps still sits or squats."""
 _LEVEL_M = 0.08
 """Change of a foot's height from swing to swing, and of the pelvis from cycle to cycle, on level ground."""
 
@@ -89,7 +91,7 @@ def walking_scores(motion: Motion, cycles: list[Float64[Tensor, "_ point"]]) -> 
 
 
 def standing(motion: Motion) -> Bool[Tensor, "time"]:
-    """Frames in which somebody stands upright and quietly: both ankles and the pelvis are still, the trunk is upright."""
+    """Frames in which somebody stands upright and quietly: ankles and pelvis are still, the trunk is upright, nobody sits."""
     still = torch.zeros(len(motion), dtype=torch.bool)
     if len(motion) < 3:
         return still
@@ -102,4 +104,4 @@ def standing(motion: Motion) -> Bool[Tensor, "time"]:
     apart = (t[:, 0] - t[:, 1])[:, :2].norm(dim=-1)
     even = (t[:, 0, 2] - t[:, 1, 2]).abs() < 0.05
     still[1:-1] = slow
-    return still & (trunk[:, 2] > 0.95) & (apart < 0.5 * legs) & even
+    return still & (trunk[:, 2] > 0.95) & (apart < 0.5 * legs) & even & (knee_deg(motion) < SEATED_DEG).all(1)

@@ -16,8 +16,8 @@ from wearcap.metrics.physics import foot_contact, foot_points, foot_skate_cm_s
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 
-LEAST_CYCLES, LEAST_S, SEATED_DEG = 4, 1.0, 60.0
-"""Least cycles of walking, least time (s) of standing or of a recording's walking; knee of somebody who sits."""
+LEAST_CYCLES, LEAST_S = 4, 1.0
+"""Least cycles of walking, least time (s) of standing or of a recording's walking."""
 ROOT_M_S, JOINT_M_S = 8.0, 15.0
 """Speeds that neither the pelvis nor any joint of a person reaches, as `prepare`'s limits have them."""
 
@@ -55,7 +55,7 @@ def _knees(motions: Sequence[Motion]) -> dict[str, float]:
     """The figures of cycles and knees."""
     left, right = (torch.cat(side) for side in zip(*(knee_cycles(motion) for motion in motions)))
     both, knees = torch.cat([left, right]), [knee_deg(motion) for motion in motions]
-    stands = [standing(motion) & (knee < SEATED_DEG).all(1) for motion, knee in zip(motions, knees)]
+    stands = [standing(motion) for motion in motions]
     stood = torch.cat([knee[mask].flatten() for knee, mask in zip(knees, stands)])
     stood_s = sum(int(mask.sum()) / motion.fps for motion, mask in zip(motions, stands))
     known, sides = len(both) >= LEAST_CYCLES, min(len(left), len(right)) >= LEAST_CYCLES
