@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Bool, Float
 
-from wearcap.simulation.people.plan import SIDES, Footprint, Plan
+from wearcap.simulation.people.plan import SIDES, STEP_M, Footprint, Plan
 from wearcap.simulation.people.track import Track, ease, hermite
 
 ROLL_DOWN_S = 0.12
@@ -56,6 +56,8 @@ class _FootMotion:
     yielding: Float[np.ndarray, "time"]
     """Bend by which the knee yields to the load after a landing, and takes back until the heel rises (rad)."""
     running: Bool[np.ndarray, "time"]
+    climbs: Bool[np.ndarray, "time"]
+    """Between a print and one on another step, kerb or stair."""
 
     @classmethod
     def of(cls, plan: Plan, side: str, times: Float[np.ndarray, "time"]) -> "_FootMotion":
@@ -109,10 +111,9 @@ class _FootMotion:
         ankle = ground + np.stack([along * cos, along * sin, above], 1)
         pressure = ground + at.pressure(heel, ball)[:, None] * np.stack([cos, sin, np.zeros_like(cos)], 1)
         contact = at.planted[:, None] & np.stack([roll < 0.01, roll > -0.01], 1)
-        pitch = roll + tilt
-        return cls(
-            ankle, ground, heading, pitch, bend, at.planted, contact, pressure, at["land_s"], at.yielding(), at.running
-        )
+        landed, yielding, pitch = at["land_s"], at.yielding(), roll + tilt
+        gait = (at.planted, contact, pressure, landed, yielding, at.running, at["climbs"])
+        return cls(ankle, ground, heading, pitch, bend, *gait)
 
 
 @dataclass(frozen=True)
@@ -169,6 +170,8 @@ class _Timeline:
         columns["ground"] = np.stack([p.ground for p in prints])
         columns["height"] = columns["ground"][:, 2]
         columns["step"] = np.array([a.rise_to(b) for a, b in pairwise(prints)] + [0.0])
+        steps = np.abs(columns["step"]) > STEP_M
+        columns["climbs"] = steps | np.append(False, steps[:-1])
         self._columns = columns
         self.now = np.clip(np.searchsorted(columns["land_s"], times, side="right") - 1, 0, None)
         self.next = np.minimum(self.now + 1, len(prints) - 1)

@@ -187,7 +187,8 @@ def _height(
     # the pole goes over from leg to leg about each landing
     on_left = blur((left.landed_s > right.landed_s).astype(np.float64), HAND_OVER_S, fps)
     walked = blur(pole_right + on_left * (pole_left - pole_right), 0.022, fps)
-    walks = moving * (1.0 - running) * np.maximum(1.0 - 2.0 * stairs, 0.0)
+    level_ground = 1.0 - blur((left.climbs | right.climbs).astype(np.float64), 0.12, fps)
+    walks = moving * (1.0 - running) * level_ground
     wanted += walks * (walked - wanted)
     return wanted + lower_envelope(np.minimum(top - wanted, 0.0), ENVELOPE_S, fps)
 
