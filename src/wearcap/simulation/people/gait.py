@@ -30,7 +30,7 @@ SOFT_M = 0.008
 LONG_STAND_S = 0.9
 LATE_LIFT = 0.04
 """Height of the heel shortly before it lands, per angle by which the toes are up then (m/rad)."""
-STAIR_WAIT = 0.16
+STAIR_WAIT = 0.18
 """Share of a swing up a stair during which the foot only rises, and of one down during which it only sinks."""
 
 
@@ -256,7 +256,10 @@ def glide(share: Float[np.ndarray, "*batch"], ramps: tuple[float, float] = (0.26
 def advance(share: Float[np.ndarray, "*batch"], rise: Float[np.ndarray, "*#batch"]) -> Float[np.ndarray, "*batch"]:
     """Horizontal progress of a swing that rises by `rise` (m) in total, from 0 to 1."""
     up, down = np.clip(rise / 0.12, 0.0, 1.0), np.clip(-rise / 0.12, 0.0, 1.0)
-    return glide(np.clip((share - STAIR_WAIT * up) / (1.0 - STAIR_WAIT * (up + down)), 0.0, 1.0))
+    both = up + down
+    return glide(
+        np.clip((share - STAIR_WAIT * up) / (1.0 - STAIR_WAIT * both), 0.0, 1.0), (0.26 + 0.1 * both, 0.4 - 0.1 * both)
+    )
 
 
 def bump(share: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
