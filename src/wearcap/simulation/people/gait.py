@@ -34,6 +34,9 @@ STAIR_WAIT = 0.18
 """Share of a swing up a stair during which the foot only rises, and of one down during which it only sinks."""
 
 
+Ramp = float | Float[np.ndarray, "*#batch"]
+
+
 @dataclass(frozen=True)
 class _FootMotion:
     """One foot over time."""
@@ -240,7 +243,7 @@ def toe_bend(roll: Float[np.ndarray, "time"]) -> tuple[Float[np.ndarray, "time"]
     return np.maximum(roll, 0.0) - beyond**3 / scale, 1.0 - beyond**2 * (beyond**2 + 3.0 * TOES_STIFF) / scale**2
 
 
-def glide(share: Float[np.ndarray, "*batch"], ramps: tuple[float, float] = (0.26, 0.4)) -> Float[np.ndarray, "*batch"]:
+def glide(share: Float[np.ndarray, "*batch"], ramps: tuple[Ramp, Ramp] = (0.26, 0.4)) -> Float[np.ndarray, "*batch"]:
     """Progress of a swing, 0 to 1: accelerates over the first of `ramps` (shares of it), decelerates over the last."""
 
     def integral(u):
