@@ -21,7 +21,7 @@ HANGING_RAD = 0.28
 """How far the toes lag behind the smoothest turn, late in mid-swing."""
 TOES_FLAT, TOES_STIFF = 0.21, 0.47
 """Pitch of the sole (rad) up to which the toes stay flat, and what slows their further bend (rad²)."""
-YIELD_RAD, YIELD_S, YIELD_TOP = 0.11, 0.51, 0.33
+YIELD_RAD, YIELD_S, YIELD_TOP = 0.16, 0.51, 0.33
 """Bend by which a knee yields to the load in a long step, for how long, and when it is largest, as a share of that."""
 FULL_STRIKE = -0.33
 """Pitch of a landing sole in a long step (rad)."""
