@@ -121,7 +121,7 @@ PIPELINES = {
 
 QUIET = "callbacks.capture=null"
 TWO = "data.sources.cmu=null"
-THREE = "data.sources.hdm05=null"
+THREE = "people@data.sources=none"
 VAL = "data.val_sources.cmu.root=data/walkers"
 ONE = "data.sources.simulated.root=data/walkers"
 TRAININGS: dict[str, tuple[str, ...]] = {

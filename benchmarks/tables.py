@@ -15,6 +15,8 @@ Prints them and writes OUTPUT/SYSTEM.json (OUTPUT is outputs/tables), which --pu
     egoview       our image encoder: hands in the head camera's pictures
     voxels        codes of the points around the body: what they bring back
     objects       the object encoder's feature: category, extents, instance of objects unknown to it
+    truth         whether data sets move as people do: knees, soles, sides, proportions, by set or by person
+    sets          what each set of motion brings on validation people of the others: one left out at a time
     simulation    how far simulated people differ from CMU's: gait statistics, and a discriminator
 
 Each system is a module tables_SYSTEM.py in this folder with `add_arguments(parser)`, `tables(options, about)` and, where

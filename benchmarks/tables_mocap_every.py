@@ -397,7 +397,7 @@ def _ours(options: argparse.Namespace) -> list[Method]:
     variants = {
         "ours": ("pipeline=mocap_every",),
         "ours, floor fixed at the beginning": ("pipeline=mocap_every", level),
-        UPRIGHT: ("pipeline=mocap_every", "pipeline.carried=1"),
+        UPRIGHT: ("pipeline=mocap_every", "+pipeline.carried=1"),
         UNMIRRORED: ("pipeline=mocap_every", "pipeline.mirror_average=false"),
         "ours, not anchored to the head": ("pipeline=mocap_every", "pipeline.anchor=false"),
         "ours, three frames at a time": ("pipeline=mocap_every_online",),

@@ -33,7 +33,7 @@ def importable(monkeypatch):
 @pytest.fixture(scope="module")
 def datasets(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("datasets")
-    for name in ("cmu", "simulated", "hdm05"):
+    for name in ("cmu", "simulated", "accad", "hdm05", "ui_prmd", "fubot_vr"):
         small_dataset(folder / name)
     return folder
 

@@ -20,15 +20,17 @@ from wearcap.cli.verbs import help_of
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.datasets.amass import write_amass
+from wearcap.metrics.gait import knee_cycles, normal_knee_deg
 from wearcap.prepare import Splits, check_recording
 from wearcap.prepare.mocap import About, CleaningLimits, MocapSettings, foot_patches, mocap_recording, without_glitches
-from wearcap.prepare.mocap_sources import amass_tasks, bvh_tasks, cmu_tasks
+from wearcap.prepare.mocap_sources import Hips, amass_tasks, bvh_tasks, cmu_tasks
 from wearcap.recording import Motion, RecordingStore
 from wearcap.recording.timing import resampled
 
 LIMITS = CleaningLimits(8.0, 15.0, 0.5, 0.06, 0.12)
 SETTINGS = MocapSettings(60.0, (0.09, 0.0, 0.09), LIMITS)
 ABOUT = About("a", "1", "test", "none")
+KEPT = Hips(False, (0.0, 0.0))
 SPLITS = Splits(Path("any.csv"), (("*", "train"),))
 
 
@@ -281,7 +283,9 @@ def test_cmus_split_covers_every_subject_and_keeps_its_largest_for_training():
 def test_every_kind_of_cmu_trial_becomes_a_recording(real_data):
     config = compose("prepare", ["prepare=cmu"])
     splits = Splits.read(splits_dir() / "cmu.csv")
-    tasks = cmu_tasks(real_data / "cmu_mocap", splits, SETTINGS, config.amc_fps, "CMU")
+    tasks = cmu_tasks(
+        real_data / "cmu_mocap", splits, SETTINGS, config.amc_fps, "CMU", Hips(config.repair, list(config.usual_m))
+    )
     indices = [path.read_text(encoding="utf-8") for path in (real_data / "cmu_mocap").glob("index*.csv")]
     assert len(tasks) == sum(len(text.splitlines()) - 1 for text in indices) >= 240
     by_name = {task.name: task for task in tasks}
@@ -300,6 +304,10 @@ def test_every_kind_of_cmu_trial_becomes_a_recording(real_data):
     walk = by_name["35_01"].make()
     assert (walk.activity, by_name["35_01"].split) == ("walk", "test")
     assert walk.motion is not None
+    assert "up" in walk.motion.provenance["hips_moved_m"]
+    cycles = torch.cat(knee_cycles(walk.motion))
+    assert len(cycles) >= 2
+    assert (cycles.mean(0) - normal_knee_deg()).square().mean().sqrt() < 9, "13° with the file's hips"
     path = walk.motion.t_world_root[:, :2].diff(dim=0).norm(dim=-1).sum().item()
     assert 1.0 < path / walk.duration_s < 1.6
 
@@ -311,7 +319,7 @@ def test_xz_and_plain_give_the_same_recording(real_data, tmp_path):
     plain.write_bytes(read_bytes(folder / "35_20.amc.xz"))
     shutil.copy(folder / "35.asf", tmp_path)
     first, second = (
-        next(task for task in bvh_tasks(file, SPLITS, SETTINGS, 120, "CMU")).make().motion
+        next(task for task in bvh_tasks(file, SPLITS, SETTINGS, 120, "CMU", KEPT)).make().motion
         for file in (folder / "35_20.amc.xz", plain)
     )
     assert first is not None
@@ -344,7 +352,7 @@ def foreign_folder(tmp_path) -> Path:
 def test_subjects_follow_a_pattern_the_folder_or_a_name(rule, subjects, warned, foreign_folder):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        tasks = bvh_tasks(foreign_folder / "in", SPLITS, SETTINGS, 120, "none", subject=rule)
+        tasks = bvh_tasks(foreign_folder / "in", SPLITS, SETTINGS, 120, "none", KEPT, subject=rule)
     assert [task.name for task in tasks] == [f"{p}__{p}-{take}" for p in ("anna", "ben") for take in ("a", "b")]
     assert {task.make.args[2].subject for task in tasks} == subjects  # pyright: ignore[reportFunctionMemberAccess]
     assert any("subject=" in str(warning.message) for warning in caught) == warned
@@ -355,7 +363,7 @@ def test_subjects_follow_a_pattern_the_folder_or_a_name(rule, subjects, warned, 
 )
 def test_a_pattern_that_finds_no_subject_is_refused(rule, message, foreign_folder):
     with pytest.raises(WearcapError, match=message):
-        bvh_tasks(foreign_folder / "in", SPLITS, SETTINGS, 120, "none", subject=rule)
+        bvh_tasks(foreign_folder / "in", SPLITS, SETTINGS, 120, "none", KEPT, subject=rule)
 
 
 def test_foreign_files_become_recordings_and_what_the_doctor_refuses_does_not(foreign_folder, capfd):
@@ -390,7 +398,7 @@ def test_foreign_files_become_recordings_and_what_the_doctor_refuses_does_not(fo
 
 @pytest.mark.real
 def test_another_laboratorys_files_land_in_its_people(real_data):
-    tasks = bvh_tasks(real_data / "hdm05" / "trials", SPLITS, SETTINGS, 120, "none")
+    tasks = bvh_tasks(real_data / "hdm05" / "trials", SPLITS, SETTINGS, 120, "none", KEPT)
     subjects = [task.make.args[2].subject for task in tasks]  # pyright: ignore[reportFunctionMemberAccess]
     assert len(subjects) == 232
     assert set(subjects) == {"HDM_bd", "HDM_bk", "HDM_dg", "HDM_mm"}
@@ -400,7 +408,7 @@ def test_another_laboratorys_files_land_in_its_people(real_data):
 @pytest.mark.slow
 def test_standing_soles_lie_on_the_floor(real_data):
     """Heels and toe tips of CMU's standing feet; when soles kept the bind pose's tilt, heels were at 1.5 cm in the median."""
-    tasks = {task.name: task for task in cmu_tasks(real_data / "cmu_mocap", SPLITS, SETTINGS, 120, "CMU")}
+    tasks = {task.name: task for task in cmu_tasks(real_data / "cmu_mocap", SPLITS, SETTINGS, 120, "CMU", KEPT)}
     heights = []
     for name in ("07_01", "10_01", "14_14", "16_05", "35_20", "55_28", "13_29", "29_01", "127_03", "43_02"):
         if name not in tasks:

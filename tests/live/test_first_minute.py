@@ -83,6 +83,23 @@ def test_without_a_floor_the_default_height_and_a_note():
     assert "default" in " ".join(first.found.notes)
 
 
+@pytest.mark.parametrize(("guided", "seconds"), [(False, 8.0), (True, 2.2)])
+def test_who_sits_keeps_the_default_height_and_the_floor(guided, seconds):
+    """A head that is still at 1.12 m: as that of somebody of 1.25 m who stands."""
+    first, motion = FirstMinute(HEAD, guided=guided), acting(1.75, [("stand", 12.0)])
+    motion = replace(motion, t_world_root=motion.t_world_root - torch.tensor([0.0, 0.0, 0.45]))
+    assert Devices().play(motion, first) == pytest.approx(seconds, abs=0.5)
+    assert first.found.skeleton.stature == pytest.approx(xsens23().stature)
+    assert first.found.floor_m == 0.0
+    assert "seated: the height is not known" in " ".join(first.found.notes)
+
+
+def test_a_child_who_walks_is_no_wearer_who_sits():
+    first = FirstMinute(HEAD)
+    Devices().play(acting(1.3, [("stand", 3.0), ("walk", 12.0)]), first)
+    assert first.found.skeleton.stature == pytest.approx(1.3, abs=0.03)
+
+
 def test_a_floor_that_the_device_knows():
     first = FirstMinute(HEAD)
     first.see("head", HeadSample(99.9, None, floor_height=2.5), 4.9)

@@ -11,7 +11,6 @@ import torch
 import wearcap
 from command_line import exit_code
 from mvnx_files import mvnx
-from wearcap.body.skeleton import skeleton_of_height, xsens23
 from wearcap.body.skeletons import smplh52
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
@@ -21,9 +20,7 @@ from wearcap.io.formats.camera_json import write_camera
 from wearcap.io.formats.motion_npz import read_motion, write_motion
 from wearcap.reading import read
 from wearcap.recording import RecordingStore
-from wearcap.tracking.floor import CARRIED
-from wearcap.tracking.stature import estimate_stature, with_stature
-from wearcap_testing import PROJECT, recording_of, swaying_motion
+from wearcap_testing import recording_of, swaying_motion
 
 SECONDS = 1.0
 
@@ -124,47 +121,6 @@ def test_motions_save_themselves_by_their_names(tmp_path):
     assert read_motion(tmp_path / "a.npz").skeleton == motion.skeleton
     with pytest.raises(WearcapError, match=r"ends with \.npz, \.bvh, \.glb, _smplh\.npz"):
         motion.save(tmp_path / "a.fbx")
-
-
-@pytest.mark.parametrize("height", [1.55, 1.9])
-def test_a_height_follows_from_the_head_over_a_known_floor(height):
-    skeleton = skeleton_of_height(height)
-    frames = 1200
-    motion = replace(swaying_motion(frames, skeleton=skeleton), skeleton=skeleton)
-    still = motion.R_parent_joint.clone()
-    still[:] = torch.eye(3)
-    motion = replace(motion, R_parent_joint=still)
-    recording = replace(recording_of(motion, "a"), motion=motion)
-    head, T = recording.head, motion.joint("head")
-    assert head is not None
-    head = replace(
-        head, timestamps=motion.timestamps, R_world_device=T.R, t_world_device=T.t, t_head_device=torch.zeros(3)
-    )
-    head = replace(head, R_head_device=torch.eye(3))
-    unknown = replace(recording, head=head, motion=None, skeleton=None, suit=None)
-    found = estimate_stature(unknown, xsens23())
-    assert found is not None
-    assert found.height_m == pytest.approx(height / CARRIED, abs=0.01), "who carries the head so high is taller"
-    fitted, stature = with_stature(unknown, xsens23())
-    assert stature is not None
-    assert stature.source == "head"
-    assert fitted.skeleton is not None
-    assert abs(fitted.skeleton.stature - found.height_m) < 1e-4
-    given, stature = with_stature(unknown, xsens23(), 1.68)
-    assert str(stature) == "1.68 m, as given"
-    assert given.skeleton is not None
-    assert abs(given.skeleton.stature - 1.68) < 1e-4
-    assert with_stature(replace(unknown, floor=None, points=None), xsens23())[1] is None
-    with pytest.raises(WearcapError, match="a height of 17"):
-        with_stature(unknown, xsens23(), 17.0)
-
-
-@pytest.mark.real
-def test_the_real_aria_wearer_s_height_is_read_off_the_path():
-    """The head is 1.50 m above the floor on this walk, so the wearer is not as tall as the default body."""
-    recording = wearcap.read(PROJECT.parent / "shared" / "data" / "aria_mps")
-    assert recording.skeleton is not None
-    assert recording.skeleton.stature == pytest.approx(1.65, abs=0.05)
 
 
 def test_numbers_of_a_broken_npz_are_named(tmp_path):

@@ -301,7 +301,7 @@ def arguments(experiment: str, data: str, people: str, run: Path, *more: str) ->
         f"data.sources.objects.root={data}",
         f"data.val_sources.objects.root={data}",
         f"data.sources.cmu.root={people}",
-        "++data.sources.hdm05=null",
+        "people@data.sources=none",
         "debug=fast",
         f"hydra.run.dir={run}",
         f"paths.outputs={run.parent}",

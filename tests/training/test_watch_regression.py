@@ -52,7 +52,7 @@ def arguments(experiment: str, data: Path, run: Path, *more: str) -> list[str]:
         f"experiment={experiment}",
         f"data.sources.cmu.root={data}",
         "data.sources.simulated=null",
-        "data.sources.hdm05=null",
+        "people@data.sources=none",
         f"data.val_sources.cmu.root={data}",
         "debug=fast",
         f"hydra.run.dir={run}",

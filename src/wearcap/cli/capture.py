@@ -73,10 +73,8 @@ def captured(config: Any, system: System) -> Motion | None:
     dataset = dataset_folder(config.recording)
     if recording.note and not (dataset / MANIFEST).is_file():
         show(f"read: {escape(recording.note)}")
-    if stature is None:
-        show(f"height unknown, {xsens23().stature:.2f} m assumed: give height=… (m)")
-    elif stature.source != "skeleton":
-        show(f"height: {stature}")
+    if stature.source != "skeleton":
+        show(f"height: {stature}" if stature.known else f"{stature}: give height=… (m)")
     source = CaptureInput.in_dataset(recording, dataset, config.scene, config.metres_per_unit)
     seeds = range(config.seed, config.seed + (config.samples if system.draws else 1))
     cache = None if config.cache is None else Path(config.cache)

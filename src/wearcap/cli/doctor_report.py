@@ -7,6 +7,7 @@ from dataclasses import asdict
 from functools import partial
 
 from hydra.utils import instantiate
+from rich.box import SIMPLE
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
@@ -16,6 +17,7 @@ from wearcap.cli.conf import compose
 from wearcap.cli.stated import stated
 from wearcap.doctor import Report
 from wearcap.doctor.preflight import preflight
+from wearcap.doctor.truth import FIGURES
 from wearcap.reading import examine
 from wearcap.runtime.system import System
 
@@ -29,7 +31,7 @@ def examined(options: argparse.Namespace) -> Report:
     if options.json:
         report = examine(options.path, preflight=check, how=how)
         findings = {name: [asdict(finding) for finding in found] for name, found in report.findings.items()}
-        content = {"source": report.source, "sound": report.sound, "findings": findings}
+        content = {"source": report.source, "sound": report.sound, "findings": findings, "people": report.people}
         print(json.dumps(content, indent=1, ensure_ascii=False))
     else:
         console = Console()
@@ -39,10 +41,12 @@ def examined(options: argparse.Namespace) -> Report:
                 options.path, lambda done, total: progress.update(task, completed=done, total=total), check, how
             )
         console.print(_table(report, options.quiet))
+        if report.people:
+            Console(width=max(console.width, 180)).print(_people(report))
         counts = {severity: len(report.of_severity(severity)) for severity in ("error", "warning", "note")}
         listed = ", ".join(f"{count} {severity}{'s' if count != 1 else ''}" for severity, count in counts.items())
         verdict = "[green]sound[/]" if report.sound else "[bold red]not sound[/]"
-        count = len(report.findings)
+        count = len(report.findings) - len(report.people)
         console.print(f"{count} recording{'s' if count != 1 else ''}: {verdict} ({listed})")
     return report
 
@@ -70,4 +74,13 @@ def _table(report: Report, quiet: bool) -> Table:
         if several:
             cell.append(f"\n{len(names)}: {', '.join(names[:3])}{' …' if len(names) > 3 else ''}", style="italic")
         table.add_row(Text(finding.severity, style=color), Text(finding.check), cell)
+    return table
+
+
+def _people(report: Report) -> Table:
+    """One row per person of a data set: its figures, those out of bounds in the color of warnings."""
+    table = Table("person", *(figure.heading for figure in FIGURES), title="people", title_justify="left", box=SIMPLE)
+    table.columns[0].no_wrap = True
+    for subject, person in report.people.items():
+        table.add_row(subject, *(Text(f.text(person), style=_COLOR["warning"] * f.is_odd(person)) for f in FIGURES))
     return table

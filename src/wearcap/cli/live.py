@@ -62,7 +62,8 @@ def run(config: DictConfig) -> dict[str, Any]:
             _show(f"read: {recording.note}")
         if float(config.speed) > 1:  # too fast for the first minute, which looks at the wearer in real time
             recording, stature = with_stature(recording, xsens23(), config.height)
-            recording = recording if stature else replace(recording, skeleton=xsens23())
+            recording = recording if stature.known else replace(recording, skeleton=xsens23())
+            _show(f"height: {stature}" if stature.known else f"{stature}: give height=… (m)")
         place = CaptureInput.in_dataset(recording, folder, config.scene, config.metres_per_unit)
     require_choice(config.hands, HANDS, f"hands={config.hands}")
     sources, setup = _sources(config, system, place)

@@ -9,6 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 from wearcap.cli.conf import compose, explained, require_writable, splits_dir
 from wearcap.cli.verbs import sources
 from wearcap.doctor import require_sound
+from wearcap.doctor.truth import of_person, people
 from wearcap.errors import WearcapError, nearest
 from wearcap.prepare.engine import Report, Splits, prepare
 from wearcap.recording.store import SPLITS, RecordingStore
@@ -46,6 +47,11 @@ def _show_report(report: Report, store: RecordingStore) -> None:
         minutes = sum(entry.duration_s for entry in entries) / 60
         subjects = len({entry.subject for entry in entries})
         print(f"  {split:5} {len(entries):4} recordings, {subjects:3} subjects, {minutes:7.1f} min")
+    fresh = {store.entries[name].subject for name in report.written}
+    names = sorted(name for name in ours if store.entries[name].subject in fresh)
+    for subject, person in people(store, names).items():
+        if wrong := [f"{finding.what} ({finding.evidence})" for finding in of_person(person)]:
+            print(f"warning: person {subject}: {'; '.join(wrong)}")
 
 
 def main(arguments: list[str]) -> None:

@@ -26,7 +26,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording import FloorTrack, HeadStream, Motion, Recording
 from wearcap.scene.floor import estimate_floor
-from wearcap.tracking.stature import estimate_stature
+from wearcap.tracking.stature import estimate_stature, skeleton_of
 
 UNUSUAL_M = 0.10
 """Difference of heights beyond which a wearer's body is doubtful."""
@@ -96,20 +96,16 @@ def examine_recording(recording: Recording) -> list[Finding]:
 
 def _check_height(recording: Recording) -> list[Finding]:
     """The wearer's height as the head's height over a known floor tells it, against that of the skeleton, if there is one."""
-    own = recording.skeleton or (None if recording.motion is None else recording.motion.skeleton)
-    found, check = estimate_stature(recording, own or xsens23()), Check("height")
-    if found is None:
+    own, check = skeleton_of(recording), Check("height")
+    found = estimate_stature(recording, own or xsens23())
+    if own is None and found.source != "unknown":
+        return [check.note(str(found), "no skeleton in the recording", "Give height=… (m) where it is known.")]
+    if own is None or not found.known:
         return []
-    if own is None:
-        fix = "Give height=… (m) where it is known better."
-        return [check.note(str(found), "no skeleton in the recording", fix)]
     evidence = f"{found}; the skeleton is {own.stature:.2f} m tall"
     if abs(found.height_m - own.stature) > UNUSUAL_M:
-        return [
-            check.warning(
-                "the body does not fit how high the head is carried", evidence, f"Give height={found.height_m:.2f}."
-            )
-        ]
+        what, fix = "the body does not fit how high the head is carried", f"Give height={found.height_m:.2f}."
+        return [check.warning(what, evidence, fix)]
     return [check.ok("the body fits how high the head is carried", evidence)]
 
 

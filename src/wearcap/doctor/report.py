@@ -1,7 +1,7 @@
 """The doctor's findings by recording, the worst first."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partialmethod
 
 from wearcap.errors import WearcapError
@@ -58,10 +58,12 @@ def refusal(error: WearcapError, check: str = "reading") -> Finding:
 
 @dataclass(frozen=True)
 class Report:
-    """Findings of every examined recording."""
+    """Findings of every examined recording, and of every person of a data set ("person NAME")."""
 
     source: str
     findings: dict[str, tuple[Finding, ...]]
+    people: dict[str, dict[str, float]] = field(default_factory=dict)
+    """Figures of a data set's people (`metrics.truth`)."""
 
     def of_severity(self, *severities: str) -> list[tuple[str, Finding]]:
         """(recording, finding) of these severities."""

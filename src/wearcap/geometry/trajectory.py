@@ -83,14 +83,15 @@ def slerp(
 
 
 def interpolate_clamped(
-    timestamps: Float64[Tensor, "time"], value: Float[Tensor, "time"], at: Float64[Tensor, "new_time"]
-) -> Float[Tensor, "new_time"]:
-    """Values at any times, by linear interpolation; beyond the ends they are constant."""
+    timestamps: Float64[Tensor, "time"], value: Float[Tensor, "time *rest"], at: Float64[Tensor, "*new"]
+) -> Float[Tensor, "..."]:
+    """Values (of shape `*new *rest`) at any times, by linear interpolation; beyond the ends they are constant."""
     if len(timestamps) == 1:
-        return value.expand(len(at)).clone()
-    right = torch.searchsorted(timestamps, at).clamp(1, len(timestamps) - 1)
+        return value[0].expand(*at.shape, *value.shape[1:]).clone()
+    right = torch.searchsorted(timestamps, at.contiguous()).clamp(1, len(timestamps) - 1)
     share = ((at - timestamps[right - 1]) / (timestamps[right] - timestamps[right - 1])).clamp(0, 1)
-    return value[right - 1] + share.to(value.dtype) * (value[right] - value[right - 1])
+    share = share.to(value.dtype).reshape(*at.shape, *[1] * (value.ndim - 1))
+    return value[right - 1] + share * (value[right] - value[right - 1])
 
 
 def nearest_frames(timestamps: Float64[Tensor, "time"], at: Float64[Tensor, "new_time"]) -> Int64[Tensor, "new_time"]:

@@ -20,6 +20,7 @@ from wearcap.live.setup import Seat, Setup, hand_seat, head_seat
 from wearcap.live.wearing import Seen, Window
 from wearcap.sensors import packets
 from wearcap.sensors.samples import HeadSample, SuitPiece, WatchSample, WristSample
+from wearcap.tracking.stature import UNKNOWN, height_over, source_of
 
 LOOK_EVERY_S = 0.1
 SHORT_S = 0.5
@@ -83,6 +84,8 @@ class FirstMinute:
         self._head, self._floor_m, self._own_floor_m = head_seat(), None, None
         self._measured = False
         """Whether the height is known better than by the default."""
+        self._source = "unknown"
+        """What the head's path showed of the height (`tracking.stature.source_of`)."""
         self._hanging: dict[str, Tensor] = {}
         """Orientation of hanging devices, "time 3 3"."""
         self._hanging_m: dict[str, float] = {}
@@ -228,9 +231,9 @@ class FirstMinute:
         head = self._window(HEAD, self._now_s - HOLD_S)
         if not self._measured and self.height_m is not None:
             early = self._window(HEAD, self._now_s - SHORT_S)
-            self._measured = early is not None and self._measure(early.v[:, 2].median().item())
+            self._measured = early is not None and self._measure(early)
         elif not self._measured and head is not None and self._is_standing(head):
-            self._measured = self._measure(head.v[:, 2].median().item())
+            self._measured = self._measure(head)
         placed = not self._missing and (self.tracked or not self._wrists)
         arms = placed or (head is not None and self._see_arms(head, waited))
         late = waited > (DEVICES_S if self._missing or not arms else SOON_S)
@@ -242,13 +245,10 @@ class FirstMinute:
     def _measure_path(self) -> None:
         """Height of a wearer who did not stand still, from how high the head is carried, else the default."""
         path = self._window(HEAD, max(self._now_s - SOON_S, self._hold_s))
-        if path is not None and self._measure(path.v[:, 2].quantile(0.9).item()):
+        if path is not None and self._measure(path, 0.9):
             self.notes.append("The height is rough: the wearer did not stand still.")
-            return
-        self.notes.append(
-            f"Height: the default of {self.skeleton.stature:.2f} m, since the wearer did not stand still on a known floor. "
-            "Give the height, or use the guided first minute."
-        )
+        else:
+            self._default_height(", since the wearer did not stand still on a known floor")
 
     def _is_standing(self, head: Window) -> bool:
         return not _sways(head) and rotation.mean_rotation(head.R)[2, 2].item() > 0.8
@@ -278,12 +278,17 @@ class FirstMinute:
 
     # --- measuring ------------------------------------------------------------------------------------------------
 
-    def _measure(self, head_m: float) -> bool:
-        """Height and floor of a wearer whose head joint is at `head_m` while upright; whether the height is known."""
-        floor_m = self._floor_below(head_m)
+    def _measure(self, head: Window, upright: float = 0.5) -> bool:
+        """Height and floor of a wearer by the quantile of the head's height that is upright; whether the height is known."""
+        head_m = head.v[:, 2].quantile(upright).item()
+        floor_m, self._source = self._floor_below(head_m), "unknown"
         if self.height_m is None:
-            height_m = None if floor_m is None else wearing.height_over(head_m - floor_m, self.skeleton)
-            if height_m is None or floor_m is None:
+            if floor_m is None:
+                return False
+            height_m = height_over(head_m - floor_m, self.skeleton, 1.0)
+            self._source = source_of(height_m, head.timestamps, head.v)
+            if self._source != "head":
+                self._floor_m = None if self._source == "unknown" else floor_m
                 return False
             self.skeleton = skeleton_of_height(height_m, self.skeleton)
             self.notes.append(f"Height: {height_m:.2f} m, from the head {head_m - floor_m:.2f} m above the floor.")
@@ -300,9 +305,15 @@ class FirstMinute:
         self._floor_m = floor_m
         return True
 
+    def _default_height(self, why: str = "") -> None:
+        """Note that the default stands for the height; somebody who sits is the reason before any other."""
+        why = why if self._source == "unknown" else f" ({UNKNOWN[self._source]})"
+        guide = "" if self.guided else ", or use the guided first minute"
+        self.notes.append(f"Height: the default of {self.skeleton.stature:.2f} m{why}. Give the height{guide}.")
+
     def _floor_below(self, head_m: float) -> float | None:
         """Floor height (m) that is believed below an upright head joint at `head_m`: the device's, that of last time, 0."""
-        low, high = wearing.STANDING_M
+        low, high = wearing.HEAD_M
         if self.height_m is not None:
             upright = self.skeleton.height_of("head")
             low, high = upright - AGREE_M, upright + AGREE_M
@@ -387,8 +398,8 @@ class FirstMinute:
         self.notes.append(note)
         step = self._steps[0]
         head = self._window(HEAD, self._now_s - HOLD_S)
-        if step == STAND and (head is None or not self._measure(head.v[:, 2].median().item())):
-            self.notes.append(f"Height: the default of {self.skeleton.stature:.2f} m.")
+        if step == STAND and (head is None or not self._measure(head)):
+            self._default_height()
         elif step in (ARMS, RAISE) and head is not None:
             self._see_arms(head, math.inf)
         self._next()
@@ -427,12 +438,10 @@ class FirstMinute:
         self._head = replace(self._head, R_joint_device=level)
         head = self._window(HEAD, self._hold_s)
         assert head is not None
-        head_m = head.v[:, 2].median().item()
-        if not self._measure(head_m):
-            self.notes.append(
-                f"Height: the default of {self.skeleton.stature:.2f} m, since the floor is not known. Give the height."
-            )
-            self._floor_m = head_m - self.skeleton.height_of("head")
+        if not self._measure(head):
+            self._default_height(", since the floor is not known")
+            if self._floor_m is None:
+                self._floor_m = head.v[:, 2].median().item() - self.skeleton.height_of("head")
         return True
 
     def _arms(self) -> bool:

@@ -12,12 +12,10 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from wearcap.body.skeleton import Skeleton
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
 from wearcap.sensors.initialization import yaw_between
-from wearcap.tracking.stature import HEIGHTS_M
 
 KEEP_S = 20.0
 """Time (s) of samples that are kept of a device."""
@@ -29,8 +27,8 @@ CLOCK_BACK_S = 1.0
 """Step back in time (s) after which a device's clock is taken as set anew."""
 STILL_M, STILL_DEG = 0.04, 8.0
 """Largest distance (m) and angle from the mean of someone who stands still: people sway by some centimetres."""
-STANDING_M = (1.1, 2.1)
-"""Heights (m) of a standing wearer's head joint above the floor that are believed."""
+HEAD_M = (0.9, 2.1)
+"""Heights (m) above the floor that are believed of the head joint of a wearer who stands, or sits on a chair."""
 BELOW_M = 0.25
 """Least distance (m) of hanging hands below the head."""
 HAND_LEAST = 0.25
@@ -98,12 +96,6 @@ def moves(window: Window, watch: bool) -> bool:
         return True
     R = rotation.mean_rotation(window.R)
     return math.degrees(rotation.geodesic(R.expand_as(window.R), window.R).max().item()) > STILL_DEG
-
-
-def height_over(above_m: float, skeleton: Skeleton) -> float | None:
-    """Height (m) of a wearer whose head joint is `above_m` over the floor; None for one that is no person's."""
-    height_m = above_m * skeleton.stature / skeleton.height_of("head")
-    return height_m if HEIGHTS_M[0] <= height_m <= HEIGHTS_M[1] else None
 
 
 def level_head(R_world_device: Float[Tensor, "time 3 3"], most_deg: float = 35.0) -> Float[Tensor, "3 3"] | None:

@@ -5,10 +5,11 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from scipy.signal import find_peaks
 from torch import Tensor
 
+from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.recording.motion import Motion
 
 POINTS = 101
@@ -45,26 +46,46 @@ def knee_deg(motion: Motion) -> Float[Tensor, "time side"]:
     return torch.atan2(across, (thigh * shank).sum(-1)).rad2deg().float()
 
 
-def knee_cycles(motion: Motion) -> list[Float[Tensor, "cycle point"]]:
-    """Flexion (degrees) of left and right knees over all cycles of straight, level walking, from peak of swing to peak."""
-    pelvis = motion.t_world_root.double().numpy()
+def cycle_times(motion: Motion) -> list[Float64[Tensor, "cycle point"]]:
+    """Times (s) of the points of all cycles in which the left and the right knee walk straight ahead on level ground."""
+    pelvis = motion.joint("pelvis")
+    path, ahead = pelvis.t.double().numpy(), pelvis.R[..., 0].double().numpy()
     times, flexion = motion.timestamps.numpy(), knee_deg(motion).numpy()
     found = []
     for k, side in enumerate(("left", "right")):
-        ankle, curves = motion.joint(f"{side}_ankle").t[:, 2].numpy(), []
+        ankle, cycles = motion.joint(f"{side}_ankle").t[:, 2].numpy(), []
         peaks, _ = find_peaks(flexion[:, k], _PEAK_DEG, distance=max(round(0.45 * motion.fps), 1), prominence=15)
         for start, stop in pairwise(peaks.tolist()):
-            seconds, path = times[stop] - times[start], pelvis[start : stop + 1]
-            steps = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=-1)
-            gone = np.linalg.norm(path[-1, :2] - path[0, :2])
-            level = max(abs(ankle[stop] - ankle[start]), abs(path[-1, 2] - path[0, 2])) < _LEVEL_M
-            straight = gone > 0.9 * steps.sum()
-            walked = _CYCLE_S[0] < seconds < _CYCLE_S[1] and SPEED_M_S[0] < gone / seconds < SPEED_M_S[1]
-            if level and straight and walked:
-                at = np.linspace(times[start], times[stop], POINTS)
-                curves.append(np.interp(at, times[start : stop + 1], flexion[start : stop + 1, k]))
-        found.append(torch.from_numpy(np.array(curves).reshape(-1, POINTS)).float())
+            seconds, gone = times[stop] - times[start], path[stop] - path[start]
+            steps = np.linalg.norm(np.diff(path[start : stop + 1, :2], axis=0), axis=-1).sum()
+            far = np.linalg.norm(gone[:2])
+            level = max(abs(ankle[stop] - ankle[start]), abs(gone[2])) < _LEVEL_M
+            walked = _CYCLE_S[0] < seconds < _CYCLE_S[1] and SPEED_M_S[0] < far / seconds < SPEED_M_S[1]
+            forward = ahead[start : stop + 1].mean(0) @ gone > 0.8 * far
+            if level and walked and forward and far > 0.9 * steps:
+                cycles.append(np.linspace(times[start], times[stop], POINTS))
+        found.append(torch.from_numpy(np.array(cycles).reshape(-1, POINTS)).double())
     return found
+
+
+def knees_over(motion: Motion, cycles: list[Float64[Tensor, "_ point"]]) -> list[Float[Tensor, "_ point"]]:
+    """Flexion (degrees) of left and right knees at the times of cycles, which may be another motion's on the same clock."""
+    return [interpolate_clamped(motion.timestamps, flexion, at) for flexion, at in zip(knee_deg(motion).T, cycles)]
+
+
+def knee_cycles(motion: Motion) -> list[Float[Tensor, "_ point"]]:
+    """Flexion (degrees) of left and right knees over `cycle_times`, from peak of swing to peak of swing."""
+    return knees_over(motion, cycle_times(motion))
+
+
+def walking_scores(motion: Motion, cycles: list[Float64[Tensor, "_ point"]]) -> dict[str, float]:
+    """`stance_knee_deg`, the median over cycles of the mean flexion in `STANCE`, and `knee_curve_rms_deg`, the deviation
+    of the mean curve from the normal one; none without a cycle."""
+    curves = torch.cat(knees_over(motion, cycles))
+    if not len(curves):
+        return {}
+    off = (curves.mean(0) - normal_knee_deg()).square().mean().sqrt()
+    return {"stance_knee_deg": curves[:, STANCE].mean(1).median().item(), "knee_curve_rms_deg": off.item()}
 
 
 def standing(motion: Motion) -> Bool[Tensor, "time"]:

@@ -19,7 +19,7 @@ from wearcap.body.kinematics import forward_kinematics
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry.rigid import Rigid
-from wearcap.metrics import physics, position
+from wearcap.metrics import gait, physics, position
 from wearcap.recording.motion import Motion
 
 MAX_DECIMALS = 6
@@ -28,11 +28,14 @@ WIDTH = 80
 LEAST_OF_TRUTH = 0.05
 """A value of the truth (in the metric's unit) below which a ratio to it says nothing."""
 P95 = "p95_"
-"""Beginning of the names of 95th percentiles, which the thesis averages over sequences (Table 6.6); all other metrics are
-averaged over frames."""
+"""Beginning of the names of 95th percentiles, which the thesis averages over sequences (Table 6.6)."""
 
 TRUTH = "truth_"
 """Beginning of the names of scores that belong to the true motion."""
+
+PER_RECORDING = (P95, "stance_knee_", "knee_curve_")
+"""Beginnings of the names of scores, also behind `TRUTH`, that are averaged over the recordings that have them; all others
+are averaged over frames."""
 
 RATIOS = {"skate_ratio": "foot_skate_cm_s", "jitter_ratio": "jitter_m_s3"}
 """Scores that are shares of the truth's, and what of."""
@@ -110,7 +113,15 @@ def evaluate_motion(
         **plausible,
         **{f"{TRUTH}{name}": value for name, value in plausible_true.items()},
     }
-    return {name: float(value) for name, value in scores.items()}
+    return {name: float(value) for name, value in scores.items()} | both_walking(prediction, truth)
+
+
+def both_walking(prediction: Motion, truth: Motion) -> dict[str, float]:
+    """How the knees of a captured motion and of the truth move over the truth's walking cycles (`gait.walking_scores`);
+    nothing where it has none. Both have the same timestamps."""
+    cycles = gait.cycle_times(truth)
+    own = gait.walking_scores(truth, cycles)
+    return gait.walking_scores(prediction, cycles) | {f"{TRUTH}{name}": value for name, value in own.items()}
 
 
 def _double_pose(motion: Motion) -> Rigid:
@@ -148,8 +159,8 @@ def _span(motion: Motion) -> str:
 
 
 def aggregate(rows: list[Row]) -> dict[str, Summary]:
-    """Mean over recordings within each seed, weighted by frames (`P95`: equally), then mean and
-    spread over seeds. Scores that are NaN (no contact, too few frames) are ignored. Where there are both, `RATIOS` of
+    """Mean over recordings within each seed, weighted by frames (`PER_RECORDING`: equally), then mean
+    and spread over seeds. Scores that are NaN or missing (no contact, no walking, too few frames) are ignored. Where there are both, `RATIOS` of
     these means to the truth's are added.
 
     Raises WearcapError unless every seed was scored on the same recordings, once each.
@@ -168,7 +179,8 @@ def aggregate(rows: list[Row]) -> dict[str, Summary]:
         for recordings in by_seed.values():
             scored = [(row.scores.get(name, math.nan), row.frames) for row in recordings.values()]
             known = [(score, frames) for score, frames in scored if not math.isnan(score)]
-            weighted = [(score, 1 if name.startswith(P95) else frames) for score, frames in known]
+            equally = name.removeprefix(TRUTH).startswith(PER_RECORDING)
+            weighted = [(score, 1 if equally else frames) for score, frames in known]
             total = sum(weight for _, weight in weighted)
             means.append(sum(score * weight for score, weight in weighted) / total if total else math.nan)
         by_metric[name] = means

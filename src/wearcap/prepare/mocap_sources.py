@@ -5,10 +5,12 @@ import re
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from itertools import takewhile
 from pathlib import Path
+
+from torch import Tensor
 
 from wearcap.boundary.opening import understood
 from wearcap.boundary.texts import numbered_lines
@@ -18,19 +20,28 @@ from wearcap.io.datasets.amass import read_amass
 from wearcap.prepare.engine import NOTE, Splits, Task, content_hash, source_folder
 from wearcap.prepare.foreign import read_foreign_motion, straightest
 from wearcap.prepare.foreign_conventions import Mapping, read_mapping
-from wearcap.prepare.foreign_files import asf_beside
+from wearcap.prepare.foreign_files import Take, asf_beside
+from wearcap.prepare.hips import find_shift, with_shift
 from wearcap.prepare.levels import Levels, levels_in
 from wearcap.prepare.mocap import About, MocapSettings, mocap_recording
 from wearcap.recording.recording import Recording
 
-CMU_VERSION, BVH_VERSION, AMASS_VERSION = 4, 2, 3
+CMU_VERSION, BVH_VERSION, AMASS_VERSION = 5, 3, 3
 """Versions of the conversions, increased when the same source and settings yield another recording."""
 
 MOTION_SUFFIXES = (".amc", ".amc.xz", ".amc.gz", ".bvh", ".bvh.xz", ".bvh.gz")
-LEVEL_TRIALS = 6
-"""Number of a subject's trials from which the tilts of head and feet are estimated."""
-AXES_TRIALS = 24
-"""Number of a subject's BVH files among which the straightest are sought."""
+SUBJECT_TRIALS = 24
+"""Number of a subject's trials, spread over all, that show what is constant of them: axes, levels, hip joints."""
+
+
+@dataclass(frozen=True)
+class Hips:
+    """Whether and from where a person's hip joints are moved (`prepare.hips`)."""
+
+    repair: bool
+    usual_m: Sequence[float]
+    """Usual shift ahead and up (m), which is taken for people who neither walk nor stand."""
+
 
 NO_MOTION = ("shape.npz", "stagei.npz")
 """Name suffixes of AMASS's files that hold no motion."""
@@ -43,17 +54,18 @@ def _foreign_recording(
     amc_fps: float | int,
     mapping: Mapping,
     settings: MocapSettings,
+    hips: Hips,
     same_subject: tuple[Path, ...] = (),
 ) -> Recording:
     """One file of motion, fitted to its joints; what was detected is kept in the motion's provenance as `conventions`.
 
-    The tilts of head and feet, and a BVH file's axes, are estimated from `same_subject`, trials of the same subject.
-    Raises WearcapError for an AMC file without a skeleton.
+    The tilts of head and feet, a BVH file's axes and the hips' places are estimated from `same_subject`, trials of the
+    same subject. Raises WearcapError for an AMC file without a skeleton.
     """
-    levels = None if asf is None else _levels(asf, same_subject, amc_fps)
-    siblings = straightest(same_subject, tuple(mapping.joints.items())) if asf is None and same_subject[1:] else ()
+    given = tuple(mapping.joints.items()), mapping.unit_m, mapping.up, mapping.forward
+    levels, siblings, shift = _of_subject(same_subject, asf, amc_fps, given, hips.repair and tuple(hips.usual_m))
     read = read_foreign_motion(file, mapping, amc_fps=amc_fps, asf=asf, levels=levels, siblings=siblings)
-    recording = mocap_recording(read.motion, about, settings)
+    recording = mocap_recording(read.motion if shift is None else with_shift(read.motion, shift), about, settings)
     assert recording.motion is not None
     known = recording.motion.provenance
     notes = [known[NOTE]] if NOTE in known else []
@@ -63,44 +75,62 @@ def _foreign_recording(
 
 
 @cache
-def _levels(asf: Path, files: tuple[Path, ...], amc_fps: float | int) -> Levels | None:
-    """Tilts of a subject's head and feet in the captured frames: CMU's head markers sit 5…45° off, by subject."""
+def _of_subject(
+    files: tuple[Path, ...], asf: Path | None, amc_fps: float | int, given: tuple, usual_m: tuple[float, ...] | bool
+) -> tuple[Levels | None, tuple[Take, ...], Tensor | None]:
+    """What is constant of a subject: tilts of head and feet (of AMC), straight clips (of BVH), shift of the hips.
+
+    CMU's head markers sit 5…45° off, by subject. Files that cannot be read are left out.
+    """
+    mapping = Mapping(dict(given[0]), *given[1:])
+    siblings = straightest(files, given[0]) if asf is None and files[1:] else ()
     motions = []
-    for file in files:
+    for file in files if asf is not None or usual_m else ():
         with suppress(WearcapError):  # reported by the trial's own task
-            read = read_foreign_motion(file, amc_fps=amc_fps, asf=asf, levels=Levels(None, {}))
+            levels = None if asf is None else Levels(None, {})
+            read = read_foreign_motion(file, mapping, amc_fps=amc_fps, asf=asf, levels=levels, siblings=siblings)
             motions.append(read.motion)
-    return levels_in(motions) if motions else None
+    levels = levels_in(motions) if motions and asf is not None else None
+    return levels, siblings, find_shift(motions, usual_m) if motions and isinstance(usual_m, tuple) else None
 
 
 def cmu_tasks(
-    source: str | Path,
+    source: str | Path | Sequence[str | Path],
     splits: Splits,
     settings: MocapSettings,
     amc_fps: float | int,
     license: str,
+    hips: Hips,
     subject: str | None = None,
 ) -> list[Task]:
-    """One task per trial found anywhere below `source`.
+    """One task per trial found anywhere below `source`, a folder or several.
 
     Files are named SUBJECT_TRIAL.amc or .bvh (also .xz, .gz); an .amc needs SUBJECT.asf in its folder. Where a
-    trial exists as both, the AMC is taken. `index.csv` (columns trial, category) provides activities if it exists.
+    trial exists as both, the AMC is taken. A folder's `index.csv` (columns trial, category) provides activities.
     """
-    source = source_folder(source)
-    index, activities = source / "index.csv", {}
-    if index.is_file():
-        with understood("not a list of trials", index, "columns trial,category", errors=csv.Error):
-            rows = csv.DictReader(line for _, line in numbered_lines(index, "table"))
-            activities = {row["trial"]: row.get("category") for row in rows if row.get("trial")}
     trials: dict[str, Path] = {}
-    for path in _motion_files(source):
-        name = _stem(path)
-        if name in trials and path.parent != trials[name].parent:
-            raise WearcapError(f"two trials are called {name!r}: {trials[name]} and {path}", fix="Rename one.")
-        trials.setdefault(name, path)  # .amc comes first
-    subjects = _subjects(source, trials, subject)
+    subjects, activities = dict[str, str](), dict[str, str | None]()
+    for folder in [source] if isinstance(source, str | Path) else source:
+        root, own = source_folder(folder), dict[str, Path]()
+        for path in _motion_files(root):
+            name = _stem(path)
+            known = own.get(name, trials.get(name))
+            if known is not None and path.parent != known.parent:
+                raise WearcapError(f"two trials are called {name!r}: {known} and {path}", fix="Rename one.")
+            own.setdefault(name, path)  # .amc comes first
+        trials, subjects = trials | own, subjects | _subjects(root, own, subject)
+        activities |= _activities(root / "index.csv")
     abouts = {name: About(name, subjects[name], "cmu", license, activities.get(name) or "") for name in trials}
-    return _motion_tasks(trials, abouts, splits, settings, amc_fps, Mapping(), CMU_VERSION)
+    return _motion_tasks(trials, abouts, splits, settings, amc_fps, Mapping(), hips, CMU_VERSION)
+
+
+def _activities(index: Path) -> dict[str, str | None]:
+    """Categories by trial of an index, if it exists."""
+    if not index.is_file():
+        return {}
+    with understood("not a list of trials", index, "columns trial,category", errors=csv.Error):
+        rows = csv.DictReader(line for _, line in numbered_lines(index, "table"))
+        return {row["trial"]: row.get("category") for row in rows if row.get("trial")}
 
 
 def bvh_tasks(
@@ -109,6 +139,7 @@ def bvh_tasks(
     settings: MocapSettings,
     amc_fps: float | int,
     license: str,
+    hips: Hips,
     mapping: str | Path | None = None,
     subject: str | None = None,
     activity: str | None = None,
@@ -139,7 +170,7 @@ def bvh_tasks(
     abouts = {name: About(name, subjects[name], "bvh", license, activities[name]) for name in trials}
     given, how = Mapping() if mapping is None else read_mapping(mapping), Conventions(unit=unit, up=up)
     given = replace(given, unit_m=how.unit_m or given.unit_m, up=given.up if how.up == AUTO else how.up)
-    return _motion_tasks(trials, abouts, splits, settings, amc_fps, given, BVH_VERSION)
+    return _motion_tasks(trials, abouts, splits, settings, amc_fps, given, hips, BVH_VERSION)
 
 
 def _motion_files(source: Path) -> list[Path]:
@@ -163,27 +194,33 @@ def _motion_tasks(
     settings: MocapSettings,
     amc_fps: float | int,
     mapping: Mapping,
+    hips: Hips,
     version: int,
 ) -> list[Task]:
-    groups: dict[str, tuple[str, Path | str | None]] = {}
-    same: dict[tuple[str, Path | str | None], list[Path]] = {}
+    groups, skeletons = dict[str, tuple[str, str]](), dict[str, Path | None]()
+    same: dict[tuple[str, str], list[Path]] = {}
     for name, path in trials.items():
-        skeleton = None
+        asf, digest = None, ""
         with suppress(WearcapError):  # raised again by the trial's own task
-            skeleton = asf_beside(path) if ".amc" in path.name.lower() else _hierarchy(path)
-        groups[name] = (abouts[name].subject, skeleton)
+            asf = asf_beside(path) if ".amc" in path.name.lower() else None
+            digest = _hierarchy(path) if asf is None else content_hash(asf)
+        groups[name], skeletons[name] = (abouts[name].subject, digest), asf
         same.setdefault(groups[name], []).append(path)
-    spread = {
-        group: tuple(files[:: -(-len(files) // (LEVEL_TRIALS if isinstance(group[1], Path) else AXES_TRIALS))])
-        for group, files in same.items()
-    }
+    spread = {group: tuple(files[:: -(-len(files) // SUBJECT_TRIALS)]) for group, files in same.items()}
     digests = {group: content_hash(*files) for group, files in spread.items()}
     tasks = []
     for name, path in trials.items():
-        about, skeleton = abouts[name], groups[name][1]
-        asf = skeleton if isinstance(skeleton, Path) else None
-        make = partial(_foreign_recording, path, asf, about, amc_fps, mapping, settings, spread[groups[name]])
-        described = [asdict(about), asdict(settings), asdict(mapping), amc_fps, version, digests[groups[name]]]
+        about, asf = abouts[name], skeletons[name]
+        make = partial(_foreign_recording, path, asf, about, amc_fps, mapping, settings, hips, spread[groups[name]])
+        described = [
+            asdict(about),
+            asdict(settings),
+            asdict(mapping),
+            asdict(hips),
+            amc_fps,
+            version,
+            digests[groups[name]],
+        ]
         sources = [path] if asf is None else [path, asf]
         tasks.append(Task(name, make, splits.of(about.subject), content_hash(*described, *sources)))
     return tasks

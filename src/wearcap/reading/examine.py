@@ -6,7 +6,8 @@ from pathlib import Path
 
 from wearcap.doctor.agreement import check_files
 from wearcap.doctor.examine import examine_recording, is_empty
-from wearcap.doctor.report import Finding, Report, refusal
+from wearcap.doctor.report import Finding, Report, has_error, refusal
+from wearcap.doctor.truth import of_person, people
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import DETECTED, Conventions
 from wearcap.io.datasets.hps import hps_names, read_hps_sequence
@@ -24,6 +25,7 @@ def examine(
 ) -> Report:
     """Examine a recording, or all in a data set, recording file, MPS folder, motion capture file or folder of them.
 
+    Of a data set its people are reported, too, by the recordings without errors.
     Unreadable files are errors in the report; `progress(done, all)` is called after each recording. `preflight` adds
     findings on a recording and the folder of its files.
     Raises WearcapError when there is nothing to examine.
@@ -43,7 +45,12 @@ def examine(
             findings[name] = tuple(read if read and is_empty(recording) else [*read, *examine_recording(recording)])
         if progress:
             progress(done, len(found))
-    return Report(str(source), findings)
+    store = RecordingStore(source)
+    figures = people(
+        store, [name for name, found in findings.items() if name in store.entries and not has_error(found)]
+    )
+    findings |= {f"person {subject}": tuple(of_person(person)) for subject, person in figures.items()}
+    return Report(str(source), findings, figures)
 
 
 def _patients(path: Path, how: Conventions) -> dict[str, Callable[[], Loaded]]:
