@@ -33,8 +33,8 @@ LATE_LIFT = 0.04
 STAIR_WAIT = 0.18
 """Share of a swing up a stair during which the foot only rises, and of one down during which it only sinks."""
 
-
 Ramp = float | Float[np.ndarray, "*#batch"]
+"""A share of a swing, one for all frames or each frame's own."""
 
 
 @dataclass(frozen=True)
