@@ -28,6 +28,8 @@ FULL_STRIKE = -0.33
 SOFT_M = 0.008
 """Width over which the lowest point of a swinging sole changes from ball to heel."""
 LONG_STAND_S = 0.9
+EARLY_LIFT = 0.02
+"""Height of the sole early in the swing, when it moves away over the floor (m)."""
 LATE_LIFT = 0.04
 """Height of the heel shortly before it lands, per angle by which the toes are up then (m/rad)."""
 STAIR_WAIT = 0.18
@@ -85,6 +87,7 @@ class _FootMotion:
         # once the toes bend no further, the foot goes on about their tip
         tipped = tip[0] - (np.cos(roll - bend) * tip[0] + np.sin(roll - bend) * tip[2])
         rolled = rolled + (1.0 - on_heel) * tipped
+        early = (share / 0.25) ** 3 * ((1.0 - share) / 0.75) ** 9  # the top at 0.25
         late = (share / 0.75) ** 9 * ((1.0 - share) / 0.25) ** 3  # a bump with its top at 0.75
         # height of the ankle over the sole's lowest point (m): a softened maximum over heel, ball and tip
         soft = SOFT_M * lifted
@@ -101,7 +104,9 @@ class _FootMotion:
         width = np.maximum(soft, 1e-5)
         top = points.max(0)
         depth = top + width * np.log(np.exp((points - top) / width).sum(0)) * (soft > 1e-5)
-        raised = at.clearance * lifted + LATE_LIFT * np.maximum(-at.land_pitch_next, 0.0) * late + depth
+        raised = (
+            at.clearance * lifted + EARLY_LIFT * early + LATE_LIFT * np.maximum(-at.land_pitch_next, 0.0) * late + depth
+        )
         tilt, heading = at.mix("tilt", turned), at.mix("heading", turned)
         ground = at.mix("ground", moved[:, None])
         ground[:, 2] = at["height"] + slope * moved + rise * climb(rise, share)

@@ -178,7 +178,7 @@ def _walk_step(plan: Plan, side: str, lift: float, land: float, print_: Footprin
     size = min(stride / 1.35, 1.15) * plan.style.gait.heel_rise
     rise = old.rise_to(print_)
     lift_pitch, land_pitch, clearance = (
-        (0.85, -0.10, 0.10) if running else (1.04 * size**0.39, FULL_STRIKE * size, 0.024)
+        (0.85, -0.10, 0.10) if running else (1.04 * size**0.39, FULL_STRIKE * size, 0.012)
     )
     if rise > STEP_M:
         lift_pitch, land_pitch, clearance = 0.55, 0.06, 0.05
