@@ -15,11 +15,11 @@ ROLL_UP_S = 0.59
 """Time from the flat foot to toe-off."""
 STRIKE_RATE, OFF_RATE = 1.3, 2.1
 """Turn rates of the sole at landing and toe-off, as multiples of its pitch then over these times."""
-TURN_ON = 0.53
+TURN_ON = 0.42
 """Share of a swing in which the turn of the toe-off dies down."""
 HANGING_RAD = 0.28
 """How far the toes lag behind the smoothest turn, late in mid-swing."""
-TOES_FLAT, TOES_STIFF = 0.21, 0.47
+TOES_FLAT, TOES_STIFF = 0.21, 0.4
 """Pitch of the sole (rad) up to which the toes stay flat, and what slows their further bend (rad²)."""
 YIELD_RAD, YIELD_S, YIELD_TOP = 0.16, 0.51, 0.33
 """Bend by which a knee yields to the load in a long step, for how long, and when it is largest, as a share of that."""

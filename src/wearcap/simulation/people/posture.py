@@ -32,7 +32,7 @@ STANCE_BEND = 0.9
 """More bend of a bearing knee in walking than in standing, as a share of the knee's softness."""
 STRIKE_BEND, STRAIGHTEST = 0.104, 0.065
 """Bend of the knee over which the pelvis walks, and the least bend that it leaves to either knee (rad)."""
-HAND_OVER_S = 0.057
+HAND_OVER_S = 0.07
 """Spread of the time about a landing in which the other leg takes the pelvis over."""
 HELP = ("lean", "bend", "twist", "crouch", "ahead", "aside")
 """Trunk motions that help hands to reach, columns of `help_`: as `Plan.lean` (rad), `crouch` and `shift` (m)."""
