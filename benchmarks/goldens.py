@@ -57,6 +57,7 @@ DATA = {
         "video_s=0",
         "returns_m=[8,16]",
         "end_m=24",
+        "check=false",
     ),
     "flats": ("simulated_interactions", "recordings={train: 1, val: 1, test: 1}", "minutes=0.5", "spacing_m=0.05"),
     "objects": ("simulated_objects", "recordings={train: 1, val: 1, test: 1}", "minutes=0.3"),
