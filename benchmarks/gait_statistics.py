@@ -4,15 +4,20 @@ Everything is brought to 30 Hz first, so that rates and marker noise above 15 Hz
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.recording import Recording
+from wearcap.geometry.trajectory import interpolate_clamped
+from wearcap.metrics.gait import HEEL_STRIKE, POINTS, cycle_times, knees_over, normal_knee_deg
+from wearcap.recording import Motion, Recording
 
 FPS = 30
 WINDOW = 2 * FPS
@@ -26,6 +31,18 @@ JOINTS = (
         for name in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle", "toe")
     ),
 )
+
+SPEEDS_M_S = (0.6, 0.95, 1.2, 1.45, 1.9)
+"""Bounds of the speeds by which curves of walking are averaged."""
+FLIGHT = 0.04
+"""Share of a cycle in which neither foot touches the floor, from which on it is run."""
+_NORMAL = {
+    "hip": ((0, 12, 31, 50, 62, 75, 87, 100), (20, 20, 0, -20, -10, 15, 25, 20)),
+    "ankle": ((0, 7, 12, 31, 48, 62, 75, 87, 100), (0, -5, 0, 5, 10, -15, -5, 0, 0)),
+}
+"""Thigh against the vertical (flexion) and foot against the shank (dorsiflexion) of healthy adults at 1.3 to 1.4 m/s
+(degrees), at % from heel strike: the ends of the phases as in J. Perry and J. M. Burnfield, Gait Analysis, 2010 (chapters
+on ankle, hip and total limb), with straight lines between them."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +72,55 @@ def clip_of(recording: Recording) -> Clip:
         average(floor),
         motion.skeleton.height_of("head"),
     )
+
+
+def normal_curves() -> dict[str, Float[Tensor, "point"]]:
+    """Knee, hip and ankle of healthy adults (degrees) from peak to peak of the knee's swing."""
+    share = 100 * ((np.linspace(0, 1, POINTS) - HEEL_STRIKE) % 1.0)
+    others = {name: torch.from_numpy(np.interp(share, *points)).float() for name, points in _NORMAL.items()}
+    return {"knee": normal_knee_deg()} | others
+
+
+def walking_curves(motion: Motion) -> dict[str, Float[Tensor, "cycle *point"]]:
+    """Knee, hip and ankle (degrees) over all cycles of level walking of both legs, and each cycle's speed (m/s)."""
+    ahead = torch.nn.functional.normalize(motion.joint("pelvis").R[..., :2, 0], dim=-1)
+    cycles = [times[[not _is_run(motion, cycle) for cycle in times]] for times in cycle_times(motion)]
+    found = {"knee": knees_over(motion, cycles), "hip": [], "ankle": [], "speed": []}
+    for side, times in zip(("left", "right"), cycles):
+        knee, ankle, toe = (motion.joint(f"{side}_{name}").t for name in ("knee", "ankle", "toe"))
+        thigh = knee - motion.joint(f"{side}_hip").t
+        hip = torch.atan2((thigh[:, :2] * ahead).sum(-1), -thigh[:, 2])
+        upper, lower = motion.skeleton.t_parent_joint[motion.skeleton.indices(f"{side}_ankle", f"{side}_toe")]
+        bent = _between(-upper, lower) - _between(knee - ankle, toe - ankle)
+        for name, angle in (("hip", hip), ("ankle", bent)):
+            found[name].append(interpolate_clamped(motion.timestamps, angle.rad2deg(), times))
+        ends = interpolate_clamped(motion.timestamps, motion.t_world_root, times[:, [0, -1]])
+        found["speed"].append((ends[:, 1] - ends[:, 0])[:, :2].norm(dim=-1) / (times[:, -1] - times[:, 0]))
+    return {name: torch.cat(sides).float() for name, sides in found.items()}
+
+
+def _is_run(motion: Motion, times: Float[Tensor, "point"]) -> bool:
+    within = (motion.timestamps >= times[0]) & (motion.timestamps <= times[-1])
+    if motion.contact_prob is None:
+        return False
+    return bool((motion.contact_prob[within] < 0.5).all(1).float().mean() > FLIGHT)
+
+
+def curve_deviations(motions: Iterable[Motion]) -> dict[str, dict[str, float]]:
+    """By range of speed: recordings with such cycles, and of knee, hip and ankle the median over them of the rms (degrees)
+    by which the mean curve is off the normal one, and the largest of the knee's."""
+    normal, measured = normal_curves(), [walking_curves(motion) for motion in motions]
+    rows = {}
+    for low, high in pairwise(SPEEDS_M_S):
+        off = {name: [] for name in normal}
+        for curves in measured:
+            chosen = (curves["speed"] >= low) & (curves["speed"] < high)
+            for name in normal if chosen.sum() >= 2 else ():
+                off[name].append((curves[name][chosen].mean(0) - normal[name]).square().mean().sqrt().item())
+        if off["knee"]:
+            row = {f"{name}_rms_deg": float(np.median(values)) for name, values in off.items()}
+            rows[f"{low} to {high} m/s"] = {"recordings": len(off["knee"])} | row | {"worst_knee_deg": max(off["knee"])}
+    return rows
 
 
 def windows_of(value: Float[Tensor, "time *rest"]) -> Float[Tensor, "window frame *rest"]:

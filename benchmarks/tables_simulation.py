@@ -1,5 +1,6 @@
 """How far simulated people and sensors differ from real ones: gait statistics of straight walking and a discriminator
-against CMU, and sensors' errors against what papers and vendors say.
+against CMU, knees, hips and ankles over the gait cycle against those of healthy adults, and sensors' errors against what
+papers and vendors say.
 
 The discriminator is a small network that sees two seconds of head and wrist paths and predicts which they are from; it is
 judged on people it has not seen. 50 % means that it cannot tell.
@@ -7,12 +8,12 @@ judged on people it has not seen. 50 % means that it cannot tell.
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import torch
 from discriminator import held_out_accuracy
-from gait_statistics import Clip, clip_of, walking_windows
+from gait_statistics import Clip, clip_of, curve_deviations, walking_windows
 from result_pages import Grid, Page, Tree, Trees, grid_of, text
 from rich.console import Console
 from rich.table import Table
@@ -21,7 +22,7 @@ from simulated_sensors import Sensing, sensors
 from tabling import finite
 
 from wearcap.files import write_text
-from wearcap.recording import RecordingStore
+from wearcap.recording import Recording, RecordingStore
 from wearcap.simulation.recordings.hps import HpsConfig, Protocol
 
 WIDTH = 220
@@ -53,13 +54,26 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
 
 
 def _shown(found: Tree) -> list[Table]:
-    made = {"walking": _statistics_table, "discriminator": _accuracy_table, "sensors": _sensors_table}
+    made = {
+        "walking": _statistics_table,
+        "curves": _curves_table,
+        "discriminator": _accuracy_table,
+        "sensors": _sensors_table,
+    }
     return [made[part](tree) for part, tree in found.items()]
 
 
 def _walking(options: argparse.Namespace) -> Tree:
     simulated, cmu = (walking_windows(_clips(root, options.quick)) for root in (options.simulated, options.cmu))
     return _compared(simulated, cmu)
+
+
+def _curves(options: argparse.Namespace) -> Tree:
+    stores = {"simulated": options.simulated, "CMU": options.cmu}
+    return {
+        name: curve_deviations(recording.motion for recording in _recordings(root, options.quick) if recording.motion)
+        for name, root in stores.items()
+    }
 
 
 def _discriminator(options: argparse.Namespace) -> Tree:
@@ -79,7 +93,7 @@ def _sensors(options: argparse.Namespace) -> Tree:
     return sensors(Sensing(HpsConfig(protocol=protocol), sessions, draws, options.interactions))
 
 
-PARTS = {"sensors": _sensors, "walking": _walking, "discriminator": _discriminator}
+PARTS = {"sensors": _sensors, "walking": _walking, "curves": _curves, "discriminator": _discriminator}
 LITERATURE = Path(__file__).with_name("sensor_literature.tsv")
 """Quantity, label with unit, digits, what is published, and where; "ours" is an assumption."""
 KEY = (
@@ -156,11 +170,15 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     )
 
 
-def _clips(root: str, quick: bool) -> list[Clip]:
+def _recordings(root: str, quick: bool) -> Iterator[Recording]:
     store = RecordingStore.open(root)
     names = [name for name in store.names() if store.entries[name].duration_s >= 2]
     names = names[:: max(1, len(names) // 60)] if quick else names
-    return [clip_of(store.load(name)) for name in names]
+    return (store.load(name) for name in names)
+
+
+def _clips(root: str, quick: bool) -> list[Clip]:
+    return [clip_of(recording) for recording in _recordings(root, quick)]
 
 
 def _halves(clips: list[Clip]) -> tuple[list[Clip], list[Clip]]:
@@ -202,6 +220,19 @@ def _statistics_table(statistics: dict[str, dict[str, float]]) -> Table:
     for name, row in statistics.items():
         sides = [f"{row[side + '_mean']:.2f} ± {row[side + '_std']:.2f}" for side in ("simulated", "cmu")]
         table.add_row(name, *sides, f"{row['ks_distance']:.2f}")
+    return table
+
+
+def _curves_table(curves: dict[str, dict[str, dict[str, float]]]) -> Table:
+    table = Table(
+        title="Mean curves of level walking off those of healthy adults, rms in degrees: median of recordings"
+    )
+    columns = ("recordings", "knee_rms_deg", "worst_knee_deg", "hip_rms_deg", "ankle_rms_deg")
+    for name in ("", "recordings", "knee", "knee, worst", "hip", "ankle"):
+        table.add_column(name, justify="right" if name else "left")
+    for whose, rows in curves.items():
+        for speeds, row in rows.items():
+            table.add_row(f"{whose}, {speeds}", *(f"{row[name]:.{int(name != 'recordings')}f}" for name in columns))
     return table
 
 

@@ -11,7 +11,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from normal_walk import walk
 from wearcap.cli.conf import compose
+from wearcap.geometry.rotation import about_axis
+from wearcap.metrics.gait import normal_knee_deg
+from wearcap.recording import Motion
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 GOALS = {"windows_vs_npz", "lightning_step_vs_loop", "ddp_gradient_error"}
@@ -178,6 +182,51 @@ def test_gait_statistics_of_a_planted_walk():
     assert found["head_height_share"].mean().item() == pytest.approx(1.0, abs=0.01)
     assert not gait.is_walking(walker(0.2, "b")).any()
     assert not gait.is_walking(walker(1.2, "b", bob=0.2)).any()
+
+
+def bent_walk(hip_deg: float, ankle_deg: float, speed: float) -> Motion:
+    """A walk with normal knees whose thighs are flexed and whose feet are drawn up by constant angles."""
+    motion = walk(speed=speed)
+    R = motion.R_parent_joint.clone()
+    for side in ("left", "right"):
+        R[:, motion.skeleton.index(f"{side}_hip")] = about_axis("y", -torch.tensor(math.radians(hip_deg)))
+        R[:, motion.skeleton.index(f"{side}_ankle")] = about_axis("y", -torch.tensor(math.radians(ankle_deg)))
+    return replace(motion, R_parent_joint=R)
+
+
+def test_curves_of_walking_are_those_of_the_joints():
+    import gait_statistics as gait
+
+    curves = gait.walking_curves(bent_walk(12.0, 7.0, 1.1))
+    assert len(curves["knee"]) == len(curves["speed"]) > 8
+    assert curves["speed"].numpy() == pytest.approx(1.1, abs=1e-3)
+    assert (curves["knee"] - normal_knee_deg()).abs().max() < 1.5
+    assert curves["hip"].numpy() == pytest.approx(12.0, abs=0.01)
+    assert curves["ankle"].numpy() == pytest.approx(7.0, abs=0.01)
+
+
+def test_curves_are_compared_with_healthy_adults_by_speed():
+    import gait_statistics as gait
+
+    rows = gait.curve_deviations([bent_walk(0.0, 0.0, 1.1), bent_walk(0.0, 0.0, 1.3), bent_walk(6.0, 0.0, 1.35)])
+    assert {name: row["recordings"] for name, row in rows.items()} == {"0.95 to 1.2 m/s": 1, "1.2 to 1.45 m/s": 2}
+    slow = rows["0.95 to 1.2 m/s"]
+    hip = gait.normal_curves()["hip"]
+    assert hip.amin() == pytest.approx(-20, abs=1)
+    assert hip.amax() == pytest.approx(25, abs=1)
+    assert slow["hip_rms_deg"] == pytest.approx(hip.square().mean().sqrt().item(), abs=0.05)
+    assert slow["knee_rms_deg"] == pytest.approx(slow["worst_knee_deg"], abs=1e-9)
+    assert slow["knee_rms_deg"] < 1.0
+
+
+def test_cycles_with_a_flight_are_no_walk():
+    import gait_statistics as gait
+
+    motion = bent_walk(0.0, 0.0, 1.1)
+    contact = torch.ones(len(motion), 4)
+    assert len(gait.walking_curves(replace(motion, contact_prob=contact))["knee"]) > 8
+    contact[::5] = 0.0
+    assert len(gait.walking_curves(replace(motion, contact_prob=contact))["knee"]) == 0
 
 
 def test_discriminator_separates_what_can_be_separated_and_no_more():

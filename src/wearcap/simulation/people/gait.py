@@ -6,20 +6,37 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Bool, Float
 
-from wearcap.simulation.people.plan import SIDES, Footprint, Plan
+from wearcap.simulation.people.plan import SIDES, STEP_M, Footprint, Plan
 from wearcap.simulation.people.track import Track, ease, hermite
 
-ROLL_DOWN_S = 0.13
+ROLL_DOWN_S = 0.12
 """Time from landing to the flat foot."""
-ROLL_UP_S = 0.42
+ROLL_UP_S = 0.59
 """Time from the flat foot to toe-off."""
+STRIKE_RATE, OFF_RATE = 1.3, 2.1
+"""Turn rates of the sole at landing and toe-off, as multiples of its pitch then over these times."""
+TURN_ON = 0.42
+"""Share of a swing in which the turn of the toe-off dies down."""
+HANGING_RAD = 0.28
+"""How far the toes lag behind the smoothest turn, late in mid-swing."""
+TOES_FLAT, TOES_STIFF = 0.21, 0.4
+"""Pitch of the sole (rad) up to which the toes stay flat, and what slows their further bend (rad²)."""
+YIELD_RAD, YIELD_S, YIELD_TOP = 0.16, 0.51, 0.33
+"""Bend by which a knee yields to the load in a long step, for how long, and when it is largest, as a share of that."""
+FULL_STRIKE = -0.33
+"""Pitch of a landing sole in a long step (rad)."""
 SOFT_M = 0.008
 """Width over which the lowest point of a swinging sole changes from ball to heel."""
 LONG_STAND_S = 0.9
-LATE_LIFT = 0.06
+EARLY_LIFT = 0.02
+"""Height of the sole early in the swing, when it moves away over the floor (m)."""
+LATE_LIFT = 0.04
 """Height of the heel shortly before it lands, per angle by which the toes are up then (m/rad)."""
-STAIR_WAIT = 0.16
+STAIR_WAIT = 0.18
 """Share of a swing up a stair during which the foot only rises, and of one down during which it only sinks."""
+
+Ramp = float | Float[np.ndarray, "*#batch"]
+"""A share of a swing, one for all frames or each frame's own."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +56,13 @@ class _FootMotion:
     """Contact of heel and toe tip."""
     pressure: Float[np.ndarray, "time 3"]
     """Centre of pressure of the foot on the floor while it stands (m)."""
+    landed_s: Float[np.ndarray, "time"]
+    """Time of the last landing."""
+    yielding: Float[np.ndarray, "time"]
+    """Bend by which the knee yields to the load after a landing, and takes back until the heel rises (rad)."""
     running: Bool[np.ndarray, "time"]
+    climbs: Bool[np.ndarray, "time"]
+    """Between a print and one on another step, kerb or stair."""
 
     @classmethod
     def of(cls, plan: Plan, side: str, times: Float[np.ndarray, "time"]) -> "_FootMotion":
@@ -61,6 +84,10 @@ class _FootMotion:
         on_heel = np.where(at.planted, (roll < 0).astype(np.float64), np.where(at.land_pitch_next > 0, 0.0, turned))
         pivot_x, pivot_z = (ball[i] + on_heel * (heel[i] - ball[i]) for i in (0, 2))
         rolled = pivot_x - (np.cos(roll) * pivot_x + np.sin(roll) * pivot_z)
+        # once the toes bend no further, the foot goes on about their tip
+        tipped = tip[0] - (np.cos(roll - bend) * tip[0] + np.sin(roll - bend) * tip[2])
+        rolled = rolled + (1.0 - on_heel) * tipped
+        early = (share / 0.25) ** 3 * ((1.0 - share) / 0.75) ** 9  # the top at 0.25
         late = (share / 0.75) ** 9 * ((1.0 - share) / 0.25) ** 3  # a bump with its top at 0.75
         # height of the ankle over the sole's lowest point (m): a softened maximum over heel, ball and tip
         soft = SOFT_M * lifted
@@ -77,7 +104,9 @@ class _FootMotion:
         width = np.maximum(soft, 1e-5)
         top = points.max(0)
         depth = top + width * np.log(np.exp((points - top) / width).sum(0)) * (soft > 1e-5)
-        raised = at.clearance * lifted + LATE_LIFT * np.maximum(-at.land_pitch_next, 0.0) * late + depth
+        raised = (
+            at.clearance * lifted + EARLY_LIFT * early + LATE_LIFT * np.maximum(-at.land_pitch_next, 0.0) * late + depth
+        )
         tilt, heading = at.mix("tilt", turned), at.mix("heading", turned)
         ground = at.mix("ground", moved[:, None])
         ground[:, 2] = at["height"] + slope * moved + rise * climb(rise, share)
@@ -90,7 +119,9 @@ class _FootMotion:
         ankle = ground + np.stack([along * cos, along * sin, above], 1)
         pressure = ground + at.pressure(heel, ball)[:, None] * np.stack([cos, sin, np.zeros_like(cos)], 1)
         contact = at.planted[:, None] & np.stack([roll < 0.01, roll > -0.01], 1)
-        return cls(ankle, ground, heading, roll + tilt, bend, at.planted, contact, pressure, at.running)
+        landed, yielding, pitch = at["land_s"], at.yielding(), roll + tilt
+        gait = (at.planted, contact, pressure, landed, yielding, at.running, at["climbs"])
+        return cls(ankle, ground, heading, pitch, bend, *gait)
 
 
 @dataclass(frozen=True)
@@ -147,6 +178,8 @@ class _Timeline:
         columns["ground"] = np.stack([p.ground for p in prints])
         columns["height"] = columns["ground"][:, 2]
         columns["step"] = np.array([a.rise_to(b) for a, b in pairwise(prints)] + [0.0])
+        steps = np.abs(columns["step"]) > STEP_M
+        columns["climbs"] = steps | np.append(False, steps[:-1])
         self._columns = columns
         self.now = np.clip(np.searchsorted(columns["land_s"], times, side="right") - 1, 0, None)
         self.next = np.minimum(self.now + 1, len(prints) - 1)
@@ -156,6 +189,8 @@ class _Timeline:
         self.swing_s = np.where(self.planted, 1.0, columns["land_s"][self.next] - self["lift_s"])
         self.swing_share = np.clip(-self.until_lift / self.swing_s, 0.0, 1.0)
         self.clearance, self.bow = columns["clearance"][self.next], columns["bow"][self.next]
+        stance_s = (columns["lift_s"] - columns["land_s"])[self.next]
+        self.down_next = np.minimum(ROLL_DOWN_S, 0.35 * stance_s)
         self.land_pitch_next = columns["land_pitch"][self.next]
         run = np.array([p.running for p in prints])
         self.running = run[self.now] | run[self.next]
@@ -172,30 +207,48 @@ class _Timeline:
         """Pitch of the sole against the floor and bend of the toes (rad)."""
         stance_s = self["lift_s"] - self["land_s"]
         down, up = np.minimum(ROLL_DOWN_S, 0.35 * stance_s), np.minimum(ROLL_UP_S, 0.58 * stance_s)
-        rate = 1.7 * self["lift_pitch"] / up
+        rate = OFF_RATE * self["lift_pitch"] / up
         zero = np.zeros_like(rate)
-        landing = hermite(self.since_land / down, (self["land_pitch"], zero), (zero, zero))
+        landing = hermite(self.since_land / down, (self["land_pitch"], zero), (-STRIKE_RATE * self["land_pitch"], zero))
         leaving = hermite(1.0 - self.until_lift / up, (zero, self["lift_pitch"]), (zero, rate * up))
         stance = landing + leaving + heel_lift
         start = (self["lift_pitch"] + heel_lift, rate * self.swing_s)
-        swing = hermite(self.swing_share, (start[0], self.land_pitch_next), (start[1], zero))
+        arriving = -STRIKE_RATE * self.land_pitch_next / self.down_next * self.swing_s
+        swing = hermite(self.swing_share, (start[0], self.land_pitch_next), (zero, arriving))
+        swing += hermite(self.swing_share / TURN_ON, (zero, zero), (TURN_ON * start[1], zero))
+        swing += HANGING_RAD * (self.swing_share / 0.625) ** 5 * ((1.0 - self.swing_share) / 0.375) ** 3
         early, late = self.swing_share / 0.5, self.swing_share / 0.4 - 1.5
-        relax = hermite(early, (start[0], zero), (start[1] * 0.5, zero))
-        brace = hermite(late, (zero, np.maximum(self.land_pitch_next, 0.0)), (zero, zero))
+        bent, gain = toe_bend(start[0])
+        relax = hermite(early, (bent, zero), (gain * start[1] * 0.5, zero))
+        brace = hermite(late, (zero, np.maximum(self.land_pitch_next, 0.0)), (zero, np.minimum(0.4 * arriving, 0.0)))
         roll = np.where(self.planted, stance, swing)
-        return roll, np.where(self.planted, np.maximum(stance, 0.0), relax + brace)
+        return roll, np.where(self.planted, toe_bend(stance)[0], relax + brace)
+
+    def yielding(self) -> np.ndarray:
+        """Bend of the knee beyond the nearly straight one with which the heel strikes (rad); more in longer steps."""
+        strike = np.clip(self["land_pitch"] / FULL_STRIKE, 0.0, 1.2) ** 2
+        share = self.since_land / np.minimum(YIELD_S, 0.62 * (self["lift_s"] - self["land_s"]))
+        return YIELD_RAD * strike * ease(share / YIELD_TOP) * ease((1.0 - share) / (1.0 - YIELD_TOP))
 
     def pressure(self, heel: Float[np.ndarray, "3"], ball: Float[np.ndarray, "3"]) -> np.ndarray:
         """Centre of pressure ahead of the ankle (m): from heel to toes in a step, under the arch when standing."""
         middle = 0.30 * ball[0]
-        after, before = ease(self.since_land / 0.25), ease(1.0 - self.until_lift / 0.32)
+        after, before = ease(self.since_land / 0.28), ease(1.0 - self.until_lift / 0.45)
         strike = np.clip(self["land_pitch"] / -0.3, -1.0, 1.0)
         back = np.where(strike > 0, strike * (0.4 * heel[0] - middle), -strike * (ball[0] - middle))
         forth = np.clip(self["lift_pitch"] / 0.6, 0.0, 1.0) * (ball[0] + 0.01 - middle)
         return middle + back * (1.0 - after) + forth * before
 
 
-def glide(share: Float[np.ndarray, "*batch"], ramps: tuple[float, float] = (0.36, 0.30)) -> Float[np.ndarray, "*batch"]:
+def toe_bend(roll: Float[np.ndarray, "time"]) -> tuple[Float[np.ndarray, "time"], Float[np.ndarray, "time"]]:
+    """Bend of the toes of a standing foot whose heel is up by an angle (rad), and its derivative: they lie flat at
+    first, and bend less the further the heel is up."""
+    beyond = np.maximum(roll - TOES_FLAT, 0.0)
+    scale = beyond**2 + TOES_STIFF
+    return np.maximum(roll, 0.0) - beyond**3 / scale, 1.0 - beyond**2 * (beyond**2 + 3.0 * TOES_STIFF) / scale**2
+
+
+def glide(share: Float[np.ndarray, "*batch"], ramps: tuple[Ramp, Ramp] = (0.26, 0.4)) -> Float[np.ndarray, "*batch"]:
     """Progress of a swing, 0 to 1: accelerates over the first of `ramps` (shares of it), decelerates over the last."""
 
     def integral(u):
@@ -211,7 +264,10 @@ def glide(share: Float[np.ndarray, "*batch"], ramps: tuple[float, float] = (0.36
 def advance(share: Float[np.ndarray, "*batch"], rise: Float[np.ndarray, "*#batch"]) -> Float[np.ndarray, "*batch"]:
     """Horizontal progress of a swing that rises by `rise` (m) in total, from 0 to 1."""
     up, down = np.clip(rise / 0.12, 0.0, 1.0), np.clip(-rise / 0.12, 0.0, 1.0)
-    return glide(np.clip((share - STAIR_WAIT * up) / (1.0 - STAIR_WAIT * (up + down)), 0.0, 1.0))
+    both = up + down
+    return glide(
+        np.clip((share - STAIR_WAIT * up) / (1.0 - STAIR_WAIT * both), 0.0, 1.0), (0.26 + 0.1 * both, 0.4 - 0.1 * both)
+    )
 
 
 def bump(share: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:

@@ -98,7 +98,7 @@ LOGNORMAL = {
 """Medians of all others; their logarithms deviate by `LOG_DEVIATION`."""
 LOG_DEVIATION = 0.22
 LIMITS = {
-    "heel_rise": (0.8, 1.2), "knee_soft": (0.08, 0.25), "step_width": (0.05, 0.16), "stance_width": (0.12, 0.30),
+    "heel_rise": (0.88, 1.12), "knee_soft": (0.08, 0.25), "step_width": (0.05, 0.16), "stance_width": (0.12, 0.30),
     "variability": (0.015, 0.05), "speed": (0.9, 1.65), "briskness": (0.7, 1.4),
 }  # fmt: skip
 
@@ -135,7 +135,7 @@ def draw_person(name: str, rng: np.random.Generator) -> Person:
     drawn["speed"] *= (skeleton.root_height / LEG_M) ** 0.5
     drawn["walk_ratio"] = drawn["walk_ratio"] * skeleton.root_height / LEG_M
     drawn |= {name: median * float(np.exp(rng.normal(0.0, LOG_DEVIATION))) for name, median in LOGNORMAL.items()}
-    drawn["heel_rise"] = rng.normal(1.0, 0.1)
+    drawn["heel_rise"] = rng.normal(1.0, 0.06)
     drawn |= {name: float(np.clip(drawn[name], *limits)) for name, limits in LIMITS.items()}
     habits = (part(**{f.name: drawn[f.name] for f in fields(part)}) for part in (_Gait, _Arms, _Posture))
     return Person(name, skeleton, _Style(*habits, drawn["briskness"]), shape, device)

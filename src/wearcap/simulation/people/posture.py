@@ -26,10 +26,14 @@ STAIR_APART_M, STAIRS_LEVELLED = 0.15, 0.5
 """On stairs (feet so far apart in height) knees bend more, which evens out the pelvis' path."""
 BOUNCE_M, BOUNCE_MIDDLE = 0.12, 0.68
 """In running the pelvis is lowest over the bent standing leg and rises in flight: by how much, about which load."""
-HIPS_AHEAD_M = 0.042
+HIPS_AHEAD_M = 0.096
 """Additional forward offset of the hips in walking, relative to standing."""
 STANCE_BEND = 0.9
 """More bend of a bearing knee in walking than in standing, as a share of the knee's softness."""
+STRIKE_BEND, STRAIGHTEST = 0.104, 0.065
+"""Bend of the knee over which the pelvis walks, and the least bend that it leaves to either knee (rad)."""
+HAND_OVER_S = 0.07
+"""Spread of the time about a landing in which the other leg takes the pelvis over."""
 HELP = ("lean", "bend", "twist", "crouch", "ahead", "aside")
 """Trunk motions that help hands to reach, columns of `help_`: as `Plan.lean` (rad), `crouch` and `shift` (m)."""
 LEAD_S = 0.32
@@ -158,21 +162,19 @@ def _height(
     moving: Float[np.ndarray, "time"],
     R_world_pelvis: Float[Tensor, "time 3 3"],
 ) -> Float[np.ndarray, "time"]:
-    """Height of the pelvis (m): as high as both legs let it, with soft knees, and smooth."""
+    """Height of the pelvis (m).
+
+    In level walking the leg that landed last carries it, as a pole with a knee that yields a little; else it is as high
+    as both legs let it, with soft knees, and smooth.
+    """
     fps, left, right = feet.fps, feet.left, feet.right
-    limits = []
+    soft, found = feet.plan.style.gait.knee_soft, []
     for side in SIDES:
-        hip, knee, ankle = feet.plan.bones(f"{side}_hip", f"{side}_knee", f"{side}_ankle")
         bears = blur(feet[side].planted.astype(np.float64), 0.08, fps)
-        soft = np.zeros_like(place[:, :1]).repeat(3, 1)
-        soft[:, 1] = feet.plan.style.gait.knee_soft * (0.5 + (0.5 + STANCE_BEND * moving) * bears)
-        lower = rotation.exp(torch.from_numpy(soft)) @ ankle[:, None]
-        leg = (knee + lower[..., 0]).norm(dim=-1).numpy()
-        offset = (R_world_pelvis @ hip).numpy()
-        away = np.linalg.norm(feet[side].ankle[:, :2] - place - offset[:, :2], axis=1)
-        up = np.sqrt(np.maximum(leg**2 - away**2, (0.35 * leg) ** 2))
-        limits.append(feet[side].ankle[:, 2] + up - offset[:, 2])
-    limit = np.minimum(*limits)
+        bent = soft * (0.25 + (0.25 + STANCE_BEND * moving) * bears)
+        bends = np.stack([bent, STRIKE_BEND + feet[side].yielding, np.full_like(bent, STRAIGHTEST)])
+        found.append(_heights(feet, side, place, R_world_pelvis, bends))
+    (limit, _, top), (_, (pole_left, pole_right), _) = np.minimum(*found), np.stack(found, 1)
     high, level = lower_envelope(limit, ENVELOPE_S, fps), lower_envelope(limit, STEP_ENVELOPE_S, fps)
     stairs = blur(np.clip(np.abs(left.ground[:, 2] - right.ground[:, 2]) / STAIR_APART_M, 0.0, 1.0), 0.25, fps)
     share = LEVELLED * moving + (STAIRS_LEVELLED - LEVELLED * moving) * stairs
@@ -181,7 +183,32 @@ def _height(
     stands = blur((left.planted | right.planted).astype(np.float64), 0.045, fps)
     bounce = BOUNCE_M * running * (BOUNCE_MIDDLE - stands)
     wanted = np.minimum(high + share * (level - high) + bounce, high)
-    return blur(falling_at_most(wanted, GRAVITY, fps), 0.02, fps)
+    wanted = blur(falling_at_most(wanted, GRAVITY, fps), 0.02, fps)
+    # the pole goes over from leg to leg about each landing
+    on_left = blur((left.landed_s > right.landed_s).astype(np.float64), HAND_OVER_S, fps)
+    walked = blur(pole_right + on_left * (pole_left - pole_right), 0.022, fps)
+    level_ground = 1.0 - blur((left.climbs | right.climbs).astype(np.float64), 0.12, fps)
+    walks = moving * (1.0 - running) * level_ground
+    wanted += walks * (walked - wanted)
+    return wanted + lower_envelope(np.minimum(top - wanted, 0.0), ENVELOPE_S, fps)
+
+
+def _heights(
+    feet: Feet,
+    side: str,
+    place: Float[np.ndarray, "time 2"],
+    R_world_pelvis: Float[Tensor, "time 3 3"],
+    bends: Float[np.ndarray, "bend time"],
+) -> Float[np.ndarray, "bend time"]:
+    """Heights of the pelvis (m) over one leg, each for a bend of its knee (rad)."""
+    hip, knee, ankle = feet.plan.bones(f"{side}_hip", f"{side}_knee", f"{side}_ankle")
+    turns = torch.zeros(*bends.shape, 3, dtype=torch.float64)
+    turns[..., 1] = torch.from_numpy(bends)
+    leg = (knee + (rotation.exp(turns) @ ankle[:, None])[..., 0]).norm(dim=-1).numpy()
+    offset = (R_world_pelvis @ hip).numpy()
+    away = np.linalg.norm(feet[side].ankle[:, :2] - place - offset[:, :2], axis=1)
+    up = np.sqrt(np.maximum(leg**2 - away**2, (0.35 * leg) ** 2))
+    return feet[side].ankle[:, 2] + up - offset[:, 2]
 
 
 def look_about(

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from wearcap.simulation.people.gait import advance, bump, climb
+from wearcap.simulation.people.gait import FULL_STRIKE, advance, bump, climb
 from wearcap.simulation.people.plan import LEFT_SIGN, OTHER, SIDES, STEP_M, Footprint, Plan, wrap
 from wearcap.simulation.people.track import blur, ease
 from wearcap.simulation.places.outline import turn
@@ -22,6 +22,8 @@ JOG_SPEED = 1.4
 ACCELERATION, BRAKING = 1.0, 0.85
 END_SPEED = 0.32
 MIN_CADENCE = 80.0
+LONGEST_STEP = 0.86
+"""Longest step in walking, as a share of the hips' height; who is faster steps more often."""
 READY_S = 0.42
 """Time between the decision to walk and the first foot's lift, in which the weight moves to the other leg."""
 CURVE_SPEED = 0.95
@@ -98,6 +100,7 @@ class _Course:
         limit = np.sqrt(np.minimum.accumulate((squared + fall)[::-1])[::-1] - fall)
         limit = blur(limit, 0.10, 1 / SPACING_M)
         stride = np.minimum(np.sqrt(60 * plan.style.gait.walk_ratio * limit), limit * 60 / MIN_CADENCE)
+        stride = np.minimum(stride, LONGEST_STEP * plan.hip_height)
         run_from = JOG_SPEED if speed > RUN_SPEED else np.inf
         stride = np.where(limit > run_from, limit * 60 / (158 + 6 * limit), stride)
         phase = np.concatenate([[0.0], np.cumsum(SPACING_M / stride[:-1])])
@@ -162,7 +165,7 @@ def walk_along(
         if running:  # there is a time in which neither foot stands
             both = float(np.clip(-0.22 - 0.08 * (how - RUN_SPEED), -0.38, -0.12))
         else:
-            both = float(np.clip(0.24 + 0.16 * (1.3 - how), 0.14, 0.42))
+            both = float(np.clip(0.21 + 0.12 * (1.3 - how), 0.14, 0.42))
         _walk_step(plan, side, land - beat * (1.0 - both) if k > 1 else land - 0.5, land, print_, running)
         side = OTHER[side]
 
@@ -174,7 +177,9 @@ def _walk_step(plan: Plan, side: str, lift: float, land: float, print_: Footprin
     stride = float(np.linalg.norm((print_.ground - old.ground)[:2]))
     size = min(stride / 1.35, 1.15) * plan.style.gait.heel_rise
     rise = old.rise_to(print_)
-    lift_pitch, land_pitch, clearance = (0.85, -0.10, 0.10) if running else (0.95 * size, -0.44 * size, 0.02)
+    lift_pitch, land_pitch, clearance = (
+        (0.85, -0.10, 0.10) if running else (1.04 * size**0.39, FULL_STRIKE * size, 0.012)
+    )
     if rise > STEP_M:
         lift_pitch, land_pitch, clearance = 0.55, 0.06, 0.05
     elif rise < -STEP_M:
