@@ -60,14 +60,18 @@ def _lacking(distance: Tensor, thigh: Tensor, shank: Tensor) -> Tensor:
     return SOFT_M * torch.nn.functional.softplus((distance - farthest) / SOFT_M)
 
 
-def find_shift(motions: Sequence[Motion], usual_m: Sequence[float]) -> Float64[Tensor, "2"]:
+def find_shift(
+    motions: Sequence[Motion], usual_m: Sequence[float], R_pelvis_level: Float[Tensor, "3 3"] | None = None
+) -> Float64[Tensor, "2"]:
     """How far (m) a person's hips belong ahead and up in the pelvis, from motions of one xsens23 skeleton.
+
+    `R_pelvis_level` turns the motions' pelvis to the axes in which the shift is wanted.
 
     Knees of level walking are held against the normal curve and standing ones against 4°, legs that are too short cost,
     and so does what differs from `usual_m`, which remains for people who neither walk nor stand. People who act are
     outliers (Geman and McClure's cost).
     """
-    walks, stands = _poses(motions)
+    walks, stands = _poses(motions, torch.eye(3) if R_pelvis_level is None else R_pelvis_level)
     normal, usual = normal_knee_deg().double(), torch.tensor(usual_m, dtype=torch.float64)
     cycles = min(len(walks.hip), _MOST_CYCLES)
 
@@ -91,11 +95,11 @@ def _outlying(square: Tensor) -> Tensor:
     return square / (1 + square)
 
 
-def _poses(motions: Sequence[Motion]) -> tuple[_Legs, _Legs]:
+def _poses(motions: Sequence[Motion], R_pelvis_level: Float[Tensor, "3 3"]) -> tuple[_Legs, _Legs]:
     """Both legs over all cycles of walking, and in standing frames (at most 10 a second)."""
     walks, stands = [], []
     for motion in motions:
-        pelvis, still = motion.joint("pelvis").R.double(), standing(motion)
+        pelvis, still = (motion.joint("pelvis").R @ R_pelvis_level).double(), standing(motion)
         still = still.nonzero()[:: max(round(motion.fps / 10), 1), 0]
         for side, times in zip(("left", "right"), cycle_times(motion)):
             hip, knee, ankle = (motion.joint(f"{side}_{name}").t.double() for name in ("hip", "knee", "ankle"))

@@ -91,7 +91,9 @@ def _of_subject(
             read = read_foreign_motion(file, mapping, amc_fps=amc_fps, asf=asf, levels=levels, siblings=siblings)
             motions.append(read.motion)
     levels = levels_in(motions) if motions and asf is not None else None
-    return levels, siblings, find_shift(motions, usual_m) if motions and isinstance(usual_m, tuple) else None
+    if not motions or not isinstance(usual_m, tuple):
+        return levels, siblings, None
+    return levels, siblings, find_shift(motions, usual_m, levels and levels.R_pelvis)
 
 
 def cmu_tasks(
