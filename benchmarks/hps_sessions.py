@@ -10,14 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from depth_rig import Background, DepthView, person_cloud
+from depth_rig import Background, DepthView, person_cloud, voxel_downsample
 from hps_scores import RigCloud, nearest_frames, visit_times
 from simulated_depth_rig import approximate, place_rig, simulate_rig
 
 from wearcap.body.anny_body import anny_body
 from wearcap.files import write_text
 from wearcap.geometry.mesh import Mesh
-from wearcap.geometry.surface import voxel_downsample
 from wearcap.io.formats.ply import Ply, read_ply, write_ply
 from wearcap.prepare.engine import content_hash
 from wearcap.prepare.simulated import source_files
