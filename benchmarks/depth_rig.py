@@ -13,12 +13,13 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int64, UInt16
 from scipy.spatial import KDTree
 from sklearn.cluster import DBSCAN
+from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.render import Splats, render
 from wearcap.geometry.rigid import Rigid
-from wearcap.geometry.surface import SurfaceIndex, voxel_downsample
+from wearcap.geometry.surface import SurfaceIndex
 
 CLUSTER_EPS_M = 0.12
 """DBSCAN's distance (thesis §4.5.1)."""
@@ -297,3 +298,14 @@ def _no_overlap(reach_m: float) -> WearcapError:
         expected="an approximate pose, within some 30 cm and 8°",
         fix="Check the camera's pose, and that cloud and scene are both in metres.",
     )
+
+
+def voxel_downsample(
+    points: Float[Tensor, "point 3"], voxel_size: float
+) -> tuple[Float[Tensor, "voxel 3"], Int64[Tensor, "point"]]:
+    """Mean of the points in each occupied voxel (edge length in m), and the voxel index of every point."""
+    cell = torch.floor(points.double() / voxel_size).long()
+    _, voxel, count = torch.unique(cell, dim=0, return_inverse=True, return_counts=True)
+    total = torch.zeros(len(count), 3, dtype=torch.float64, device=points.device)
+    total.index_add_(0, voxel, points.double())
+    return (total / count[:, None]).to(points.dtype), voxel

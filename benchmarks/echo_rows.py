@@ -9,12 +9,15 @@ import torch
 from sensed import GIVEN, sensed
 
 from wearcap.cli.conf import compose, load_pipeline
+from wearcap.errors import require_choice
+from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording import Motion, RecordingStore
 from wearcap.runtime.system import CaptureInput
 from wearcap.simulation.recordings.measured import EnvironmentErrors, as_measured
-from wearcap.systems.echo.observations import BatchItem, Scenario, batch_item_of
+from wearcap.systems.echo.model import MODALITIES
+from wearcap.systems.echo.observations import BatchItem, Observed, Scenario, batch_item_of
 from wearcap.systems.echo.pipeline import Echo
-from wearcap.systems.echo.scores import Truth, observed_share
+from wearcap.systems.echo.scores import Truth
 from wearcap.tracking.head_path import head_path
 
 
@@ -96,6 +99,31 @@ def _observing(method: Method, echo: Echo, scenario: Scenario, root: Path, seed:
     blank = Motion(path.timestamps, path.skeleton, *_still(len(path.timestamps), len(path.skeleton)))
     truth = echo.truth(blank, CaptureInput(recording, root))
     return replace(scenario, observed=observed_share(truth, *method.observed, seed))
+
+
+def observed_share(truth: Truth, modality: str, share: float, seed: int) -> Observed:
+    """Ground truth of one modality in a random share of the frames, drawn uniformly (ECHO Tables 3, S2).
+
+    Raises WearcapError for an unknown modality.
+    """
+    require_choice(modality, MODALITIES, f"no modality {modality!r}")
+    rng = np.random.default_rng([17, seed])
+    count = len(truth.motion)
+    chosen = np.sort(rng.choice(count, max(1, round(share * count)), replace=False))
+    take = torch.from_numpy(chosen)
+    times = truth.motion.timestamps[take]
+    if modality == "human":
+        R, t = truth.motion.R_parent_joint[take], truth.motion.t_world_root[take]
+        return Observed(motion=Motion(times, truth.motion.skeleton, R, t))
+    if modality == "object":
+        tracks = {}
+        for number, shape in enumerate(truth.objects):
+            rows = take[truth.active[take] == number]
+            pose = shape.of_mesh(truth.T_world_object[number][rows])
+            tracks[shape.name] = Trajectory(truth.motion.timestamps[rows], pose.R, pose.t)
+        return Observed(object_motion=tracks)
+    contact = torch.cat([truth.touch.float(), truth.foot_contact], 1)[take]
+    return Observed(contact_times=times, contact=contact)
 
 
 def _still(count: int, joints: int):

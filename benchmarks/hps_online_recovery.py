@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from hps_outages import with_outage
 from hps_sessions import TrueClock
 from hydra.utils import instantiate
 from jaxtyping import Float, Float64
@@ -20,7 +21,7 @@ from wearcap.recording.timing import at_times
 from wearcap.scene.scan import Scan
 from wearcap.sensors.suit import SuitNoise
 from wearcap.simulation.recordings.hps import HpsConfig, Protocol, simulate_hps
-from wearcap.simulation.recordings.localization_noise import LocalizationNoise, with_outage
+from wearcap.simulation.recordings.localization_noise import LocalizationNoise
 from wearcap.simulation.rendering.scan import scan_world
 from wearcap.simulation.rendering.views import Scenery
 from wearcap.systems.hps.stream import HpsStream

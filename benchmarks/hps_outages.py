@@ -10,7 +10,8 @@ from torch import Tensor
 from wearcap.errors import WearcapError
 from wearcap.metrics.position import joint_error_cm
 from wearcap.recording import Motion
-from wearcap.recording.recording import Intervals
+from wearcap.recording.recording import Intervals, Localization
+from wearcap.simulation.recordings.localization_noise import without
 
 MARGIN_S = 5.0
 """Least time (s) between a visit to the depth-camera rig and a planted outage."""
@@ -76,3 +77,16 @@ def disturbance(disturbed: Motion, undisturbed: Motion, truth: Motion, frames: B
         joint_error_cm(motion.T_world_joint.t, truth.T_world_joint.t)[frames] for motion in (disturbed, undisturbed)
     )
     return _Disturbance(*(float(e) for e in (with_[:, 0].mean(), with_.mean(), without[:, 0].mean(), without.mean())))
+
+
+def with_outage(localization: Localization, start_s: float, length_s: float) -> Localization:
+    """The same localisation without any found frames for a while from `start_s` (on its own clock).
+
+    Raises WearcapError when no frame falls into it.
+    """
+    times = localization.timestamps
+    lost = (times >= start_s) & (times < start_s + length_s)
+    if not lost.any():
+        expected = f"within {times[0]:.1f} to {times[-1]:.1f} s"
+        raise WearcapError(f"an outage of {length_s} s at {start_s} s", expected=expected)
+    return without(localization, lost)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from hps_scores import HpsTruth, nearest_frames
 from hps_sessions import Session
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
@@ -19,7 +20,6 @@ from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.render import Light, Splats, render
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
-from wearcap.systems.hps.scores import HpsTruth, nearest_frames
 from wearcap.viewer.picture import captioned, save_png
 
 COLORS = {

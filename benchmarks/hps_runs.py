@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from hps_outages import Outage, disturbance, planted_outages
+from hps_outages import Outage, disturbance, planted_outages, with_outage
 from hps_pictures import draw_feet, draw_paths
+from hps_scores import HpsScores, HpsTruth, score_hps
 from hps_sessions import Session, SessionSettings, TrueClock, load_session
 from hydra.utils import instantiate
 
@@ -18,8 +19,6 @@ from wearcap.metrics.surface import FootSurface
 from wearcap.recording import Motion
 from wearcap.runtime.stages import run_stages
 from wearcap.runtime.system import CaptureInput
-from wearcap.simulation.recordings.localization_noise import with_outage
-from wearcap.systems.hps.scores import HpsScores, HpsTruth, score_hps
 
 ROWS = {
     "IMU": "baseline/hps_imu",

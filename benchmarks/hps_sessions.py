@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from depth_rig import Background, DepthView, person_cloud
+from depth_rig import Background, DepthView, person_cloud, voxel_downsample
+from hps_scores import RigCloud, nearest_frames, visit_times
 from simulated_depth_rig import approximate, place_rig, simulate_rig
 
 from wearcap.body.anny_body import anny_body
 from wearcap.files import write_text
 from wearcap.geometry.mesh import Mesh
-from wearcap.geometry.surface import voxel_downsample
 from wearcap.io.formats.ply import Ply, read_ply, write_ply
 from wearcap.prepare.engine import content_hash
 from wearcap.prepare.simulated import source_files
@@ -30,7 +30,6 @@ from wearcap.simulation.recordings.hps import HpsConfig, simulate_hps
 from wearcap.simulation.rendering.head_camera import SOUND_HZ, sound_track
 from wearcap.simulation.rendering.scan import scan_world
 from wearcap.simulation.rendering.views import Scenery
-from wearcap.systems.hps.scores import RigCloud, nearest_frames, visit_times
 
 RIG_SCENE_M = 8.0
 """Of the scan around the spot, the rig is registered to."""

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from hydra.utils import instantiate
 from interaction_rig import rig_distances, rig_looks
+from ireplica_baselines import held_when_near, interpolated_objects, nearness, static_objects
 from rgb_objects import found_objects, with_found_objects
 from seen_flat import SeenFlat
 from simulated_detections import FPS, HOD, detections, seen_hands
@@ -32,7 +33,6 @@ from wearcap.systems.ireplica.contact_prediction import ContactPredictor
 from wearcap.systems.ireplica.detected_contacts import DetectedContacts
 from wearcap.systems.ireplica.object_tracker import ObjectTracker
 from wearcap.systems.ireplica.pipeline import IReplica
-from wearcap.systems.ireplica.published import held_when_near, interpolated_objects, nearness, static_objects
 from wearcap.systems.ireplica.scores import score_interactions
 
 ON_BENT_PATH = (

@@ -9,18 +9,25 @@ from functools import cache
 from itertools import product
 
 import numpy as np
-from jaxtyping import Bool
+import torch
+from jaxtyping import Bool, Float
+from scipy.stats import norm
 from sensed import sensed
 from torch import Tensor
+from two_wearers import face_to_face, simulate_two_wearers
 
 from wearcap.body.kinematics import forward_kinematics
+from wearcap.geometry import rotation
+from wearcap.geometry.camera import Camera
 from wearcap.geometry.trajectory import Trajectory, nearest_frames
 from wearcap.metrics.position import body_parts, joint_error_cm
 from wearcap.metrics.scores import truth_at
 from wearcap.metrics.table import Row
 from wearcap.recording import Motion, Recording
-from wearcap.sensors.keypoints import ACTION_CAMERA, action_camera, camera_path, seen_pose
-from wearcap.simulation.recordings.simulate import SimulationConfig, face_to_face, simulate_two_wearers
+from wearcap.recording.timing import at_times
+from wearcap.sensors.keypoints import ACTION_CAMERA, BURST_S, NEAR_M, action_camera, camera_path
+from wearcap.sensors.simulated import smooth_noise
+from wearcap.simulation.recordings.simulate import SimulationConfig
 from wearcap.systems.mocap_every.pipeline import MocapEvery
 from wearcap.systems.mocap_every.visual_cues import View, VisualCues, capture_session
 
@@ -39,6 +46,8 @@ VIEW_DEG, VIEW_MISSED = 12.0, 0.1
 
 With 12° joints are 9.4 cm off relative to the root, 7.5 cm after Procrustes alignment; on 3DPW, SPIN is 9.7 and 5.9 cm
 off, HMR 2.0 7.0 and 4.4 cm."""
+POSE_DRIFT_S, POSE_JITTER = 2.0, 1 / 6
+"""Time (s) over which the errors of an estimated pose vary, and the share of them that is new in every frame."""
 FRAMES = ("all frames", "frames seen")
 VIEWS = {"edited by the other's view": (VIEW_DEG, VIEW_MISSED), "edited by exact views": (0.0, 0.0)}
 """Rows: error (°) and missed share of their views; those of exact views are the most that the editing can reach."""
@@ -125,3 +134,31 @@ def _at(motion: Motion, truth: Motion, frames: Bool[Tensor, "time"], name: str) 
     scores = {f"{part}_pe_cm": error[indices].mean().item() for part, indices in body_parts(truth.skeleton).items()}
     scores |= {"mpjpe_cm": error.mean().item(), "jitter_m_s3": jerk.mean().item()}
     return Row(name, 0, int(frames.sum()), scores)
+
+
+def seen_pose(
+    motion: Motion, T_world_cam: Trajectory, camera: Camera, error_deg: float, drop: float, rng: np.random.Generator
+) -> tuple[Motion, Float[Tensor, "time joint"]]:
+    """Simulated monocular estimate of a person's pose in a camera's frames, and the confidence of each joint's rotation.
+
+    Confidence is 0 where the joint or one of its children is outside the image, and in a share `drop` of the frames, in
+    short bursts. Local rotations are off by `error_deg` (root mean square angle): half of the variance is constant, half
+    drifts, and there is a little jitter (`POSE_JITTER`). The error level varies over the same time, and confidence
+    decreases with it. The root is the true one.
+    """
+    seen = at_times(motion, T_world_cam.timestamps)
+    count, joints, fps = len(seen), len(seen.skeleton), seen.fps
+    p_cam = T_world_cam.T_world_body.inverse()[:, None] @ seen.T_world_joint.t
+    _, inside = camera.project(p_cam)
+    outside = ~(inside & (torch.linalg.vector_norm(p_cam, dim=-1) > NEAR_M))
+    parents = torch.tensor(seen.skeleton.parents[1:])
+    hidden = outside.float().index_add(1, parents, outside[:, 1:].float()) > 0
+    missed = smooth_noise(rng, count, 1, BURST_S, fps) > norm.isf(drop)
+    level = (0.4 * smooth_noise(rng, count, 1, POSE_DRIFT_S, fps)).exp()
+    fixed = torch.from_numpy(rng.standard_normal((1, 3 * joints))).float()
+    drift, jitter = (smooth_noise(rng, count, 3 * joints, period, fps) for period in (POSE_DRIFT_S, 0.0))
+    error = np.deg2rad(error_deg) / np.sqrt(3) * level * ((fixed + drift) / np.sqrt(2) + POSE_JITTER * jitter)
+    error = error.unflatten(1, (joints, 3))
+    error[:, 0] = 0
+    confidence = 1 / (1 + 0.25 * level**2) if error_deg else torch.ones(count, 1)
+    return replace(seen, R_parent_joint=seen.R_parent_joint @ rotation.exp(error)), confidence * ~(hidden | missed)

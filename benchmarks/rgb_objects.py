@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from ireplica_baselines import static_objects
 from jaxtyping import Float32, UInt8
 from seen_flat import SeenFlat, depth_of, uncovered
 from simulated_depth_rig import look_at
@@ -27,7 +28,6 @@ from wearcap.recording.timing import at_times
 from wearcap.scene.objects import Environment
 from wearcap.simulation.rendering.head_camera import Filming, film
 from wearcap.simulation.rendering.views import Development, Scenery, exposed, render_view
-from wearcap.systems.ireplica.published import static_objects
 from wearcap.systems.ireplica.scores import SETTLED_S
 
 FPS = 2.0

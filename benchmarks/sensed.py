@@ -5,10 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from wearables import WEARABLES, WornNoise, worn
 
 from wearcap.body.skeleton import skeleton_of_height
 from wearcap.recording import Recording, RecordingStore
-from wearcap.sensors.wearables import WEARABLES, WornNoise, worn
 from wearcap.tracking.stature import skeleton_of
 
 GIVEN = "given"

@@ -17,6 +17,7 @@ from hps_sessions import TrueClock
 from jaxtyping import Bool, Float, Float64
 from tabling import summarize
 from torch import Tensor
+from wearables import WEARABLES
 
 from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
@@ -28,7 +29,6 @@ from wearcap.sensors.clock import mutual_pairs
 from wearcap.sensors.imu import GRAVITY, ImuNoise, synthesize_imu
 from wearcap.sensors.simulated import SlamNoise, head_stream
 from wearcap.sensors.suit import SUITS, SuitNoise, suit_motion
-from wearcap.sensors.wearables import WEARABLES
 from wearcap.simulation.recordings.hps import HpsConfig, Simulated, simulate_hps
 from wearcap.simulation.recordings.interaction_session import flat_of
 from wearcap.simulation.recordings.localization_noise import LocalizationNoise, by_gravity, localize_statistically

@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 
 import echo_limits
+from echo_baselines import NearestEcho, RigidWrist
 from echo_limits import EQUAL
 from echo_paper import PAPER, PAPER_HUMAN
 from echo_rows import Captured, Method, captured, pipeline_of, scenario_of
@@ -55,7 +56,6 @@ from wearcap.files import write_text
 from wearcap.metrics.table import TRUTH, Scores, Summary, aggregate, markdown_table, truth_row
 from wearcap.recording import RecordingStore
 from wearcap.runtime.system import CaptureInput
-from wearcap.systems.echo.published import NearestEcho, RigidWrist
 from wearcap.systems.echo.scores import score_echo
 
 BODY = {

@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.table import Table
 from sensed import GIVEN, WRONG_HEIGHTS, add_sensors
 from tabling import TRAINING, add_people, budget, finite, is_trained, left_out, split_of, titled, trainings_of
+from wearables import WEARABLES
 
 from wearcap.errors import WearcapError
 from wearcap.evaluation.breakdown import extremes
@@ -26,7 +27,6 @@ from wearcap.files import write_text
 from wearcap.metrics.table import P95, Scores, Summary, rich_lines, truth_row
 from wearcap.models.checkpoint import checkpoint_file
 from wearcap.recording import RecordingStore
-from wearcap.sensors.wearables import WEARABLES
 
 COLUMNS = {
     "mpjpe_cm": "MPJPE",

@@ -47,12 +47,12 @@ from tabling import (
     trainings_of,
     upright,
 )
+from wearables import WEARABLES
 
 from wearcap.files import write_text
 from wearcap.metrics.table import Row, Scores, Summary, aggregate, markdown_table, truth_row
 from wearcap.models.checkpoint import checkpoint_file
 from wearcap.recording import RecordingStore
-from wearcap.sensors.wearables import WEARABLES
 from wearcap.systems.mocap_every.energy import LatentSolver
 from wearcap.systems.mocap_every.visual_cues import load_visual_cues
 

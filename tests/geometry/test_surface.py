@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-import torch
 from scipy.spatial import KDTree
 
 from wearcap.errors import WearcapError
-from wearcap.geometry.surface import SurfaceIndex, voxel_downsample
+from wearcap.geometry.surface import SurfaceIndex
 
 
 @pytest.mark.parametrize("count", [1, 40, 20_000])
@@ -50,13 +49,3 @@ def test_an_empty_cloud_and_a_kilometre_are_refused():
         SurfaceIndex.build(np.zeros((0, 3), np.float32))
     with pytest.raises(WearcapError, match="millimetres"):
         SurfaceIndex.build(np.array([[0, 0, 0], [2e5, 0, 0]], np.float32))
-
-
-def test_voxels():
-    points = torch.tensor([[0.01, 0, 0], [0.03, 0, 0], [-0.01, 0, 0], [5, 5, 5]])
-    centres, voxel = voxel_downsample(points, 0.05)
-    assert len(centres) == 3
-    assert voxel[0] == voxel[1]
-    assert len({voxel[i].item() for i in (0, 2, 3)}) == 3
-    assert torch.allclose(centres[voxel[0]], torch.tensor([0.02, 0, 0]))
-    assert torch.allclose(centres[voxel[3]], points[3])

@@ -18,12 +18,14 @@ from wearcap.metrics.objects import vertex_error_cm
 from wearcap.recording import RecordingStore
 from wearcap.runtime.system import CaptureInput
 from wearcap.systems.echo.features import CONTACTS
+from wearcap.systems.echo.model import MODALITIES
 from wearcap.systems.echo.observations import batch_item_of
-from wearcap.systems.echo.published import NearestEcho, RigidWrist
-from wearcap.systems.echo.scores import MODALITIES, observed_share, score_echo, truth_of
+from wearcap.systems.echo.scores import score_echo, truth_of
 from wearcap.systems.echo.training_windows import EchoContent
 from wearcap.tracking.head_path import head_path
+from wearcap_testing import benchmark
 
+baselines, rows = map(benchmark, ("echo_baselines", "echo_rows"))
 RECORDING = carrying(1.5)
 TIMES = RECORDING.motion.timestamps
 
@@ -142,7 +144,7 @@ def test_without_a_truth_there_is_nothing_to_compare_with(scenario, missing):
 @pytest.mark.parametrize("modality", MODALITIES)
 @pytest.mark.parametrize("share", [0.1, 1.0])
 def test_a_share_of_the_truth_is_observed(truth, scenario, modality, share):
-    seen = observed_share(truth, modality, share, seed=1)
+    seen = rows.observed_share(truth, modality, share, seed=1)
     echo = drawn_echo()
     item = batch_item_of(
         replace(scenario, observed=seen), head_path(RECORDING, echo.model.skeleton, echo.fps), echo.reader()
@@ -154,7 +156,7 @@ def test_a_share_of_the_truth_is_observed(truth, scenario, modality, share):
         assert torch.equal(observed_parts[:, place], active if modality == "object" else torch.ones_like(active))
     elif modality != "object":
         assert observed_parts[:, place].sum() == round(share * len(TIMES))
-    other = observed_share(truth, modality, share, seed=1)
+    other = rows.observed_share(truth, modality, share, seed=1)
     assert str(other) == str(seen)
     if modality == "contact":
         assert seen.contact.shape[1] == CONTACTS
@@ -162,7 +164,7 @@ def test_a_share_of_the_truth_is_observed(truth, scenario, modality, share):
 
 def test_an_unknown_modality_is_refused(truth):
     with pytest.raises(WearcapError, match="no modality 'smell'. Expected one of human, object, contact"):
-        observed_share(truth, "smell", 0.1, 0)
+        rows.observed_share(truth, "smell", 0.1, 0)
 
 
 def test_a_data_set_brings_its_objects(dataset):
@@ -179,7 +181,7 @@ def test_a_data_set_brings_its_objects(dataset):
 
 
 def test_the_nearest_window_of_what_was_seen_is_itself(dataset):
-    nearest = NearestEcho.fit(dataset, window=12, stride=1)
+    nearest = baselines.NearestEcho.fit(dataset, window=12, stride=1)
     recording = replace(dataset.recordings[0][0].load("c0"), name="again")
     motion = nearest.capture_scenarios([scenario_of(recording, margin_s=2.0)], [0])[0]
     away = (motion.T_world_joint.t - recording.motion.T_world_joint.t).norm(dim=-1)
@@ -189,7 +191,7 @@ def test_the_nearest_window_of_what_was_seen_is_itself(dataset):
 
 
 def test_an_object_is_stuck_to_the_wrist_that_carried_it(dataset):
-    stuck = RigidWrist.fit(dataset)
+    stuck = baselines.RigidWrist.fit(dataset)
     echo, recording = drawn_echo(), carrying(1.5)
     scenario = scenario_of(recording, margin_s=2.0)
     item = batch_item_of(scenario, head_path(recording, echo.model.skeleton, echo.fps), echo.reader())
@@ -203,7 +205,7 @@ def test_an_object_is_stuck_to_the_wrist_that_carried_it(dataset):
 
 
 def test_baselines_are_functions_of_the_training_split_alone(dataset):
-    one, two = (NearestEcho.fit(dataset, window=12) for _ in range(2))
+    one, two = (baselines.NearestEcho.fit(dataset, window=12) for _ in range(2))
     assert torch.equal(one.outputs, two.outputs)
     assert set(one.descriptor) == {"box"}
     np.testing.assert_array_equal(one.frames["box"].numpy(), two.frames["box"].numpy())

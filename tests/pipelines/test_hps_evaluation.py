@@ -14,20 +14,10 @@ from wearcap.metrics.position import joint_error_cm
 from wearcap.recording import Motion, Recording
 from wearcap.recording.recording import ContactTrack, Intervals
 from wearcap.scene.scan import Scan
-from wearcap.systems.hps.scores import (
-    HpsTruth,
-    RigCloud,
-    drift,
-    interval_chamfer,
-    nearest_frames,
-    score_hps,
-    travelled_m,
-    visit_times,
-)
 from wearcap_testing import benchmark
 
 SECONDS, FPS, SPEED = 2.0, 60.0, 0.5
-outages = benchmark("hps_outages")
+outages, hps = map(benchmark, ("hps_outages", "hps_scores"))
 
 
 def gliding(speed: float = SPEED) -> Motion:
@@ -53,47 +43,48 @@ def recording() -> Recording:
 
 
 @pytest.fixture(scope="module")
-def truth(recording: Recording) -> HpsTruth:
+def truth(recording: Recording) -> hps.HpsTruth:
     rng = np.random.default_rng(0)
     floor = rng.uniform([-1, -1, 0], [2.5, 1, 0], (40_000, 3)).astype(np.float32)
     motion, body = recording.motion, anny_body(xsens23())
     assert motion is not None
-    clouds = [RigCloud(motion.timestamps[k].item(), body.vertices(motion.T_world_joint[k])) for k in (20, 60)]
-    return HpsTruth.of(recording, Scan(floor), [clouds[:1], clouds])
+    clouds = [hps.RigCloud(motion.timestamps[k].item(), body.vertices(motion.T_world_joint[k])) for k in (20, 60)]
+    return hps.HpsTruth.of(recording, Scan(floor), [clouds[:1], clouds])
 
 
-def test_the_truth_scores_nothing(truth: HpsTruth):
-    scores = score_hps(truth.motion, truth)
+def test_the_truth_scores_nothing(truth: hps.HpsTruth):
+    scores = hps.score_hps(truth.motion, truth)
     assert len(truth.motion) == 60
     assert len(scores.literal) == len(scores.surface) == 2
     assert max(part.mean_cm for part in (*scores.literal, *scores.surface)) < 0.01
     assert scores.joints["root_cm"] == scores.joints["mpjpe_cm"] == scores.drift.error_cm[0] == 0.0
 
 
-def test_a_body_that_is_lifted_by_five_centimetres_is_five_centimetres_off(truth: HpsTruth):
-    scores, lifted = score_hps(truth.motion, truth), score_hps(moved(truth.motion, 0.0, 0.0, 0.05), truth)
+def test_a_body_that_is_lifted_by_five_centimetres_is_five_centimetres_off(truth: hps.HpsTruth):
+    scores, lifted = hps.score_hps(truth.motion, truth), hps.score_hps(moved(truth.motion, 0.0, 0.0, 0.05), truth)
     assert lifted.joints["root_cm"] == pytest.approx(5.0, abs=1e-3)
     assert lifted.joints["mpjpe_cm"] == pytest.approx(5.0, abs=1e-3)
     assert lifted.feet.distance_cm - scores.feet.distance_cm == pytest.approx(5.0, abs=0.01)
     assert lifted.drift.error_cm == pytest.approx((5.0,), abs=1e-3)
 
 
-def test_feet_slide_as_far_as_they_go_from_frame_to_frame(truth: HpsTruth):
-    feet = score_hps(truth.motion, truth).feet
+def test_feet_slide_as_far_as_they_go_from_frame_to_frame(truth: hps.HpsTruth):
+    feet = hps.score_hps(truth.motion, truth).feet
     assert feet.sliding_cm == pytest.approx(100 * SPEED / 30, abs=1e-3)
     standing = replace(truth.motion, t_world_root=truth.motion.t_world_root[:1].expand(60, 3))
-    assert score_hps(standing, truth).feet.sliding_cm == pytest.approx(0.0, abs=1e-4)
+    assert hps.score_hps(standing, truth).feet.sliding_cm == pytest.approx(0.0, abs=1e-4)
 
 
-def test_contacts_are_those_asked_for(truth: HpsTruth):
-    scores = score_hps(truth.motion, truth)
+def test_contacts_are_those_asked_for(truth: hps.HpsTruth):
+    scores = hps.score_hps(truth.motion, truth)
     assert scores.feet.contacts == 4 * scores.feet_true_contact.contacts
     assert scores.feet_true_contact.contacts > 0
 
 
-def test_chamfer_grows_with_the_shift_up_to_all_of_it(truth: HpsTruth):
+def test_chamfer_grows_with_the_shift_up_to_all_of_it(truth: hps.HpsTruth):
     near, far = (
-        interval_chamfer(moved(truth.motion, 0.0, 0.0, shift), truth.body, truth.visits[1]) for shift in (0.05, 10.0)
+        hps.interval_chamfer(moved(truth.motion, 0.0, 0.0, shift), truth.body, truth.visits[1])
+        for shift in (0.05, 10.0)
     )
     for literal, surface in (near, far):
         assert surface.cloud_to_body_cm <= literal.cloud_to_body_cm + 1e-9
@@ -103,16 +94,16 @@ def test_chamfer_grows_with_the_shift_up_to_all_of_it(truth: HpsTruth):
     assert 1000 - 100 * tall < far[0].mean_cm < 1000.0
 
 
-def test_clouds_are_met_at_their_own_time(truth: HpsTruth):
+def test_clouds_are_met_at_their_own_time(truth: hps.HpsTruth):
     late = replace(truth.motion, timestamps=truth.motion.timestamps + 0.2)
-    off = interval_chamfer(late, truth.body, truth.visits[1])[0]
+    off = hps.interval_chamfer(late, truth.body, truth.visits[1])[0]
     assert off.mean_cm > 1.0, "10 cm of path"
     with pytest.raises(WearcapError, match="no captured frame at 1.00 s"):
-        interval_chamfer(truth.motion.sliced(0, 20), truth.body, truth.visits[1])
-    assert nearest_frames(truth.motion.timestamps, torch.tensor([0.34, 1.01]).double()).tolist() == [10, 30]
+        hps.interval_chamfer(truth.motion.sliced(0, 20), truth.body, truth.visits[1])
+    assert hps.nearest_frames(truth.motion.timestamps, torch.tensor([0.34, 1.01]).double()).tolist() == [10, 30]
 
 
-def test_a_captured_turn_leaves_the_root_where_it_is_and_moves_the_joints(truth: HpsTruth):
+def test_a_captured_turn_leaves_the_root_where_it_is_and_moves_the_joints(truth: hps.HpsTruth):
     R = truth.motion.R_parent_joint.clone()
     R[:, 0] = about_axis("z", torch.tensor(np.pi))
     turned = replace(truth.motion, R_parent_joint=R)
@@ -125,13 +116,13 @@ def test_a_captured_turn_leaves_the_root_where_it_is_and_moves_the_joints(truth:
 
 def test_the_slope_counts_path_length_and_not_time():
     distance = torch.cat([torch.linspace(0, 100, 500), torch.full((5000,), 100.0), torch.linspace(100, 400, 1500)])
-    grown = drift(distance.double(), (3.0 + 0.02 * distance).double())
+    grown = hps.drift(distance.double(), (3.0 + 0.02 * distance).double())
     assert grown.slope_cm_per_100m == pytest.approx(2.0, abs=0.15)
     assert len(grown.distance_m) == 20
     assert grown.error_cm[0] == pytest.approx(3.2, abs=0.05)
-    level = drift(distance.double(), torch.full_like(distance, 4.0).double())
+    level = hps.drift(distance.double(), torch.full_like(distance, 4.0).double())
     assert level.slope_cm_per_100m == pytest.approx(0.0, abs=1e-9)
-    assert np.isnan(drift(distance[:50].double(), distance[:50].double()).slope_cm_per_100m)
+    assert np.isnan(hps.drift(distance[:50].double(), distance[:50].double()).slope_cm_per_100m)
 
 
 def test_the_path_length_is_that_over_the_ground():
@@ -139,7 +130,7 @@ def test_the_path_length_is_that_over_the_ground():
     up = replace(
         motion, t_world_root=motion.t_world_root + torch.linspace(0, 3, 120)[:, None] * torch.tensor([0, 0, 1])
     )
-    assert travelled_m(up)[-1].item() == pytest.approx(119 / 60, abs=1e-4)
+    assert hps.travelled_m(up)[-1].item() == pytest.approx(119 / 60, abs=1e-4)
 
 
 def intervals(*spans: tuple[float, float]) -> Intervals:
@@ -148,7 +139,7 @@ def intervals(*spans: tuple[float, float]) -> Intervals:
 
 
 def test_instants_lie_evenly_within_their_interval():
-    times = visit_times(intervals((10.0, 20.0), (30.0, 32.0)), 4)
+    times = hps.visit_times(intervals((10.0, 20.0), (30.0, 32.0)), 4)
     assert torch.allclose(times[0], torch.tensor([11.25, 13.75, 16.25, 18.75]).double())
     assert (times[1] > 30).all()
     assert (times[1] < 32).all()
@@ -182,8 +173,8 @@ def test_a_disturbance_is_measured_in_its_own_frames():
     assert outages.disturbance(disturbed, motion, motion, ~frames).root_cm == pytest.approx(2.0, abs=1e-3)
 
 
-def test_captures_of_another_length_and_recordings_without_truth_are_refused(truth: HpsTruth, recording: Recording):
+def test_captures_of_another_length_and_recordings_without_truth_are_refused(truth: hps.HpsTruth, recording: Recording):
     with pytest.raises(WearcapError, match="the same timestamps"):
-        score_hps(truth.motion.sliced(0, 40), truth)
+        hps.score_hps(truth.motion.sliced(0, 40), truth)
     with pytest.raises(WearcapError, match="nothing to measure a capture against"):
-        HpsTruth.of(replace(recording, contacts=None), Scan(np.zeros((10, 3), np.float32)), [])
+        hps.HpsTruth.of(replace(recording, contacts=None), Scan(np.zeros((10, 3), np.float32)), [])

@@ -27,10 +27,11 @@ from wearcap.scene.objects import UNKNOWN_CLASS, Environment, Freedom, SceneObje
 from wearcap.systems.ireplica.detected_contacts import DetectedContacts
 from wearcap.systems.ireplica.object_tracker import PALMS, AttachmentSettings, ObjectTracker
 from wearcap.systems.ireplica.pipeline import IReplica
-from wearcap.systems.ireplica.published import held_when_near, interpolated_objects, static_objects
 from wearcap.systems.ireplica.scores import score_interactions
 from wearcap.systems.ireplica.snapping import BendCorrection, HandSnapping, HingeFit, SnapCorrection, fit_about_hinge
+from wearcap_testing import benchmark
 
+baselines = benchmark("ireplica_baselines")
 FPS, FRAMES = 60.0, 360
 TAKE, LEAVE = 60, 240
 CUBE = np.array([[x, y, z] for x in (-0.2, 0.2) for y in (-0.2, 0.2) for z in (-0.2, 0.2)], np.float32)
@@ -266,7 +267,7 @@ def test_handlings_outside_of_the_capture_spoil_no_mean(scene, displacement):
         ("sliding",) * 2,
     )
     truth = Recording("r", motion=motion, interactions=held, object_motion={"near": track})
-    late = static_objects(motion.sliced(60, FRAMES), environment)
+    late = baselines.static_objects(motion.sliced(60, FRAMES), environment)
     far = late.object_motion["far"]  # pyright: ignore[reportOptionalSubscript]
     far.t_world_body[-1] += 5.0
     scores = score_interactions(late, truth, environment)
@@ -321,14 +322,16 @@ def test_scores_tell_the_perfect_capture_from_the_static_one(scene, displacement
     perfect = score_interactions(captured, truth, environment)
     assert perfect.handlings[0].end_cm == pytest.approx(0.0, abs=1e-3)
     assert perfect.handlings[0].hand_object_cm < 0.1
-    still = score_interactions(static_objects(motion, environment), truth, environment)
+    still = score_interactions(baselines.static_objects(motion, environment), truth, environment)
     assert still.handlings[0].end_cm == pytest.approx(100.0, abs=0.5)
     assert still.handlings[0].hand_cm == pytest.approx(0.0, abs=1e-3)
     assert still.object_chamfer_cm > 5 > perfect.object_chamfer_cm
-    line = score_interactions(interpolated_objects(motion, environment, held, truth.object_motion), truth, environment)
+    line = score_interactions(
+        baselines.interpolated_objects(motion, environment, held, truth.object_motion), truth, environment
+    )
     assert line.handlings[0].end_cm < 0.1
     assert line.handlings[0].hand_object_cm > 2 * perfect.handlings[0].hand_object_cm
-    near = score_interactions(held_when_near(tracker(), motion, environment), truth, environment)
+    near = score_interactions(baselines.held_when_near(tracker(), motion, environment), truth, environment)
     assert near.handlings[0].end_cm < 60
 
 
@@ -337,7 +340,7 @@ def test_objects_keep_their_own_clock(scene, displacement):
     track = Trajectory(motion.timestamps[[0, -1]], torch.eye(3).repeat(2, 1, 1), torch.zeros(2, 3))
     held = Interactions(torch.zeros(0).double(), torch.zeros(0).double(), torch.zeros(0, 2, dtype=torch.bool), (), ())
     truth = Recording("r", motion=motion, interactions=held, object_motion={"near": track})
-    scores = score_interactions(static_objects(motion, environment), truth, environment)
+    scores = score_interactions(baselines.static_objects(motion, environment), truth, environment)
     assert scores.handlings == ()
     assert scores.false_moves_cm == 0
 

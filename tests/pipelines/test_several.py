@@ -9,17 +9,18 @@ import torch
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import Motion, Recording, RecordingStore
-from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_two_wearers
+from wearcap.simulation.recordings.simulate import SimulationConfig
 from wearcap.systems.mocap_every.energy import LatentSolver, LatentWeights
 from wearcap.systems.mocap_every.manifold import MotionManifold
 from wearcap.systems.mocap_every.visual_cues import View, VisualCues, capture_session
 from wearcap.tracking.anchor import anchored_to_head
+from wearcap_testing import benchmark
 
 
 @pytest.fixture(scope="module")
 def pair() -> tuple[Recording, Recording]:
     config = SimulationConfig(duration_s=3.0, fps=30.0, points=False, suit=None, world="flat")
-    return simulate_two_wearers(config, "talk", "val", 3, distance_m=2.5)
+    return benchmark("two_wearers").simulate_two_wearers(config, "talk", "val", 3, distance_m=2.5)
 
 
 class AnyMotion(MotionManifold):

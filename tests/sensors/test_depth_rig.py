@@ -215,3 +215,13 @@ def test_an_empty_room_gives_no_cloud(scene: Scene, views: list[DepthView]):
     assert len(person_cloud(list(scene.rig.empty_mm[:, 0]), views)) < 50
     with pytest.raises(WearcapError, match="2 depth images for 3 cameras"):
         person_cloud(list(scene.rig.depth_mm[:2, 0]), views)
+
+
+def test_voxels():
+    points = torch.tensor([[0.01, 0, 0], [0.03, 0, 0], [-0.01, 0, 0], [5, 5, 5]])
+    centres, voxel = rig.voxel_downsample(points, 0.05)
+    assert len(centres) == 3
+    assert voxel[0] == voxel[1]
+    assert len({voxel[i].item() for i in (0, 2, 3)}) == 3
+    assert torch.allclose(centres[voxel[0]], torch.tensor([0.02, 0, 0]))
+    assert torch.allclose(centres[voxel[3]], points[3])

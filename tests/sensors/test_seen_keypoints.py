@@ -9,9 +9,9 @@ from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording import Motion
-from wearcap.sensors.keypoints import ACTION_CAMERA, action_camera, camera_path, seen_joints, seen_pose
+from wearcap.sensors.keypoints import ACTION_CAMERA, action_camera, camera_path, seen_joints
 from wearcap.sensors.slam import R_DEVICE_CAM
-from wearcap_testing import swaying_motion
+from wearcap_testing import benchmark, swaying_motion
 
 WRISTS = ("left_wrist", "right_wrist")
 
@@ -99,6 +99,7 @@ def test_a_clock_of_its_own_is_refused(motion):
 
 def test_an_estimated_pose_is_as_wrong_as_asked_and_of_what_is_in_the_picture(motion):
     path = watching(motion, 1.2)
+    seen_pose = benchmark("mocap_every_several").seen_pose
     exact, seen = seen_pose(motion, path, ACTION_CAMERA, 0.0, 0.0, np.random.default_rng(0))
     off, confidence = seen_pose(motion, path, ACTION_CAMERA, 12.0, 0.2, np.random.default_rng(0))
     assert torch.allclose(exact.R_parent_joint, motion.R_parent_joint[::2][: len(path)], atol=1e-5)

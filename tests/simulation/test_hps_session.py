@@ -21,9 +21,9 @@ from wearcap.simulation.recordings.localization_noise import (
     MapErrors,
     by_gravity,
     localize_statistically,
-    with_outage,
 )
 from wearcap.simulation.rendering.head_camera import HEAD_CAMERA_TRUTH, SOUND_HZ, sound_track, view_texture
+from wearcap_testing import benchmark
 
 SHORT = Protocol(returns_m=(45.0,), end_m=80.0, clap_every_s=60.0)
 
@@ -177,6 +177,7 @@ def test_outages_come_where_there_is_little_to_see(long_path):
 
 def test_an_outage_can_be_planted(long_path):
     found = localize_statistically(long_path, LocalizationNoise(lost=(0.0, 0.0)), np.random.default_rng(0))
+    with_outage = benchmark("hps_outages").with_outage
     gone = with_outage(found, 100.0, 30.0)
     inside = (found.timestamps >= 100) & (found.timestamps < 130)
     assert (gone.confidence[inside] == 0).all()

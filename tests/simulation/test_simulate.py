@@ -67,7 +67,9 @@ def test_three_in_ten_recordings_are_outdoors_unless_a_world_is_asked_for(monkey
     monkeypatch.setattr(simulate, "simulate_motion", lambda *_: None)
     monkeypatch.setattr(simulate, "drawn_person", lambda *_: None)
     monkeypatch.setattr(simulate, "world_of", lambda split, number, kind: replace(stairs_flat, name=kind))
-    monkeypatch.setattr(simulate, "_sensed", lambda config, name, world, *_: Recording(name, location=world.name))
+    monkeypatch.setattr(
+        simulate, "sensed_recording", lambda config, name, world, *_: Recording(name, location=world.name)
+    )
     drawn = [simulate_recording(SHORT, "one", "train", seed).location for seed in range(300)]
     assert 0.22 < drawn.count("outdoor") / 300 < 0.38
     for kind in simulate.WORLDS:

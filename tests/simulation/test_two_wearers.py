@@ -5,8 +5,10 @@ import torch
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_two_wearers
+from wearcap.simulation.recordings.simulate import SimulationConfig
+from wearcap_testing import benchmark
 
+simulate_two_wearers = benchmark("two_wearers").simulate_two_wearers
 CONFIG = SimulationConfig(duration_s=3.0, points=False, suit=None, world="flat")
 
 

@@ -7,9 +7,7 @@ query takes less than a microsecond, against about ten with a KD-tree.
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from jaxtyping import Float, Float32, Float64, Int64
-from torch import Tensor
+from jaxtyping import Float32, Float64, Int64
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.compiled import compiled
@@ -78,17 +76,6 @@ class SurfaceIndex:
     @property
     def _grid(self) -> tuple:
         return self.points, self.cell_m, self.origin, self.keys, self.first, self.count
-
-
-def voxel_downsample(
-    points: Float[Tensor, "point 3"], voxel_size: float
-) -> tuple[Float[Tensor, "voxel 3"], Int64[Tensor, "point"]]:
-    """Mean of the points in each occupied voxel (edge length in m), and the voxel index of every point."""
-    cell = torch.floor(points.double() / voxel_size).long()
-    _, voxel, count = torch.unique(cell, dim=0, return_inverse=True, return_counts=True)
-    total = torch.zeros(len(count), 3, dtype=torch.float64, device=points.device)
-    total.index_add_(0, voxel, points.double())
-    return (total / count[:, None]).to(points.dtype), voxel
 
 
 def _pack(points: np.ndarray, origin: np.ndarray, cell_m: float) -> Int64[np.ndarray, "point"]:

@@ -114,13 +114,3 @@ def chamfer(
         to_body, _ = TriangleIndex.build(body, faces.cpu().numpy()).nearest(points)
     to_cloud, _ = KDTree(points).query(body)
     return Chamfer(100 * float(np.mean(to_body)), 100 * float(np.mean(to_cloud)))
-
-
-def mean_chamfer(frames: list[Chamfer]) -> Chamfer:
-    """Mean over frames: one row's entry in Tables 4.1 and 4.2. Raises WearcapError without frames."""
-    if not frames:
-        raise WearcapError("no frames to average", expected="at least one frame with a cloud")
-    return Chamfer(
-        float(np.mean([frame.cloud_to_body_cm for frame in frames])),
-        float(np.mean([frame.body_to_cloud_cm for frame in frames])),
-    )

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import scipy.stats
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from wearcap.errors import WearcapError
@@ -153,23 +153,11 @@ def localize_statistically(
     found = Localization(
         path.timestamps, R, path.t_world_body + error[:, 3:], confidence, torch.diag_embed(spread.float() ** 2)
     )
-    return _without(found, lost)
+    return without(found, lost)
 
 
-def with_outage(localization: Localization, start_s: float, length_s: float) -> Localization:
-    """The same localisation without any found frames for a while from `start_s` (on its own clock).
-
-    Raises WearcapError when no frame falls into it.
-    """
-    times = localization.timestamps
-    lost = (times >= start_s) & (times < start_s + length_s)
-    if not lost.any():
-        expected = f"within {times[0]:.1f} to {times[-1]:.1f} s"
-        raise WearcapError(f"an outage of {length_s} s at {start_s} s", expected=expected)
-    return _without(localization, lost)
-
-
-def _without(found: Localization, lost: Tensor) -> Localization:
+def without(found: Localization, lost: Bool[Tensor, "time"]) -> Localization:
+    """A localisation whose lost frames have not been found."""
     covariance = found.covariance
     if covariance is not None:
         covariance = torch.where(lost[:, None, None], torch.eye(6), covariance)

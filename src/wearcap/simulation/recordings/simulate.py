@@ -1,25 +1,15 @@
-"""Simulated recordings: a world, one person or two face to face, activities, and the sensor readings.
-
-Two wearers share a session, its world and its clock. The second is placed in front of the first after both were
-simulated, so walking may lead them through each other, walls and furniture: by default they stay where they are.
-"""
+"""Simulated recordings: a world, a person, activities, and the sensor readings."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from wearcap.body.skeleton import FOOT_PATCHES
 from wearcap.errors import WearcapError
-from wearcap.geometry import rotation
-from wearcap.geometry.rigid import Rigid
-from wearcap.recording.motion import Motion
 from wearcap.recording.recording import ContactTrack, FloorTrack, Recording
 from wearcap.sensors.imu import ImuNoise, synthesize_imu
-from wearcap.sensors.keypoints import action_camera
 from wearcap.sensors.simulated import SlamNoise, head_stream
 from wearcap.sensors.slam import semidense_points
 from wearcap.sensors.suit import SuitNoise, suit_motion
@@ -43,9 +33,6 @@ WORLDS = {
 """Kinds of surroundings: a number for their seeds, and their builder."""
 
 OUTDOOR_SHARE = 0.3
-STAYING = ("stand", "gesture", "look_around")
-"""Activities on the spot."""
-ACTION_CAMERA_FPS = 30.0
 
 
 @dataclass(frozen=True)
@@ -86,54 +73,15 @@ def simulate_recording(
         raise WearcapError("no folder for the head camera's video", expected="one for the data set")
     rng = np.random.default_rng([seed, sum(map(ord, split))])
     person = drawn_person(split, rng)
-    world = _drawn_world(config, split, rng)
+    world = drawn_world(config, split, rng)
     activities = list(config.activities) if config.activities else None
     simulated = simulate_motion(world, person, rng, config.duration_s, config.fps, activities)
-    recording = _sensed(config, name, world, person, simulated, rng)
+    recording = sensed_recording(config, name, world, person, simulated, rng)
     if not config.camera or folder is None:
         return recording
     file = folder / "videos" / f"{name}.mp4"
     camera = write_ego_video(file, world, simulated.motion, person.shape, person.t_head_device, seeded(31, split, seed))
     return replace(recording, camera=camera)
-
-
-def simulate_two_wearers(
-    config: SimulationConfig, name: str, split: str, seed: int, distance_m: float = 2.5
-) -> tuple[Recording, Recording]:
-    """Recordings NAME-a and NAME-b of the session NAME, of two people of the split; each wears an action camera.
-
-    They face each other in the first frame. Raises WearcapError when the cameras are to film, which is for one wearer
-    alone.
-    """
-    if config.camera:
-        raise WearcapError("cameras that film two wearers", expected="camera=false")
-    rng = seeded(seed, split, 2)
-    people = [person_of(split, int(number)) for number in rng.choice(POOLS[split][0], 2, replace=False)]
-    world = _drawn_world(config, split, rng)
-    activities = config.activities or STAYING
-    first, second = (
-        simulate_motion(world, person, rng, config.duration_s, config.fps, list(activities)) for person in people
-    )
-    rise = first.floor_height[0] - second.floor_height[0]
-    moved = second.motion.moved(face_to_face(first.motion, second.motion, distance_m, rise))
-    facing = replace(second, motion=moved, floor_height=second.floor_height + rise)
-    recordings = []
-    for letter, person, simulated in zip("ab", people, (first, facing)):
-        every = max(1, round(config.fps / ACTION_CAMERA_FPS))
-        recording = _sensed(config, f"{name}-{letter}", world, person, simulated, rng)
-        camera = action_camera(simulated.motion.timestamps[::every].contiguous())
-        recordings.append(replace(recording, session=name, camera=camera))
-    return recordings[0], recordings[1]
-
-
-def face_to_face(first: Motion, second: Motion, distance_m: float, rise_m: float | Tensor = 0.0) -> Rigid:
-    """Displacement of the second motion that puts its first frame in front of the first motion's, facing it, and raises
-    it by `rise_m`."""
-    ahead, heading = (rotation.yaw_of(motion.R_parent_joint[0, 0]) for motion in (first, second))
-    R = rotation.about_axis("z", ahead + torch.pi - heading)
-    place = first.t_world_root[0] + distance_m * torch.stack([ahead.cos(), ahead.sin(), torch.zeros(())])
-    place = torch.stack([place[0], place[1], second.t_world_root[0, 2] + rise_m])
-    return Rigid(R, place - R @ second.t_world_root[0])
 
 
 def seeded(salt: int, split: str, number: int) -> np.random.Generator:
@@ -157,13 +105,13 @@ def world_of(split: str, number: int, kind: str = "flat") -> World:
     return build(seeded(salt, split, number), f"sim-{split}-{kind}-{number:03d}")
 
 
-def _drawn_world(config: SimulationConfig, split: str, rng: np.random.Generator) -> World:
+def drawn_world(config: SimulationConfig, split: str, rng: np.random.Generator) -> World:
     """One of a split's places, of the configured kind."""
     number, kind = int(rng.integers(POOLS[split][1])), "outdoor" if rng.uniform() < OUTDOOR_SHARE else "flat"
     return world_of(split, number, config.world or kind)
 
 
-def _sensed(
+def sensed_recording(
     config: SimulationConfig,
     name: str,
     world: World,

@@ -1,4 +1,4 @@
-"""ECHO's ground truth and tables: metrics of body, object and contacts, and sparse observations of the truth."""
+"""ECHO's ground truth and tables: metrics of body, object and contacts."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from wearcap.body.anny_body import anny_body
 from wearcap.body.contact_points import BODY_POINTS, TOUCH_M, contact_points
 from wearcap.body.skeleton import FOOT_PATCHES
-from wearcap.errors import WearcapError, require_choice
+from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate_clamped, nearest_frames, resample
 from wearcap.metrics import objects as object_metrics
@@ -22,8 +22,7 @@ from wearcap.metrics.table import TRUTH, Row, both_walking
 from wearcap.recording import Motion, Recording
 from wearcap.recording.acts import active_at
 from wearcap.recording.timing import at_times
-from wearcap.systems.echo.model import MODALITIES
-from wearcap.systems.echo.observations import ObjectReader, ObjectShape, Observed, Scenario
+from wearcap.systems.echo.observations import ObjectReader, ObjectShape, Scenario
 
 FASTENED = "cabinet_door", "door", "drawer", "window"
 """Categories of objects that hinges and rails hold; the others are loose."""
@@ -165,28 +164,3 @@ def score_echo(motion: Motion, truth: Truth, name: str, seed: int) -> Row:
         precision, recall = found.precision, found.recall  # without recall the precision may be undefined
         scores["touch_f1"] = 2 * precision * recall / (precision + recall) if recall else 0.0
     return Row(name, seed, len(motion), scores)
-
-
-def observed_share(truth: Truth, modality: str, share: float, seed: int) -> Observed:
-    """Ground truth of one modality in a random share of the frames, drawn uniformly (ECHO Tables 3, S2).
-
-    Raises WearcapError for an unknown modality.
-    """
-    require_choice(modality, MODALITIES, f"no modality {modality!r}")
-    rng = np.random.default_rng([17, seed])
-    count = len(truth.motion)
-    chosen = np.sort(rng.choice(count, max(1, round(share * count)), replace=False))
-    take = torch.from_numpy(chosen)
-    times = truth.motion.timestamps[take]
-    if modality == "human":
-        R, t = truth.motion.R_parent_joint[take], truth.motion.t_world_root[take]
-        return Observed(motion=Motion(times, truth.motion.skeleton, R, t))
-    if modality == "object":
-        tracks = {}
-        for number, shape in enumerate(truth.objects):
-            rows = take[truth.active[take] == number]
-            pose = shape.of_mesh(truth.T_world_object[number][rows])
-            tracks[shape.name] = Trajectory(truth.motion.timestamps[rows], pose.R, pose.t)
-        return Observed(object_motion=tracks)
-    contact = torch.cat([truth.touch.float(), truth.foot_contact], 1)[take]
-    return Observed(contact_times=times, contact=contact)

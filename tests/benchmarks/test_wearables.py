@@ -12,8 +12,10 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Recording
 from wearcap.recording.recording import FloorTrack, PointCloud
 from wearcap.sensors.simulated import SlamNoise, head_stream, slam_poses
-from wearcap.sensors.wearables import WEARABLES, WornNoise, worn
-from wearcap_testing import swaying_motion
+from wearcap_testing import benchmark, swaying_motion
+
+wearables = benchmark("wearables")
+WEARABLES, WornNoise = wearables.WEARABLES, wearables.WornNoise
 
 SEAT = torch.tensor([0.09, 0.0, 0.08])
 
@@ -33,8 +35,8 @@ def recorded(frames: int = 600) -> Recording:
     )
 
 
-def sensed(noise: WornNoise, seed: int = 0, frames: int = 600) -> Recording:
-    return worn(recorded(frames), noise, np.random.default_rng(seed))
+def sensed(noise: wearables.WornNoise, seed: int = 0, frames: int = 600) -> Recording:
+    return wearables.worn(recorded(frames), noise, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("preset", WEARABLES)
@@ -129,4 +131,4 @@ def test_what_cannot_be_worn_is_refused():
     with pytest.raises(WearcapError, match="ideal, typical, poor"):
         WornNoise.preset("perfect")
     with pytest.raises(WearcapError, match="nothing to sense"):
-        worn(Recording("empty"), WEARABLES["ideal"], np.random.default_rng(0))
+        wearables.worn(Recording("empty"), WEARABLES["ideal"], np.random.default_rng(0))

@@ -17,7 +17,7 @@ from wearcap.body.model import BodyModel
 from wearcap.errors import WearcapError
 from wearcap.geometry.surface import SurfaceIndex
 from wearcap.metrics.position import joint_error_cm
-from wearcap.metrics.surface import Chamfer, FootSurface, chamfer, foot_surface, foot_vertices, mean_chamfer
+from wearcap.metrics.surface import Chamfer, FootSurface, chamfer, foot_surface, foot_vertices
 from wearcap.metrics.table import evaluate_motion
 from wearcap.recording import Motion, Recording
 from wearcap.recording.recording import Intervals
@@ -182,3 +182,13 @@ def drift(distance_m: Float[Tensor, "time"], error_cm: Float[Tensor, "time"]) ->
     middle = (np.flatnonzero(count) + 0.5) * BIN_M
     slope = 100 * float(np.polyfit(middle, error, 1)[0]) if len(middle) > 1 else math.nan
     return Drift(tuple(middle.tolist()), tuple(error.tolist()), slope)
+
+
+def mean_chamfer(frames: list[Chamfer]) -> Chamfer:
+    """Mean over frames: one row's entry in Tables 4.1 and 4.2. Raises WearcapError without frames."""
+    if not frames:
+        raise WearcapError("no frames to average", expected="at least one frame with a cloud")
+    return Chamfer(
+        float(np.mean([frame.cloud_to_body_cm for frame in frames])),
+        float(np.mean([frame.body_to_cloud_cm for frame in frames])),
+    )
