@@ -133,3 +133,12 @@ def test_edges_of_a_floor_are_left_out():
     assert (found["sole_low_cm"], found["sole_high_cm"]) == pytest.approx((0, 0), abs=1e-3)
     lower = FloorTrack(times, torch.where(times > 3.0, -0.2, 0.0))
     assert truth([replace(person, floor=lower)])["sole_high_cm"] == pytest.approx(20, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("activity", "walks"), [("", True), ("WalkTurnLeft", True), ("sit, walk", True), ("jump", False)]
+)
+def test_cycles_of_other_activities_are_not_walking(activity, walks):
+    """Somebody who runs up to a jump is no walker."""
+    recording = Recording("walk", motion=walk(), activity=activity)
+    assert (truth([recording]).get("cycles", 0) > 0) == walks

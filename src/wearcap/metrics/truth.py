@@ -40,7 +40,7 @@ def truth(recordings: Sequence[Recording]) -> dict[str, float]:
     pitches = torch.cat([_walking_pitch_deg(motion) for motion in motions])
     found = {
         "minutes": minutes,
-        **_knees(motions),
+        **_knees(motions, [not recording.activity or "walk" in recording.activity.lower() for recording, _ in pairs]),
         **dict(zip(("bones_cm", "stature_m", "leg", "eyes"), bodies.tolist())),
         **dict(zip(("sole_low_cm", "sole_cm", "sole_high_cm"), soles)),
         "skate_cm_s": (skate / planted).item(),
@@ -51,9 +51,10 @@ def truth(recordings: Sequence[Recording]) -> dict[str, float]:
     return {name: value for name, value in found.items() if isfinite(value)}
 
 
-def _knees(motions: Sequence[Motion]) -> dict[str, float]:
-    """The figures of cycles and knees."""
-    left, right = (torch.cat(side) for side in zip(*(knee_cycles(motion) for motion in motions)))
+def _knees(motions: Sequence[Motion], walks: Sequence[bool]) -> dict[str, float]:
+    """The figures of cycles, those of motions in which somebody may walk by their activity, and knees."""
+    cycles = [[side[: len(side) * may] for side in knee_cycles(motion)] for motion, may in zip(motions, walks)]
+    left, right = (torch.cat(side) for side in zip(*cycles))
     both, knees = torch.cat([left, right]), [knee_deg(motion) for motion in motions]
     stands = [standing(motion) for motion in motions]
     stood = torch.cat([knee[mask].flatten() for knee, mask in zip(knees, stands)])
