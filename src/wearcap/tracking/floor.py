@@ -16,10 +16,10 @@ from wearcap.scene.floor import estimate_floor
 
 MIN_POINTS = 500
 """Fewest points that a floor is estimated from."""
-CARRIED = 0.97
+CARRIED = 0.985
 """How high people carry the head joint while upright, as a share of its height in the rest pose: neck, hips and knees are a
-little bent. In the training splits it is 0.976 of CMU's people and 0.958 of HDM05's, but 0.997 of simulated ones
-(benchmarks/carried_heads.py)."""
+little bent. Medians of people in the training splits: CMU 0.980, ACCAD 0.984, FuBoT-VR 0.980, UI-PRMD 0.993, simulated 0.998
+(`benchmarks/carried_heads.py`)."""
 UPRIGHT_WITHIN_S = 30.0
 """People are assumed to be upright for a tenth of any interval of this length (s)."""
 _LOOK_EVERY_S = 0.25
