@@ -32,6 +32,9 @@ MOST_ROWS = 12
 """Of a headline table."""
 TRANSCRIBED = "transcribed"
 """Key of a JSON's `about` whose figures were taken from an earlier page and not from the command's own output."""
+STRAIGHTENED = "2026-11-28"
+"""Date from which the truth's knees straighten: CMU's and HDM05's hips are repaired, simulated people walk as people do."""
+BENT = "truth with bent knees"
 LEFT = "left"
 """Key of a table's `about` that names rows of an earlier run, which this one left as they were, and its command."""
 _RANKED = "The worst, the median and the best of {}, truth above and captured below; dots mark contact"
@@ -224,6 +227,7 @@ def about(command: str) -> dict[str, str]:
 def origin(about: Mapping[str, Any], spread: str = "") -> str:
     """A table's command, date and machine, and over what it spreads."""
     parts = [f"`{about['command']}`", about["date"], about["machine"], *([spread] if spread else [])]
+    parts += [BENT] if about["date"] < STRAIGHTENED else []
     words = ", ".join(map(str, parts)) + ("; transcribed from an earlier page" if about.get(TRANSCRIBED) else "") + "."
     if left := about.get(LEFT):
         words += (
@@ -348,6 +352,11 @@ def render(system: str, page: Page, speed: Mapping[str, list[Tree]]) -> str:
     made = f"Written by `python benchmarks/tables.py {system} --page` from the JSON files beside this page."
     if any(TRANSCRIBED in grid.origin for grid in page.full):
         made += " Tables that say so are transcribed from an earlier page; the same command makes them anew."
+    if any(BENT in grid.origin for grid in page.full):
+        made += (
+            f" Tables of {BENT} were taken before CMU's and HDM05's hips were repaired and simulated people walked upright "
+            "([truth](../data.md#truth)), with the checkpoints of that time: do not compare them with later ones."
+        )
     parts = [f"# {page.title}", made, page.headline.title, markdown(page.headline)]
     parts += ["## Held out", page.held_out, "## Simulated", page.simulated]
     parts += ["## Limits", "\n".join(f"- {limit}" for limit in page.limits)]
