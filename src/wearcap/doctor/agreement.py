@@ -196,8 +196,8 @@ def check_camera(stream: CameraStream) -> list[Finding]:
     return findings
 
 
-def check_localization(found: Localization, body: Motion | None, clapped: bool) -> list[Finding]:
-    """Share of localised frames, plausibility of the camera's path for a head, and its clock, its own if one `clapped`."""
+def check_localization(found: Localization, body: Motion | None, claps: list[Finding]) -> list[Finding]:
+    """Share of localised frames, plausibility of the camera's path for a head, and its clock; claps are `check_claps`."""
     check, known = Check("localization"), found.confidence > 0
     share = known.float().mean().item()
     edges = torch.cat([found.timestamps[:1], found.timestamps[known], found.timestamps[-1:]])
@@ -242,6 +242,7 @@ def check_localization(found: Localization, body: Motion | None, clapped: bool) 
     if lag is not None and lag[1] < 0.5 and (spread := turning.std().item()) < HARDLY_TURNS:
         evidence = f"the head turns at {spread:.2g} rad/s, correlation {lag[1]:.2f}"
         return [*findings, Check("localization: clock offset").note("not enough motion to compare clocks", evidence)]
+    clapped = any(finding.severity == "ok" for finding in claps)
     return findings + check_offset("localization: clock offset", lag, "the camera", clapped)
 
 

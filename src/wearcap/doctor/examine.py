@@ -90,8 +90,7 @@ def examine_recording(recording: Recording) -> list[Finding]:
         findings += check_camera(recording.camera)
     findings += (claps := check_claps(recording))
     if recording.localization is not None and "localization" in usable:
-        clapped = any(finding.severity == "ok" for finding in claps)
-        findings += check_localization(recording.localization, bodies.get("suit", body), clapped)
+        findings += check_localization(recording.localization, bodies.get("suit", body), claps)
     return sorted(findings, key=lambda finding: -SEVERITIES.index(finding.severity))
 
 
