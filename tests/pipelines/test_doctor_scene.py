@@ -11,8 +11,10 @@ from PIL import Image
 from small_scene import LEVEL, inverted, room_cloud, write_room
 
 from walking_person import sound_recording
-from wearcap.doctor import Finding
+from wearcap.doctor import Finding, examine_recording, require_sound
+from wearcap.doctor.agreement import check_localization, check_offset
 from wearcap.doctor.body import check_contact_prob
+from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import about_axis
@@ -218,6 +220,58 @@ DEFECTS = {
 def test_a_defect_of_a_recording_is_named(defect, sound):
     plant, severity, message = DEFECTS[defect]
     assert [f for f in found(examine(plant(sound)), severity) if message in f.what]
+
+
+def clapped(recording: Recording) -> Recording:
+    """With three claps at uneven intervals: shocks that stop the left palm within hundredths of a second."""
+    wrist = recording.imu["left_wrist"]
+    times = wrist.timestamps[:, None] - torch.tensor([1.3, 2.4, 3.9], dtype=torch.float64)
+    shock = 60 * torch.exp(-0.5 * (times / 0.011) ** 2).sum(1, keepdim=True).float() * torch.tensor([0.0, 1.0, 0.0])
+    return replace(recording, imu={"left_wrist": replace(wrist, acc_imu=None, acc_world=wrist.acc_world + shock)})
+
+
+@pytest.mark.parametrize("shift_s", [0.2, -0.94, 2.5])
+def test_a_camera_on_its_own_clock_is_an_error_only_without_claps(shift_s):
+    """The offset is measured, beyond a second too; where claps join the clocks it stops nobody."""
+    recording, what = localized(shift_s), f"the camera is {'late' if shift_s > 0 else 'early'}"
+    for made, severity in ((recording, "error"), (clapped(recording), "note")):
+        (clock,) = [f for f in examine_recording(made) if f.check == "localization: clock offset"]
+        assert (clock.severity, clock.what) == (severity, what), clock
+        measured_ms = float(clock.evidence.split(" at ")[1].split(" ms")[0])
+        assert measured_ms == pytest.approx(1000 * shift_s, abs=10)
+    require_sound(clapped(recording))
+    with pytest.raises(WearcapError, match=what):
+        require_sound(recording)
+
+
+def test_claps_do_not_excuse_the_camera_of_another_walk(sound):
+    """Turns that match the suit's at no offset stay a warning."""
+    turns = about_axis("z", torch.sin(0.2 * sound.suit.timestamps**2).float())
+    other = clapped(spot(sound, R_world_cam=turns @ LEVEL))
+    clock = [(f.severity, f.what) for f in examine_recording(other) if f.check == "localization: clock offset"]
+    assert clock == [("warning", "does not match this motion")]
+
+
+@pytest.mark.parametrize(
+    ("best", "clapped", "severity"), [(0.95, False, "error"), (0.7, False, "warning"), (0.7, True, "note")]
+)
+def test_an_offset_that_noise_may_feign_is_no_error(best, clapped, severity):
+    (clock,) = check_offset("clock", (0.4, best, 0.1), "the camera", clapped)
+    assert (clock.severity, clock.what) == (severity, "the camera is late")
+    assert clock.fix.endswith("Add -0.400 s to its timestamps.")
+
+
+def test_clocks_are_not_compared_where_nobody_turns(sound):
+    """A wearer who sways by half a degree: the camera's noise is larger."""
+    times, generator = sound.suit.timestamps, torch.Generator().manual_seed(1)
+    R = sound.suit.R_parent_joint[:1].repeat(len(times), 1, 1, 1)
+    R[:, 0] = about_axis("z", 0.01 * torch.sin(times).float()) @ R[:, 0]
+    still = replace(sound.suit, R_parent_joint=R, t_world_root=sound.suit.t_world_root[:1].repeat(len(times), 1))
+    head = still.joint("head")
+    noise = about_axis("z", 0.01 * torch.randn(len(times), generator=generator))
+    seen = replace(sound.localization, timestamps=times + 0.9, R_world_cam=noise @ head.R @ LEVEL, t_world_cam=head.t)
+    (clock,) = [f for f in check_localization(seen, still, []) if f.check == "localization: clock offset"]
+    assert (clock.severity, clock.what) == ("note", "not enough motion to compare clocks")
 
 
 def cut_contacts(recording: Recording, rows: int) -> Recording:

@@ -34,6 +34,10 @@ LONG_OUTAGE_S = 30.0
 REACH_M = (0.05, 1.3)
 """Range of the usual distance (m) between head and hand."""
 SCAN_FILE = "scene: file"
+CAMERA_LAG_S = 10.0
+"""Largest offset of a camera that is searched: turns about the vertical do not repeat as steps do."""
+HARDLY_TURNS, CERTAIN = 0.1, 0.8
+"""Deviation (rad/s) of turning below which a camera's noise hides it; correlation beyond which an offset is no chance."""
 HEAD_M = (-0.1, 2.6)
 """Range of the head's height (m) above the floor, from lying to standing."""
 _ACC_UNITS = {"g": GRAVITY, "milli-g": GRAVITY / 1000, "cm/s²": 0.01}
@@ -192,8 +196,8 @@ def check_camera(stream: CameraStream) -> list[Finding]:
     return findings
 
 
-def check_localization(found: Localization, body: Motion | None) -> list[Finding]:
-    """Share of localised frames, plausibility of the camera's path for a head, and its clock."""
+def check_localization(found: Localization, body: Motion | None, claps: list[Finding]) -> list[Finding]:
+    """Share of localised frames, plausibility of the camera's path for a head, and its clock; claps are `check_claps`."""
     check, known = Check("localization"), found.confidence > 0
     share = known.float().mean().item()
     edges = torch.cat([found.timestamps[:1], found.timestamps[known], found.timestamps[-1:]])
@@ -234,8 +238,12 @@ def check_localization(found: Localization, body: Motion | None) -> list[Finding
     head, seen = body.joint("head"), smooth(track, 0.05)
     # Turns about the vertical, which suit and scene share, depend on neither mount nor heading.
     turning = angular_velocity(Trajectory(body.timestamps, head.R, head.t))[:, 2]
-    lag = lag_between(body.timestamps, turning, seen.timestamps, angular_velocity(seen)[:, 2])
-    return findings + check_offset("localization: clock offset", lag, "the camera")
+    lag = lag_between(body.timestamps, turning, seen.timestamps, angular_velocity(seen)[:, 2], CAMERA_LAG_S)
+    if lag is not None and lag[1] < 0.5 and (spread := turning.std().item()) < HARDLY_TURNS:
+        evidence = f"the head turns at {spread:.2g} rad/s, correlation {lag[1]:.2f}"
+        return [*findings, Check("localization: clock offset").note("not enough motion to compare clocks", evidence)]
+    clapped = any(finding.severity == "ok" for finding in claps)
+    return findings + check_offset("localization: clock offset", lag, "the camera", clapped)
 
 
 def check_claps(recording: Recording) -> list[Finding]:
@@ -400,18 +408,25 @@ def _against_motion(stream: str, imu: ImuStream, joint: Trajectory) -> list[Find
     return findings
 
 
-def check_offset(name: str, lag: tuple[float, float, float] | None, who: str = "the sensor") -> list[Finding]:
-    """Whether two clocks agree, by a lag of `lag_between`; an empty list if it could not be measured."""
+def check_offset(
+    name: str, lag: tuple[float, float, float] | None, who: str = "the sensor", clapped: bool = False
+) -> list[Finding]:
+    """Whether two clocks agree, by a lag of `lag_between`; an empty list if it could not be measured.
+
+    An offset is only noted where a capture can join the clocks by claps (`clapped`).
+    """
     if lag is None:
         return []
     check, (seconds, best, unshifted) = Check(name), lag
     evidence = f"correlation {best:.2f} at {1000 * seconds:+.0f} ms, {unshifted:.2f} without a shift"
     if best < 0.5:
-        fix = "Another joint, another recording, or a clock more than a second off."
+        fix = "Another joint, another recording, or a clock further off than is searched."
         return [check.warning("does not match this motion", evidence, fix)]
     if abs(seconds) > 0.02 and 1 - unshifted > 2 * (1 - best) + 0.001:
-        severity = "error" if abs(seconds) > 0.05 else "warning"
+        severity = "error" if abs(seconds) > 0.05 and best > CERTAIN else "warning"
         what, fix = f"{who} is {'late' if seconds > 0 else 'early'}", f"Add {-seconds:+.3f} s to its timestamps."
+        if clapped:
+            severity, fix = "note", f"Capture joins the clocks by claps. For clock=shared: {fix}"
         return [check.found(severity, what, evidence, fix)]
     return [check.ok("in time with the motion", evidence)]
 

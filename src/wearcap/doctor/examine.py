@@ -88,9 +88,9 @@ def examine_recording(recording: Recording) -> list[Finding]:
         findings += check_points(recording.points, head)
     if recording.camera is not None:
         findings += check_camera(recording.camera)
+    findings += (claps := check_claps(recording))
     if recording.localization is not None and "localization" in usable:
-        findings += check_localization(recording.localization, bodies.get("suit", body))
-    findings += check_claps(recording)
+        findings += check_localization(recording.localization, bodies.get("suit", body), claps)
     return sorted(findings, key=lambda finding: -SEVERITIES.index(finding.severity))
 
 
