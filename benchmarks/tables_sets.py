@@ -27,7 +27,7 @@ from wearcap.recording import RecordingStore
 
 EXPERIMENT = "motion_diffusion_head"
 ALL, WALKERS = "all sets", "walkers"
-SETS = ("cmu", "cmu_more", "hdm05", "accad", "ui_prmd", "fubot_vr", "simulated")
+SETS = ("cmu", "hdm05", "accad", "ui_prmd", "fubot_vr", "simulated")
 KNEE = "stance_knee_deg"
 QUICK_STEPS = 300
 
