@@ -34,7 +34,8 @@ TRANSCRIBED = "transcribed"
 """Key of a JSON's `about` whose figures were taken from an earlier page and not from the command's own output."""
 STRAIGHTENED = "2026-11-28"
 """Date from which the truth's knees straighten: CMU's and HDM05's hips are repaired, simulated people walk as people do."""
-BENT = "truth with bent knees"
+BENT = "bent knees"
+"""What a table says that was measured before."""
 LEFT = "left"
 """Key of a table's `about` that names rows of an earlier run, which this one left as they were, and its command."""
 _RANKED = "The worst, the median and the best of {}, truth above and captured below; dots mark contact"
@@ -354,8 +355,8 @@ def render(system: str, page: Page, speed: Mapping[str, list[Tree]]) -> str:
         made += " Tables that say so are transcribed from an earlier page; the same command makes them anew."
     if any(BENT in grid.origin for grid in page.full):
         made += (
-            f" Tables of {BENT} were taken before CMU's and HDM05's hips were repaired and simulated people walked upright "
-            "([truth](../data.md#truth)), with the checkpoints of that time: do not compare them with later ones."
+            f" Tables that say “{BENT}” were taken before CMU's and HDM05's hips were repaired and simulated people walked "
+            "upright ([truth](../data.md#truth)): do not compare them with later ones."
         )
     parts = [f"# {page.title}", made, page.headline.title, markdown(page.headline)]
     parts += ["## Held out", page.held_out, "## Simulated", page.simulated]

@@ -74,8 +74,9 @@ def test_what_is_transcribed_says_so():
     (grid,) = score_grids(tree, {"b_cm": ("B", 1), "a_cm": ("A", 2)})
     assert grid.columns == ("", "B", "A")
     assert grid.rows == [["ours", "–", "1.26 ± 0.04"], ["paper: theirs", "2.0", "–"]]
-    assert grid.origin.endswith("a machine, 4 seeds; transcribed from an earlier page.")
+    assert grid.origin.endswith("a machine, 4 seeds, bent knees; transcribed from an earlier page.")
     assert "transcribed" not in origin(ABOUT)
+    assert "bent knees" not in origin({**ABOUT, "date": "2026-11-28"})
     line = "Tables that say so are transcribed"
     assert line in render("echo", small_page(full=[grid]), {})
     assert line not in render("echo", small_page(), {})
