@@ -11,6 +11,7 @@ import math
 import os
 import platform
 import re
+import shlex
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -247,14 +248,25 @@ def origin(about: Mapping[str, Any], spread: str = "") -> str:
 
 
 def commands(trees: Trees) -> tuple[str, ...]:
-    """Lines that make the tables of the trees, with date and machine; without what leaves rows as they were published."""
+    """Lines that make the tables of the trees, with their last date and machine: those of the tables that later runs do
+    not replace, without what chooses rows or leaves them as they were published."""
     known: dict[str, Tree] = {}
     for tree in trees.values():
+        kept_ones = {f"{name}, {title}" for title in tree.get("tables", {}) for name in kept(tree, title)}
         for title, each in tree.get("origins", {"": tree["about"]}).items():
-            if ", " not in title.split(":")[0] or title.startswith("Table"):
-                plain = re.sub(r" --(leave|rows) ((?!--)('[^']*'|\"[^\"]*\"|\S)+ ?)*", " ", each["command"]).strip()
-                known[plain] = max(known.get(plain, each), each, key=lambda about: about["date"])
-    return tuple(f"{command}  # {each['date']}, {machine_of(each)}" for command, each in known.items())
+            if not any(title.startswith(one.split(":")[0]) for one in kept_ones):
+                line = _plain(each["command"])
+                known[line] = max(known.get(line, each), each, key=lambda about: about["date"])
+    return tuple(f"{line}  # {each['date']}, {machine_of(each)}" for line, each in known.items())
+
+
+def _plain(command: str) -> str:
+    """A command without the options `--rows` and `--leave`, and their values."""
+    words, option = [], ""
+    for word in shlex.split(command):
+        option = word if word.startswith("--") else option
+        words += [] if option in ("--rows", "--leave") else [word]
+    return shlex.join(words)
 
 
 def markdown(grid: Grid) -> str:
@@ -375,7 +387,9 @@ def render(system: str, page: Page, speed: Mapping[str, list[Tree]]) -> str:
     parts += ["## Held out", page.held_out, "## Simulated", page.simulated]
     parts += ["## Limits", _listed(page.limits)]
     clocked = _clocked(page.clocks, speed)
-    parts += ["## Speed", "On two cores; ranges are over the machines that are named.", _listed(clocked)] if clocked else []
+    parts += (
+        ["## Speed", "On two cores; ranges are over the machines that are named.", _listed(clocked)] if clocked else []
+    )
     parts += ["## Pictures"] if page.pictures else []
     parts += [f"{caption}:\n\n![{caption.split(',')[0]}](../{name})" for name, caption in page.pictures]
     timed = [f"python benchmarks/run.py {' '.join(page.clocks)} --write docs/results/{SPEED}"] if clocked else []
@@ -401,7 +415,9 @@ def _straightened(system: str, page: Page) -> list[str]:
     if not any(BENT in grid.origin for grid in page.full):
         return []
     card = f"../../checkpoints/{system}.md"
-    newer = f" Today's checkpoint is scored on repaired hips in [its card]({card})." if (RESULTS / card).is_file() else ""
+    newer = (
+        f" Today's checkpoint is scored on repaired hips in [its card]({card})." if (RESULTS / card).is_file() else ""
+    )
     return [
         f"Figures of before {STRAIGHTENED} are of {BENT}: of people as they were before CMU's and HDM05's hips were repaired "
         f"and simulated people walked upright ([truth](../data.md#truth)). Do not compare them with later ones.{newer}"
@@ -424,9 +440,9 @@ def _between(values: Iterable[float]) -> str:
     return " to ".join(dict.fromkeys([shown[0], shown[-1]]))
 
 
-def everything(page: Page, speed: Mapping[str, list[Tree]]) -> str:
-    """All tables of the page's JSON in Markdown, and its figures of speed."""
-    clocks = speed_grid(page.clocks, speed)
+def everything(system: str, page: Page, speed: Mapping[str, list[Tree]]) -> str:
+    """All tables of the page's JSON in Markdown, and the system's figures of speed."""
+    clocks = speed_grid({name: "" for name in speed if name.startswith(f"{system}_")} | dict(page.clocks), speed)
     grids = [page.headline, *page.full, *([clocks] if clocks.rows else [])]
     return "\n\n".join(f"## {grid.title}\n\n{grid.origin}\n\n{markdown(grid)}" for grid in grids) + "\n"
 
@@ -437,8 +453,8 @@ def speed_grid(clocks: Mapping[str, str], speed: Mapping[str, list[Tree]]) -> Gr
     for benchmark, inside in clocks.items():
         for figure in speed.get(benchmark, []):
             measured = [f"{number(figure[key])}" for key in ("value", "baseline", "ratio", "goal")]
-            said = inside if figure is speed[benchmark][0] else ""
-            rows.append([f"`{figure['name']}`", said, *measured, figure["unit"], figure["date"], machine_of(figure)])
+            what = inside if figure is speed[benchmark][0] else ""
+            rows.append([f"`{figure['name']}`", what, *measured, figure["unit"], figure["date"], machine_of(figure)])
     columns = ("", "what is measured", "ours", "against", "ratio", "goal", "unit", "date", "machine")
     return Grid("Speed", columns, rows, f"`python benchmarks/run.py NAME --write docs/results/{SPEED}`.")
 

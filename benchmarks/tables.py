@@ -64,7 +64,7 @@ def main(arguments: list[str]) -> None:
         print(f"written: {write_page(arguments[0])}")
         return
     if "--all" in arguments:
-        print(everything(page_of(arguments[0]), read_speed()), end="")
+        print(everything(arguments[0], page_of(arguments[0]), read_speed()), end="")
         return
     system = importlib.import_module(f"tables_{arguments[0]}")
     parser = argparse.ArgumentParser(f"tables.py {arguments[0]}", description=system.__doc__)

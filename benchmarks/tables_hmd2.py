@@ -427,8 +427,9 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
                 if any(name in rows for _, rows in shown)
             ],
         ),
-        held_out="People and places of the test split of simulated wearers, four CMU subjects (92 short recordings) and one person "
-        "of HDM05. Everything was chosen on the validation split.",
+        held_out="People and places of the test split of simulated wearers, four CMU subjects "
+        f"({trees['hmd2_cmu_surrounded']['about']['recordings']} short recordings) and one person of HDM05. Everything was chosen on the "
+        "validation split.",
         simulated="People, flats, points and pictures of the simulated wearers; on CMU the motion is real, and surroundings, points "
         "and pictures are simulated. The head's path has the jitter of [simulation](simulation.md). Rows without other words have "
         "typical sensors.",
@@ -484,8 +485,8 @@ def _limits(simulated: dict[str, Tree], real: dict[str, Tree], strangers: dict[s
     fid, paper = PAPER_METRICS.index("fid"), PAPER["HMD² (h = 180)"]
     ours, rival, hands = BRIEF, "EgoEgo-style, its mean", "AvatarPoser-style (head and hands)"
     return (
-        "A real walk with Aria glasses is captured crouching: its knees stay bent where the person's straighten. "
-        "[The card](../../checkpoints/hmd2.md) has the angles; why is not known.",
+        "A real walk with Aria glasses is captured crouching: its knees stay bent "
+        "([the card](../../checkpoints/hmd2.md) has the angles). Why is not known.",
         f"On HDM05's person HMD² has no lead over the EgoEgo-style rival of equal budget ({error(strangers, ours)} against "
         f"{error(strangers, rival)} cm; the shared checkpoint, which learned longer, {error(strangers, ALONE)}). On CMU it has: "
         f"{error(real, ours)} against {error(real, rival)} cm.",
@@ -499,7 +500,7 @@ def _limits(simulated: dict[str, Tree], real: dict[str, Tree], strangers: dict[s
         f"{error(real, hands, 'lower_pe_cm')} against {error(real, OURS, 'lower_pe_cm')}.",
         f"Jitter on simulated wearers is {error(simulated, OURS, 'jitter_ratio')} times the truth's. Bad are arms out of the camera's "
         "sight, and CMU's dances and jumps.",
-        f"Rivals that see the head alone, and “as briefly” of ours (the mean of three trainings), learned from the people that our checkpoint learned "
+        f"Rivals that see the head alone, and the row of ours trained as briefly (the mean of three trainings), learned from the people that our checkpoint learned "
         f"from last, {_frames(real)} million frames each, at the best of three learning rates; our checkpoint {OURS_SAW} in three "
         "trainings. They are compared on real motion alone. Captured as their papers sample them, most are worse: `--all`.",
         f"The paper reports {paper[0]:.2f} cm and an FID of {paper[fid]:.2f} on its own real recordings (Nymeria): no comparison. FID needs more windows than "

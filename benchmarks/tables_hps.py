@@ -29,7 +29,6 @@ from result_pages import (
     mean,
     ranged,
     text,
-    times,
 )
 from rich.console import Console
 from rich.table import Table
@@ -212,7 +211,11 @@ def _headline(tree: Tree, row: str) -> list[str]:
     whole, feet = tree["whole"][row], tree["feet"][row]
     places = (tree["chamfer_cm"][name][row][-1] for name in ("stand", "move"))
     cells = [text(whole["mpjpe_cm"], 1), mean(whole["p95_cm"]), *(text(place, 1) for place in places)]
-    return [*cells, *(mean(feet[name], 2) for name in ("absolute_distance_cm", "sliding_cm")), mean(whole["jitter_ratio"])]
+    return [
+        *cells,
+        *(mean(feet[name], 2) for name in ("absolute_distance_cm", "sliding_cm")),
+        mean(whole["jitter_ratio"]),
+    ]
 
 
 def _paper_headline() -> list[str]:

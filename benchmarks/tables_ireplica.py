@@ -16,20 +16,7 @@ from typing import Any
 import torch
 from ireplica_runs import DISTURBANCES, GAPS_S, Networks, RecordingRun, run_recording
 from joblib import Parallel, delayed
-from result_pages import (
-    NONE,
-    Grid,
-    Page,
-    Tree,
-    Trees,
-    commands,
-    figures_of,
-    grid_of,
-    machines,
-    mean,
-    text,
-    times,
-)
+from result_pages import NONE, Grid, Page, Tree, Trees, commands, figures_of, grid_of, machines, mean, text, times
 from rich.console import Console
 from rich.table import Table
 from tabling import cell, finite, new_table, summarize
@@ -183,7 +170,15 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
             "Where objects were left, and hands and objects against their own true places during contact: "
             f"{tree['handlings']} handlings, means over {spread}, ± the deviation over groups; AP of the contacts "
             "that drive the row.",
-            ("", "object's end (cm)", "end (°)", "hand to object (cm)", "hand off (cm)", "object off (cm)", "contacts' AP"),
+            (
+                "",
+                "object's end (cm)",
+                "end (°)",
+                "hand to object (cm)",
+                "hand off (cm)",
+                "object off (cm)",
+                "contacts' AP",
+            ),
             _headline_rows(tree, beside),
         ),
         held_out="People, flats and objects are those of the test split; networks were trained on the training "
