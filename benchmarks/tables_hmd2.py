@@ -465,14 +465,11 @@ COMPARED = (
 
 def _measured(simulated: dict[str, Tree], real: dict[str, Tree]) -> str:
     """README's cell: ranges over sensors, beside the lookup of the nearest window."""
-    errors = [
-        f"{ranged(rows[name]['mpjpe_cm'] for name in SENSING if name in rows)} (the nearest training window: "
-        f"{mean(rows['nearest window']['mpjpe_cm'])})"
-        for rows in (simulated, real)
-        if rows
-    ]
-    return f"joints {errors[0]} cm off, with ideal to poor sensors" + (
-        f"; real motion (CMU) {errors[1]}" if len(errors) > 1 else ""
+    errors = [ranged(rows[name]["mpjpe_cm"] for name in SENSING if name in rows) for rows in (simulated, real)]
+    looked_up = [mean(rows["nearest window"]["mpjpe_cm"]) for rows in (simulated, real)]
+    return (
+        f"joints {errors[0]} cm off (the nearest training window: {looked_up[0]}); real motion (CMU) {errors[1]} ({looked_up[1]}); both with "
+        "ideal to poor sensors"
     )
 
 

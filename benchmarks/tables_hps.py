@@ -15,21 +15,7 @@ from hps_pictures import draw_drift
 from hps_runs import DISTURBED, ROWS, TRUTH, SeedRun, run_seed
 from hps_sessions import SessionSettings
 from joblib import Parallel, delayed
-from result_pages import (
-    NONE,
-    Grid,
-    Page,
-    Tree,
-    Trees,
-    commands,
-    figures_of,
-    grid_of,
-    machine_of,
-    machines,
-    mean,
-    ranged,
-    text,
-)
+from result_pages import NONE, Grid, Page, Tree, Trees, commands, figures_of, grid_of, machines, mean, ranged, text
 from rich.console import Console
 from rich.table import Table
 from tabling import cell, finite, new_table, summarize
@@ -175,10 +161,11 @@ def _speed(tree: Tree, speed: dict[str, list[Tree]]) -> str:
     seconds = sum(stage["mean"] for stage in tree["stage_seconds"].get("ours", {}).values())
     if not seconds:
         return ""
-    given = f"{tree['frames']['mean'] / 30 / seconds:.0f} × real time, localised cameras given ({machine_of(tree['about'])})"
     figures = figures_of(speed, "hps_end_to_end_realtime")
     values = ranged({"mean": figure["value"]} for figure in figures)
-    return given + (f"; {values} × with localisation ({machines(figures)})" if figures else "")
+    whole = f", {values} × with localisation" if figures else ""
+    given = f"{tree['frames']['mean'] / 30 / seconds:.0f} × real time, localised cameras given"
+    return f"{given}{whole} ({machines([tree['about'], *figures])})"
 
 
 CLOCKS = {
