@@ -133,19 +133,15 @@ TRAINING = {
 """Columns of what a row's training took."""
 
 
-def score_grids(
-    tree: Tree, labels: Mapping[str, tuple[str, int]], spread: str = "seeds", hidden: Collection[str] = ()
-) -> list[Grid]:
+def score_grids(tree: Tree, labels: Mapping[str, tuple[str, int]], spread: str = "seeds") -> list[Grid]:
     """The tables of a tree {"tables": {title: {row: {metric: summary}}}}: columns are the metrics that have a label
-    (and digits), then all others but those of the truth, which has a row, and hidden ones, which the JSON has."""
+    (and digits), then all others but those of the truth, which has a row."""
     grids, labels = [], {**labels, **TRAINING}
     for title, rows in tree["tables"].items():
         rows = {**rows}
         for name, earlier in kept(tree, title).items():
             rows |= {f"{name}: {row}": scores for row, scores in earlier.items() if row != "truth"}
-        present = list(
-            dict.fromkeys(m for row in rows.values() for m in row if not m.startswith("truth_") and m not in hidden)
-        )
+        present = list(dict.fromkeys(m for row in rows.values() for m in row if not m.startswith("truth_")))
         metrics = [name for name in labels if name in present] + [name for name in present if name not in labels]
         cells = [
             [name, *(text(row.get(m), _digits(name, row.get(m), labels.get(m, ("", 2))[1])) for m in metrics)]
@@ -193,16 +189,16 @@ def rows_of(trees: Trees, title: str) -> dict[str, dict[str, Any]]:
 
 
 def picked(
-    trees: Trees, rows: Iterable[tuple[str, str, str]], columns: Iterable[tuple[str, tuple[str, ...], int]]
+    trees: Trees, rows: Iterable[tuple[str, str, str]], columns: Collection[tuple[str, str, int]]
 ) -> list[list[str]]:
-    """Lines of a headline table. rows: a table's title, a row of it, what the page calls it; columns: a heading, the
-    metrics of which a row has one, digits. Rows that are not in the tables are left out."""
-    lines, columns = [], tuple(columns)
-    for title, name, label in rows:
-        if (found := rows_of(trees, title).get(name)) is not None:
-            chosen = ((next((found[m] for m in metrics if m in found), None), digits) for _, metrics, digits in columns)
-            lines.append([label, *(text(summary, digits) for summary, digits in chosen)])
-    return lines
+    """Lines of a headline table. rows: a table's title, a row of it, what the page calls it; columns: a heading, a
+    metric, digits. Rows that are not in the tables are left out."""
+    found = [(label, rows_of(trees, title).get(name)) for title, name, label in rows]
+    return [
+        [label, *(text(row.get(metric), digits) for _, metric, digits in columns)]
+        for label, row in found
+        if row is not None
+    ]
 
 
 def figures_of(speed: Mapping[str, list[Tree]], name: str) -> list[Tree]:

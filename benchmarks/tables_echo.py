@@ -442,12 +442,6 @@ LABELS = {
     "training_minutes": ("minutes learned from", 0),
 }
 """Columns of the page's tables with their digits."""
-HIDDEN = (
-    *(f"{part}_pe_mm" for part in ("head", "trunk", "arm", "leg", "foot")),
-    *(f"{kind}_symmetric_v2v_cm" for kind in ("loose", "fastened")),
-    "busy_mpjpe_mm",
-)
-"""Metrics of the JSON that the page's tables do not show."""
 OBJECTS_1, EQUAL_1, CMU, HDM05 = "Table 1:", "Table 1, equal", "Table 2", "People (hdm05)"
 HEADLINE = (
     (OBJECTS_1, "nearest training window", "objects: nearest window of the training, looked up"),
@@ -463,7 +457,7 @@ HEADLINE = (
 )
 """Rows of the page's first table: table, row, and what the page calls it."""
 COMPARED = tuple(
-    (LABELS[name][0], (name,), LABELS[name][1])
+    (LABELS[name][0], name, LABELS[name][1])
     for name in (
         "mpjpe_mm",
         "jitter_ratio",
@@ -474,7 +468,7 @@ COMPARED = tuple(
         "rotation_deg",
     )
 )
-"""Columns of the page's first table: heading, metrics of which a row has one, digits."""
+"""Columns of the page's first table: heading, metric, digits."""
 CLOCKS = {
     "echo_online_small_fps": "Online, from tracked points, which are given, to poses, object and contacts, beside real time"
 }
@@ -509,7 +503,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         "body have the errors of devices, and nobody has measured the floor (without 127_32). Sizes of errors are in "
         "[simulation](simulation.md).",
         limits=echo_limits.limits(trees, OBJECTS_1, CMU, HDM05),
-        full=[grid for tree in trees.values() for grid in score_grids(tree, LABELS, hidden=HIDDEN)],
+        full=[grid for tree in trees.values() for grid in score_grids(tree, LABELS)],
         commands=commands(trees),
         measured=f"joints {ranged([joints])} cm and objects {placed} cm off, exactly tracked ({unknown} with unknown hinges); real motion (CMU) "
         f"{ranged(tracked)}, with exact to poor tracking",

@@ -434,7 +434,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         "and pictures are simulated. The head's path has the jitter of [simulation](simulation.md). Rows without other words have "
         "typical sensors.",
         limits=_limits(simulated, real, strangers),
-        full=[*score_grids(people, _labels(), "repetitions", hidden=_tails(people)), *_grids(trees)],
+        full=[*score_grids(people, _labels(), "repetitions"), *_grids(trees)],
         commands=found,
         measured=_measured(simulated, real),
         speed=f"{times(online)} online, head's path and points given ({machines(online)})" if online else "",
@@ -510,13 +510,6 @@ def _frames(rows: dict[str, Tree]) -> str:
     """Million frames that rivals which see the head alone, and ours beside them, saw."""
     seen = [rows[row]["frames_seen_m"] for row, (_, _, sensors) in TRAINED.items() if sensors is None and row in rows]
     return ranged(seen)
-
-
-def _tails(people: Tree) -> set[str]:
-    """95th percentiles of body parts, which Table 6.6 has of CMU, and what the JSON has besides."""
-    names = {name for rows in people["tables"].values() for scores in rows.values() for name in scores}
-    tails = {name for name in names - {*COLUMNS} if name.startswith(P95)}
-    return tails | {"head_pe_cm", "rotation_deg", "world_root_cm"}
 
 
 def _grids(trees: Trees) -> list[Grid]:

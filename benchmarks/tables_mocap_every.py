@@ -233,15 +233,15 @@ HEADLINE = (
 )
 """Rows of the page's first table: table, row, and what the page calls it."""
 COLUMNS = (
-    ("MPJPE (cm)", ("mpjpe_cm",), 2),
-    ("lower body", ("lower_pe_cm",), 2),
-    ("hands", ("hand_pe_cm",), 2),
-    ("MPJVE (cm/s)", ("mpjve_cm_s",), 2),
-    ("jitter", ("jitter_ratio",), 2),
-    ("skate (cm/s)", ("foot_skate_cm_s",), 1),
-    ("into the floor", ("floor_penetration_cm",), 1),
+    ("MPJPE (cm)", "mpjpe_cm", 2),
+    ("lower body", "lower_pe_cm", 2),
+    ("hands", "hand_pe_cm", 2),
+    ("MPJVE (cm/s)", "mpjve_cm_s", 2),
+    ("jitter", "jitter_ratio", 2),
+    ("skate (cm/s)", "foot_skate_cm_s", 1),
+    ("into the floor", "floor_penetration_cm", 1),
 )
-"""Columns of the page's first table: heading, metrics of which a row has one, digits."""
+"""Columns of the page's first table: heading, metric, digits."""
 CLOCKS = {
     "mocap_every_online_fps": "Online, from head poses, points and watch samples to poses, the floor followed, three frames at a "
     "time, beside real time",

@@ -164,7 +164,7 @@ def test_what_is_kept_stays_and_is_shown_beside_what_is_new(tmp_path):
         "8.00",
         "9.00",
     )
-    lines = picked({"echo": tree}, [("Table 2", "ours", "CMU"), ("Table 9", "ours", "none")], [("error", ("a_cm",), 1)])
+    lines = picked({"echo": tree}, [("Table 2", "ours", "CMU"), ("Table 9", "ours", "none")], [("error", "a_cm", 1)])
     assert lines == [["CMU", "5.0"]]
 
 
