@@ -90,8 +90,8 @@ def ranked(system: str) -> tuple[tuple[str, str], ...]:
 
 
 def text(summary: Mapping[str, Any] | None, digits: int = 2) -> str:
-    """A cell: mean ± deviation; a dash where there is none."""
-    return cell(dict(summary), digits) if summary else NONE
+    """A cell: mean ± deviation, unless that rounds to zero; a dash where there is none."""
+    return cell(dict(summary), digits).removesuffix(f" ± {0:.{digits}f}") if summary else NONE
 
 
 def mean(summary: Mapping[str, Any] | None, digits: int = 1) -> str:

@@ -500,7 +500,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         "from training. Settings were chosen on the validation split.",
         simulated="People with objects altogether, their tracked points included, which are exact. CMU's and HDM05's motion is real, "
         "their tracked points exact; with typical and poor tracking the head's path, the wrists, which are tracked from it, and the "
-        "body have the errors of devices, and nobody has measured the floor (without 127_32). Sizes of errors are in "
+        "body have the errors of devices, nobody has measured the floor, and 127_32 is left out. Sizes of errors are in "
         "[simulation](simulation.md).",
         limits=echo_limits.limits(trees, OBJECTS_1, CMU, HDM05),
         full=[grid for tree in trees.values() for grid in score_grids(tree, LABELS)],

@@ -139,6 +139,7 @@ def test_cells_of_what_is_not_known_and_ranges():
     from result_pages import number, ranged, text
 
     assert text(None) == text(summary(None)) == "–"
+    assert [text(summary(1.25, std)) for std in (None, 0.004, 0.006)] == ["1.25", "1.25", "1.25 ± 0.01"]
     assert ranged([summary(3.21), summary(2.44), summary(None), summary(4.96)]) == "2.4 to 5.0"
     assert ranged([summary(3.21)]) == "3.2"
     assert ranged([]) == ""
