@@ -21,9 +21,9 @@ from rich.table import Table
 from tabling import cell, finite, new_table, summarize
 
 from wearcap.files import write_text
-from wearcap.sensors.suit import SUITS, SuitNoise
-from wearcap.simulation.recordings.hps import HpsConfig, Protocol
-from wearcap.simulation.recordings.localization_noise import LocalizationNoise
+from wearsim.recordings.hps import HpsConfig, Protocol
+from wearsim.recordings.localization_noise import LocalizationNoise
+from wearsim.sensors.suit import SUITS, SuitNoise
 
 PAPER = {
     "stand": {

@@ -23,7 +23,7 @@ from tabling import finite
 
 from wearcap.files import write_text
 from wearcap.recording import Recording, RecordingStore
-from wearcap.simulation.recordings.hps import HpsConfig, Protocol
+from wearsim.recordings.hps import HpsConfig, Protocol
 
 WIDTH = 220
 
