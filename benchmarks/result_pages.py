@@ -376,8 +376,9 @@ def compact(tree: Tree) -> str:
 def render(system: str, page: Page, speed: Mapping[str, list[Tree]]) -> str:
     """The page in Markdown. Raises WearcapError when it has too many words, or its table too many rows or columns."""
     made = (
-        f"Written by `python benchmarks/tables.py {system} --page` from the JSON files beside this page; "
-        f"`python benchmarks/tables.py {system} --all` prints all their tables."
+        "After this page you know how good the figures are, on whom they were measured and where they fail, and can make each anew. It "
+        f"is written by `python benchmarks/tables.py {system} --page` from the JSON files beside it; `python benchmarks/tables.py {system} "
+        "--all` prints all their tables."
     )
     parts = [f"# {page.title}", made, *_straightened(system, page), page.headline.title, markdown(page.headline)]
     parts += ["## Held out", page.held_out, "## Simulated", page.simulated]

@@ -279,6 +279,31 @@ def test_a_page_is_one_table_and_what_a_person_reads(system):
     assert max(line.count(" |") for line in lines) <= 8
 
 
+@pytest.mark.parametrize("system", PAGES)
+def test_all_prints_every_table_of_the_json(system, capsys):
+    import tables
+
+    tables.main([system, "--all"])
+    shown = capsys.readouterr().out
+    trees = tables.results(system, tables.systems())
+    assert trees
+    for tree in trees.values():
+        for title, rows in tree.get("tables", {}).items():
+            named = (
+                [row["method"] for row in rows] if isinstance(rows, list) else rows if system != "simulation" else ()
+            )
+            assert not named or title in shown
+            assert all(f"| {name} |" in shown for name in named)
+        assert all(f"| {name} |" in shown for name in tree.get("rows", tree.get("whole", ())))
+
+
+@pytest.mark.parametrize("path", [*RESULTS.parent.rglob("*.md")], ids=lambda path: path.stem)
+def test_a_page_begins_with_what_one_can_do_after_it(path):
+    title, first, *_ = path.read_text(encoding="utf-8").split("\n\n")
+    assert title.startswith("# ")
+    assert first.startswith("After this page ")
+
+
 def test_every_system_has_a_page():
     assert {"hps", "ireplica", "hmd2", "mocap_every", "echo", "simulation"} <= set(PAGES)
     assert max(path.stat().st_size for path in RESULTS.iterdir()) < 200_000
