@@ -385,7 +385,13 @@ def render(system: str, page: Page, speed: Mapping[str, list[Tree]]) -> str:
     parts += ["## Limits", _listed(page.limits)]
     clocked = _clocked(page.clocks, speed)
     parts += (
-        ["## Speed", "On two cores; ranges are over the machines that are named.", _listed(clocked)] if clocked else []
+        [
+            "## Speed",
+            "On two cores; speeds depend on the CPU, and ranges are over the machines that are named.",
+            _listed(clocked),
+        ]
+        if clocked
+        else []
     )
     parts += ["## Pictures"] if page.pictures else []
     parts += [f"{caption}:\n\n![{caption.split(',')[0]}](../{name})" for name, caption in page.pictures]

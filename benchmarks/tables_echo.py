@@ -60,38 +60,40 @@ from wearcap.recording import RecordingStore
 from wearcap.runtime.system import CaptureInput
 from wearcap.systems.echo.scores import score_echo
 
-BODY = {
-    "mpjpe_mm": "MPJPE (mm)",
-    "upper_pe_mm": "upper body (mm)",
-    "lower_pe_mm": "lower body (mm)",
-    "hand_pe_mm": "hands (mm)",
-    "mpjve_mm": "MPJVE (mm per frame at 30 Hz)",
-    "mpjve_printed": "MPJVE as the paper prints it, without unit",
-    "foot_contact": "FC",
-    "foot_skate_cm_s": "skate (cm/s)",
-    "skate_ratio": "skate, of the truth's",
-    "floor_penetration_cm": "into the floor (cm)",
-    "physicality": "physicality",
-    "jitter_m_s3": "jitter (m/s³)",
-    "jitter_ratio": "jitter, of the truth's",
-    **TRAINING,
+OF_BODIES = {
+    "mpjpe_mm": ("MPJPE (mm)", 1),
+    "upper_pe_mm": ("upper body (mm)", 1),
+    "lower_pe_mm": ("lower body (mm)", 1),
+    "hand_pe_mm": ("hands (mm)", 1),
+    "mpjve_mm": ("MPJVE (mm a frame)", 1),
+    "mpjve_printed": ("MPJVE as the paper prints it", 1),
+    "foot_contact": ("FC", 2),
+    "jitter_m_s3": ("jitter (m/s³)", 1),
+    "jitter_ratio": ("jitter, of the truth's", 2),
+    "foot_skate_cm_s": ("skate (cm/s)", 1),
+    "skate_ratio": ("skate, of the truth's", 2),
+    "floor_penetration_cm": ("into the floor (cm)", 2),
+    "physicality": ("physicality", 4),
 }
-"""Columns of the tables of bodies. Ours of MPJVE is in the unit of ECHO's words, which its figures cannot have
+"""Columns of the tables with their digits. Ours of MPJVE is in the unit of ECHO's words, which its figures cannot have
 (`joint_step_error_mm`): they have a column of their own."""
-OBJECTS = {
-    **BODY,
-    "v2v_cm": "E_v2v (cm)",
-    "symmetric_v2v_cm": "E_v2v modulo symmetry (cm)",
-    "add_s_cm": "ADD-S (cm)",
-    "center_cm": "E_c (cm)",
-    "loose_center_cm": "E_c of loose objects (cm)",
-    "fastened_center_cm": "E_c of doors, drawers, windows (cm)",
-    "rotation_deg": "rotation (°)",
-    "symmetric_rotation_deg": "modulo symmetry (°)",
-    "quaternion": "quaternion",
-    "touch_f1": "contact F1",
-    "training_minutes": "min. learned from",
+LABELS = {
+    **OF_BODIES,
+    "v2v_cm": ("E_v2v (cm)", 1),
+    "symmetric_v2v_cm": ("E_v2v modulo symmetry (cm)", 1),
+    "center_cm": ("E_c (cm)", 1),
+    "loose_center_cm": ("E_c of loose objects (cm)", 1),
+    "fastened_center_cm": ("E_c of doors, drawers, windows (cm)", 1),
+    "add_s_cm": ("ADD-S (cm)", 1),
+    "rotation_deg": ("rotation (°)", 1),
+    "symmetric_rotation_deg": ("rotation modulo symmetry (°)", 1),
+    "quaternion": ("quaternion", 2),
+    "touch_f1": ("contact F1", 2),
+    "training_minutes": ("minutes learned from", 0),
 }
+"""Columns of the tables of objects."""
+BODY, OBJECTS = ({name: heading for name, (heading, _) in of.items()} | TRAINING for of in (OF_BODIES, LABELS))
+"""Their headings, of people alone and with objects."""
 ANYWHERE = ("pipeline=echo", "pipeline.freedoms=false")
 """Like the rivals, which know no hinges, rails or floor that an object keeps to."""
 CONVEYOR = ("pipeline=ablation/echo_conveyor",)
@@ -411,37 +413,6 @@ PARTS = {
 }
 
 
-LABELS = {
-    "mpjpe_mm": ("MPJPE (mm)", 1),
-    "upper_pe_mm": ("upper body (mm)", 1),
-    "lower_pe_mm": ("lower body (mm)", 1),
-    "hand_pe_mm": ("hands (mm)", 1),
-    "mpjve_mm": ("MPJVE (mm a frame)", 1),
-    "mpjve_printed": ("MPJVE as the paper prints it", 1),
-    "foot_contact": ("FC", 2),
-    "true_foot_contact": ("FC, truth", 2),
-    "v2v_cm": ("E_v2v (cm)", 1),
-    "symmetric_v2v_cm": ("E_v2v modulo symmetry (cm)", 1),
-    "center_cm": ("E_c (cm)", 1),
-    "loose_center_cm": ("E_c of loose objects (cm)", 1),
-    "fastened_center_cm": ("E_c of doors, drawers, windows (cm)", 1),
-    "loose_symmetric_v2v_cm": ("E_v2v of loose objects modulo symmetry (cm)", 1),
-    "fastened_symmetric_v2v_cm": ("E_v2v of doors, drawers, windows modulo symmetry (cm)", 1),
-    "add_s_cm": ("ADD-S (cm)", 1),
-    "rotation_deg": ("rotation (°)", 1),
-    "symmetric_rotation_deg": ("rotation modulo symmetry (°)", 1),
-    "quaternion": ("quaternion", 2),
-    "touch_f1": ("contact F1", 2),
-    "jitter_m_s3": ("jitter (m/s³)", 1),
-    "true_jitter_m_s3": ("jitter, truth", 1),
-    "jitter_ratio": ("jitter, of the truth's", 2),
-    "foot_skate_cm_s": ("skate (cm/s)", 1),
-    "skate_ratio": ("skate, of the truth's", 2),
-    "floor_penetration_cm": ("into the floor (cm)", 2),
-    "physicality": ("physicality", 4),
-    "training_minutes": ("minutes learned from", 0),
-}
-"""Columns of the page's tables with their digits."""
 OBJECTS_1, EQUAL_1, CMU, HDM05 = "Table 1:", "Table 1, equal", "Table 2", "People (hdm05)"
 HEADLINE = (
     (OBJECTS_1, "nearest training window", "objects: nearest window of the training, looked up"),
