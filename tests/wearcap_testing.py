@@ -1,7 +1,6 @@
 """Small recordings for tests, made in milliseconds: a body that sways while it wanders in a circle."""
 
 import importlib
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -34,13 +33,8 @@ def experiments(*kinds: str) -> list[str]:
 
 
 def benchmark(name: str) -> ModuleType:
-    """A module of `benchmarks/`."""
-    folder = str(PROJECT / "benchmarks")
-    sys.path.insert(0, folder)
-    try:
-        return importlib.import_module(name)
-    finally:
-        sys.path.remove(folder)
+    """A module of `benchmarks/`, by its room and name."""
+    return importlib.import_module(f"benchmarks.{name}")
 
 
 def swaying_motion(frames: int, seed: int = 0, fps: float = 60.0, skeleton: Skeleton | None = None) -> Motion:

@@ -3,13 +3,19 @@
 import argparse
 import json
 import math
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
+from benchmarks.speed import latent_optimisation_vs_best_adam as clocks
+from benchmarks.tables import echo as tables_echo
+from benchmarks.tables import gait_statistics as gait
+from benchmarks.tables import hmd2 as tables_hmd2
+from benchmarks.tables import mocap_every as tables
+from benchmarks.tables import tabling
+from benchmarks.tables.discriminator import held_out_accuracy
+from benchmarks.tables.hmd2_runs import Result, best_of
+from benchmarks.tables.sensed import GIVEN, WRONG_HEIGHTS, SensedStore, sensed
 
 from normal_walk import walk
 from wearcap.cli.conf import compose
@@ -17,45 +23,10 @@ from wearcap.geometry.rotation import about_axis
 from wearcap.metrics.gait import normal_knee_deg
 from wearcap.recording import Motion
 
-FOLDER = Path(__file__).parents[2] / "benchmarks"
 GOALS = {"windows_vs_npz", "lightning_step_vs_loop", "ddp_gradient_error"}
 
 
-@pytest.fixture(autouse=True)
-def importable(monkeypatch):
-    monkeypatch.syspath_prepend(str(FOLDER))
-
-
-def test_list_names_every_benchmark():
-    command = [sys.executable, str(FOLDER / "run.py"), "--list"]
-    lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
-    assert {line.split()[0] for line in lines} >= GOALS
-    assert all(len(line.split()) > 3 for line in lines)
-
-
-def test_unknown_names_are_refused():
-    command = [sys.executable, str(FOLDER / "run.py"), "windows_vs_zip"]
-    ended = subprocess.run(command, capture_output=True, text=True)
-    assert ended.returncode == 2
-    assert "windows_vs_npz" in ended.stderr
-    ended = subprocess.run([sys.executable, str(FOLDER / "tables.py"), "hmd3"], capture_output=True, text=True)
-    assert ended.returncode == 2
-    assert "hmd2_head" in ended.stderr
-
-
-def test_a_figure_with_other_keys_is_refused(monkeypatch, tmp_path):
-    import run
-
-    (tmp_path / "askew.py").write_text("def measure():\n    return [{'name': 'askew', 'value': 1}]\n")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    assert list(run.discover(tmp_path)) == ["askew"]
-    with pytest.raises(SystemExit, match="Expected name, value, unit"):
-        run.run("askew")
-
-
 def test_a_row_prints_what_its_training_took(tmp_path, trusted):
-    import tabling
-
     from wearcap.models.checkpoint import read_checkpoint
 
     took = tabling.training_of("hmd2")
@@ -75,19 +46,7 @@ def test_a_row_prints_what_its_training_took(tmp_path, trusted):
     assert tabling.training_of(str(tmp_path / "run.ckpt"), "seed_1.ckpt", "seed_2.ckpt")["trainings"].mean == 3
 
 
-def test_windows_from_the_store_are_faster_than_npz():
-    import run
-    import windows_vs_npz
-
-    figure = windows_vs_npz.measure(minutes=0.5, windows=20, npz_windows=3)[0]
-    assert tuple(json.loads(json.dumps(figure))) == run.KEYS
-    assert figure["ratio"] == pytest.approx(figure["baseline"] / figure["value"])
-    assert figure["ratio"] > 2  # half a minute instead of fifteen
-
-
 def test_adams_clock_stops_at_equal_energy_and_says_where_it_never_gets_there():
-    import latent_optimisation_vs_best_adam as clocks
-
     goal = torch.linspace(-1, 1, 48).reshape(2, 4, 6)
     problem = clocks.Problem(torch.zeros(2, 4, 6), lambda z: {"bowl": (z - goal).square().sum((1, 2))})
     schedule, solver = clocks.Schedule(0.1, 60), clocks.LatentSolver(steps=30)
@@ -103,50 +62,7 @@ def test_adams_clock_stops_at_equal_energy_and_says_where_it_never_gets_there():
     assert "Adam does not reach 1.0000: its time is a lower bound" in slow["unit"]
 
 
-MEASURED = """
-import json, sys
-
-sys.path.insert(0, sys.argv[1])
-import echo_stream_memory, lightning_step_vs_loop
-
-print(json.dumps(echo_stream_memory.measure(minutes=0.2)[0]))
-print(json.dumps(lightning_step_vs_loop.measure(steps=4, overrides=("data.loading.batch_size=2",))[0]))
-"""
-
-
-@pytest.fixture(scope="module")
-def figures() -> dict[str, dict]:
-    """Two benchmarks made short, in a process of their own as users run them; the one of peak memory comes first."""
-    ended = subprocess.run([sys.executable, "-c", MEASURED, str(FOLDER)], capture_output=True, text=True)
-    assert ended.returncode == 0, ended.stderr
-    printed = [json.loads(line) for line in ended.stdout.splitlines()]
-    return {figure["name"]: figure for figure in printed}
-
-
-@pytest.mark.slow
-def test_lightning_and_the_loop_take_turns(figures):
-    figure = figures["lightning_step_vs_loop"]
-    assert 0.3 < figure["ratio"] < 3
-
-
-@pytest.mark.slow
-def test_two_processes_give_the_joint_gradient():
-    ended = subprocess.run(
-        [sys.executable, str(FOLDER / "run.py"), "ddp_gradient_error"], capture_output=True, text=True
-    )
-    figure = json.loads(ended.stdout)
-    assert figure["baseline"] > 0.01
-    assert figure["ratio"] <= figure["goal"]
-
-
-@pytest.mark.slow
-def test_a_short_echo_stream_is_measured(figures):
-    assert 0.9 < figures["echo_stream_memory"]["ratio"] < 1.2
-
-
 def test_dominant_frequency_finds_a_planted_one():
-    import gait_statistics as gait
-
     t = torch.arange(gait.WINDOW) / gait.FPS
     waves = torch.stack([3 + torch.sin(2 * math.pi * f * t + f) for f in (0.7, 0.95, 1.2)])
     assert gait.dominant_frequency(waves).tolist() == pytest.approx([0.7, 0.95, 1.2], abs=0.015)
@@ -155,8 +71,6 @@ def test_dominant_frequency_finds_a_planted_one():
 
 def walker(speed: float, person: str, seconds: int = 6, bob: float = 0.03, swing: float = 0.2):
     """A clip of someone whose pelvis bobs and whose legs swing in antiphase."""
-    import gait_statistics as gait
-
     t = torch.arange(seconds * gait.FPS) / gait.FPS
     phase = 2 * math.pi * 0.9 * t
     pelvis = torch.stack([speed * t, 0.02 * phase.sin(), 0.95 + bob / 2 * (2 * phase).cos()], -1)
@@ -171,8 +85,6 @@ def walker(speed: float, person: str, seconds: int = 6, bob: float = 0.03, swing
 
 
 def test_gait_statistics_of_a_planted_walk():
-    import gait_statistics as gait
-
     found = gait.statistics(walker(1.25, "a"))
     assert len(found["speed_m_s"]) == 5
     assert found["speed_m_s"].mean().item() == pytest.approx(1.25, abs=0.01)
@@ -195,8 +107,6 @@ def bent_walk(hip_deg: float, ankle_deg: float, speed: float) -> Motion:
 
 
 def test_curves_of_walking_are_those_of_the_joints():
-    import gait_statistics as gait
-
     curves = gait.walking_curves(bent_walk(12.0, 7.0, 1.1))
     assert len(curves["knee"]) == len(curves["speed"]) > 8
     assert curves["speed"].numpy() == pytest.approx(1.1, abs=1e-3)
@@ -206,8 +116,6 @@ def test_curves_of_walking_are_those_of_the_joints():
 
 
 def test_curves_are_compared_with_healthy_adults_by_speed():
-    import gait_statistics as gait
-
     rows = gait.curve_deviations([bent_walk(0.0, 0.0, 1.1), bent_walk(0.0, 0.0, 1.3), bent_walk(6.0, 0.0, 1.35)])
     assert {name: row["recordings"] for name, row in rows.items()} == {"0.95 to 1.2 m/s": 1, "1.2 to 1.45 m/s": 2}
     slow = rows["0.95 to 1.2 m/s"]
@@ -220,8 +128,6 @@ def test_curves_are_compared_with_healthy_adults_by_speed():
 
 
 def test_cycles_with_a_flight_are_no_walk():
-    import gait_statistics as gait
-
     motion = bent_walk(0.0, 0.0, 1.1)
     contact = torch.ones(len(motion), 4)
     assert len(gait.walking_curves(replace(motion, contact_prob=contact))["knee"]) > 8
@@ -230,8 +136,6 @@ def test_cycles_with_a_flight_are_no_walk():
 
 
 def test_discriminator_separates_what_can_be_separated_and_no_more():
-    from discriminator import held_out_accuracy
-
     random = torch.Generator().manual_seed(0)
     speeds = 0.9 + 0.6 * torch.rand(2, 12, generator=random)
     some, alike = ([walker(v, f"{i}_{k}") for k, v in enumerate(row.tolist())] for i, row in enumerate(speeds))
@@ -241,8 +145,6 @@ def test_discriminator_separates_what_can_be_separated_and_no_more():
 
 
 def test_discriminator_needs_people_to_hold_out():
-    from discriminator import held_out_accuracy
-
     from wearcap.errors import WearcapError
 
     one = [walker(1.0, "only")]
@@ -251,8 +153,6 @@ def test_discriminator_needs_people_to_hold_out():
 
 
 def test_sensed_stores_hold_no_truth_and_lend_it_to_scores(tmp_path):
-    from sensed import GIVEN, SensedStore
-
     from watched_walk import watched_walk
     from wearcap.recording import RecordingStore
 
@@ -273,8 +173,6 @@ def test_sensed_stores_hold_no_truth_and_lend_it_to_scores(tmp_path):
 
 @pytest.mark.parametrize("sensors", ["typical", "given"])
 def test_a_wrong_height_is_off_by_as_much_whatever_is_sensed_and_the_truth_stays(sensors):
-    from sensed import WRONG_HEIGHTS, sensed
-
     from watched_walk import watched_walk
 
     recording = watched_walk(1.0)
@@ -290,8 +188,6 @@ def test_a_wrong_height_is_off_by_as_much_whatever_is_sensed_and_the_truth_stays
 
 
 def test_best_samples_are_chosen_by_recording():
-    from hmd2_runs import best_of
-
     from wearcap.metrics.table import Row, aggregate
 
     errors = {("a", 0): (3.0, 9.0), ("a", 1): (2.0, 8.0), ("b", 0): (4.0, 5.0), ("b", 1): (6.0, 1.0)}
@@ -302,9 +198,6 @@ def test_best_samples_are_chosen_by_recording():
 
 
 def test_scenarios_are_where_ours_is_best_in_the_middle_and_worst():
-    import tables_hmd2
-    from hmd2_runs import Result
-
     from wearcap.metrics.table import Summary
 
     def scores(value: float) -> dict[str, Summary]:
@@ -321,10 +214,6 @@ def test_scenarios_are_where_ours_is_best_in_the_middle_and_worst():
 
 
 def test_hmd2_tables_write_tails_scenarios_and_sweeps_on_validation(tmp_path, monkeypatch, capsys):
-    import tables_hmd2
-    from hmd2_runs import Result
-    from sensed import GIVEN
-
     from watched_walk import watched_walk
     from wearcap.metrics.table import Summary
     from wearcap.recording import RecordingStore
@@ -364,10 +253,6 @@ def test_hmd2_tables_write_tails_scenarios_and_sweeps_on_validation(tmp_path, mo
 
 @pytest.mark.parametrize("keep", [None, "before it"])
 def test_hmd2_strangers_are_captured_from_the_head_alone(keep, tmp_path, monkeypatch):
-    import tables_hmd2
-    from hmd2_runs import Result
-    from sensed import GIVEN
-
     from watched_walk import watched_walk
     from wearcap.metrics.table import Summary
     from wearcap.recording import RecordingStore
@@ -415,8 +300,6 @@ def frames_of(overrides: list[str]) -> tuple[str, int]:
 
 
 def test_learned_rivals_of_hmd2_see_as_many_frames_as_ours():
-    import tables_hmd2
-
     for run in tables_hmd2.RUNS:
         name, frames = frames_of(tables_hmd2.training(run))
         assert name == run
@@ -426,14 +309,10 @@ def test_learned_rivals_of_hmd2_see_as_many_frames_as_ours():
 
 
 def test_learned_rivals_of_echo_see_as_many_frames_as_ours():
-    import tables_echo
-
     _, ours = frames_of(tables_echo.training("echo_short"))
     for run in tables_echo.TRAININGS:
         assert frames_of(tables_echo.training(run))[1] == pytest.approx(ours, rel=0.05), run
 
 
 def test_learned_rivals_of_mocap_every_see_as_many_frames_as_ours():
-    import tables_mocap_every as tables
-
     assert len({frames_of(tables.training(run))[1] for run in tables.RUNS}) == 1

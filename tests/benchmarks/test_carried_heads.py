@@ -1,23 +1,19 @@
 """Heads that are carried lower than in the rest pose by a planted share are measured so, by person."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
+from benchmarks import carried_heads
 from standing_person import acting
 from wearcap.recording import RecordingStore
 from wearcap_testing import recording_of
 
-FOLDER = Path(__file__).parents[2] / "benchmarks"
 PEOPLE = {"anna": 0.97, "ben": 0.99, "cleo": 0.98}
 
 
 def test_shares_by_person(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(str(FOLDER))
-    import carried_heads
-
     store = RecordingStore(tmp_path / "set")
     for person, share in PEOPLE.items():
         motion = acting(1.7, [("stand", 4.0), ("walk", 12.0)])

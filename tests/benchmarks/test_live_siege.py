@@ -1,8 +1,7 @@
 """The siege of a live capture, at its smallest: nothing of the devices is lost."""
 
-from pathlib import Path
-
 import pytest
+from benchmarks.faults import live_siege
 
 from wearcap.recording.store import save_recording
 from wearcap_testing import recording_of, swaying_motion
@@ -10,9 +9,6 @@ from wearcap_testing import recording_of, swaying_motion
 
 @pytest.mark.slow
 def test_devices_are_served_beside_silent_sockets_and_floods(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
-    import live_siege
-
     save_recording(recording_of(swaying_motion(200, 0), "sway"), tmp_path / "in.safetensors")
     row = live_siege.siege("hmd2", 0.1, 100, 50.0, str(tmp_path / "in.safetensors"))
     assert (row["adapter"], row["sent"], row["sessions"]) == ("kept", 360, 1)

@@ -1,23 +1,14 @@
 """What the benchmark of the live capture's first minute measures, on a planted wearer."""
 
-from pathlib import Path
-
-import pytest
 import torch
+from benchmarks.faults import live_turns
 
 from standing_person import acting
 from wearcap.body.skeleton import WRISTS
 from wearcap_testing import recording_of
 
 
-@pytest.fixture(autouse=True)
-def importable(monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
-
-
 def test_headings_are_off_by_what_the_watches_worlds_are_turned_beyond_what_is_planted(monkeypatch):
-    import live_turns
-
     recording = recording_of(acting(1.75, [("stand", 5.0)]), "stands")
     found = list(live_turns.headings(recording, 0))
     assert [each.wrist for each in found] == list(WRISTS)

@@ -6,17 +6,35 @@ import re
 from pathlib import Path
 
 import pytest
+from benchmarks.tables import command
+from benchmarks.tables import hps as tables_hps
+from benchmarks.tables.command import page_of
+from benchmarks.tables.hps_runs import DISTURBED, ROWS, TRUTH
+from benchmarks.tables.result_pages import (
+    Grid,
+    Page,
+    commands,
+    compact,
+    everything,
+    number,
+    origin,
+    picked,
+    publish,
+    ranged,
+    read_speed,
+    render,
+    results,
+    score_grids,
+    text,
+    with_readme,
+    write_speed,
+)
 
 from wearcap.errors import WearcapError
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "docs" / "results"
 PAGES = sorted(path.stem for path in RESULTS.glob("*.md"))
-
-
-@pytest.fixture(autouse=True)
-def importable(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
 
 
 def summary(mean: float | None, std: float | None = None, seeds: int = 1) -> dict:
@@ -27,8 +45,6 @@ ABOUT = {"command": "python benchmarks/tables.py echo", "date": "2026-11-01", "m
 
 
 def small_page(rows: int = 2, **changes):
-    from result_pages import Grid, Page
-
     headline = Grid("What was measured.", ("", "error (cm)"), [[f"row {k}", f"{k}.00"] for k in range(rows)])
     grid = Grid("Table 9: all of it", ("", "error"), [["ours", "1.25 ± 0.10"]], "`command`, today, here.")
     parts = {
@@ -54,8 +70,6 @@ def fast(value: float, machine: str) -> dict:
 
 
 def test_a_page_has_its_sections_in_order():
-    from result_pages import render
-
     page = small_page(clocks=FAST, pictures=(("echo_box.png", "A box, carried"),))
     shown = render("echo", page, {"fast_fps": [fast(90.4, "AMD EPYC"), fast(120.0, "Intel(R) Xeon(R) Processor")]})
     headings = re.findall(r"^#+ .*", shown, re.MULTILINE)
@@ -70,8 +84,6 @@ def test_a_page_has_its_sections_in_order():
 
 
 def test_all_tables_are_printed_and_every_figure_of_speed():
-    from result_pages import everything
-
     figures = {"fast_fps": [fast(90.4, "AMD EPYC")], "echo_old": [{**fast(1.0, "AMD EPYC"), "name": "echo_old"}]}
     shown = everything("echo", small_page(clocks=FAST), figures)
     assert (
@@ -90,8 +102,6 @@ def test_all_tables_are_printed_and_every_figure_of_speed():
     [({"rows": 11}, "11 rows"), ({"columns": 9}, "9 columns"), ({"held_out": "word " * 1200}, r"12\d\d words")],
 )
 def test_a_page_that_nobody_reads_is_refused(page, found):
-    from result_pages import Grid, render
-
     assert "row 9" in render("echo", small_page(10), {})
     columns = page.pop("columns", 2)
     page = small_page(page.pop("rows", 1), **page)
@@ -101,8 +111,6 @@ def test_a_page_that_nobody_reads_is_refused(page, found):
 
 
 def test_tables_of_before_the_repair_say_so():
-    from result_pages import origin, render, score_grids
-
     table = {"ours": {"a_cm": summary(1.256, 0.04, 4)}, "paper: theirs": {"b_cm": summary(2.0)}}
     tree = {"about": ABOUT, "tables": {"Table 1": table}}
     (grid,) = score_grids(tree, {"b_cm": ("B", 1), "a_cm": ("A", 2)})
@@ -118,8 +126,6 @@ def test_tables_of_before_the_repair_say_so():
 
 
 def test_commands_leave_out_what_chooses_rows_and_tables_that_later_runs_leave():
-    from result_pages import commands
-
     def by(command: str, date: str) -> dict:
         return {**ABOUT, "command": f"python benchmarks/tables.py echo {command}", "date": date}
 
@@ -136,8 +142,6 @@ def test_commands_leave_out_what_chooses_rows_and_tables_that_later_runs_leave()
 
 
 def test_cells_of_what_is_not_known_and_ranges():
-    from result_pages import number, ranged, text
-
     assert text(None) == text(summary(None)) == "–"
     assert [text(summary(1.25, std)) for std in (None, 0.004, 0.006)] == ["1.25", "1.25", "1.25 ± 0.01"]
     assert ranged([summary(3.21), summary(2.44), summary(None), summary(4.96)]) == "2.4 to 5.0"
@@ -147,8 +151,6 @@ def test_cells_of_what_is_not_known_and_ranges():
 
 
 def test_what_is_kept_stays_and_is_shown_beside_what_is_new(tmp_path):
-    from result_pages import picked, publish, score_grids
-
     def scores(error: float) -> dict:
         return {"ours": {"a_cm": summary(error)}, "ours, 3 cm too tall": {"a_cm": summary(9.0)}, "truth": {}}
 
@@ -170,8 +172,6 @@ def test_what_is_kept_stays_and_is_shown_beside_what_is_new(tmp_path):
 
 
 def test_published_tables_are_merged_by_number(tmp_path):
-    from result_pages import publish
-
     folder, made = tmp_path / "results", tmp_path / "echo.json"
     folder.mkdir()
     for date, tables in (("d1", {"A: old": {"x": 1}, "B: old": {"x": 2}}), ("d2", {"B: new": {"x": 3}})):
@@ -189,8 +189,6 @@ def test_published_tables_are_merged_by_number(tmp_path):
 
 @pytest.mark.parametrize("as_list", [False, True])
 def test_rows_that_a_run_leaves_stay_and_name_their_own_command(tmp_path, as_list):
-    from result_pages import origin, publish
-
     def made(date: str, rows: dict) -> dict:
         table = [{"method": name, "x": value} for name, value in rows.items()] if as_list else rows
         about = {**ABOUT, "date": date, "command": f"run {date}"}
@@ -213,16 +211,12 @@ def test_rows_that_a_run_leaves_stay_and_name_their_own_command(tmp_path, as_lis
 
 
 def test_published_json_is_short():
-    from result_pages import compact
-
     shown = compact({"about": ABOUT, "rows": {"ours": [summary(1.23456789, None, 4), {"a": summary(2.0)}]}})
     assert json.loads(shown)["rows"]["ours"] == [summary(1.23457, None, 4), {"a": summary(2.0)}]
     assert '{"mean":1.23457,"std":null,"seeds":4}' in shown
 
 
 def test_figures_of_speed_replace_those_of_their_benchmark_alone(tmp_path):
-    from result_pages import read_speed, write_speed
-
     path = tmp_path / "speed.jsonl"
     write_speed(path, "b", [{"name": "b", "value": 1.0}, {"name": "b_small", "value": 2.0}], ABOUT)
     write_speed(path, "a", [{"name": "a", "value": 3.0}], ABOUT)
@@ -238,16 +232,12 @@ def test_figures_of_speed_replace_those_of_their_benchmark_alone(tmp_path):
 
 
 def test_a_systems_results_are_not_those_of_one_with_a_longer_name(tmp_path):
-    from result_pages import results
-
     for name in ("hmd2", "hmd2_cmu", "hmd2_head", "hps"):
         (tmp_path / f"{name}.json").write_text("{}")
     assert list(results("hmd2", ["hmd2", "hmd2_head", "hps"], tmp_path)) == ["hmd2", "hmd2_cmu"]
 
 
 def test_readme_takes_a_pages_cells_and_keeps_all_else():
-    from result_pages import with_readme
-
     readme = "| [ECHO](docs/echo.md) | head | body | 9 cm | 3 × |\n| [HPS](docs/hps.md) | suit | body | 1 cm | 2 × |\n"
     assert with_readme(readme, "echo", small_page()) == readme.replace("9 cm", "joints 1.2 cm off")
     assert "| 5 × |" in with_readme(readme, "hps", small_page(speed="5 ×"))
@@ -258,9 +248,6 @@ def test_readme_takes_a_pages_cells_and_keeps_all_else():
 @pytest.mark.parametrize("system", PAGES)
 def test_the_page_is_what_its_json_gives(system):
     """Neither a page nor README's row holds a figure that the JSON beside the page does not."""
-    from result_pages import read_speed, render, with_readme
-    from tables import page_of
-
     page = page_of(system)
     assert all((ROOT / "docs" / name).is_file() for name, _ in page.pictures)
     assert render(system, page, read_speed()) == (RESULTS / f"{system}.md").read_text(encoding="utf-8")
@@ -281,11 +268,9 @@ def test_a_page_is_one_table_and_what_a_person_reads(system):
 
 @pytest.mark.parametrize("system", PAGES)
 def test_all_prints_every_table_of_the_json(system, capsys):
-    import tables
-
-    tables.main([system, "--all"])
+    command.main([system, "--all"])
     shown = capsys.readouterr().out
-    trees = tables.results(system, tables.systems())
+    trees = command.results(system, command.SYSTEMS)
     assert trees
     for tree in trees.values():
         for title, rows in tree.get("tables", {}).items():
@@ -318,7 +303,6 @@ def test_all_of_the_documentation_is_read_in_an_evening():
 
 def hps_run(ours_cm: float) -> dict:
     """What `hps_runs.run_seed` measures of one session, as far as its page shows it."""
-    from hps_runs import DISTURBED, ROWS, TRUTH
 
     def scores(cm: float) -> dict:
         chamfer = [{"mean_cm": cm, "cloud_to_body_cm": cm}] * 8
@@ -340,9 +324,6 @@ def hps_run(ours_cm: float) -> dict:
 
 
 def test_hps_page_shows_the_range_over_presets_of_sensors():
-    import tables_hps
-    from result_pages import render
-
     def tree(sensors: str, *ours_cm: float) -> dict:
         found = tables_hps.summarized([hps_run(cm) for cm in ours_cm])
         return {"about": ABOUT, "sensors": sensors, "places": ["at start", "70 m", "200 m", "380 m"], **found}

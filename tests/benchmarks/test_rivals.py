@@ -13,7 +13,7 @@ from wearcap.metrics.table import Row, Summary
 from wearcap.models.checkpoint import read_checkpoint
 from wearcap_testing import benchmark, small_dataset
 
-rivals, tabling = map(benchmark, ("rivals", "tabling"))
+rivals, tabling = map(benchmark, ("rivals.trainings", "tables.tabling"))
 NAME, STEP = "motion_diffusion_head", 8 * 240
 SMALL = [f"model.net.{name}" for name in ("width=32", "layers=1", "heads=4", "feedforward=32")]
 QUIET = [
@@ -23,11 +23,6 @@ QUIET = [
     "trainer.enable_progress_bar=false",
     "callbacks.progress=null",
 ]
-
-
-@pytest.fixture(autouse=True)
-def importable(monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(rivals.__file__).parent))
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +120,7 @@ def test_another_budget_and_no_finite_loss_are_refused(datasets, tmp_path, monke
 
 @pytest.mark.parametrize("system", rivals.SYSTEMS)
 def test_budgets_scale_with_what_is_asked_for(system):
-    table = benchmark(f"tables_{system}")
+    table = benchmark(f"tables.{system}")
     ours = compose("train", table.training(table.RUNS[0])).data.loading.batch_size
     for run in table.RUNS:
         small, large = (compose("train", table.training(run, frames)) for frames in (table.BUDGET, 10 * table.BUDGET))
@@ -164,7 +159,7 @@ def two_trainings(tmp_path) -> tuple[str, str]:
 
 
 def test_a_row_of_hmd2_is_the_mean_of_trainings_that_differ_in_the_seed(two_trainings, tmp_path, monkeypatch):
-    runs = benchmark("hmd2_runs")
+    runs = benchmark("tables.hmd2_runs")
     errors = dict(zip(two_trainings, (3.0, 5.0)))
 
     def evaluate(path, store, names, seeds, **_):
@@ -181,7 +176,7 @@ def test_a_row_of_hmd2_is_the_mean_of_trainings_that_differ_in_the_seed(two_trai
 
 
 def test_a_row_of_echo_captures_each_training_with_a_seed_of_its_own(two_trainings, tmp_path, monkeypatch):
-    tables = benchmark("tables_echo")
+    tables = benchmark("tables.echo")
     options = argparse.Namespace(runs=tmp_path, leave=(), quick=False, seeds=4, items=2, pipeline=[])
     made = tables._trained({"ours": (NAME, "pipeline=echo")}, options, Progress())
     monkeypatch.setattr(

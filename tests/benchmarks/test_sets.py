@@ -21,10 +21,8 @@ SMALL = [
 
 
 @pytest.fixture
-def table(monkeypatch):
-    made = benchmark("tables_sets")
-    monkeypatch.syspath_prepend(str(Path(made.__file__).parent))
-    return made
+def table():
+    return benchmark("tables.sets")
 
 
 def given(table, tmp_path: Path, *more: str) -> argparse.Namespace:

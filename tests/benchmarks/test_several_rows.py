@@ -1,11 +1,11 @@
 """Rows of several wearers: who is seen, how wrong views are, and that exact views mend a planted error."""
 
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
+from benchmarks.tables import mocap_every_several as module
 
 from wearcap.geometry import rotation
 from wearcap.recording import Motion
@@ -14,15 +14,10 @@ from wearcap.systems.mocap_every.manifold import MotionManifold
 from wearcap.systems.mocap_every.visual_cues import VisualCues
 from wearcap.tracking.anchor import anchored_to_head
 
-FOLDER = Path(__file__).parents[2] / "benchmarks"
-
 
 @pytest.fixture(scope="module")
 def several():
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(FOLDER))
-        import mocap_every_several as module
-
         patch.setattr(module, "DURATION_S", 1.5)
         patch.setattr(module, "SHORTEST_S", 1.0)
         module.pair_of.cache_clear()

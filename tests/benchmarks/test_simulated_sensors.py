@@ -1,10 +1,11 @@
 """Errors of simulated sensors are measured as they were planted."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
+from benchmarks.tables import simulated_sensors
+from benchmarks.tables import simulated_sensors as measured
+from benchmarks.tables import simulation as tables_simulation
 
 from wearcap.sensors.imu import ImuNoise
 from wearcap.sensors.simulated import SlamNoise
@@ -12,38 +13,24 @@ from wearsim.recordings.hps import HpsConfig, Protocol
 from wearsim.recordings.localization_noise import LocalizationNoise, MapErrors
 from wearsim.sensors.suit import BodyErrors, ContactErrors, PathErrors, SegmentErrors, SuitNoise
 
-FOLDER = Path(__file__).parents[2] / "benchmarks"
 SEGMENTS = SegmentErrors(fixed_deg=0.0, slow_deg=0.0, soft_tissue_deg=0.0)
 PATH = PathErrors(0.0, 0.0, 0.0, scale=0.0, step_scale=0.0, height_m=0.0, height_drift_m=0.0)
 PERFECT = SuitNoise(SEGMENTS, PATH, BodyErrors(0.0, 0.0), ContactErrors((0.0, 0.0), (0.0, 0.0)))
 
 
-@pytest.fixture(autouse=True)
-def importable(monkeypatch):
-    monkeypatch.syspath_prepend(str(FOLDER))
-
-
 @pytest.fixture(scope="module")
 def walked():
     """A short session of the simulator."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(FOLDER))
-        import simulated_sensors
-
-        return simulated_sensors.session(0, HpsConfig(protocol=Protocol(returns_m=(15.0,), end_m=20.0)))
+    return simulated_sensors.session(0, HpsConfig(protocol=Protocol(returns_m=(15.0,), end_m=20.0)))
 
 
 def test_a_perfect_suit_has_no_errors(walked):
-    import simulated_sensors as measured
-
     found = measured.suit_errors(walked, PERFECT, (15.0,), np.random.default_rng(0))
     assert set(found) >= {"heading_deg_per_sqrt_min", "bone_percent", "off_after_15_m_cm", "contact_late_ms"}
     assert {name: value for name, value in found.items() if abs(value) > 0.1} == {}
 
 
 def test_a_suits_planted_errors_are_found_apart(walked):
-    import simulated_sensors as measured
-
     path = PathErrors(6.0, 0.0, 0.0, scale=0.01, step_scale=0.0, height_m=0.0, height_drift_m=0.0)
     noise = SuitNoise(SEGMENTS, path, BodyErrors(0.0, 0.02), ContactErrors((0.05, 0.05), (0.0, 0.0)))
     draws = [measured.suit_errors(walked, noise, (15.0,), np.random.default_rng(k)) for k in range(16)]
@@ -58,8 +45,6 @@ def test_a_suits_planted_errors_are_found_apart(walked):
 
 
 def test_localisation_and_map_are_found_apart(walked):
-    import simulated_sensors as measured
-
     flat = MapErrors((1.0, 1.0), (0.004, 0.004), (0.0, 0.0))
     noise = LocalizationNoise(
         (0.05, 0.05), (1.0, 1.0), outliers=(0.1, 0.1), outlier_m=(1.0, 5.0), lost=(0.0, 0.0), map=flat
@@ -74,8 +59,6 @@ def test_localisation_and_map_are_found_apart(walked):
 
 
 def test_a_watch_and_a_head_tracker(walked):
-    import simulated_sensors as measured
-
     motion = walked.session.simulated.motion
     alone = ImuNoise(0.0, 8.0, 0.0, acc_noise=0.04, acc_bias=0.0, gyro_noise_deg_s=0.3, strap_deg=0.0)
     found = measured.watch_errors(motion, alone, np.random.default_rng(0))
@@ -88,16 +71,12 @@ def test_a_watch_and_a_head_tracker(walked):
 
 
 def test_flags_that_are_late_are_not_wrong():
-    import simulated_sensors as measured
-
     true = torch.rand(600, 4, generator=torch.Generator().manual_seed(0)) > 0.5
     late = torch.cat([true[:1].expand(3, -1), true[:-3]])
     assert measured.flag_errors(late.float(), true, 60.0) == (pytest.approx(0.05), 0.0)
 
 
 def test_a_reach_of_minimum_jerk():
-    import simulated_sensors as measured
-
     t = np.linspace(0, 1, 200)
     found = measured.movement(np.concatenate([np.zeros(50), 30 * t**2 * (1 - t) ** 2, np.zeros(50)]), 200.0)
     assert found is not None
@@ -106,8 +85,6 @@ def test_a_reach_of_minimum_jerk():
 
 
 def test_every_literature_figure_has_a_source():
-    import tables_simulation
-
     rows = tables_simulation._literature()
     assert len({row[0] for row in rows}) == len(rows)
     assert all(len(row) == 5 and all(row) for row in rows)

@@ -3,10 +3,10 @@
 import argparse
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
+from benchmarks.tables import truth as tables_truth
 
 from walking_person import sound_recording
 from wearcap.recording import RecordingStore
@@ -14,9 +14,6 @@ from wearcap.recording import RecordingStore
 
 @pytest.fixture
 def table(monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
-    import tables_truth
-
     return tables_truth
 
 

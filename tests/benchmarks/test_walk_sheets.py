@@ -23,10 +23,8 @@ FLOOR_M = 0.4
 
 
 @pytest.fixture
-def sheets(monkeypatch):
-    made = benchmark("contact_sheets")
-    monkeypatch.syspath_prepend(str(Path(made.__file__).parent))
-    return made
+def sheets():
+    return benchmark("pictures.contact_sheets")
 
 
 @pytest.fixture

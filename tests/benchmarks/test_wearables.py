@@ -14,7 +14,7 @@ from wearcap.recording.recording import FloorTrack, PointCloud
 from wearcap.sensors.simulated import SlamNoise, head_stream, slam_poses
 from wearcap_testing import benchmark, swaying_motion
 
-wearables = benchmark("wearables")
+wearables = benchmark("tables.wearables")
 WEARABLES, WornNoise = wearables.WEARABLES, wearables.WornNoise
 
 SEAT = torch.tensor([0.09, 0.0, 0.08])

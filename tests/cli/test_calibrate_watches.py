@@ -20,7 +20,7 @@ from wearcap.sensors.watch_calibration import read_watch_calibration, write_watc
 from wearcap.sensors.watches import watches_at
 from wearcap_testing import benchmark, recording_of, swaying_motion
 
-simulated = benchmark("calibration_session")
+simulated = benchmark("tables.calibration_session")
 CalibrationSession = simulated.CalibrationSession
 MARKS, STANDING, SWINGS_S = simulated.MARKS, simulated.STANDING, simulated.SWINGS_S
 G = 9.80665

@@ -227,7 +227,7 @@ def holds(process, root: Path) -> bool:
 def test_kills_at_random_moments_leave_the_same_bytes(alone, tmp_path, monkeypatch):
     """Each run is started as soon as the one before it was killed; every eighth is left to come to its end.
 
-    `benchmarks/faults.py` kills hundreds.
+    `benchmarks/faults/faults.py` kills hundreds.
     """
     moments, kills = random.Random(0), 0
     context = multiprocessing.get_context("forkserver")  # what it has imported, a run need not import again

@@ -1,4 +1,4 @@
-"""A short run of benchmarks/fuzz_readers.py: every reader, some damaged files."""
+"""A short run of benchmarks/faults/fuzz_readers.py: every reader, some damaged files."""
 
 import json
 import os
@@ -8,14 +8,11 @@ from pathlib import Path
 from subprocess import run
 
 import pytest
+from benchmarks.faults import fuzz_readers
+from benchmarks.faults.fuzz_files import Reader
+from benchmarks.faults.fuzz_readers import READERS, failed, fuzz, outcome
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-sys.path.insert(0, str(BENCHMARKS))
-import fuzz_readers  # noqa: E402
-from fuzz_files import Reader  # noqa: E402
-from fuzz_readers import READERS, failed, fuzz, outcome  # noqa: E402
-
-sys.path.remove(str(BENCHMARKS))
+ROOT = Path(__file__).parents[2]
 INPUTS = int(os.environ.get("WEARCAP_EXAMPLES", "25"))
 """Inputs of each reader."""
 BOUNDED = {"aria_vrs"}
@@ -24,8 +21,8 @@ BOUNDED = {"aria_vrs"}
 
 def rows_of(*arguments: str) -> list[dict]:
     """The lines that the program prints, and its total."""
-    command = [sys.executable, BENCHMARKS / "fuzz_readers.py", *arguments]
-    done = run(command, capture_output=True, text=True, check=False)
+    command = [sys.executable, "-m", "benchmarks.faults.fuzz_readers", *arguments]
+    done = run(command, capture_output=True, text=True, check=False, cwd=ROOT)
     assert done.stdout, done.stderr[-3000:]
     return [json.loads(line) for line in done.stdout.splitlines()]
 
@@ -38,8 +35,8 @@ def test_damaged_files_are_read_or_refused(tmp_path):
 
 
 def test_every_module_that_reads_is_in_the_table():
-    source = Path(__file__).parents[2] / "src/wearcap/io"
-    table = (BENCHMARKS / "fuzz_files.py").read_text()
+    source = ROOT / "src/wearcap/io"
+    table = (ROOT / "benchmarks/faults/fuzz_files.py").read_text()
     reading = {path.stem for path in source.rglob("*.py") if "\ndef read_" in path.read_text()}
     assert {module for module in reading if f"{module}.read_" not in table} <= BOUNDED
 

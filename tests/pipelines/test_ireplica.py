@@ -31,7 +31,7 @@ from wearcap.systems.ireplica.scores import score_interactions
 from wearcap.systems.ireplica.snapping import BendCorrection, HandSnapping, HingeFit, SnapCorrection, fit_about_hinge
 from wearcap_testing import benchmark
 
-baselines = benchmark("ireplica_baselines")
+baselines = benchmark("rivals.ireplica_baselines")
 FPS, FRAMES = 60.0, 360
 TAKE, LEAVE = 60, 240
 CUBE = np.array([[x, y, z] for x in (-0.2, 0.2) for y in (-0.2, 0.2) for z in (-0.2, 0.2)], np.float32)

@@ -20,7 +20,7 @@ from wearsim.recordings.simulate import SimulationConfig
 @pytest.fixture(scope="module")
 def pair() -> tuple[Recording, Recording]:
     config = SimulationConfig(duration_s=3.0, fps=30.0, points=False, suit=None, world="flat")
-    return benchmark("two_wearers").simulate_two_wearers(config, "talk", "val", 3, distance_m=2.5)
+    return benchmark("tables.two_wearers").simulate_two_wearers(config, "talk", "val", 3, distance_m=2.5)
 
 
 class AnyMotion(MotionManifold):

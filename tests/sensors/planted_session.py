@@ -10,7 +10,7 @@ from wearcap.sensors.stillness import Stretch
 from wearcap.sensors.watch_calibration import WatchCalibration, measure_watches, require_watches
 from wearcap_testing import benchmark
 
-simulated = benchmark("calibration_session")
+simulated = benchmark("tables.calibration_session")
 CalibrationSession = simulated.CalibrationSession
 SEEDS = range(5)
 

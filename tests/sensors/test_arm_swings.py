@@ -12,7 +12,7 @@ from wearcap.sensors.clock import fit_swing_clock, swing_peaks
 from wearcap.sensors.stillness import require
 from wearcap_testing import benchmark
 
-SWINGS_S = benchmark("calibration_session").SWINGS_S
+SWINGS_S = benchmark("tables.calibration_session").SWINGS_S
 MIDDLE = torch.tensor([SWINGS_S + 8], dtype=torch.float64)
 
 

@@ -15,7 +15,7 @@ from wearcap.sensors.monocular_slam import scale_by_walks
 from wearcap.sensors.stillness import require
 from wearcap_testing import benchmark
 
-simulated = benchmark("calibration_session")
+simulated = benchmark("tables.calibration_session")
 MARKS, STANDING = simulated.MARKS, simulated.STANDING
 WORLD = torch.tensor([[0, 0.1, 0.8], [0, 0.6, 0.8], [0.15, 0, 0.8], [0.55, 0, 0.8]], dtype=torch.float64)
 DISTANCES = (0.5, 0.4)

@@ -18,7 +18,7 @@ from wearcap.metrics.surface import chamfer
 from wearcap_testing import benchmark
 from wearsim.places.builder import WorldBuilder
 
-rig = benchmark("depth_rig")
+rig = benchmark("tables.depth_rig")
 Background = rig.Background
 DepthView = rig.DepthView
 _unproject_depth = rig._unproject_depth
@@ -26,7 +26,7 @@ _visible_points = rig._visible_points
 largest_cluster = rig.largest_cluster
 person_cloud = rig.person_cloud
 
-simulated = benchmark("simulated_depth_rig")
+simulated = benchmark("tables.simulated_depth_rig")
 KINECT = simulated.KINECT
 SimulatedRig = simulated.SimulatedRig
 approximate = simulated.approximate

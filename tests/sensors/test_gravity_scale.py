@@ -14,7 +14,7 @@ from wearcap.recording import ImuStream
 from wearcap.sensors.monocular_slam import _GravityScale, by_floor, by_head_imu
 from wearcap_testing import benchmark
 
-simulated = benchmark("calibration_session")
+simulated = benchmark("tables.calibration_session")
 CalibrationSession = simulated.CalibrationSession
 STANDING = simulated.STANDING
 SEEDS = range(4)

@@ -10,7 +10,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.pcd import read_pcd
 from wearcap_testing import benchmark
 
-rig = benchmark("depth_rig")
+rig = benchmark("tables.depth_rig")
 _register = rig._register
 
 

@@ -99,7 +99,7 @@ def test_a_clock_of_its_own_is_refused(motion):
 
 def test_an_estimated_pose_is_as_wrong_as_asked_and_of_what_is_in_the_picture(motion):
     path = watching(motion, 1.2)
-    seen_pose = benchmark("mocap_every_several").seen_pose
+    seen_pose = benchmark("tables.mocap_every_several").seen_pose
     exact, seen = seen_pose(motion, path, ACTION_CAMERA, 0.0, 0.0, np.random.default_rng(0))
     off, confidence = seen_pose(motion, path, ACTION_CAMERA, 12.0, 0.2, np.random.default_rng(0))
     assert torch.allclose(exact.R_parent_joint, motion.R_parent_joint[::2][: len(path)], atol=1e-5)

@@ -30,7 +30,7 @@ from wearcap_testing import benchmark, experiments, small_dataset
 
 pytestmark = pytest.mark.usefixtures("few_statistics")
 
-RUNS = {name: (f"experiment={name}",) for name in experiments("echo")} | benchmark("tables_echo").TRAININGS
+RUNS = {name: (f"experiment={name}",) for name in experiments("echo")} | benchmark("tables.echo").TRAININGS
 WEIGHTS = {
     "human": 1.0,
     "object": 1.0,
@@ -356,7 +356,7 @@ def test_a_baseline_learns_in_a_few_steps_and_captures(name, data, people, tmp_p
     train.main(arguments(f"baseline/{name}", data, people, run, *small))
     losses = [float(loss) for loss in losses_of(run).values()]
     assert sum(losses[-5:]) < 0.9 * sum(losses[:5])
-    rows = benchmark("echo_rows")
+    rows = benchmark("tables.echo_rows")
     method = rows.Method(
         name,
         f"{run}/checkpoints/last.ckpt",

@@ -27,7 +27,7 @@ from wearcap_testing import benchmark, small_dataset
 
 pytestmark = pytest.mark.usefixtures("few_statistics")
 
-TRAININGS = benchmark("tables_mocap_every").TRAININGS
+TRAININGS = benchmark("tables.mocap_every").TRAININGS
 SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
 WEIGHTS = {
     "skate": 0.5,

@@ -172,7 +172,7 @@ def test_outages_come_where_there_is_little_to_see(long_path):
 
 def test_an_outage_can_be_planted(long_path):
     found = localize_statistically(long_path, LocalizationNoise(lost=(0.0, 0.0)), np.random.default_rng(0))
-    with_outage = benchmark("hps_outages").with_outage
+    with_outage = benchmark("tables.hps_outages").with_outage
     gone = with_outage(found, 100.0, 30.0)
     inside = (found.timestamps >= 100) & (found.timestamps < 130)
     assert (gone.confidence[inside] == 0).all()

@@ -11,7 +11,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap_testing import benchmark
 from wearsim.places.world import World
 
-simulated = benchmark("simulated_depth_rig")
+simulated = benchmark("tables.simulated_depth_rig")
 KINECT = simulated.KINECT
 DepthNoise = simulated.DepthNoise
 approximate = simulated.approximate

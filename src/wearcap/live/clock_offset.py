@@ -4,7 +4,7 @@ The quickest packets show how two clocks stand only up to the time that every pa
 phone that may be seconds. A wearer who turns to and fro carries head and watches along: the angular speeds about the
 vertical, which need neither headings nor seats, are alike at one offset of the clocks.
 
-People turn their head before the body, so that a good clock, too, seems to be off. `python benchmarks/live_turns.py`
+People turn their head before the body, so that a good clock, too, seems to be off. `python -m benchmarks.faults.live_turns`
 measures this on CMU recordings, in windows of 10 s in which head and wrist turn enough to both sides. Of people who turn at
 one place with hanging arms, 38 of 60 windows, of 6 recordings, reach a correlation of `LEAST_LIKENESS`: in them watches seem
 late by 0.08 s (median; 5th and 95th percentile 0 and 0.12 s, at most 0.14 s). Where they also walk or use their hands, it is

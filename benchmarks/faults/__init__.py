@@ -1,0 +1,1 @@
+"""Damaged files and packets, kills, floods and long runs."""

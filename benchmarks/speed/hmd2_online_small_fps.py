@@ -1,0 +1,12 @@
+"""HMD² online on this machine's CPU (h = 10, batch 1), small model: frames per second, everything included.
+
+The steps, runtime and precision of `pipeline=hmd2_online`; median push of a walk among points with embeddings at 30 Hz.
+baseline: real time, 60; ratio = value / baseline, to be at least `goal` (150 frames/s on two cores).
+"""
+
+from benchmarks.speed.online import figure, frames_per_second, pipeline_of
+
+
+def measure(pushes: int = 40) -> list[dict]:
+    value = frames_per_second(pipeline_of("small"), pushes)
+    return [figure("hmd2_online_small_fps", value, 60.0, 2.5)]

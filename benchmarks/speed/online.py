@@ -1,0 +1,144 @@
+"""Streams for benchmarks of HMD²: a checkpoint or its size with random weights, and moments of a walk among points."""
+
+import statistics
+import sys
+import time
+
+import torch
+from hydra.utils import instantiate
+
+from benchmarks.speed.planted import swinging
+from wearcap.body.skeleton import xsens23
+from wearcap.cli.conf import compose, load_pipeline
+from wearcap.diffusion.schedule import CosineSchedule
+from wearcap.geometry.rigid import Rigid
+from wearcap.models.checkpoint import shared_checkpoints
+from wearcap.models.voxel_autoencoder import VoxelAutoencoder
+from wearcap.runtime.wearer import Wearer
+from wearcap.systems.hmd2.features import HeadFeatures
+from wearcap.systems.hmd2.model import MotionDenoiser
+from wearcap.systems.hmd2.pipeline import HMD2, DiffusionModel
+from wearcap.systems.hmd2.stream import HeadSample, HMD2Session
+
+EXPERIMENTS = {"small": "hmd2", "full": "full/hmd2"}
+"""Experiments of both sizes; where there is a checkpoint, it has the same name."""
+IMAGE = 64
+LAP_S = 20.0
+"""The walk leads there and back, over and over."""
+
+
+def pipeline_of(size: str, device: str = "cpu", *overrides: str) -> HMD2:
+    """The online pipeline around a checkpoint of the project, or around random weights of that size, which is printed."""
+    config = compose("capture", ["pipeline=hmd2_online", *overrides, "recording=none"]).pipeline
+    if EXPERIMENTS[size] in shared_checkpoints():
+        pipeline = load_pipeline(EXPERIMENTS[size], config, device)
+        assert isinstance(pipeline, HMD2)
+    else:
+        net = random_net(size)
+        model = DiffusionModel(net, _FEATURES, CosineSchedule(), xsens23(), 60.0, VoxelAutoencoder(), "any")
+        pipeline = instantiate(config, _convert_="all")(model=model, device=device)
+        count = sum(parameter.numel() for parameter in net.parameters()) / 1e6
+        print(f"no checkpoint {EXPERIMENTS[size]!r}: random weights, {count:.1f} M parameters", file=sys.stderr)
+    return pipeline
+
+
+_FEATURES = HeadFeatures(contacts=True, body=True)
+
+
+def random_net(size: str) -> MotionDenoiser:
+    """The network of an experiment's config, its weights drawn."""
+    torch.manual_seed(0)
+    config = compose("train", [f"experiment={EXPERIMENTS[size]}"])
+    net = instantiate(config.model.net)(
+        motion_size=_FEATURES.motion_size,
+        condition_size=_FEATURES.condition_size,
+        points_size=VoxelAutoencoder().size,
+        image_size=IMAGE,
+    )
+    for parameter in net.parameters():
+        torch.nn.init.normal_(parameter, std=0.02)
+    return net
+
+
+class Walk:
+    """A head's path there and back at 60 Hz, with an embedding every other frame, and points on the first lap or forever."""
+
+    def __init__(self, pipeline: HMD2, new_points: int = 40, forever: bool = False):
+        self.pipeline, self.new_points, self.forever = pipeline, new_points, forever
+        head = swinging("walk", LAP_S / 2, 0).head
+        assert head is not None
+        there = head.T_world_device
+        self.lap = Rigid(torch.cat([there.R, there.R.flip(0)]), torch.cat([there.t, there.t.flip(0)]))
+        self._random = torch.Generator().manual_seed(0)
+
+    def moment(self, number: int) -> HeadSample:
+        place = number % len(self.lap.t)
+        pose = self.lap[place]
+        count = self.new_points if self.forever or number < len(self.lap.t) else 0
+        points = pose.t + 4 * torch.rand(count, 3, generator=self._random) - torch.tensor([2.0, 2.0, 3.0])
+        shown = torch.randn(self.pipeline.model.net.image_size, generator=self._random) if number % 2 == 0 else None
+        return HeadSample(number / 60, pose, points, shown)
+
+
+class Streamed:
+    """A session that is fed a walk; seconds of work per push that gives poses."""
+
+    def __init__(self, pipeline: HMD2):
+        self.session, self.walk, self.number = HMD2Session(pipeline, [Wearer(xsens23())], [0]), Walk(pipeline), 0
+        self.stride, self.seconds = pipeline.advance, []
+
+    def step(self) -> None:
+        """One stride: everything from its first moment to its poses."""
+        moments = [self.walk.moment(self.number + i) for i in range(self.stride)]
+        self.number += self.stride
+        begin = time.perf_counter()
+        for moment in moments:
+            self.session.push([[moment]])
+            self.session.poses()
+        self.seconds.append(time.perf_counter() - begin)
+
+    def fill(self) -> "Streamed":
+        """Until windows are full, and what is compiled is."""
+        while self.number < self.session.system.window + 3 * self.stride:
+            self.step()
+        self.seconds.clear()
+        return self
+
+    @property
+    def frames_per_second(self) -> float:
+        return self.stride / statistics.median(self.seconds)
+
+
+def frames_per_second(pipeline: HMD2, pushes: int = 40) -> float:
+    """Rate at which a full window advances by the pipeline's stride, everything included."""
+    stream = Streamed(pipeline).fill()
+    for _ in range(pushes):
+        stream.step()
+    return stream.frames_per_second
+
+
+def figure(name: str, value: float, baseline: float, goal: float | None) -> dict:
+    return {
+        "name": name,
+        "value": value,
+        "unit": "frames/s",
+        "baseline": baseline,
+        "ratio": value / baseline,
+        "goal": goal,
+    }
+
+
+def beside_paper(name: str, stride: int, paper: float, pushes: int) -> list[dict]:
+    """Full model on a GPU at one stride in 20 steps, beside the paper's frames per second; nothing without a GPU."""
+    if without_cuda(name):
+        return []
+    sampling = "pipeline.sampling.steps=20", "pipeline.sampling.spacing=1.0", "pipeline.precision=auto"
+    pipeline = pipeline_of("full", "cuda", f"pipeline.overlap.stride={stride}", *sampling)
+    return [figure(name, frames_per_second(pipeline, pushes), paper, 10.0)]
+
+
+def without_cuda(name: str) -> bool:
+    """Whether a benchmark for a GPU has none, which is printed."""
+    if not torch.cuda.is_available():
+        print(f"{name}: left out, no CUDA device", file=sys.stderr)
+    return not torch.cuda.is_available()

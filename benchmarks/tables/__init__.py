@@ -1,0 +1,1 @@
+"""What `tables.py` makes: a module per system or data, and what they share."""
