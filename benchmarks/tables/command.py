@@ -8,7 +8,6 @@ Prints them and writes OUTPUT/SYSTEM.json (OUTPUT is outputs/tables), which --pu
 the other prints every table (Markdown). Systems:
 
     hmd2          HMD2 with points and pictures: its paper's tables on held-out people and places
-    hmd2_head     HMD2 on the head path alone: MPJPE and its parts, realism, beside trivial baselines
     hps           HPS on simulated sessions: its paper's three tables, drift, outages of localisation
     ireplica      iReplica on simulated interactions: its paper's tables, robustness
     echo          ECHO: bodies, objects and contacts; baselines, ablations, sparse observations
@@ -18,7 +17,7 @@ the other prints every table (Markdown). Systems:
     objects       the object encoder's feature: category, extents, instance of objects unknown to it
     truth         whether data sets move as people do: knees, soles, sides, proportions, by set or by person
     sets          what each set of motion brings on validation people of the others: one left out at a time
-    simulation    how far simulated people differ from CMU's: gait statistics, and a discriminator
+    simulation    errors of simulated sensors, beside published ones
 
 Each system is a module of this folder with `add_arguments(parser)`, `tables(options, about)` and, where
 it has a page, `page(trees, speed)`.
@@ -50,7 +49,6 @@ SYSTEMS = (
     "echo",
     "egoview",
     "hmd2",
-    "hmd2_head",
     "hps",
     "ireplica",
     "mocap_every",
