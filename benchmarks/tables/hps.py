@@ -1,6 +1,6 @@
 """HPS on simulated sessions of more than 400 m: Tables 4.1 to 4.3 of the paper, drift, outages, time per stage.
 
-Sessions, scans and the rig's clouds are kept in OUTPUT/hps/cache, pictures go to OUTPUT/hps.
+Sessions, scans and the rig's clouds are kept in OUTPUT/hps/cache.
 """
 
 import argparse
@@ -15,7 +15,6 @@ from joblib import Parallel, delayed
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.pictures.hps_pictures import draw_drift
 from benchmarks.tables.hps_runs import DISTURBED, ROWS, TRUTH, SeedRun, run_seed
 from benchmarks.tables.hps_sessions import SessionSettings
 from benchmarks.tables.result_pages import (
@@ -86,17 +85,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     """Print and write all tables; returns the path of the JSON file."""
     count = 1 if options.quick else options.seeds
-    folder = options.output / ("hps" if options.sensors == "typical" else f"hps_{options.sensors}")
+    name = "hps" if options.sensors == "typical" else f"hps_{options.sensors}"
     protocol = Protocol(returns_m=tuple(options.returns), end_m=options.end)
     suit, localization = SuitNoise.preset(options.sensors), LocalizationNoise.preset(options.sensors)
     config = HpsConfig(protocol=protocol, suit=suit, localization=localization)
     settings = SessionSettings(options.split, config, options.spacing)
     jobs = min(options.jobs, count)
     first = options.first_seed
-    seeds = [
-        SeedRun(settings, first + k, folder / "cache", folder if k == 0 else None, options.jobs // jobs)
-        for k in range(count)
-    ]
+    seeds = [SeedRun(settings, first + k, options.output / name / "cache", options.jobs // jobs) for k in range(count)]
     runs = [run for run in Parallel(n_jobs=jobs)(delayed(run_seed)(seed) for seed in seeds) if run]
     places = ["at start", *(f"{distance:.0f} m" for distance in options.returns)]
     tree: dict[str, Any] = {"about": about, "sensors": options.sensors, "places": places, **summarized(runs)}
@@ -104,9 +100,8 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     for table in _all_tables(tree):
         show(table)
     show(_order_line(tree["order_beyond_start"]))
-    draw_drift(folder / "drift.png", {row: [run["scores"][row]["drift"] for run in runs] for row in ROWS})
     tree["seeds"] = runs
-    path = options.output / ("hps.json" if options.sensors == "typical" else f"hps_{options.sensors}.json")
+    path = options.output / f"{name}.json"
     write_text(path, json.dumps(finite(tree), indent=1, allow_nan=False) + "\n")
     return path
 

@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from hydra.utils import instantiate
 
-from benchmarks.pictures.hps_pictures import draw_feet, draw_paths
 from benchmarks.rivals.hps_scores import HpsScores, HpsTruth, score_hps
 from benchmarks.tables.hps_outages import Outage, disturbance, planted_outages, with_outage
 from benchmarks.tables.hps_sessions import Session, SessionSettings, TrueClock, load_session
@@ -42,7 +41,6 @@ class SeedRun:
     settings: SessionSettings
     seed: int
     cache: Path
-    pictures: Path | None
     solver_jobs: int
 
 
@@ -61,10 +59,6 @@ def run_seed(run: SeedRun) -> dict[str, Any]:
         scores[row] = _plain(score_hps(motions[row], truth))
         tell(f"{row}: {_short(scores[row])}")
     outages = _outages(session, truth, motions, run, tell)
-    if run.pictures is not None:
-        tell("pictures …")
-        draw_paths(run.pictures / "paths.png", session, truth, motions)
-        draw_feet(run.pictures / "feet.png", session, truth, motions)
     scores[TRUTH] = _plain(score_hps(truth.motion, truth))
     recording = session.recording
     assert recording.intervals is not None
