@@ -246,13 +246,6 @@ def person_cloud(
     return merged[largest_cluster(merged)]
 
 
-def scene_cloud(
-    depth_mm: Sequence[UInt16[np.ndarray, "height width"]], views: Sequence[DepthView]
-) -> Float[np.ndarray, "point 3"]:
-    """All that the cameras measure of the scene (m) at one instant, but for flying pixels; raises as `person_cloud`."""
-    return _merged(depth_mm, views, [(image > 0) & ~_flying(image / np.float32(1000)) for image in depth_mm])
-
-
 def _merged(
     depth_mm: Sequence[np.ndarray], views: Sequence[DepthView], masks: Sequence[np.ndarray]
 ) -> Float[np.ndarray, "point 3"]:

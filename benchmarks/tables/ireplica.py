@@ -42,7 +42,6 @@ from wearcap.scene.objects import CONTACT_CLASSES
 
 PAPER_END = {
     "HPS": (60.81, 46.89),
-    "HPS w/ RGB object localisation": (597.83, 61.43),
     "as published": (6.88, 7.13),
     "as published, contacts of a simulated detector": (38.58, 28.41),
     "as published, w/o contact corr.": (11.68, 10.28),
@@ -51,7 +50,6 @@ PAPER_END = {
 PAPER_HAND = {
     "HPS": 33.61,
     "HPS w/ GT": 10.44,
-    "HPS w/ RGB object localisation": 287.12,
     "as published": 2.93,
     "as published, contacts of a simulated detector": 31.26,
     "as published, w/o contact corr.": 11.37,
@@ -295,7 +293,6 @@ def _tree(groups: list[list[dict[str, Any]]]) -> dict[str, Any]:
         "detection": {
             name: _detection([[run["detection"][name] for run in group] for group in groups]) for name in detectors
         },
-        **_by_depth_cameras(groups),
         "robustness": {
             name: _row([[run[name] for run in group] for group in disturbed])
             | _detection([[run[name]["detection"] for run in group] for group in disturbed])
@@ -303,20 +300,6 @@ def _tree(groups: list[list[dict[str, Any]]]) -> dict[str, Any]:
         }
         if any(disturbed)
         else {},
-    }
-
-
-def _by_depth_cameras(groups: list[list[dict[str, Any]]]) -> dict[str, Any]:
-    """Distances to depth cameras' clouds, and pictures in which an object was found, where recordings are simulated."""
-    looks = [run["rig"] for group in groups for run in group if run.get("rig")]
-    names = looks[0] if looks else {}
-    rgb = [run["rgb"] for group in groups for run in group if "rgb" in run]
-    return {
-        "rig": {
-            row: {name: summarize([look[row][name] for look in looks]) for name in ("body_cm", "object_cm")}
-            for row in names
-        },
-        "rgb": {name: sum(run[name] for run in rgb) for name in ("pictures", "found")} if rgb else {},
     }
 
 
@@ -382,14 +365,6 @@ def _show(tree: dict[str, Any]) -> None:
     parts = (_ends(tree), _hands(tree), _detections(tree), _gaps(tree), _chamfer(tree))
     for part in (*parts, *([_robustness(tree)] if tree["robustness"] else [])):
         console.print(part)
-    if not tree["rgb"]:
-        console.print(
-            "left out: what head and depth cameras see (no simulated recording of flats as they are built now)"
-        )
-    else:
-        console.print(
-            "RGB object localisation: found in {found} of {pictures} pictures of handlings".format(**tree["rgb"])
-        )
     console.print(f"{tree['handlings']} handlings in {len(tree['about']['recordings'])} recordings")
 
 
@@ -451,18 +426,13 @@ def _gaps(tree: dict[str, Any]) -> Table:
 
 def _chamfer(tree: dict[str, Any]) -> Table:
     shown = new_table(
-        "Table 5.5: Chamfer to the true surfaces during interactions (cm), and to what depth cameras around one of "
-        "them measure (as documented; in brackets the paper's)",
-        ["", "body", "object", "body, cameras", "object, cameras"],
+        "Table 5.5: Chamfer to the true surfaces during interactions (cm); in brackets the paper's, to depth cameras' clouds",
+        ["", "body", "object"],
     )
-    rig = tree.get("rig", {})
     for row, found in tree["rows"].items():
-        exact = [cell(found["whole"][name], 1) for name in ("body_chamfer_cm", "object_chamfer_cm")]
-        seen = [cell(rig[row][name], 1) for name in ("body_cm", "object_cm")] if row in rig else ["", ""]
+        cells = [cell(found["whole"][name], 1) for name in ("body_chamfer_cm", "object_chamfer_cm")]
         beside = [f"  [{value:.1f}]" for value in PAPER_CHAMFER.get(row, ())] or ["", ""]
-        shown.add_row(row, *exact, *(value + known for value, known in zip(seen, beside)))
-    if "truth" in rig:
-        shown.add_row("truth", "", "", *(cell(rig["truth"][name], 1) for name in ("body_cm", "object_cm")))
+        shown.add_row(row, *(value + known for value, known in zip(cells, beside)))
     return shown
 
 

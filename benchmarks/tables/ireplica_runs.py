@@ -14,8 +14,6 @@ from hydra.utils import instantiate
 from torch import Tensor
 
 from benchmarks.rivals.ireplica_baselines import held_when_near, interpolated_objects, nearness, static_objects
-from benchmarks.tables.interaction_rig import rig_distances, rig_looks
-from benchmarks.tables.rgb_objects import found_objects, with_found_objects
 from benchmarks.tables.seen_flat import SeenFlat
 from benchmarks.tables.simulated_detections import FPS, HOD, detections, seen_hands
 from wearcap.body.kinematics import local_rotations
@@ -44,8 +42,6 @@ ON_BENT_PATH = (
     "ours, on the bent path, w/o contact corr.",
 )
 """Rows whose wearer is registered as documented; HPS registers the others'."""
-RIG_ROWS = ("HPS", "as published", "ours")
-"""Rows that are measured by depth cameras, too."""
 GAPS_S = (0.0, 0.25, 0.5, 1.0, 2.0)
 """Of the paper's Table 5.4."""
 
@@ -67,7 +63,7 @@ class RecordingRun:
     networks: Networks
     robustness: bool
     rows: tuple[str, ...] = ()
-    """Rows that are captured, without what head and depth cameras see; none: all."""
+    """Rows that are captured, without detections in the head camera's pictures; none: all."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +102,6 @@ def run_recording(run: RecordingRun) -> dict[str, Any]:
     placed = ours.placed(case.environment, case.source)
     contacts = {"ours": _contacts(ours, case), "published": _contacts(published, case)}
     seen = None if run.rows else SeenFlat.of(case.recording)
-    objects = None if seen is None else found_objects(seen)
     if seen is not None:
         contacts["detections"] = detected_contacts(seen, contacts["ours"]["timestamps"])
     rows = {
@@ -129,11 +124,6 @@ def run_recording(run: RecordingRun) -> dict[str, Any]:
             ),
         },
     }
-    if seen is not None and objects is not None:
-        captured = with_found_objects(motion, seen, objects, case.environment)
-        found["rows"]["HPS w/ RGB object localisation"] = scored(captured, case)
-        found["rgb"] = {"pictures": objects.looked, "found": objects.found}
-        found["rig"] = _rig(seen, case, rows)
     if run.robustness:
         found["robustness"] = {name: _worse(ours, case, change) for name, change in DISTURBANCES.items()}
     return found
@@ -184,17 +174,6 @@ def _rows(
         "ours, classes in parallel": track(changed(one_class=False, class_m=None), "ours"),
         "ours, true contacts": lambda motion: ours.tracker(motion, oracle, placed),
     } | seen_rows
-
-
-def _rig(seen: SeenFlat, case: Case, rows: dict[str, Motion]) -> dict[str, Any]:
-    """Distances to what depth cameras around one handling measure, of `RIG_ROWS` and the truth (thesis Table 5.5)."""
-    scan = case.source.read_scan()
-    looks = None if scan is None else rig_looks(seen, scan.points)
-    if looks is None:
-        return {}
-    truth = replace(seen.motion, object_motion=case.recording.object_motion)
-    motions = {"truth": truth} | {name: rows[name] for name in RIG_ROWS}
-    return {name: rig_distances(looks, motion, seen) for name, motion in motions.items()}
 
 
 def _with_gap(tracker: ObjectTracker, gap_s: float) -> ObjectTracker:
