@@ -18,10 +18,10 @@ from wearcap.io.formats.camera_json import write_photos
 from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.localization.features import RootSift
 from wearcap.localization.point_map import PointMapper
-from wearcap.optimize.banded import BandedSettings, solve_banded
-from wearcap.optimize.costs import Loss
-from wearcap.optimize.hps import HpsEnergy
+from wearcap.optimize.losses import Loss
 from wearcap.recording import Localization, Recording, RecordingStore
+from wearcap.systems.hps.banded import BandedSettings, solve_banded
+from wearcap.systems.hps.energy import HpsEnergy
 from wearcap.systems.hps.pipeline import HPS
 from wearcap.systems.hps.training import HpsValidation, TrainedFeatures
 

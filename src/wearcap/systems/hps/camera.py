@@ -180,6 +180,7 @@ def camera_stages(source: CaptureInput, synchronization: Synchronization, locali
             "synchronize",
             lambda results: synchronization(recording, folder),
             lambda: synchronization.reads(recording, folder),
+            kinds=(Clock,),
         ),
         Stage("localize", lambda results: localize(recording, folder), lambda: localize.reads(recording, folder)),
     ]

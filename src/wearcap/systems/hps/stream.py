@@ -20,7 +20,6 @@ from wearcap.body import skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry import rigid, rotation, trajectory
 from wearcap.geometry.rigid import Rigid
-from wearcap.optimize.hps import HpsData, HpsState
 from wearcap.recording import Motion, Recording
 from wearcap.recording import motion as motion_types
 from wearcap.recording import recording as recording_types
@@ -43,6 +42,7 @@ from wearcap.sensors.packets import (
     values_fault,
 )
 from wearcap.sensors.samples import LocalizationSample, SuitPiece
+from wearcap.systems.hps.energy import HpsData, HpsState
 from wearcap.systems.hps.pipeline import HPS, mount
 
 MAX_UNALIGNED_S = 600.0

@@ -12,13 +12,14 @@ from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.surface import SurfaceIndex
-from wearcap.optimize import costs
-from wearcap.optimize.adam_windows import AdamSettings, solve_adam_windows
-from wearcap.optimize.banded import BandedSettings, Stretch, solve_banded, solve_in_stretches
-from wearcap.optimize.banded_kernels import LEGS
-from wearcap.optimize.block_tridiagonal import factor_and_solve
-from wearcap.optimize.costs import Loss
-from wearcap.optimize.hps import TERMS, FootPatches, HpsData, HpsEnergy, HpsState, SuitSteps, Term, energy_terms
+from wearcap.optimize import losses
+from wearcap.optimize.losses import Loss
+from wearcap.systems.hps import costs
+from wearcap.systems.hps.adam_windows import AdamSettings, solve_adam_windows
+from wearcap.systems.hps.banded import BandedSettings, Stretch, solve_banded, solve_in_stretches
+from wearcap.systems.hps.banded_kernels import LEGS
+from wearcap.systems.hps.block_tridiagonal import factor_and_solve
+from wearcap.systems.hps.energy import TERMS, FootPatches, HpsData, HpsEnergy, HpsState, SuitSteps, Term, energy_terms
 
 MIXED = {
     "hold": Loss("cauchy", 0.05),
@@ -80,7 +81,7 @@ def disturbed(data: HpsData, scale: float) -> HpsState:
     )
 
 
-@pytest.mark.parametrize("kind", costs.LOSSES)
+@pytest.mark.parametrize("kind", losses.LOSSES)
 def test_losses_have_true_derivatives_and_none_at_zero(kind):
     loss = Loss(kind, 0.7)
     residual = randn(6, 3).requires_grad_()
@@ -333,7 +334,7 @@ def test_stretches_join_to_the_whole(monkeypatch):
         solved.append(len(stretch))
         return solve_banded(energy, stretch, settings)
 
-    monkeypatch.setattr("wearcap.optimize.banded.solve_banded", noted)
+    monkeypatch.setattr("wearcap.systems.hps.banded.solve_banded", noted)
     joined = solve_in_stretches(energy, data, settings, stretch=10, overlap=8, jobs=1)
     assert len(joined.state) == len(data)
     assert (joined.state.t_world_root - whole.t_world_root).norm(dim=1).max() < 0.02

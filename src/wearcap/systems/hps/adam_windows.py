@@ -8,7 +8,7 @@ from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.optimize.hps import HpsData, HpsEnergy, HpsState, Solution, energy_terms
+from wearcap.systems.hps.energy import HpsData, HpsEnergy, HpsState, Solution, energy_terms
 
 
 @dataclass(frozen=True)

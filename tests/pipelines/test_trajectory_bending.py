@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
-from wearcap.optimize.costs import Loss
-from wearcap.optimize.trajectory import Bending, bend, bend_adam, bending_problem, bent, energy_terms, wrapped
-from wearcap.optimize.trajectory_banded import bend_banded
+from wearcap.optimize.losses import Loss
+from wearcap.systems.ireplica.trajectory import Bending, bend, bend_adam, bending_problem, bent, energy_terms, wrapped
+from wearcap.systems.ireplica.trajectory_banded import bend_banded
 
 NOWHERE = torch.zeros(2, dtype=torch.float64)
 VARIANTS = {

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 
 from wearcap.geometry.compiled import compiled
-from wearcap.optimize.banded_kernels import NORM, reweight
-from wearcap.optimize.costs import LOSSES
-from wearcap.optimize.trajectory import NORMS, BendingProblem, BentPath, bent_path
+from wearcap.optimize.losses import LOSSES
+from wearcap.systems.hps.banded_kernels import NORM, reweight
+from wearcap.systems.ireplica.trajectory import NORMS, BendingProblem, BentPath, bent_path
 
 SQUARE = 0  # of trajectory.NORMS
 TINY = 1e-12

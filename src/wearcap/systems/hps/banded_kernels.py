@@ -19,7 +19,7 @@ import numpy as np
 from wearcap.geometry.compiled import compiled
 
 NORM, SQUARE, HUBER, CAUCHY = 0, 1, 2, 3
-"""Kinds of loss, in the order of `costs.LOSSES`."""
+"""Kinds of loss, in the order of `losses.LOSSES`."""
 TRANSLATION, ROOT, HEAD_ROTATION, POSE, LEG_POSE, SOLES, DIFFERENTIATED = range(7)
 """Values that a term acts on; a `DIFFERENTIATED` term is not added by these kernels."""
 HEAD = 6

@@ -18,11 +18,20 @@ from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.optimize import banded_kernels as kernels
-from wearcap.optimize.banded_kernels import HEAD, LEGS, Body, Forms, Kinematics, Rows
-from wearcap.optimize.block_tridiagonal import factor_and_solve
-from wearcap.optimize.costs import LOSSES
-from wearcap.optimize.hps import TERMS, FootPatches, HpsData, HpsEnergy, HpsState, Solution, data_values, find_ground
+from wearcap.optimize.losses import LOSSES
+from wearcap.systems.hps import banded_kernels as kernels
+from wearcap.systems.hps.banded_kernels import HEAD, LEGS, Body, Forms, Kinematics, Rows
+from wearcap.systems.hps.block_tridiagonal import factor_and_solve
+from wearcap.systems.hps.energy import (
+    TERMS,
+    FootPatches,
+    HpsData,
+    HpsEnergy,
+    HpsState,
+    Solution,
+    data_values,
+    find_ground,
+)
 
 _VALUES = {
     "t_root": kernels.TRANSLATION,

@@ -13,8 +13,8 @@ from wearcap.body.model import FOOT_REGIONS, BodyModel
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.surface import SurfaceIndex
-from wearcap.optimize import costs
-from wearcap.optimize.costs import Loss
+from wearcap.optimize.losses import Loss
+from wearcap.systems.hps import costs
 
 
 @dataclass(frozen=True)

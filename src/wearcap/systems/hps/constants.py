@@ -20,7 +20,7 @@ from wearcap.body.kinematics import forward_kinematics, local_rotations
 from wearcap.body.model import BodyModel
 from wearcap.body.skeleton import Skeleton
 from wearcap.geometry import rotation
-from wearcap.optimize.hps import (
+from wearcap.systems.hps.energy import (
     HpsData,
     HpsEnergy,
     HpsState,

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import require_rising
-from wearcap.optimize.costs import Loss
+from wearcap.optimize.losses import Loss
 
 NORMS = ("square", "absolute")
 STILL_M = 1e-6

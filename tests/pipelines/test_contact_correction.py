@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from wearcap.errors import WearcapError
-from wearcap.optimize.contact_correction import OffsetSettings, bend_contacts, offset_for
-from wearcap.optimize.trajectory import Bending, bend
-from wearcap.optimize.trajectory_banded import bend_banded
+from wearcap.systems.ireplica.contact_correction import OffsetSettings, bend_contacts, offset_for
+from wearcap.systems.ireplica.trajectory import Bending, bend
+from wearcap.systems.ireplica.trajectory_banded import bend_banded
 
 FPS = 60
 BEND = functools.partial(bend, settings=Bending(0.003, clamped_ends=True), solver=bend_banded)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from wearcap.errors import WearcapError
 from wearcap.geometry.trajectory import require_rising
-from wearcap.optimize.trajectory import BentPath
+from wearcap.systems.ireplica.trajectory import BentPath
 
 SETTLED = 2.0717
 """x with exp(−x) (cos x + sin x) = 0.05: decay of the offset after a contact, as a function of rate · time."""
