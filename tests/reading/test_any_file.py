@@ -113,14 +113,14 @@ def test_a_pipeline_says_what_the_file_lacks(take):
         wearcap.load("recorded")(replace(read(take), suit=None))
 
 
-def test_motions_save_themselves_by_their_names(tmp_path):
+def test_motions_are_saved_by_their_names(tmp_path):
     motion = swaying_motion(10)
     for name in ("a.npz", "a.bvh", "a.glb", "a_smplh.npz"):
-        motion.save(tmp_path / name)
+        wearcap.save(motion, tmp_path / name)
         assert (tmp_path / name).stat().st_size > 500
     assert read_motion(tmp_path / "a.npz").skeleton == motion.skeleton
     with pytest.raises(WearcapError, match=r"ends with \.npz, \.bvh, \.glb, _smplh\.npz"):
-        motion.save(tmp_path / "a.fbx")
+        wearcap.save(motion, tmp_path / "a.fbx")
 
 
 def test_numbers_of_a_broken_npz_are_named(tmp_path):
