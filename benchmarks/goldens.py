@@ -302,9 +302,6 @@ def hmd2_streamed() -> Motion | None:
         session.push([[HeadSample(now, head.T_world_device[number], points.points_world[new], embedding)]])
         parts += session.poses()
         before = now
-        if number == len(head.timestamps) // 2:
-            session.save("streams/hmd2.safetensors")
-            session = HMD2Session.load("streams/hmd2.safetensors", pipeline)
     return joined([part for part in (*parts, *session.poses(ended=True)) if part is not None])
 
 

@@ -160,15 +160,9 @@ class EchoQueue:
         self._random = [torch.Generator().manual_seed(seed) for seed in seeds]
         self._frame: Rigid | None = None
 
-    transient = ("guided",)
-
     def guide(self, guided: Guided) -> None:
         """Give the queue the bodies and objects that guidance needs."""
         self.guided = guided
-
-    def restored(self) -> None:
-        """A saved queue comes back without the bodies and objects that guidance needs."""
-        self.guided = None
 
     @torch.no_grad()
     def push(self, fresh: Conditioning) -> Outputs | None:
