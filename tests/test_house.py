@@ -27,7 +27,7 @@ LEVEL = {folder: level for level, floor in enumerate(FLOORS) for folder in floor
 LIGHTNING = {"lightning", "pytorch_lightning", "torchmetrics"}
 HYDRA = {"hydra", "omegaconf"}
 TRAINING = {"training", "calibration", "validation"} | {
-    f"{name}_training" for name in ("egoview", "manifold", "object", "point_codes")
+    f"{name}_training" for name in ("egoview", "manifold", "object", "voxel_autoencoder")
 }
 """Modules of a system that are LightningModules and callbacks."""
 PRIVATE_WORDS = {

@@ -24,7 +24,6 @@ from wearcap.runtime.needs import HEAD, HEIGHT, TRACKED_WRISTS
 from wearcap.runtime.system import CaptureInput, LearnedSystem
 from wearcap.scene.objects import Environment
 from wearcap.systems.echo.contacts import ContactUse, GuidedScene, with_static_objects
-from wearcap.systems.echo.handover import HandOver
 from wearcap.systems.echo.model import EchoRunner
 from wearcap.systems.echo.observations import BatchItem, ObjectReader, ObjectShape, Scenario, batch_item_of
 from wearcap.systems.echo.queue import Conditioning, EchoModel, EchoQueue, Guided, Outputs
@@ -307,8 +306,6 @@ class Echo(LearnedSystem):
         if (share := self.sampling.wrists) is not None and reaches(model.features):
             reaching = Reaching(model.net, model.features, model.skeleton, queue.t_parent_joint, conditioning, frame)
             corrections.append(lambda x0_hat: reaching.corrected(x0_hat, share))
-        if model.features.object_in_wrists and model.contacts:
-            corrections.append(HandOver(model.net, model.features, conditioning, frame).corrected)
         if guidance is not None and queue.guided is not None:
             surfaces, objects = queue.guided
             scene = GuidedScene(model.net, model.features, conditioning, frame, surfaces, objects)

@@ -19,7 +19,7 @@ from wearcap.diffusion.observed import spreading, with_residuals
 from wearcap.diffusion.schedule import Schedule
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.point_encoder import PointNeXt
-from wearcap.systems.echo.features import OBJECT_SIZE, TWIN_CONTACTS, TWIN_POINTS, Body, EchoFeatures, ThreePoints
+from wearcap.systems.echo.features import TWIN_CONTACTS, TWIN_POINTS, Body, EchoFeatures, ThreePoints
 from wearcap.systems.echo.model import EchoDenoiser
 
 
@@ -224,7 +224,7 @@ class EchoQueue:
             features = self.pipeline.model.features
             body = features.encode_body(Body(conditioning.R_parent_joint, conditioning.t_world_root), frame)
             T_world_object = Rigid(conditioning.R_world_object, conditioning.t_world_object)
-            scene_object = features.encode_object(T_world_object, *features.object_frames(conditioning.points, frame))
+            scene_object = features.encode_object(T_world_object, frame)
             raw = torch.cat([body, scene_object, 2 * conditioning.contact - 1], -1)
             observed = self.pipeline.model.net.motion_normalizer(raw.to(self.pipeline.device)).cpu()
         never = torch.zeros_like(conditioning.has_object)
@@ -277,5 +277,5 @@ class EchoQueue:
         raw = net.motion_normalizer.inverse(x[:, part].to(self.pipeline.device)).cpu()
         human, scene_object, contact = raw.split(net.sizes, -1)
         at = frame if frame.t.shape[1] == 1 else Rigid(frame.R[:, part], frame.t[:, part])
-        body, T = features.decode_body(human, at), features.decode_object(scene_object[..., :OBJECT_SIZE], at)
+        body, T = features.decode_body(human, at), features.decode_object(scene_object, at)
         return Outputs(*body, T.R, T.t, ((contact + 1) / 2).clamp(0, 1))

@@ -29,6 +29,7 @@ from wearcap.scene.objects import Environment
 from wearcap.systems.echo.features import (
     CONTACTS,
     EXTENTS,
+    OBJECT_SIZE,
     POINTS,
     TWIN_CONTACTS,
     TWIN_POINTS,
@@ -280,7 +281,7 @@ class EchoContent(Content):
         if window.scale != 1:
             code[:, len(self.features.classes) :][:, :EXTENTS] *= window.scale
             mean, spread = mean * window.scale, spread * window.scale**2
-        features = self.features.human_size + self.features.object_size + CONTACTS
+        features = self.features.human_size + OBJECT_SIZE + CONTACTS
         chosen = CANONICAL[window.mirrored] if self.canonical else "object"
         values = {name: value for name, value in window.values.items() if not name.endswith(CANONICAL)}
         values |= {f"{kind}_world_canonical": window.values[f"{kind}_world_{chosen}"] for kind in "Rt"}
