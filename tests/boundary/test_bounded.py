@@ -20,7 +20,7 @@ from wearcap.boundary.texts import read_json, read_text, read_yaml_object
 from wearcap.errors import WearcapError
 from wearcap.io.datasets.hcontact import read_smpl_json
 from wearcap.io.formats.asf_amc import read_asf
-from wearcap.io.formats.bvh import read_bvh
+from wearcap.io.formats.bvh import read_bvh_content
 from wearcap.io.formats.camera_json import read_photos
 from wearcap.io.formats.colmap import read_colmap
 from wearcap.io.formats.mvnx import read_mvnx
@@ -35,7 +35,7 @@ MIB = 1 << 20
 READERS = {
     "a.txt": read_trajectory,
     "a.csv": read_trajectory,
-    "a.bvh": read_bvh,
+    "a.bvh": read_bvh_content,
     "a.asf": read_asf,
     "a.mvnx": read_mvnx,
     "a.npz": read_npz,
