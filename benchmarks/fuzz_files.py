@@ -331,7 +331,7 @@ READERS: dict[str, Reader] = {
         "c.json", json.dumps(CONTACTS), lambda path: contact_labels.read_contact_labels(path, CLOCK)
     ),
     "csv_table": _one(
-        "a.csv", "a,b,n\n1,x,3\n2.5,y,4\n", lambda path: csv_table.read_columns(path, ["a"], text=["b"], whole=["n"])
+        "a.csv", "a,b,n\n1,x,3\n2.5,y,4\n", lambda path: csv_table.read_columns(path, ["a"], text=["b"], integers=["n"])
     ),
     "egohoi": Reader(
         lambda folder: test_egohoi.write_set(folder, FRAMES), lambda folder: egohoi.read_egohoi(folder, test_egohoi.ONE)

@@ -16,7 +16,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.environment import write_environment
 from wearcap.recording import ContactTrack, FloorTrack, HeadStream, Recording, RecordingStore
-from wearcap.recording.acts import true_acts
+from wearcap.recording.active_objects import true_spans
 from wearcap.recording.motion import Interactions
 from wearcap.scene.objects import Environment, Freedom, SceneObject
 from wearcap.systems.echo.contacts import ContactUse
@@ -128,5 +128,5 @@ def with_settings(model: EchoModel, kind: type[Echo] = Echo, **settings) -> Echo
 
 def scenario_of(recording: Recording, carried=CARRIED, margin_s: float = 0.1, **changes) -> Scenario:
     """The scenario of a walk with boxes."""
-    acts = tuple(true_acts(recording, margin_s)) if recording.object_motion else ()
-    return Scenario(recording, boxes(carried), acts, **changes)
+    spans = tuple(true_spans(recording, margin_s)) if recording.object_motion else ()
+    return Scenario(recording, boxes(carried), spans, **changes)

@@ -9,7 +9,7 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "wearcap"
 ROOT = SOURCE.parents[1]
 FLOORS = (
-    ("errors", "files", "locks", "spread", "workers", "boundary"),
+    ("errors", "files", "locks", "parallel", "workers", "boundary"),
     ("geometry",),
     ("body", "scene"),
     ("recording",),

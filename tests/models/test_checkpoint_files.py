@@ -133,7 +133,12 @@ def refusal(path: Path) -> str:
 
 
 @pytest.mark.parametrize(
-    ("name", "old"), [("voxel_autoencoder", "point_codes_training"), ("echo", '\\"object_in_wrists\\": false')]
+    ("name", "old"),
+    [
+        ("voxel_autoencoder", "point_codes_training"),
+        ("echo", '\\"object_in_wrists\\": false'),
+        ("echo", '\\"whole\\": 0.'),
+    ],
 )
 def test_files_of_before_a_name_moved_or_a_setting_went_open(name, old):
     assert old.encode() in (CONF.parent / "checkpoints" / f"{name}.safetensors").read_bytes()

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_echo_stream import TWO, activate_acts, assert_same
+from test_echo_stream import TWO, activate_objects, assert_same
 from test_echo_stream import streamed as echo_streamed
 from test_echo_stream import wearer as echo_wearer
 from test_hmd2_stream import moments, pipeline, places, surrounded, wearer
@@ -73,7 +73,7 @@ def test_echo_stream_with_objects_at_its_latency():
     recording, echo = carrying(1.2, carried=TWO), drawn_echo(refinement=REFINEMENT)
     scenario = scenario_of(recording, TWO)
     session = EchoStream(echo, echo_wearer(recording), boxes(TWO), seed=3)
-    activate_acts(session, scenario)
+    activate_objects(session, scenario)
     motion, counts = echo_streamed(session, recording)
     assert_same(motion, echo.capture_scenarios([scenario], [3])[0], scenario)
     latency = round(echo.latency_s * echo.fps)

@@ -63,6 +63,8 @@ TARGETS: dict[str, tuple[str, ...]] = {
 
 MOVED = {"wearcap.systems.hmd2.point_codes_training": "wearcap.systems.hmd2.voxel_autoencoder_training"}
 """Modules that files of before name, and where their classes are now."""
+RENAMED = {"wearcap.diffusion.levels.LevelMix": {"whole": "fully_observed"}}
+"""Settings that files of before have under another name, by target."""
 STRUCK = {"object_in_wrists": False}
 """Settings that went, with the value at which files of before have them and do without."""
 
@@ -83,14 +85,17 @@ TIMES_WEIGHTS = 8
 
 
 def brought_up_to_date(config: Any) -> None:
-    """Rename, in place, the targets of a model's config that moved, and leave out settings that went and were off."""
+    """Give, in place, a model's config today's names of targets and settings, and leave out settings that went and were off."""
     rest = [config]
     while rest:
         value = rest.pop()
         if isinstance(value, dict):
             if isinstance(target := value.get(_TARGET), str):
                 module, dot, name = target.rpartition(".")
-                value[_TARGET] = MOVED.get(module, module) + dot + name
+                target = value[_TARGET] = MOVED.get(module, module) + dot + name
+                for old, new in RENAMED.get(target, {}).items():
+                    if old in value:
+                        value[new] = value.pop(old)
             for name in [name for name, off in STRUCK.items() if name in value and value[name] is off]:
                 del value[name]
         rest += value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()

@@ -161,7 +161,8 @@ def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], abo
         encoder: Any = build({**about.encoder, "_target_": target}, weights["encoder"], "the sidecar's encoder")
         encoder.requires_grad_(False)
     # Files of before these settings captured without them.
-    settings = {"freedoms": False, "spread": None, "wrists": None, **about.settings}
+    settings = {"freedoms": False, "wrists": None, **about.settings}
+    settings.setdefault("observed_length_scale", settings.pop("spread", None))  # its former name
     model = EchoModel(
         _ExportedEchoDenoiser(runs, about),
         about.features,

@@ -15,7 +15,7 @@ from wearcap.body.skeleton import MIRROR, Skeleton
 from wearcap.data.features import body_size
 from wearcap.data.transforms import mirrored_rotations
 from wearcap.diffusion.conveyor import Conveyor, Correct, Denoise, Observation, RollingSchedule
-from wearcap.diffusion.observed import spreading, with_residuals
+from wearcap.diffusion.observed import residual_weights, with_residuals
 from wearcap.diffusion.schedule import Schedule
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.point_encoder import PointNeXt
@@ -123,7 +123,7 @@ class _Sampling(Protocol):
     """The part of a pipeline's sampling that the queue uses."""
 
     @property
-    def spread(self) -> float | None: ...
+    def observed_length_scale(self) -> float | None: ...
 
     @property
     def mirror_average(self) -> bool: ...
@@ -237,13 +237,13 @@ class EchoQueue:
         self, corrections: Sequence[Correct], conditioning: Conditioning, observation: Observation
     ) -> Correct:
         """Spreads the residuals of observed frames, then applies the pipeline's corrections in turn."""
-        frames, corrections = self.pipeline.sampling.spread, list(corrections)
+        frames, corrections = self.pipeline.sampling.observed_length_scale, list(corrections)
         if frames is not None and observation.is_observed.any():
             valid, number = conditioning.valid, torch.where(conditioning.has_object, conditioning.object_number, -1.0)
             together = valid[:, :, None] & valid[:, None]
             touching = together & (number[:, :, None] == number[:, None])
             alike = torch.stack([together, touching, touching], 1)
-            weights = spreading(observation.is_observed.mT, alike, frames)
+            weights = residual_weights(observation.is_observed.mT, alike, frames)
             sizes = self.pipeline.model.net.sizes
             corrections.insert(0, lambda x0_hat: with_residuals(x0_hat, observation.observed, weights, sizes))
         return lambda x0_hat: reduce(lambda value, correct: correct(value), corrections, x0_hat)

@@ -19,7 +19,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording import Motion
-from wearcap.recording.acts import SAME_S, changes
+from wearcap.recording.active_objects import SAME_S, changes
 from wearcap.recording.timing import joined
 from wearcap.runtime.graphs import undisturbed
 from wearcap.runtime.session import HeadAndWristsStream, Session
@@ -60,7 +60,7 @@ class EchoStream(HeadAndWristsStream):
         self._shapes: dict[str, ObjectShape] = {}
         """Objects that were named so far, in order of their first use."""
         self._queue: EchoQueue | None = None
-        self._acts: list[tuple[float, str | None]] = []
+        self._activated: list[tuple[float, str | None]] = []
         self._seen: list[tuple[float, str, Rigid]] = []
         self._restart()
 
@@ -72,8 +72,8 @@ class EchoStream(HeadAndWristsStream):
 
     def _restart(self, again: bool = False) -> None:
         if again:
-            active = next((name for start, name in reversed(self._acts) if start <= self._track.newest), None)
-            self._acts = [] if active is None else [(-math.inf, active)]
+            active = next((name for start, name in reversed(self._activated) if start <= self._track.newest), None)
+            self._activated = [] if active is None else [(-math.inf, active)]
             self._seen = []
         super()._restart(again)
         self._queue = None
@@ -126,8 +126,8 @@ class EchoStream(HeadAndWristsStream):
                 # Half a frame later, so that the first frame from `timestamp` on is the nearest one.
                 soon = timestamp + 0.499 / self.pipeline.fps
                 self._see(name, soon, self._environment.by_name(name).T_world_object)
-        self._acts = [act for act in self._acts if act[0] < timestamp] + [(timestamp, name)]
-        del self._acts[:-MAX_WAITING]
+        self._activated = [span for span in self._activated if span[0] < timestamp] + [(timestamp, name)]
+        del self._activated[:-MAX_WAITING]
         self._update_pending()
 
     def see_object(self, name: str, timestamp: float, T_world_object: Rigid) -> None:
@@ -242,7 +242,7 @@ class EchoStream(HeadAndWristsStream):
 
     def _active(self, time: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Whether an object is active at a time, its codes and its index."""
-        name = next((name for start, name in reversed(self._acts) if start <= time + SAME_S), None)
+        name = next((name for start, name in reversed(self._activated) if start <= time + SAME_S), None)
         if name is None:
             nothing = self._reader.nothing[None]
             return torch.zeros(1, dtype=torch.bool), nothing, nothing, torch.full((1,), -1.0)
@@ -302,8 +302,8 @@ class EchoStream(HeadAndWristsStream):
         path = HeadPath(clock, T_world_head, T_world_head, floor_height, skeleton, stretches)
         # Object events that no later frame needs are dropped.
         self._seen = [row for row in self._seen if row[0] > times[-1] - 1.0]
-        past = [k for k, (start, _) in enumerate(self._acts) if start <= times[-1]]
-        self._acts = self._acts[past[-1] :] if past else self._acts
+        past = [k for k, (start, _) in enumerate(self._activated) if start <= times[-1]]
+        self._activated = self._activated[past[-1] :] if past else self._activated
         if self._static is not None:
             one = (Outputs(*(field[:, k : k + 1] for field in outputs)) for k in range(len(times)))
             static = [self._static(each, part) for each, part in zip(every, one)]
@@ -347,7 +347,7 @@ class EchoSession(Session):
     @classmethod
     def of_objects(cls, system: Echo, source: CaptureInput) -> list[ActiveObject | ObjectSample]:
         scenario = system.scenario(source.recording, system.objects(source))
-        return [ActiveObject(name, time_s) for time_s, name in changes(scenario.acts)]
+        return [ActiveObject(name, time_s) for time_s, name in changes(scenario.active_objects)]
 
 
 SESSION = EchoSession

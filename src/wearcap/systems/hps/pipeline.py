@@ -25,7 +25,7 @@ from wearcap.geometry.trajectory import Trajectory, finite_difference, resample
 from wearcap.optimize.hps import FootPatches, HpsData, HpsEnergy, HpsState, Solution, SuitSteps
 from wearcap.optimize.hps_constants import Constants, ConstantsPrior, estimate_constants, segments, with_constants
 from wearcap.recording import Motion, Recording
-from wearcap.recording.growing import follow_pieces
+from wearcap.recording.pieces import follow_pieces
 from wearcap.recording.recording import Localization
 from wearcap.recording.timing import resampled
 from wearcap.runtime.needs import CAMERA, CONTACTS, LOCALIZATION, SCAN, SUIT, Need
