@@ -128,7 +128,7 @@ class Heading(NamedTuple):
     off_deg: float
 
 
-def worn(recording: Recording, seed: int) -> ReplaySource:
+def replayed(recording: Recording, seed: int) -> ReplaySource:
     """A replay of a recording's head and watches; watches that it lacks are made of its motion."""
     assert recording.motion is not None
     rng, imu = np.random.default_rng(seed), dict(recording.imu)
@@ -155,7 +155,7 @@ def unguided(source: ReplaySource) -> tuple[Setup, float] | None:
 def headings(recording: Recording, seed: int) -> Iterator[Heading]:
     """The headings that the first minute finds of a recording's watches."""
     motion = recording.motion
-    if motion is None or recording.head is None or (found := unguided(worn(recording, seed))) is None:
+    if motion is None or recording.head is None or (found := unguided(replayed(recording, seed))) is None:
         return
     setup, time_s = found
     stop = int(torch.searchsorted(motion.timestamps, time_s))
