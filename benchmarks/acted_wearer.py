@@ -27,11 +27,11 @@ from wearcap.live.setup import hand_seat
 from wearcap.recording import Motion
 from wearcap.recording.timing import joined
 from wearcap.sensors.imu import acceleration
-from wearcap.simulation.people.person import Person, draw_person
-from wearcap.simulation.people.plan import Plan
-from wearcap.simulation.people.track import ease
-from wearcap.simulation.people.walking import turn_to, walk_along
-from wearcap.simulation.people.wearer import TAIL_S, perform
+from wearsim.people.person import Person, draw_person
+from wearsim.people.plan import Plan
+from wearsim.people.track import ease
+from wearsim.people.walking import turn_to, walk_along
+from wearsim.people.wearer import TAIL_S, perform
 
 TICKS_HZ, HEAD_HZ, WATCH_HZ = 300, 60, 100
 CHUNK = 30

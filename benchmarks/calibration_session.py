@@ -26,8 +26,8 @@ from wearcap.geometry.trajectory import Trajectory, finite_difference, slerp
 from wearcap.recording.recording import ImuStream
 from wearcap.sensors.imu import GRAVITY, angular_rate
 from wearcap.sensors.simulated import smooth_noise
-from wearcap.sensors.slam import R_DEVICE_CAM
 from wearcap.sensors.stillness import Stretch
+from wearsim.sensors.slam import R_DEVICE_CAM
 
 BOARD, T_POSE, STANDING = (3.0, 6.5), (14.0, 17.5), (52.0, 62.0)
 MARKS = ((24.0, 27.0), (30.0, 33.0), (36.0, 39.0), (42.0, 45.0))

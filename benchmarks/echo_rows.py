@@ -13,12 +13,12 @@ from wearcap.errors import require_choice
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording import Motion, RecordingStore
 from wearcap.runtime.system import CaptureInput
-from wearcap.simulation.recordings.measured import EnvironmentErrors, as_measured
 from wearcap.systems.echo.model import MODALITIES
 from wearcap.systems.echo.observations import BatchItem, Observed, Scenario, batch_item_of
 from wearcap.systems.echo.pipeline import Echo
 from wearcap.systems.echo.scores import Truth
 from wearcap.tracking.head_path import head_path
+from wearsim.recordings.measured import EnvironmentErrors, as_measured
 
 
 @dataclass(frozen=True)

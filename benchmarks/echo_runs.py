@@ -13,12 +13,12 @@ from wearcap.cli.conf import compose, load_pipeline
 from wearcap.models.checkpoint import shared_checkpoints
 from wearcap.runtime.wearer import Wearer
 from wearcap.scene.objects import Environment
-from wearcap.simulation.places.movables import make_movable
 from wearcap.systems.echo.observations import Scenario, batch_item_of
 from wearcap.systems.echo.pipeline import Echo
 from wearcap.systems.echo.queue import Conditioning
 from wearcap.systems.echo.stream import EchoStream
 from wearcap.tracking.head_path import head_path
+from wearsim.places.movables import make_movable
 
 NAME = "echo"
 FPS = 30.0

@@ -10,6 +10,7 @@ import argparse
 import ast
 import json
 import re
+import statistics
 from collections import Counter
 from pathlib import Path
 
@@ -75,24 +76,42 @@ def followed(source: Path, trees: dict[Path, ast.Module], system: str) -> int:
     return len(reached)
 
 
+def lines_of(folder: Path, pattern: str = "*.py") -> int:
+    return sum(len(path.read_text(encoding="utf-8").splitlines()) for path in folder.rglob(pattern))
+
+
+def words_of(root: Path) -> int:
+    """Words of README and of all pages of docs/."""
+    pages = [root / "README.md", *(root / "docs").rglob("*.md")]
+    return sum(len(page.read_text(encoding="utf-8").split()) for page in pages)
+
+
 def figures(root: Path) -> dict[str, object]:
-    source = root / "src" / "wearcap"
-    texts = {path: path.read_text(encoding="utf-8") for path in sorted(source.rglob("*.py"))}
+    source, houses = root / "src" / "wearcap", (root / "src", root / "data_prep")
+    texts = {path: path.read_text(encoding="utf-8") for house in houses for path in sorted(house.rglob("*.py"))}
     trees = {path: ast.parse(text) for path, text in texts.items()}
-    lines = {path: len(text.splitlines()) for path, text in texts.items()}
-    once, every = called_once(trees)
+    of_product = {path: tree for path, tree in trees.items() if path.is_relative_to(source)}
+    once, every = called_once(of_product)
+    lengths = [(f.end_lineno or 0) - f.lineno + 1 for tree in trees.values() for f in functions(tree)]
+    code = [line for text in texts.values() for line in text.splitlines() if line.strip()]
     return {
-        "lines": sum(lines.values()),
-        "files": len(lines),
-        "simulation_lines": sum(
-            count for path, count in lines.items() if "simulation" in path.relative_to(source).parts
-        ),
+        "wearcap_lines": lines_of(source),
+        "wearsim_lines": lines_of(root / "src" / "wearsim"),
+        "data_prep_lines": lines_of(root / "data_prep"),
+        "lines": sum(len(text.splitlines()) for text in texts.values()),
+        "files": len(texts),
+        "benchmark_lines": lines_of(root / "benchmarks"),
+        "test_lines": lines_of(root / "tests"),
+        "yaml_files": sum(1 for _ in (root / "conf").rglob("*.yaml")),
+        "doc_words": words_of(root),
+        "median_function_lines": statistics.median(lengths),
+        "characters_a_line": round(statistics.mean(map(len, code)), 1),
         "fmt_skip": sum(len(re.findall(r"# fmt: skip", text)) for text in texts.values()),
         "private_functions_called_once": round(once / every, 3),
         "public_names": sum(len(public_names(tree)) for tree in trees.values()),
-        "wide_constructors": wide_constructors(trees),
+        "wide_constructors": wide_constructors(of_product),
         "followed": {
-            system: followed(source, trees, system) for system in SYSTEMS if (source / "systems" / system).is_dir()
+            system: followed(source, of_product, system) for system in SYSTEMS if (source / "systems" / system).is_dir()
         },
     }
 

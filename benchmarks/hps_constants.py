@@ -18,10 +18,10 @@ from wearcap.optimize.hps_constants import ConstantsPrior
 from wearcap.recording.timing import resampled
 from wearcap.runtime.system import CaptureInput
 from wearcap.scene.scan import Scan
-from wearcap.simulation.recordings.hps import HpsConfig, Protocol, simulate_hps
-from wearcap.simulation.rendering.scan import scan_world
-from wearcap.simulation.rendering.views import Scenery
 from wearcap.systems.hps.camera import on_one_clock
+from wearsim.recordings.hps import HpsConfig, Protocol, simulate_hps
+from wearsim.rendering.scan import scan_world
+from wearsim.rendering.views import Scenery
 
 PRIORS = {
     "scale": ConstantsPrior(scale=0.02, mount_m=0.0, height_m=0.0, segments_deg=0.0),

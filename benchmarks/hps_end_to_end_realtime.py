@@ -32,7 +32,7 @@ from wearcap.recording.recording import Localization
 from wearcap.recording.store import RecordingStore
 from wearcap.recording.timing import resampled
 from wearcap.runtime.system import CaptureInput
-from wearcap.simulation.rendering.head_camera import HEAD_CAMERA_TRUTH
+from wearsim.rendering.head_camera import HEAD_CAMERA_TRUTH
 
 FOLDER = Path("outputs/benchmarks/hps_end_to_end")
 ANEW = ("head_camera@pipeline=each_frame",)

@@ -19,12 +19,12 @@ from wearcap.cli.conf import compose
 from wearcap.recording.recording import Localization
 from wearcap.recording.timing import at_times
 from wearcap.scene.scan import Scan
-from wearcap.sensors.suit import SuitNoise
-from wearcap.simulation.recordings.hps import HpsConfig, Protocol, simulate_hps
-from wearcap.simulation.recordings.localization_noise import LocalizationNoise
-from wearcap.simulation.rendering.scan import scan_world
-from wearcap.simulation.rendering.views import Scenery
 from wearcap.systems.hps.stream import HpsStream
+from wearsim.recordings.hps import HpsConfig, Protocol, simulate_hps
+from wearsim.recordings.localization_noise import LocalizationNoise
+from wearsim.rendering.scan import scan_world
+from wearsim.rendering.views import Scenery
+from wearsim.sensors.suit import SuitNoise
 
 LOST_S, OUTAGE_S, END_S = 60.0, 30.0, 105.0
 BEFORE_S, AFTER_S = (20.0, 60.0), (93.0, 102.0)

@@ -11,7 +11,7 @@ from wearcap.errors import WearcapError
 from wearcap.metrics.position import joint_error_cm
 from wearcap.recording import Motion
 from wearcap.recording.recording import Intervals, Localization
-from wearcap.simulation.recordings.localization_noise import without
+from wearsim.recordings.localization_noise import without
 
 MARGIN_S = 5.0
 """Least time (s) between a visit to the depth-camera rig and a planted outage."""

@@ -25,11 +25,11 @@ from wearcap.recording.store import RecordingFile, save_recording
 from wearcap.scene.scan import Scan
 from wearcap.sensors.claps import detect_claps_audio
 from wearcap.sensors.clock import Clock
-from wearcap.simulation.places.world import World
-from wearcap.simulation.recordings.hps import HpsConfig, simulate_hps
-from wearcap.simulation.rendering.head_camera import SOUND_HZ, sound_track
-from wearcap.simulation.rendering.scan import scan_world
-from wearcap.simulation.rendering.views import Scenery
+from wearsim.places.world import World
+from wearsim.recordings.hps import HpsConfig, simulate_hps
+from wearsim.rendering.head_camera import SOUND_HZ, sound_track
+from wearsim.rendering.scan import scan_world
+from wearsim.rendering.views import Scenery
 
 RIG_SCENE_M = 8.0
 """Of the scan around the spot, the rig is registered to."""

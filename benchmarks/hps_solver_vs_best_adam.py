@@ -43,8 +43,8 @@ from wearcap.optimize.hps import (
     find_ground,
     state_values,
 )
-from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_recording
 from wearcap.systems.hps.pipeline import turns
+from wearsim.recordings.simulate import SimulationConfig, simulate_recording
 
 ITERATIONS = (8, 10, 12, 16, 20, 30)
 """Iterations of ours; the first of them set the target."""

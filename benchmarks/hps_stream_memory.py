@@ -18,9 +18,9 @@ from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import CameraStream, Localization, Motion, Recording
 from wearcap.scene.scan import Scan
-from wearcap.sensors.slam import R_DEVICE_CAM
-from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_recording
 from wearcap.systems.hps.stream import HpsStream
+from wearsim.recordings.simulate import SimulationConfig, simulate_recording
+from wearsim.sensors.slam import R_DEVICE_CAM
 
 MOUNT = Rigid(R_DEVICE_CAM, torch.tensor([0.09, 0.0, 0.09]))
 

@@ -24,8 +24,8 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.metrics.objects import handlings
 from wearcap.recording import Motion
 from wearcap.recording.timing import at_times
-from wearcap.simulation.places.world import World
 from wearcap.systems.ireplica.scores import poses_at, surface_points
+from wearsim.places.world import World
 
 INSTANTS = 6
 """Of the handling, at which the cameras look."""

@@ -39,7 +39,7 @@ ON_BENT_PATH = (
     "as published",
     "as published, w/o contact corr.",
     "as published, our contacts",
-    "as published, contacts from detections",
+    "as published, contacts of a simulated detector",
     "ours, on the bent path",
     "ours, on the bent path, w/o contact corr.",
 )
@@ -156,8 +156,8 @@ def _rows(
     seen_rows: dict[str, Callable[[Motion], Motion]] = {}
     if "detections" in contacts:
         seen_rows = {
-            "as published, contacts from detections": track(published.tracker, "detections", environment),
-            "ours, contacts from detections": track(ours.tracker, "detections"),
+            "as published, contacts of a simulated detector": track(published.tracker, "detections", environment),
+            "ours, contacts of a simulated detector": track(ours.tracker, "detections"),
         }
     return {
         "HPS": lambda motion: static_objects(motion, environment),

@@ -32,11 +32,11 @@ from wearcap.cli.conf import compose
 from wearcap.geometry import rotation
 from wearcap.models.checkpoint import load_trained, shared_checkpoints
 from wearcap.recording import Motion, Recording
-from wearcap.sensors.keypoints import action_camera, camera_path, seen_joints
 from wearcap.systems.mocap_every import energy
 from wearcap.systems.mocap_every.energy import LatentSolver
 from wearcap.systems.mocap_every.manifold import MotionManifold
 from wearcap.systems.mocap_every.visual_cues import VisualCues
+from wearsim.sensors.keypoints import action_camera, camera_path, seen_joints
 
 NAME = "motion_manifold"
 OFF_DEG = 15.0

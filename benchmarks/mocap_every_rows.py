@@ -17,10 +17,10 @@ from wearcap.metrics.position import joint_error_cm
 from wearcap.metrics.scores import score_in_world, truth_at
 from wearcap.metrics.table import Row, evaluate_motion
 from wearcap.recording import Motion, Recording, RecordingStore
-from wearcap.sensors.keypoints import action_camera, camera_path, seen_joints
 from wearcap.systems.mocap_every.energy import LatentSolver
 from wearcap.systems.mocap_every.pipeline import CapturedWithFloor, MocapEvery
 from wearcap.systems.mocap_every.visual_cues import at_frames, load_visual_cues
+from wearsim.sensors.keypoints import action_camera, camera_path, seen_joints
 
 NEAR_M = 0.03
 DETECTOR_PX, MISSED = 4.0, 0.1

@@ -25,11 +25,11 @@ from wearcap.metrics.scores import truth_at
 from wearcap.metrics.table import Row
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import at_times
-from wearcap.sensors.keypoints import ACTION_CAMERA, BURST_S, NEAR_M, action_camera, camera_path
 from wearcap.sensors.simulated import smooth_noise
-from wearcap.simulation.recordings.simulate import SimulationConfig
 from wearcap.systems.mocap_every.pipeline import MocapEvery
 from wearcap.systems.mocap_every.visual_cues import View, VisualCues, capture_session
+from wearsim.recordings.simulate import SimulationConfig
+from wearsim.sensors.keypoints import ACTION_CAMERA, BURST_S, NEAR_M, action_camera, camera_path
 
 SCENES = (
     ("flat", ("stand", "gesture", "look_around")),

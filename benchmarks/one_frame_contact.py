@@ -14,13 +14,13 @@ from torch.nn import functional as F
 
 from wearcap.metrics.detection import average_precision
 from wearcap.scene.objects import CONTACT_CLASSES
-from wearcap.sensors.suit import suit_motion
-from wearcap.simulation.handling.household import USUAL, Household
-from wearcap.simulation.people.wearer import perform
-from wearcap.simulation.places.interactive_flat import House
-from wearcap.simulation.recordings.interaction_session import FLATS, InteractionConfig, flat_of
-from wearcap.simulation.recordings.simulate import drawn_person, seeded
 from wearcap.systems.ireplica.features import HandViews
+from wearsim.handling.household import USUAL, Household
+from wearsim.people.wearer import perform
+from wearsim.places.interactive_flat import House
+from wearsim.recordings.interaction_session import FLATS, InteractionConfig, flat_of
+from wearsim.recordings.simulate import drawn_person, seeded
+from wearsim.sensors.suit import suit_motion
 
 ANY = "any"
 SECONDS = 120.0

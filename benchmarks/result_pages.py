@@ -1,8 +1,8 @@
 """Pages of results: docs/results/SYSTEM.md, made of nothing but the JSON files beside it.
 
 `tables.py SYSTEM --publish` puts a table's JSON there, `tables.py SYSTEM --page` makes the page of it, and the cells of
-README's table. A system's module has `page(trees, speed)`, which says what its page holds; prose stands beside the
-table that it is about, with figures taken from the JSON.
+README's table; `tables.py SYSTEM --all` prints every table of the JSON. A system's module has `page(trees, speed)`, which
+says what both hold; prose has figures taken from the JSON.
 """
 
 import datetime
@@ -11,6 +11,7 @@ import math
 import os
 import platform
 import re
+import shlex
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,10 +29,8 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results"
 SPEED = "speed.jsonl"
 """What `run.py --write` measured, one figure a line."""
-MOST_ROWS = 12
-"""Of a headline table."""
-TRANSCRIBED = "transcribed"
-"""Key of a JSON's `about` whose figures were taken from an earlier page and not from the command's own output."""
+MOST_ROWS, MOST_COLUMNS, MOST_WORDS = 10, 8, 1200
+"""Of a page: rows and columns of its table, and words in all, as `wc -w` counts them."""
 STRAIGHTENED = "2026-11-28"
 """Date from which the truth's knees straighten: CMU's and HDM05's hips are repaired, simulated people walk as people do."""
 BENT = "bent knees"
@@ -68,12 +67,15 @@ class Page:
     simulated: str
     limits: tuple[str, ...]
     full: list[Grid]
+    """Every table of the JSON, for `--all`."""
+    commands: tuple[str, ...]
+    """Lines that make the tables."""
     measured: str
     """README's cell "measured here"."""
     speed: str = ""
     """README's cell "speed"; empty: it stays as it is."""
     clocks: Mapping[str, str] = field(default_factory=dict)
-    """What the clock of a benchmark (by name) counts, and what is given."""
+    """What a benchmark (by name) measures, what is given, and what its ratio is to."""
     pictures: tuple[tuple[str, str], ...] = ()
     """Files of docs/, and what they show."""
 
@@ -88,8 +90,8 @@ def ranked(system: str) -> tuple[tuple[str, str], ...]:
 
 
 def text(summary: Mapping[str, Any] | None, digits: int = 2) -> str:
-    """A cell: mean ± deviation; a dash where there is none."""
-    return cell(dict(summary), digits) if summary else NONE
+    """A cell: mean ± deviation, unless that rounds to zero; a dash where there is none."""
+    return cell(dict(summary), digits).removesuffix(f" ± {0:.{digits}f}") if summary else NONE
 
 
 def mean(summary: Mapping[str, Any] | None, digits: int = 1) -> str:
@@ -131,19 +133,15 @@ TRAINING = {
 """Columns of what a row's training took."""
 
 
-def score_grids(
-    tree: Tree, labels: Mapping[str, tuple[str, int]], spread: str = "seeds", hidden: Collection[str] = ()
-) -> list[Grid]:
+def score_grids(tree: Tree, labels: Mapping[str, tuple[str, int]], spread: str = "seeds") -> list[Grid]:
     """The tables of a tree {"tables": {title: {row: {metric: summary}}}}: columns are the metrics that have a label
-    (and digits), then all others but those of the truth, which has a row, and hidden ones, which the JSON has."""
+    (and digits), then all others but those of the truth, which has a row."""
     grids, labels = [], {**labels, **TRAINING}
     for title, rows in tree["tables"].items():
         rows = {**rows}
         for name, earlier in kept(tree, title).items():
             rows |= {f"{name}: {row}": scores for row, scores in earlier.items() if row != "truth"}
-        present = list(
-            dict.fromkeys(m for row in rows.values() for m in row if not m.startswith("truth_") and m not in hidden)
-        )
+        present = list(dict.fromkeys(m for row in rows.values() for m in row if not m.startswith("truth_")))
         metrics = [name for name in labels if name in present] + [name for name in present if name not in labels]
         cells = [
             [name, *(text(row.get(m), _digits(name, row.get(m), labels.get(m, ("", 2))[1])) for m in metrics)]
@@ -191,29 +189,37 @@ def rows_of(trees: Trees, title: str) -> dict[str, dict[str, Any]]:
 
 
 def picked(
-    trees: Trees, rows: Iterable[tuple[str, str, str]], columns: Iterable[tuple[str, tuple[str, ...], int]]
+    trees: Trees, rows: Iterable[tuple[str, str, str]], columns: Collection[tuple[str, str, int]]
 ) -> list[list[str]]:
-    """Lines of a headline table. rows: a table's title, a row of it, what the page calls it; columns: a heading, the
-    metrics of which a row has one, digits. Rows that are not in the tables are left out; our row of an earlier version
-    that was kept follows that of now."""
-
-    def line(label: str, found: Mapping[str, Any]) -> list[str]:
-        chosen = ((next((found[m] for m in metrics if m in found), None), digits) for _, metrics, digits in columns)
-        return [label, *(text(summary, digits) for summary, digits in chosen)]
-
-    lines, columns = [], tuple(columns)
-    for title, name, label in rows:
-        found = rows_of(trees, title).get(name)
-        lines += [line(label, found)] if found is not None else []
-        for tree in trees.values():
-            earlier = kept(tree, title).items()
-            lines += [line(f"{label}, {of}", kept_rows[name]) for of, kept_rows in earlier if name == OURS in kept_rows]
-    return lines
+    """Lines of a headline table. rows: a table's title, a row of it, what the page calls it; columns: a heading, a
+    metric, digits. Rows that are not in the tables are left out."""
+    found = [(label, rows_of(trees, title).get(name)) for title, name, label in rows]
+    return [
+        [label, *(text(row.get(metric), digits) for _, metric, digits in columns)]
+        for label, row in found
+        if row is not None
+    ]
 
 
-def figure_of(speed: Mapping[str, list[Tree]], name: str) -> Tree | None:
-    """The first figure of a benchmark of this name."""
-    return next((figure for figure in speed.get(name, []) if figure["name"] == name), None)
+def figures_of(speed: Mapping[str, list[Tree]], name: str) -> list[Tree]:
+    """The figures of this benchmark's own name in its first unit: one of each machine."""
+    named = [figure for figure in speed.get(name, []) if figure["name"] == name]
+    return [figure for figure in named if figure["unit"] == named[0]["unit"]]
+
+
+def times(figures: Iterable[Tree]) -> str:
+    """How many times what it is compared with, over machines: "6 to 7 ×"."""
+    return f"{ranged(({'mean': figure['ratio']} for figure in figures), 0)} ×"
+
+
+def machine_of(about: Mapping[str, Any]) -> str:
+    """A machine's processor, in short: "Intel Xeon"."""
+    return about["machine"].split(",")[0].replace("(R)", "").removesuffix(" Processor")
+
+
+def machines(figures: Iterable[Tree]) -> str:
+    """The processors of figures."""
+    return ", ".join(sorted({machine_of(figure) for figure in figures}))
 
 
 def about(command: str) -> dict[str, str]:
@@ -229,12 +235,34 @@ def origin(about: Mapping[str, Any], spread: str = "") -> str:
     """A table's command, date and machine, and over what it spreads."""
     parts = [f"`{about['command']}`", about["date"], about["machine"], *([spread] if spread else [])]
     parts += [BENT] if about["date"] < STRAIGHTENED else []
-    words = ", ".join(map(str, parts)) + ("; transcribed from an earlier page" if about.get(TRANSCRIBED) else "") + "."
+    words = ", ".join(map(str, parts)) + "."
     if left := about.get(LEFT):
         words += (
             f" Of an earlier run: {', '.join(left['rows'])} (`{left['command']}`, {left['date']}, {left['machine']})."
         )
     return words
+
+
+def commands(trees: Trees) -> tuple[str, ...]:
+    """Lines that make the tables of the trees, with their last date and machine: those of the tables that later runs do
+    not replace, without what chooses rows or leaves them as they were published."""
+    known: dict[str, Tree] = {}
+    for tree in trees.values():
+        kept_ones = {f"{name}, {title}" for title in tree.get("tables", {}) for name in kept(tree, title)}
+        for title, each in tree.get("origins", {"": tree["about"]}).items():
+            if not any(title.startswith(one.split(":")[0]) for one in kept_ones):
+                line = _plain(each["command"])
+                known[line] = max(known.get(line, each), each, key=lambda about: about["date"])
+    return tuple(f"{line}  # {each['date']}, {machine_of(each)}" for line, each in known.items())
+
+
+def _plain(command: str) -> str:
+    """A command without the options `--rows` and `--leave`, and their values."""
+    words, option = [], ""
+    for word in shlex.split(command):
+        option = word if word.startswith("--") else option
+        words += [] if option in ("--rows", "--leave") else [word]
+    return shlex.join(words)
 
 
 def markdown(grid: Grid) -> str:
@@ -266,9 +294,10 @@ def read_speed(path: Path = RESULTS / SPEED) -> dict[str, list[Tree]]:
 
 
 def write_speed(path: Path, benchmark: str, figures: list[Tree], about: Mapping[str, str]) -> None:
-    """A benchmark's figures take the place of its earlier ones; those of other benchmarks stay."""
+    """A benchmark's figures take the place of its earlier ones on this machine; all others stay."""
     known = read_speed(path)
-    known[benchmark] = [{"benchmark": benchmark, **figure, **about} for figure in figures]
+    others = [figure for figure in known.get(benchmark, []) if figure["machine"] != about["machine"]]
+    known[benchmark] = [*({"benchmark": benchmark, **figure, **about} for figure in figures), *others]
     lines = [json.dumps(figure) for name in sorted(known) for figure in known[name]]
     write_text(path, "\n".join(lines) + "\n")
 
@@ -345,46 +374,92 @@ def compact(tree: Tree) -> str:
 
 
 def render(system: str, page: Page, speed: Mapping[str, list[Tree]]) -> str:
-    """The page in Markdown. Raises WearcapError when the headline has too many rows."""
-    if len(page.headline.rows) > MOST_ROWS:
-        raise WearcapError(
-            f"a headline table of {len(page.headline.rows)} rows", where=system, expected=f"at most {MOST_ROWS}"
-        )
-    made = f"Written by `python benchmarks/tables.py {system} --page` from the JSON files beside this page."
-    if any(TRANSCRIBED in grid.origin for grid in page.full):
-        made += " Tables that say so are transcribed from an earlier page; the same command makes them anew."
-    if any(BENT in grid.origin for grid in page.full):
-        made += (
-            f" Tables that say “{BENT}” were taken before CMU's and HDM05's hips were repaired and simulated people walked "
-            "upright ([truth](../data.md#truth)): do not compare them with later ones."
-        )
-    parts = [f"# {page.title}", made, page.headline.title, markdown(page.headline)]
+    """The page in Markdown. Raises WearcapError when it has too many words, or its table too many rows or columns."""
+    made = (
+        "After this page you know how good the figures are, on whom they were measured and where they fail, and can make each anew. It "
+        f"is written by `python benchmarks/tables.py {system} --page` from the JSON files beside it; `python benchmarks/tables.py {system} "
+        "--all` prints all their tables."
+    )
+    parts = [f"# {page.title}", made, *_straightened(system, page), page.headline.title, markdown(page.headline)]
     parts += ["## Held out", page.held_out, "## Simulated", page.simulated]
-    parts += ["## Limits", "\n".join(f"- {limit}" for limit in page.limits)]
-    clocks = speed_grid(page.clocks, speed)
-    if clocks.rows:
-        parts += ["## Speed", clocks.title, markdown(clocks)]
-    parts += ["## All tables"] if page.full else []
-    for grid in page.full:
-        shown = f"<details><summary>{grid.title}</summary>\n\n{grid.origin}\n\n{markdown(grid)}\n\n</details>"
-        parts.append(shown)
+    parts += ["## Limits", _listed(page.limits)]
+    clocked = _clocked(page.clocks, speed)
+    parts += (
+        [
+            "## Speed",
+            "On two cores; speeds depend on the CPU, and ranges are over the machines that are named.",
+            _listed(clocked),
+        ]
+        if clocked
+        else []
+    )
     parts += ["## Pictures"] if page.pictures else []
-    parts += [f"{caption}:\n\n![{caption}](../{name})" for name, caption in page.pictures]
-    return "\n\n".join(parts) + "\n"
+    parts += [f"{caption}:\n\n![{caption.split(',')[0]}](../{name})" for name, caption in page.pictures]
+    timed = [f"python benchmarks/run.py {' '.join(page.clocks)} --write docs/results/{SPEED}"] if clocked else []
+    lines = "\n".join([*page.commands, *timed])
+    parts += ["## Commands", f"```\n{lines}\n```"]
+    shown = "\n\n".join(parts) + "\n"
+    counts = len(page.headline.rows), len(page.headline.columns), len(shown.split())
+    if any(count > most for count, most in zip(counts, (MOST_ROWS, MOST_COLUMNS, MOST_WORDS))):
+        raise WearcapError(
+            f"a page with a table of {counts[0]} rows and {counts[1]} columns and {counts[2]} words",
+            where=system,
+            expected=f"at most {MOST_ROWS} rows, {MOST_COLUMNS} columns and {MOST_WORDS} words",
+        )
+    return shown
+
+
+def _listed(lines: Iterable[str]) -> str:
+    return "\n".join(f"- {line}" for line in lines)
+
+
+def _straightened(system: str, page: Page) -> list[str]:
+    """That figures are of people with bent knees, and where newer ones stand."""
+    if not any(BENT in grid.origin for grid in page.full):
+        return []
+    card = f"../../checkpoints/{system}.md"
+    newer = (
+        f" Today's checkpoint is scored on repaired hips in [its card]({card})." if (RESULTS / card).is_file() else ""
+    )
+    return [
+        f"Figures of before {STRAIGHTENED} are of {BENT}: of people as they were before CMU's and HDM05's hips were repaired "
+        f"and simulated people walked upright ([truth](../data.md#truth)). Do not compare them with later ones.{newer}"
+    ]
+
+
+def _clocked(clocks: Mapping[str, str], speed: Mapping[str, list[Tree]]) -> list[str]:
+    """A sentence for each of the named benchmarks."""
+    lines = []
+    for benchmark, inside in clocks.items():
+        if figures := figures_of(speed, benchmark):
+            unit = re.split(r" \(|,", figures[0]["unit"])[0]
+            reached, ratio = (_between(figure[key] for figure in figures) for key in ("value", "ratio"))
+            lines.append(f"{inside}: {reached} {unit}, {ratio} × ({machines(figures)}).")
+    return lines
+
+
+def _between(values: Iterable[float]) -> str:
+    shown = [number(value) for value in sorted(values)]
+    return " to ".join(dict.fromkeys([shown[0], shown[-1]]))
+
+
+def everything(system: str, page: Page, speed: Mapping[str, list[Tree]]) -> str:
+    """All tables of the page's JSON in Markdown, and the system's figures of speed."""
+    clocks = speed_grid({name: "" for name in speed if name.startswith(f"{system}_")} | dict(page.clocks), speed)
+    grids = [page.headline, *page.full, *([clocks] if clocks.rows else [])]
+    return "\n\n".join(f"## {grid.title}\n\n{grid.origin}\n\n{markdown(grid)}" for grid in grids) + "\n"
 
 
 def speed_grid(clocks: Mapping[str, str], speed: Mapping[str, list[Tree]]) -> Grid:
-    """Figures of the named benchmarks, with what their clocks count."""
+    """Figures of the named benchmarks, with what they measure."""
     rows = []
     for benchmark, inside in clocks.items():
         for figure in speed.get(benchmark, []):
-            date = figure["date"] + (" (transcribed)" if figure.get(TRANSCRIBED) else "")
             measured = [f"{number(figure[key])}" for key in ("value", "baseline", "ratio", "goal")]
-            name = f"`{figure['name']}`"
-            rows.append([name, inside if figure is speed[benchmark][0] else "", *measured, figure["unit"], date])
-    machines = {figure["machine"] for name in clocks for figure in speed.get(name, [])}
-    title = f"`python benchmarks/run.py NAME --write docs/results/{SPEED}`; {'; '.join(sorted(machines))}."
-    return Grid(title, ("", "the clock counts", "ours", "against", "ratio", "goal", "unit", "date"), rows)
+            what = inside if figure is speed[benchmark][0] else ""
+            rows.append([f"`{figure['name']}`", what, *measured, figure["unit"], figure["date"], machine_of(figure)])
+    columns = ("", "what is measured", "ours", "against", "ratio", "goal", "unit", "date", "machine")
+    return Grid("Speed", columns, rows, f"`python benchmarks/run.py NAME --write docs/results/{SPEED}`.")
 
 
 def number(value: float | None) -> str:

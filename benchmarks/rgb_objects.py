@@ -26,9 +26,9 @@ from wearcap.metrics.objects import handlings
 from wearcap.recording import Motion
 from wearcap.recording.timing import at_times
 from wearcap.scene.objects import Environment
-from wearcap.simulation.rendering.head_camera import Filming, film
-from wearcap.simulation.rendering.views import Development, Scenery, exposed, render_view
 from wearcap.systems.ireplica.scores import SETTLED_S
+from wearsim.rendering.head_camera import Filming, film
+from wearsim.rendering.views import Development, Scenery, exposed, render_view
 
 FPS = 2.0
 """Rate of the pictures in which a handled object is looked for."""

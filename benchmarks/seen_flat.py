@@ -15,11 +15,11 @@ from wearcap.geometry.render import render
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import at_times
-from wearcap.simulation.places.interactive_flat import InteractiveFlat
-from wearcap.simulation.places.world import World
-from wearcap.simulation.recordings.interaction_session import flat_of
 from wearcap.systems.ireplica.object_tracker import PALMS
 from wearcap.systems.ireplica.scores import poses_at
+from wearsim.places.interactive_flat import InteractiveFlat
+from wearsim.places.world import World
+from wearsim.recordings.interaction_session import flat_of
 
 SAME_M = 1e-3
 """Largest distance of an object from its true place for a flat to be the recording's."""

@@ -14,7 +14,7 @@ from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.render import render
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import exp
-from wearcap.simulation.places.world import World
+from wearsim.places.world import World
 
 KINECT = Camera("pinhole", 640, 576, 504.0, 504.0, 319.5, 287.5)
 """Azure Kinect's unbinned narrow mode: 65° x 59° of its 75° x 65°, whose rim the lens bends."""

@@ -28,12 +28,12 @@ from wearcap.sensors.claps import detect_claps
 from wearcap.sensors.clock import mutual_pairs
 from wearcap.sensors.imu import GRAVITY, ImuNoise, synthesize_imu
 from wearcap.sensors.simulated import SlamNoise, head_stream
-from wearcap.sensors.suit import SUITS, SuitNoise, suit_motion
-from wearcap.simulation.recordings.hps import HpsConfig, Simulated, simulate_hps
-from wearcap.simulation.recordings.interaction_session import flat_of
-from wearcap.simulation.recordings.localization_noise import LocalizationNoise, by_gravity, localize_statistically
-from wearcap.simulation.recordings.measured import EnvironmentErrors, as_measured
-from wearcap.simulation.rendering.head_camera import HEAD_CAMERA_TRUTH, head_camera
+from wearsim.recordings.hps import HpsConfig, Simulated, simulate_hps
+from wearsim.recordings.interaction_session import flat_of
+from wearsim.recordings.localization_noise import LocalizationNoise, by_gravity, localize_statistically
+from wearsim.recordings.measured import EnvironmentErrors, as_measured
+from wearsim.rendering.head_camera import HEAD_CAMERA_TRUTH, head_camera
+from wearsim.sensors.suit import SUITS, SuitNoise, suit_motion
 
 Values = dict[str, float]
 OUTLIER_M = 0.3

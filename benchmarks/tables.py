@@ -1,10 +1,11 @@
 """A system's tables as in its paper, with ours, baselines and ablations.
 
     python benchmarks/tables.py SYSTEM [--quick] [--publish [--leave ROW …]] [--help]
-    python benchmarks/tables.py SYSTEM --page
+    python benchmarks/tables.py SYSTEM --page | --all
 
 Prints them and writes OUTPUT/SYSTEM.json (OUTPUT is outputs/tables), which --publish puts into docs/results as well.
---page computes nothing: it writes docs/results/SYSTEM.md and README's row from the JSON files in docs/results. Systems:
+--page and --all compute nothing: from the JSON files in docs/results the one writes docs/results/SYSTEM.md and README's row,
+the other prints every table (Markdown). Systems:
 
     hmd2          HMD2 with points and pictures: its paper's tables on held-out people and places
     hmd2_head     HMD2 on the head path alone: MPJPE and its parts, realism, beside trivial baselines
@@ -29,7 +30,19 @@ import shlex
 import sys
 from pathlib import Path
 
-from result_pages import RESULTS, ROOT, SPEED, Page, about, publish, read_speed, render, results, with_readme
+from result_pages import (
+    RESULTS,
+    ROOT,
+    SPEED,
+    Page,
+    about,
+    everything,
+    publish,
+    read_speed,
+    render,
+    results,
+    with_readme,
+)
 
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
@@ -50,6 +63,9 @@ def main(arguments: list[str]) -> None:
     if "--page" in arguments:
         print(f"written: {write_page(arguments[0])}")
         return
+    if "--all" in arguments:
+        print(everything(arguments[0], page_of(arguments[0]), read_speed()), end="")
+        return
     system = importlib.import_module(f"tables_{arguments[0]}")
     parser = argparse.ArgumentParser(f"tables.py {arguments[0]}", description=system.__doc__)
     parser.add_argument("--quick", action="store_true", help="minutes instead of hours: a look, not a result")
@@ -58,6 +74,7 @@ def main(arguments: list[str]) -> None:
     leave = "rows that stay as they were published, such as rivals whose trainings are not here: the page says so"
     parser.add_argument("--leave", nargs="+", default=[], metavar="ROW", help=leave)
     parser.add_argument("--page", action="store_true", help="make the page of what is in docs/results, nothing else")
+    parser.add_argument("--all", action="store_true", help="print every table in docs/results, nothing else")
     system.add_arguments(parser)
     options = parser.parse_args(arguments[1:])
     command = shlex.join(["python", "benchmarks/tables.py", *(word for word in arguments if word != "--publish")])
@@ -72,19 +89,17 @@ def main(arguments: list[str]) -> None:
             print(f"written: {write_page(arguments[0])}")
 
 
-def page_of(system: str, folder: Path = RESULTS) -> Page | None:
-    """What the page of a system holds; None where it has no page, or nothing is published."""
+def page_of(system: str, folder: Path = RESULTS) -> Page:
+    """What the page of a system holds; leaves with a message where it has no page, or nothing is published."""
     make, trees = getattr(importlib.import_module(f"tables_{system}"), "page", None), results(system, systems(), folder)
-    return make(trees, read_speed(folder / SPEED)) if make and trees else None
+    if make is None or not trees:
+        sys.exit(f"error: no page of {system!r}. Expected {folder / system}.json, from tables.py {system} --publish.")
+    return make(trees, read_speed(folder / SPEED))
 
 
 def write_page(system: str) -> Path:
     """docs/results/SYSTEM.md, and README's row where it has one; returns the page's path."""
     page = page_of(system)
-    if page is None:
-        sys.exit(
-            f"error: no page of {system!r}. Expected docs/results/{system}.json, from tables.py {system} --publish."
-        )
     write_text(RESULTS / f"{system}.md", render(system, page, read_speed()))
     if page.measured:
         readme = ROOT / "README.md"

@@ -20,18 +20,20 @@ from echo_paper import PAPER, PAPER_HUMAN
 from echo_rows import Captured, Method, captured, pipeline_of, scenario_of
 from hydra.utils import instantiate
 from result_pages import (
-    NONE,
     Grid,
     Page,
     Tree,
     Trees,
-    figure_of,
+    commands,
+    figures_of,
+    machines,
     mean,
     picked,
+    ranged,
     ranked,
     rows_of,
     score_grids,
-    upside_down,
+    times,
 )
 from rich.console import Console
 from rich.progress import Progress
@@ -58,38 +60,40 @@ from wearcap.recording import RecordingStore
 from wearcap.runtime.system import CaptureInput
 from wearcap.systems.echo.scores import score_echo
 
-BODY = {
-    "mpjpe_mm": "MPJPE (mm)",
-    "upper_pe_mm": "upper body (mm)",
-    "lower_pe_mm": "lower body (mm)",
-    "hand_pe_mm": "hands (mm)",
-    "mpjve_mm": "MPJVE (mm per frame at 30 Hz)",
-    "mpjve_printed": "MPJVE as the paper prints it, without unit",
-    "foot_contact": "FC",
-    "foot_skate_cm_s": "skate (cm/s)",
-    "skate_ratio": "skate, of the truth's",
-    "floor_penetration_cm": "into the floor (cm)",
-    "physicality": "physicality",
-    "jitter_m_s3": "jitter (m/s³)",
-    "jitter_ratio": "jitter, of the truth's",
-    **TRAINING,
+OF_BODIES = {
+    "mpjpe_mm": ("MPJPE (mm)", 1),
+    "upper_pe_mm": ("upper body (mm)", 1),
+    "lower_pe_mm": ("lower body (mm)", 1),
+    "hand_pe_mm": ("hands (mm)", 1),
+    "mpjve_mm": ("MPJVE (mm a frame)", 1),
+    "mpjve_printed": ("MPJVE as the paper prints it", 1),
+    "foot_contact": ("FC", 2),
+    "jitter_m_s3": ("jitter (m/s³)", 1),
+    "jitter_ratio": ("jitter, of the truth's", 2),
+    "foot_skate_cm_s": ("skate (cm/s)", 1),
+    "skate_ratio": ("skate, of the truth's", 2),
+    "floor_penetration_cm": ("into the floor (cm)", 2),
+    "physicality": ("physicality", 4),
 }
-"""Columns of the tables of bodies. Ours of MPJVE is in the unit of ECHO's words, which its figures cannot have
+"""Columns of the tables with their digits. Ours of MPJVE is in the unit of ECHO's words, which its figures cannot have
 (`joint_step_error_mm`): they have a column of their own."""
-OBJECTS = {
-    **BODY,
-    "v2v_cm": "E_v2v (cm)",
-    "symmetric_v2v_cm": "E_v2v modulo symmetry (cm)",
-    "add_s_cm": "ADD-S (cm)",
-    "center_cm": "E_c (cm)",
-    "loose_center_cm": "E_c of loose objects (cm)",
-    "fastened_center_cm": "E_c of doors, drawers, windows (cm)",
-    "rotation_deg": "rotation (°)",
-    "symmetric_rotation_deg": "modulo symmetry (°)",
-    "quaternion": "quaternion",
-    "touch_f1": "contact F1",
-    "training_minutes": "min. learned from",
+LABELS = {
+    **OF_BODIES,
+    "v2v_cm": ("E_v2v (cm)", 1),
+    "symmetric_v2v_cm": ("E_v2v modulo symmetry (cm)", 1),
+    "center_cm": ("E_c (cm)", 1),
+    "loose_center_cm": ("E_c of loose objects (cm)", 1),
+    "fastened_center_cm": ("E_c of doors, drawers, windows (cm)", 1),
+    "add_s_cm": ("ADD-S (cm)", 1),
+    "rotation_deg": ("rotation (°)", 1),
+    "symmetric_rotation_deg": ("rotation modulo symmetry (°)", 1),
+    "quaternion": ("quaternion", 2),
+    "touch_f1": ("contact F1", 2),
+    "training_minutes": ("minutes learned from", 0),
 }
+"""Columns of the tables of objects."""
+BODY, OBJECTS = ({name: heading for name, (heading, _) in of.items()} | TRAINING for of in (OF_BODIES, LABELS))
+"""Their headings, of people alone and with objects."""
 ANYWHERE = ("pipeline=echo", "pipeline.freedoms=false")
 """Like the rivals, which know no hinges, rails or floor that an object keeps to."""
 CONVEYOR = ("pipeline=ablation/echo_conveyor",)
@@ -319,7 +323,9 @@ def _sparse(options: argparse.Namespace, progress: Progress) -> tuple[str, Mappi
     store, names = recordings_of(options, "simulated_objects")
     rows = [None, *((modality, share) for modality, shares in SHARES.items() for share in shares)]
     methods = [Method(_given(row), options.checkpoint, UNGUIDED, row) for row in rows]
-    methods += [Method(f"{_given(row)}, guided", options.checkpoint, observed=row) for row in (None, ("contact", 1.0))]
+    for label, changes in (("guided", ANYWHERE), ("guided, hinges and rails known", ("pipeline=echo",))):
+        guided = [(None, "nothing"), (("contact", 1.0), "100 % of contact")]
+        methods += [Method(f"{what}, {label}", options.checkpoint, changes, row) for row, what in guided]
     return f"Tables 3, S2: observed, {options.split}", OBJECTS, _scores(methods, options, progress, store, names)
 
 
@@ -407,114 +413,74 @@ PARTS = {
 }
 
 
-LABELS = {
-    "mpjpe_mm": ("MPJPE (mm)", 1),
-    "upper_pe_mm": ("upper body (mm)", 1),
-    "lower_pe_mm": ("lower body (mm)", 1),
-    "hand_pe_mm": ("hands (mm)", 1),
-    "mpjve_mm": ("MPJVE (mm a frame)", 1),
-    "mpjve_printed": ("MPJVE as the paper prints it", 1),
-    "foot_contact": ("FC", 2),
-    "true_foot_contact": ("FC, truth", 2),
-    "v2v_cm": ("E_v2v (cm)", 1),
-    "symmetric_v2v_cm": ("E_v2v modulo symmetry (cm)", 1),
-    "center_cm": ("E_c (cm)", 1),
-    "loose_center_cm": ("E_c of loose objects (cm)", 1),
-    "fastened_center_cm": ("E_c of doors, drawers, windows (cm)", 1),
-    "loose_symmetric_v2v_cm": ("E_v2v of loose objects modulo symmetry (cm)", 1),
-    "fastened_symmetric_v2v_cm": ("E_v2v of doors, drawers, windows modulo symmetry (cm)", 1),
-    "add_s_cm": ("ADD-S (cm)", 1),
-    "rotation_deg": ("rotation (°)", 1),
-    "symmetric_rotation_deg": ("rotation modulo symmetry (°)", 1),
-    "quaternion": ("quaternion", 2),
-    "touch_f1": ("contact F1", 2),
-    "jitter_m_s3": ("jitter (m/s³)", 1),
-    "true_jitter_m_s3": ("jitter, truth", 1),
-    "jitter_ratio": ("jitter, of the truth's", 2),
-    "foot_skate_cm_s": ("skate (cm/s)", 1),
-    "skate_ratio": ("skate, of the truth's", 2),
-    "floor_penetration_cm": ("into the floor (cm)", 2),
-    "physicality": ("physicality", 4),
-    "training_minutes": ("minutes learned from", 0),
-}
-"""Columns of the page's tables with their digits."""
-HIDDEN = (
-    *(f"{part}_pe_mm" for part in ("head", "trunk", "arm", "leg", "foot")),
-    *(f"{kind}_symmetric_v2v_cm" for kind in ("loose", "fastened")),
-    "busy_mpjpe_mm",
-)
-"""Metrics of the JSON that the page's tables do not show."""
+OBJECTS_1, EQUAL_1, CMU, HDM05 = "Table 1:", "Table 1, equal", "Table 2", "People (hdm05)"
 HEADLINE = (
-    ("Table 1:", "ours", "objects: **ours**"),
-    ("Table 1:", "ours, hinges and rails unknown", "objects: **ours**, hinges and rails unknown, as for rivals"),
-    ("Table 1, equal", "ours, the same budget", "objects: ours, the rivals' budget"),
-    ("Table 1, equal", "BoDiffusion-style + object, its mean", "objects: BoDiffusion-style + object, its mean"),
-    ("Table 1:", "paper: BEHAVE", "the paper's, on BEHAVE"),
-    ("Table 2", "ours", "people alone (CMU): **ours**"),
-    ("Table 2", "ours, typical tracking", "people alone (CMU): **ours**, typical tracking, floor and bones unknown"),
-    ("Table 2", "ours, the same budget", "people alone (CMU): ours, the rivals' budget"),
-    ("Table 2", "BoDiffusion-style, its mean", "people alone (CMU): BoDiffusion-style, the same budget"),
-    ("People (hdm05)", "ours", "people alone (another laboratory's, HDM05): **ours**"),
-    ("People (hdm05)", "BoDiffusion-style, its mean", "people alone (another laboratory's, HDM05): BoDiffusion-style"),
+    (OBJECTS_1, "nearest training window", "objects: nearest window of the training, looked up"),
+    (OBJECTS_1, "ours", "objects: **ours**"),
+    (OBJECTS_1, "ours, hinges and rails unknown", "objects: **ours**, hinges unknown, as for rivals"),
+    (EQUAL_1, "ours, the same budget", "objects: ours, the rivals' budget"),
+    (EQUAL_1, "BoDiffusion-style + object, its mean", "objects: BoDiffusion-style + object"),
+    (CMU, "ours", "CMU: **ours**"),
+    (CMU, "ours, typical tracking", "CMU: **ours**, typical tracking, floor and bones unknown"),
+    (CMU, "BoDiffusion-style, its mean", "CMU: BoDiffusion-style"),
+    (HDM05, "ours", "HDM05: **ours**"),
+    (HDM05, "BoDiffusion-style, its mean", "HDM05: BoDiffusion-style"),
 )
 """Rows of the page's first table: table, row, and what the page calls it."""
+COMPARED = tuple(
+    (LABELS[name][0], name, LABELS[name][1])
+    for name in (
+        "mpjpe_mm",
+        "jitter_ratio",
+        "foot_skate_cm_s",
+        "v2v_cm",
+        "symmetric_v2v_cm",
+        "center_cm",
+        "rotation_deg",
+    )
+)
+"""Columns of the page's first table: heading, metric, digits."""
 CLOCKS = {
-    "echo_online_small_fps": "tracked points to poses, object and contacts: as `pipeline=echo_online`, in eager "
-    "PyTorch, and with the steps of `pipeline=echo` without guidance; tracked points given; against real time",
-    "echo_conveyor_vs_rewindow": "a frame's steps of the rolling schedule; against windows from scratch with all steps of "
-    "a frame, and with as many evaluations of the network as the conveyor; then errors and jitter against both",
+    "echo_online_small_fps": "Online, from tracked points, which are given, to poses, object and contacts, beside real time"
 }
-"""Benchmarks of the page's table of speed: what their clocks count, and what is given."""
+"""Benchmarks: what is measured, what is given, and what it is held against."""
 
 
 def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
     """What docs/results/echo.md says."""
-    objects, people = rows_of(trees, "Table 1:"), rows_of(trees, "Table 2")
-    ours, online = objects["ours"], figure_of(speed, "echo_online_small_fps")
-    shown = {metric for title, row, _ in HEADLINE for metric in rows_of(trees, title).get(row, {})}
-    columns = [
-        (LABELS[name][0], (name,), LABELS[name][1])
-        for name in LABELS
-        if name in shown and name in OBJECTS and "_pe_" not in name
-    ]
-    placed, unknown = (
-        mean(objects.get(row, {}).get("center_cm"), 0) for row in ("ours", "ours, hinges and rails unknown")
-    )
-    placed += " cm off" + (f" ({unknown} with unknown hinges)" if unknown != NONE else "")
-    tracked = ("ours", "ours, typical tracking", "ours, poor tracking")
-    real = [people[row]["mpjpe_mm"]["mean"] / 10 for row in tracked if row in people]
-    real = (
-        f"; real motion (CMU) {min(real):.1f} to {max(real):.1f}, with exact to poor tracking" if len(real) > 1 else ""
+    objects, people = rows_of(trees, OBJECTS_1), rows_of(trees, CMU)
+    online = figures_of(speed, "echo_online_small_fps")
+    placed, unknown = (mean(objects[row]["center_cm"], 0) for row in ("ours", "ours, hinges and rails unknown"))
+    joints, *tracked = (
+        {"mean": rows[row]["mpjpe_mm"]["mean"] / 10}
+        for rows, row in (
+            (objects, "ours"),
+            *((people, f"ours{tracking}") for tracking in ("", ", typical tracking", ", poor tracking")),
+        )
     )
     return Page(
         title="[ECHO](../echo.md): figures",
         headline=Grid(
-            "Whole recordings, bodies and objects measured where they stand in the world; means over seeds of the "
-            "noise, ± their deviation, which leaves the mean of the plausible motions almost as it is.",
-            ("", *(name for name, _, _ in columns)),
-            picked(trees, HEADLINE, columns),
+            "Whole recordings, bodies and objects measured where they stand in the world: simulated people with objects, CMU's people "
+            "and a person of another laboratory (HDM05) without. Means over seeds of the noise, ± their deviation. Rivals and ours of "
+            "their budget learned alike; all are captured as means.",
+            ("", *(name for name, _, _ in COMPARED)),
+            picked(trees, HEADLINE, COMPARED),
         ),
-        held_out="People and object instances of the test split, and four CMU subjects; kinds of objects are known "
-        "from training. Settings were chosen on the validation split, from which the table of settings is.",
-        simulated="People with objects altogether, tracked points included, which are exact; people alone are CMU's "
-        "real motion, whose tracked points are exact, too, but in the rows of typical and poor tracking: there the head's path, "
-        "the wrists, which are tracked from it, and the body have the errors of devices, and nobody has measured the floor (without 127_32). "
-        "The paper's rows are from real recordings: no comparison. The paper gives its MPJVE without a "
-        "unit of time; ours is the difference of displacements from one frame to the next at 30 Hz.",
-        limits=(
-            echo_limits.orientation(objects),
-            *echo_limits.observing(rows_of(trees, "Tables 3, S2")),
-            *echo_limits.hinges(objects),
-            *echo_limits.recordings_of_objects(trees),
-            *echo_limits.conveyor(speed),
-            *upside_down(people, "mpjpe_mm", "mm", 1),
-            *echo_limits.budgets(rows_of(trees, "Table 1, equal"), people, rows_of(trees, "People (hdm05)")),
-            "The trainings of the ablation have one seed each, and are scored without guidance but where the row says so.",
-            "No recording of real people with objects has been captured.",
-        ),
-        full=[grid for tree in trees.values() for grid in score_grids(tree, LABELS, hidden=HIDDEN)],
-        measured=f"joints {ours['mpjpe_mm']['mean'] / 10:.1f} cm{real}; objects {placed}",
-        speed=f"{online['ratio']:.0f} × online, head and wrists tracked, active object given" if online else "",
+        held_out="People and object instances of the test split, four CMU subjects and one person of HDM05; kinds of objects are known "
+        "from training. Settings were chosen on the validation split.",
+        simulated="People with objects altogether, their tracked points included, which are exact. CMU's and HDM05's motion is real, "
+        "their tracked points exact; with typical and poor tracking the head's path, the wrists, which are tracked from it, and the "
+        "body have the errors of devices, nobody has measured the floor, and 127_32 is left out. Sizes of errors are in "
+        "[simulation](simulation.md).",
+        limits=echo_limits.limits(trees, OBJECTS_1, CMU, HDM05),
+        full=[grid for tree in trees.values() for grid in score_grids(tree, LABELS)],
+        commands=commands(trees),
+        measured=f"joints {ranged([joints])} cm and objects {placed} cm off, exactly tracked ({unknown} with unknown hinges); real motion (CMU) "
+        f"{ranged(tracked)}, with exact to poor tracking",
+        speed=f"{times(online)} online, head and wrists tracked, active object given ({machines(online)})"
+        if online
+        else "",
         clocks=CLOCKS,
         pictures=(
             *ranked("echo"),

@@ -21,8 +21,8 @@ from torch.nn import functional as F
 from wearcap.files import write_text
 from wearcap.models.checkpoint import load_trained
 from wearcap.models.point_encoder import bounds, to_unit_sphere
-from wearcap.simulation.places.object_clouds import generate_clouds
 from wearcap.systems.echo.object_training import CloudAugmentation, ObjectEncoding
+from wearsim.places.object_clouds import generate_clouds
 
 VIEWS = {"as it is": None, "about the vertical": 0.0, "in any way": 1.0}
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 from discriminator import held_out_accuracy
 from gait_statistics import Clip, clip_of, curve_deviations, walking_windows
-from result_pages import Grid, Page, Tree, Trees, grid_of, text
+from result_pages import Grid, Page, Tree, Trees, commands, grid_of, text
 from rich.console import Console
 from rich.table import Table
 from scipy.stats import ks_2samp
@@ -23,7 +23,7 @@ from tabling import finite
 
 from wearcap.files import write_text
 from wearcap.recording import Recording, RecordingStore
-from wearcap.simulation.recordings.hps import HpsConfig, Protocol
+from wearsim.recordings.hps import HpsConfig, Protocol
 
 WIDTH = 220
 
@@ -100,7 +100,6 @@ KEY = (
     "heading_deg_per_sqrt_min",
     "off_after_380_m_cm",
     "length_percent",
-    "bone_percent",
     "joint_deg",
     "position_cm",
     "outlier_percent",
@@ -166,6 +165,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
             for part in tree["tables"]
             for table in _shown({part: tree["tables"][part]})
         ],
+        commands=commands(trees),
         measured="",
     )
 

@@ -13,16 +13,9 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion, Recording
-from wearcap.sensors.keypoints import action_camera
-from wearcap.simulation.people.wearer import simulate_motion
-from wearcap.simulation.recordings.simulate import (
-    POOLS,
-    SimulationConfig,
-    drawn_world,
-    person_of,
-    seeded,
-    sensed_recording,
-)
+from wearsim.people.wearer import simulate_motion
+from wearsim.recordings.simulate import POOLS, SimulationConfig, drawn_world, person_of, seeded, sensed_recording
+from wearsim.sensors.keypoints import action_camera
 
 STAYING = ("stand", "gesture", "look_around")
 """Activities on the spot."""

@@ -9,8 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from wearcap.simulation.recordings.interaction_session import InteractionConfig, simulate_interactions
 from wearcap.viewer.picture import write_video
+from wearsim.recordings.interaction_session import InteractionConfig, simulate_interactions
 
 FPS = 30.0
 

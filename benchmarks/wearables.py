@@ -23,7 +23,7 @@ from wearcap.recording.motion import Motion
 from wearcap.recording.recording import HeadStream, Recording
 from wearcap.sensors.imu import ImuNoise, synthesize_imu
 from wearcap.sensors.simulated import SlamNoise, slam_poses
-from wearcap.sensors.suit import SUITS, BodyErrors, estimated_skeleton
+from wearsim.sensors.suit import SUITS, BodyErrors, estimated_skeleton
 
 
 @dataclass(frozen=True)

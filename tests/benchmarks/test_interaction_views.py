@@ -9,8 +9,8 @@ import torch
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis
 from wearcap.recording import Recording
-from wearcap.simulation.recordings.interaction_session import InteractionConfig, simulate_interactions
 from wearcap_testing import benchmark
+from wearsim.recordings.interaction_session import InteractionConfig, simulate_interactions
 
 seen_flat, detecting, rgb, rig = map(benchmark, ("seen_flat", "simulated_detections", "rgb_objects", "interaction_rig"))
 PERFECT = detecting.Detector(found=1.0, side=1.0, state=1.0, apart=1.0, false_hands=0.0, whole=0.01)

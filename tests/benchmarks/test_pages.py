@@ -1,5 +1,6 @@
 """Pages of results: rendered from JSON alone, published JSON is merged, README says what the JSON says."""
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -36,56 +37,109 @@ def small_page(rows: int = 2, **changes):
         "held_out": "People.",
         "simulated": "Sensors.",
         "limits": ("One.", "Two."),
+        "full": [grid],
+        "commands": ("python benchmarks/tables.py echo",),
+        "measured": "joints 1.2 cm off",
     }
-    return Page(**{**parts, "full": [grid], "measured": "joints 1.2 cm off", **changes})
+    return Page(**{**parts, **changes})
 
 
-def test_a_page_has_its_sections_in_order_and_folds_the_full_tables():
+FAST = {"fast_fps": "Everything, poses given", "slow_fps": "Nothing"}
+
+
+def fast(value: float, machine: str) -> dict:
+    about = {**ABOUT, "machine": f"{machine}, 2 cores, Linux"}
+    figure = {"name": "fast_fps", "unit": "frames/s, all (of them)", "baseline": 30.0, "goal": None}
+    return {**figure, "value": value, "ratio": value / 30.0, "benchmark": "fast_fps", **about}
+
+
+def test_a_page_has_its_sections_in_order():
     from result_pages import render
 
-    page = small_page(clocks={"fast_fps": "everything; poses given", "slow_fps": "nothing"})
-    figure = {"name": "fast_fps", "value": 90.4, "unit": "frames/s", "baseline": 30.0, "ratio": 3.013, "goal": None}
-    shown = render("echo", page, {"fast_fps": [{**figure, "benchmark": "fast_fps", **ABOUT}]})
+    page = small_page(clocks=FAST, pictures=(("echo_box.png", "A box, carried"),))
+    shown = render("echo", page, {"fast_fps": [fast(90.4, "AMD EPYC"), fast(120.0, "Intel(R) Xeon(R) Processor")]})
     headings = re.findall(r"^#+ .*", shown, re.MULTILINE)
-    assert headings == ["# A system", "## Held out", "## Simulated", "## Limits", "## Speed", "## All tables"]
+    names = ("Held out", "Simulated", "Limits", "Speed", "Pictures", "Commands")
+    assert headings == ["# A system", *(f"## {name}" for name in names)]
     assert "| row 1 | 1.00 |" in shown.split("## Held out")[0]
     assert "- One.\n- Two." in shown
-    assert "| `fast_fps` | everything; poses given | 90.4 | 30.0 | 3.01 | frames/s | 2026-11-01 |" in shown
-    assert "slow_fps" not in shown
-    folded = re.search(r"<details><summary>(.*?)</summary>\n\n(.*?)\n\n(\| .*)</details>", shown, re.DOTALL)
-    assert folded is not None
-    assert folded[1] == "Table 9: all of it"
-    assert folded[2] == "`command`, today, here."
+    assert "- Everything, poses given: 90.4 to 120 frames/s, 3.01 to 4.00 × (AMD EPYC, Intel Xeon)." in shown
+    assert "Nothing" not in shown
+    assert "Table 9" not in shown
+    assert "```\npython benchmarks/tables.py echo\npython benchmarks/run.py fast_fps slow_fps --write" in shown
 
 
-def test_a_headline_of_more_than_twelve_rows_is_refused():
-    from result_pages import render
+def test_all_tables_are_printed_and_every_figure_of_speed():
+    from result_pages import everything
 
-    assert "row 11" in render("echo", small_page(12), {})
-    with pytest.raises(WearcapError, match="13 rows"):
-        render("echo", small_page(13), {})
+    figures = {"fast_fps": [fast(90.4, "AMD EPYC")], "echo_old": [{**fast(1.0, "AMD EPYC"), "name": "echo_old"}]}
+    shown = everything("echo", small_page(clocks=FAST), figures)
+    assert (
+        "## Table 9: all of it\n\n`command`, today, here.\n\n|  | error |\n| --- | ---: |\n| ours | 1.25 ± 0.10 |"
+        in shown
+    )
+    assert (
+        "| `fast_fps` | Everything, poses given | 90.4 | 30.0 | 3.01 | frames/s, all (of them) | 2026-11-01 |" in shown
+    )
+    assert "| `echo_old` |  | 1.00 |" in shown
+    assert "| row 1 | 1.00 |" in shown
 
 
-def test_what_is_transcribed_says_so():
+@pytest.mark.parametrize(
+    ("page", "found"),
+    [({"rows": 11}, "11 rows"), ({"columns": 9}, "9 columns"), ({"held_out": "word " * 1200}, r"12\d\d words")],
+)
+def test_a_page_that_nobody_reads_is_refused(page, found):
+    from result_pages import Grid, render
+
+    assert "row 9" in render("echo", small_page(10), {})
+    columns = page.pop("columns", 2)
+    page = small_page(page.pop("rows", 1), **page)
+    wide = Grid("Wide.", ("",) * columns, [["1"] * columns]) if columns > 2 else page.headline
+    with pytest.raises(WearcapError, match=found):
+        render("echo", dataclasses.replace(page, headline=wide), {})
+
+
+def test_tables_of_before_the_repair_say_so():
     from result_pages import origin, render, score_grids
 
     table = {"ours": {"a_cm": summary(1.256, 0.04, 4)}, "paper: theirs": {"b_cm": summary(2.0)}}
-    tree = {"about": ABOUT, "tables": {"Table 1": table}, "origins": {"Table 1": {**ABOUT, "transcribed": True}}}
+    tree = {"about": ABOUT, "tables": {"Table 1": table}}
     (grid,) = score_grids(tree, {"b_cm": ("B", 1), "a_cm": ("A", 2)})
     assert grid.columns == ("", "B", "A")
     assert grid.rows == [["ours", "–", "1.26 ± 0.04"], ["paper: theirs", "2.0", "–"]]
-    assert grid.origin.endswith("a machine, 4 seeds, bent knees; transcribed from an earlier page.")
-    assert "transcribed" not in origin(ABOUT)
+    assert grid.origin.endswith("a machine, 4 seeds, bent knees.")
     assert "bent knees" not in origin({**ABOUT, "date": "2026-11-28"})
-    line = "Tables that say so are transcribed"
+    line = "are of bent knees"
     assert line in render("echo", small_page(full=[grid]), {})
     assert line not in render("echo", small_page(), {})
+    assert "(../../checkpoints/echo.md)" in render("echo", small_page(full=[grid]), {})
+    assert "checkpoints" not in render("hps", small_page(full=[grid]), {})
+
+
+def test_commands_leave_out_what_chooses_rows_and_tables_that_later_runs_leave():
+    from result_pages import commands
+
+    def by(command: str, date: str) -> dict:
+        return {**ABOUT, "command": f"python benchmarks/tables.py echo {command}", "date": date}
+
+    origins = {
+        "before it, Table 2: CMU": by("--parts human --keep 'before it'", "2026-11-01"),
+        "Table 2: CMU": by("--parts human --rows none --leave 'our own' --seeds 1", "2026-11-03"),
+        "Table 1: objects": by("--parts human --seeds 1", "2026-11-02"),
+    }
+    tree = {"about": ABOUT, "tables": {title: {} for title in origins}, "origins": origins}
+    assert commands({"echo": tree}) == (
+        "python benchmarks/tables.py echo --parts human --seeds 1  # 2026-11-03, a machine",
+    )
+    assert commands({"hps": {"about": ABOUT}}) == ("python benchmarks/tables.py echo  # 2026-11-01, a machine",)
 
 
 def test_cells_of_what_is_not_known_and_ranges():
     from result_pages import number, ranged, text
 
     assert text(None) == text(summary(None)) == "–"
+    assert [text(summary(1.25, std)) for std in (None, 0.004, 0.006)] == ["1.25", "1.25", "1.25 ± 0.01"]
     assert ranged([summary(3.21), summary(2.44), summary(None), summary(4.96)]) == "2.4 to 5.0"
     assert ranged([summary(3.21)]) == "3.2"
     assert ranged([]) == ""
@@ -111,8 +165,8 @@ def test_what_is_kept_stays_and_is_shown_beside_what_is_new(tmp_path):
         "8.00",
         "9.00",
     )
-    lines = picked({"echo": tree}, [("Table 2", "ours", "CMU"), ("Table 9", "ours", "none")], [("error", ("a_cm",), 1)])
-    assert lines == [["CMU", "5.0"], ["CMU, before it", "8.0"]]
+    lines = picked({"echo": tree}, [("Table 2", "ours", "CMU"), ("Table 9", "ours", "none")], [("error", "a_cm", 1)])
+    assert lines == [["CMU", "5.0"]]
 
 
 def test_published_tables_are_merged_by_number(tmp_path):
@@ -178,6 +232,8 @@ def test_figures_of_speed_replace_those_of_their_benchmark_alone(tmp_path):
         "b": [4.0],
     }
     assert read_speed(path)["a"][0]["date"] == ABOUT["date"]
+    write_speed(path, "a", [{"name": "a", "value": 5.0}], {**ABOUT, "machine": "another"})
+    assert [figure["value"] for figure in read_speed(path)["a"]] == [5.0, 3.0], "machines stand side by side"
     assert read_speed(tmp_path / "none.jsonl") == {}
 
 
@@ -206,7 +262,6 @@ def test_the_page_is_what_its_json_gives(system):
     from tables import page_of
 
     page = page_of(system)
-    assert page is not None
     assert all((ROOT / "docs" / name).is_file() for name, _ in page.pictures)
     assert render(system, page, read_speed()) == (RESULTS / f"{system}.md").read_text(encoding="utf-8")
     if page.measured:
@@ -214,10 +269,51 @@ def test_the_page_is_what_its_json_gives(system):
         assert with_readme(readme, system, page) == readme
 
 
-def test_every_system_has_a_page_that_is_small():
+@pytest.mark.parametrize("system", PAGES)
+def test_a_page_is_one_table_and_what_a_person_reads(system):
+    page = (RESULTS / f"{system}.md").read_text(encoding="utf-8")
+    assert len(page.split()) <= 1200
+    (table,) = re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE)
+    lines = table.splitlines()
+    assert len(lines) - 2 <= 10
+    assert max(line.count(" |") for line in lines) <= 8
+
+
+@pytest.mark.parametrize("system", PAGES)
+def test_all_prints_every_table_of_the_json(system, capsys):
+    import tables
+
+    tables.main([system, "--all"])
+    shown = capsys.readouterr().out
+    trees = tables.results(system, tables.systems())
+    assert trees
+    for tree in trees.values():
+        for title, rows in tree.get("tables", {}).items():
+            named = (
+                [row["method"] for row in rows] if isinstance(rows, list) else rows if system != "simulation" else ()
+            )
+            assert not named or title in shown
+            assert all(f"| {name} |" in shown for name in named)
+        assert all(f"| {name} |" in shown for name in tree.get("rows", tree.get("whole", ())))
+
+
+@pytest.mark.parametrize("path", [*RESULTS.parent.rglob("*.md")], ids=lambda path: path.stem)
+def test_a_page_begins_with_what_one_can_do_after_it(path):
+    title, first, *_ = path.read_text(encoding="utf-8").split("\n\n")
+    assert title.startswith("# ")
+    assert first.startswith("After this page ")
+
+
+def test_every_system_has_a_page():
     assert {"hps", "ireplica", "hmd2", "mocap_every", "echo", "simulation"} <= set(PAGES)
-    assert max(path.stat().st_size for path in RESULTS.glob("*.md")) < 50_000
     assert max(path.stat().st_size for path in RESULTS.iterdir()) < 200_000
+
+
+def test_all_of_the_documentation_is_read_in_an_evening():
+    readme = len((ROOT / "README.md").read_text(encoding="utf-8").split())
+    pages = sum(len(path.read_text(encoding="utf-8").split()) for path in (ROOT / "docs").rglob("*.md"))
+    assert readme <= 700
+    assert readme + pages <= 30_000
 
 
 def hps_run(ours_cm: float) -> dict:
@@ -256,7 +352,7 @@ def test_hps_page_shows_the_range_over_presets_of_sensors():
         one.measured
         == "joints 3.5 cm off over 380 m and more, with typical sensors (as published 50.0; suit alone: 50)"
     )
-    assert one.speed == "100 × real time, localised cameras given"
+    assert one.speed == "100 × real time, localised cameras given (a machine)"
     trees = {"hps": tree("typical", 3.0, 4.0), "hps_ideal": tree("ideal", 2.0), "hps_poor": tree("poor", 7.0)}
     page = tables_hps.page(trees, {})
     assert page.measured.startswith("joints 2.0 to 7.0 cm off")
@@ -266,6 +362,6 @@ def test_hps_page_shows_the_range_over_presets_of_sensors():
         "3.5 ± 0.7",
         "7.0",
     ]
-    assert "| the truth itself |" in shown
-    assert shown.count("Table 4.1") == 3
-    assert "Localisation lost in mid-walk for 30 s: the root is 9.9 cm off meanwhile" in shown
+    assert "the truth itself is 50.0 and 50.0 cm from them" in shown
+    assert sum("Table 4.1" in grid.title for grid in page.full) == 3
+    assert "When localisation is lost in mid-walk for 30 s the root is 9.9 cm off meanwhile" in shown

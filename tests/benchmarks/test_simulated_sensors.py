@@ -8,9 +8,9 @@ import torch
 
 from wearcap.sensors.imu import ImuNoise
 from wearcap.sensors.simulated import SlamNoise
-from wearcap.sensors.suit import BodyErrors, ContactErrors, PathErrors, SegmentErrors, SuitNoise
-from wearcap.simulation.recordings.hps import HpsConfig, Protocol
-from wearcap.simulation.recordings.localization_noise import LocalizationNoise, MapErrors
+from wearsim.recordings.hps import HpsConfig, Protocol
+from wearsim.recordings.localization_noise import LocalizationNoise, MapErrors
+from wearsim.sensors.suit import BodyErrors, ContactErrors, PathErrors, SegmentErrors, SuitNoise
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 SEGMENTS = SegmentErrors(fixed_deg=0.0, slow_deg=0.0, soft_tissue_deg=0.0)

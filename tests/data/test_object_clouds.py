@@ -10,8 +10,8 @@ from wearcap.data.datamodule import Loading, WindowsModule
 from wearcap.data.objects import object_cloud
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
-from wearcap.simulation.places.object_clouds import generate_clouds
 from wearcap.systems.echo.object_training import CloudAugmentation, ObjectClouds, random_rotation
+from wearsim.places.object_clouds import generate_clouds
 
 CLASSES = ["box", "chair", "drawer", "door"]
 

@@ -15,7 +15,7 @@ from wearcap.recording import Recording, RecordingStore
 from wearcap.recording.recording import CameraStream, HeadStream
 from wearcap.recording.serialize import flatten
 from wearcap.recording.store import Entry, recording_path, save_recording
-from wearcap.simulation.rendering.ego_view import EGO_CAMERA
+from wearsim.rendering.ego_view import EGO_CAMERA
 
 MOTIONS = {"7_01": captured.walk(1.0), "35_02": captured.sit(0.5).sliced(60, 200)}
 

@@ -17,8 +17,8 @@ from wearcap.localization.keypoints import Keypoint
 from wearcap.prepare import keypoints
 from wearcap.prepare.keypoints import Found, Recorded, Simulated, keypoints_dataset
 from wearcap.recording import CameraStream, Cue, Recording, RecordingStore
-from wearcap.sensors.keypoints import ACTION_CAMERA
 from wearcap_testing import small_dataset
+from wearsim.sensors.keypoints import ACTION_CAMERA
 
 FRAMES, JOINT = 30, "left_wrist"
 

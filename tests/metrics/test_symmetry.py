@@ -15,7 +15,7 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.triangle_distance import TriangleIndex
 from wearcap.metrics.objects import vertex_error_cm
 from wearcap.metrics.symmetry import Symmetry, closest_surface_error_cm
-from wearcap.simulation.places.movables import make_movable
+from wearsim.places.movables import make_movable
 
 TILTED = Rotation.from_rotvec([0.3, -0.5, 0.8]).as_matrix()
 

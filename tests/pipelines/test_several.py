@@ -9,12 +9,12 @@ import torch
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import Motion, Recording, RecordingStore
-from wearcap.simulation.recordings.simulate import SimulationConfig
 from wearcap.systems.mocap_every.energy import LatentSolver, LatentWeights
 from wearcap.systems.mocap_every.manifold import MotionManifold
 from wearcap.systems.mocap_every.visual_cues import View, VisualCues, capture_session
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap_testing import benchmark
+from wearsim.recordings.simulate import SimulationConfig
 
 
 @pytest.fixture(scope="module")

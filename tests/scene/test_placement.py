@@ -10,7 +10,7 @@ from wearcap.geometry.mesh import Mesh
 from wearcap.scene.objects import Environment, Freedom, SceneObject
 from wearcap.scene.placement import placed_on_scan
 from wearcap.scene.scan import Scan
-from wearcap.simulation.recordings.measured import EnvironmentErrors, as_measured
+from wearsim.recordings.measured import EnvironmentErrors, as_measured
 
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float64)
 SIDES = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]

@@ -11,9 +11,9 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import Motion
 from wearcap.sensors.contacts import contacts_from_motion
-from wearcap.sensors.suit import SuitNoise, suit_motion
-from wearcap.simulation.people.wearer import simulate_motion
-from wearcap.simulation.recordings.simulate import person_of, world_of
+from wearsim.people.wearer import simulate_motion
+from wearsim.recordings.simulate import person_of, world_of
+from wearsim.sensors.suit import SuitNoise, suit_motion
 
 
 @pytest.fixture(scope="module")

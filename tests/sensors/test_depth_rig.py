@@ -15,8 +15,8 @@ from wearcap.geometry.camera import Camera
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
 from wearcap.metrics.surface import chamfer
-from wearcap.simulation.places.builder import WorldBuilder
 from wearcap_testing import benchmark
+from wearsim.places.builder import WorldBuilder
 
 rig = benchmark("depth_rig")
 Background = rig.Background

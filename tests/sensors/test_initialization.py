@@ -23,7 +23,7 @@ from wearcap.sensors.initialization import (
     yaw_between,
 )
 from wearcap.sensors.path_fusion import DriftPrior
-from wearcap.sensors.suit import SuitNoise, suit_motion
+from wearsim.sensors.suit import SuitNoise, suit_motion
 
 PAPER = InitializationSettings("tangent")
 

@@ -9,9 +9,9 @@ from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording import Motion
-from wearcap.sensors.keypoints import ACTION_CAMERA, action_camera, camera_path, seen_joints
-from wearcap.sensors.slam import R_DEVICE_CAM
 from wearcap_testing import benchmark, swaying_motion
+from wearsim.sensors.keypoints import ACTION_CAMERA, action_camera, camera_path, seen_joints
+from wearsim.sensors.slam import R_DEVICE_CAM
 
 WRISTS = ("left_wrist", "right_wrist")
 

@@ -10,7 +10,7 @@ from boxes import BOX_FACES, box_corners
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.recording import HeadStream
-from wearcap.sensors.slam import CAMERA, R_DEVICE_CAM, SlamPoints, keyframes, semidense_points, textured_points
+from wearsim.sensors.slam import CAMERA, R_DEVICE_CAM, SlamPoints, keyframes, semidense_points, textured_points
 
 EXACT = SlamPoints(noise_at_2m=0.0, outliers=0.0)
 

@@ -11,7 +11,7 @@ from wearcap.body.skeleton import FOOT_PATCHES, Skeleton, xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import Motion
-from wearcap.sensors.suit import (
+from wearsim.sensors.suit import (
     SUITS,
     BodyErrors,
     ContactErrors,

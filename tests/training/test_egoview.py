@@ -18,7 +18,6 @@ from wearcap.models.checkpoint import read_checkpoint
 from wearcap.models.image_encoder import EgoViewEncoder
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.recording.recording import CameraStream
-from wearcap.sensors.slam import R_DEVICE_CAM
 from wearcap.systems.hmd2.egoview_frames import (
     HANDS,
     POINTS,
@@ -31,6 +30,7 @@ from wearcap.systems.hmd2.egoview_frames import (
 )
 from wearcap.systems.hmd2.egoview_training import view_scores
 from wearcap_testing import recording_of, swaying_motion
+from wearsim.sensors.slam import R_DEVICE_CAM
 
 CAMERA = Camera.pinhole(96, 72, 85)
 COLOURS = {"left": (230, 60, 40), "right": (40, 80, 230)}

@@ -3,12 +3,12 @@
 import numpy as np
 
 from wearcap.scene.scan import Scan
-from wearcap.simulation.places.builder import WorldBuilder
-from wearcap.simulation.places.furniture import MAKERS
-from wearcap.simulation.places.outline import rectangle
-from wearcap.simulation.places.world import Room
-from wearcap.simulation.rendering.scan import Scanner, scan_world
-from wearcap.simulation.rendering.views import Scenery
+from wearsim.places.builder import WorldBuilder
+from wearsim.places.furniture import MAKERS
+from wearsim.places.outline import rectangle
+from wearsim.places.world import Room
+from wearsim.rendering.scan import Scanner, scan_world
+from wearsim.rendering.views import Scenery
 
 ROOM = (0.0, 0.0, 4.2, 3.4)
 DOOR_X, DOOR_Y = 1.4, 3.4

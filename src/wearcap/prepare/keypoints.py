@@ -20,7 +20,7 @@ from wearcap.prepare.engine import Report, Task, content_hash, prepare
 from wearcap.prepare.files import with_own_files
 from wearcap.recording.recording import CameraStream, Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
-from wearcap.sensors.keypoints import action_camera, camera_path, seen_joints
+from wearsim.sensors.keypoints import action_camera, camera_path, seen_joints
 
 VERSION = 2
 """Version of the conversion, increased when the same recording and settings yield another one."""

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 import wearcap.sensors
-import wearcap.simulation
+import wearsim
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry import rotation
@@ -27,24 +27,24 @@ from wearcap.io.formats.scene_folder import CLOUD
 from wearcap.prepare.engine import Splits, Task, content_hash
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import SPLITS, RecordingFile, RecordingStore
-from wearcap.sensors.slam import semidense_points
-from wearcap.sensors.suit import SuitNoise
-from wearcap.simulation.places.site import changed_world
-from wearcap.simulation.places.surround import surround
-from wearcap.simulation.recordings.hps import HpsConfig, Protocol, simulate_hps
-from wearcap.simulation.recordings.interaction_session import (
+from wearsim.places.site import changed_world
+from wearsim.places.surround import surround
+from wearsim.recordings.hps import HpsConfig, Protocol, simulate_hps
+from wearsim.recordings.interaction_session import (
     InteractionConfig,
     ObjectConfig,
     simulate_interactions,
     simulate_objects,
 )
-from wearcap.simulation.recordings.localization_noise import LocalizationNoise
-from wearcap.simulation.recordings.measured import EnvironmentErrors, as_measured
-from wearcap.simulation.recordings.simulate import SimulationConfig, simulate_recording
-from wearcap.simulation.rendering.ego_view import write_ego_video
-from wearcap.simulation.rendering.head_camera import HEAD_CAMERA_TRUTH, Filming, write_head_video
-from wearcap.simulation.rendering.scan import SceneSettings, scan_world, write_scene
-from wearcap.simulation.rendering.views import Scenery
+from wearsim.recordings.localization_noise import LocalizationNoise
+from wearsim.recordings.measured import EnvironmentErrors, as_measured
+from wearsim.recordings.simulate import SimulationConfig, simulate_recording
+from wearsim.rendering.ego_view import write_ego_video
+from wearsim.rendering.head_camera import HEAD_CAMERA_TRUTH, Filming, write_head_video
+from wearsim.rendering.scan import SceneSettings, scan_world, write_scene
+from wearsim.rendering.views import Scenery
+from wearsim.sensors.slam import semidense_points
+from wearsim.sensors.suit import SuitNoise
 
 MADE = "made.json"
 """File in a scene's folder that holds the settings with which it was made."""
@@ -54,7 +54,7 @@ TURNS, DOWN_DEG, VIEW_S = 12, (0.0, 38.0), 0.25
 
 def source_files() -> str:
     """Digest of the simulator's source code."""
-    folders = [Path(package.__file__ or "").parent for package in (wearcap.simulation, wearcap.sensors)]
+    folders = [Path(package.__file__ or "").parent for package in (wearsim, wearcap.sensors)]
     return content_hash(*(path for folder in folders for path in sorted(folder.rglob("*.py"))))
 
 

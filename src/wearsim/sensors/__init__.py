@@ -1,0 +1,1 @@
+"""Simulated sensors of the simulated wearer: suit, SLAM points, keypoints in view."""
