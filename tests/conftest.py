@@ -14,7 +14,7 @@ from hypothesis import settings
 from jaxtyping import install_import_hook
 
 gc.disable()  # until all is imported, which leaves little to collect
-install_import_hook(["wearcap", "wearsim"], "shapes.checker")
+install_import_hook(["wearcap", "wearsim", "data_prep"], "shapes.checker")
 
 # What tests remember of files (checksums) is not the user's; it goes with the system's temporary files.
 os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="wearcap-tests-")

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from data_prep.hcontact import read_smpl_json
 from wearcap.boundary import limits
 from wearcap.boundary.arrays import read_npz
 from wearcap.boundary.pickles import read_pickle
 from wearcap.boundary.texts import read_json, read_text, read_yaml_object
 from wearcap.errors import WearcapError
-from wearcap.io.datasets.hcontact import read_smpl_json
 from wearcap.io.formats.asf_amc import read_asf
 from wearcap.io.formats.bvh import read_bvh_content
 from wearcap.io.formats.camera_json import read_photos
