@@ -1,4 +1,4 @@
-"""What is lost when a writer is killed: prepare, train, capture, export, annotate and a stream's save, at random moments.
+"""What is lost when a writer is killed: prepare, train, capture, export and annotate, at random moments.
 
 Each writer works in a process of its own that is killed (SIGKILL) and started again in the same folder, with TMPDIR on
 another file system where there is one (/dev/shm). After every kill each file must be whole, and nothing may be older than
@@ -25,22 +25,14 @@ from rich.progress import track
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
 
-from wearcap.body.skeleton import xsens23
+from own_bvh import read_bvh
 from wearcap.cli import capture, export, train
-from wearcap.diffusion.schedule import CosineSchedule
 from wearcap.export.files import open_exported
-from wearcap.geometry.rigid import Rigid
-from wearcap.io.formats.bvh import read_bvh
 from wearcap.io.formats.contact_labels import LabelClock
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.models.checkpoint import read_checkpoint, read_run_file
 from wearcap.prepare.engine import Task, prepare
 from wearcap.recording import RecordingStore
-from wearcap.runtime.wearer import Wearer
-from wearcap.systems.hmd2.features import HeadFeatures
-from wearcap.systems.hmd2.model import MotionDenoiser
-from wearcap.systems.hmd2.pipeline import HMD2, DiffusionModel, Overlap, Sampling
-from wearcap.systems.hmd2.stream import HeadSample, HMD2Session
 from wearcap.training.loggers import read_metrics
 from wearcap.training.run import RunCheckpointIO
 from wearcap.viewer.annotate import AnnotationFile
@@ -217,41 +209,12 @@ def _check_annotated(folder: Path, least: int) -> None:
         json.loads(path.read_text(encoding="utf-8"))
 
 
-def _pipeline() -> HMD2:
-    torch.manual_seed(0)
-    features = HeadFeatures(contacts=True, body=True)
-    net = MotionDenoiser(features.motion_size, features.condition_size, 60, 32, 1, 4, 64, frames_per_token=4)
-    model = DiffusionModel(net, features, CosineSchedule(), xsens23(), 60.0)
-    return HMD2(model, Sampling(steps=1), Overlap(stride=10, lookahead=0), live=True)
-
-
-def _stream(folder: Path, finished: Finished) -> None:
-    path, recording, pipeline = folder / "session.safetensors", _recording(0), _pipeline()
-    session = HMD2Session.load(path, pipeline) if path.is_file() else HMD2Session(pipeline, [Wearer(xsens23())], [0])
-    frame = int(json.loads((folder / "frame.json").read_text())) if (folder / "frame.json").is_file() else 0
-    while True:
-        head, at = recording.head, frame % FRAMES
-        pose = Rigid(head.R_world_device[at], head.t_world_device[at])
-        session.push([[HeadSample(frame / 60.0, pose)]])
-        session.poses()
-        frame += 1
-        session.save(path)
-        finished(frame)
-
-
-def _check_stream(folder: Path, least: int) -> None:
-    path = folder / "session.safetensors"
-    if least or path.is_file():
-        HMD2Session.load(path, _pipeline()).poses(ended=True)
-
-
 WRITERS = {
     "prepare": Writer(_prepare, _check_prepared, 2.0),
     "train": Writer(_train, _check_trained, 6.0),
     "capture": Writer(_capture, _check_captured, 4.0),
     "export": Writer(_export, _check_exported, 6.0),
     "annotate": Writer(_annotate, _check_annotated, 1.0),
-    "stream": Writer(_stream, _check_stream, 1.0),
 }
 
 

@@ -322,7 +322,7 @@ READERS: dict[str, Reader] = {
         lambda folder: behave.read_behave(folder, one_object_files.BEHAVE_NAME),
     ),
     "behave_mesh": Reader(one_object_files.write_behave, lambda folder: behave.read_behave_mesh(folder, "boxlarge")),
-    "bvh": _made("a.bvh", lambda path: bvh.write_bvh(swaying_motion(4), path), bvh.read_bvh),
+    "bvh": _made("a.bvh", lambda path: bvh.write_bvh(swaying_motion(4), path), bvh.read_bvh_content),
     "foreign_bvh": _made("a.bvh", _foreign_walk, foreign.read_foreign_motion),
     "camera_json": _made("c.json", lambda path: camera_json.write_camera(LENS, path), camera_json.read_camera),
     "colmap_text": Reader(test_colmap.write_text_model, colmap.read_colmap),
@@ -331,7 +331,7 @@ READERS: dict[str, Reader] = {
         "c.json", json.dumps(CONTACTS), lambda path: contact_labels.read_contact_labels(path, CLOCK)
     ),
     "csv_table": _one(
-        "a.csv", "a,b,n\n1,x,3\n2.5,y,4\n", lambda path: csv_table.read_columns(path, ["a"], text=["b"], whole=["n"])
+        "a.csv", "a,b,n\n1,x,3\n2.5,y,4\n", lambda path: csv_table.read_columns(path, ["a"], text=["b"], integers=["n"])
     ),
     "egohoi": Reader(
         lambda folder: test_egohoi.write_set(folder, FRAMES), lambda folder: egohoi.read_egohoi(folder, test_egohoi.ONE)

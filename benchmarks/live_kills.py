@@ -18,7 +18,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from wearcap.io.formats.bvh import read_bvh
+from wearcap.io.formats.bvh import read_bvh_content
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.live.sinks.files import join_sections
 
@@ -59,7 +59,7 @@ def killed(folder: Path, after_s: float) -> tuple[int, float]:
         read_motion(path)
         opened += 1
     for path in wearer.glob("motion-*.bvh"):
-        read_bvh(path)
+        read_bvh_content(path)
         opened += 1
     kept_s = join_sections(wearer).timestamps[-1].item() + 1 / 60 if opened else 0.0
     return opened, sent_s - kept_s

@@ -9,7 +9,7 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "wearcap"
 ROOT = SOURCE.parents[1]
 FLOORS = (
-    ("errors", "files", "locks", "spread", "workers", "boundary"),
+    ("errors", "files", "locks", "parallel", "workers", "boundary"),
     ("geometry",),
     ("body", "scene"),
     ("recording",),
@@ -27,7 +27,7 @@ LEVEL = {folder: level for level, floor in enumerate(FLOORS) for folder in floor
 LIGHTNING = {"lightning", "pytorch_lightning", "torchmetrics"}
 HYDRA = {"hydra", "omegaconf"}
 TRAINING = {"training", "calibration", "validation"} | {
-    f"{name}_training" for name in ("egoview", "manifold", "object", "point_codes")
+    f"{name}_training" for name in ("egoview", "manifold", "object", "voxel_autoencoder")
 }
 """Modules of a system that are LightningModules and callbacks."""
 PRIVATE_WORDS = {

@@ -263,7 +263,7 @@ def test_help_names_what_there_is():
 
 
 @pytest.mark.parametrize(
-    "source", sorted(set(verb.sources()) - {"embeddings", "keypoints", "motion_graph"})
+    "source", sorted(set(verb.sources()) - {"embeddings", "keypoints"})
 )  # these work on data sets that stand
 def test_every_source_composes_and_has_a_split_list(source):
     config = compose("prepare", [f"prepare={source}"])

@@ -14,7 +14,7 @@ from bad_packets import Mutator, broken, unchecked
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
 from wearcap.recording import Motion, Recording
-from wearcap.recording.growing import _piece_path, close_pieces, follow_pieces, write_piece
+from wearcap.recording.pieces import _piece_path, close_pieces, follow_pieces, write_piece
 from wearcap.systems.hps import stream as hps_stream
 from wearcap.systems.hps.energy import Solution
 from wearcap.systems.hps.pipeline import HPS

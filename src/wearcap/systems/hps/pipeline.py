@@ -23,7 +23,7 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, finite_difference, resample
 from wearcap.recording import Motion, Recording
-from wearcap.recording.growing import follow_pieces
+from wearcap.recording.pieces import follow_pieces
 from wearcap.recording.recording import Localization
 from wearcap.recording.timing import resampled
 from wearcap.runtime.needs import CAMERA, CONTACTS, LOCALIZATION, SCAN, SUIT, Need

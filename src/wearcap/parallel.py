@@ -24,8 +24,8 @@ Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
-class Spread:
-    """How items are spread. Raises WearcapError for an unknown backend, and for no jobs."""
+class Parallel:
+    """How items are spread over processes. Raises WearcapError for an unknown backend, and for no jobs."""
 
     jobs: int = -1
     """Number of items at a time, as joblib counts (-1: one per core); with 1 they are processed in this process."""

@@ -31,10 +31,10 @@ from wearcap.io.formats.scene_folder import cloud_file, used_files
 from wearcap.locks import folder_lock
 from wearcap.metrics.table import TRUTH, Row, decimals
 from wearcap.models.checkpoint import checkpoint_file, shared_checkpoints
+from wearcap.parallel import Parallel, divided, progress_bar, reason_of
 from wearcap.recording import RecordingStore
 from wearcap.runtime.stages import code_digest, digest
 from wearcap.runtime.system import StageOptions, System
-from wearcap.spread import Spread, divided, progress_bar, reason_of
 
 SHOWN = 3
 """Metrics of a table of recordings; its file has them all."""
@@ -71,7 +71,7 @@ def over_recordings(
     work: Work,
     store: RecordingStore,
     names: Sequence[str],
-    how: Spread,
+    how: Parallel,
     *,
     chunk: int = 1,
     notes: Path | None = None,
@@ -102,7 +102,7 @@ def over_recordings(
                 yield kept
                 done()
         chunks = divided(todo, chunk)
-        how = how if len(chunks) > 1 else Spread(jobs=1)
+        how = how if len(chunks) > 1 else Parallel(jobs=1)
         try:
             with closing(how.run(partial(_worked, work=work, notes=notes), chunks, lock)) as finished:
                 for outcomes in finished:
@@ -172,7 +172,7 @@ def settings_key(config: dict[str, Any], checkpoints: Sequence[str | Path], *mod
 
     `modules`: further ones whose code decides results.
     """
-    values, targets = list(_values(config)), {*modules, "wearcap.evaluation.whole"}
+    values, targets = list(_values(config)), {*modules, "wearcap.evaluation.datasets"}
     for key, value in values:
         parts = str(value).split(".")
         if key == "_target_" and parts[0] == "wearcap":

@@ -15,9 +15,9 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import about_axis, exp
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.live.clock_offset import LEAST_OFFSET_S, offset_by_turning
-from wearcap.live.first_minute import FirstMinute
 from wearcap.live.guided import ARMS, RAISE, STAND, TURN, WALK
 from wearcap.live.setup import Seat, Setup, hand_seat, read_setup, write_setup
+from wearcap.live.setup_estimation import SetupEstimation
 from wearcap.sensors.samples import HeadSample, SuitPiece, WatchSample, WristSample
 
 HEAD, HANDS = ("head",), ("head", "left_wrist", "right_wrist")
@@ -46,7 +46,7 @@ def watches(**changed):
 
 @pytest.mark.parametrize("height_m", [1.55, 1.82, 1.98])
 def test_height_of_someone_who_stands(height_m):
-    first = FirstMinute(HEAD)
+    first = SetupEstimation(HEAD)
     took_s = Devices().play(acting(height_m, [("stand", 5.0)]), first)
     assert took_s < 3.0
     assert first.found.skeleton.stature == pytest.approx(height_m, abs=0.01)
@@ -56,7 +56,7 @@ def test_height_of_someone_who_stands(height_m):
 
 
 def test_height_is_not_taken_while_walking_but_from_the_head_at_last():
-    first = FirstMinute(HEAD)
+    first = SetupEstimation(HEAD)
     took_s = Devices().play(acting(1.7, [("walk", 12.0)]), first)
     assert 8.0 < took_s < 9.0
     assert first.found.skeleton.stature == pytest.approx(1.7, abs=0.03)
@@ -64,18 +64,18 @@ def test_height_is_not_taken_while_walking_but_from_the_head_at_last():
 
 
 def test_a_given_height_starts_at_once_and_believes_only_its_own_floor():
-    first = FirstMinute(HEAD, height_m=1.9)
+    first = SetupEstimation(HEAD, height_m=1.9)
     assert Devices().play(acting(1.9, [("walk", 5.0)]), first) < 1.0
     assert (first.found.skeleton.stature, first.found.floor_m) == (pytest.approx(1.9), 0.0)
-    first = FirstMinute(HEAD, height_m=1.9)
+    first = SetupEstimation(HEAD, height_m=1.9)
     Devices(floor_m=-0.4).play(acting(1.9, [("walk", 5.0)]), first)
     assert first.found.floor_m is None
     with pytest.raises(WearcapError, match="height of 19"):
-        FirstMinute(HEAD, height_m=19.0)
+        SetupEstimation(HEAD, height_m=19.0)
 
 
 def test_without_a_floor_the_default_height_and_a_note():
-    first = FirstMinute(HEAD)
+    first = SetupEstimation(HEAD)
     took_s = Devices(floor_m=-1.6).play(acting(1.6, [("stand", 12.0)]), first)
     assert 8.0 < took_s < 9.0
     assert first.found.skeleton.stature == pytest.approx(xsens23().stature)
@@ -86,7 +86,7 @@ def test_without_a_floor_the_default_height_and_a_note():
 @pytest.mark.parametrize(("guided", "seconds"), [(False, 8.0), (True, 2.2)])
 def test_who_sits_keeps_the_default_height_and_the_floor(guided, seconds):
     """A head that is still at 1.12 m: as that of somebody of 1.25 m who stands."""
-    first, motion = FirstMinute(HEAD, guided=guided), acting(1.75, [("stand", 12.0)])
+    first, motion = SetupEstimation(HEAD, guided=guided), acting(1.75, [("stand", 12.0)])
     motion = replace(motion, t_world_root=motion.t_world_root - torch.tensor([0.0, 0.0, 0.45]))
     assert Devices().play(motion, first) == pytest.approx(seconds, abs=0.5)
     assert first.found.skeleton.stature == pytest.approx(xsens23().stature)
@@ -95,13 +95,13 @@ def test_who_sits_keeps_the_default_height_and_the_floor(guided, seconds):
 
 
 def test_a_child_who_walks_is_no_wearer_who_sits():
-    first = FirstMinute(HEAD)
+    first = SetupEstimation(HEAD)
     Devices().play(acting(1.3, [("stand", 3.0), ("walk", 12.0)]), first)
     assert first.found.skeleton.stature == pytest.approx(1.3, abs=0.03)
 
 
 def test_a_floor_that_the_device_knows():
-    first = FirstMinute(HEAD)
+    first = SetupEstimation(HEAD)
     first.see("head", HeadSample(99.9, None, floor_height=2.5), 4.9)
     Devices(floor_m=2.5).play(acting(1.65, [("stand", 5.0)]), first)
     assert first.found.floor_m == 2.5
@@ -110,7 +110,7 @@ def test_a_floor_that_the_device_knows():
 
 @pytest.mark.parametrize("names", [("left_wrist", "right_wrist"), ("B", "A"), ("A", "B"), ("left_wrist", "LHR-1")])
 def test_controllers_become_wrists_of_the_right_side(names):
-    first, devices = FirstMinute(HANDS), Devices(names=names, T_wrist_device=controllers())
+    first, devices = SetupEstimation(HANDS), Devices(names=names, T_wrist_device=controllers())
     motion = acting(1.8, [("stand", 5.0)])
     assert devices.play(motion, first) < 3.5
     for side, joint in enumerate(HANDS[1:]):
@@ -124,7 +124,7 @@ def test_controllers_become_wrists_of_the_right_side(names):
 
 @pytest.mark.parametrize("names", [("left_wrist", "right_wrist"), ("watch-9", "watch-1")])
 def test_watches_are_seated_roughly_by_hanging_arms(names):
-    first, devices = FirstMinute(HANDS, tracked=False), watches(names=names)
+    first, devices = SetupEstimation(HANDS, tracked=False), watches(names=names)
     assert devices.play(acting(1.75, [("stand", 6.0)]), first) < 4.0
     for side, joint in enumerate(HANDS[1:]):
         seat = first.found.seats[names[side]]
@@ -135,7 +135,7 @@ def test_watches_are_seated_roughly_by_hanging_arms(names):
 
 
 def test_a_device_that_is_missing_is_not_waited_for_forever():
-    first = FirstMinute(HANDS)
+    first = SetupEstimation(HANDS)
     took_s = Devices(names=("left_wrist", "")).play(acting(1.8, [("stand", 20.0)]), first)
     assert 15.0 < took_s < 16.0
     assert first.found.seats.keys() == {"head", "left_wrist", "right_wrist"}
@@ -143,7 +143,7 @@ def test_a_device_that_is_missing_is_not_waited_for_forever():
 
 
 def test_a_suit_brings_its_own_skeleton():
-    first = FirstMinute(("suit", "camera"))
+    first = SetupEstimation(("suit", "camera"))
     motion = acting(1.66, [("stand", 0.1)])
     first.see("suit", SuitPiece(motion), 0.0)
     assert first.found.skeleton is motion.skeleton
@@ -157,7 +157,7 @@ def test_guided_head_is_levelled():
     """A headset that is tilted on the head, in a world whose floor is not known, with a given height."""
     tilt = about_axis("y", torch.tensor(math.radians(20.0)))
     devices = Devices(T_head_device=Rigid(tilt, torch.tensor([0.09, 0.0, 0.075])), floor_m=0.7)
-    first = FirstMinute(HEAD, height_m=1.8, guided=True)
+    first = SetupEstimation(HEAD, height_m=1.8, guided=True)
     assert (first.step.name, first.step.progress) == (STAND, 0.0)
     devices.play(acting(1.8, GUIDED), first)
     assert degrees(first.found.seats["head"].R_joint_device, tilt) < 1.0
@@ -167,7 +167,7 @@ def test_guided_head_is_levelled():
 
 @pytest.mark.parametrize("names", [("left_wrist", "right_wrist"), ("watch-9", "watch-1"), ("watch-1", "watch-9")])
 def test_guided_watches(names):
-    first, devices = FirstMinute(HANDS, tracked=False, guided=True), watches(names=names)
+    first, devices = SetupEstimation(HANDS, tracked=False, guided=True), watches(names=names)
     took_s = devices.play(acting(1.75, GUIDED), first)
     assert took_s < 25.0
     assert first.found.skeleton.stature == pytest.approx(1.75, abs=0.01)
@@ -180,7 +180,7 @@ def test_guided_watches(names):
 
 
 def test_watches_whose_application_sends_a_second_at_once():
-    first, devices = FirstMinute(HANDS, tracked=False, guided=True), watches(batch_s=1.0)
+    first, devices = SetupEstimation(HANDS, tracked=False, guided=True), watches(batch_s=1.0)
     devices.play(acting(1.75, GUIDED), first)
     assert not [note for note in first.found.notes if "too long" in note]
     for side, joint in enumerate(HANDS[1:]):
@@ -191,7 +191,7 @@ def test_watches_whose_application_sends_a_second_at_once():
 def test_guided_trackers_strapped_anyhow():
     """Trackers of unknown place that are no controllers: sides by where they hang, seats by the hanging arm."""
     turned = tuple(Rigid(exp(torch.tensor([0.2, 3.0, -0.4])), torch.zeros(3)) for _ in range(2))
-    first = FirstMinute(HANDS, guided=True)
+    first = SetupEstimation(HANDS, guided=True)
     Devices(names=("T2", "T1"), T_wrist_device=turned).play(acting(1.7, GUIDED), first)
     for device, joint in (("T2", "left_wrist"), ("T1", "right_wrist")):
         seat = first.found.seats[device]
@@ -200,7 +200,7 @@ def test_guided_trackers_strapped_anyhow():
 
 
 def test_steps_say_why_they_wait_and_can_be_skipped_and_done_again():
-    first, devices = FirstMinute(HANDS, tracked=False, guided=True), watches()
+    first, devices = SetupEstimation(HANDS, tracked=False, guided=True), watches()
     devices.play(acting(1.75, [("walk", 4.0)]), first)
     assert first.step.name == STAND
     assert str(first.step) == "Stand still and look straight ahead. Head still moves."
@@ -220,7 +220,7 @@ def test_steps_say_why_they_wait_and_can_be_skipped_and_done_again():
 
 
 def test_a_step_that_takes_too_long_is_left():
-    first = FirstMinute(HEAD, guided=True)
+    first = SetupEstimation(HEAD, guided=True)
     took_s = Devices().play(acting(1.75, [("walk", 30.0)]), first)
     assert 25.0 < took_s < 26.0
     assert "too long" in " ".join(first.found.notes)
@@ -229,7 +229,7 @@ def test_a_step_that_takes_too_long_is_left():
 def test_all_steps_in_their_order():
     """Watches whose x axis shows no side: the raised left hand decides."""
     across = Rigid(exp(torch.tensor([0.0, 0.0, 0.1])), torch.zeros(3))
-    first = FirstMinute(HANDS, tracked=False, guided=True)
+    first = SetupEstimation(HANDS, tracked=False, guided=True)
     devices = Devices(watches=True, names=("a", "b"), T_wrist_device=(across, across))
     steps, motion = [], acting(1.75, GUIDED)
     original = first.look
@@ -304,10 +304,10 @@ def test_a_damaged_setup_is_refused_in_one_line(tmp_path, place, value):
 
 
 def test_the_setup_of_last_time_spares_the_waiting():
-    before = FirstMinute(HANDS)
+    before = SetupEstimation(HANDS)
     devices = Devices(names=("X", "Y"), T_wrist_device=controllers())
     devices.play(acting(1.83, [("stand", 5.0)]), before)
-    again = FirstMinute(HANDS, setup=before.found)
+    again = SetupEstimation(HANDS, setup=before.found)
     assert devices.play(acting(1.83, [("walk", 5.0)]), again) < 1.0
     assert again.found.skeleton == before.found.skeleton
     assert {name: seat.joint for name, seat in again.found.seats.items()} == {
@@ -325,7 +325,7 @@ def test_the_setup_of_last_time_spares_the_waiting():
 @pytest.mark.parametrize("tracked", [False, True])
 def test_nothing_that_devices_send_raises(guided, tracked):
     random = torch.Generator().manual_seed(0)
-    first = FirstMinute(HANDS, tracked=tracked, guided=guided)
+    first = SetupEstimation(HANDS, tracked=tracked, guided=guided)
     bad = [float("nan"), float("inf"), -1e30, 1e9, None, "late", 3.0]
     for number in range(1500):
         pick = int(torch.randint(0, 12, (1,), generator=random))
@@ -351,7 +351,7 @@ def test_nothing_that_devices_send_raises(guided, tracked):
 
 
 def test_a_head_that_is_lost_and_a_clock_that_is_set_anew():
-    first, devices = FirstMinute(HEAD), Devices()
+    first, devices = SetupEstimation(HEAD), Devices()
     devices.play(acting(1.7, [("stand", 1.0)]), first)
     for number in range(60):
         first.see("head", HeadSample(101 + number / 60), 6 + number / 60)
@@ -387,7 +387,7 @@ GUIDED_WALK = [("stand", 6.0), ("turn", 8.0), ("stand", 4.0), ("walk", 9.0), ("s
 @pytest.mark.parametrize("batch_s", [0.0, 1.0])
 def test_watches_that_come_late_or_early_are_aligned_by_the_turn(batch_s):
     """The head leads by a tenth of a second, as people's do. The walk that follows is seen at its own time, too."""
-    first = FirstMinute(HANDS, tracked=False, guided=True)
+    first = SetupEstimation(HANDS, tracked=False, guided=True)
     devices = watches(offset_s=(-1.7, 0.6), batch_s=batch_s)
     took_s = devices.play(acting(1.75, GUIDED_WALK, head_leads_s=0.1), first)
     assert took_s < 26.0
@@ -403,14 +403,14 @@ def test_watches_that_come_late_or_early_are_aligned_by_the_turn(batch_s):
 
 @pytest.mark.parametrize("head_leads_s", [0.0, 0.06, 0.16])
 def test_a_head_that_turns_before_the_body_does_not_make_a_good_clock_worse(head_leads_s):
-    first, devices = FirstMinute(HANDS, tracked=False, guided=True), watches()
+    first, devices = SetupEstimation(HANDS, tracked=False, guided=True), watches()
     assert devices.play(acting(1.75, GUIDED_WALK, head_leads_s=head_leads_s), first) < 25.0
     assert [each.offset_s for each in devices.aligned.values()] == [0.0, 0.0]
     assert all(f"no offset of its clock above {LEAST_OFFSET_S}" in each.note for each in devices.aligned.values())
 
 
 def test_who_does_not_turn_is_told_that_the_clocks_are_as_before():
-    first, devices = FirstMinute(HANDS, tracked=False, guided=True), watches(offset_s=(-1.7, 0.6))
+    first, devices = SetupEstimation(HANDS, tracked=False, guided=True), watches(offset_s=(-1.7, 0.6))
     took_s = devices.play(acting(1.75, [("stand", 32.0), ("walk", 6.0)]), first)
     assert 25.0 < took_s < 36.0
     for joint in HANDS[1:]:
@@ -424,7 +424,7 @@ def test_a_head_that_turns_alone_is_asked_once_more_and_gives_nothing():
     turned = replace(still, R_parent_joint=still.R_parent_joint.clone())
     neck = still.skeleton.index("head")
     turned.R_parent_joint[:, neck] = still.R_parent_joint[:, 0].mT @ motion.R_parent_joint[:, 0]
-    first, devices = FirstMinute(HANDS, tracked=False, guided=True), watches()
+    first, devices = SetupEstimation(HANDS, tracked=False, guided=True), watches()
     devices.play(turned, first, until_s=17.0)
     assert str(first.step).endswith("wrist has not turned as far.")
     devices.play(turned, first, begin_s=117.0)

@@ -11,13 +11,13 @@ from wearcap.body.skeleton import WRISTS, Skeleton, skeleton_of_height, xsens23
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.live import wearing
+from wearcap.live import placement
 from wearcap.live.clock_offset import Aligned, aligned_by_turning, turned
 from wearcap.live.devices import MAX_DEVICES
 from wearcap.live.guided import ARMS, RAISE, SENTENCES, STAND, TURN, WALK, Step
 from wearcap.live.packets import HEAD
+from wearcap.live.placement import Seen, Window
 from wearcap.live.setup import Seat, Setup, hand_seat, head_seat
-from wearcap.live.wearing import Seen, Window
 from wearcap.sensors import packets
 from wearcap.sensors.samples import HeadSample, SuitPiece, WatchSample, WristSample
 from wearcap.tracking.stature import UNKNOWN, height_over, source_of
@@ -42,7 +42,7 @@ NO_CONTROLLER_DEG = 50.0
 """Angle between a hanging hand and a controller's nominal seat above which it is no controller that is held."""
 
 
-class FirstMinute:
+class SetupEstimation:
     """Finds the set-up of one wearer. `look` and `see` never raise for what devices send.
 
     By itself it starts as soon as possible; `guided`, step after step, each of which can be skipped and done again.
@@ -193,7 +193,7 @@ class FirstMinute:
         found = self._seen[device].between(start_s - lag_s, now_s - lag_s)
         if found is None or device != HEAD:
             return found
-        return wearing.head_of(found, Rigid(self._head.R_joint_device, self._head.t_joint_device))
+        return placement.head_of(found, Rigid(self._head.R_joint_device, self._head.t_joint_device))
 
     # --- devices --------------------------------------------------------------------------------------------------
 
@@ -267,7 +267,7 @@ class FirstMinute:
         worn = [device for device, seat in self._seats.items() if seat.joint in WRISTS and device in self._seen]
         if self._missing or any(device not in seen for device in worn):
             return False
-        still = not _sways(head) and not any(wearing.moves(seen[device], True) for device in worn)
+        still = not _sways(head) and not any(placement.moves(seen[device], True) for device in worn)
         if not still and not late:
             return False
         self._heading = rotation.yaw_of(rotation.mean_rotation(head.R)).item()
@@ -313,7 +313,7 @@ class FirstMinute:
 
     def _floor_below(self, head_m: float) -> float | None:
         """Floor height (m) that is believed below an upright head joint at `head_m`: the device's, that of last time, 0."""
-        low, high = wearing.HEAD_M
+        low, high = placement.HEAD_M
         if self.height_m is not None:
             upright = self.skeleton.height_of("head")
             low, high = upright - AGREE_M, upright + AGREE_M
@@ -323,9 +323,9 @@ class FirstMinute:
 
     def _place_trackers(self, head: Window, seen: dict[str, Window]) -> None:
         """Find the hands among trackers of unknown place, by the side of the head on which they are."""
-        places = {device: wearing.placed(head, seen[device]) for device in self._unplaced if device in seen}
+        places = {device: placement.placed(head, seen[device]) for device in self._unplaced if device in seen}
         above = None if self._floor_m is None else head.v[:, 2].median().item() - self._floor_m
-        for device, joint in wearing.sides_of(places, self._missing, above).items():
+        for device, joint in placement.sides_of(places, self._missing, above).items():
             self._seats[device] = self._nominal(joint)
             self.notes.append(
                 f"{_plain(joint)}: {device!r}, {abs(places[device].left_m):.2f} m to that side of the head."
@@ -334,7 +334,7 @@ class FirstMinute:
     def _place_watches(self, seen: dict[str, Window], sure: bool) -> None:
         """Find the sides of watches of unknown place: by how watches are usually worn, at last (`sure`) by their names."""
         for device in sorted(device for device in self._unplaced if device in seen):
-            joint = wearing.watch_side(seen[device].R)
+            joint = placement.watch_side(seen[device].R)
             missing = self._missing
             if joint in missing and joint is not None:
                 self._seats[device] = self._nominal(joint)
@@ -347,15 +347,15 @@ class FirstMinute:
         """Seat and heading of a watch on a hanging arm."""
         seat, R = self._seats[device], self._hanging[device]
         known = self.before is not None and device in self.before.seats
-        mount = None if known else wearing.watch_mount(R, seat.joint)
+        mount = None if known else placement.watch_mount(R, seat.joint)
         if mount is not None:
             seat = replace(seat, R_joint_device=mount)
         R_ref_joint = R @ seat.R_joint_device.mT
         if not known and mount is None:
             self.notes.append(f"{_plain(seat.joint)}: its z axis is along the arm; taken as mounted along the joint.")
-        elif not wearing.arm_is_down(R_ref_joint, seat.joint):
+        elif not placement.arm_is_down(R_ref_joint, seat.joint):
             self.notes.append(f"{_plain(seat.joint)}: the arm did not hang; its heading is a guess.")
-        yaw = wearing.hanging_yaw(R_ref_joint, seat.joint, self._heading)
+        yaw = placement.hanging_yaw(R_ref_joint, seat.joint, self._heading)
         self._seats[device] = replace(seat, yaw_rad=yaw)
         if rough:
             self.notes.append(f"{_plain(seat.joint)}: seat and heading are rough, from an arm that hangs.")
@@ -415,7 +415,7 @@ class FirstMinute:
                 continue
             if window is None or whole is None:
                 self._reason = f"{name} sends nothing."
-            elif _sways(whole) if device == HEAD else wearing.moves(whole, self._seen[device].watch):
+            elif _sways(whole) if device == HEAD else placement.moves(whole, self._seen[device].watch):
                 self._reason = f"{name} still moves."
             else:
                 continue
@@ -431,7 +431,7 @@ class FirstMinute:
         if not self._hold(()):
             return False
         raw = self._seen[HEAD].between(self._hold_s, self._now_s)
-        level = None if raw is None else wearing.level_head(raw.R)
+        level = None if raw is None else placement.level_head(raw.R)
         if level is None:
             self._reason, self._hold_s, self._progress = "Look straight ahead.", self._now_s, 0.0
             return False
@@ -460,7 +460,7 @@ class FirstMinute:
             return False
         self._heading = rotation.yaw_of(rotation.mean_rotation(head.R)).item()
         if self.tracked:
-            raised = next((device for device, one in seen.items() if wearing.placed(head, one).below_m < 0.25), None)
+            raised = next((device for device, one in seen.items() if placement.placed(head, one).below_m < 0.25), None)
             if raised is not None:
                 name = _plain(self._seats[raised].joint if raised in self._seats else raised)
                 self._reason, self._hold_s, self._progress = f"{name} is not down yet.", self._now_s, 0.0
@@ -479,7 +479,7 @@ class FirstMinute:
             self._seat_watch(device, rough=False)
             return
         seat, R = self._seats[device], rotation.mean_rotation(self._hanging[device])
-        R_world_joint = wearing.hanging(seat.joint, self._heading)
+        R_world_joint = placement.hanging(seat.joint, self._heading)
         off = math.degrees(rotation.geodesic(R @ seat.R_joint_device.mT, R_world_joint).item())
         if off > NO_CONTROLLER_DEG and self.before is None:
             self._seats[device] = replace(
@@ -494,7 +494,7 @@ class FirstMinute:
 
         What is not found within `STEP_S` is left as it is.
         """
-        start_s = max(self._hold_s - HOLD_S, self._now_s - wearing.KEEP_S + 1.0)
+        start_s = max(self._hold_s - HOLD_S, self._now_s - placement.KEEP_S + 1.0)
         worn = [device for device in self._seen if device in self._seats or (device != HEAD and self._missing)]
         watches = {device: self._track(device, start_s) for device in worn}
         head, over = self._track(HEAD, start_s), self._looked_s - self._step_s > STEP_S
@@ -545,11 +545,11 @@ class FirstMinute:
         return (up + 1) / (RAISED_UP + 1)
 
     def _walk(self) -> bool:
-        head = self._window(HEAD, max(self._hold_s, self._now_s - wearing.KEEP_S + 1.0))
+        head = self._window(HEAD, max(self._hold_s, self._now_s - placement.KEEP_S + 1.0))
         if head is None:
             self._reason = "" if self._now_s - self._hold_s < 1.0 else "The head is not tracked."
             return False
-        walk = wearing.walk_of(head)
+        walk = placement.walk_of(head)
         shown = walk.before(self._now_s - self.late_s)
         self._progress = shown.seconds / WALKED_S
         self._reason = "" if walk.seconds else "You are not walking yet."
@@ -558,7 +558,9 @@ class FirstMinute:
         for device, seat in list(self._seats.items()):
             watch = None if seat.joint not in WRISTS else self._window(device, head.timestamps[0].item())
             yaw = (
-                None if watch is None else wearing.swing_yaw(walk, watch, seat.R_joint_device, seat.joint, seat.yaw_rad)
+                None
+                if watch is None
+                else placement.swing_yaw(walk, watch, seat.R_joint_device, seat.joint, seat.yaw_rad)
             )
             if yaw is not None:
                 self._seats[device] = replace(seat, yaw_rad=yaw)
@@ -584,7 +586,7 @@ class FirstMinute:
 
 def _sways(head: Window) -> bool:
     """Whether a head moves more than that of someone who stands; it may turn."""
-    return (head.v - head.v.median(0).values).norm(dim=-1).max().item() > wearing.STILL_M
+    return (head.v - head.v.median(0).values).norm(dim=-1).max().item() > placement.STILL_M
 
 
 def _plain(joint: str) -> str:
