@@ -30,7 +30,7 @@ from wearcap.cli import capture, evaluate, export, prepare, train
 from wearcap.cli.conf import compose, load_pipeline
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.recording import Motion, Recording
-from wearcap.recording.acts import true_acts
+from wearcap.recording.active_objects import true_spans
 from wearcap.recording.serialize import flatten
 from wearcap.recording.store import dataset_folder, load_recording
 from wearcap.recording.timing import joined
@@ -302,9 +302,6 @@ def hmd2_streamed() -> Motion | None:
         session.push([[HeadSample(now, head.T_world_device[number], points.points_world[new], embedding)]])
         parts += session.poses()
         before = now
-        if number == len(head.timestamps) // 2:
-            session.save("streams/hmd2.safetensors")
-            session = HMD2Session.load("streams/hmd2.safetensors", pipeline)
     return joined([part for part in (*parts, *session.poses(ended=True)) if part is not None])
 
 
@@ -337,9 +334,9 @@ def echo_streamed() -> Motion | None:
     environment = CaptureInput(recording, dataset_folder(place)).objects()
     wearer = Wearer(recording.skeleton, head.R_head_device, head.t_head_device, shape=recording.shape)
     session = EchoStream(pipeline, wearer, environment, seed=3)
-    for act in true_acts(recording):
-        session.activate(act.object, act.start_s)
-        session.activate(None, act.stop_s)
+    for span in true_spans(recording):
+        session.activate(span.object, span.start_s)
+        session.activate(None, span.stop_s)
     parts = []
     wrists = {joint: motion.joint(joint) for joint in ("left_wrist", "right_wrist")}
     for number, now in enumerate(motion.timestamps.tolist()):

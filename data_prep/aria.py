@@ -1,8 +1,30 @@
-"""The same as `wearcap prepare aria`: python data_prep/aria.py source=DIR [key=value …]"""
+"""Project Aria's recordings after Meta's machine perception services (MPS)."""
 
-import sys
+from functools import partial
+from pathlib import Path
 
-from wearcap.cli.main import run_verb
+from wearcap.errors import WearcapError
+from wearcap.io.devices.aria_mps import is_mps_folder, mps_files, read_mps
+from wearcap.prepare.engine import Splits, Task, changed, content_hash, source_folder
 
-if __name__ == "__main__":
-    sys.exit(run_verb("prepare", ["aria", *sys.argv[1:]]))
+VERSION = 2
+"""Version of the conversion, increased when the same source and settings yield another recording."""
+
+
+def aria_tasks(source: str | Path, splits: Splits, subject: str, fps: float | int, license: str) -> list[Task]:
+    """One task per closed-loop trajectory at or below `source`, named after its recording's folder."""
+    source = source_folder(source)
+    folders: dict[Path, Path] = {}  # by trajectory, the outermost folder: REC of REC/slam and REC/mps/slam, too
+    for folder in sorted([source, *(path for path in source.rglob("*") if path.is_dir())]):
+        if is_mps_folder(folder):
+            folders.setdefault(mps_files(folder)[0], folder)
+    if not folders:
+        raise WearcapError("no MPS output", where=source, expected="folders with closed_loop_trajectory.csv")
+    tasks = []
+    for folder in folders.values():
+        name = folder.resolve().name
+        key = content_hash(name, subject, float(fps), VERSION, *mps_files(folder))
+        read = partial(read_mps, folder, fps=float(fps))
+        make = partial(changed, read, name=name, subject=subject, license=license)
+        tasks.append(Task(name, make, splits.of(subject), key))
+    return tasks

@@ -1,8 +1,41 @@
-"""The same as `wearcap prepare ui_prmd`: python data_prep/ui_prmd.py source=DIR [key=value …]"""
+"""UI-PRMD (Vakanski et al. 2018): 39 Plug-in-Gait markers of exercises at 100 Hz, millimetres, z up, dropped ones zero.
 
-import sys
+A trial is a text file of the original, one frame a row, or `TRIAL.d2.npy.xz`: second differences in time of hundredths of a
+millimetre. The markers' order, which no file states, was inferred from Vicon's list and checked on sides and heights.
+"""
 
-from wearcap.cli.main import run_verb
+from pathlib import Path
 
-if __name__ == "__main__":
-    sys.exit(run_verb("prepare", ["ui_prmd", *sys.argv[1:]]))
+import numpy as np
+import torch
+
+from wearcap.boundary.arrays import read_npy
+from wearcap.boundary.texts import at_line, finite_floats, numbered_lines
+from wearcap.errors import WearcapError
+from wearcap.io.formats.trc import Markers
+
+FPS = 100.0
+_TRUNK, _ARM, _LEG = (
+    "LFHD RFHD LBHD RBHD C7 T10 CLAV STRN RBAK",
+    "SHO UPA ELB FRM WRA WRB FIN",
+    "THI KNE TIB ANK HEE TOE",
+)
+_LIMBS = [side + name for limb in (_ARM, "ASI", "PSI", _LEG) for side in "LR" for name in limb.split()]
+NAMES = (*_TRUNK.split(), *_LIMBS)
+
+
+def read_ui_prmd(path: str | Path) -> Markers:
+    """Markers of one trial. Raises WearcapError for a file that is not of either form."""
+    if ".npy" in Path(path).suffixes:
+        steps = read_npy(path)
+        steps = steps.astype(np.int64) if steps.dtype.kind == "i" and steps.ndim == 2 else np.zeros((0, 0), np.int64)
+        mm = steps.cumsum(0).cumsum(0) / 100.0
+    else:
+        lines = [(number, line.replace(",", " ").split()) for number, line in numbered_lines(path, "table")]
+        rows = [finite_floats(words, at_line(path, number)) for number, words in lines if len(words) == 3 * len(NAMES)]
+        mm = np.array(rows) if len(rows) == len(lines) else np.zeros((0, 0))
+    if not mm.size or mm.shape[1] != 3 * len(NAMES):
+        raise WearcapError("no trial of UI-PRMD", path, f"rows of {3 * len(NAMES)} numbers (whole ones in .d2.npy)")
+    points = torch.from_numpy(mm.reshape(len(mm), -1, 3) / 1000)
+    points[(points == 0).all(-1)] = torch.nan
+    return Markers(torch.arange(len(points), dtype=torch.float64) / FPS, NAMES, points)

@@ -9,5 +9,5 @@ import wearcap
 
 recording = wearcap.read(sys.argv[1], height=float(sys.argv[3]) if len(sys.argv) > 3 else None)
 motion = wearcap.load("hmd2")(recording)
-motion.save(sys.argv[2])
+wearcap.save(motion, sys.argv[2])
 print(f"{len(motion)} frames at {motion.fps:.0f} Hz: {sys.argv[2]}")

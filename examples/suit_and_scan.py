@@ -10,7 +10,7 @@ import wearcap
 
 recording = wearcap.source(sys.argv[1])  # with its scan
 motion = wearcap.load("hps")(recording)
-motion.save(sys.argv[2])
+wearcap.save(motion, sys.argv[2])
 suit = wearcap.load("recorded")(recording)
 left = (motion.t_world_root - motion.t_world_root[0]).norm(dim=1)[-1] - (suit.t_world_root - suit.t_world_root[0]).norm(
     dim=1

@@ -10,5 +10,5 @@ import wearcap
 
 recording = wearcap.read(sys.argv[1], height=float(sys.argv[3]))
 motion = wearcap.load("mocap_every")(recording)
-motion.save(sys.argv[2])
+wearcap.save(motion, sys.argv[2])
 print(f"{len(motion)} frames at {motion.fps:.0f} Hz: {sys.argv[2]}")

@@ -16,11 +16,11 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.environment import write_environment
 from wearcap.recording import ContactTrack, FloorTrack, HeadStream, Recording, RecordingStore
-from wearcap.recording.acts import true_acts
+from wearcap.recording.active_objects import true_spans
 from wearcap.recording.motion import Interactions
 from wearcap.scene.objects import Environment, Freedom, SceneObject
 from wearcap.systems.echo.contacts import ContactUse
-from wearcap.systems.echo.features import CONTACTS, EchoFeatures
+from wearcap.systems.echo.features import CONTACTS, OBJECT_SIZE, EchoFeatures
 from wearcap.systems.echo.model import EchoDenoiser
 from wearcap.systems.echo.observations import Scenario
 from wearcap.systems.echo.pipeline import Echo, Sampling
@@ -98,20 +98,14 @@ def small_features(frame: str = "own", **changes) -> EchoFeatures:
 def small_net(features: EchoFeatures, **changes) -> EchoDenoiser:
     """A network with random weights, and statistics with which any output is a valid pose."""
     torch.manual_seed(0)
-    sizes = (
-        features.human_size,
-        features.object_size,
-        CONTACTS,
-        features.condition_size,
-        features.object_condition_size,
-    )
+    sizes = (features.human_size, OBJECT_SIZE, CONTACTS, features.condition_size, features.object_condition_size)
     settings = {"window": WINDOW, "width": 32, "layers": 1, "heads": 2, "feedforward": 32, "dropout": 0.0}
     net = EchoDenoiser(*sizes, **settings | changes)
     for parameter in net.parameters():
         torch.nn.init.normal_(parameter, std=0.1)
     mean, scale = torch.zeros(sum(net.sizes)), torch.full((sum(net.sizes),), 0.5)
     mean[9 : features.human_size] = torch.tensor([1.0, 0, 0, 0, 1.0, 0]).repeat(features.joints - 1)
-    scale[net.sizes[0] + features.object_size :] = 1.0
+    scale[net.sizes[0] + OBJECT_SIZE :] = 1.0
     net.motion_normalizer.set(mean, scale)
     return net.eval()
 
@@ -134,5 +128,5 @@ def with_settings(model: EchoModel, kind: type[Echo] = Echo, **settings) -> Echo
 
 def scenario_of(recording: Recording, carried=CARRIED, margin_s: float = 0.1, **changes) -> Scenario:
     """The scenario of a walk with boxes."""
-    acts = tuple(true_acts(recording, margin_s)) if recording.object_motion else ()
-    return Scenario(recording, boxes(carried), acts, **changes)
+    spans = tuple(true_spans(recording, margin_s)) if recording.object_motion else ()
+    return Scenario(recording, boxes(carried), spans, **changes)

@@ -14,7 +14,7 @@ from hypothesis import settings
 from jaxtyping import install_import_hook
 
 gc.disable()  # until all is imported, which leaves little to collect
-install_import_hook(["wearcap", "wearsim"], "shapes.checker")
+install_import_hook(["wearcap", "wearsim", "data_prep"], "shapes.checker")
 
 # What tests remember of files (checksums) is not the user's; it goes with the system's temporary files.
 os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="wearcap-tests-")
@@ -50,8 +50,8 @@ def trusted(monkeypatch):
 def few_statistics():
     """Training takes its normalisation from 100 windows in place of up to 1500, which would take most of a short run."""
     from wearcap.systems.echo.training import EchoDiffusion
-    from wearcap.systems.hmd2.point_codes_training import VoxelReconstruction
     from wearcap.systems.hmd2.pose_regressor.training import PoseRegression
+    from wearcap.systems.hmd2.voxel_autoencoder_training import VoxelReconstruction
     from wearcap.systems.ireplica.training import ContactDetection
     from wearcap.systems.mocap_every.manifold_training import ManifoldTraining
     from wearcap.systems.mocap_every.training import WatchRegression

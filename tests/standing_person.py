@@ -9,7 +9,7 @@ from wearcap.body.skeleton import skeleton_of_height
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import about_axis, exp
 from wearcap.live.clock_offset import Aligned
-from wearcap.live.first_minute import FirstMinute
+from wearcap.live.setup_estimation import SetupEstimation
 from wearcap.recording import Motion
 from wearcap.sensors.imu import synthesize_imu
 from wearcap.sensors.samples import HeadSample, WatchSample, WristSample
@@ -77,7 +77,7 @@ class Devices:
     now_s: float = 5.0
     """Our time; it goes on from one play to the next."""
 
-    def play(self, motion: Motion, first: FirstMinute, begin_s: float = 100.0, until_s: float = math.inf) -> float:
+    def play(self, motion: Motion, first: SetupEstimation, begin_s: float = 100.0, until_s: float = math.inf) -> float:
         """Show the samples to a first minute until it is done; returns the seconds it took."""
         random = torch.Generator().manual_seed(3)
         shift = Rigid(torch.eye(3), torch.tensor([0.4, -1.0, self.floor_m]))

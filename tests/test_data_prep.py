@@ -1,4 +1,4 @@
-"""`data_prep/` stays in step with `wearcap prepare`: a script and a row of its page for every source, a split list where one is read."""
+"""`data_prep/` stays in step with `wearcap prepare`: a file or another source's, a row of its page, a split list where one is read."""
 
 import re
 from pathlib import Path
@@ -31,8 +31,10 @@ def test_the_page_tells_what_a_source_needs(source):
         assert Splits.read(splits_dir() / name).rows
 
 
-def test_every_source_has_its_script_and_every_list_its_source():
-    scripts = {path.stem: path.read_text(encoding="utf-8") for path in DATA_PREP.glob("*.py")}
-    assert scripts.keys() == sources().keys()
-    assert all(f'"prepare", ["{name}", ' in text for name, text in scripts.items())
-    assert {path.stem for path in (DATA_PREP / "splits").glob("*.csv")} <= sources().keys()
+def test_every_file_serves_a_source_and_every_list_has_one():
+    configs = {name: path.read_text(encoding="utf-8") for name, path in sources().items()}
+    used = {file for text in configs.values() for file in re.findall(r"_target_: data_prep\.(\w+)\.", text)}
+    files = {path.stem for path in DATA_PREP.glob("*.py")} - {"__init__", "one_object", "ui_prmd"}  # read by others
+    assert files <= used
+    assert all(f"data_prep.{name}." in configs[name] for name in files & configs.keys())
+    assert {path.stem for path in (DATA_PREP / "splits").glob("*.csv")} <= configs.keys()

@@ -9,7 +9,7 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "wearcap"
 ROOT = SOURCE.parents[1]
 FLOORS = (
-    ("errors", "files", "locks", "spread", "workers", "boundary"),
+    ("errors", "files", "locks", "parallel", "workers", "boundary"),
     ("geometry",),
     ("body", "scene"),
     ("recording",),
@@ -19,15 +19,15 @@ FLOORS = (
     ("evaluation", "export", "viewer", "doctor", "prepare"),
     ("reading",),
     ("live",),
-    ("cli",),
+    ("cli", "data_prep"),
 )
-MAY_SIMULATE = ("wearsim", "prepare", "cli")
+MAY_SIMULATE = ("wearsim", "data_prep", "cli")
 """Folders that may use the simulator; it stands beside the product and no part of a capture knows it."""
 LEVEL = {folder: level for level, floor in enumerate(FLOORS) for folder in floor}
 LIGHTNING = {"lightning", "pytorch_lightning", "torchmetrics"}
 HYDRA = {"hydra", "omegaconf"}
 TRAINING = {"training", "calibration", "validation"} | {
-    f"{name}_training" for name in ("egoview", "manifold", "object", "point_codes")
+    f"{name}_training" for name in ("egoview", "manifold", "object", "voxel_autoencoder")
 }
 """Modules of a system that are LightningModules and callbacks."""
 PRIVATE_WORDS = {
@@ -48,13 +48,15 @@ PRIVATE_WORDS = {
 }
 """Of identifiers: condition, output, batch item, anchored, below, object, rolling schedule, dropped, correction instead."""
 SIMULATOR = SOURCE.with_name("wearsim")
-MODULES = sorted([*SOURCE.rglob("*.py"), *SIMULATOR.rglob("*.py")])
+DATA_PREP = ROOT / "data_prep"
+MODULES = sorted(path for house in (SOURCE, SIMULATOR, DATA_PREP) for path in house.rglob("*.py"))
 MAX_FUNCTION, MAX_MODULE, MAX_ENTRY = 60, 600, 40
 
 
 def folder_of(path: Path) -> str:
-    if path.is_relative_to(SIMULATOR):
-        return "wearsim"
+    for house in (SIMULATOR, DATA_PREP):
+        if path.is_relative_to(house):
+            return house.name
     relative = path.relative_to(SOURCE)
     return relative.parts[0] if len(relative.parts) > 1 else relative.stem
 
@@ -80,7 +82,7 @@ def upward(folder: str, tree: ast.AST) -> list[str]:
     wrong = []
     for name, line in imports(tree):
         parts = name.split(".")
-        if parts[0] == "wearsim" and folder not in MAY_SIMULATE:
+        if (parts[0] == "wearsim" and folder not in MAY_SIMULATE) or (parts[0] == "data_prep" != folder):
             wrong.append(f"line {line}: {name}")
         if parts[0] == "wearcap" and len(parts) > 1 and parts[1] != "__version__":
             assert parts[1] in LEVEL, f"line {line}: {name} stands on no floor"
@@ -123,7 +125,7 @@ def trains(path: Path) -> bool:
     return folder_of(path) in ("training", "data", "cli") or (folder_of(path) == "systems" and path.stem in TRAINING)
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(SOURCE.parent).as_posix())
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_a_module_keeps_the_rules(path):
     tree, folder = parsed(path), folder_of(path)
     if folder != "__init__":
@@ -147,7 +149,7 @@ def test_folders_of_one_floor_do_not_use_each_other_in_a_circle():
     for path in MODULES:
         names = [name.split(".") for name, _ in imports(parsed(path))]
         used = {parts[1] for parts in names if parts[0] == "wearcap" and len(parts) > 1}
-        used |= {"wearsim" for parts in names if parts[0] == "wearsim"}
+        used |= {parts[0] for parts in names if parts[0] in ("wearsim", "data_prep")} - {folder_of(path)}
         uses.setdefault(folder_of(path), set()).update(used & set(LEVEL) - {folder_of(path)})
     for folder in uses:
         reached, border = set(), {folder}
@@ -210,7 +212,7 @@ def test_nothing_unsafe_is_read():
         ("geometry", "from wearcap.body.skeleton import Skeleton", True),
         ("geometry", "import wearcap.cli.conf", True),
         ("cli", "from wearcap.training.run import fit", False),
-        ("prepare", "from wearsim.places.world import World", False),
+        ("data_prep", "from wearsim.places.world import World", False),
         ("data", "from wearsim.places.world import World", True),
         ("recording", "from wearcap.errors import WearcapError", False),
     ],

@@ -25,9 +25,9 @@ from rich.progress import track
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
 
+from own_bvh import read_bvh
 from wearcap.cli import capture, export, train
 from wearcap.export.files import open_exported
-from wearcap.io.formats.bvh import read_bvh
 from wearcap.io.formats.contact_labels import LabelClock
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.models.checkpoint import read_checkpoint, read_run_file

@@ -40,23 +40,12 @@ import foreign_bvh  # noqa: E402
 import keypoint_files  # noqa: E402
 import marker_person  # noqa: E402
 import short_walk  # noqa: E402
+from data_prep import behave, egohoi, hcontact, mocap_every_folder, omomo, ui_prmd  # noqa: E402
 from wearcap.body.skeletons import smplh52  # noqa: E402
 from wearcap.boundary import arrays, pickles, texts  # noqa: E402
 from wearcap.geometry.camera import Camera  # noqa: E402
 from wearcap.geometry.rigid import Rigid  # noqa: E402
-from wearcap.io.datasets import (  # noqa: E402
-    adt,
-    amass,
-    behave,
-    egohoi,
-    hcontact,
-    hps,
-    mocap_every_folder,
-    nymeria,
-    omomo,
-    totalcapture,
-    ui_prmd,
-)
+from wearcap.io.datasets import adt, amass, hps, nymeria, totalcapture  # noqa: E402
 from wearcap.io.devices import aria_mps, headset_log, headset_tables, watch_log  # noqa: E402
 from wearcap.io.formats import (  # noqa: E402
     asf_amc,
@@ -322,7 +311,7 @@ READERS: dict[str, Reader] = {
         lambda folder: behave.read_behave(folder, one_object_files.BEHAVE_NAME),
     ),
     "behave_mesh": Reader(one_object_files.write_behave, lambda folder: behave.read_behave_mesh(folder, "boxlarge")),
-    "bvh": _made("a.bvh", lambda path: bvh.write_bvh(swaying_motion(4), path), bvh.read_bvh),
+    "bvh": _made("a.bvh", lambda path: bvh.write_bvh(swaying_motion(4), path), bvh.read_bvh_content),
     "foreign_bvh": _made("a.bvh", _foreign_walk, foreign.read_foreign_motion),
     "camera_json": _made("c.json", lambda path: camera_json.write_camera(LENS, path), camera_json.read_camera),
     "colmap_text": Reader(test_colmap.write_text_model, colmap.read_colmap),
@@ -331,7 +320,7 @@ READERS: dict[str, Reader] = {
         "c.json", json.dumps(CONTACTS), lambda path: contact_labels.read_contact_labels(path, CLOCK)
     ),
     "csv_table": _one(
-        "a.csv", "a,b,n\n1,x,3\n2.5,y,4\n", lambda path: csv_table.read_columns(path, ["a"], text=["b"], whole=["n"])
+        "a.csv", "a,b,n\n1,x,3\n2.5,y,4\n", lambda path: csv_table.read_columns(path, ["a"], text=["b"], integers=["n"])
     ),
     "egohoi": Reader(
         lambda folder: test_egohoi.write_set(folder, FRAMES), lambda folder: egohoi.read_egohoi(folder, test_egohoi.ONE)

@@ -42,7 +42,6 @@ from wearcap.reading import examine  # noqa: E402
 from wearcap.reading.any_file import read  # noqa: E402
 from wearcap.recording import PointCloud, Recording, RecordingStore  # noqa: E402
 from wearcap.recording.store import RecordingFile, save_recording  # noqa: E402
-from wearcap.runtime.session import read_state, write_state  # noqa: E402
 from wearcap.runtime.stages import StageCache  # noqa: E402
 from wearcap.systems.ireplica.contact_prediction import ContactDetector  # noqa: E402
 from wearcap.systems.ireplica.contact_sequence import ContactSequence  # noqa: E402
@@ -216,11 +215,6 @@ OWN: dict[str, Reader] = {
     "visual_map": _made("map.safetensors", lambda path: test_doctor_scene.small_map(3, 5).save(path), VisualMap.load),
     "exported_onnx": Reader(_exported, _read_exported),
     "training_run": Reader(_run, _read_run),
-    "session_state": _made(
-        "s.safetensors",
-        lambda path: write_state(path, {"t": torch.ones(3), "n": [1, 2.5, None, "x"]}, {"fps": 60}, {}),
-        lambda path: read_state(path, {"fps": 60}, {}),
-    ),
     "stage_cache": Reader(_stage, lambda folder: StageCache(folder).read("poses", "ab")),
     "live_setup": _made(
         "s.json", lambda path: write_setup(Setup(xsens23(), {"head": head_seat()}, 0.1), path), read_setup

@@ -16,7 +16,7 @@ watches on arms whose forearm is hanging in the last two seconds of the first mi
 recordings and persons, quantiles (50, 75, 95, 100 %) of the error (degrees) of the heading that was found, and the median of
 each wrist with its sign. Recordings that end before the first minute does are left out.
 
-`--palms`: how the palms of people face who stand with hanging arms, from which `live.wearing.PRONATED_DEG` comes: in windows
+`--palms`: how the palms of people face who stand with hanging arms, from which `live.placement.PRONATED_DEG` comes: in windows
 of two seconds of the training recordings in which the pelvis hardly moves and a forearm hangs. Prints for each data set and
 wrist one JSON line: numbers of windows and persons, and over the persons the least, median and largest of their median angles
 (degrees) by which the palm faces backwards from the thigh.
@@ -38,10 +38,10 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.live.clock_offset import LEAST_OFFSET_S, offset_by_turning, turned
-from wearcap.live.first_minute import HOLD_S, FirstMinute
+from wearcap.live.placement import PRONATED_DEG, hanging
 from wearcap.live.setup import Setup
+from wearcap.live.setup_estimation import HOLD_S, SetupEstimation
 from wearcap.live.sources.replay import ReplaySource
-from wearcap.live.wearing import PRONATED_DEG, hanging
 from wearcap.recording import Motion, Recording
 from wearcap.recording.store import RecordingStore
 from wearcap.sensors.imu import ImuNoise, synthesize_imu
@@ -128,7 +128,7 @@ class Heading(NamedTuple):
     off_deg: float
 
 
-def worn(recording: Recording, seed: int) -> ReplaySource:
+def replayed(recording: Recording, seed: int) -> ReplaySource:
     """A replay of a recording's head and watches; watches that it lacks are made of its motion."""
     assert recording.motion is not None
     rng, imu = np.random.default_rng(seed), dict(recording.imu)
@@ -140,7 +140,7 @@ def worn(recording: Recording, seed: int) -> ReplaySource:
 
 def unguided(source: ReplaySource) -> tuple[Setup, float] | None:
     """What the first minute finds, and when (s, the recording's time); None where the recording ends before."""
-    first = FirstMinute(MocapEverySession.devices, tracked=False)
+    first = SetupEstimation(MocapEverySession.devices, tracked=False)
     for time_s, device, sample in source.events():
         if isinstance(sample, WatchSample):
             turn = rotation.about_axis("z", torch.tensor(-YAW_RAD[device]))
@@ -155,7 +155,7 @@ def unguided(source: ReplaySource) -> tuple[Setup, float] | None:
 def headings(recording: Recording, seed: int) -> Iterator[Heading]:
     """The headings that the first minute finds of a recording's watches."""
     motion = recording.motion
-    if motion is None or recording.head is None or (found := unguided(worn(recording, seed))) is None:
+    if motion is None or recording.head is None or (found := unguided(replayed(recording, seed))) is None:
         return
     setup, time_s = found
     stop = int(torch.searchsorted(motion.timestamps, time_s))

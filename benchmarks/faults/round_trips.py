@@ -11,6 +11,7 @@ import subprocess
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import wearcap
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.prepare.foreign import read_foreign_motion
 from wearcap.recording import Motion
@@ -33,7 +34,7 @@ validator.validateBytes(new Uint8Array(fs.readFileSync(process.argv[1]))).then(
 
 def through_blender(motion: Motion, python: str, folder: Path) -> str:
     """Distances of all joints after the round trip."""
-    motion.save(folder / "ours.bvh")
+    wearcap.save(motion, folder / "ours.bvh")
     (folder / "run.py").write_text(BLENDER, encoding="utf-8")
     fps = str(round(motion.fps))
     subprocess.run(
@@ -48,7 +49,7 @@ def through_blender(motion: Motion, python: str, folder: Path) -> str:
 
 def validated(motion: Motion, modules: Path, folder: Path) -> str:
     """What Khronos' validator counts in a .glb."""
-    motion.save(folder / "ours.glb")
+    wearcap.save(motion, folder / "ours.glb")
     run = subprocess.run(
         ["node", "-e", VALIDATE, folder / "ours.glb"], cwd=modules, check=True, capture_output=True, text=True
     )

@@ -14,11 +14,11 @@ from hydra.utils import instantiate
 from benchmarks.tables.hps_sessions import TrueClock
 from wearcap.cli.conf import compose
 from wearcap.metrics.table import evaluate_motion
-from wearcap.optimize.hps_constants import ConstantsPrior
 from wearcap.recording.timing import resampled
 from wearcap.runtime.system import CaptureInput
 from wearcap.scene.scan import Scan
 from wearcap.systems.hps.camera import on_one_clock
+from wearcap.systems.hps.constants import ConstantsPrior
 from wearsim.recordings.hps import HpsConfig, Protocol, simulate_hps
 from wearsim.rendering.scan import scan_world
 from wearsim.rendering.views import Scenery

@@ -30,8 +30,8 @@ from wearcap.body.anny_body import anny_body
 from wearcap.cli.conf import compose
 from wearcap.geometry import rotation
 from wearcap.geometry.surface import SurfaceIndex
-from wearcap.optimize.banded import BandedSettings, solve_in_stretches
-from wearcap.optimize.hps import (
+from wearcap.systems.hps.banded import BandedSettings, solve_in_stretches
+from wearcap.systems.hps.energy import (
     FootPatches,
     HpsData,
     HpsEnergy,

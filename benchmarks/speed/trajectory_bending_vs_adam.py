@@ -15,8 +15,8 @@ import torch
 from hydra.utils import instantiate
 
 from wearcap.cli.conf import compose
-from wearcap.optimize.trajectory import BendingProblem, BentPath, bend_adam, bending_problem
-from wearcap.optimize.trajectory_banded import bend_banded
+from wearcap.systems.ireplica.trajectory import BendingProblem, BentPath, bend_adam, bending_problem
+from wearcap.systems.ireplica.trajectory_banded import bend_banded
 
 RATES, LONGEST, WITHIN = (1e-3, 3e-3, 1e-2), 1000, 1.001
 FPS = 30

@@ -163,14 +163,14 @@ RIVALS: dict[str, tuple[str, ...]] = {
         "pipeline=baseline/bodiffusion_object",
     ),
     "BoDiffusion-style": ("bodiffusion", "pipeline=baseline/bodiffusion"),
-    "BoDiffusion-style, its mean": ("bodiffusion", *MEAN, "pipeline.acts=none"),
+    "BoDiffusion-style, its mean": ("bodiffusion", *MEAN, "pipeline.active_objects=none"),
 }
 HUMANS: dict[str, tuple[str, ...]] = {
     **{name: row for name, row in RIVALS.items() if "paper's frame" not in name and "guidance" not in name},
     "EgoAllo-style (head)": ("egoallo_human", "pipeline=baseline/bodiffusion"),
-    "EgoAllo-style (head), its mean": ("egoallo_human", *MEAN, "pipeline.acts=none", *HEAD_ALONE),
+    "EgoAllo-style (head), its mean": ("egoallo_human", *MEAN, "pipeline.active_objects=none", *HEAD_ALONE),
     "AGRoL-style": ("agrol_human", "pipeline=baseline/bodiffusion"),
-    "AGRoL-style, its mean": ("agrol_human", *MEAN, "pipeline.acts=none"),
+    "AGRoL-style, its mean": ("agrol_human", *MEAN, "pipeline.active_objects=none"),
     "ours, the same budget, no humans alone": ABLATIONS["no humans alone"],
 }
 """Rows of Table 2 with trainings of their own."""
@@ -265,7 +265,7 @@ def _objects(options: argparse.Namespace, progress: Progress) -> tuple[str, Mapp
     more = [
         Method("ours, environment exact", options.checkpoint),
         Method("ours, hinges and rails unknown", options.checkpoint, ANYWHERE),
-        Method("ours, human alone", options.checkpoint, ("pipeline=echo", "pipeline.acts=none")),
+        Method("ours, human alone", options.checkpoint, ("pipeline=echo", "pipeline.active_objects=none")),
     ]
     scores |= _scores(more, options, progress, store, names)
     return (
@@ -485,7 +485,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         pictures=(
             *ranked("echo"),
             ("echo_box.png", "A box that is carried, truth above and captured below, points that touch lit"),
-            ("echo_table.png", "A table that is pushed: the act of median error"),
-            ("echo_suitcase.png", "A suitcase that is carried: the act of median error"),
+            ("echo_table.png", "A table that is pushed: the span of median error"),
+            ("echo_suitcase.png", "A suitcase that is carried: the span of median error"),
         ),
     )

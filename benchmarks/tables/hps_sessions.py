@@ -14,12 +14,12 @@ import torch
 from benchmarks.rivals.hps_scores import RigCloud, nearest_frames, visit_times
 from benchmarks.tables.depth_rig import Background, DepthView, person_cloud, voxel_downsample
 from benchmarks.tables.simulated_depth_rig import approximate, place_rig, simulate_rig
+from data_prep.simulated import source_files
 from wearcap.body.anny_body import anny_body
 from wearcap.files import write_text
 from wearcap.geometry.mesh import Mesh
 from wearcap.io.formats.ply import Ply, read_ply, write_ply
 from wearcap.prepare.engine import content_hash
-from wearcap.prepare.simulated import source_files
 from wearcap.recording import Recording
 from wearcap.recording.store import RecordingFile, save_recording
 from wearcap.scene.scan import Scan

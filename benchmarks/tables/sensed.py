@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.tables.wearables import WEARABLES, WornNoise, worn
+from benchmarks.tables.wearables import WEARABLES, WearableNoise, with_noise
 from wearcap.body.skeleton import skeleton_of_height
 from wearcap.recording import Recording, RecordingStore
 from wearcap.tracking.stature import skeleton_of
@@ -29,7 +29,7 @@ def sensed(recording: Recording, sensors: str, height_off_m: float | None = None
     given = recording
     if sensors != GIVEN:
         rng = np.random.default_rng([5, *recording.name.encode()])
-        given = worn(recording, WornNoise.preset(sensors), rng)
+        given = with_noise(recording, WearableNoise.preset(sensors), rng)
     true, known = skeleton_of(recording), skeleton_of(given)
     if height_off_m is None or true is None:
         return given

@@ -24,7 +24,7 @@ from wearcap.data.windows import Source, Windows
 from wearcap.files import write_text
 from wearcap.metrics.detection import distance_mae_cm, occupancy_iou, occupied_distance_mae_cm
 from wearcap.scene.voxels import VoxelGrid
-from wearcap.systems.hmd2.point_codes_training import PlaceContent
+from wearcap.systems.hmd2.voxel_autoencoder_training import PlaceContent
 from wearcap.viewer.picture import save_png
 
 Rebuild = Callable[[Tensor], Tensor]

@@ -27,7 +27,7 @@ from wearsim.sensors.suit import SUITS, BodyErrors, estimated_skeleton
 
 
 @dataclass(frozen=True)
-class WornNoise:
+class WearableNoise:
     """Errors of a head tracker, of two watches, and of what is known of their wearer."""
 
     head: SlamNoise
@@ -46,7 +46,7 @@ class WornNoise:
     """Root mean square angle of a tracked wrist's axes, likewise."""
 
     @classmethod
-    def preset(cls, name: str) -> "WornNoise":
+    def preset(cls, name: str) -> "WearableNoise":
         """Errors of devices "ideal", "typical" or "poor". Raises WearcapError for another name."""
         if name not in WEARABLES:
             raise WearcapError(f"wearables={name!r}", expected=f"one of {', '.join(WEARABLES)}")
@@ -54,7 +54,7 @@ class WornNoise:
 
 
 WEARABLES = {
-    "ideal": WornNoise(
+    "ideal": WearableNoise(
         SlamNoise(jitter_m=0.0, jitter_deg=0.0),
         seat_m=0.0,
         seat_deg=0.0,
@@ -64,7 +64,7 @@ WEARABLES = {
         grip_m=0.0,
         grip_deg=0.0,
     ),
-    "typical": WornNoise(
+    "typical": WearableNoise(
         SlamNoise(
             drift_share=0.01,  # 3 cm after 10 m, 10 cm after 100 m
             yaw_drift_deg_per_sqrt_min=0.1,
@@ -82,7 +82,7 @@ WEARABLES = {
         grip_m=0.01,
         grip_deg=3.0,
     ),
-    "poor": WornNoise(
+    "poor": WearableNoise(
         SlamNoise(
             jitter_m=0.003,
             jitter_deg=0.2,
@@ -105,7 +105,7 @@ WEARABLES = {
 """Head trackers and watches by name; those of "ideal" have no error at all, as in the papers' synthetic data."""
 
 
-def worn(recording: Recording, noise: WornNoise, rng: np.random.Generator) -> Recording:
+def with_noise(recording: Recording, noise: WearableNoise, rng: np.random.Generator) -> Recording:
     """What devices sense of a recording's true motion, and what their wearer knows: nothing of the truth is left in it.
 
     The head's path, watches, tracked wrists and points are in one SLAM world: points and wrists lie where they were seen
@@ -144,7 +144,7 @@ def worn(recording: Recording, noise: WornNoise, rng: np.random.Generator) -> Re
     )
 
 
-def _tracked(motion: Motion, joint: str, drift: Rigid, noise: WornNoise, rng: np.random.Generator) -> Trajectory:
+def _tracked(motion: Motion, joint: str, drift: Rigid, noise: WearableNoise, rng: np.random.Generator) -> Trajectory:
     """A wrist as the head's device tracks it: `drift` (time) leads from the true world to that of its SLAM."""
     turned, shifted = torch.from_numpy(rng.standard_normal((2, 3)) / np.sqrt(3)).float()
     grip = Rigid(rotation.exp(np.deg2rad(noise.grip_deg) * turned), noise.grip_m * shifted)

@@ -41,3 +41,13 @@ def source(path, height: float | None = None, scene=None, **stated):
 
     recording, _ = with_stature(read_any(path, Conventions(**stated)), xsens23(), height)
     return CaptureInput.in_dataset(recording, dataset_folder(path), scene)
+
+
+def save(motion, path) -> None:
+    """Write a `recording.Motion` as what the name's ending says: .npz, .bvh, .glb or _smplh.npz (SMPL+H, as AMASS has it).
+
+    Raises WearcapError for another ending, and when the file cannot be written.
+    """
+    from wearcap.io.saving import save as save_motion
+
+    save_motion(motion, path)

@@ -1,8 +1,8 @@
 """The siege of a live capture, at its smallest: nothing of the devices is lost."""
 
 import pytest
-from benchmarks.faults import live_siege
 
+from benchmarks.faults import live_siege
 from wearcap.recording.store import save_recording
 from wearcap_testing import recording_of, swaying_motion
 

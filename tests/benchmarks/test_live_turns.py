@@ -1,8 +1,8 @@
 """What the benchmark of the live capture's first minute measures, on a planted wearer."""
 
 import torch
-from benchmarks.faults import live_turns
 
+from benchmarks.faults import live_turns
 from standing_person import acting
 from wearcap.body.skeleton import WRISTS
 from wearcap_testing import recording_of

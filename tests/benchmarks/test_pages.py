@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
+
 from benchmarks.tables import command
 from benchmarks.tables import hps as tables_hps
 from benchmarks.tables.command import page_of
@@ -29,7 +30,6 @@ from benchmarks.tables.result_pages import (
     with_readme,
     write_speed,
 )
-
 from wearcap.errors import WearcapError
 
 ROOT = Path(__file__).parents[2]

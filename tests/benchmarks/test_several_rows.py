@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from benchmarks.tables import mocap_every_several as module
 
+from benchmarks.tables import mocap_every_several as module
 from wearcap.geometry import rotation
 from wearcap.recording import Motion
 from wearcap.systems.mocap_every.energy import LatentSolver, LatentWeights

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
+
 from benchmarks.tables import simulated_sensors
 from benchmarks.tables import simulated_sensors as measured
 from benchmarks.tables import simulation as tables_simulation
-
 from wearcap.sensors.imu import ImuNoise
 from wearcap.sensors.simulated import SlamNoise
 from wearsim.recordings.hps import HpsConfig, Protocol

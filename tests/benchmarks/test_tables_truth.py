@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from benchmarks.tables import truth as tables_truth
 
+from benchmarks.tables import truth as tables_truth
 from walking_person import sound_recording
 from wearcap.recording import RecordingStore
 

@@ -15,7 +15,7 @@ from wearcap.sensors.simulated import SlamNoise, head_stream, slam_poses
 from wearcap_testing import benchmark, swaying_motion
 
 wearables = benchmark("tables.wearables")
-WEARABLES, WornNoise = wearables.WEARABLES, wearables.WornNoise
+WEARABLES, WearableNoise = wearables.WEARABLES, wearables.WearableNoise
 
 SEAT = torch.tensor([0.09, 0.0, 0.08])
 
@@ -35,13 +35,13 @@ def recorded(frames: int = 600) -> Recording:
     )
 
 
-def sensed(noise: wearables.WornNoise, seed: int = 0, frames: int = 600) -> Recording:
-    return wearables.worn(recorded(frames), noise, np.random.default_rng(seed))
+def sensed(noise: wearables.WearableNoise, seed: int = 0, frames: int = 600) -> Recording:
+    return wearables.with_noise(recorded(frames), noise, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("preset", WEARABLES)
 def test_nothing_of_the_truth_is_left(preset):
-    found = sensed(WornNoise.preset(preset))
+    found = sensed(WearableNoise.preset(preset))
     assert found.motion is None
     assert found.floor is None
     assert found.contacts is None
@@ -52,7 +52,7 @@ def test_nothing_of_the_truth_is_left(preset):
 
 
 def test_ideal_devices_sense_the_truth():
-    found, true = sensed(WornNoise.preset("ideal")), recorded()
+    found, true = sensed(WearableNoise.preset("ideal")), recorded()
     torch.testing.assert_close(found.head.T_world_head.t, true.head.T_world_head.t, atol=1e-5, rtol=0)
     torch.testing.assert_close(found.points.points_world, true.points.points_world, atol=1e-4, rtol=0)
     wrist = true.motion.joint("left_wrist")
@@ -64,7 +64,7 @@ def test_ideal_devices_sense_the_truth():
 @pytest.mark.parametrize("preset", ["typical", "poor"])
 def test_tracked_wrists_drift_with_the_head_and_sit_where_nobody_measured(preset):
     """Seen from the head they are off by how they are held, and by little else."""
-    noise, true = WornNoise.preset(preset), recorded().motion
+    noise, true = WearableNoise.preset(preset), recorded().motion
     off_m, off_deg = [], []
     for seed in range(12):
         found = sensed(noise, seed)
@@ -85,7 +85,7 @@ def test_tracked_wrists_drift_with_the_head_and_sit_where_nobody_measured(preset
 )
 def test_heads_are_as_far_off_as_their_preset_says(preset, cm, deg):
     true = recorded().head.T_world_head
-    off = [sensed(WornNoise.preset(preset), seed).head.T_world_head for seed in range(20)]
+    off = [sensed(WearableNoise.preset(preset), seed).head.T_world_head for seed in range(20)]
     far = torch.stack([(T.t - true.t).norm(dim=-1).mean() for T in off]).mean()
     turned = torch.stack([rotation.geodesic(T.R, true.R).mean() for T in off]).mean()
     assert cm[0] < 100 * far < cm[1]
@@ -95,13 +95,13 @@ def test_heads_are_as_far_off_as_their_preset_says(preset, cm, deg):
 def test_watches_are_off_by_strap_heading_and_attitude():
     true = recorded().motion.joint("left_wrist").R
     for preset, low, high in (("typical", 3.0, 6.5), ("poor", 6.0, 13.0)):
-        off = [sensed(WornNoise.preset(preset), seed).imu["left_wrist"].R_world_imu for seed in range(20)]
+        off = [sensed(WearableNoise.preset(preset), seed).imu["left_wrist"].R_world_imu for seed in range(20)]
         assert low < torch.stack([rotation.geodesic(R, true).mean() for R in off]).mean().rad2deg() < high
 
 
 def test_points_are_seen_from_the_path_as_tracked():
     """A device keeps its distance and direction to a point at the moment when it sees it, but for the world's scale."""
-    noise = replace(WornNoise.preset("poor"), seat_m=0.0, seat_deg=0.0)
+    noise = replace(WearableNoise.preset("poor"), seat_m=0.0, seat_deg=0.0)
     found, true = sensed(noise), recorded()
     frame = torch.arange(400) % 600
     seen, was = (r.head.T_world_device[frame].inverse() @ r.points.points_world for r in (found, true))
@@ -129,6 +129,6 @@ def test_the_stature_is_nearly_right():
 
 def test_what_cannot_be_worn_is_refused():
     with pytest.raises(WearcapError, match="ideal, typical, poor"):
-        WornNoise.preset("perfect")
+        WearableNoise.preset("perfect")
     with pytest.raises(WearcapError, match="nothing to sense"):
-        wearables.worn(Recording("empty"), WEARABLES["ideal"], np.random.default_rng(0))
+        wearables.with_noise(Recording("empty"), WEARABLES["ideal"], np.random.default_rng(0))

@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from data_prep.hcontact import read_smpl_json
 from wearcap.boundary import limits
 from wearcap.boundary.arrays import read_npz
 from wearcap.boundary.pickles import read_pickle
 from wearcap.boundary.texts import read_json, read_text, read_yaml_object
 from wearcap.errors import WearcapError
-from wearcap.io.datasets.hcontact import read_smpl_json
 from wearcap.io.formats.asf_amc import read_asf
-from wearcap.io.formats.bvh import read_bvh
+from wearcap.io.formats.bvh import read_bvh_content
 from wearcap.io.formats.camera_json import read_photos
 from wearcap.io.formats.colmap import read_colmap
 from wearcap.io.formats.mvnx import read_mvnx
@@ -35,7 +35,7 @@ MIB = 1 << 20
 READERS = {
     "a.txt": read_trajectory,
     "a.csv": read_trajectory,
-    "a.bvh": read_bvh,
+    "a.bvh": read_bvh_content,
     "a.asf": read_asf,
     "a.mvnx": read_mvnx,
     "a.npz": read_npz,
@@ -178,8 +178,6 @@ COUNTS = {
     + "".join(BVH_JOINT % k + "}\n" for k in range(30_000)),
     "deep joints.bvh": "HIERARCHY\nROOT r\n{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Xrotation Yrotation\n"
     + "".join(BVH_JOINT % k for k in range(30_000)),
-    "frames.bvh": "HIERARCHY\nROOT r\n{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Xrotation Yrotation\nEnd Site\n{\nOFFSET 0 0 0\n}\n}\n"
-    "MOTION\nFrames: 1000000000000\nFrame Time: 0.01\n0 0 0\n",
     "channels.bvh": "HIERARCHY\nROOT r\n{\nOFFSET 0 0 0\nCHANNELS 1000000000000 Zrotation\n",
     "bones.asf": ":units\n:root\norder RX\naxis XYZ\nposition 0 0 0\norientation 0 0 0\n:bonedata\n"
     + "".join(f"begin\nname b{k}\ndirection 0 0 1\nlength 1\naxis 0 0 0 XYZ\nend\n" for k in range(20_000)),

@@ -80,8 +80,8 @@ def test_a_data_set_is_scored(data, tmp_path, capfd):
 
 
 def test_localisation_by_learned_features_is_a_choice():
-    chosen = compose("capture", ["pipeline=paper/hps", "recording=x", "localization@pipeline.localization=superpoint"])
-    assert chosen.pipeline.localization.extractor._target_.endswith("SuperPointExtractor")
+    chosen = compose("capture", ["pipeline=paper/hps", "recording=x", "localization@pipeline.localization=disk"])
+    assert chosen.pipeline.localization.extractor._target_.endswith("DiskExtractor")
     assert chosen.pipeline.localization._target_.endswith("MapLocalization")
 
 

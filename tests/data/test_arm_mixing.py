@@ -69,7 +69,7 @@ def test_arms_stay_where_no_trunk_agrees(tmp_path):
     store = stored(tmp_path, own=moving(wave(300, 3.0), 0.1), upright=moving(torch.zeros(300), 0.9))
     motion = store.load("own").motion
     assert motion is not None
-    mixed = donors_of(store, agreement=0.2).mixed(motion, store.open_file("own"), 0)
+    mixed = donors_of(store, tolerance=0.2).mixed(motion, store.open_file("own"), 0)
     assert torch.equal(mixed.R_parent_joint, motion.R_parent_joint)
     alone = ArmDonors([store.open_file("own")]).mixed(motion, store.open_file("own"), 0)
     assert torch.equal(alone.R_parent_joint, motion.R_parent_joint)

@@ -14,7 +14,7 @@ from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import RecordingStore
-from wearcap.systems.ireplica.features import HandViews, SmplAngles, in_skeleton, pose_frames, worn
+from wearcap.systems.ireplica.features import HandViews, SmplAngles, in_skeleton, pose_frames, retarget_skeleton
 from wearcap.systems.ireplica.training_windows import ContactContent, PoseNoise
 
 SHIFTED = {"shift": Shift(), "stretch": TimeStretch(1.0), "drop": DropFrames(0.0)}
@@ -108,7 +108,7 @@ def test_another_skeleton_and_rate_are_converted(tmp_path):
     )
     store.add(replace(recording, suit=half), split="train", config_hash="test")
     window = dataset(tmp_path, features=SmplAngles())[(0, 0)]
-    expected = in_skeleton(xsens23(), worn(xsens23(), smpl24()), recording.suit.R_parent_joint[:120])
+    expected = in_skeleton(xsens23(), retarget_skeleton(xsens23(), smpl24()), recording.suit.R_parent_joint[:120])
     assert rotation.geodesic(window.R_parent_joint, expected).max() < math.radians(2)
 
 

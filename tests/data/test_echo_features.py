@@ -4,11 +4,10 @@ import pytest
 import torch
 
 from carried_box import CLASSES, carrying, small_features
-from wearcap.body.skeleton import MIRROR
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.systems.echo.features import OBJECT_SIZE, TWIN_POINTS, Body, ThreePoints
+from wearcap.systems.echo.features import OBJECT_SIZE, Body, ThreePoints
 
 FRAMES = ("own", "window", "world")
 TURN = Rigid(rotation.about_axis("z", torch.tensor(1.3)), torch.tensor([5.0, -3.0, 0.7]))
@@ -43,42 +42,6 @@ def test_body_and_object_come_back_as_they_went_in(walked, frame):
         torch.testing.assert_close(back, given, atol=1e-5, rtol=0)
     back = features.decode_object(scene_object, at)
     torch.testing.assert_close(back.matrix(), box.matrix(), atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize("frame", FRAMES)
-def test_an_object_comes_back_from_every_frame_it_is_expressed_in(walked, frame):
-    points, _, box, _ = walked
-    features = small_features(frame, object_in_wrists=True)
-    frames = features.object_frames(points, features.canonical(points))
-    value = features.encode_object(box, *frames)
-    assert value.shape[-1] == features.object_size == 27
-    assert torch.equal(value[..., :OBJECT_SIZE], features.encode_object(box, frames[0])), "its own come first"
-    for part, at in zip(value.split(OBJECT_SIZE, -1), frames, strict=True):
-        torch.testing.assert_close(features.decode_object(part, at).matrix(), box.matrix(), atol=1e-5, rtol=0)
-    in_left = value[..., OBJECT_SIZE : 2 * OBJECT_SIZE]
-    torch.testing.assert_close(in_left, in_left[:, :1].expand_as(in_left), atol=1e-5, rtol=0, msg="it is carried")
-
-
-def test_in_a_mirror_the_wrists_change_places(walked):
-    """An object is mirrored along its own y axis, too: of its axes in a wrist's, the entries of one y change sign."""
-    points, _, box, _ = walked
-    features = small_features(object_in_wrists=True)
-    flip = torch.tensor(MIRROR)
-    turn = torch.outer(flip, flip)
-    twins = ThreePoints(points.R_world_point[:, :, TWIN_POINTS] * turn, points.t_world_point[:, :, TWIN_POINTS] * flip)
-    value, mirrored = (
-        features.encode_object(T, *features.object_frames(seen, features.canonical(seen)))
-        for T, seen in ((box, points), (Rigid(box.R * turn, box.t * flip), twins))
-    )
-    signs = torch.cat([flip, turn[:, :2].T.flatten()]).repeat(3)
-    expected = (value * signs).unflatten(-1, (3, OBJECT_SIZE))[..., TWIN_POINTS, :].flatten(-2)
-    torch.testing.assert_close(mirrored, expected, atol=1e-5, rtol=0)
-
-
-def test_without_wrists_no_object_is_in_them():
-    assert small_features().object_size == OBJECT_SIZE
-    with pytest.raises(WearcapError, match="without tracked wrists. Expected points head, left_wrist, right_wrist"):
-        small_features(points=["head"], object_in_wrists=True)
 
 
 @pytest.mark.parametrize("frame", ["window", "own"])

@@ -11,12 +11,12 @@ import pytest
 import torch
 from PIL import Image
 
+from data_prep.embeddings import embed_dataset
 from wearcap.cli import prepare
 from wearcap.data.embeddings import embed_camera, embedding_name
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.models.image_encoder import EgoViewEncoder
-from wearcap.prepare.embeddings import embed_dataset
 from wearcap.recording import RecordingStore, serialize
 from wearcap.recording.recording import CameraStream
 from wearcap_testing import small_dataset

@@ -14,7 +14,7 @@ from wearcap.errors import WearcapError
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording import PointCloud, RecordingStore
 from wearcap.scene.voxels import VoxelGrid, mirrored, voxelize
-from wearcap.systems.hmd2.point_codes_training import PlaceContent
+from wearcap.systems.hmd2.voxel_autoencoder_training import PlaceContent
 from wearcap_testing import recording_of, swaying_motion
 
 pytestmark = pytest.mark.usefixtures("trusted")
@@ -41,7 +41,7 @@ def checkpoint(path, seed: int, **settings):
     torch.manual_seed(seed)
     net = VoxelAutoencoder(**settings)
     model = {
-        "_target_": "wearcap.systems.hmd2.point_codes_training.VoxelReconstruction",
+        "_target_": "wearcap.systems.hmd2.voxel_autoencoder_training.VoxelReconstruction",
         "net": {"_target_": "wearcap.models.voxel_autoencoder.VoxelAutoencoder", **settings},
     }
     state = {f"net.{name}": value for name, value in net.state_dict().items()}

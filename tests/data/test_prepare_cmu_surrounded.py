@@ -7,9 +7,9 @@ import torch
 from hydra.utils import instantiate
 
 import captured_motion as captured
+from data_prep import cmu_surrounded
 from wearcap.cli.conf import compose, splits_dir
 from wearcap.cli.prepare import run
-from wearcap.prepare import simulated
 from wearcap.prepare.engine import Splits
 from wearcap.recording import Recording, RecordingStore
 from wearcap.recording.recording import CameraStream, HeadStream
@@ -100,7 +100,7 @@ def test_the_camera_films_into_the_data_set(plain, tmp_path, monkeypatch):
         name = f"{file.parent.name}/{file.name}"
         return CameraStream(motion.timestamps[::2], EGO_CAMERA, torch.eye(3), t_head_device, video=name)
 
-    monkeypatch.setattr(simulated, "write_ego_video", film)
+    monkeypatch.setattr(cmu_surrounded, "write_ego_video", film)
     assert surrounded(store.root, tmp_path).failed == {}
     assert filmed.keys() == {tmp_path / "videos" / f"{name}.mp4" for name in MOTIONS}
     assert filmed[tmp_path / "videos" / "7_01.mp4"][:2] == ("cmu-room-7_01", pytest.approx([0.09, 0.0, 0.09]))

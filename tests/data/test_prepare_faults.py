@@ -20,9 +20,9 @@ from wearcap import locks
 from wearcap.errors import WearcapError
 from wearcap.files import sha256_of, write_text
 from wearcap.locks import LOCK
+from wearcap.parallel import Parallel
 from wearcap.prepare import engine, prepare
 from wearcap.recording import RecordingStore
-from wearcap.spread import Spread
 
 posix = pytest.mark.skipif(os.name != "posix", reason="SIGKILL")
 linux = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="/proc tells who lives")
@@ -183,7 +183,7 @@ def test_an_interrupted_run_ends_its_workers_before_it_gives_the_folder_up(tmp_p
 
 def test_nothing_to_do_starts_no_workers(tmp_path, monkeypatch):
     prepare(tasks(2), tmp_path, jobs=1)
-    monkeypatch.setattr(Spread, "_backend", None)
+    monkeypatch.setattr(Parallel, "_backend", None)
     assert prepare(tasks(2), tmp_path, jobs=2, backend="dask").current == ["r00", "r01"]
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from boxes import box_mesh
+from data_prep.keypoints import Simulated, keypoints_dataset
 from hostile import in_time
 from mvnx_files import mvnx
 from wearcap.cli import prepare
@@ -21,7 +22,6 @@ from wearcap.prepare import files
 from wearcap.prepare.engine import Task
 from wearcap.prepare.engine import prepare as prepare_tasks
 from wearcap.prepare.files import with_own_files
-from wearcap.prepare.keypoints import Simulated, keypoints_dataset
 from wearcap.recording import CameraStream, Recording, RecordingStore
 from wearcap.scene.objects import Environment, Freedom, SceneObject
 from wearcap.systems.hps.camera import MapLocalization

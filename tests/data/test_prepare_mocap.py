@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 import torch
 
+from data_prep.amass import amass_tasks
+from data_prep.bvh import Hips, bvh_tasks
+from data_prep.cmu import cmu_tasks
 from foreign_bvh import CONVENTIONS, walk, write
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
 from wearcap.boundary.texts import read_bytes
@@ -23,7 +26,6 @@ from wearcap.io.datasets.amass import write_amass
 from wearcap.metrics.gait import knee_cycles, normal_knee_deg
 from wearcap.prepare import Splits, check_recording
 from wearcap.prepare.mocap import About, CleaningLimits, MocapSettings, foot_patches, mocap_recording, without_glitches
-from wearcap.prepare.mocap_sources import Hips, amass_tasks, bvh_tasks, cmu_tasks
 from wearcap.recording import Motion, RecordingStore
 from wearcap.recording.timing import resampled
 
@@ -261,7 +263,7 @@ def test_help_names_what_there_is():
 
 
 @pytest.mark.parametrize(
-    "source", sorted(set(verb.sources()) - {"embeddings", "keypoints", "motion_graph"})
+    "source", sorted(set(verb.sources()) - {"embeddings", "keypoints"})
 )  # these work on data sets that stand
 def test_every_source_composes_and_has_a_split_list(source):
     config = compose("prepare", [f"prepare={source}"])

@@ -32,7 +32,7 @@ def root(tmp_path_factory):
     return str(small_dataset(tmp_path_factory.mktemp("data")).root)
 
 
-MOVED = {"shift": Shift(whole=False), "stretch": TimeStretch(1.0)}
+MOVED = {"shift": Shift(whole_frames=False), "stretch": TimeStretch(1.0)}
 SEEN = {"yaw": Yaw(), "mirror": Mirror()}
 
 

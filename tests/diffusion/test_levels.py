@@ -92,7 +92,7 @@ def test_what_is_observed_does_not_change_the_other_modalities_levels():
 
 @pytest.mark.parametrize("whole", [0.0, 0.4])
 def test_as_many_windows_as_asked_for_are_known_whole(whole):
-    levels, _ = drawn(independent=1.0, conveyor=0.0, observed=1.0, whole=whole)
+    levels, _ = drawn(independent=1.0, conveyor=0.0, observed=1.0, fully_observed=whole)
     observed_parts = (levels == 0).all(1).any(-1).float().mean()
     assert observed_parts == pytest.approx(whole, abs=0.04)
     some = (levels == 0).any(1).any(-1).float().mean()
@@ -104,7 +104,7 @@ def test_as_many_windows_as_asked_for_are_known_whole(whole):
     [
         {"lead": [0.0, 0.0, 1.0]},
         {"chances": [1.0, -1.0, 1.0]},
-        {"whole": 1.0},
+        {"fully_observed": 1.0},
         {"ramp": [20, 10]},
         {"ramp": [0, 5]},
         {"independent": 0.7, "conveyor": 0.6},
@@ -133,7 +133,7 @@ def test_a_modality_in_the_lead_is_denoised_first():
 
 
 def test_the_observed_modality_is_drawn_by_its_chance():
-    levels, _ = drawn(independent=1.0, conveyor=0.0, observed=1.0, whole=0.99, chances=[1.0, 0.0, 3.0])
+    levels, _ = drawn(independent=1.0, conveyor=0.0, observed=1.0, fully_observed=0.99, chances=[1.0, 0.0, 3.0])
     share = (levels == 0).any(1).float().mean(0)
     assert share[1] == 0
     assert (share[2] / share[0]).item() == pytest.approx(3.0, rel=0.15)

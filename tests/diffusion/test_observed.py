@@ -2,7 +2,7 @@
 
 import torch
 
-from wearcap.diffusion.observed import spreading, with_residuals
+from wearcap.diffusion.observed import residual_weights, with_residuals
 
 EVERYONE = torch.ones(1, 1, 1, dtype=torch.bool)
 
@@ -14,7 +14,7 @@ def seen_at(*frames: int, count: int = 60) -> torch.Tensor:
 
 
 def test_observed_frames_are_met_and_far_ones_left_alone():
-    weights = spreading(seen_at(10, 14), EVERYONE.expand(1, 60, 60), 4.0)[0]
+    weights = residual_weights(seen_at(10, 14), EVERYONE.expand(1, 60, 60), 4.0)[0]
     assert torch.count_nonzero(weights.abs().sum(0)) == 2, "only the observed frames give"
     residual = torch.zeros(60)
     residual[10], residual[14] = 1.0, 3.0
@@ -28,7 +28,7 @@ def test_observed_frames_are_met_and_far_ones_left_alone():
 def test_a_slow_residual_is_found_between_its_observations():
     time = torch.arange(60) / 60
     residual = torch.sin(2 * torch.pi * 2 * time) + 0.5
-    weights = spreading(seen_at(*range(2, 60, 6)), EVERYONE.expand(1, 60, 60), 8.0)[0]
+    weights = residual_weights(seen_at(*range(2, 60, 6)), EVERYONE.expand(1, 60, 60), 8.0)[0]
     inside = slice(4, 56)
     found = weights @ residual
     assert (found - residual)[inside].abs().max() < 0.1
@@ -36,7 +36,7 @@ def test_a_slow_residual_is_found_between_its_observations():
 
 
 def test_neighbouring_observations_do_not_blow_up():
-    weights = spreading(torch.ones(2, 60, dtype=torch.bool), EVERYONE.expand(2, 60, 60), 30.0)
+    weights = residual_weights(torch.ones(2, 60, dtype=torch.bool), EVERYONE.expand(2, 60, 60), 30.0)
     assert weights.isfinite().all()
     noise = torch.randn(60, generator=torch.Generator().manual_seed(0))
     assert (weights[0] @ noise).abs().max() < 4
@@ -44,7 +44,7 @@ def test_neighbouring_observations_do_not_blow_up():
 
 def test_frames_of_another_object_hear_nothing():
     number = torch.arange(60)[None] // 30
-    weights = spreading(seen_at(28), number[:, :, None] == number[:, None], 8.0)[0]
+    weights = residual_weights(seen_at(28), number[:, :, None] == number[:, None], 8.0)[0]
     assert weights[25:30, 28].min() > 0.5
     assert (weights[30:] == 0).all()
 
@@ -54,7 +54,7 @@ def test_every_modality_has_its_own_observations():
     x0_hat, observed = torch.randn(2, 60, 5, generator=random), torch.randn(2, 60, 5, generator=random)
     is_observed = torch.zeros(2, 2, 60, dtype=torch.bool)
     is_observed[0, 1, 7] = True
-    weights = spreading(is_observed, torch.ones(1, 1, 60, 60, dtype=torch.bool), 8.0)
+    weights = residual_weights(is_observed, torch.ones(1, 1, 60, 60, dtype=torch.bool), 8.0)
     corrected = with_residuals(x0_hat, observed, weights, (2, 3))
     assert torch.equal(corrected[..., :2], x0_hat[..., :2])
     assert torch.equal(corrected[1], x0_hat[1])

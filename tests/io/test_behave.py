@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from one_object_files import BEHAVE_NAME, CORNERS, behave_arrays, carried, frame_times, standing_about, write_behave
 
 from boxes import BOX_FACES
+from data_prep.behave import R_WORLD_CAMERA, behave_names, read_behave, read_behave_mesh
 from hostile import fuzz, mutated_bytes
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.datasets.behave import R_WORLD_CAMERA, behave_names, read_behave, read_behave_mesh
 from wearcap.io.formats.ply import Ply
 
 

@@ -9,11 +9,11 @@ import torch
 from hoi_files import motion, moved, older, smpl_content, write_json, write_zip
 from hypothesis import given
 
+from data_prep.egohoi import egohoi_names, read_egohoi, read_egohoi_contacts, read_object_locations
 from hostile import fuzz, mutated
 from wearcap.cli.main import run_verb
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap.io.datasets.egohoi import egohoi_names, read_egohoi, read_egohoi_contacts, read_object_locations
 from wearcap.io.formats.contact_labels import LabelClock
 from wearcap.io.formats.environment import read_environment
 from wearcap.io.formats.ply import Ply, read_ply, write_ply

@@ -8,6 +8,7 @@ from pathlib import Path
 from subprocess import run
 
 import pytest
+
 from benchmarks.faults import fuzz_readers
 from benchmarks.faults.fuzz_files import Reader
 from benchmarks.faults.fuzz_readers import READERS, failed, fuzz, outcome

@@ -8,18 +8,18 @@ import torch
 from hoi_files import motion, moved, older, smpl_content, write_json, write_zip
 from hypothesis import given
 
-from hostile import fuzz, mutated
-from wearcap.cli.main import run_verb
-from wearcap.errors import WearcapError
-from wearcap.io.datasets.hcontact import (
+from data_prep.hcontact import (
     about_sequence,
     hcontact_names,
+    hcontact_tasks,
     read_hcontact,
     read_hcontact_split,
     read_smpl_json,
 )
+from hostile import fuzz, mutated
+from wearcap.cli.main import run_verb
+from wearcap.errors import WearcapError
 from wearcap.prepare.engine import Splits
-from wearcap.prepare.worn import hcontact_tasks
 from wearcap.recording.store import RecordingStore
 
 DOOR, SOFA = "SUB5_TUB_2OG_door.00", "SUB9_TUB_2OG_sofamove.00"

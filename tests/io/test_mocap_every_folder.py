@@ -12,16 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mocap_every_files import BOARD_M, FIX, SCALE, SHUTTER_S, cloud, truth, world_of, write_capture
 
-from hostile import fuzz, mutated, mutated_bytes
-from wearcap.errors import WearcapError
-from wearcap.geometry import rotation
-from wearcap.io.datasets.mocap_every_folder import (
+from data_prep.mocap_every_folder import (
     _BoardWalks,
     is_mocap_every_folder,
     mocap_every_files,
     mocap_every_recording,
     read_mocap_every_folder,
 )
+from hostile import fuzz, mutated, mutated_bytes
+from wearcap.errors import WearcapError
+from wearcap.geometry import rotation
 from wearcap.sensors.camera_alignment import align_by_walks
 
 

@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from one_object_files import CORNERS, OMOMO_NAME, SCALE, carried, obj_text, omomo_entry, standing_about, write_omomo
 
+from data_prep.omomo import omomo_take, read_omomo
 from hostile import fuzz, mutated_bytes
 from wearcap.body.skeletons import smplx22
 from wearcap.errors import WearcapError
 from wearcap.io.datasets.amass import PELVIS_SMPLX
-from wearcap.io.datasets.omomo import omomo_take, read_omomo
 
 
 def take_of(root, fps=30.0):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
+from data_prep.ui_prmd import NAMES, read_ui_prmd
 from marker_person import write_trc
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import Conventions
-from wearcap.io.datasets.ui_prmd import NAMES, read_ui_prmd
 from wearcap.io.formats.trc import Markers, read_trc
 
 HEAD = "PathFileType\t4\t(X/Y/Z)\ta.trc\nDataRate\tUnits\n{rates}\nFrame#\tTime\tA\t\t\tS:B\t\t\n\t\tX1\tY1\tZ1\tX2\tY2\tZ2\n\n"

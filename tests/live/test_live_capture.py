@@ -23,13 +23,13 @@ from websockets.sync.client import connect
 
 import wearcap
 from carried_box import carrying, drawn_echo
+from own_bvh import read_bvh
 from ports import free_port
 from small_hmd2 import hmd2_of
 from watched_walk import drawn_pipeline, watched_walk
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis, matrix_from_quat_wxyz
-from wearcap.io.formats.bvh import read_bvh
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.live import wearer as wearer_module
 from wearcap.live.capture import LiveCapture, report_text

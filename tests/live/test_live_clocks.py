@@ -10,9 +10,9 @@ from watched_walk import drawn_pipeline
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import about_axis, exp
 from wearcap.live.clocks import AGREEING
-from wearcap.live.first_minute import FirstMinute
 from wearcap.live.guided import TURN
 from wearcap.live.packets import Packet
+from wearcap.live.setup_estimation import SetupEstimation
 from wearcap.live.wearer import LiveWearer, Opener
 from wearcap.sensors.imu import synthesize_imu
 from wearcap.sensors.samples import HeadSample, WatchSample
@@ -68,7 +68,7 @@ def packets(plan, late_s, batch_s: float = 0.0, head_leads_s: float = 0.06):
 
 def guided() -> tuple[LiveWearer, Kept]:
     session = Kept()
-    minute = lambda setup, guide: FirstMinute(DEVICES, tracked=False, setup=setup, guided=guide)  # noqa: E731
+    minute = lambda setup, guide: SetupEstimation(DEVICES, tracked=False, setup=setup, guided=guide)  # noqa: E731
     wearer = LiveWearer("", Opener(lambda wearer: session, DEVICES, False, False, minute))  # type: ignore[arg-type]
     wearer.guide()
     return wearer, session
@@ -113,7 +113,7 @@ def test_a_session_waits_for_the_latest_watch():
         sessions.append(MocapEverySession.of_wearers(system, [worn], 0, None))
         return sessions[-1]
 
-    minute = lambda setup, guide: FirstMinute(DEVICES, tracked=False, setup=setup, guided=guide)  # noqa: E731
+    minute = lambda setup, guide: SetupEstimation(DEVICES, tracked=False, setup=setup, guided=guide)  # noqa: E731
     wearer = LiveWearer("", Opener(opened, DEVICES, False, False, minute))
     wearer.guide()
     frames = 0

@@ -36,7 +36,7 @@ from wearcap.live.sources import source_of
 from wearcap.live.sources.replay import ReplaySource
 from wearcap.live.wearer import LiveWearer, Opener
 from wearcap.recording import Motion, Recording
-from wearcap.recording.acts import active_at
+from wearcap.recording.active_objects import active_at
 from wearcap.runtime.system import CaptureInput
 from wearcap.runtime.wearer import Wearer
 from wearcap.sensors.samples import ActiveObject, HeadSample, ObjectSample
@@ -59,7 +59,7 @@ def placed(folder: Path, seconds: float = 1.2) -> CaptureInput:
     return CaptureInput.in_dataset(walk, folder)
 
 
-@pytest.mark.parametrize("settings", [{}, {"acts": ACTS, "placed": True}])
+@pytest.mark.parametrize("settings", [{}, {"active_objects": ACTS, "placed": True}])
 def test_a_replay_gives_the_offline_capture_with_its_objects(settings, tmp_path: Path):
     system, place, kept = drawn_echo(**settings), placed(tmp_path), Kept()
     source = ReplaySource(place.recording, EchoSession, math.inf, objects=EchoSession.of_objects(system, place))
@@ -68,9 +68,9 @@ def test_a_replay_gives_the_offline_capture_with_its_objects(settings, tmp_path:
     torch.testing.assert_close(motion.timestamps, whole.timestamps, atol=1e-6, rtol=0)
     torch.testing.assert_close(motion.T_world_joint.t, whole.T_world_joint.t, atol=1e-3, rtol=0)
     torch.testing.assert_close(motion.body_contact_prob, whole.body_contact_prob, atol=1e-3, rtol=0)
-    acts = system.scenario(place.recording, system.objects(place)).acts
+    spans = system.scenario(place.recording, system.objects(place)).active_objects
     names = ["box_1", "box_2"]
-    active = active_at(acts, names, whole.timestamps)
+    active = active_at(spans, names, whole.timestamps)
     assert set(motion.object_motion) == set(names)
     for number, name in enumerate(names):
         # A stream has an object's pose while it is active, a capture of the whole recording always.
@@ -87,7 +87,7 @@ def test_a_replay_of_a_walk_without_interactions_names_no_object(tmp_path: Path)
     place = placed(tmp_path)
     bare = replace(place, recording=replace(place.recording, interactions=None, object_motion={}))
     assert EchoSession.of_objects(drawn_echo(), bare) == []
-    assert EchoSession.of_objects(drawn_echo(acts="none"), place) == []
+    assert EchoSession.of_objects(drawn_echo(active_objects="none"), place) == []
 
 
 def test_a_users_own_environment_needs_no_recording(tmp_path: Path):

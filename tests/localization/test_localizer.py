@@ -123,7 +123,7 @@ def test_retrieval_finds_what_shows_the_same_wall(mapper, room_map):
     ranks = []
     for truth in planted(8):
         image = photograph(mapper, QUERY, truth)
-        summary = localizer.descriptor(image, EXTRACTOR(image))
+        summary = localizer.vlad.aggregate(EXTRACTOR(image).descriptors)
         best = most_similar(summary, room_map.global_descriptors, 3)
         angle = np.arccos(np.clip(room_map.T_world_cam.R.numpy()[:, :, 2] @ truth.R[:, 2].numpy(), -1, 1))
         ranks.append(angle[best].min() < np.radians(40))

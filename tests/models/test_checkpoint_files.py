@@ -12,8 +12,8 @@ from torch import nn
 
 from wearcap.errors import WearcapError
 from wearcap.models import checkpoint as module
-from wearcap.models.build import check_weights
-from wearcap.models.checkpoint import read_checkpoint, share_checkpoint
+from wearcap.models.build import build, check_weights
+from wearcap.models.checkpoint import load_trained, read_checkpoint, share_checkpoint
 
 pytestmark = pytest.mark.usefixtures("trusted")
 
@@ -130,6 +130,24 @@ def refusal(path: Path) -> str:
         read_checkpoint(path)
     assert str(raised.value).startswith(str(path))
     return str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "old"),
+    [
+        ("voxel_autoencoder", "point_codes_training"),
+        ("echo", '\\"object_in_wrists\\": false'),
+        ("echo", '\\"whole\\": 0.'),
+    ],
+)
+def test_files_of_before_a_name_moved_or_a_setting_went_open(name, old):
+    assert old.encode() in (CONF.parent / "checkpoints" / f"{name}.safetensors").read_bytes()
+    module, config = load_trained(name)
+    target = config["model"]["_target_"]
+    assert f"{type(module).__module__}.{type(module).__qualname__}" == target
+    assert old not in json.dumps(config)
+    with pytest.raises(WearcapError, match="object_in_wrists"):
+        build({**config["model"], "object_in_wrists": True}, {}, "a file whose network needs what went")
 
 
 def test_a_shared_checkpoint_cut_anywhere_is_refused(tmp_path):

@@ -12,8 +12,8 @@ from small_scene import LEVEL, inverted, room_cloud, write_room
 
 from walking_person import sound_recording
 from wearcap.doctor import Finding, examine_recording, require_sound
-from wearcap.doctor.agreement import check_localization, check_offset
 from wearcap.doctor.body import check_contact_prob
+from wearcap.doctor.consistency import check_localization, check_offset
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid

@@ -45,9 +45,9 @@ def assert_true(motion: Motion, recording, scenario, atol: float = 2e-4) -> None
     true = recording.motion
     torch.testing.assert_close(motion.R_parent_joint, true.R_parent_joint, atol=atol, rtol=0)
     torch.testing.assert_close(motion.t_world_root, true.t_world_root, atol=atol, rtol=0)
-    for act in scenario.acts:
-        active = (true.timestamps >= act.start_s) & (true.timestamps < act.stop_s)
-        found, given = motion.object_motion[act.object], recording.object_motion[act.object]
+    for span in scenario.active_objects:
+        active = (true.timestamps >= span.start_s) & (true.timestamps < span.stop_s)
+        found, given = motion.object_motion[span.object], recording.object_motion[span.object]
         torch.testing.assert_close(found.t_world_body[active], given.t_world_body[active], atol=atol, rtol=0)
         torch.testing.assert_close(found.R_world_body[active], given.R_world_body[active], atol=atol, rtol=0)
 
@@ -387,17 +387,17 @@ def test_objects_are_static_between_the_times_they_are_active():
     recording = carrying(1.2, carried=TWO)
     scenario = scenario_of(recording, TWO)
     motion = drawn_echo().capture_scenarios([scenario], [0])[0]
-    for act in scenario.acts:
-        track, time = motion.object_motion[act.object], motion.timestamps
+    for span in scenario.active_objects:
+        track, time = motion.object_motion[span.object], motion.timestamps
         assert torch.equal(track.timestamps, time)
-        before, behind = track.t_world_body[time < act.start_s], track.t_world_body[time >= act.stop_s]
-        active = track.t_world_body[(time >= act.start_s) & (time < act.stop_s)]
+        before, behind = track.t_world_body[time < span.start_s], track.t_world_body[time >= span.stop_s]
+        active = track.t_world_body[(time >= span.start_s) & (time < span.stop_s)]
         assert (before == active[:1]).all()
         assert (behind == active[-1:]).all()
         assert (active.diff(dim=0).norm(dim=-1) > 0).all()
     idle = torch.ones(len(motion), dtype=torch.bool)
-    for act in scenario.acts:
-        idle &= (motion.timestamps < act.start_s) | (motion.timestamps >= act.stop_s)
+    for span in scenario.active_objects:
+        idle &= (motion.timestamps < span.start_s) | (motion.timestamps >= span.stop_s)
     assert not motion.body_contact_prob[idle].any()
 
 
@@ -459,24 +459,24 @@ def test_a_queues_memory_is_bounded():
 
 def test_acts_may_be_listed():
     recording, environment = carrying(1.5), boxes()
-    acts = [{"object": "box_1", "start_s": 0.9, "stop_s": 1.2}, {"object": "box_1", "start_s": 0.2, "stop_s": 0.4}]
-    found = drawn_echo(acts=acts).scenario(recording, environment).acts
-    assert [act.start_s for act in found] == [0.2, 0.9]
-    assert drawn_echo(acts="none").scenario(recording, environment).acts == ()
-    assert [act.object for act in drawn_echo().scenario(recording, environment).acts] == ["box_1"]
-    assert drawn_echo().scenario(carrying(1.0, carried=()), None).acts == ()
+    spans = [{"object": "box_1", "start_s": 0.9, "stop_s": 1.2}, {"object": "box_1", "start_s": 0.2, "stop_s": 0.4}]
+    found = drawn_echo(active_objects=spans).scenario(recording, environment).active_objects
+    assert [span.start_s for span in found] == [0.2, 0.9]
+    assert drawn_echo(active_objects="none").scenario(recording, environment).active_objects == ()
+    assert [span.object for span in drawn_echo().scenario(recording, environment).active_objects] == ["box_1"]
+    assert drawn_echo().scenario(carrying(1.0, carried=()), None).active_objects == ()
 
 
 def test_interactions_name_the_active_object_without_its_poses():
     recording = replace(carrying(1.5), object_motion={})
-    assert [act.object for act in drawn_echo().scenario(recording, boxes()).acts] == ["box_1"]
-    assert drawn_echo().scenario(replace(recording, interactions=None), boxes()).acts == ()
+    assert [span.object for span in drawn_echo().scenario(recording, boxes()).active_objects] == ["box_1"]
+    assert drawn_echo().scenario(replace(recording, interactions=None), boxes()).active_objects == ()
 
 
 @pytest.mark.parametrize("wrong", ["guess", [{"object": "a"}], [{"object": "a", "start_s": 0.0, "end_s": 1.0}]])
 def test_invalid_acts_are_refused(wrong):
-    with pytest.raises(WearcapError, match="acts.*Expected .*a list of {object, start_s, stop_s}"):
-        drawn_echo(acts=wrong)
+    with pytest.raises(WearcapError, match="active_objects.*Expected .*a list of {object, start_s, stop_s}"):
+        drawn_echo(active_objects=wrong)
 
 
 def tracked(recording, **changes):

@@ -135,7 +135,7 @@ def test_what_waits_for_a_lost_head_is_bounded(echo, recording, monkeypatch):
         session.activate("box_1" if k % 2 else None, k / 30)
         session.see_object("box_1", k / 30, pose)
         assert session.poses() is None
-    assert len(session._wrists.samples["left_wrist"]) == len(session._acts) == 50
+    assert len(session._wrists.samples["left_wrist"]) == len(session._activated) == 50
     assert len(session._seen) == 20
 
 
@@ -170,4 +170,4 @@ def test_whatever_comes_it_goes_on(echo, recording, seed):
         *session._wrists.samples.values(),
     )
     assert max(map(len, sizes)) < 100
-    assert len(session._acts) + len(session._seen) < 300
+    assert len(session._activated) + len(session._seen) < 300

@@ -10,7 +10,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
-from wearcap.recording.acts import active_at
+from wearcap.recording.active_objects import active_at
 from wearcap.recording.timing import joined
 from wearcap.runtime.wearer import Wearer
 from wearcap.scene.objects import Environment
@@ -49,10 +49,10 @@ def streamed(session: EchoStream, recording, before=None, frames=None, wrists=WR
     return joined([part for part in parts if part is not None]), counts
 
 
-def activate_acts(session: EchoStream, scenario) -> None:
-    for act in scenario.acts:
-        session.activate(act.object, act.start_s)
-        session.activate(None, act.stop_s)
+def activate_objects(session: EchoStream, scenario) -> None:
+    for span in scenario.active_objects:
+        session.activate(span.object, span.start_s)
+        session.activate(None, span.stop_s)
 
 
 def assert_same(motion: Motion, whole: Motion, scenario) -> None:
@@ -60,9 +60,9 @@ def assert_same(motion: Motion, whole: Motion, scenario) -> None:
     torch.testing.assert_close(motion.T_world_joint.t, whole.T_world_joint.t, atol=1e-3, rtol=0)
     for name in ("contact_prob", "body_contact_prob"):
         torch.testing.assert_close(getattr(motion, name), getattr(whole, name), atol=1e-3, rtol=0)
-    for act in scenario.acts:
-        active = active_at([act], [act.object], whole.timestamps) == 0
-        found, given = motion.object_motion[act.object], whole.object_motion[act.object]
+    for span in scenario.active_objects:
+        active = active_at([span], [span.object], whole.timestamps) == 0
+        found, given = motion.object_motion[span.object], whole.object_motion[span.object]
         torch.testing.assert_close(found.t_world_body, given.t_world_body[active], atol=1e-3, rtol=0)
         torch.testing.assert_close(found.R_world_body, given.R_world_body[active], atol=1e-3, rtol=0)
 
@@ -75,7 +75,7 @@ def test_a_stream_equals_a_capture_of_the_whole_recording(settings):
     recording, echo = carrying(1.2, carried=TWO), drawn_echo(**settings)
     scenario = replace(scenario_of(recording, TWO), placed=echo.placed)
     session = EchoStream(echo, wearer(recording), boxes(TWO), seed=3)
-    activate_acts(session, scenario)
+    activate_objects(session, scenario)
     motion, counts = streamed(session, recording)
     assert_same(motion, echo.capture_scenarios([scenario], [3])[0], scenario)
     latency = round(echo.latency_s * echo.fps)
@@ -90,7 +90,7 @@ def test_a_stream_of_averaged_windows_equals_a_capture_of_the_whole_recording(se
     recording, echo = carrying(1.2, carried=TWO), drawn_echo(**AVERAGED, **settings)
     scenario = replace(scenario_of(recording, TWO), placed=echo.placed)
     session = EchoStream(echo, wearer(recording), boxes(TWO), seed=3)
-    activate_acts(session, scenario)
+    activate_objects(session, scenario)
     motion, counts = streamed(session, recording)
     assert_same(motion, echo.capture_scenarios([scenario], [3])[0], scenario)
     assert all(0 <= k + 1 - count <= round(echo.latency_s * echo.fps) + 1 for k, count in enumerate(counts))
@@ -101,7 +101,7 @@ def test_averaged_windows_forget_what_they_predicted_before_an_object_was_seen()
     recording = carrying(1.2)
     echo = drawn_echo(**AVERAGED, anchor=False)
     session = EchoStream(echo, wearer(recording), boxes(), seed=3)
-    activate_acts(session, scenario_of(recording))
+    activate_objects(session, scenario_of(recording))
     track, at = recording.object_motion["box_1"], 15
     time = recording.motion.timestamps[at].item()
     seen = Rigid(track.R_world_body[at], track.t_world_body[at])
@@ -120,15 +120,15 @@ def test_objects_in_a_stream_are_static_from_their_first_contact_on():
     likely = drawn.body_contact_prob.amax(1)
     threshold = likely[likely > 0].median().item()
     session = EchoStream(drawn_echo(static_threshold=threshold), wearer(recording), boxes(TWO), seed=3)
-    activate_acts(session, scenario)
+    activate_objects(session, scenario)
     motion, _ = streamed(session, recording)
-    for act in scenario.acts:
-        active = (active_at([act], [act.object], drawn.timestamps) == 0).nonzero()[:, 0]
+    for span in scenario.active_objects:
+        active = (active_at([span], [span.object], drawn.timestamps) == 0).nonzero()[:, 0]
         touched = likely[active] >= threshold
         first = int(touched.nonzero()[0])
         assert not touched[first:].all()
-        found = motion.object_motion[act.object].t_world_body
-        path = drawn.object_motion[act.object].t_world_body[active]
+        found = motion.object_motion[span.object].t_world_body
+        path = drawn.object_motion[span.object].t_world_body[active]
         torch.testing.assert_close(found[: first + 1], path[: first + 1], atol=1e-3, rtol=0)
         moves = found.diff(dim=0).norm(dim=1) > 1e-6
         assert not (moves & ~touched[1:])[first:].any()
@@ -145,7 +145,7 @@ def test_a_human_alone_needs_no_objects():
 
 @pytest.mark.parametrize(("late", "settings"), [(0, {}), (3, {}), (6, {}), (0, AVERAGED), (3, AVERAGED)])
 def test_an_object_may_be_activated_until_its_frames_are_final(late, settings):
-    """The act begins at frame 20; frames that were output already do not change."""
+    """The span begins at frame 20; frames that were output already do not change."""
     recording, echo = carrying(1.4), drawn_echo(**settings)
     session = EchoStream(echo, wearer(recording), boxes(), seed=3)
     start = recording.motion.timestamps[20].item()
@@ -355,7 +355,7 @@ def test_a_streams_memory_is_bounded():
         sizes.append(
             (
                 *(len(part) for part in session._wrists.samples.values()),
-                len(session._acts),
+                len(session._activated),
                 len(session._seen),
                 len(session._pending),
                 len(session._chunks),

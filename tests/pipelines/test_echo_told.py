@@ -13,7 +13,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.recording.acts import Act
+from wearcap.recording.active_objects import ActiveSpan
 from wearcap.scene.objects import Environment
 from wearcap.systems.echo.features import CONTACTS
 from wearcap.systems.echo.observations import Observed, batch_item_of, wrist_poses
@@ -98,13 +98,13 @@ FAULTS = {
         lambda: with_mesh(category="piano"),
         "object 'box_1' of carry: .*no object class 'piano'. Expected one of box, chair",
     ),
-    "an act of an unknown object": (
-        lambda: replace(scenario_of(RECORDING), acts=(Act("ghost", 0.0, 1.0),)),
+    "a span of an unknown object": (
+        lambda: replace(scenario_of(RECORDING), active_objects=(ActiveSpan("ghost", 0.0, 1.0),)),
         "object 'ghost' of carry: no object 'ghost'. Expected one of box_1",
     ),
-    "acts, but no objects": (
+    "spans, but no objects": (
         lambda: replace(scenario_of(RECORDING), environment=None),
-        "carry: acts of 'box_1', but no objects",
+        "carry: spans of 'box_1', but no objects",
     ),
     "wrists swapped": (swapped, "carry: the left wrist is .* cm to the right of the right one.*Swap the two trackers"),
     "no wrists": (
@@ -205,11 +205,11 @@ def test_the_floor_is_the_recordings_else_the_paths():
 
 
 def test_an_object_begins_where_its_environment_has_it():
-    acts = (Act("box_1", 0.1, 0.3), Act("box_1", 0.6, 0.8))
+    spans = (ActiveSpan("box_1", 0.1, 0.3), ActiveSpan("box_1", 0.6, 0.8))
     item = scene_object("box_1")
     turn = rotation.exp(torch.tensor([0.3, -0.2, 0.9]))
     there = Environment((replace(item, R_world_object=turn, t_world_object=torch.tensor([1.0, 2.0, 0.5])),))
-    scenario = replace(scenario_of(RECORDING), acts=acts, environment=there, placed=True)
+    scenario = replace(scenario_of(RECORDING), active_objects=spans, environment=there, placed=True)
     seen = conditioning(scenario)
     assert seen.is_observed[0, :, 1].nonzero()[:, 0].tolist() == [3]
     torch.testing.assert_close(seen.R_world_object[0, 3], turn)
@@ -223,8 +223,8 @@ def test_an_object_begins_where_its_environment_has_it():
 
 
 def test_objects_are_read_once_however_often_they_are_active():
-    acts = (Act("box_1", 0.0, 0.3), Act("box_1", 0.6, 0.8))
-    echo, scenario = drawn_echo(), replace(scenario_of(RECORDING), acts=acts, environment=boxes())
+    spans = (ActiveSpan("box_1", 0.0, 0.3), ActiveSpan("box_1", 0.6, 0.8))
+    echo, scenario = drawn_echo(), replace(scenario_of(RECORDING), active_objects=spans, environment=boxes())
     batch_item = batch_item_of(scenario, head_path(RECORDING, echo.model.skeleton, echo.fps), echo.reader())
     assert len(batch_item.objects) == 1
     assert batch_item.conditioning.has_object[0].sum() == 9 + 6

@@ -1,6 +1,7 @@
 """HMD² as a stream: the same poses as in one go, whatever happens on the way, in bounded memory."""
 
 import math
+import pickle
 from dataclasses import replace
 
 import pytest
@@ -209,30 +210,6 @@ def test_several_wearers_are_as_alone(pipeline):
     assert_same(replace(second, timestamps=second.timestamps - 500.0), hmd2(recordings[1], seed=6), 1e-4)
 
 
-@pytest.mark.parametrize(("lookahead", "given"), [(0, 50), (13, 37)])
-def test_saved_and_restored_it_goes_on_bit_for_bit(pipeline, tmp_path, lookahead, given):
-    recording, hmd2 = surrounded(120), pipeline(lookahead=lookahead)
-    conditions = moments(recording)
-    whole, first = (HMD2Session(hmd2, [wearer(recording)], [4]) for _ in range(2))
-    stream(first, conditions[:57], ended=False)
-    first.save(tmp_path / "session.safetensors")
-    again = HMD2Session.load(tmp_path / "session.safetensors", hmd2)
-    expected = stream(whole, conditions)[0]
-    resumed = stream(again, conditions[57:])[0]
-    for name in ("timestamps", "R_parent_joint", "t_world_root", "contact_prob"):
-        assert torch.equal(getattr(resumed, name), getattr(expected, name)[given:])
-
-
-def test_a_session_is_loaded_with_its_own_pipeline_alone(pipeline, tmp_path):
-    path = tmp_path / "session.safetensors"
-    HMD2Session(pipeline(), [Wearer(xsens23())], [0]).save(path)
-    with pytest.raises(WearcapError, match="a session with stride 10, not 20"):
-        HMD2Session.load(path, pipeline(20))
-    path.write_bytes(b"nothing")
-    with pytest.raises(WearcapError, match="not a saved session"):
-        HMD2Session.load(path, pipeline())
-
-
 @pytest.mark.parametrize("missing", [range(33, 37), range(20, 29), range(0)])
 def test_missing_poses_within_a_chunk_are_interpolated(pipeline, missing):
     recording, hmd2 = surrounded(75), pipeline(points=False)
@@ -348,15 +325,14 @@ def test_points_beyond_the_memory_are_forgotten(pipeline):
     assert (kept - at)[:, :2].norm(dim=-1).min() < 1.0
 
 
-def test_a_long_stream_needs_no_more_than_a_short_one(pipeline, tmp_path):
-    """A minute in which the map is full after a few seconds: what would be saved does not grow."""
+def test_a_long_stream_needs_no_more_than_a_short_one(pipeline):
+    """A minute in which the map is full after a few seconds: what the wearer keeps does not grow."""
     session = HMD2Session(pipeline(60, steps=1), [Wearer(xsens23())], [0], Memory(5.0, 1000))
     conditions, sizes = moments(surrounded(120))[::6], []
     for lap in range(30):
         pushed(session, [[moment._replace(timestamp=moment.timestamp + 2 * lap) for moment in conditions]])
         if lap % 5 == 4:
-            session.save(tmp_path / "session.safetensors")
-            sizes.append((tmp_path / "session.safetensors").stat().st_size)
+            sizes.append(len(pickle.dumps(vars(session.streams[0].places) | vars(session.streams[0].track))))
     assert max(sizes[3:]) <= 1.02 * max(sizes[:3])
 
 

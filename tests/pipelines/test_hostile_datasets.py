@@ -15,13 +15,13 @@ from command_line import exit_code
 from hostile import in_time
 from wearcap.cli import capture, evaluate
 from wearcap.errors import WearcapError
-from wearcap.evaluation.whole import Outcome, outcome_table, over_recordings
+from wearcap.evaluation.datasets import Outcome, outcome_table, over_recordings
+from wearcap.parallel import Parallel
 from wearcap.reading import read
 from wearcap.recording import RecordingStore
 from wearcap.recording.store import save_recording
 from wearcap.runtime.stages import StagedSystem
 from wearcap.runtime.system import StageOptions
-from wearcap.spread import Spread
 from wearcap_testing import recording_of, swaying_motion
 
 NAMES = (
@@ -105,7 +105,7 @@ def outcomes(store: RecordingStore, notes: Path) -> dict[str, str]:
     store = RecordingStore.open(store.root)
     return {
         found.recording: found.error
-        for found in over_recordings(work, store, store.names(), Spread(jobs=1), notes=notes)
+        for found in over_recordings(work, store, store.names(), Parallel(jobs=1), notes=notes)
     }
 
 

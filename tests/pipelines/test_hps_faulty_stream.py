@@ -13,10 +13,10 @@ from test_hps_stream import pieces
 from bad_packets import Mutator, broken, unchecked
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
-from wearcap.optimize.hps import Solution
 from wearcap.recording import Motion, Recording
-from wearcap.recording.growing import _piece_path, close_pieces, follow_pieces, write_piece
+from wearcap.recording.pieces import _piece_path, close_pieces, follow_pieces, write_piece
 from wearcap.systems.hps import stream as hps_stream
+from wearcap.systems.hps.energy import Solution
 from wearcap.systems.hps.pipeline import HPS
 from wearcap.systems.hps.stream import HpsStream, StreamSettings, follow
 

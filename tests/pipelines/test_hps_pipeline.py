@@ -21,22 +21,22 @@ from wearcap.localization.features import RootSift
 from wearcap.localization.localizer import Localizer
 from wearcap.localization.map_builder import MapSettings, build_map
 from wearcap.localization.point_map import PointMapper
-from wearcap.optimize.banded import BandedSettings, solve_banded
-from wearcap.optimize.costs import Loss
-from wearcap.optimize.hps import HpsEnergy
-from wearcap.optimize.hps_constants import ConstantsPrior
-from wearcap.optimize.trajectory import Bending, bend
-from wearcap.optimize.trajectory_banded import bend_banded
+from wearcap.optimize.losses import Loss
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import resampled
 from wearcap.runtime.stages import digest
 from wearcap.runtime.system import Captured, CaptureInput, StageOptions, System
 from wearcap.scene.scan import Scan
 from wearcap.systems.hps import pipeline as hps_module
+from wearcap.systems.hps.banded import BandedSettings, solve_banded
 from wearcap.systems.hps.camera import MapLocalization, Synchronization
+from wearcap.systems.hps.constants import ConstantsPrior
+from wearcap.systems.hps.energy import HpsEnergy
 from wearcap.systems.hps.pipeline import HPS, at_frames
 from wearcap.systems.hps.published import HpsBaseline
 from wearcap.systems.ireplica.published import BentSuit
+from wearcap.systems.ireplica.trajectory import Bending, bend
+from wearcap.systems.ireplica.trajectory_banded import bend_banded
 
 ENERGY = HpsEnergy(
     {

@@ -10,7 +10,7 @@ from hydra.utils import instantiate
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
 from wearcap.recording import Recording
-from wearcap.recording.growing import _piece_path, close_pieces, follow_pieces, write_piece
+from wearcap.recording.pieces import _piece_path, close_pieces, follow_pieces, write_piece
 from wearcap.runtime.system import CaptureInput
 from wearcap.scene.scan import Scan
 from wearcap.systems.hps.pipeline import HPS

@@ -16,19 +16,19 @@ from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.contact_labels import LabelClock, labels_of
 from wearcap.io.formats.environment import write_environment
 from wearcap.metrics.objects import summary
-from wearcap.optimize.contact_correction import OffsetSettings
-from wearcap.optimize.trajectory import Bending, bend
-from wearcap.optimize.trajectory_banded import bend_banded
 from wearcap.recording import CameraStream, Motion, Recording
 from wearcap.recording.motion import Interactions
 from wearcap.runtime.stages import StagedSystem, digest
 from wearcap.runtime.system import CaptureInput
 from wearcap.scene.objects import UNKNOWN_CLASS, Environment, Freedom, SceneObject
+from wearcap.systems.ireplica.contact_correction import OffsetSettings
 from wearcap.systems.ireplica.detected_contacts import DetectedContacts
 from wearcap.systems.ireplica.object_tracker import PALMS, AttachmentSettings, ObjectTracker
 from wearcap.systems.ireplica.pipeline import IReplica
 from wearcap.systems.ireplica.scores import score_interactions
 from wearcap.systems.ireplica.snapping import BendCorrection, HandSnapping, HingeFit, SnapCorrection, fit_about_hinge
+from wearcap.systems.ireplica.trajectory import Bending, bend
+from wearcap.systems.ireplica.trajectory_banded import bend_banded
 from wearcap_testing import benchmark
 
 baselines = benchmark("rivals.ireplica_baselines")

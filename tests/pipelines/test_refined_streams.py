@@ -1,24 +1,21 @@
-"""Streams that refine give what whole captures give, later by the refinement's lookahead, saved and loaded or not."""
+"""Streams that refine give what whole captures give, later by the refinement's lookahead."""
 
 from dataclasses import replace
 
 import pytest
 import torch
-from test_echo_stream import TWO, activate_acts, assert_same, feed
+from test_echo_stream import TWO, activate_objects, assert_same
 from test_echo_stream import streamed as echo_streamed
 from test_echo_stream import wearer as echo_wearer
-from test_hmd2_stream import moments, pipeline, places, surrounded, together, wearer
+from test_hmd2_stream import moments, pipeline, places, surrounded, wearer
 from test_hmd2_stream import stream as hmd2_stream
-from test_mocap_every_stream import streamed, wearing
-from test_sessions import run, watch_samples
+from test_mocap_every_stream import streamed
 
 from carried_box import boxes, carrying, drawn_echo, scenario_of
 from watched_walk import drawn_pipeline, watched_walk
 from wearcap.recording import Motion
-from wearcap.recording.timing import joined
-from wearcap.systems.echo.stream import EchoSession, EchoStream
+from wearcap.systems.echo.stream import EchoStream
 from wearcap.systems.hmd2.stream import HMD2Session
-from wearcap.systems.mocap_every.stream import MocapEverySession
 from wearcap.tracking.foot_lock import FootLock
 from wearcap.tracking.refinement import Refinement
 
@@ -76,7 +73,7 @@ def test_echo_stream_with_objects_at_its_latency():
     recording, echo = carrying(1.2, carried=TWO), drawn_echo(refinement=REFINEMENT)
     scenario = scenario_of(recording, TWO)
     session = EchoStream(echo, echo_wearer(recording), boxes(TWO), seed=3)
-    activate_acts(session, scenario)
+    activate_objects(session, scenario)
     motion, counts = echo_streamed(session, recording)
     assert_same(motion, echo.capture_scenarios([scenario], [3])[0], scenario)
     latency = round(echo.latency_s * echo.fps)
@@ -84,40 +81,6 @@ def test_echo_stream_with_objects_at_its_latency():
     wrists = recording.motion.skeleton.indices("left_wrist", "right_wrist")
     found, true = (each.T_world_joint.R[:, wrists] for each in (motion, recording.motion))
     torch.testing.assert_close(found, true, atol=1e-4, rtol=0)
-
-
-def saved(session, tmp_path, system):
-    session.save(tmp_path / "session.safetensors")
-    return type(session).load(tmp_path / "session.safetensors", system)
-
-
-def test_saved_sessions_go_on(pipeline, tmp_path):
-    recording, system = watched_walk(2.0), drawn_pipeline(refinement=REFINEMENT)
-    frames = [[part] for part in watch_samples(recording)]
-    session = MocapEverySession(system, [wearing(recording)])
-    first = run(session, frames[:37])[0]
-    session = saved(session, tmp_path, system)
-    rest = run(session, frames[37:])[0] + session.poses(ended=True)
-    assert_near(joined([*first, *rest]), system(recording))
-
-    recording, system = surrounded(90), pipeline(10, lookahead=None, refinement=REFINEMENT)
-    session = HMD2Session(system, [wearer(recording)], [3])
-    first = run(session, [[[moment]] for moment in moments(recording)[:47]])[0]
-    session = saved(session, tmp_path, system)
-    parts = [*first, *run(session, [[[moment]] for moment in moments(recording)[47:]])[0], *session.poses(ended=True)]
-    assert_near(together([part for part in parts if part is not None]), system(recording, seed=3))
-
-
-def test_a_saved_echo_session_goes_on(tmp_path):
-    recording, echo = carrying(1.0), drawn_echo(refinement=REFINEMENT)
-    session, parts = EchoSession(echo, [echo_wearer(recording)], [1]), []
-    for frame in range(len(recording.motion)):
-        if frame == 20:
-            session = saved(session, tmp_path, echo)
-        feed(session.streams[0], recording, frame)
-        parts.append(session.poses()[0])
-    parts.append(session.poses(ended=True)[0])
-    assert_near(joined([part for part in parts if part is not None]), echo.capture([recording], [1])[0].motion)
 
 
 @pytest.mark.parametrize("gap", [(40, 70)])

@@ -43,7 +43,7 @@ def measured(motion: Motion) -> Measured:
 
 
 def refined(refinement: Refinement, motion: Motion, known: Measured | None = None) -> Motion:
-    return refinement.whole(motion, known or measured(motion), [(0, len(motion))], FPS, anchored=True)
+    return refinement.refined(motion, known or measured(motion), [(0, len(motion))], FPS, anchored=True)
 
 
 def slid(motion: Motion, speed_m_s: float = 0.25, sink_m: float = 0.0) -> Motion:
@@ -161,7 +161,7 @@ def test_pieces_give_what_the_whole_gives(piece, anchored):
     known = Measured.of(motion.joint("head"), torch.zeros(len(motion)), wrists)
     known.given[40:43] = True
     refinement = Refinement(0.8, FEET, True)
-    whole = refinement.whole(bad, known, [(0, len(bad))], FPS, anchored)
+    whole = refinement.refined(bad, known, [(0, len(bad))], FPS, anchored)
     refiner, parts, waits = Refiner(refinement, bad.skeleton, FPS, anchored), [], []
     for start in range(0, len(bad), piece):
         stop = min(start + piece, len(bad))
@@ -179,10 +179,10 @@ def test_pieces_give_what_the_whole_gives(piece, anchored):
 def test_stretches_know_nothing_of_each_other():
     motion, _ = truth()
     bad, refinement = slid(motion), Refinement(1.0, FEET, False)
-    parts = refinement.whole(bad, measured(motion), [(0, 50), (60, len(bad))], FPS, anchored=True)
+    parts = refinement.refined(bad, measured(motion), [(0, 50), (60, len(bad))], FPS, anchored=True)
     for start, stop in ((0, 50), (60, len(bad))):
         alone = bad.sliced(start, stop)
-        expected = refinement.whole(alone, measured(motion).part(slice(start, stop)), [(0, stop - start)], FPS, True)
+        expected = refinement.refined(alone, measured(motion).part(slice(start, stop)), [(0, stop - start)], FPS, True)
         torch.testing.assert_close(parts.R_parent_joint[start:stop], expected.R_parent_joint)
     torch.testing.assert_close(parts.R_parent_joint[50:60], bad.R_parent_joint[50:60])
 

@@ -1,16 +1,12 @@
-"""Sessions of several wearers: each as alone, and saved and restored they go on as if nothing had happened.
+"""Sessions of several wearers: each as alone.
 
-Bit for bit but for ECHO, whose cached plans are sums in another order after a restart.
+Bit for bit but for ECHO, whose batched plans are sums in another order.
 """
-
-from dataclasses import replace
 
 import pytest
 import torch
-from hps_walk import floor_points, hps_recording
 from test_echo_stream import TWO, WRISTS
 from test_echo_stream import wearer as echo_wearer
-from test_hps_stream import SETTINGS, hps, pieces
 from test_mocap_every_stream import wearing
 
 from carried_box import boxes, carrying, drawn_echo
@@ -20,11 +16,9 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import joined
 from wearcap.runtime.session import Session
-from wearcap.scene.scan import Scan
-from wearcap.sensors.samples import ActiveObject, HeadSample, ObjectSample, SuitPiece, WatchSample, WristSample
+from wearcap.sensors.samples import ActiveObject, HeadSample, ObjectSample, WatchSample, WristSample
 from wearcap.systems.echo.contacts import Guidance
 from wearcap.systems.echo.stream import EchoSession, EchoStream
-from wearcap.systems.hps.stream import HpsSession
 from wearcap.systems.mocap_every.stream import MocapEverySession
 
 ROUNDED = 2e-3
@@ -86,36 +80,17 @@ def assert_equal(motion: Motion, other: Motion, atol: float = 0.0) -> None:
         torch.testing.assert_close(motion.object_motion[name].t_world_body, track.t_world_body, atol=atol, rtol=0)
 
 
-def assert_goes_on(make, load, frames: list[list[list]], path, atol: float = 0.0) -> list[Motion]:
-    """A session that is saved and restored in the middle gives the poses of one that is not."""
-    whole = make()
-    expected = ended(whole, run(whole, frames))
-    first, half = make(), len(frames) // 2
-    before = run(first, frames[:half])
-    first.save(path)
-    again = load(path)
-    after = run(again, frames[half:])
-    for motion, other in zip(ended(again, [a + b for a, b in zip(before, after)]), expected):
-        assert_equal(motion, other, atol)
-    assert again.refused == whole.refused
-    return expected
-
-
 @pytest.mark.parametrize("floor", ["follow", "update", "fixed"])
-def test_mocap_every_goes_on_with_two_wearers(floor, tmp_path):
+def test_two_wearers_of_mocap_every_are_as_alone(floor):
     recording, pipeline = watched_walk(), drawn_pipeline(floor=floor)
     samples = watch_samples(recording)
     late = [[], [], [], *samples][: len(samples)] + samples[len(samples) - 3 :]
     frames = [[a, b] for a, b in zip([*samples, [], [], []], late)]
-    make = lambda: MocapEverySession(pipeline, [wearing(recording), wearing(recording)])  # noqa: E731
-    first, second = assert_goes_on(
-        make, lambda path: MocapEverySession.load(path, pipeline), frames, tmp_path / "s.safetensors"
-    )
+    both = MocapEverySession(pipeline, [wearing(recording), wearing(recording)])
+    first, second = ended(both, run(both, frames))
     alone = MocapEverySession(pipeline, [wearing(recording)])
     assert_equal(first, ended(alone, run(alone, [[part] for part in samples]))[0])
     assert len(second) == len(first)
-    with pytest.raises(WearcapError, match="a session with floor"):
-        MocapEverySession.load(tmp_path / "s.safetensors", replace(pipeline, floor="points"))
 
 
 AVERAGED = {"rewindow": 3, "rewindow_steps": 1, "average": True}
@@ -130,14 +105,13 @@ AVERAGED = {"rewindow": 3, "rewindow_steps": 1, "average": True}
         AVERAGED | {"mirror_average": True, "guidance": Guidance(object=2.0)},
     ],
 )
-def test_echo_goes_on_with_two_wearers(settings, tmp_path):
+def test_two_wearers_of_echo_are_as_alone(settings):
     recording, echo = carrying(1.2, carried=TWO), drawn_echo(**settings)
     samples = echo_samples(recording)
     frames = [[part, part[:3]] for part in samples]
     who = [echo_wearer(recording), echo_wearer(recording)]
-    make = lambda: EchoSession(echo, who, [3, 4], boxes(TWO))  # noqa: E731
-    load = lambda path: EchoSession.load(path, echo, boxes(TWO))  # noqa: E731
-    assert_goes_on(make, load, frames, tmp_path / "s.safetensors", ROUNDED)
+    both = EchoSession(echo, who, [3, 4], boxes(TWO))
+    first = ended(both, run(both, frames))[0]
     stream = EchoStream(echo, who[0], boxes(TWO), 3)
     alone = EchoSession(echo, who[:1], [3], boxes(TWO))
     motion = ended(alone, run(alone, [[part] for part in samples]))[0]
@@ -148,16 +122,7 @@ def test_echo_goes_on_with_two_wearers(settings, tmp_path):
         parts.append(stream.poses())
     parts.append(stream.poses(ended=True))
     assert_equal(motion, joined([part for part in parts if part is not None]), ROUNDED)
-    with pytest.raises(WearcapError, match="box_1"):
-        EchoSession.load(tmp_path / "s.safetensors", echo)
-
-
-def test_hps_goes_on(tmp_path):
-    recording, scan, pipeline = hps_recording(seconds=14.0), Scan(floor_points()), hps()
-    samples = [[[SuitPiece(piece.suit, piece.localization)]] for piece in pieces(recording)]
-    make = lambda: HpsSession(pipeline, [recording], scan, SETTINGS)  # noqa: E731
-    load = lambda path: HpsSession.load(path, pipeline, [recording], scan)  # noqa: E731
-    assert_goes_on(make, load, samples, tmp_path / "s.safetensors")
+    assert_equal(first, motion, ROUNDED)
 
 
 def test_samples_of_another_kind_are_refused_and_of_other_wearers_raise():

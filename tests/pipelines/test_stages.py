@@ -46,7 +46,7 @@ def three(settings: Settings, made: list[str], die: bool = False) -> list[Stage]
         return None if settings.gain == 0 else done["doubled"]["value"].sum().item()
 
     return [
-        Stage("start", start, lambda: [settings.shift]),
+        Stage("start", start, lambda: [settings.shift], kinds=(Clock,)),
         Stage("doubled", doubled, lambda: [settings.gain], ("start",)),
         Stage("end", end, list, ("doubled",)),
     ]
@@ -221,5 +221,5 @@ def test_the_modules_of_what_a_stage_reads():
     assert modules_of([energy, {"a": torch.ones(2)}, 3]) == {
         "wearcap.runtime.stages",
         "wearcap.systems.ireplica.snapping",
-        "wearcap.optimize.contact_correction",
+        "wearcap.systems.ireplica.contact_correction",
     }

@@ -18,14 +18,14 @@ from PIL import Image
 from wearcap.cli import capture, evaluate, export, train
 from wearcap.cli.conf import compose, conf_dir, load_pipeline, with_pipeline
 from wearcap.errors import WearcapError
-from wearcap.evaluation import whole
-from wearcap.evaluation.whole import Outcome, over_recordings, scored, settings_key
+from wearcap.evaluation import datasets
+from wearcap.evaluation.datasets import Outcome, over_recordings, scored, settings_key
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.metrics.table import Row
 from wearcap.models.checkpoint import shared_checkpoints
+from wearcap.parallel import Parallel
 from wearcap.recording import RecordingStore
 from wearcap.runtime.system import Captured, CaptureInput, System, training_of
-from wearcap.spread import Spread
 from wearcap_testing import recording_of, small_dataset, swaying_motion
 
 FEW_STEPS = "pipeline.sampling.steps=1"
@@ -159,7 +159,7 @@ def test_an_evaluation_goes_on_and_lists_what_failed(checkpoint, data, tmp_path,
     assert (bool(rows["r5"]["error"]), bool(rows["r4"]["error"])) == (True, False)
     store.path_of("r5").write_bytes(whole_file)
     captured = []
-    monkeypatch.setattr(whole, "evaluate", lambda *given: captured.append(given[2]) or _evaluate(*given))
+    monkeypatch.setattr(datasets, "evaluate", lambda *given: captured.append(given[2]) or _evaluate(*given))
     both = evaluating(checkpoint, own, output, "jobs=1")
     assert captured[0] == ["r5"], "the other one is finished"
     captured.clear()
@@ -167,7 +167,7 @@ def test_an_evaluation_goes_on_and_lists_what_failed(checkpoint, data, tmp_path,
     assert captured == []
 
 
-_evaluate = whole.evaluate
+_evaluate = datasets.evaluate
 
 
 def test_an_evaluation_says_where_it_errs_and_draws_the_worst(checkpoint, data, tmp_path, capsys):
@@ -281,7 +281,7 @@ def test_memory_does_not_grow_with_the_number_of_recordings(tmp_path):
     def work(names):
         return scored(names, system=lambda: system, key="k", root=store.root, seeds=[0], batch_size=4)
 
-    outcomes = list(over_recordings(work, store, store.names(), Spread(jobs=1), chunk=4, notes=tmp_path / "n"))
+    outcomes = list(over_recordings(work, store, store.names(), Parallel(jobs=1), chunk=4, notes=tmp_path / "n"))
     assert [outcome.recording for outcome in outcomes] == store.names()
     assert len(system.alive) == 6
     assert max(system.alive) <= 8, "those of one chunk, and no more than the one before"
@@ -298,7 +298,7 @@ def test_what_was_finished_before_a_kill_is_kept(tmp_path):
         return [Outcome(names[0], 1.5, 3, rows)]
 
     def outcomes():
-        return list(over_recordings(work, store, store.names(), Spread(jobs=1), notes=tmp_path / "n", settings="s"))
+        return list(over_recordings(work, store, store.names(), Parallel(jobs=1), notes=tmp_path / "n", settings="s"))
 
     with pytest.raises(KeyboardInterrupt):
         outcomes()
@@ -315,7 +315,7 @@ def test_what_was_finished_before_a_kill_is_kept(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         outcomes()
     assert done == [first[0], next(name for name in store.names() if name not in {*first, *third})]
-    (kept,) = over_recordings(work, store, [first[1]], Spread(jobs=1), notes=tmp_path / "n", settings="s")
+    (kept,) = over_recordings(work, store, [first[1]], Parallel(jobs=1), notes=tmp_path / "n", settings="s")
     assert kept.rows[0].scores["a_cm"] == 1.0
     assert kept.rows[0].scores["unknown"] != kept.rows[0].scores["unknown"]
     assert kept.rows[0].scores["endless"] == float("inf")

@@ -84,22 +84,6 @@ def oracle(frame: str = "own", **changes) -> EchoDiffusion:
     return learner(net, features=small_features(frame, **changes))
 
 
-def test_what_is_in_the_hand_is_learned_where_the_wrist_has_it(data):
-    """Errors in the wrists' channels cost vertices in frames of contact alone, and are held by the left hand alone here."""
-    system = oracle(object_in_wrists=True)
-    windows = batch(system.features, data)
-    truth = system.truth(windows, system.features.canonical(windows.points))
-    own, left, right = (slice(system.net.sizes[0] + k, system.net.sizes[0] + k + 3) for k in (0, 9, 18))
-    costs = {}
-    for name, part in {"none": slice(0), "own": own, "left": left, "right": right}.items():
-        system.net.outputs = truth.clone()
-        system.net.outputs[..., part] += 0.1
-        costs[name] = system.terms(windows)["object_vertices"].item()
-    assert costs["none"] < 0.01
-    assert costs["right"] == pytest.approx(costs["none"], abs=1e-4), "this hand holds nothing"
-    assert 0.03 < costs["left"] - costs["none"] < costs["own"]
-
-
 def explicit_vertices(batch: EchoWindow, cloud: torch.Tensor, R, t) -> torch.Tensor:
     """Root of the mean square over all points of an object, point by point."""
     found = (R[:, :, None] @ cloud[None, None, :, :, None])[..., 0] + t[:, :, None]
@@ -107,10 +91,9 @@ def explicit_vertices(batch: EchoWindow, cloud: torch.Tensor, R, t) -> torch.Ten
     return ((found - true).square().sum(-1).mean(-1) + 1e-6).sqrt()
 
 
-@pytest.mark.parametrize("in_wrists", [False, True])
 @pytest.mark.parametrize("frame", ["own", "window", "world"])
-def test_the_truth_costs_nothing(data, people, frame, in_wrists):
-    system = oracle(frame, object_in_wrists=in_wrists)
+def test_the_truth_costs_nothing(data, people, frame):
+    system = oracle(frame)
     windows = batch(system.features, data, people)
     at = system.features.canonical(windows.points)
     system.net.outputs = system.truth(windows, at)
@@ -167,8 +150,8 @@ def small_net_like(**_):
 
 
 def test_windows_draw_noise_for_every_channel(data):
-    for features in (small_features(), small_features(object_in_wrists=True)):
-        assert batch(features, data, count=1).noise.shape[-1] == sum(learner(features=features).net.sizes)
+    features = small_features()
+    assert batch(features, data, count=1).noise.shape[-1] == sum(learner(features=features).net.sizes)
 
 
 def test_absent_objects_are_noise_alone(data, people):
@@ -249,11 +232,10 @@ def test_alike_orientations_are_asked_for_where_no_clean_frame_shows_the_true_on
     assert torch.equal(asked.R_world_object, windows.R_world_canonical), "what is not there shows nothing"
 
 
-@pytest.mark.parametrize("in_wrists", [False, True])
 @pytest.mark.parametrize("frame", ["own", "window", "world"])
-def test_every_term_is_finite_and_every_weight_is_learned(data, people, frame, in_wrists):
+def test_every_term_is_finite_and_every_weight_is_learned(data, people, frame):
     torch.manual_seed(0)
-    system = learner(features=small_features(frame, object_in_wrists=in_wrists))
+    system = learner(features=small_features(frame))
     system.set_statistics(dataset(system.features, data, people), limit=100)
     terms = system.terms(batch(system.features, data, people))
     assert set(terms) == set(WEIGHTS)

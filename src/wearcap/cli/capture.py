@@ -22,7 +22,7 @@ from wearcap.cli.capture_all import capture_all, is_dataset
 from wearcap.cli.conf import hydra_main, load_pipeline, with_pipeline, with_pipeline_of_content
 from wearcap.cli.stated import stated
 from wearcap.doctor import require_sound
-from wearcap.doctor.agreement import SCAN_FILE
+from wearcap.doctor.consistency import SCAN_FILE
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.io.datasets.amass import write_amass

@@ -10,9 +10,9 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from rich import print as show
 
-from wearcap.cli.conf import load_pipeline, spread_of
+from wearcap.cli.conf import load_pipeline, parallel_of
 from wearcap.errors import WearcapError
-from wearcap.evaluation.whole import (
+from wearcap.evaluation.datasets import (
     Outcome,
     loaded,
     outcome_table,
@@ -21,10 +21,10 @@ from wearcap.evaluation.whole import (
     settings_key,
     write_outcomes,
 )
+from wearcap.parallel import reason_of
 from wearcap.recording import Motion, RecordingStore
 from wearcap.recording.store import MANIFEST
 from wearcap.runtime.system import CaptureInput, System
-from wearcap.spread import reason_of
 
 Capture = Callable[[Any, System], Motion | None]
 """Captures the one recording of a config and writes its files. The config's values are plain: names of recordings, in
@@ -64,7 +64,7 @@ def capture_all(config: DictConfig, capture: Capture) -> None:
             partial(_captured, plain=plain, key=key, capture=capture),
             store,
             names,
-            spread_of(config),
+            parallel_of(config),
             notes=output / "finished",
             settings=key,
             scene=config.scene,

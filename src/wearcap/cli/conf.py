@@ -34,12 +34,12 @@ from wearcap.errors import WearcapError, nearest
 from wearcap.files import resource
 from wearcap.locks import LOCK
 from wearcap.models.checkpoint import read_checkpoint
+from wearcap.parallel import Parallel
 from wearcap.reading import read
 from wearcap.recording import RecordingStore
 from wearcap.recording.store import MANIFEST, dataset_folder
 from wearcap.runtime.needs import Need
 from wearcap.runtime.system import CaptureInput, System, training_of
-from wearcap.spread import Spread
 
 
 def splits_dir() -> Path:
@@ -344,7 +344,7 @@ def trained_on(checkpoint: str | Path) -> tuple[list[str], str]:
     return sources, validated[0]
 
 
-def spread_of(config: DictConfig) -> Spread:
+def parallel_of(config: DictConfig) -> Parallel:
     """How a command's recordings are spread: its `jobs` (null: one per core, on a GPU one), `backend`, `scheduler`."""
     jobs = config.jobs if config.jobs is not None else -1 if config.device == "cpu" else 1
-    return Spread(jobs, config.backend, config.scheduler, threads=None)
+    return Parallel(jobs, config.backend, config.scheduler, threads=None)

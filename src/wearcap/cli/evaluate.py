@@ -10,7 +10,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from rich import get_console
 from rich import print as show
 
-from wearcap.cli.conf import hydra_main, load_systems, spread_of, trained_on, with_pipeline
+from wearcap.cli.conf import hydra_main, load_systems, parallel_of, trained_on, with_pipeline
 from wearcap.cli.stated import stated
 from wearcap.errors import WearcapError
 from wearcap.evaluation.baselines import BASELINES
@@ -24,8 +24,7 @@ from wearcap.evaluation.breakdown import (
     part_table,
     recording_table,
 )
-from wearcap.evaluation.evaluate import Realism
-from wearcap.evaluation.whole import (
+from wearcap.evaluation.datasets import (
     Outcome,
     failures,
     loaded,
@@ -37,13 +36,14 @@ from wearcap.evaluation.whole import (
     settings_key,
     write_outcomes,
 )
+from wearcap.evaluation.evaluate import Realism
 from wearcap.metrics.table import Row, Scores, Summary, aggregate, rich_table, write_scores
+from wearcap.parallel import Parallel
 from wearcap.prepare.files import with_own_files
 from wearcap.reading import read
 from wearcap.recording import RecordingStore
 from wearcap.recording.store import MANIFEST, dataset_folder
 from wearcap.runtime.system import CaptureInput, System
-from wearcap.spread import Spread
 from wearcap.viewer.page_layers import with_objects
 from wearcap.viewer.picture import contact_sheet, save_png
 
@@ -181,7 +181,7 @@ class _Scoring:
         key = settings_key(plain | {"seeds": list(seeds)}, checkpoints)
         loaded(key, lambda: system)
         make = partial(_load, list(checkpoints), plain["pipeline"], self.config.device)
-        return self.outcomes(self.names, system, make, key, seeds, title, method, spread_of(self.config))
+        return self.outcomes(self.names, system, make, key, seeds, title, method, parallel_of(self.config))
 
     def outcomes(
         self,
@@ -192,7 +192,7 @@ class _Scoring:
         seeds: Sequence[int],
         title: str,
         method: str,
-        how: Spread,
+        how: Parallel,
     ) -> list[Outcome]:
         """Outcomes of a system that `make` makes; with `realism`, whose latents are kept here, in this process."""
         config, realism = self.config, self.realism
@@ -216,7 +216,7 @@ class _Scoring:
             work,
             self.store,
             names,
-            how if realism is None else Spread(jobs=1),
+            how if realism is None else Parallel(jobs=1),
             chunk=chunk,
             notes=notes if realism is None else None,
             settings=key,
@@ -247,7 +247,7 @@ def _baselines(scoring: _Scoring, labels: Sequence[str], checkpoint: str, names:
             key += "".join(entry.sha256 for store in stores for entry in store.entries.values())
             chosen = [name for name in scoring.names if name in names]
             outcomes = scoring.outcomes(
-                chosen, baseline, lambda made=baseline: made, key, [0], label, label, Spread(jobs=1)
+                chosen, baseline, lambda made=baseline: made, key, [0], label, label, Parallel(jobs=1)
             )
             require_all(outcomes, scoring.store.root)
             found[label] = rows_of(outcomes)

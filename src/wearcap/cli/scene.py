@@ -28,10 +28,8 @@ def run(config: DictConfig) -> VisualMap:
         expected = "every=1 (all photos) or more, check=0 or more"
         raise WearcapError(f"every={config.every} check={config.check}", expected=expected)
     photos, source = read_scene(config.scene, config.images, config.metres_per_unit)
-    extractor, matcher, descriptor = (
-        instantiate(config.localization[part]) for part in ("extractor", "matcher", "descriptor")
-    )
-    options = {"descriptor": descriptor, "settings": instantiate(config.settings), "progress": True}
+    extractor, matcher = (instantiate(config.localization[part]) for part in ("extractor", "matcher"))
+    options = {"settings": instantiate(config.settings), "progress": True}
     taken = np.arange(0, len(photos), config.every)
     held_out = (
         taken[:: len(taken) // config.check][: config.check] if 0 < config.check <= len(taken) // 4 else taken[:0]
@@ -42,7 +40,7 @@ def run(config: DictConfig) -> VisualMap:
     else:
         made = extended(VisualMap.load(config.extend), *_part(photos, source, rest), extractor, **options)
     if len(held_out):
-        localizer = Localizer(made, extractor, matcher, instantiate(config.localizer), descriptor=descriptor)
+        localizer = Localizer(made, extractor, matcher, instantiate(config.localizer))
         _check(localizer, [photos[number] for number in held_out])
         made = extended(made, *_part(photos, source, held_out), extractor, **options)
     _show_report(made)

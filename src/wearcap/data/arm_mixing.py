@@ -42,10 +42,10 @@ class _Segment:
 class ArmDonors:
     """Recordings whose arms others may move, with the way in which their trunks move."""
 
-    def __init__(self, files: Sequence[RecordingFile], agreement: float = 0.5, blend_s: float = 0.5):
-        """`agreement`: largest RMS of the differences between two trunks, in units of tolerances; arms are blended over
+    def __init__(self, files: Sequence[RecordingFile], tolerance: float = 0.5, blend_s: float = 0.5):
+        """`tolerance`: largest RMS of the differences between two trunks, in units of tolerances; arms are blended over
         `blend_s`. Files without a motion have none to give."""
-        self.agreement, self.blend_s = agreement, blend_s
+        self.tolerance, self.blend_s = tolerance, blend_s
         self._files, trunks = [], []
         for file in files:
             motion = file.part("motion")
@@ -112,7 +112,7 @@ class ArmDonors:
         rms = rms.where((owner == last) & usable[owner], torch.inf)
         best = torch.full((len(usable),), torch.inf).scatter_reduce(0, owner, rms, "amin")
         order = best.argsort()[:_CANDIDATES]
-        order = order[best[order] <= self.agreement]
+        order = order[best[order] <= self.tolerance]
         if not len(order):
             return None
         donor = order[torch.randint(len(order), (), generator=random)]

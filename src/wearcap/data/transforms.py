@@ -184,12 +184,12 @@ Transform = Callable[[Window, Draws], Window]
 class Shift:
     """Starts a window up to a stride later."""
 
-    whole: bool = True
+    whole_frames: bool = True
     """Whether by a whole number of frames; otherwise frames are interpolated."""
 
     def retimed(self, cut: Cut, random: Draws) -> Cut:
         later = random.uniform("shift") * cut.stride
-        return replace(cut, start=cut.start + (int(later) if self.whole else later))
+        return replace(cut, start=cut.start + (int(later) if self.whole_frames else later))
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ class LevelMix:
     conveyor: float
     observed: float
     pure: float = 0.0
-    whole: float = 0.0
+    fully_observed: float = 0.0
     """Share of the windows with observations in which all frames of that modality are observed."""
     ramp: tuple[int, int] | list[int] = (10, 60)
     """Smallest and largest number of frames over which a conveyor's level grows from 0 to 1."""
@@ -44,12 +44,12 @@ class LevelMix:
             not 1 <= low <= high
             or min(self.independent, self.conveyor, self.pure) < 0
             or self.independent + self.conveyor + self.pure > 1 + 1e-9
-            or not 0 <= self.whole < 1
+            or not 0 <= self.fully_observed < 1
             or not all(0 <= lead < 1 for lead in self.lead)
             or min(self.chances, default=1.0) < 0
         ):
             raise WearcapError(
-                f"shares {self.independent}, {self.conveyor} and {self.pure}, {self.whole} of windows fully observed, ramps of {low} to {high} frames",
+                f"shares {self.independent}, {self.conveyor} and {self.pure}, {self.fully_observed} of windows fully observed, ramps of {low} to {high} frames",
                 expected="shares that add up to no more than 1, less than 1 fully observed and in the lead, and a rising pair of 1 or more frames",
             )
 
@@ -75,5 +75,5 @@ class LevelMix:
         chances = frames.new_tensor(list(self.chances) or [1.0] * count).cumsum(0)
         modality = torch.arange(count, device=frames.device) == (which >= chances[:-1] / chances[-1]).sum(-1, True)
         # The share of observed frames is the cube of a uniform number, so that few are as frequent as many.
-        seen = chance < (share / (1 - self.whole)) ** 3
+        seen = chance < (share / (1 - self.fully_observed)) ** 3
         return torch.where((observed_parts < self.observed) & modality & seen, 0.0, levels)

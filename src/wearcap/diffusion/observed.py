@@ -10,7 +10,7 @@ NOISE = 1e-3
 """Variance of an observation beside the residual's own, which keeps neighbouring observations solvable."""
 
 
-def spreading(
+def residual_weights(
     is_observed: Bool[Tensor, "*batch frame"], alike: Bool[Tensor, "*#batch frame frame"], frames: float
 ) -> Float[Tensor, "*batch frame frame"]:
     """Weights by which each frame (row) takes over the residuals of the observed ones (column): the mean of a Gaussian process
@@ -34,6 +34,6 @@ def with_residuals(
     weights: Float[Tensor, "batch modality frame frame"],
     sizes: tuple[int, ...],
 ) -> Float[Tensor, "batch frame feature"]:
-    """x̂0 corrected by the residuals of the observed frames, spread by the `weights` of each modality (`spreading`)."""
+    """x̂0 corrected by the residuals of the observed frames, spread by the `weights` of each modality (`residual_weights`)."""
     parts = zip(x0_hat.split(sizes, -1), observed.split(sizes, -1), weights.unbind(1))
     return torch.cat([part + weight @ (true - part) for part, true, weight in parts], -1)

@@ -8,7 +8,8 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from wearcap.body.skeleton import xsens23
-from wearcap.doctor.agreement import (
+from wearcap.doctor.body import check_contact_prob, check_motion
+from wearcap.doctor.consistency import (
     check_camera,
     check_carried,
     check_claps,
@@ -19,7 +20,6 @@ from wearcap.doctor.agreement import (
     check_localization,
     check_points,
 )
-from wearcap.doctor.body import check_contact_prob, check_motion
 from wearcap.doctor.report import SEVERITIES, Check, Finding, has_error
 from wearcap.doctor.streams import check_clock, check_spans, check_track
 from wearcap.errors import WearcapError

@@ -1,5 +1,6 @@
-"""What `Motion.save` writes, by the ending of the file's name."""
+"""Motion as a file of the kind that its name's ending says."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from wearcap.io.datasets.amass import write_amass
 from wearcap.io.formats.bvh import write_bvh
 from wearcap.io.formats.gltf import write_glb
 from wearcap.io.formats.motion_npz import write_motion
-from wearcap.recording.motion import WRITERS, Motion
+from wearcap.recording.motion import Motion
 
 
 def on_skeleton(motion: Motion, skeleton: Skeleton) -> Motion:
@@ -35,4 +36,21 @@ def write_surface(motion: Motion, path: Path) -> None:
     write_glb(motion, path, body=body)
 
 
-WRITERS |= {".npz": write_motion, ".bvh": write_bvh, ".glb": write_surface, "_smplh.npz": write_smplh}
+WRITERS: dict[str, Callable[[Motion, Path], None]] = {
+    ".npz": write_motion,
+    ".bvh": write_bvh,
+    ".glb": write_surface,
+    "_smplh.npz": write_smplh,
+}
+"""What writes a motion, by the ending of the file's name; the longest ending counts."""
+
+
+def save(motion: Motion, path: str | Path) -> None:
+    """Write a motion as .npz, .bvh, .glb or _smplh.npz.
+
+    Raises WearcapError for another ending, and when the file cannot be written.
+    """
+    endings = [ending for ending in WRITERS if Path(path).name.endswith(ending)]
+    if not endings:
+        raise WearcapError("no kind of motion file", path, f"a name that ends with {', '.join(WRITERS)}")
+    WRITERS[max(endings, key=len)](motion, Path(path))

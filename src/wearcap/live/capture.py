@@ -17,9 +17,9 @@ import torch
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
-from wearcap.live.first_minute import FirstMinute
 from wearcap.live.packets import HEAD, Inbox, Packet
 from wearcap.live.setup import Setup, plain_name, read_setup, write_setup
+from wearcap.live.setup_estimation import SetupEstimation
 from wearcap.live.sink import Sink, SinkThread
 from wearcap.live.source import Source
 from wearcap.live.status import LiveStatus, SinkStatus
@@ -106,7 +106,7 @@ class LiveCapture:
         environment = system.objects(source) if kind.takes_objects and source is not None else None
         self.objects = () if environment is None else environment.objects
         """Those of the place, where the system takes objects."""
-        minute = lambda before, guide: FirstMinute(  # noqa: E731
+        minute = lambda before, guide: SetupEstimation(  # noqa: E731
             kind.devices,
             tracked=kind.tracks_wrists,
             hands=hands,

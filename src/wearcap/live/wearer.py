@@ -16,10 +16,10 @@ from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.live.clocks import Clocks
 from wearcap.live.devices import Devices
-from wearcap.live.first_minute import FirstMinute
 from wearcap.live.latency import Latencies
 from wearcap.live.packets import HEAD, SUIT, Packet
 from wearcap.live.setup import Setup
+from wearcap.live.setup_estimation import SetupEstimation
 from wearcap.live.status import MAX_POINTS, Stage, WearerStatus
 from wearcap.recording import Motion
 from wearcap.runtime.session import Session
@@ -57,7 +57,7 @@ class Opener:
     """Devices that the session needs; the first one's clock times the motion."""
     tracks_wrists: bool
     takes_objects: bool
-    first_minute: Callable[[Setup | None, bool], FirstMinute]
+    estimation: Callable[[Setup | None, bool], SetupEstimation]
     """(set-up of last time, whether guided) → a new first minute."""
 
 
@@ -81,7 +81,7 @@ class LiveWearer:
 
     def __post_init__(self) -> None:
         self.clocks = Clocks()
-        self.first: FirstMinute | None = None
+        self.first: SetupEstimation | None = None
         self.session: Session | None = None
         self.skeleton: Skeleton | None = None
         self.fps = 0.0
@@ -225,7 +225,7 @@ class LiveWearer:
         """Look for the set-up, and open the session once it is known."""
         if self.setup is None or (self.first is not None and self.first.found is None):
             if self.first is None:
-                self.first = self.opener.first_minute(None, False)
+                self.first = self.opener.estimation(None, False)
             self.stage = "first minute"
             self.first.see(device, sample, now_s)
             self._align()
@@ -349,7 +349,7 @@ class LiveWearer:
     def guide(self) -> None:
         """Begin the guided first minute; the session that runs ends."""
         self.leave()
-        self.first, self.stage = self.opener.first_minute(self.setup, True), "first minute"
+        self.first, self.stage = self.opener.estimation(self.setup, True), "first minute"
         self.first.late_s = self.clocks.late_s
 
     def status(self) -> WearerStatus:

@@ -1,5 +1,5 @@
 """Local and global features of an image: keypoints with descriptors, VLAD over a vocabulary trained on the map (thesis
-eq. 2.1), and the interfaces of extractors, matchers and global descriptors.
+eq. 2.1), and the interfaces of extractors and matchers.
 """
 
 from dataclasses import dataclass
@@ -47,18 +47,6 @@ class Matcher(Protocol):
     """Pairs the keypoints of two pictures: rows (number in `query`, number in `other`), one per pair."""
 
     def __call__(self, query: Features, other: Features) -> Int64[np.ndarray, "match 2"]: ...
-
-
-@runtime_checkable
-class GlobalDescriptor(Protocol):
-    """Describes an image by one vector of unit length; similar places have a large dot product."""
-
-    @property
-    def name(self) -> str: ...
-
-    def __call__(
-        self, image: UInt8[np.ndarray, "height width 3"], features: Features
-    ) -> Float32[np.ndarray, "feature"]: ...
 
 
 class RootSift:
@@ -146,13 +134,8 @@ class Vlad:
             centers = torch.where(count > 0, total / count.clamp(min=1), centers)
         return cls(centers.numpy())
 
-    def __call__(
-        self, image: UInt8[np.ndarray, "height width 3"], features: Features
-    ) -> Float32[np.ndarray, "feature"]:
-        """Global descriptor; `image` is not used. Zeros for an image without features."""
-        return self.aggregate(features.descriptors)
-
     def aggregate(self, descriptors: Float32[np.ndarray, "keypoint feature"]) -> Float32[np.ndarray, "global"]:
+        """Global descriptor of a picture by its local ones; zeros without any."""
         centers, local = torch.from_numpy(self.vocabulary), torch.from_numpy(descriptors)
         word = _nearest_word(local, centers)
         total = torch.zeros_like(centers).index_add_(0, word, local - centers[word])

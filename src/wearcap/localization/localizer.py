@@ -21,7 +21,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.localization.absolute_pose import CameraPose, Matches, match_landmarks, match_nearby
-from wearcap.localization.features import Extractor, Features, GlobalDescriptor, Matcher, Vlad, most_similar
+from wearcap.localization.features import Extractor, Features, Matcher, Vlad, most_similar
 from wearcap.localization.point_map import described
 from wearcap.localization.visual_map import VisualMap, from_bytes
 from wearcap.recording.recording import Localization
@@ -71,7 +71,7 @@ class Localizer:
     """Finds the poses of pictures in a visual map.
 
     `matcher`: pairs the keypoints of picture and database picture (LightGlue); None: keypoints are matched with the
-    landmarks of all retrieved pictures at once. `descriptor`: the global descriptor that the map was made with; None: its VLAD.
+    landmarks of all retrieved pictures at once.
     Raises WearcapError for an empty map, and one made with other features.
     """
 
@@ -81,16 +81,14 @@ class Localizer:
         extractor: Extractor,
         matcher: Matcher | None = None,
         settings: LocalizerSettings = LocalizerSettings(),
-        *,
-        descriptor: GlobalDescriptor | None = None,
     ):
         if not len(visual_map) or not len(visual_map.landmarks.points_world):
             what = "the map is empty: nothing can be localised in it"
             fix = "Build it from photos that show the scene: wearcap scene."
             raise WearcapError(what, expected="pictures with landmarks", fix=fix)
-        visual_map.require_features(extractor, descriptor)
+        visual_map.require_features(extractor)
         self.map, self.extractor, self.matcher, self.settings = visual_map, extractor, matcher, settings
-        self.descriptor: GlobalDescriptor = descriptor or Vlad(visual_map.vocabulary)
+        self.vlad = Vlad(visual_map.vocabulary)
         extent = np.linalg.norm(np.ptp(visual_map.landmarks.points_world, axis=0))
         self._same_m = max(2.5 * visual_map.cell_m, 0.002 * float(extent))
 
@@ -114,7 +112,7 @@ class Localizer:
             raise WearcapError("no intrinsics of the camera", expected="a calibrated camera", fix=fix)
         fov_deg = self.settings.horizontal_fov_deg
         image, camera, features = described(image, camera, self.extractor, fov_deg, "localization")
-        return _Described(camera, features, self.descriptor(image, features))
+        return _Described(camera, features, self.vlad.aggregate(features.descriptors))
 
     def locate(self, picture: _Described, prior: Rigid | None = None) -> CameraPose | None:
         """Pose of a described picture's camera; `prior` as in a call."""

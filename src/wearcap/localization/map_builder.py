@@ -16,7 +16,7 @@ from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.colmap import Tracks
 from wearcap.io.formats.video import read_image
-from wearcap.localization.features import Extractor, Features, GlobalDescriptor, Vlad
+from wearcap.localization.features import Extractor, Features, Vlad
 from wearcap.localization.point_map import PointMapper, described, undistortion
 from wearcap.localization.visual_map import Observations, VisualMap, from_bytes, merge, to_bytes
 from wearcap.scene.scan import Photo, Scan
@@ -49,7 +49,6 @@ class _Picture:
     keypoints: Float32[np.ndarray, "keypoint 2"]
     positions: Float32[np.ndarray, "keypoint 3"]
     valid: Bool[np.ndarray, "keypoint"]
-    global_descriptor: np.ndarray | None
 
 
 def build_map(
@@ -57,24 +56,21 @@ def build_map(
     source: Scan | Tracks,
     extractor: Extractor,
     *,
-    descriptor: GlobalDescriptor | None = None,
     settings: MapSettings = MapSettings(),
     progress: bool = False,
 ) -> VisualMap:
     """A map of the photos, their keypoints lifted by a scan or by tracks (whose photo numbers are the photos').
 
-    `descriptor`: global descriptor for retrieval; None: VLAD over a vocabulary trained on these photos.
+    They are retrieved by VLAD over a vocabulary trained on them.
     Raises WearcapError for no photos, photos whose size is not their camera's, unreadable ones, and an empty map.
     """
-    pictures = _pictures(photos, source, extractor, descriptor, settings, progress)
-    vlad = None
-    if descriptor is None:
-        # The vocabulary is trained on 60,000 descriptors, drawn alike from all pictures.
-        random, share = np.random.default_rng(0), max(1, 60_000 // len(pictures))
-        chosen = [p.descriptors[random.permutation(len(p.descriptors))[:share]] for p in pictures]
-        vlad = Vlad.trained(from_bytes(np.concatenate(chosen)), settings.words)
+    pictures = _pictures(photos, source, extractor, settings, progress)
+    # The vocabulary is trained on 60,000 descriptors, drawn alike from all pictures.
+    random, share = np.random.default_rng(0), max(1, 60_000 // len(pictures))
+    chosen = [p.descriptors[random.permutation(len(p.descriptors))[:share]] for p in pictures]
+    vlad = Vlad.trained(from_bytes(np.concatenate(chosen)), settings.words)
     cell_m = settings.cell_m if isinstance(source, Scan) else 0.0
-    return _assemble(photos, pictures, extractor.name, vlad or descriptor, vlad, cell_m)
+    return _assemble(photos, pictures, extractor.name, vlad, cell_m)
 
 
 def extended(
@@ -83,15 +79,13 @@ def extended(
     source: Scan | Tracks,
     extractor: Extractor,
     *,
-    descriptor: GlobalDescriptor | None = None,
     settings: MapSettings = MapSettings(),
     progress: bool = False,
 ) -> VisualMap:
     """The map with more photos; its vocabulary stays. Raises WearcapError as `build_map`, and for other features."""
-    visual_map.require_features(extractor, descriptor)
-    pictures = _pictures(photos, source, extractor, descriptor, settings, progress)
-    vlad = Vlad(visual_map.vocabulary) if descriptor is None else None
-    more = _assemble(photos, pictures, extractor.name, vlad or descriptor, vlad, 0.0)
+    visual_map.require_features(extractor)
+    pictures = _pictures(photos, source, extractor, settings, progress)
+    more = _assemble(photos, pictures, extractor.name, Vlad(visual_map.vocabulary), 0.0)
     old, new = visual_map.observations, more.observations
     joined = {
         name: np.concatenate([getattr(old, name), getattr(new, name)])
@@ -112,7 +106,7 @@ def extended(
     )
 
 
-def _pictures(photos, source, extractor, descriptor, settings: MapSettings, progress: bool) -> list[_Picture]:
+def _pictures(photos, source, extractor, settings: MapSettings, progress: bool) -> list[_Picture]:
     """Features of each photo. Raises WearcapError without photos, and when none of them shows the scene."""
     if not photos:
         raise WearcapError("no photos to build a map from", expected="database photos with cameras and poses")
@@ -124,8 +118,7 @@ def _pictures(photos, source, extractor, descriptor, settings: MapSettings, prog
         where = str(photo.file)
         image, camera, features = described(image, photo.camera, extractor, settings.horizontal_fov_deg, where)
         positions, valid = lift(number, photo, camera, features)
-        summary = None if descriptor is None else descriptor(image, features)
-        return _Picture(camera, to_bytes(features.descriptors), features.keypoints, positions, valid, summary)
+        return _Picture(camera, to_bytes(features.descriptors), features.keypoints, positions, valid)
 
     with ThreadPoolExecutor(settings.jobs) as pool:
         done: Iterable[_Picture] = pool.map(one, range(len(photos)))
@@ -182,25 +175,22 @@ def _lift(source: Scan | Tracks, settings: MapSettings) -> Callable[[int, Photo,
     return by_tracks
 
 
-def _assemble(
-    photos, pictures: list[_Picture], extractor: str, descriptor, vlad: Vlad | None, cell_m: float
-) -> VisualMap:
+def _assemble(photos, pictures: list[_Picture], extractor: str, vlad: Vlad, cell_m: float) -> VisualMap:
     positions = np.concatenate([p.positions[p.valid] for p in pictures]).astype(np.float32)
     descriptors = np.concatenate([p.descriptors[p.valid] for p in pictures])
     landmarks, landmark = merge(positions, descriptors, cell_m)
     counts = [int(p.valid.sum()) for p in pictures]
     first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     keypoints = np.concatenate([p.keypoints[p.valid] for p in pictures])
-    summaries = [vlad.aggregate(from_bytes(p.descriptors)) if vlad else p.global_descriptor for p in pictures]
     return VisualMap(
         extractor,
-        descriptor.name,
+        vlad.name,
         tuple(photo.file.name for photo in photos),
         tuple(picture.camera for picture in pictures),
         Rigid(*(torch.stack([getattr(photo.T_world_cam, part).double() for photo in photos]) for part in "Rt")),
-        np.stack(summaries),
+        np.stack([vlad.aggregate(from_bytes(p.descriptors)) for p in pictures]),
         Observations(keypoints, descriptors, positions, first, landmark),
         landmarks,
-        vlad.vocabulary if vlad else np.zeros((0, descriptors.shape[1]), np.float32),
+        vlad.vocabulary,
         cell_m,
     )

@@ -19,7 +19,7 @@ from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
-from wearcap.localization.features import Extractor, GlobalDescriptor, Vlad
+from wearcap.localization.features import Extractor, Vlad
 
 SCHEMA_VERSION = 1
 STEPS = 254.0
@@ -101,12 +101,17 @@ class VisualMap:
         angle = np.arccos(np.clip(self.T_world_cam.R.numpy()[:, :, 2] @ forward, -1, 1))
         return np.argsort(distance + angle / np.radians(30), kind="stable")[:count].astype(np.int64)
 
-    def require_features(self, extractor: Extractor, descriptor: GlobalDescriptor | None) -> None:
-        """Raises WearcapError when the map was made with another extractor or another global descriptor (None: VLAD)."""
-        described = descriptor.name if descriptor is not None else Vlad(self.vocabulary).name
+    def require_features(self, extractor: Extractor) -> None:
+        """Raises WearcapError when the map was made with another extractor or another global descriptor than VLAD."""
         for mine, name, made, part, what in (
             (self.extractor, extractor.name, f"{self.extractor!r} features", "features", "extractor"),
-            (self.descriptor, described, f"the global descriptor {self.descriptor!r}", "descriptor", "descriptor"),
+            (
+                self.descriptor,
+                Vlad(self.vocabulary).name,
+                f"the global descriptor {self.descriptor!r}",
+                "descriptor",
+                "descriptor",
+            ),
         ):
             if name != mine:
                 expected = f"the same {part} in map and picture"

@@ -53,13 +53,20 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "wearcap.systems.echo.object_training": ("ObjectEncoding",),
     "wearcap.systems.hmd2.pose_regressor.training": ("PoseRegression",),
     "wearcap.training.schedules": ("warmup_cosine",),
-    "wearcap.systems.hmd2.point_codes_training": ("VoxelReconstruction",),
+    "wearcap.systems.hmd2.voxel_autoencoder_training": ("VoxelReconstruction",),
     "wearcap.systems.mocap_every.training": ("WatchRegression",),
     "prodigyopt": ("Prodigy",),
     "torch.optim": tuple(_OPTIMIZERS.split()),
     "torch.optim.lr_scheduler": tuple(_SCHEDULERS.split()),
 }
 """Classes (and functions that return plain objects) that a model's config may name, by their modules."""
+
+MOVED = {"wearcap.systems.hmd2.point_codes_training": "wearcap.systems.hmd2.voxel_autoencoder_training"}
+"""Modules that files of before name, and where their classes are now."""
+RENAMED = {"wearcap.diffusion.levels.LevelMix": {"whole": "fully_observed"}}
+"""Settings that files of before have under another name, by target."""
+STRUCK = {"object_in_wrists": False}
+"""Settings that went, with the value at which files of before have them and do without."""
 
 _BY_NAME = {f"{module}.{name}": (module, name) for module, names in TARGETS.items() for name in names}
 _TARGET, _PARTIAL = "_target_", "_partial_"
@@ -75,6 +82,23 @@ ALLOWANCE = 1 << 26
 """Bytes (64 MiB) that building may take beyond what follows from the size of the file's weights."""
 TIMES_WEIGHTS = 8
 """Limit of the memory that building writes, as a multiple of the weights' size; ours write 2.5 times it."""
+
+
+def brought_up_to_date(config: Any) -> None:
+    """Give, in place, a model's config today's names of targets and settings, and leave out settings that went and were off."""
+    rest = [config]
+    while rest:
+        value = rest.pop()
+        if isinstance(value, dict):
+            if isinstance(target := value.get(_TARGET), str):
+                module, dot, name = target.rpartition(".")
+                target = value[_TARGET] = MOVED.get(module, module) + dot + name
+                for old, new in RENAMED.get(target, {}).items():
+                    if old in value:
+                        value[new] = value.pop(old)
+            for name in [name for name, off in STRUCK.items() if name in value and value[name] is off]:
+                del value[name]
+        rest += value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
 
 
 def check_config(config: Any, where: str | Path) -> None:

@@ -23,7 +23,7 @@ from wearcap.boundary.tensors import plain_tensors, read_tensors, read_torch
 from wearcap.boundary.texts import parse_json, require_layout
 from wearcap.errors import WearcapError, nearest
 from wearcap.files import atomic_path, resource
-from wearcap.models.build import build, check_config
+from wearcap.models.build import brought_up_to_date, build, check_config
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -103,6 +103,7 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
     require_layout(config, _Config, path)
     if (digest := config.pop(_DIGEST, None)) is not None and digest != _digest(config, state):
         raise WearcapError("its checksum differs from its content", where=path, fix="Fetch the file again.")
+    brought_up_to_date(config["model"])
     check_config(config["model"], path)
     halves = (torch.float16, torch.bfloat16)
     return config, {name: v.float() if v.dtype in halves else v for name, v in state.items()}

@@ -9,7 +9,12 @@ from wearcap.boundary.tensors import plain_tensors, read_tensors, read_torch
 from wearcap.errors import WearcapError
 
 _SHOWN = 4
-_NESTED = ("state_dict", "model_state_dict", "model")  # keys of the weights in the files of training scripts
+_NESTED = (
+    "state_dict",
+    "model_state_dict",
+    "model",
+    "extractor",
+)  # keys of the weights in the files of training scripts
 
 
 def read_weights(path: str | Path) -> dict[str, Tensor]:

@@ -1,5 +1,4 @@
-"""Motion as the minimum of an energy: terms as pure functions, problems that list them, solvers.
+"""What optimisers share: robust losses (`losses.py`), and bodies fitted to optical markers (`markers.py`).
 
-HPS: the table of terms in `hps.py` with their costs in `costs.py`, minimised by `banded.py` (ours) or `adam_windows.py`
-(thesis). iReplica's trajectory correction: `trajectory.py`. Open `costs.py` and `hps.py` first.
+HPS's energy and its solver are in `systems/hps/`, iReplica's trajectory correction in `systems/ireplica/`.
 """

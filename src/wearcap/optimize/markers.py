@@ -23,7 +23,7 @@ from wearcap.body.skeleton import Skeleton, xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.formats.trc import Markers
-from wearcap.optimize.costs import Loss
+from wearcap.optimize.losses import Loss
 from wearcap.recording.motion import Motion
 
 MARKER_M = 0.01

@@ -27,11 +27,11 @@ from wearcap.errors import WearcapError
 from wearcap.files import remove_leftovers, sha256_of
 from wearcap.io.formats.poses import are_rotations
 from wearcap.locks import folder_lock
+from wearcap.parallel import Parallel, progress_bar, reason_of
 from wearcap.prepare.files import with_own_files
 from wearcap.recording.recording import MIN_DURATION_S, Recording
 from wearcap.recording.serialize import flatten
 from wearcap.recording.store import SPLITS, Entry, RecordingStore, recording_path, save_recording
-from wearcap.spread import Spread, progress_bar, reason_of
 
 REGISTER_EVERY_S = 1.0
 """Least interval (s) between writes of the manifest: a large data set's has megabytes."""
@@ -143,14 +143,14 @@ def prepare(
     if len(names) < len(tasks):
         twice = Counter(task.name for task in tasks).most_common(1)[0][0]
         raise WearcapError(f"two sources give a recording the name {twice!r}", expected="unique names")
-    spread = Spread(jobs, backend, scheduler)
+    parallel = Parallel(jobs, backend, scheduler)
     with folder_lock(output, "prepare") as lock:
         store = RecordingStore(output)
         store.register({})  # missing permission or space should show now and not after the first hour
         remove_leftovers(store.root, below=True)
         todo = tasks if overwrite else [task for task in tasks if not _is_current(store, task)]
         report = Report(current=sorted(names - {task.name for task in todo}))
-        outcomes = spread.run(partial(_run, root=store.root, inspect=inspect), todo, lock)
+        outcomes = parallel.run(partial(_run, root=store.root, inspect=inspect), todo, lock)
         try:
             with closing(outcomes), registering(store, len(tasks), len(report.current)) as finish:
                 for name, outcome, note in outcomes:

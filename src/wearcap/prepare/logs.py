@@ -3,11 +3,9 @@
 Each source has a function that lists its recordings as tasks, preceded by the one that makes a recording of it.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -22,7 +20,7 @@ from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.conventions import AUTO, Conventions
 from wearcap.io.devices.aria_mps import T_HEAD_DEVICE, head_stream, is_mps_folder, read_mps, read_points
 from wearcap.io.devices.axes import CAMERA, DEVICES, UPRIGHT, WORLDS, DeviceAxes, device_axes, to_head_axes
-from wearcap.io.devices.headset_log import is_headset_log, is_headset_session, read_headset_log
+from wearcap.io.devices.headset_log import read_headset_log
 from wearcap.io.devices.watch_log import read_inertial_log, read_watch_log
 from wearcap.io.formats.camera_json import read_camera
 from wearcap.io.formats.csv_table import read_columns, read_header
@@ -30,19 +28,13 @@ from wearcap.io.formats.pcd import read_pcd
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.pose_columns import FIRST_CAMERA
 from wearcap.io.formats.poses import check_finite
-from wearcap.io.formats.trajectory import TrajectoryFile, read_trajectory_file, trajectory_file, trajectory_format
+from wearcap.io.formats.trajectory import TrajectoryFile, read_trajectory_file
 from wearcap.io.formats.video import video_info
-from wearcap.prepare.engine import Splits, Task, content_hash
+from wearcap.prepare.engine import content_hash
 from wearcap.recording.recording import CameraStream, FloorTrack, HeadStream, ImuStream, PointCloud, Recording
 from wearcap.sensors.camera_alignment import SlamAlignment
-from wearcap.sensors.clock import require_overlap
-from wearcap.sensors.monocular_slam import clean_track
 from wearcap.sensors.slam_alignment import SceneEvidence, align_cleaned, pose_of
-from wearcap.sensors.watch_calibration import WatchSession, read_watch_calibration
-from wearcap.sensors.watches import watch_gaps
 
-VERSION = {"trajectory": 2, "watches": 1, "headset": 1}
-"""Versions of the conversions, increased when the same source and settings yield another recording."""
 Numbers = Sequence[float | int]
 
 
@@ -241,92 +233,6 @@ def _camera(settings: TrajectorySettings, head: HeadStream) -> CameraStream | No
     return CameraStream(times, lens, R, head.t_head_device, video=str(Path(settings.video).absolute()))
 
 
-def trajectory_tasks(
-    source: str | Path, splits: Splits, subject: str, license: str, settings: TrajectorySettings
-) -> list[Task]:
-    """One task per trajectory: a file, a folder that is one, or each trajectory in a folder.
-
-    Raises WearcapError where there is none, and for points, a video or an inertial log of several trajectories.
-    """
-    source = Path(source)
-    if not source.exists():
-        raise WearcapError("no such file or folder", where=source, fix="Give it as source=FILE or source=DIR.")
-    if source.is_dir() and not is_mps_folder(source) and trajectory_file(source) is None:
-        found = [path for path in sorted(source.iterdir()) if path.is_dir() and trajectory_file(path)]
-        found += [path for path in sorted(source.iterdir()) if path.is_file() and trajectory_format(path)]
-    else:
-        found = [source]
-    if not found:
-        raise WearcapError("no trajectory in this folder", source, "a file that wearcap doctor knows as one")
-    if len(found) > 1 and (settings.files() or settings.video):
-        what = f"{len(found)} trajectories, but points, video or head_imu of one"
-        raise WearcapError(what, where=source, fix="Prepare that one alone: source=FILE.")
-    files = settings.files()
-    return [_task("trajectory", path, read_path, splits, subject, license, settings, files) for path in found]
-
-
-def _watches(camera: Path, name: str, about: dict[str, str], settings: "WatchesSettings") -> Recording:
-    """The head's path and both watches, calibrated where a calibration is given."""
-    watches = {joint: read_watch_log(path, joint) for joint, path in settings.logs().items()}
-    way = settings.camera
-    fps = None if way.fps is None else float(way.fps)
-    read = read_trajectory_file(camera, way.time_unit, fps)
-    recording, notes = Recording(name, skeleton=way.skeleton(), **about), []
-    if settings.calibration is not None:
-        found = read_watch_calibration(settings.calibration)
-        slam = read.trajectory
-        if found.camera is not None:
-            slam, kept, _ = clean_track(slam, float(way.max_acceleration) / found.camera.scale, float(way.max_burst_s))
-            notes += [f"{int((~kept).sum())} outliers of {len(kept)} camera poses removed"] if not kept.all() else []
-        recording = WatchSession(watches, slam).added_to(recording, found)
-        notes.append(f"calibrated by {Path(settings.calibration).name}")
-    else:
-        recording = replace(recording, imu=watches)
-        notes.append(
-            "watches not calibrated: their heading and how they sit on the wrists are taken as they are "
-            "(wearcap calibrate steps=watches)"
-        )
-    if recording.head is None:
-        head, alignment, note = head_of(read, way, str(camera))
-        recording = replace(recording, head=head, origin=origin_of(read, alignment))
-        notes.insert(0, note)
-    assert recording.head is not None
-    fix = "Calibrate their clocks (wearcap calibrate steps=watches … swings=[…]), or take the logs of one session."
-    require_overlap(
-        {**{joint: imu.timestamps for joint, imu in recording.imu.items()}, "camera": recording.head.timestamps}, fix
-    )
-    for gap in watch_gaps(recording.imu, recording.head.timestamps):
-        notes.append(gap)
-    if recording.skeleton is None:
-        notes.append("height not given: taken from how high the head is carried, where the floor is known")
-    return replace(recording, note="; ".join(notes))
-
-
-@dataclass(frozen=True)
-class WatchesSettings:
-    """The logs of two watches, their calibration, and how the camera's trajectory is read."""
-
-    left: str
-    right: str
-    calibration: str | None
-    camera: TrajectorySettings
-
-    def logs(self) -> dict[str, Path]:
-        """Both logs by joint."""
-        return dict(zip(WRISTS, (Path(self.left), Path(self.right))))
-
-
-def watches_tasks(
-    camera: str | Path, splits: Splits, subject: str, license: str, settings: WatchesSettings
-) -> list[Task]:
-    """The one recording of two watches and a head camera; hashed by all files."""
-    others = [*settings.logs().values(), *([Path(settings.calibration)] if settings.calibration else [])]
-    files = [Path(camera), *others, *settings.camera.files()]
-    if missing := [str(file) for file in files if not file.exists()]:
-        raise WearcapError("no such file", where=missing[0], fix="Give left=CSV right=CSV camera=TRAJECTORY.")
-    return [_task("watches", Path(camera), _watches, splits, subject, license, settings, files[1:])]
-
-
 @dataclass(frozen=True)
 class HeadsetSettings:
     """How a headset's log is read, and who wore it; "auto" and None: from the file's content."""
@@ -364,29 +270,6 @@ class HeadsetSettings:
         )
 
 
-def _headset(path: Path, name: str, about: dict[str, str], settings: HeadsetSettings) -> Recording:
-    return settings.read(path, name, about)
-
-
-def headset_tasks(
-    source: str | Path, splits: Splits, subject: str, license: str, settings: HeadsetSettings
-) -> list[Task]:
-    """One task per log: a file, or each in a folder. Raises WearcapError where there is none."""
-    source = Path(source)
-    if not source.exists():
-        raise WearcapError("no such file or folder", where=source, fix="Give it as source=FILE or source=DIR.")
-    kinds = (".csv", ".tsv", ".json", ".jsonl", ".txt", ".bsor")
-    found = [source]
-    if source.is_dir() and not is_headset_session(source):
-        there = sorted(source.rglob("*"))
-        found = [path for path in there if path.is_dir() and path.name != "trackers" and is_headset_session(path)]
-        files = [path for path in there if path.is_file() and set(path.suffixes) & set(kinds)]
-        found += [path for path in files if not set(path.parents) & set(found) and is_headset_log(path)]
-    if not found:
-        raise WearcapError("no headset's log in this folder", source, "CSV or JSON with time, head_pos_x, …")
-    return [_task("headset", path, _headset, splits, subject, license, settings) for path in found]
-
-
 def log_name(path: Path) -> str:
     """A recording's name: its file's or folder's, or that of the folder above a usual one; replays are named after players."""
     if path.suffix.lower() == ".bsor":
@@ -394,26 +277,3 @@ def log_name(path: Path) -> str:
     name = path.resolve().name.split(".")[0] if path.is_file() else path.resolve().name
     usual = ("images", "data", "poses", "trajectory", "closed_loop_trajectory", "trackers")
     return path.resolve().parent.name if name in usual else name
-
-
-def _task(
-    kind: str,
-    path: Path,
-    make: Callable[..., Recording],
-    splits: Splits,
-    subject: str,
-    license: str,
-    settings: Any,
-    files: Sequence[Path] = (),
-) -> Task:
-    """A task that is hashed by its files and settings, and named after its file or folder."""
-    name = log_name(path)
-    read = [path] if path.is_file() else [file for file in sorted(path.rglob("*")) if file.is_file()]
-    small = [file for file in (*read, *files) if file.stat().st_size < 1 << 30]
-    key = content_hash(kind, name, subject, license, asdict(settings), VERSION[kind], *small)
-    about = {
-        "subject": subject,
-        "license": license,
-        "source": f"{kind} {path.name if path.suffix != '.bsor' else name}",
-    }
-    return Task(name or kind, partial(make, path, name or kind, about, settings), splits.of(subject), key)

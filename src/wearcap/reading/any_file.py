@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from wearcap.boundary.arrays import read_npz
-from wearcap.doctor.agreement import check_files
+from wearcap.doctor.consistency import check_files
 from wearcap.doctor.examine import require_sound
 from wearcap.doctor.places import is_map, is_place, read_environment_file, read_map, read_place
 from wearcap.doctor.report import Check, Finding

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from wearcap.doctor.agreement import check_files
+from wearcap.doctor.consistency import check_files
 from wearcap.doctor.examine import examine_recording, is_empty
 from wearcap.doctor.report import Finding, Report, has_error, refusal
 from wearcap.doctor.truth import of_person, people

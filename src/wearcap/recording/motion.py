@@ -1,10 +1,8 @@
 """The Motion (output of a pipeline, or ground truth), and interactions: which hands hold which object at which time."""
 
-import importlib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -88,18 +86,6 @@ class Motion:
     def __len__(self) -> int:
         return len(self.timestamps)
 
-    def save(self, path: str | Path) -> None:
-        """Write a file of the kind that its name's ending says (`io.saving`): .npz, .bvh, .glb or _smplh.npz.
-
-        Raises WearcapError for another ending, and when the file cannot be written.
-        """
-        if not WRITERS:  # the writers stand above this module, and enter themselves
-            importlib.import_module("wearcap.io.saving")
-        endings = [ending for ending in WRITERS if Path(path).name.endswith(ending)]
-        if not endings:
-            raise WearcapError("no kind of motion file", path, f"a name that ends with {', '.join(WRITERS)}")
-        WRITERS[max(endings, key=len)](self, Path(path))
-
     @property
     def fps(self) -> float:
         """Nominal frame rate (Hz): the inverse of the median time step."""
@@ -154,7 +140,3 @@ class Motion:
                 for name, track in objects.items()
             }
         return replace(self, R_parent_joint=R, t_world_root=self.t_world_root @ R_new.mT + t_new, object_motion=objects)
-
-
-WRITERS: dict[str, Callable[[Motion, Path], None]] = {}
-"""What writes a motion, by the ending of the file's name; entered by `io.saving`."""

@@ -28,16 +28,10 @@ from wearcap.boundary.tensors import read_tensors
 from wearcap.boundary.texts import read_json
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, sha256_of, write_text
-from wearcap.optimize.hps import HpsState, Solution
-from wearcap.optimize.hps_constants import Constants
 from wearcap.recording import Motion, Recording
 from wearcap.recording.serialize import KNOWN, dumps, flatten, unflatten
 from wearcap.runtime.system import Captured, CaptureInput, StageOptions, System
-from wearcap.sensors.clock import Clock
-from wearcap.sensors.initialization import Initialization
 
-RESULTS = KNOWN | {cls.__name__: cls for cls in (Clock, Initialization, Constants, Solution, HpsState)}
-"""Classes that a cached result may contain."""
 PACKAGE = Path(__file__).parents[1]
 _DAMAGE = (ValueError, LookupError, TypeError, AttributeError, WearcapError)
 """Exceptions that reading a damaged result may raise."""
@@ -160,6 +154,8 @@ class Stage:
     cache."""
     after: tuple[str, ...] = ()
     """Names of the earlier stages whose results it takes."""
+    kinds: tuple[type, ...] = ()
+    """Classes that a cached result may contain beside those of a recording."""
 
 
 @dataclass(frozen=True)
@@ -168,15 +164,17 @@ class StageCache:
 
     folder: Path
 
-    def read(self, stage: str, key: str) -> tuple[Any, str, float] | None:
+    def read(self, stage: Stage, key: str) -> tuple[Any, str, float] | None:
         """(result, its digest, seconds), or None if it is not cached. Raises WearcapError when it is damaged."""
-        note, tensors = self._files(stage, key)
+        note, tensors = self._files(stage.name, key)
         if not note.exists():
             return None
         try:
             kept = read_json(note)
             _, content = read_tensors(tensors, "result")
-            value = unflatten(kept["result"], content.__getitem__, RESULTS).get("value")
+            value = unflatten(
+                kept["result"], content.__getitem__, KNOWN | {kind.__name__: kind for kind in stage.kinds}
+            ).get("value")
             found, seconds = digest(kept["result"], content), float(kept["seconds"])
             expected = kept["digest"]
         except _DAMAGE as error:
@@ -222,7 +220,7 @@ def run_stages(
             reads, followed = list(stage.reads()), [digests[name] for name in stage.after]
             key = digest(stage.name, code_digest(*modules_of([stage.make, reads])), reads, followed)
             try:
-                kept = cache.read(stage.name, key)
+                kept = cache.read(stage, key)
             except WearcapError as error:
                 damage = f"{stage.name}: {error.where} is {error.what}; it is made again"
                 console.print(damage, markup=False, soft_wrap=True)

@@ -160,14 +160,6 @@ class _Cloud:
 
     def __init__(self):
         self._trees: list[KDTree] = []
-        self._points: list[np.ndarray] = []
-        """Points of each tree (m)."""
-
-    transient = ("_trees",)
-
-    def restored(self) -> None:
-        """Rebuild the trees after loading."""
-        self._trees = [KDTree(points) for points in self._points]
 
     def add(self, points_world: Float[Tensor, "point 3"]) -> None:
         points = points_world.detach().cpu().double().numpy()
@@ -177,7 +169,6 @@ class _Cloud:
             points = np.concatenate([self._trees.pop().data, points])
         if len(points):
             self._trees.append(KDTree(points))
-        self._points = [np.asarray(tree.data) for tree in self._trees]
 
     def within(self, position: np.ndarray, radius_m: float) -> np.ndarray:
         """Heights (m) of all points within a radius of a position."""

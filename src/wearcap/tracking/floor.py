@@ -78,14 +78,9 @@ class FloorTracker:
         """Number of frames so far."""
         self._height = 0.0
 
-    transient = ("_tiles",)
-
     def forget(self) -> None:
         """Forget all points."""
         self._tiles = defaultdict(list)
-
-    restored = forget
-    """A saved tracker comes back without points, which must be added again."""
 
     def see(self, points_world: Float[Tensor, "point 3"]) -> None:
         """Add points (m); points that are not finite are left out."""

@@ -90,7 +90,7 @@ class Refinement:
         feet = values["feet"]
         return cls(**{**values, "feet": None if feet is None else FootLock(**feet)})
 
-    def whole(
+    def refined(
         self, motion: Motion, measured: Measured, stretches: Sequence[tuple[int, int]], fps: float, anchored: bool
     ) -> Motion:
         """A whole motion, each stretch (frames from, to) by itself; frames between stretches stay.

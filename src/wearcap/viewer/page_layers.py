@@ -27,7 +27,7 @@ from wearcap.geometry.trajectory import Trajectory, nearest_frames
 from wearcap.io.formats.glb import read_glb
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.wavefront import read_obj
-from wearcap.recording.acts import NO_OBJECT, active_at, true_acts
+from wearcap.recording.active_objects import NO_OBJECT, active_at, true_spans
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import ContactTrack, HeadStream, PointCloud, Recording
 from wearcap.scene.objects import Environment, SceneObject
@@ -307,8 +307,8 @@ def _true_body_contact(
         return None
     touches = torch.zeros(len(truth), len(points.rest_vertices))
     names = [item.name for item in environment.objects]
-    acts = [act for act in true_acts(recording) if act.object in names]
-    active = active_at(acts, names, truth.timestamps)
+    spans = [span for span in true_spans(recording) if span.object in names]
+    active = active_at(spans, names, truth.timestamps)
     for number in active.unique().tolist():
         if number == NO_OBJECT:
             continue

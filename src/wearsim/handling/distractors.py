@@ -12,7 +12,7 @@ import torch
 from wearcap.geometry.rigid import Rigid
 from wearcap.scene.objects import SceneObject
 from wearsim.handling.grips import Grip, GripPlace, Handling, Vector, still, vector, wandering
-from wearsim.handling.holding import bend_for, bow, spread
+from wearsim.handling.holding import bend_for, bow, keep_hands_aside
 from wearsim.people.actions import ON_THIGHS, POSTURES, hold, squat
 from wearsim.people.plan import SIDES, Plan
 from wearsim.people.posture import look_about, look_at
@@ -101,7 +101,7 @@ def _reach_out(
         grips.append((side, grip))
         stop = max(stop, grip.stop_s)
     if crouch > 0:
-        spread(plan, (start, start + 0.45 * out), (leave, stop))
+        keep_hands_aside(plan, (start, start + 0.45 * out), (leave, stop))
     bow(plan, start, touch, crouch, lean)
     bow(plan, leave, stop, 0.0, 0.0)
     _look(plan, T_world_object, first.point, start, min(leave, touch + rng.uniform(0.5, 2.0)))

@@ -143,7 +143,7 @@ class Errand:
     ) -> None:
         """Put the free hand on the thigh while the knees bend, or let it hang; two hands come from beside the object."""
         if self.side is None:
-            spread(plan, out, back)
+            keep_hands_aside(plan, out, back)
         elif bend > 0.5 * DEEP * plan.hip_height or rng.random() < 0.3:
             hold(plan, (OTHER[self.side],), ON_THIGHS, out[0], back[1] + 0.1, rng)
 
@@ -446,7 +446,7 @@ def bow(plan: Plan, start: float, stop: float, crouch: float, lean: float, aside
         plan.heel_lift[side].move(first, last, HEELS_RAD if lifted else 0.0)
 
 
-def spread(plan: Plan, out: tuple[float, float], back: tuple[float, float]) -> None:
+def keep_hands_aside(plan: Plan, out: tuple[float, float], back: tuple[float, float]) -> None:
     """Keep hands that do not hold the object beside it while bending over it."""
     for side in SIDES:
         plan.hands[side].take(OUT_OF_THE_WAY, out, back)

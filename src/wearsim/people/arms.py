@@ -248,12 +248,12 @@ def _swing(trunk: Trunk, sign: float, running: np.ndarray, rng: np.random.Genera
     walk, run = 1.0 - running, running
     swing = gain * ahead * (walk + 0.75 * run) + 0.05 - 0.30 * run + slow[:, 0]
     swing += 0.9 * (trunk.chest_angles[:, 1] - style.posture.slouch)  # gravity pulls them down when the trunk leans
-    spread = style.arms.spread + 0.05 * run + slow[:, 1]
+    abduction = style.arms.abduction + 0.05 * run + slow[:, 1]
     turn = style.arms.turn + 0.25 * run + slow[:, 2]
     elbow = style.arms.elbow + walk * 0.07 * np.clip(stance.speed, 0.0, 2.0) + 1.15 * run + slow[:, 3]
     forwards = 0.08 * np.logaddexp(0.0, swing / 0.08)  # decays smoothly to zero where the swing is backward
     elbow = elbow + (1.15 * walk + 0.25 * run) * forwards
-    angles = [torch.from_numpy(np.ascontiguousarray(a)) for a in (swing, spread, turn, elbow)]
+    angles = [torch.from_numpy(np.ascontiguousarray(a)) for a in (swing, abduction, turn, elbow)]
     about = rotation.about_axis
     hang = about("x", -sign * (np.pi / 2 - angles[1]))
     return about("y", -angles[0]) @ hang @ about("y", angles[2]), angles[3].clamp(min=0.06)

@@ -38,7 +38,7 @@ class _Arms:
     symmetry: float
     """More swing left than right, as a share."""
     elbow: float
-    spread: float
+    abduction: float
     turn: float
     """Inward turn of the hanging arm: palms face back."""
 
@@ -91,7 +91,7 @@ NORMAL = {
 }  # fmt: skip
 """Means and deviations of habits that are normally distributed among adults."""
 LOGNORMAL = {
-    "variability": 0.03, "knee_soft": 0.14, "heel_rise": 1.0, "swing": 0.46, "elbow": 0.30, "spread": 0.14,
+    "variability": 0.03, "knee_soft": 0.14, "heel_rise": 1.0, "swing": 0.46, "elbow": 0.30, "abduction": 0.14,
     "turn": 0.32, "pelvis_tilt": 0.07, "pelvis_yaw": 0.12, "pelvis_list": 0.06, "trunk_counter": 1.1, "sway": 0.005,
     "briskness": 1.0,
 }  # fmt: skip

@@ -138,7 +138,7 @@ def read_points(path: str | Path, observations: str | Path | None = None) -> Poi
     Raises WearcapError for missing columns or NaN positions, and for the observations of another recording.
     """
     position = [f"p{axis}_world" for axis in "xyz"]
-    table = read_columns(path, [*position, "inv_dist_std", "dist_std"], whole=["uid"] if observations else [])
+    table = read_columns(path, [*position, "inv_dist_std", "dist_std"], integers=["uid"] if observations else [])
     points = np.stack([table[name] for name in position], 1)
     check_finite({"position": points}, path)
     keep = (table["inv_dist_std"] < MAX_INV_DIST_STD) & (table["dist_std"] < MAX_DIST_STD)
@@ -149,7 +149,7 @@ def read_points(path: str | Path, observations: str | Path | None = None) -> Poi
         order = np.argsort(uid, kind="stable")
         known = uid[order]
         first_us = np.full(len(uid), np.iinfo(np.int64).max)
-        for rows in iter_columns(observations, [], whole=["uid", "frame_tracking_timestamp_us"]):
+        for rows in iter_columns(observations, [], integers=["uid", "frame_tracking_timestamp_us"]):
             place = np.minimum(np.searchsorted(known, rows["uid"]), len(known) - 1)
             named = known[place] == rows["uid"]
             np.minimum.at(first_us, place[named], rows["frame_tracking_timestamp_us"][named])

@@ -2,12 +2,11 @@
 
 A joint's rotation is the product of its rotation channels in the file's order (the first one outermost), acting on the
 bind pose given by the OFFSETs. Position channels replace a joint's OFFSET, as Blender reads them, or shift it, as the
-values show. A body that is no person's size or lies down is refused with the setting that would mend it.
+values show.
 """
 
 import math
 import re
-import warnings
 from array import array
 from collections import Counter
 from collections.abc import Iterator
@@ -20,13 +19,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from wearcap.body.skeleton import Site, Skeleton
+from wearcap.body.skeleton import Skeleton
 from wearcap.boundary.limits import LIMITS
 from wearcap.boundary.texts import at_line, finite_floats, numbered_lines
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.geometry.rotation import about_axis
-from wearcap.io.formats.motion_npz import even_frames, nominal_fps
+from wearcap.io.formats.motion_npz import even_frames
 from wearcap.recording.motion import Motion
 
 _CHANNELS = {f"{axis}{kind}": (kind[0], axis) for axis in "xyz" for kind in ("position", "rotation")}
@@ -38,16 +37,6 @@ _LONGEST_STEP_S = 4.0
 """A longer time step is in milliseconds (at most 250 Hz): in no motion do four seconds pass between frames."""
 _END_SITE = -1
 """Index that marks an End Site among the open blocks."""
-_END_SITES = {
-    "toe": "toe_tip",
-    "toebase": "toe_tip",
-    "wrist": "fingertip",
-    "handindex1": "fingertip",
-    "thumb": "thumb_tip",
-}
-"""wearcap's names of End Sites, by the joint's name without its side."""
-STRETCH_M = 0.005
-"""Largest change of a bone's length without a warning."""
 UNITS_M = {
     "metres": 1.0,
     "decimetres": 0.1,
@@ -270,35 +259,6 @@ def read_bvh_content(path: str | Path) -> BvhContent:
     )
 
 
-def read_bvh(
-    path: str | Path, *, unit_m: float | int = 0.01, up: str = "y", forward: str = "z", check: bool = True
-) -> Motion:
-    """Read a .bvh file (plain, .gz or .xz). Rest is the file's bind pose; End Sites become sites.
-
-    `unit_m`: metres per unit. `up`, `forward`: the file's axes ("x", "-y" …) that point up, and ahead of the body in
-    its bind pose. Raises WearcapError naming file
-    and line, and, unless `check` is False, when the body is no person's size or lies down, with the setting that fixes it.
-    """
-    path = Path(path)
-    R_world_file = axes_rotation(path, up, forward)
-    content = read_bvh_content(path)
-    for note in content.notes:
-        warnings.warn(f"{path}: {note}", stacklevel=2)
-    bones = _bones(path, content, float(unit_m))
-    to_world = float(unit_m) * R_world_file.T
-    skeleton = Skeleton("bvh", content.names, content.parents, (bones @ to_world).float(), _sites(content, to_world))
-    motion = Motion(
-        torch.arange(len(content.R_parent_joint), dtype=torch.float64) / nominal_fps(1 / content.step_s),
-        skeleton,
-        (R_world_file @ content.R_parent_joint @ R_world_file.T).float(),
-        (content.t_parent_joint[:, 0] @ to_world).float(),
-        provenance={"source": path.name, "format": "bvh"},
-    )
-    if check:
-        _check_body(motion, path, float(unit_m), R_world_file)
-    return motion
-
-
 def axes_rotation(path: Path, up: str, forward: str) -> Tensor:
     """R_world_file from the names of the axes that point up and forward."""
     rows = {}
@@ -355,65 +315,6 @@ def _are_shifts(values: Float[Tensor, "time joint 3"], rest: Float[Tensor, "join
     for_shift = (((median - rest).abs() + room) / (median.abs() + room)).log()
     votes = (for_shift > 1).any(-1).int() - (for_shift < -1).any(-1).int()
     return torch.where(votes == 0, votes.sum(), votes) > 0
-
-
-def _bones(path: Path, content: BvhContent, unit_m: float) -> Float[Tensor, "joint 3"]:
-    """Constant bone offsets (file units; the root's is zero), from OFFSET or from the position channels' median."""
-    bones = content.t_parent_joint.median(0).values
-    stretch = (content.t_parent_joint - bones).norm(dim=-1).amax(0) * unit_m
-    stretch[0], bones[0] = 0, 0
-    worst = int(stretch.argmax())
-    if stretch[worst] > STRETCH_M:
-        warnings.warn(
-            f"{path}: bone {content.names[worst]!r} changes its length by up to {stretch[worst]:.3f} m; "
-            "its median is kept",
-            stacklevel=3,
-        )
-    return bones
-
-
-def _sites(content: BvhContent, to_world: Float[Tensor, "3 3"]) -> dict[str, Site]:
-    """End Sites, under wearcap's names where their joints' names are known ("LeftToeBase", "l_wrist" …)."""
-    sites = {}
-    for joint, end in zip(content.names, content.ends):
-        if end is None:
-            continue
-        plain = joint.lower().replace("_", "")
-        named = [
-            f"{side}_{_END_SITES[plain.removeprefix(start)]}"
-            for side, start in (("left", "left"), ("right", "right"), ("left", "l"), ("right", "r"))
-            if plain.startswith(start) and plain.removeprefix(start) in _END_SITES
-        ]
-        name = "crown" if plain == "head" else [*named, f"{joint}_end"][0]
-        sites[name] = Site(joint, tuple((torch.tensor(end, dtype=torch.float64) @ to_world).tolist()))
-    return sites
-
-
-def _check_body(motion: Motion, path: Path, unit_m: float, R_world_file: Float[Tensor, "3 3"]) -> None:
-    """Raise WearcapError, naming the setting that fixes it, when the body is no person's size or lies on its side."""
-    height = longest_path(motion.skeleton) / REACH_PER_HEIGHT
-    if not HEIGHT_M[0] < height < HEIGHT_M[1]:
-        name = min(UNITS_M, key=lambda name: abs(height / unit_m * UNITS_M[name] - 1.7))
-        what = f"the body would be about {height:.3g} m tall with unit_m={unit_m:g}"
-        fix = (
-            f"unit_m={UNITS_M[name]:.6g} ({name}) would make it {height / unit_m * UNITS_M[name]:.2f} m; "
-            "check=False takes it as it is."
-        )
-        raise WearcapError(what, path, "a person's size", fix)
-    rest_joints = motion.skeleton.rest_joints
-    rest = rest_joints.amax(0) - rest_joints.amin(0)
-    positions = motion.sliced(0, len(motion)).T_world_joint.t
-    moving = (positions.amax(1) - positions.amin(1)).median(0).values
-    long_axes = [axis for axis in (0, 1) if rest[2] < 0.5 * rest[axis] and moving[2] < 0.6 * moving[axis]]
-    if long_axes:
-        # Arms may span as much as the body is tall, but only across them left mirrors right: the mean distance (m)
-        # from each joint, mirrored along an axis through the root, to the nearest one tells them apart.
-        mirrors = {axis: torch.ones(3).index_fill(0, torch.tensor(axis), -1.0) for axis in long_axes}
-        axis = max(long_axes, key=lambda k: torch.cdist(rest_joints * mirrors[k], rest_joints).amin(1).mean().item())
-        name = "xyz"[int(R_world_file[axis].abs().argmax())]
-        what = f"the body lies down: {moving[2]:.2f} m high and {moving[axis]:.2f} m long"
-        fix = f'up="{name}" (or "-{name}") would raise it; check=False takes it as it is.'
-        raise WearcapError(what, path, "a person upright in the bind pose or in most frames", fix)
 
 
 def longest_path(skeleton: Skeleton) -> float:

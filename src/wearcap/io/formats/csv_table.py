@@ -71,14 +71,14 @@ def read_header(path: str | Path) -> list[str]:
 
 
 def read_columns(
-    path: str | Path, columns: Sequence[str], *, text: Sequence[str] = (), whole: Sequence[str] = ()
+    path: str | Path, columns: Sequence[str], *, text: Sequence[str] = (), integers: Sequence[str] = ()
 ) -> dict[str, np.ndarray]:
-    """Named columns as float64 arrays, those in `text` as byte strings (at most 64 characters), in `whole` as int64.
+    """Named columns as float64 arrays, those in `text` as byte strings (at most 64 characters), in `integers` as int64.
 
     Raises WearcapError for a missing column (with the nearest name that is there), a field that is no number
     (with its line), or a file without rows.
     """
-    return next(iter_columns(path, columns, text=text, whole=whole, rows=None))
+    return next(iter_columns(path, columns, text=text, integers=integers, rows=None))
 
 
 def iter_columns(
@@ -86,18 +86,18 @@ def iter_columns(
     columns: Sequence[str],
     *,
     text: Sequence[str] = (),
-    whole: Sequence[str] = (),
+    integers: Sequence[str] = (),
     rows: int | None = 1_000_000,
 ) -> Iterator[dict[str, np.ndarray]]:
     """As `read_columns`, but at most `rows` lines at a time, for files larger than memory."""
     about, header, delimiter = read_layout(path)
-    wanted = [*columns, *text, *whole]
+    wanted = [*columns, *text, *integers]
     for name in wanted:
         if name not in header:
             near = difflib.get_close_matches(name, header, n=1)
             fix = f"The nearest is {near[0]!r}." if near else ""
             raise WearcapError(f"no column {name!r}", path, f"the columns {', '.join(wanted)}", fix)
-    kinds = dict.fromkeys(columns, "f8") | dict.fromkeys(text, "S64") | dict.fromkeys(whole, "i8")
+    kinds = dict.fromkeys(columns, "f8") | dict.fromkeys(text, "S64") | dict.fromkeys(integers, "i8")
     done = 0
     with open_text(path, "table" if rows is None else "streamed table") as file:
         lines = islice(file, len(about) + 1, None)

@@ -60,7 +60,7 @@ def read_hand_detections(path: str | Path, min_score: float) -> HandDetections:
     other content, numbers that are not finite, boxes, scores, states and sides that are none, and without pictures.
     """
     if ".csv" in Path(path).suffixes:
-        columns = read_columns(path, HOD_COLUMNS[1:], whole=HOD_COLUMNS[:1])
+        columns = read_columns(path, HOD_COLUMNS[1:], integers=HOD_COLUMNS[:1])
         table = np.stack([columns[name] for name in HOD_COLUMNS[1:]], 1)
         numbers = columns["frame"].tolist()
         rows = [_hod_row(number, row, path) for number, row in zip(numbers, table.tolist())]

@@ -6,7 +6,7 @@ import torch
 
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
-from wearcap.recording.acts import SAME_S
+from wearcap.recording.active_objects import SAME_S
 
 
 class SeenObject(NamedTuple):

@@ -17,7 +17,7 @@ from wearcap.live.packets import CAMERA, HEAD, OBJECT, SUIT, Inbox, Packet
 from wearcap.live.setup import Seat, Setup
 from wearcap.live.source import Address, Source
 from wearcap.recording import ImuStream, Motion, Recording
-from wearcap.recording.acts import SAME_S
+from wearcap.recording.active_objects import SAME_S
 from wearcap.runtime.session import Session
 from wearcap.sensors.imu import acceleration
 from wearcap.sensors.samples import (

@@ -100,7 +100,7 @@ class GuidedScene:
         mean, scale = self.net.motion_normalizer.mean.to(x0_hat), self.net.motion_normalizer.scale.to(x0_hat)
         human, scene_object, contact = (x0_hat * scale + mean).split(self.net.sizes, -1)
         body = self.features.decode_body(human, self.frame)
-        T_object = self.features.decode_object(scene_object[..., :OBJECT_SIZE], self.frame)
+        T_object = self.features.decode_object(scene_object, self.frame)
         in_contact = (contact.detach() + 1) / 2 > threshold
         in_contact = torch.where(self.conditioning.is_observed[..., 2:], self.conditioning.contact > 0.5, in_contact)
         has_object = self.conditioning.valid & self.conditioning.has_object

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from wearcap.body.contact_points import BODY_POINTS
-from wearcap.body.skeleton import FOOT_PATCHES, WRISTS, Skeleton
+from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
 from wearcap.data.features import LIMBS
 from wearcap.errors import WearcapError
 from wearcap.models.build import build
@@ -93,11 +93,10 @@ def condition_channels(features: EchoFeatures) -> list[str]:
 def motion_channels(skeleton: Skeleton, features: EchoFeatures) -> list[str]:
     """Names of a frame's output channels in order; normalised by `motion_mean` and `motion_scale`."""
     pose = [*(f"_{axis}" for axis in "xyz"), *(f".{entry}" for entry in ROT6D)]
-    objects = ["object", *(f"object_in_{wrist}" for wrist in WRISTS if features.object_in_wrists)]
     return [
         *(f"root_{axis}" for axis in "xyz"),
         *(f"{joint}.{entry}" for joint in skeleton.joint_names for entry in ROT6D),
-        *(f"{each}{entry}" for each in objects for entry in pose),
+        *(f"object{entry}" for entry in pose),
         *(f"point_{k}.contact" for k in range(BODY_POINTS)),
         *(f"{patch}.contact" for patch in FOOT_PATCHES),
     ]
@@ -162,7 +161,8 @@ def from_export(runs: dict[str, Run], weights: dict[str, dict[str, Tensor]], abo
         encoder: Any = build({**about.encoder, "_target_": target}, weights["encoder"], "the sidecar's encoder")
         encoder.requires_grad_(False)
     # Files of before these settings captured without them.
-    settings = {"freedoms": False, "spread": None, "wrists": None, **about.settings}
+    settings = {"freedoms": False, "wrists": None, **about.settings}
+    settings.setdefault("observed_length_scale", settings.pop("spread", None))  # its former name
     model = EchoModel(
         _ExportedEchoDenoiser(runs, about),
         about.features,

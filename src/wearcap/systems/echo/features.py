@@ -69,17 +69,12 @@ class EchoFeatures:
     """Frame rate of the model (Hz)."""
     points: Sequence[str] = POINTS
     """Tracked points that the condition has, the head first: all, or for a baseline the head alone."""
-    object_in_wrists: bool = False
-    """Whether an object's pose is among the outputs in both wrists' axes, too, in which it changes little while it is
-    held (ours)."""
 
     def __post_init__(self):
         require_choice(self.frame, FRAMES, f"ECHO has no frame {self.frame!r}")
         if tuple(self.points) not in (POINTS[:1], POINTS):
             what = f"tracked points {', '.join(self.points) or '(none)'}"
             raise WearcapError(what, expected=f"{', '.join(POINTS)}, or the head alone")
-        if self.object_in_wrists and tuple(self.points) != POINTS:
-            raise WearcapError("object_in_wrists without tracked wrists", expected=f"points {', '.join(POINTS)}")
 
     @property
     def condition_size(self) -> int:
@@ -91,11 +86,6 @@ class EchoFeatures:
     def human_size(self) -> int:
         """Features of a body's pose: root translation and 6D rotations of all joints."""
         return 3 + 6 * self.joints
-
-    @property
-    def object_size(self) -> int:
-        """Features of an object's pose: nine in each of `object_frames`."""
-        return OBJECT_SIZE * (len(POINTS) if self.object_in_wrists else 1)
 
     @property
     def object_condition_size(self) -> int:
@@ -172,16 +162,11 @@ class EchoFeatures:
         root = frame @ Rigid(R[:, :, 0], human[..., :3])
         return Body(torch.cat([root.R[:, :, None], R[:, :, 1:]], 2), root.t)
 
-    def object_frames(self, points: ThreePoints, frame: Rigid) -> list[Rigid]:
-        """Frames in which an object's pose is expressed: the canonical one and, with `object_in_wrists`, both wrists'."""
-        wrists = range(1, len(POINTS)) if self.object_in_wrists else ()
-        return [frame, *(Rigid(points.R_world_point[:, :, k], points.t_world_point[:, :, k]) for k in wrists)]
-
-    def encode_object(self, T_world_object: Rigid, *frames: Rigid) -> Float[Tensor, "batch time object"]:
-        """Translation and 6D rotation of an object in coordinates of each frame."""
-        each = [frame.inverse() @ T_world_object for frame in frames]
-        return torch.cat([part for T in each for part in (T.t, rotation.rot6d_from_matrix(T.R))], -1)
+    def encode_object(self, T_world_object: Rigid, frame: Rigid) -> Float[Tensor, "batch time 9"]:
+        """Translation and 6D rotation of an object in coordinates of `frame`."""
+        T = frame.inverse() @ T_world_object
+        return torch.cat([T.t, rotation.rot6d_from_matrix(T.R)], -1)
 
     def decode_object(self, value: Float[Tensor, "batch time 9"], frame: Rigid) -> Rigid:
-        """The inverse of `encode_object` for one frame."""
+        """The inverse of `encode_object`."""
         return frame @ Rigid(rotation.matrix_from_rot6d(value[..., 3:]), value[..., :3])

@@ -19,7 +19,7 @@ from wearcap.geometry.trajectory import Trajectory, interpolate_clamped, resampl
 from wearcap.geometry.triangle_distance import TriangleIndex
 from wearcap.metrics.symmetry import Symmetry
 from wearcap.models.point_encoder import PointNeXt, bounds
-from wearcap.recording.acts import NO_OBJECT, Act, active_at
+from wearcap.recording.active_objects import NO_OBJECT, ActiveSpan, active_at
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 from wearcap.recording.timing import at_times
@@ -139,7 +139,7 @@ class Scenario:
 
     recording: Recording
     environment: Environment | None = None
-    acts: tuple[Act, ...] = ()
+    active_objects: tuple[ActiveSpan, ...] = ()
     """Intervals with an active object; empty: the human alone is captured."""
     observed: Observed = field(default_factory=Observed)
     placed: bool = False
@@ -160,14 +160,14 @@ class BatchItem:
 def batch_item_of(scenario: Scenario, path: HeadPath, reader: ObjectReader) -> BatchItem:
     """Conditioning of a scenario, for every frame of the head path.
 
-    Raises WearcapError for wrists that are not tracked or are swapped, for acts of unknown objects, for objects whose
+    Raises WearcapError for wrists that are not tracked or are swapped, for spans of unknown objects, for objects whose
     mesh or class cannot be used, and for observations beyond the recording.
     """
     recording = scenario.recording
     R, t = _tracked_points(recording, path)
-    names = list(dict.fromkeys(act.object for act in scenario.acts))
+    names = list(dict.fromkeys(span.object for span in scenario.active_objects))
     objects = _objects(scenario, names, reader)
-    active = active_at(scenario.acts, names, path.timestamps)
+    active = active_at(scenario.active_objects, names, path.timestamps)
     codes = torch.stack([*(shape.code for shape in objects), reader.nothing])
     mirrored = torch.stack([*(shape.code_mirrored for shape in objects), reader.nothing])
     floor = path.floor_below(CARRIED)
@@ -242,7 +242,7 @@ def _require_times(times: Float64[Tensor, "frame"], path: HeadPath, what: str, w
 
 def _objects(scenario: Scenario, names: list[str], reader: ObjectReader) -> list[ObjectShape]:
     if names and scenario.environment is None:
-        what = f"acts of {names[0]!r}, but no objects"
+        what = f"spans of {names[0]!r}, but no objects"
         expected = "an environment with the objects' meshes"
         raise WearcapError(what, where=scenario.recording.name, expected=expected, fix="Give environment=FILE.")
     shapes = []

@@ -18,13 +18,12 @@ from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.environment import read_environment
 from wearcap.metrics.table import Row
 from wearcap.recording import Motion, Recording
-from wearcap.recording.acts import Act, true_acts
+from wearcap.recording.active_objects import ActiveSpan, true_spans
 from wearcap.runtime.graphs import chosen
 from wearcap.runtime.needs import HEAD, HEIGHT, TRACKED_WRISTS
 from wearcap.runtime.system import CaptureInput, LearnedSystem
 from wearcap.scene.objects import Environment
 from wearcap.systems.echo.contacts import ContactUse, GuidedScene, with_static_objects
-from wearcap.systems.echo.handover import HandOver
 from wearcap.systems.echo.model import EchoRunner
 from wearcap.systems.echo.observations import BatchItem, ObjectReader, ObjectShape, Scenario, batch_item_of
 from wearcap.systems.echo.queue import Conditioning, EchoModel, EchoQueue, Guided, Outputs
@@ -49,8 +48,8 @@ class Sampling:
     step: str = "posterior"
     lead: float = 0.0
     """Share by which the contacts' ramp of levels is shorter: they are denoised before body and object (ours)."""
-    spread: float | None = 8.0
-    """Frames over which the residual of x̂0 in an observed frame is taken over by its neighbours (ours); None: not at all."""
+    observed_length_scale: float | None = 8.0
+    """Length scale (frames) of the Gaussian process by which an observed frame's residual of x̂0 reaches its neighbours (ours); None: not at all."""
     wrists: float | None = 0.3
     """Share of its distance from the tracked wrists by which x̂0 approaches them in every step (ours); None: not at all
     (ECHO)."""
@@ -82,7 +81,9 @@ class Echo(LearnedSystem):
     """Whether the body is anchored to the measured head (ours) or keeps its sampled position (ECHO)."""
     refinement: Refinement | None = None
     """How sampled motion is refined (ours); None: it stays as sampled."""
-    acts: str | Sequence[Mapping[str, Any]] | Callable[[Motion, Environment], tuple[Act, ...]] = "truth"
+    active_objects: str | Sequence[Mapping[str, Any]] | Callable[[Motion, Environment], tuple[ActiveSpan, ...]] = (
+        "truth"
+    )
     """Which object is active when: "truth", the recording's interactions; "none": the human alone; a list of
     {object, start_s, stop_s}; or a search."""
     environment: str | None = None
@@ -105,10 +106,10 @@ class Echo(LearnedSystem):
     baselines = ()
 
     def __post_init__(self):
-        if isinstance(self.acts, str) and self.acts not in ("truth", "none"):
+        if isinstance(self.active_objects, str) and self.active_objects not in ("truth", "none"):
             expected = "truth, none, or a list of {object, start_s, stop_s}"
-            raise WearcapError(f"unknown acts {self.acts!r}", expected=expected)
-        ramp, _ = self.rolling.ramp, self._listed_acts()
+            raise WearcapError(f"unknown active_objects {self.active_objects!r}", expected=expected)
+        ramp, _ = self.rolling.ramp, self._listed_spans()
         rewindow = self.sampling.rewindow
         if rewindow is not None and not (rewindow > 0 and (self.sampling.average or rewindow <= ramp)):
             what = f"windows that advance by {rewindow} frames"
@@ -192,36 +193,38 @@ class Echo(LearnedSystem):
         environment, recording = self.objects(source), source.recording
         self._reader = self._reader or self.reader()
         has_objects = environment is not None and bool(recording.object_motion)
-        acts = tuple(true_acts(recording)) if has_objects else ()
-        return truth_of(Scenario(recording, environment, acts), motion.timestamps, self._reader)
+        spans = tuple(true_spans(recording)) if has_objects else ()
+        return truth_of(Scenario(recording, environment, spans), motion.timestamps, self._reader)
 
     def score(self, motion: Motion, source: CaptureInput, seed: int) -> Row:
         """ECHO's metrics of one capture (ECHO §4.1)."""
         return score_echo(motion, self.truth(motion, source), source.recording.name, seed)
 
-    def _listed_acts(self) -> tuple[Act, ...]:
-        if isinstance(self.acts, str) or callable(self.acts):
+    def _listed_spans(self) -> tuple[ActiveSpan, ...]:
+        if isinstance(self.active_objects, str) or callable(self.active_objects):
             return ()
         try:
-            return tuple(sorted((Act(**row) for row in self.acts), key=lambda act: act.start_s))
+            return tuple(sorted((ActiveSpan(**row) for row in self.active_objects), key=lambda span: span.start_s))
         except TypeError as error:
-            raise WearcapError(f"acts {self.acts!r}", expected="a list of {object, start_s, stop_s}") from error
+            raise WearcapError(
+                f"active_objects {self.active_objects!r}", expected="a list of {object, start_s, stop_s}"
+            ) from error
 
     def scenario(self, recording: Recording, environment: Environment | None) -> Scenario:
-        """A recording with its active objects, according to `acts`.
+        """A recording with its active objects, according to `active_objects`.
 
-        Without an environment, or without interactions and object poses, the human alone is captured, unless `acts`
+        Without an environment, or without interactions and object poses, the human alone is captured, unless `active_objects`
         is a list.
         """
-        if self.acts == "truth":
+        if self.active_objects == "truth":
             tracked = bool(recording.object_motion) or recording.interactions is not None
             has_objects = environment is not None and tracked
-            acts = tuple(true_acts(recording)) if has_objects else ()
-            return Scenario(recording, environment, acts, placed=self.placed)
-        if callable(self.acts) and environment is not None:
+            spans = tuple(true_spans(recording)) if has_objects else ()
+            return Scenario(recording, environment, spans, placed=self.placed)
+        if callable(self.active_objects) and environment is not None:
             alone = self.capture_scenarios([Scenario(recording)], [0])[0]
-            return Scenario(recording, environment, self.acts(alone, environment), placed=self.placed)
-        return Scenario(recording, environment, self._listed_acts(), placed=self.placed)
+            return Scenario(recording, environment, self.active_objects(alone, environment), placed=self.placed)
+        return Scenario(recording, environment, self._listed_spans(), placed=self.placed)
 
     @torch.no_grad()
     def capture_scenarios(self, scenarios: Sequence[Scenario], seeds: Sequence[int]) -> list[Motion]:
@@ -273,7 +276,7 @@ class Echo(LearnedSystem):
         if self.refinement is None:
             return motion
         path = item.path
-        motion = self.refinement.whole(motion, measured_of(item), path.stretches, self.fps, self.anchor)
+        motion = self.refinement.refined(motion, measured_of(item), path.stretches, self.fps, self.anchor)
         return motion if len(path.stretches) == 1 else held_in_gaps(motion, path, self.anchor)
 
     def queue(
@@ -307,8 +310,6 @@ class Echo(LearnedSystem):
         if (share := self.sampling.wrists) is not None and reaches(model.features):
             reaching = Reaching(model.net, model.features, model.skeleton, queue.t_parent_joint, conditioning, frame)
             corrections.append(lambda x0_hat: reaching.corrected(x0_hat, share))
-        if model.features.object_in_wrists and model.contacts:
-            corrections.append(HandOver(model.net, model.features, conditioning, frame).corrected)
         if guidance is not None and queue.guided is not None:
             surfaces, objects = queue.guided
             scene = GuidedScene(model.net, model.features, conditioning, frame, surfaces, objects)
@@ -317,7 +318,7 @@ class Echo(LearnedSystem):
 
     def settings(self) -> dict[str, str]:
         """Settings that a capture depends on, for its provenance."""
-        acts, use = "search" if callable(self.acts) else self.acts, self.contact_use
+        spans, use = "search" if callable(self.active_objects) else self.active_objects, self.contact_use
         own = {
             "rewindow": self.stride,
             "anchor": self.anchor,
@@ -326,7 +327,7 @@ class Echo(LearnedSystem):
             "placed": self.placed,
             "freedoms": self.freedoms,
         }
-        settings = {**vars(self.sampling), **own, "guidance": use.guidance, "acts": acts}
+        settings = {**vars(self.sampling), **own, "guidance": use.guidance, "active_objects": spans}
         return {"pipeline": "echo"} | {name: str(value) for name, value in settings.items()}
 
 

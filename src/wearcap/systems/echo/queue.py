@@ -15,11 +15,11 @@ from wearcap.body.skeleton import MIRROR, Skeleton
 from wearcap.data.features import body_size
 from wearcap.data.transforms import mirrored_rotations
 from wearcap.diffusion.conveyor import Conveyor, Correct, Denoise, Observation, RollingSchedule
-from wearcap.diffusion.observed import spreading, with_residuals
+from wearcap.diffusion.observed import residual_weights, with_residuals
 from wearcap.diffusion.schedule import Schedule
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.point_encoder import PointNeXt
-from wearcap.systems.echo.features import OBJECT_SIZE, TWIN_CONTACTS, TWIN_POINTS, Body, EchoFeatures, ThreePoints
+from wearcap.systems.echo.features import TWIN_CONTACTS, TWIN_POINTS, Body, EchoFeatures, ThreePoints
 from wearcap.systems.echo.model import EchoDenoiser
 
 
@@ -123,7 +123,7 @@ class _Sampling(Protocol):
     """The part of a pipeline's sampling that the queue uses."""
 
     @property
-    def spread(self) -> float | None: ...
+    def observed_length_scale(self) -> float | None: ...
 
     @property
     def mirror_average(self) -> bool: ...
@@ -160,15 +160,9 @@ class EchoQueue:
         self._random = [torch.Generator().manual_seed(seed) for seed in seeds]
         self._frame: Rigid | None = None
 
-    transient = ("guided",)
-
     def guide(self, guided: Guided) -> None:
         """Give the queue the bodies and objects that guidance needs."""
         self.guided = guided
-
-    def restored(self) -> None:
-        """A saved queue comes back without the bodies and objects that guidance needs."""
-        self.guided = None
 
     @torch.no_grad()
     def push(self, fresh: Conditioning) -> Outputs | None:
@@ -230,7 +224,7 @@ class EchoQueue:
             features = self.pipeline.model.features
             body = features.encode_body(Body(conditioning.R_parent_joint, conditioning.t_world_root), frame)
             T_world_object = Rigid(conditioning.R_world_object, conditioning.t_world_object)
-            scene_object = features.encode_object(T_world_object, *features.object_frames(conditioning.points, frame))
+            scene_object = features.encode_object(T_world_object, frame)
             raw = torch.cat([body, scene_object, 2 * conditioning.contact - 1], -1)
             observed = self.pipeline.model.net.motion_normalizer(raw.to(self.pipeline.device)).cpu()
         never = torch.zeros_like(conditioning.has_object)
@@ -243,13 +237,13 @@ class EchoQueue:
         self, corrections: Sequence[Correct], conditioning: Conditioning, observation: Observation
     ) -> Correct:
         """Spreads the residuals of observed frames, then applies the pipeline's corrections in turn."""
-        frames, corrections = self.pipeline.sampling.spread, list(corrections)
+        frames, corrections = self.pipeline.sampling.observed_length_scale, list(corrections)
         if frames is not None and observation.is_observed.any():
             valid, number = conditioning.valid, torch.where(conditioning.has_object, conditioning.object_number, -1.0)
             together = valid[:, :, None] & valid[:, None]
             touching = together & (number[:, :, None] == number[:, None])
             alike = torch.stack([together, touching, touching], 1)
-            weights = spreading(observation.is_observed.mT, alike, frames)
+            weights = residual_weights(observation.is_observed.mT, alike, frames)
             sizes = self.pipeline.model.net.sizes
             corrections.insert(0, lambda x0_hat: with_residuals(x0_hat, observation.observed, weights, sizes))
         return lambda x0_hat: reduce(lambda value, correct: correct(value), corrections, x0_hat)
@@ -283,5 +277,5 @@ class EchoQueue:
         raw = net.motion_normalizer.inverse(x[:, part].to(self.pipeline.device)).cpu()
         human, scene_object, contact = raw.split(net.sizes, -1)
         at = frame if frame.t.shape[1] == 1 else Rigid(frame.R[:, part], frame.t[:, part])
-        body, T = features.decode_body(human, at), features.decode_object(scene_object[..., :OBJECT_SIZE], at)
+        body, T = features.decode_body(human, at), features.decode_object(scene_object, at)
         return Outputs(*body, T.R, T.t, ((contact + 1) / 2).clamp(0, 1))

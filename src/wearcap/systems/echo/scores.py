@@ -20,7 +20,7 @@ from wearcap.metrics.position import body_parts, joint_error_cm, mpjpe_cm, part_
 from wearcap.metrics.symmetry import closest_surface_error_cm
 from wearcap.metrics.table import TRUTH, Row, both_walking
 from wearcap.recording import Motion, Recording
-from wearcap.recording.acts import active_at
+from wearcap.recording.active_objects import active_at
 from wearcap.recording.timing import at_times
 from wearcap.systems.echo.observations import ObjectReader, ObjectShape, Scenario
 
@@ -53,8 +53,8 @@ def truth_of(scenario: Scenario, timestamps: Float64[Tensor, "time"], reader: Ob
     whole = recording.motion
     times = timestamps.clamp(whole.timestamps[0].item(), whole.timestamps[-1].item())
     motion = at_times(whole, times)
-    names = list(dict.fromkeys(act.object for act in scenario.acts))
-    active = active_at(scenario.acts, names, timestamps)
+    names = list(dict.fromkeys(span.object for span in scenario.active_objects))
+    active = active_at(scenario.active_objects, names, timestamps)
     surface = contact_points(anny_body(motion.skeleton, recording.shape or None))
     touch = torch.zeros(len(times), BODY_POINTS, dtype=torch.bool)
     shapes, poses = [], []

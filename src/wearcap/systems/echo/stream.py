@@ -5,66 +5,40 @@ latency of a pose is `Echo.latency_s`. Memory use is bounded.
 """
 
 import math
-import sys
 from bisect import bisect_left
 from collections.abc import Sequence
 from itertools import groupby
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from wearcap.body import skeleton
 from wearcap.body.skeleton import WRISTS
-from wearcap.diffusion import conveyor
 from wearcap.errors import WearcapError
-from wearcap.geometry import rigid, rotation, trajectory
+from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording import Motion
-from wearcap.recording import motion as motion_types
-from wearcap.recording.acts import SAME_S, changes
+from wearcap.recording.active_objects import SAME_S, changes
 from wearcap.recording.timing import joined
-from wearcap.runtime import wearer as wearer_types
 from wearcap.runtime.graphs import undisturbed
-from wearcap.runtime.session import HeadAndWristsStream, Session, classes_of
+from wearcap.runtime.session import HeadAndWristsStream, Session
 from wearcap.runtime.system import CaptureInput
 from wearcap.runtime.wearer import Wearer
 from wearcap.scene.objects import Environment
-from wearcap.sensors import packets, samples
+from wearcap.sensors import packets
 from wearcap.sensors.packets import MAX_WAITING
 from wearcap.sensors.samples import ActiveObject, HeadSample, ObjectSample, WristSample
-from wearcap.systems.echo import contacts, queue, windows
 from wearcap.systems.echo.contacts import StaticObjects
 from wearcap.systems.echo.features import CONTACTS
 from wearcap.systems.echo.model import MODALITIES
 from wearcap.systems.echo.observations import MAX_GAP_S, BatchItem, ObjectShape, wrist_poses
 from wearcap.systems.echo.pipeline import Echo, measured_of, motion_of, pulled_by, stretch_seed
 from wearcap.systems.echo.queue import Conditioning, EchoQueue, Outputs
-from wearcap.tracking import floor, foot_lock, head_path, refinement
 from wearcap.tracking.floor import CARRIED, FloorTracker
 from wearcap.tracking.head_path import Chunk, HeadPath
 from wearcap.tracking.refinement import Refiner
 
-_STATE = (
-    *(
-        skeleton,
-        motion_types,
-        trajectory,
-        rigid,
-        head_path,
-        packets,
-        samples,
-        floor,
-        conveyor,
-        queue,
-        windows,
-        contacts,
-    ),
-    *(refinement, foot_lock, wearer_types),
-)
-"""Modules with the classes that a session's state consists of."""
 MAX_SEEN = 1000
 """Most object observations that are buffered; the oldest are dropped."""
 ASIDE_M, BELOW = 0.25, 0.47
@@ -82,23 +56,13 @@ class EchoStream(HeadAndWristsStream):
             raise WearcapError(what, expected="average=true, or a conveyor: rewindow=null, rewindow_steps=null")
         super().__init__(pipeline, pipeline.fps, 1)
         self.wearer, self.seed = wearer, seed
-        self._names: list[str] = []
+        self._environment, self._reader = environment, pipeline.reader()
+        self._shapes: dict[str, ObjectShape] = {}
         """Objects that were named so far, in order of their first use."""
         self._queue: EchoQueue | None = None
-        self.bring(environment)
-        self._acts: list[tuple[float, str | None]] = []
+        self._activated: list[tuple[float, str | None]] = []
         self._seen: list[tuple[float, str, Rigid]] = []
         self._restart()
-
-    transient = ("_environment", "_reader", "_shapes")
-
-    def bring(self, environment: Environment | None) -> None:
-        """Give the stream its environment, and read the objects that were named. Raises WearcapError without them."""
-        self._environment, self._reader = environment, self.pipeline.reader()
-        self._shapes: dict[str, ObjectShape] = {}
-        for name in self._names:
-            self._shape(name)
-        self._guide()
 
     def _guide(self) -> None:
         """Give the queue the bodies and objects that guidance needs, if any."""
@@ -108,8 +72,8 @@ class EchoStream(HeadAndWristsStream):
 
     def _restart(self, again: bool = False) -> None:
         if again:
-            active = next((name for start, name in reversed(self._acts) if start <= self._track.newest), None)
-            self._acts = [] if active is None else [(-math.inf, active)]
+            active = next((name for start, name in reversed(self._activated) if start <= self._track.newest), None)
+            self._activated = [] if active is None else [(-math.inf, active)]
             self._seen = []
         super()._restart(again)
         self._queue = None
@@ -162,8 +126,8 @@ class EchoStream(HeadAndWristsStream):
                 # Half a frame later, so that the first frame from `timestamp` on is the nearest one.
                 soon = timestamp + 0.499 / self.pipeline.fps
                 self._see(name, soon, self._environment.by_name(name).T_world_object)
-        self._acts = [act for act in self._acts if act[0] < timestamp] + [(timestamp, name)]
-        del self._acts[:-MAX_WAITING]
+        self._activated = [span for span in self._activated if span[0] < timestamp] + [(timestamp, name)]
+        del self._activated[:-MAX_WAITING]
         self._update_pending()
 
     def see_object(self, name: str, timestamp: float, T_world_object: Rigid) -> None:
@@ -192,8 +156,6 @@ class EchoStream(HeadAndWristsStream):
             item = self._environment.by_name(name)
             item.check(f"object {name!r}")
             self._shapes[name] = self._reader(item)
-            if name not in self._names:
-                self._names.append(name)
             self._guide()
         return self._shapes[name]
 
@@ -280,7 +242,7 @@ class EchoStream(HeadAndWristsStream):
 
     def _active(self, time: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Whether an object is active at a time, its codes and its index."""
-        name = next((name for start, name in reversed(self._acts) if start <= time + SAME_S), None)
+        name = next((name for start, name in reversed(self._activated) if start <= time + SAME_S), None)
         if name is None:
             nothing = self._reader.nothing[None]
             return torch.zeros(1, dtype=torch.bool), nothing, nothing, torch.full((1,), -1.0)
@@ -340,8 +302,8 @@ class EchoStream(HeadAndWristsStream):
         path = HeadPath(clock, T_world_head, T_world_head, floor_height, skeleton, stretches)
         # Object events that no later frame needs are dropped.
         self._seen = [row for row in self._seen if row[0] > times[-1] - 1.0]
-        past = [k for k, (start, _) in enumerate(self._acts) if start <= times[-1]]
-        self._acts = self._acts[past[-1] :] if past else self._acts
+        past = [k for k, (start, _) in enumerate(self._activated) if start <= times[-1]]
+        self._activated = self._activated[past[-1] :] if past else self._activated
         if self._static is not None:
             one = (Outputs(*(field[:, k : k + 1] for field in outputs)) for k in range(len(times)))
             static = [self._static(each, part) for each, part in zip(every, one)]
@@ -358,8 +320,6 @@ class EchoStream(HeadAndWristsStream):
 class EchoSession(Session):
     """A streaming capture of one or several wearers and the objects of one environment, each by an `EchoStream`."""
 
-    stream_class = EchoStream
-    classes = classes_of(*_STATE, sys.modules[__name__])
     devices = ("head", *WRISTS)
     given_floor = True
     takes_objects = True
@@ -387,29 +347,7 @@ class EchoSession(Session):
     @classmethod
     def of_objects(cls, system: Echo, source: CaptureInput) -> list[ActiveObject | ObjectSample]:
         scenario = system.scenario(source.recording, system.objects(source))
-        return [ActiveObject(name, time_s) for time_s, name in changes(scenario.acts)]
-
-    @classmethod
-    def settings(cls, system: Echo) -> dict[str, Any]:
-        model = system.model
-        return {**system.settings(), "window": model.net.window, "features": str(model.features)}
-
-    @classmethod
-    def shared(cls, system: Echo) -> dict[str, Any]:
-        return super().shared(system) | {"schedule": system.model.schedule}
-
-    @classmethod
-    def load(cls, path: str | Path, system: Echo, environment: Environment | None = None) -> "EchoSession":
-        """Restore a saved session with the pipeline and the environment that it ran with.
-
-        Raises WearcapError for a file that is no session or is damaged, for a pipeline with other settings, and for an
-        environment without the session's objects.
-        """
-        session = super().load(path, system)
-        assert isinstance(session, EchoSession)
-        for stream in session.streams:
-            stream.bring(environment)
-        return session
+        return [ActiveObject(name, time_s) for time_s, name in changes(scenario.active_objects)]
 
 
 SESSION = EchoSession

@@ -17,7 +17,6 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.models.point_encoder import PointNeXt
 from wearcap.systems.echo.features import CONTACTS, HANDS, OBJECT_SIZE, POINTS, Body, EchoFeatures
-from wearcap.systems.echo.handover import handed_over, in_hand
 from wearcap.systems.echo.model import MODALITIES, EchoDenoiser
 from wearcap.systems.echo.pipeline import Echo
 from wearcap.systems.echo.queue import EchoModel
@@ -40,8 +39,7 @@ class EchoDiffusion(Training):
     "skate" are distances in metres (its last three). Ours: "velocity" of the joints; "held", how the object moves in the hand
     that touches it; "foot_contact", cross entropy of the feet's contact, both classes alike. Frames without an active object do
     not count in the object terms. An object that looks the same from several sides is asked for in the orientation that can
-    be known (`training_windows.canonical`), unless clean frames show another. With `object_in_wrists`, "object" is the mean over
-    all its channels, and the other two terms of the object also count for its pose as the true contacts hand it over.
+    be known (`training_windows.canonical`), unless clean frames show another.
     """
 
     system = Echo
@@ -66,7 +64,7 @@ class EchoDiffusion(Training):
         super().__init__(optimizer, scheduler, loss_weights, seed)
         self.net = net(
             human_size=features.human_size,
-            object_size=features.object_size,
+            object_size=OBJECT_SIZE,
             contact_size=CONTACTS,
             condition_size=features.condition_size,
             object_condition_size=features.object_condition_size,
@@ -91,7 +89,7 @@ class EchoDiffusion(Training):
             frame = self.features.canonical(batch.points)
             rows["human"].append(self.features.encode_body(batch.body, frame)[batch.valid])
             canonical = Rigid(batch.R_world_canonical, batch.t_world_canonical)
-            scene_object = self.features.encode_object(canonical, *self.features.object_frames(batch.points, frame))
+            scene_object = self.features.encode_object(canonical, frame)
             rows["object"].append(scene_object[batch.valid & batch.has_object])
             rows["condition"].append(self.features.condition(batch.points, batch.floor_height, batch.size)[batch.valid])
         human, scene_object, condition = (torch.cat(part) for part in rows.values())
@@ -123,9 +121,7 @@ class EchoDiffusion(Training):
     def truth(self, batch: EchoWindow, frame: Rigid) -> Float[Tensor, "batch time feature"]:
         """Ground truth x0 in normalised space."""
         human = self.features.encode_body(batch.body, frame)
-        scene_object = self.features.encode_object(
-            batch.T_world_object, *self.features.object_frames(batch.points, frame)
-        )
+        scene_object = self.features.encode_object(batch.T_world_object, frame)
         x0 = self.net.motion_normalizer(torch.cat([human, scene_object, 2 * batch.contact - 1], -1))
         # Frames without an object have zeros for its pose, and no contact.
         human, scene_object, contact = x0.split(self.net.sizes, -1)
@@ -147,7 +143,7 @@ class EchoDiffusion(Training):
         """Mask of meaningful features: all with an active object, else human and foot contacts."""
         always = torch.ones(sum(self.net.sizes), dtype=torch.bool, device=batch.valid.device)
         first = self.net.sizes[0]
-        always[first : first + self.features.object_size + BODY_POINTS] = False
+        always[first : first + OBJECT_SIZE + BODY_POINTS] = False
         return always | batch.has_object[..., None]
 
     def terms(self, batch: EchoWindow) -> dict[str, Tensor]:
@@ -176,9 +172,9 @@ class EchoDiffusion(Training):
                 terms["foot_contact"] = losses.balanced_cross_entropy(SLOPE * feet, standing, STANDING, weight)
             outputs = self.net.motion_normalizer.inverse(x0_hat)
             first = self.net.sizes[0]
-            poses = self._object_poses(outputs[..., first : first + self.features.object_size], batch, frame)
-            terms["object_vertices"] = torch.stack([self.object_vertices(T, batch) for T in poses]).sum()
-            terms["held"] = torch.stack([self.held(T, batch) for T in poses]).sum()
+            T_object = self.features.decode_object(outputs[..., first : first + OBJECT_SIZE], frame)
+            terms["object_vertices"] = self.object_vertices(T_object, batch)
+            terms["held"] = self.held(T_object, batch)
             body = self.features.decode_body(outputs[..., : self.net.sizes[0]], frame)
             predicted, true = self._joints(body, batch), self._joints(batch.body, batch)
             terms["joints"] = losses.joint_position(predicted, true, weight)
@@ -186,14 +182,6 @@ class EchoDiffusion(Training):
             feet = predicted[:, :, self._feet].unflatten(2, (4, 1))
             terms["skate"] = losses.foot_skate(feet, batch.contact[..., BODY_POINTS:], weight, self.features.fps)
         return terms
-
-    def _object_poses(self, value: Float[Tensor, "batch time object"], batch: EchoWindow, frame: Rigid) -> list[Rigid]:
-        """The object in the canonical frame and, with `object_in_wrists`, as it is handed over by the true contacts."""
-        values = [value[..., :OBJECT_SIZE]]
-        if self.features.object_in_wrists:
-            weights = in_hand(batch.contact, batch.has_object, batch.valid)
-            values.append(handed_over(self.features, value, self.features.object_frames(batch.points, frame), weights))
-        return [self.features.decode_object(each, frame) for each in values]
 
     def _joints(self, body: Body, batch: EchoWindow) -> Float[Tensor, "batch time joint 3"]:
         """Joint positions in the world (m)."""

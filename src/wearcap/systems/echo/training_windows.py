@@ -22,13 +22,14 @@ from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.environment import read_environment
 from wearcap.models.checkpoint import load_network
 from wearcap.models.point_encoder import PointNeXt
-from wearcap.recording.acts import NO_OBJECT, active_at, true_acts
+from wearcap.recording.active_objects import NO_OBJECT, active_at, true_spans
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
 from wearcap.scene.objects import Environment
 from wearcap.systems.echo.features import (
     CONTACTS,
     EXTENTS,
+    OBJECT_SIZE,
     POINTS,
     TWIN_CONTACTS,
     TWIN_POINTS,
@@ -138,12 +139,12 @@ class EchoTrack:
         if head is not None and len(head.timestamps) == len(motion):
             T_world_head = head.T_world_head[take]
             points.R_world_point[:, 0], points.t_world_point[:, 0] = T_world_head.R, T_world_head.t
-        acts = true_acts(recording) if environment is not None and recording.object_motion else []
-        names = list(dict.fromkeys(act.object for act in acts))
+        spans = true_spans(recording) if environment is not None and recording.object_motion else []
+        names = list(dict.fromkeys(span.object for span in spans))
         objects = [reader(environment.by_name(name)) for name in names] if environment is not None else []
         # The body's surface takes a quarter of a second, and is asked for where there is something to touch alone.
         surface = contact_points(anny_body(motion.skeleton, recording.shape or None)) if objects else None
-        active = active_at(acts, names, times)
+        active = active_at(spans, names, times)
         R, t = torch.eye(3).repeat(len(take), 1, 1), torch.zeros(len(take), 3)
         contact = torch.zeros(len(take), CONTACTS)
         for number, shape in enumerate(objects):
@@ -194,10 +195,10 @@ def canonical(
         first = start + int(touched[start:stop].float().argmax())
         heading = rotation.about_axis("z", rotation.yaw_of(R_world_head[first]) + askew)
         before = shape.of_mesh(T_world_object[first])
-        # The turn in the mesh's axes that this moment asks for is the whole act's.
+        # The turn in the mesh's axes that this moment asks for is the whole span's.
         turn = before.to(torch.float64).inverse() @ shape.symmetry.nearest(before, heading)
-        act = shape.centred(shape.of_mesh(T_world_object[start:stop]).to(torch.float64) @ turn)
-        R[start:stop], t[start:stop] = act.R.to(R), act.t.to(t)
+        pose = shape.centred(shape.of_mesh(T_world_object[start:stop]).to(torch.float64) @ turn)
+        R[start:stop], t[start:stop] = pose.R.to(R), pose.t.to(t)
     return Rigid(R, t)
 
 
@@ -280,7 +281,7 @@ class EchoContent(Content):
         if window.scale != 1:
             code[:, len(self.features.classes) :][:, :EXTENTS] *= window.scale
             mean, spread = mean * window.scale, spread * window.scale**2
-        features = self.features.human_size + self.features.object_size + CONTACTS
+        features = self.features.human_size + OBJECT_SIZE + CONTACTS
         chosen = CANONICAL[window.mirrored] if self.canonical else "object"
         values = {name: value for name, value in window.values.items() if not name.endswith(CANONICAL)}
         values |= {f"{kind}_world_canonical": window.values[f"{kind}_world_{chosen}"] for kind in "Rt"}

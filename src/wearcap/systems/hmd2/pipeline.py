@@ -273,7 +273,7 @@ class HMD2(LearnedSystem):
         motion = self.motion(path.timestamps, path.skeleton, path.T_world_head, poses)
         if self.refinement is not None:
             measured = Measured.of(path.T_world_head, frames.floor_height[0])
-            motion = self.refinement.whole(motion, measured, path.stretches, self.model.fps, anchored=True)
+            motion = self.refinement.refined(motion, measured, path.stretches, self.model.fps, anchored=True)
         if len(path.stretches) == 1:
             return motion
         return anchored_to_head(_bridged(motion, path.stretches), path.T_world_head)

@@ -45,12 +45,6 @@ class Places:
         self._center: Tensor | None = None
         """Head position at which distant points were dropped last (m)."""
 
-    transient = ("map",)
-
-    def restored(self) -> None:
-        """Rebuild the map and the floor tracker's points after loading."""
-        self._begin([_joined(self._tracked)])
-
     def add(self, points_world: Float[Tensor, "point 3"], first_seen: float) -> None:
         """Add points (m) that were first seen at a time (s); points that are not finite are left out."""
         points = points_world.detach().float().cpu()

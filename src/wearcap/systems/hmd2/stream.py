@@ -5,32 +5,23 @@ uses earlier data only), the poses are the same. Memory is bounded by a window a
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from wearcap.body import skeleton
 from wearcap.errors import WearcapError
-from wearcap.geometry import rigid
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Motion
-from wearcap.recording import motion as motion_types
 from wearcap.recording.timing import joined
-from wearcap.runtime import wearer as wearer_types
-from wearcap.runtime.session import Session, classes_of
+from wearcap.runtime.session import Session
 from wearcap.runtime.system import CaptureInput
 from wearcap.runtime.wearer import Wearer
-from wearcap.scene import voxels
-from wearcap.sensors import packets, samples
 from wearcap.sensors.packets import Admitted, time_fault
 from wearcap.sensors.samples import HeadSample
-from wearcap.systems.hmd2 import places, wearer, windows
 from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.systems.hmd2.places import Memory
 from wearcap.systems.hmd2.wearer import WearerState
 from wearcap.systems.hmd2.windows import advance
-from wearcap.tracking import floor, foot_lock, head_path, refinement
 from wearcap.tracking.head_path import Chunk
 
 
@@ -44,12 +35,6 @@ class HMD2Session(Session):
     After a gap or jump (`tracking.head_path.MAX_GAP_S`, `MAX_SPEED_M_S`) the capture restarts; gaps get no poses.
     When a wearer's clock is reset, that wearer's capture restarts as in a new session.
     """
-
-    stream_class = WearerState
-    classes = classes_of(
-        *(skeleton, motion_types, rigid, head_path, packets, samples, floor, voxels, places, windows, wearer),
-        *(refinement, foot_lock, wearer_types),
-    )
 
     def __init__(self, pipeline: HMD2, wearers: Sequence[Wearer], seeds: Sequence[int], memory: Memory | None = None):
         """Raises WearcapError when there is not one seed per wearer, or for a stride or lookahead that does not fit."""
@@ -142,27 +127,6 @@ class HMD2Session(Session):
                 state.sampler.correct(chunk.corrected @ T_device_head)
             samplers.append(state.sampler)
         advance(samplers, fresh)
-
-    @classmethod
-    def settings(cls, system: HMD2) -> dict[str, Any]:
-        net, sampling, overlap = system.model.net, system.sampling, system.overlap
-        return {
-            "window": system.window,
-            "stride": system.advance,
-            "steps": sampling.steps,
-            "fps": system.model.fps,
-            "inpaint": overlap.inpaint,
-            "fade": overlap.fade,
-            "lookahead": system.lookahead_frames,
-            "eta": sampling.eta,
-            "spacing": sampling.spacing,
-            **{name: getattr(net, name) for name in ("motion_size", "points_size", "image_size")},
-            "features": str(system.model.features),
-            "refinement": str(system.refinement),
-        }
-
-    def state(self) -> dict[str, Any]:
-        return super().state() | {"embedded": self.embedded}
 
 
 SESSION = HMD2Session

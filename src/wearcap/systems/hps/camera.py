@@ -13,7 +13,7 @@ from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError, require_choice
 from wearcap.io.formats.scene_folder import MAP_NAME
 from wearcap.io.formats.video import read_frames, read_image
-from wearcap.localization.features import Extractor, GlobalDescriptor, Matcher, RootSift
+from wearcap.localization.features import Extractor, Matcher, RootSift
 from wearcap.localization.landmark_tracking import TrackingSettings, track_video
 from wearcap.localization.localizer import Localizer, LocalizerSettings, localize_video
 from wearcap.localization.visual_map import VisualMap
@@ -100,7 +100,6 @@ class MapLocalization:
 
     extractor: Extractor = field(default_factory=RootSift)
     matcher: Matcher | None = None
-    descriptor: GlobalDescriptor | None = None
     settings: LocalizerSettings = field(default_factory=LocalizerSettings)
     map: str | None = None
     """A map's file, or a scene's folder that contains map.safetensors; None: the recording's own poses are used, or,
@@ -139,7 +138,7 @@ class MapLocalization:
         file, stream = self.map_file(recording, folder), recording.camera
         if file is None or stream is None:
             return [recording.localization]
-        features = [self.extractor, self.matcher, self.descriptor, self.settings, self.use_prior, self.tracking]
+        features = [self.extractor, self.matcher, self.settings, self.use_prior, self.tracking]
         frames = [self._step(stream), stream.timestamps, stream.camera]
         return [*features, *frames, file, *_pictures(recording, folder)]
 
@@ -153,9 +152,7 @@ class MapLocalization:
         _pictures(recording, folder)
         stream = recording.camera
         assert stream is not None
-        localizer = Localizer(
-            VisualMap.load(file), self.extractor, self.matcher, self.settings, descriptor=self.descriptor
-        )
+        localizer = Localizer(VisualMap.load(file), self.extractor, self.matcher, self.settings)
         every = self._step(stream)
         video = (_frames(stream, folder, every), stream.timestamps[::every], stream.camera, localizer)
         progress = sys.stderr.isatty()
@@ -180,6 +177,7 @@ def camera_stages(source: CaptureInput, synchronization: Synchronization, locali
             "synchronize",
             lambda results: synchronization(recording, folder),
             lambda: synchronization.reads(recording, folder),
+            kinds=(Clock,),
         ),
         Stage("localize", lambda results: localize(recording, folder), lambda: localize.reads(recording, folder)),
     ]

@@ -22,10 +22,8 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, finite_difference, resample
-from wearcap.optimize.hps import FootPatches, HpsData, HpsEnergy, HpsState, Solution, SuitSteps
-from wearcap.optimize.hps_constants import Constants, ConstantsPrior, estimate_constants, segments, with_constants
 from wearcap.recording import Motion, Recording
-from wearcap.recording.growing import follow_pieces
+from wearcap.recording.pieces import follow_pieces
 from wearcap.recording.recording import Localization
 from wearcap.recording.timing import resampled
 from wearcap.runtime.needs import CAMERA, CONTACTS, LOCALIZATION, SCAN, SUIT, Need
@@ -50,6 +48,8 @@ from wearcap.systems.hps.camera import (
     camera_stages,
     on_one_clock,
 )
+from wearcap.systems.hps.constants import Constants, ConstantsPrior, estimate_constants, segments, with_constants
+from wearcap.systems.hps.energy import FootPatches, HpsData, HpsEnergy, HpsState, Solution, SuitSteps
 
 Solver = Callable[[HpsEnergy, HpsData], Solution]
 
@@ -131,9 +131,10 @@ class HPS(StagedSystem):
                 lambda done: self.initialize(on_one_clock(recording, done), done["align"]),
                 lambda: (self.initialization, *mount(recording)),
                 ("synchronize", "localize", "align"),
+                (Initialization,),
             ),
             *(
-                [Stage("constants", lambda done: self.estimate(problem(done)), inputs, before)]
+                [Stage("constants", lambda done: self.estimate(problem(done)), inputs, before, (Constants,))]
                 if self.constants
                 else []
             ),
@@ -142,6 +143,7 @@ class HPS(StagedSystem):
                 lambda done: self.optimize(problem(done), done.get("constants")),
                 inputs,
                 (*before, "constants") if self.constants else before,
+                (Solution, HpsState),
             ),
         ]
 

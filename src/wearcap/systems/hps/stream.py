@@ -5,7 +5,6 @@ that follow. Memory is bounded by the window, however long the recording.
 """
 
 import math
-import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -16,22 +15,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body import skeleton
 from wearcap.errors import WearcapError
-from wearcap.geometry import rigid, rotation, trajectory
+from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
-from wearcap.optimize.hps import HpsData, HpsState
 from wearcap.recording import Motion, Recording
-from wearcap.recording import motion as motion_types
-from wearcap.recording import recording as recording_types
 from wearcap.recording.recording import Localization
 from wearcap.recording.timing import at_times, joined
-from wearcap.runtime.session import Session, classes_of
-from wearcap.runtime.stages import digest
+from wearcap.runtime.session import Session
 from wearcap.runtime.system import CaptureInput
 from wearcap.runtime.wearer import Wearer
 from wearcap.scene.scan import Scan
-from wearcap.sensors import packets, samples
+from wearcap.sensors import packets
 from wearcap.sensors.initialization import Initialization, align_suit, estimate_head_camera, initialize, inliers
 from wearcap.sensors.packets import (
     BEHIND_S,
@@ -43,6 +37,7 @@ from wearcap.sensors.packets import (
     values_fault,
 )
 from wearcap.sensors.samples import LocalizationSample, SuitPiece
+from wearcap.systems.hps.energy import HpsData, HpsState
 from wearcap.systems.hps.pipeline import HPS, mount
 
 MAX_UNALIGNED_S = 600.0
@@ -158,8 +153,6 @@ class HpsStream:
         self._like: Motion | None = None
         """The first valid piece; later ones must have the same joints and contacts."""
         self._begin()
-
-    transient = ("about", "scan")
 
     @property
     def dropped(self) -> int:
@@ -426,8 +419,6 @@ class HpsStream:
 class HpsSession(Session):
     """A streaming capture of one or several wearers in one scene, each by an `HpsStream`."""
 
-    stream_class = HpsStream
-    classes = classes_of(skeleton, motion_types, trajectory, rigid, recording_types, samples, sys.modules[__name__])
     devices = ("suit", "camera")
 
     def __init__(
@@ -445,25 +436,6 @@ class HpsSession(Session):
             what = "a live suit without its head camera's description"
             raise WearcapError(what, expected="recording=FILE with the camera and its mount, and the scene's scan")
         return cls(system, [source.recording] * len(wearers), source.read_scan())
-
-    @classmethod
-    def settings(cls, system: HPS) -> dict[str, Any]:
-        """The settings of a pipeline that a session's state depends on."""
-        return {"fps": system.fps, "code": digest(system.energy, system.initialization, system.evidence)}
-
-    @classmethod
-    def load(
-        cls, path: str | Path, system: HPS, wearers: Sequence[Recording] = (), scan: Scan | None = None
-    ) -> "HpsSession":
-        """Restore a saved session with the pipeline, the wearers and the scan that it ran with. Raises WearcapError as
-        `Session.load`, and for another number of wearers."""
-        session = super().load(path, system)
-        assert isinstance(session, HpsSession)
-        if len(wearers) != len(session.streams):
-            raise WearcapError(f"{len(wearers)} wearers", where=path, expected=f"the session's {len(session.streams)}")
-        for stream, about in zip(session.streams, wearers):
-            stream.about, stream.scan = about, scan
-        return session
 
 
 SESSION = HpsSession

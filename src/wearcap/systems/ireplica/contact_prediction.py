@@ -13,7 +13,7 @@ from wearcap.geometry.trajectory import interpolate
 from wearcap.models.build import build
 from wearcap.models.checkpoint import read_checkpoint
 from wearcap.recording import Motion
-from wearcap.systems.ireplica.features import FEATURES, PoseFeatures, in_skeleton, pose_frames, worn
+from wearcap.systems.ireplica.features import FEATURES, PoseFeatures, in_skeleton, pose_frames, retarget_skeleton
 
 REACH = 30
 """Number of context frames (at 60 Hz) on each side of a predicted frame."""
@@ -141,7 +141,7 @@ class ContactStream:
 
     def __init__(self, detectors: tuple[ContactDetector, ...], skeleton: Skeleton):
         self._detectors, self._skeleton = detectors, skeleton
-        self._worn = [worn(skeleton, detector.features.skeleton) for detector in detectors]
+        self._targets = [retarget_skeleton(skeleton, detector.features.skeleton) for detector in detectors]
         self._state: list[Tensor] = []
         self._frames = 0
 
@@ -153,7 +153,7 @@ class ContactStream:
             raise WearcapError(f"the pose of frame {self._frames} is not a number", expected="a pose in every frame")
         features = [
             detector.features.encode(in_skeleton(self._skeleton, target, R_parent_joint[None]))
-            for detector, target in zip(self._detectors, self._worn)
+            for detector, target in zip(self._detectors, self._targets)
         ]
         return self._advance(features)
 

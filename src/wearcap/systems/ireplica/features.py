@@ -105,7 +105,7 @@ PoseFeatures = SmplAngles | HandViews
 FEATURES = {cls.__name__: cls for cls in (SmplAngles, HandViews)}
 
 
-def worn(source: Skeleton, target: Skeleton) -> Skeleton:
+def retarget_skeleton(source: Skeleton, target: Skeleton) -> Skeleton:
     """Skeleton into which `in_skeleton` retargets a source's poses: `target` in the wearer's size, or `target`
     itself if the joints are the same."""
     return target if source.joint_names == target.joint_names else fit_offsets(source, target)
@@ -114,7 +114,7 @@ def worn(source: Skeleton, target: Skeleton) -> Skeleton:
 def in_skeleton(
     source: Skeleton, target: Skeleton, R_parent_joint: Float[Tensor, "time joint 3 3"]
 ) -> Float[Tensor, "time joint_t 3 3"]:
-    """Joint rotations of a source skeleton retargeted to a `worn` target; unchanged if both have the same joints."""
+    """Joint rotations of a source skeleton retargeted to a `retarget_skeleton`; unchanged if both have the same joints."""
     if source.joint_names == target.joint_names:
         return R_parent_joint
     return retarget(source, target, R_parent_joint, torch.zeros_like(R_parent_joint[:, 0, 0]))[0]
@@ -131,7 +131,7 @@ def pose_frames(
         raise WearcapError(what, expected="a pose in every frame", fix="Fill the gaps, or cut them out.")
     if not is_even(motion.timestamps, fps):
         motion = resampled(motion, fps)
-    R = in_skeleton(motion.skeleton, worn(motion.skeleton, skeleton), motion.R_parent_joint)
+    R = in_skeleton(motion.skeleton, retarget_skeleton(motion.skeleton, skeleton), motion.R_parent_joint)
     return motion.timestamps, R
 
 

@@ -20,7 +20,7 @@ from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, interpolate
 from wearcap.recording import Motion
-from wearcap.recording.acts import MARGIN_S, Act, spread_acts
+from wearcap.recording.active_objects import MARGIN_S, ActiveSpan, extended_spans
 from wearcap.recording.motion import Interactions
 from wearcap.recording.timing import at_times, resampled
 from wearcap.scene.objects import (
@@ -539,7 +539,7 @@ def interactions_of(held: Sequence[Held], timestamps: Float64[Tensor, "time"]) -
 
 @dataclass(eq=False)
 class ActSearch:
-    """Finds acts in a motion of the human alone, which `Echo` captures first."""
+    """Finds spans in a motion of the human alone, which `Echo` captures first."""
 
     checkpoints: Sequence[str]
     """Checkpoints of iReplica's contact networks."""
@@ -555,7 +555,7 @@ class ActSearch:
     def predictor(self) -> ContactPredictor:
         return ContactPredictor.load(*self.checkpoints)
 
-    def __call__(self, motion: Motion, environment: Environment) -> tuple[Act, ...]:
+    def __call__(self, motion: Motion, environment: Environment) -> tuple[ActiveSpan, ...]:
         """Acts in order of time; none where no contacting hand is within reach of an object."""
         rate = max(detector.fps for detector in self.predictor.detectors)
         fine = resampled(motion, rate)
@@ -564,4 +564,6 @@ class ActSearch:
         if found is None:
             return ()
         rows = sorted(zip(found.start_s.tolist(), found.stop_s.tolist(), found.objects))
-        return tuple(spread_acts([Act(name, start, stop) for start, stop, name in rows if name], self.margin_s))
+        return tuple(
+            extended_spans([ActiveSpan(name, start, stop) for start, stop, name in rows if name], self.margin_s)
+        )

@@ -7,13 +7,13 @@ import torch
 
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import interpolate
-from wearcap.optimize.trajectory import BentPath
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import resampled
 from wearcap.sensors.initialization import align_suit, body_camera, inliers
 from wearcap.systems.hps.camera import Localize, MapLocalization, Synchronization
 from wearcap.systems.hps.pipeline import required
 from wearcap.systems.hps.published import PlacedSuit
+from wearcap.systems.ireplica.trajectory import BentPath
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class BentSuit(PlacedSuit):
     """Places the suit's motion by bending its path in the ground plane; pose and height are the suit's."""
 
     bend: Callable[..., BentPath]
-    """`optimize.trajectory.bend` with its settings and solver."""
+    """`systems.ireplica.trajectory.bend` with its settings and solver."""
     fps: float = 30.0
     name: str = "bent_suit"
     synchronization: Synchronization = field(default_factory=Synchronization)

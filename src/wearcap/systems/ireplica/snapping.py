@@ -8,12 +8,12 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from wearcap.body.kinematics import site_positions
-from wearcap.optimize.contact_correction import OffsetSettings, bend_contacts, offset_for
-from wearcap.optimize.trajectory import BentPath
 from wearcap.recording import Motion
 from wearcap.recording.motion import HANDS
 from wearcap.scene.objects import Environment, SceneObject
+from wearcap.systems.ireplica.contact_correction import OffsetSettings, bend_contacts, offset_for
 from wearcap.systems.ireplica.object_tracker import PALMS, ContactInterval, Correction, Held
+from wearcap.systems.ireplica.trajectory import BentPath
 from wearcap.tracking.anchor import with_hand_moved
 
 FIT_FRAMES = 60
@@ -38,7 +38,7 @@ class BendCorrection(Correction):
     """The thesis's correction: the path is bent again, with the touched point as the only control point (eq. 5.2)."""
 
     bend: Callable[..., BentPath]
-    """`optimize.trajectory.bend` with its settings and solver."""
+    """`systems.ireplica.trajectory.bend` with its settings and solver."""
     transition_s: float = 3.0
 
     def offset(

@@ -169,7 +169,7 @@ class MocapEvery(LearnedSystem):
         tracked = self.model.features.wrists == "positions"
         hands = Rigid(sensed.R_world_wrist, sensed.t_world_wrist) if tracked else None
         measured = Measured.of(path.T_world_head, floor_height, hands)
-        motion = refinement.whole(motion, measured, path.stretches, self.model.fps, self.anchor)
+        motion = refinement.refined(motion, measured, path.stretches, self.model.fps, self.anchor)
         return motion if len(path.stretches) == 1 else held_in_gaps(motion, path, self.anchor)
 
     def score(self, motion: Motion, source: CaptureInput, seed: int) -> Row:

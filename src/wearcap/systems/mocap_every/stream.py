@@ -6,7 +6,6 @@ refinement.
 """
 
 import math
-import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,37 +13,24 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body import skeleton
 from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
-from wearcap.geometry import rigid
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import ImuStream, Motion
-from wearcap.recording import motion as motion_types
 from wearcap.recording.timing import joined
-from wearcap.runtime import wearer as wearer_types
-from wearcap.runtime.session import HeadAndWristsStream, Session, classes_of
+from wearcap.runtime.session import HeadAndWristsStream, Session
 from wearcap.runtime.wearer import Wearer
-from wearcap.scene import floor as floor_types
 from wearcap.sensors import packets
-from wearcap.sensors import samples as sample_types
 from wearcap.sensors.packets import Admitted
 from wearcap.sensors.samples import HeadSample, WatchSample
 from wearcap.sensors.watches import FILTER, MAX_GAP_S, filtered
-from wearcap.systems.mocap_every import features, windows
 from wearcap.systems.mocap_every.features import Sensed
 from wearcap.systems.mocap_every.pipeline import MocapEvery
 from wearcap.systems.mocap_every.windows import EstimatorWindows, FinalPoses
-from wearcap.tracking import foot_lock, head_path, refinement
 from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.head_path import Chunk
 from wearcap.tracking.refinement import Measured, Refiner
 
-_STATE = (
-    *(skeleton, motion_types, rigid, head_path, packets, sample_types, floor_types, features, windows),
-    *(refinement, foot_lock, wearer_types),
-)
-"""Modules with the classes that a session's state consists of."""
 MAX_POINTS = 1_000_000
 """Capacity of the buffer of points that wait for a head pose; the oldest are dropped."""
 
@@ -211,19 +197,12 @@ class MocapEveryStream(HeadAndWristsStream):
 class MocapEverySession(Session):
     """A streaming capture of one or several wearers, each by a `MocapEveryStream`."""
 
-    stream_class = MocapEveryStream
-    classes = classes_of(*_STATE, sys.modules[__name__])
     devices = ("head", *WRISTS)
     given_floor = True
 
     def __init__(self, pipeline: MocapEvery, wearers: Sequence[Wearer]):
         """Raises WearcapError without wearers."""
         super().__init__(pipeline, [MocapEveryStream(pipeline, wearer) for wearer in wearers])
-
-    @classmethod
-    def settings(cls, system: MocapEvery) -> dict[str, Any]:
-        model = system.model
-        return {**system.settings(), "window": model.net.window, "fps": model.fps, "features": str(model.features)}
 
 
 SESSION = MocapEverySession
