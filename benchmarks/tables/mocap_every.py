@@ -17,7 +17,6 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from benchmarks.tables.mocap_every_calibration import GOALS, calibration_scores
 from benchmarks.tables.mocap_every_rows import Method, body_row, captures, cue_row, floor_row, pipeline_of
 from benchmarks.tables.mocap_every_several import VIEW_DEG, Watched, session_rows, watched_pair, watched_person
 from benchmarks.tables.result_pages import (
@@ -163,12 +162,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--manifold", default="motion_manifold", help="where motion is edited by cues")
     parser.add_argument("--runs", type=Path, default=Path("outputs/train"), help="folder of the other trainings")
     parser.add_argument("--recordings", type=int, help="no more than so many of each data set")
-    parser.add_argument("--sessions", type=int, default=30, help="simulated calibrations")
     parser.add_argument("--pairs", type=int, default=8, help="simulated pairs of wearers who see each other")
     parser.add_argument(
         "--parts",
         nargs="*",
-        default=["body", "floor", "cues", "several", "calibration"],
+        default=["body", "floor", "cues", "several"],
         help="tables to make; trainings, too, for those who have several, and totalcapture for those who have prepared it",
     )
     add_people(parser)
@@ -269,7 +267,7 @@ def page(trees: Trees, speed: dict[str, list[Tree]]) -> Page:
         "blindly: this MLP's and the transformers' test rows were known when it was taken, as the validation split hardly "
         "tells them apart ([the card](../../checkpoints/mocap_every.md)).",
         simulated="Heads and watches on CMU's and HDM05's real motion; hillsides altogether; the wrists that a detector would find in "
-        "the picture, and poses that another wearer's camera would show; the calibration's sessions. Sizes of errors beside the "
+        "the picture, and poses that another wearer's camera would show. Sizes of errors beside the "
         "literature's are in [simulation](simulation.md).",
         limits=_limits(trees),
         full=[grid for tree in trees.values() for grid in score_grids(tree, LABELS, "trainings or runs")],
@@ -535,14 +533,6 @@ def _several(options: argparse.Namespace, progress: Progress) -> tuple[str, tupl
     return title, SEVERAL, scores
 
 
-def _calibration(options: argparse.Namespace, progress: Progress) -> tuple[str, tuple[str, ...], Scores]:
-    """Appendix C.2: planted frames, mounts, scales and clocks."""
-    sessions = 3 if options.quick else options.sessions
-    bar = progress.add_task("calibration", total=2 * sessions)
-    scores = calibration_scores(sessions, lambda: progress.advance(bar))
-    return f"Calibration: errors in {sessions} simulated sessions", tuple(GOALS), scores
-
-
 PARTS = {
     "body": _body,
     "trainings": _trainings,
@@ -550,5 +540,4 @@ PARTS = {
     "floor": _floor,
     "cues": _cues,
     "several": _several,
-    "calibration": _calibration,
 }

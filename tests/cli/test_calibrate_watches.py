@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+import calibration_session as simulated
 from wearcap.body.skeleton import WRISTS
 from wearcap.cli import calibrate as verb
 from wearcap.errors import WearcapError
@@ -18,9 +19,8 @@ from wearcap.recording.store import load_recording, save_recording
 from wearcap.sensors.clock import Clock
 from wearcap.sensors.watch_calibration import read_watch_calibration, write_watch_calibration
 from wearcap.sensors.watches import watches_at
-from wearcap_testing import benchmark, recording_of, swaying_motion
+from wearcap_testing import recording_of, swaying_motion
 
-simulated = benchmark("tables.calibration_session")
 CalibrationSession = simulated.CalibrationSession
 MARKS, STANDING, SWINGS_S = simulated.MARKS, simulated.STANDING, simulated.SWINGS_S
 G = 9.80665

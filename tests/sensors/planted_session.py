@@ -4,13 +4,12 @@ from functools import lru_cache
 
 from torch import Tensor
 
+import calibration_session as simulated
 from wearcap.geometry import rotation
 from wearcap.recording import ImuStream
 from wearcap.sensors.stillness import Stretch
 from wearcap.sensors.watch_calibration import WatchCalibration, measure_watches, require_watches
-from wearcap_testing import benchmark
 
-simulated = benchmark("tables.calibration_session")
 CalibrationSession = simulated.CalibrationSession
 SEEDS = range(5)
 

@@ -5,14 +5,13 @@ import pytest
 import torch
 from planted_session import SEEDS, calibrated, session
 
+from calibration_session import SWINGS_S
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import ImuStream
 from wearcap.sensors.clock import fit_swing_clock, swing_peaks
 from wearcap.sensors.stillness import require
-from wearcap_testing import benchmark
 
-SWINGS_S = benchmark("tables.calibration_session").SWINGS_S
 MIDDLE = torch.tensor([SWINGS_S + 8], dtype=torch.float64)
 
 

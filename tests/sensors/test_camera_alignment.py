@@ -7,15 +7,14 @@ import pytest
 import torch
 from planted_session import SEEDS, apart_deg, session
 
+import calibration_session as simulated
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.sensors.camera_alignment import HeadMount, align_by_marks, mark_positions, mount_by_standing
 from wearcap.sensors.monocular_slam import scale_by_walks
 from wearcap.sensors.stillness import require
-from wearcap_testing import benchmark
 
-simulated = benchmark("tables.calibration_session")
 MARKS, STANDING = simulated.MARKS, simulated.STANDING
 WORLD = torch.tensor([[0, 0.1, 0.8], [0, 0.6, 0.8], [0.15, 0, 0.8], [0.55, 0, 0.8]], dtype=torch.float64)
 DISTANCES = (0.5, 0.4)

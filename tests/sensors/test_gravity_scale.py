@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import torch
 
+import calibration_session as simulated
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import ImuStream
 from wearcap.sensors.monocular_slam import _GravityScale, by_floor, by_head_imu
-from wearcap_testing import benchmark
 
-simulated = benchmark("tables.calibration_session")
 CalibrationSession = simulated.CalibrationSession
 STANDING = simulated.STANDING
 SEEDS = range(4)
