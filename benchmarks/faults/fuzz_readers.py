@@ -35,11 +35,15 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from benchmarks.faults import fuzz_files, fuzz_own
 from benchmarks.faults.fuzz_mutate import mutated
 from wearcap.errors import WearcapError
 
-READERS = fuzz_files.READERS | fuzz_own.OWN
+sys.path[:0] = [str(Path(__file__).resolve().parents[2] / "tests")]
+
+import valid_files  # noqa: E402
+import valid_own_files  # noqa: E402
+
+READERS = valid_files.READERS | valid_own_files.OWN
 ALARM_S, DEAF_S, MEMORY_BYTES = 5.0, 30.0, 3 << 29
 """An input's time; that of one which hears no alarm; memory beyond what the imports take."""
 FREE_BYTES, TIMES_FILES = 100 << 20, 10

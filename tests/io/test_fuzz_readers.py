@@ -10,8 +10,8 @@ from subprocess import run
 import pytest
 
 from benchmarks.faults import fuzz_readers
-from benchmarks.faults.fuzz_files import Reader
 from benchmarks.faults.fuzz_readers import READERS, failed, fuzz, outcome
+from valid_files import Reader
 
 ROOT = Path(__file__).parents[2]
 INPUTS = int(os.environ.get("WEARCAP_EXAMPLES", "25"))
@@ -37,7 +37,7 @@ def test_damaged_files_are_read_or_refused(tmp_path):
 
 def test_every_module_that_reads_is_in_the_table():
     source = ROOT / "src/wearcap/io"
-    table = (ROOT / "benchmarks/faults/fuzz_files.py").read_text()
+    table = (ROOT / "tests/valid_files.py").read_text()
     reading = {path.stem for path in source.rglob("*.py") if "\ndef read_" in path.read_text()}
     assert {module for module in reading if f"{module}.read_" not in table} <= BOUNDED
 

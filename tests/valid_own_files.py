@@ -15,16 +15,16 @@ import trimesh
 import yaml
 from safetensors.torch import save_file
 
-from benchmarks.faults import fuzz_files
-from benchmarks.faults.fuzz_files import Reader, _made, _one
-from benchmarks.faults.live_fuzz import SOUND
+import valid_files
 
-sys.path[:0] = [str(fuzz_files.TESTS / folder) for folder in ("models", "pipelines", "recording")]
+sys.path[:0] = [str(valid_files.TESTS / folder) for folder in ("models", "pipelines", "recording")]
 
 import test_checkpoint_files  # noqa: E402
 import test_doctor_scene  # noqa: E402
 import test_store  # noqa: E402
 
+from sound_packets import SOUND  # noqa: E402
+from valid_files import Reader, made, one  # noqa: E402
 from wearcap.body.skeleton import xsens23  # noqa: E402
 from wearcap.boundary import arrays, tensors, texts  # noqa: E402
 from wearcap.boundary.own import trusting  # noqa: E402
@@ -193,44 +193,42 @@ def _live(name: str) -> Reader:
 
 
 OWN: dict[str, Reader] = {
-    "yaml": _one("a.yaml", "a: 1\nb:\n  c: [1, 2.5, x]\n  d: {e: null}\n", texts.read_yaml_object),
-    "mapping_yaml": _one("m.yaml", MAPPING, read_mapping),
-    "tensors": _made("a.safetensors", lambda path: save_file(NAMED, path, {"about": '{"a": [1]}'}), _read_tensors),
+    "yaml": one("a.yaml", "a: 1\nb:\n  c: [1, 2.5, x]\n  d: {e: null}\n", texts.read_yaml_object),
+    "mapping_yaml": one("m.yaml", MAPPING, read_mapping),
+    "tensors": made("a.safetensors", lambda path: save_file(NAMED, path, {"about": '{"a": [1]}'}), _read_tensors),
     "packed_json": Reader(
-        lambda folder: fuzz_files.hoi_files.write_zip('{"a": [1, 2.5, null], "b": {"c": "x"}}', folder / "a.zip"),
+        lambda folder: valid_files.hoi_files.write_zip('{"a": [1, 2.5, null], "b": {"c": "x"}}', folder / "a.zip"),
         lambda folder: arrays.read_packed_json(folder / "a.zip", "one JSON file"),
     ),
-    "npy": _made("a.npy", lambda path: np.save(path, np.arange(12.0).reshape(3, 4)), arrays.read_npy),
-    "weights_pth": _made(
+    "npy": made("a.npy", lambda path: np.save(path, np.arange(12.0).reshape(3, 4)), arrays.read_npy),
+    "weights_pth": made(
         "w.pth", lambda path: torch.save({"state_dict": NAMED, "score": np.float64(3)}, path), weights.read_weights
     ),
-    "weights_safetensors": _made("w.safetensors", lambda path: save_file(NAMED, path), weights.read_weights),
-    "checkpoint_shared": _made("c.safetensors", test_checkpoint_files.shared_file, checkpoint.read_checkpoint),
-    "checkpoint_run": _made("c.ckpt", _ckpt, _trusted(checkpoint.read_checkpoint)),
-    "checkpoint_built": _made("c.safetensors", _trained, checkpoint.load_trained),
-    "recording": _made(
+    "weights_safetensors": made("w.safetensors", lambda path: save_file(NAMED, path), weights.read_weights),
+    "checkpoint_shared": made("c.safetensors", test_checkpoint_files.shared_file, checkpoint.read_checkpoint),
+    "checkpoint_run": made("c.ckpt", _ckpt, _trusted(checkpoint.read_checkpoint)),
+    "checkpoint_built": made("c.safetensors", _trained, checkpoint.load_trained),
+    "recording": made(
         "r.safetensors", lambda path: save_recording(_recording(), path), lambda path: RecordingFile(path).load()
     ),
     "data_set": Reader(_data_set, _read_set),
-    "visual_map": _made("map.safetensors", lambda path: test_doctor_scene.small_map(3, 5).save(path), VisualMap.load),
+    "visual_map": made("map.safetensors", lambda path: test_doctor_scene.small_map(3, 5).save(path), VisualMap.load),
     "exported_onnx": Reader(_exported, _read_exported),
     "training_run": Reader(_run, _read_run),
     "stage_cache": Reader(_stage, lambda folder: StageCache(folder).read("poses", "ab")),
-    "live_setup": _made(
+    "live_setup": made(
         "s.json", lambda path: write_setup(Setup(xsens23(), {"head": head_seat()}, 0.1), path), read_setup
     ),
-    "labels_to_start": _one("l.json", LABELS, lambda path: starting_labels(path, _tiny("flat_1"), fuzz_files.CLOCK)),
-    **{f"scene_{kind}": _made(f"s.{kind}", _scene, read_scene) for kind in ("ply", "obj", "glb")},
+    "labels_to_start": one("l.json", LABELS, lambda path: starting_labels(path, _tiny("flat_1"), valid_files.CLOCK)),
+    **{f"scene_{kind}": made(f"s.{kind}", _scene, read_scene) for kind in ("ply", "obj", "glb")},
     **{
-        f"video_{kind}": _made(
-            f"v.{kind}", _video, lambda path: (video.video_info(path), list(video.read_frames(path)))
-        )
+        f"video_{kind}": made(f"v.{kind}", _video, lambda path: (video.video_info(path), list(video.read_frames(path))))
         for kind in ("mp4", "mkv", "avi")
     },
     **{f"live_{name}": _live(name) for name in SOUND if name != "watch+http"},
-    "doctor_recording": _made("r.safetensors", lambda path: save_recording(_tiny("r"), path), examine),
-    "doctor_map": _made("map.safetensors", lambda path: test_doctor_scene.small_map(3, 5).save(path), examine),
+    "doctor_recording": made("r.safetensors", lambda path: save_recording(_tiny("r"), path), examine),
+    "doctor_map": made("map.safetensors", lambda path: test_doctor_scene.small_map(3, 5).save(path), examine),
     "doctor_data_set": Reader(_data_set, examine),
-    "any_file": _one("t.txt", fuzz_files.TUM, lambda path: read(path, Conventions(up="z", axes="head"))),
+    "any_file": one("t.txt", valid_files.TUM, lambda path: read(path, Conventions(up="z", axes="head"))),
 }
 """Readers by name."""

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-TESTS = Path(__file__).resolve().parents[2] / "tests"
+TESTS = Path(__file__).resolve().parent
 sys.path[:0] = [path for path in (str(TESTS), str(TESTS / "io")) if path not in sys.path]
 
 import hoi_files  # noqa: E402
@@ -125,13 +125,13 @@ ENVIRONMENT_OBJECT = "door"
 NODES = [{"children": [1, 2], "translation": [1, 2, 3]}, {"mesh": 0, "scale": [2, 2, 2]}, {"mesh": 0}]
 
 
-def _one(name: str, content: str | bytes, read: Callable[[Path], Any]) -> Reader:
+def one(name: str, content: str | bytes, read: Callable[[Path], Any]) -> Reader:
     """A reader of one file that is known by its content."""
     data = content.encode() if isinstance(content, str) else content
     return Reader(lambda folder: (folder / name).write_bytes(data), lambda folder: read(folder / name))
 
 
-def _made(name: str, write: Callable[[Path], Any], read: Callable[[Path], Any]) -> Reader:
+def made(name: str, write: Callable[[Path], Any], read: Callable[[Path], Any]) -> Reader:
     """A reader of one file that another function writes."""
     return Reader(lambda folder: write(folder / name), lambda folder: read(folder / name))
 
@@ -293,15 +293,15 @@ def _foreign_walk(path: Path) -> None:
 
 
 READERS: dict[str, Reader] = {
-    "adt_skeleton": _made("s.json", test_adt.skeleton_file, adt.read_skeleton),
+    "adt_skeleton": made("s.json", test_adt.skeleton_file, adt.read_skeleton),
     "adt_objects": Reader(_adt_objects, adt.read_moving_objects),
-    "amass": _made("a.npz", _amass, amass.read_amass),
-    "aria_closed_loop": _made(
+    "amass": made("a.npz", _amass, amass.read_amass),
+    "aria_closed_loop": made(
         "a.csv", lambda path: test_aria_mps.write(path, test_aria_mps.rows(12)), aria_mps.read_closed_loop
     ),
-    "aria_points": _one("a.csv.gz", gzip.compress(POINTS.encode(), mtime=0), aria_mps.read_points),
+    "aria_points": one("a.csv.gz", gzip.compress(POINTS.encode(), mtime=0), aria_mps.read_points),
     "aria_mps": Reader(_mps, aria_mps.read_mps),
-    "asf": _one("a.asf", test_asf_amc.ASF, asf_amc.read_asf),
+    "asf": one("a.asf", test_asf_amc.ASF, asf_amc.read_asf),
     "amc": Reader(
         lambda folder: test_asf_amc.write(folder, amc=test_asf_amc.amc_text(4)),
         lambda folder: asf_amc.read_amc(asf_amc.read_asf(next(folder.glob("*.asf"))), next(folder.glob("*.amc"))),
@@ -311,23 +311,21 @@ READERS: dict[str, Reader] = {
         lambda folder: behave.read_behave(folder, one_object_files.BEHAVE_NAME),
     ),
     "behave_mesh": Reader(one_object_files.write_behave, lambda folder: behave.read_behave_mesh(folder, "boxlarge")),
-    "bvh": _made("a.bvh", lambda path: bvh.write_bvh(swaying_motion(4), path), bvh.read_bvh_content),
-    "foreign_bvh": _made("a.bvh", _foreign_walk, foreign.read_foreign_motion),
-    "camera_json": _made("c.json", lambda path: camera_json.write_camera(LENS, path), camera_json.read_camera),
+    "bvh": made("a.bvh", lambda path: bvh.write_bvh(swaying_motion(4), path), bvh.read_bvh_content),
+    "foreign_bvh": made("a.bvh", _foreign_walk, foreign.read_foreign_motion),
+    "camera_json": made("c.json", lambda path: camera_json.write_camera(LENS, path), camera_json.read_camera),
     "colmap_text": Reader(test_colmap.write_text_model, colmap.read_colmap),
     "colmap_binary": Reader(test_colmap.write_binary_model, colmap.read_colmap),
-    "contact_labels": _one(
-        "c.json", json.dumps(CONTACTS), lambda path: contact_labels.read_contact_labels(path, CLOCK)
-    ),
-    "csv_table": _one(
+    "contact_labels": one("c.json", json.dumps(CONTACTS), lambda path: contact_labels.read_contact_labels(path, CLOCK)),
+    "csv_table": one(
         "a.csv", "a,b,n\n1,x,3\n2.5,y,4\n", lambda path: csv_table.read_columns(path, ["a"], text=["b"], integers=["n"])
     ),
     "egohoi": Reader(
         lambda folder: test_egohoi.write_set(folder, FRAMES), lambda folder: egohoi.read_egohoi(folder, test_egohoi.ONE)
     ),
-    "egohoi_locations": _one("l.json", json.dumps(test_egohoi.SLID), egohoi.read_object_locations),
+    "egohoi_locations": one("l.json", json.dumps(test_egohoi.SLID), egohoi.read_object_locations),
     "environment": Reader(_environment, environment.read_environment),
-    "euroc": _one("e.csv", EUROC, trajectory.read_trajectory),
+    "euroc": one("e.csv", EUROC, trajectory.read_trajectory),
     "hand_detections": Reader(
         _hand_detections,
         lambda folder: [hand_detections.read_hand_detections(path, 0.5) for path in sorted(folder.iterdir())],
@@ -335,27 +333,27 @@ READERS: dict[str, Reader] = {
     "vertex_contacts": Reader(
         _vertex_contacts, lambda folder: hand_detections.read_vertex_contacts(folder / "p.npz", folder / "s.json")
     ),
-    "glb": _one("a.glb", test_glb.glb(test_glb.content(nodes=NODES)), glb.read_glb),
+    "glb": one("a.glb", test_glb.glb(test_glb.content(nodes=NODES)), glb.read_glb),
     "hcontact": Reader(
         lambda folder: test_hcontact.write_set(folder, frames=FRAMES),
         lambda folder: hcontact.read_hcontact(folder, test_hcontact.DOOR),
     ),
-    "hcontact_split": _one(
+    "hcontact_split": one(
         "s.json",
         json.dumps({"window_radius": 30, "train": [31, 99], "valid": [], "test": [150]}),
         hcontact.read_hcontact_split,
     ),
-    "hps_motion": _made("m.pkl", lambda path: hps_files.write_smpl(hps_files.motion(4), path), hps.read_hps_motion),
-    "hps_subject": _one(
+    "hps_motion": made("m.pkl", lambda path: hps_files.write_smpl(hps_files.motion(4), path), hps.read_hps_motion),
+    "hps_subject": one(
         "s.json", json.dumps({"betas": [0.1] * 10, "gender": "male", "root_to_heel": 0.93}), hps.read_hps_subject
     ),
-    "hps_starts": _one("s.json", json.dumps({"cam_start": 3, "imu_start": 4}), hps.read_hps_starts),
-    "hps_localization": _made(
+    "hps_starts": one("s.json", json.dumps({"cam_start": 3, "imu_start": 4}), hps.read_hps_starts),
+    "hps_localization": made(
         "l.json",
         lambda path: hps_files.write_localization(hps_files.motion(20), path, 3, (4,)),
         hps.read_hps_localization,
     ),
-    "hps_cameras": _one("c.json", json.dumps(hps_files.CAMERA), hps.read_hps_cameras),
+    "hps_cameras": one("c.json", json.dumps(hps_files.CAMERA), hps.read_hps_cameras),
     "hps_scene": Reader(hps_files.write_scan, hps.read_hps_scene),
     "hps_sequence": Reader(
         lambda folder: hps_files.write_hps(folder, frames=FRAMES),
@@ -365,56 +363,54 @@ READERS: dict[str, Reader] = {
         lambda folder: hps_files.write_unity(hps_files.motion(4), folder, "u"),
         lambda folder: hps.read_unity_motion(folder / "u_pose.txt", folder / "u_trans.txt"),
     ),
-    "json_text": _one("a.json", '{"a": [1, 2.5, null], "b": {"c": "x"}}', texts.read_json_object),
-    "keypoints_csv": _made("k.csv", _cues, keypoints.read_keypoints),
+    "json_text": one("a.json", '{"a": [1, 2.5, null], "b": {"c": "x"}}', texts.read_json_object),
+    "keypoints_csv": made("k.csv", _cues, keypoints.read_keypoints),
     "mocap_every": Reader(_mocap_every, mocap_every_folder.read_mocap_every_folder),
-    "motion_npz": _made("m.npz", lambda path: motion_npz.write_motion(swaying_motion(4), path), motion_npz.read_motion),
-    "mvnx": _one("m.mvnx", test_mvnx.mvnx(test_mvnx.sample(2)), mvnx.read_mvnx),
-    "mvnx_packed": _one(
+    "motion_npz": made("m.npz", lambda path: motion_npz.write_motion(swaying_motion(4), path), motion_npz.read_motion),
+    "mvnx": one("m.mvnx", test_mvnx.mvnx(test_mvnx.sample(2)), mvnx.read_mvnx),
+    "mvnx_packed": one(
         "m.mvnx.xz", lzma.compress(test_mvnx.mvnx(test_mvnx.sample(2)).encode(), preset=0), mvnx.read_mvnx
     ),
-    "npz": _made(
+    "npz": made(
         "a.npz",
         lambda path: np.savez_compressed(path, a=np.arange(12.0), b=np.array("text"), c=np.asfortranarray(np.eye(3))),
         arrays.read_npz,
     ),
-    "nymeria_xdata": _made("x.npz", _xdata, nymeria.read_xdata),
+    "nymeria_xdata": made("x.npz", _xdata, nymeria.read_xdata),
     "nymeria_metadata": Reader(
         lambda folder: (folder / "metadata.json").write_text('{"fake_name": "a", "participant_height_cm": 160}'),
         nymeria.read_metadata,
     ),
-    "sensor_frame": _one(
+    "sensor_frame": one(
         "s.xml",
         ocam_files.xml_of(LENSES),
         lambda path: [model.camera() for model in ocamcalib.read_sensor_frame(path).values()],
     ),
     "omomo": Reader(_joblib, lambda folder: [omomo.omomo_take(one, folder, 30.0) for one in omomo.read_omomo(folder)]),
-    "pcd_ascii": _one("a.pcd", PCD + "ascii\n0 0 0 1\n1 2 3 4\n2 3 4 5\nnan nan nan 0\n", pcd.read_pcd),
-    "pcd_binary": _one("a.pcd", (PCD + "binary\n").encode() + bytes(64), pcd.read_pcd),
-    "pcd_compressed": _one("a.pcd", _compressed_pcd(), pcd.read_pcd),
+    "pcd_ascii": one("a.pcd", PCD + "ascii\n0 0 0 1\n1 2 3 4\n2 3 4 5\nnan nan nan 0\n", pcd.read_pcd),
+    "pcd_binary": one("a.pcd", (PCD + "binary\n").encode() + bytes(64), pcd.read_pcd),
+    "pcd_compressed": one("a.pcd", _compressed_pcd(), pcd.read_pcd),
     "photos": Reader(
         lambda folder: camera_json.write_photos([Photo(Path("a.png"), LENS, POSE)], folder), camera_json.read_photos
     ),
     "pictures": Reader(_pictures, lambda folder: list(video.read_pictures(folder, 2))),
-    "ply_ascii": _one("a.ply", ASCII_PLY, ply.read_ply),
-    "ply_even": _made(
+    "ply_ascii": one("a.ply", ASCII_PLY, ply.read_ply),
+    "ply_even": made(
         "a.ply",
         lambda path: ply.write_ply(ply.Ply(_points(), None, np.array([[0, 1, 2]] * 4, np.int32)), path),
         ply.read_ply,
     ),
-    "ply_little": _one("a.ply", _uneven_ply("little"), ply.read_ply),
-    "ply_big": _one("a.ply", _uneven_ply("big"), ply.read_ply),
-    "pickle": _one("a.pkl", PICKLED, pickles.read_pickle),
-    "pickle_packed": _one("a.pkl", zlib.compress(PICKLED), pickles.read_pickle),
+    "ply_little": one("a.ply", _uneven_ply("little"), ply.read_ply),
+    "ply_big": one("a.ply", _uneven_ply("big"), ply.read_ply),
+    "pickle": one("a.pkl", PICKLED, pickles.read_pickle),
+    "pickle_packed": one("a.pkl", zlib.compress(PICKLED), pickles.read_pickle),
     "pickle_joblib": Reader(_joblib, lambda folder: pickles.read_pickle(next(folder.glob("*.p")))),
-    "scan": _made("s.ply", lambda path: ply.write_ply(ply.Ply(_points(300)), path), scene_folder.read_scan),
+    "scan": made("s.ply", lambda path: ply.write_ply(ply.Ply(_points(300)), path), scene_folder.read_scan),
     "scene_folder": Reader(hps_files.write_scan, scene_folder.read_scene),
-    "smpl_files": _made("m.npz", _smpl, smpl.read_smpl),
-    "smpl_json": _one("m.json", HCONTACT_JSON, hcontact.read_smpl_json),
-    "smpl_json_zip": _made(
-        "m.json.zip", lambda path: hoi_files.write_zip(HCONTACT_JSON, path), hcontact.read_smpl_json
-    ),
-    "text": _one(
+    "smpl_files": made("m.npz", _smpl, smpl.read_smpl),
+    "smpl_json": one("m.json", HCONTACT_JSON, hcontact.read_smpl_json),
+    "smpl_json_zip": made("m.json.zip", lambda path: hoi_files.write_zip(HCONTACT_JSON, path), hcontact.read_smpl_json),
+    "text": one(
         "a.txt.gz",
         gzip.compress(b"some words\nof text\n", mtime=0),
         lambda path: (texts.read_text(path), list(texts.numbered_lines(path))),
@@ -438,37 +434,37 @@ READERS: dict[str, Reader] = {
             ("mps", "closed_loop_trajectory.csv", short_walk.mps),
         )
     },
-    "headset_csv": _made("h.csv", _headset_csv, headset_log.read_headset_log),
-    "headset_tables": _made("h.csv", _headset_csv, headset_tables.read_rows),
-    "bsor": _made("a.bsor", lambda path: test_headset_layouts.replay(path.parent), bsor.read_bsor),
-    "camera_frames": _one("transforms.json", NERF, lambda path: list(camera_frames.read_camera_frames(path)[1])),
-    "headset_json": _made("h.json", lambda path: _headset_json(path, json.dumps), headset_log.read_headset_log),
-    "headset_lines": _made(
+    "headset_csv": made("h.csv", _headset_csv, headset_log.read_headset_log),
+    "headset_tables": made("h.csv", _headset_csv, headset_tables.read_rows),
+    "bsor": made("a.bsor", lambda path: test_headset_layouts.replay(path.parent), bsor.read_bsor),
+    "camera_frames": one("transforms.json", NERF, lambda path: list(camera_frames.read_camera_frames(path)[1])),
+    "headset_json": made("h.json", lambda path: _headset_json(path, json.dumps), headset_log.read_headset_log),
+    "headset_lines": made(
         "h.jsonl",
         lambda path: _headset_json(path, lambda frames: "\n".join(map(json.dumps, frames))),
         headset_log.read_headset_log,
     ),
     "x_imu": Reader(_x_imu, lambda folder: watch_log.read_inertial_log(folder / "Inertial.csv", "left_wrist")),
-    "watch_calibration": _one("c.json", WORN, watch_calibration.read_watch_calibration),
-    "trc": _made("m.trc", lambda path: marker_person.write_trc(_markers(), path), trc.read_trc),
-    "tum": _one("t.txt", TUM, trajectory.read_trajectory),
-    "tum_gz": _one("t.txt.gz", gzip.compress(TUM.encode(), mtime=0), trajectory.read_trajectory),
-    "tum_xz": _one("t.txt.xz", lzma.compress(TUM.encode()), trajectory.read_trajectory),
-    "ui_prmd": _one("m01_s01_e01.txt", "".join(",".join(["1.5"] * 117) + "\n" for _ in range(4)), ui_prmd.read_ui_prmd),
-    "ui_prmd_packed": _made("m.npy", lambda path: np.save(path, np.ones((6, 117), np.int32)), ui_prmd.read_ui_prmd),
-    "image": _made("a.png", lambda path: _pictures(path.parent), video.read_image),
-    "video_frames": _made("a.mp4", _video, lambda path: list(video.read_frames(path))),
-    "video_info": _made("a.mp4", _video, video.video_info),
-    "watch_log_logger": _made(
+    "watch_calibration": one("c.json", WORN, watch_calibration.read_watch_calibration),
+    "trc": made("m.trc", lambda path: marker_person.write_trc(_markers(), path), trc.read_trc),
+    "tum": one("t.txt", TUM, trajectory.read_trajectory),
+    "tum_gz": one("t.txt.gz", gzip.compress(TUM.encode(), mtime=0), trajectory.read_trajectory),
+    "tum_xz": one("t.txt.xz", lzma.compress(TUM.encode()), trajectory.read_trajectory),
+    "ui_prmd": one("m01_s01_e01.txt", "".join(",".join(["1.5"] * 117) + "\n" for _ in range(4)), ui_prmd.read_ui_prmd),
+    "ui_prmd_packed": made("m.npy", lambda path: np.save(path, np.ones((6, 117), np.int32)), ui_prmd.read_ui_prmd),
+    "image": made("a.png", lambda path: _pictures(path.parent), video.read_image),
+    "video_frames": made("a.mp4", _video, lambda path: list(video.read_frames(path))),
+    "video_info": made("a.mp4", _video, video.video_info),
+    "watch_log_logger": made(
         "w.csv",
         lambda path: test_watch_log.sensor_logger(test_watch_log.moved(20), path),
         lambda path: watch_log.read_watch_log(path, "left_wrist"),
     ),
-    "watch_log_log": _made(
+    "watch_log_log": made(
         "w.csv",
         lambda path: test_watch_log.sensor_log(test_watch_log.moved(20), path),
         lambda path: watch_log.read_watch_log(path, "left_wrist"),
     ),
-    "wavefront": _one("a.obj", one_object_files.obj_text(), wavefront.read_obj),
+    "wavefront": one("a.obj", one_object_files.obj_text(), wavefront.read_obj),
 }
 """Readers by name. Aria's VRS recordings are left out: they are read by projectaria-tools."""
