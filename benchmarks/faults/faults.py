@@ -25,6 +25,7 @@ from rich.progress import track
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
 
+from benchmarks.speed.figures import figure
 from own_bvh import read_bvh
 from wearcap.cli import capture, export, train
 from wearcap.export.files import open_exported
@@ -280,4 +281,4 @@ def measure(kills: int = 100, writers: tuple[str, ...] = tuple(WRITERS), seed: i
 
 
 def _figure(name: str, lost: int, struck: int) -> dict:
-    return {"name": name, "value": lost, "unit": "kills", "baseline": struck, "ratio": lost / max(struck, 1), "goal": 0}
+    return figure(name, lost, "kills", struck, lost / max(struck, 1), 0)

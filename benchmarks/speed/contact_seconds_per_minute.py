@@ -4,31 +4,14 @@ value: median seconds of ours, both classes; baseline: the minute itself. ratio 
 `goal`, which is a minute in 0.15 s.
 """
 
-import statistics
-import time
-
 from benchmarks.speed import planted
 from benchmarks.speed.contact_sequence_vs_window import SECONDS, predictors
+from benchmarks.speed.figures import figure, in_turns
 
 
 def measure(seconds: float = SECONDS, rounds: int = 15) -> list[dict]:
     motion = planted.swinging("swing", seconds, 0).motion
     assert motion is not None
     ours, _ = predictors()
-    ours(motion)
-    spent = []
-    for _ in range(rounds):
-        begin = time.perf_counter()
-        ours(motion)
-        spent.append(time.perf_counter() - begin)
-    value = statistics.median(spent)
-    return [
-        {
-            "name": "contact_seconds_per_minute",
-            "value": value,
-            "unit": "s",
-            "baseline": seconds,
-            "ratio": seconds / value,
-            "goal": SECONDS / 0.15,
-        }
-    ]
+    (value,) = in_turns([lambda: ours(motion)], rounds)
+    return [figure("contact_seconds_per_minute", value, "s", seconds, seconds / value, SECONDS / 0.15)]

@@ -5,12 +5,10 @@ for both. Their turns alternate. value and baseline: median seconds. ratio = bas
 Weights do not change the speed: they are drawn at random.
 """
 
-import statistics
-import time
-
 import torch
 
 from benchmarks.speed import planted
+from benchmarks.speed.figures import figure, in_turns
 from wearcap.systems.ireplica.contact_prediction import ContactDetector, ContactPredictor
 from wearcap.systems.ireplica.contact_sequence import ContactSequence
 from wearcap.systems.ireplica.contact_transformer import ContactTransformer
@@ -32,22 +30,5 @@ def predictors() -> tuple[ContactPredictor, ContactPredictor]:
 def measure(seconds: float = SECONDS, rounds: int = 5) -> list[dict]:
     motion = planted.swinging("swing", seconds, 0).motion
     assert motion is not None
-    both = predictors()
-    times: tuple[list[float], list[float]] = [], []
-    for turn in range(rounds + 1):
-        for predictor, spent in zip(both, times):
-            begin = time.perf_counter()
-            predictor(motion)
-            if turn:
-                spent.append(time.perf_counter() - begin)
-    value, baseline = (statistics.median(spent) for spent in times)
-    return [
-        {
-            "name": "contact_sequence_vs_window",
-            "value": value,
-            "unit": "s",
-            "baseline": baseline,
-            "ratio": baseline / value,
-            "goal": 20.0,
-        }
-    ]
+    value, baseline = in_turns([lambda each=each: each(motion) for each in predictors()], rounds)
+    return [figure("contact_sequence_vs_window", value, "s", baseline, baseline / value, 20.0)]

@@ -4,22 +4,22 @@ All have the context of `pipeline=ablation/echo_conveyor`, no guidance, in the s
 the conveyor (112) need those for 10 frames, the conveyor two for each: 5.6 times as many evaluations of the network,
 less its queue. "Equal" windows take the 20 evaluations that the conveyor takes for 10 frames. Of times (ms per frame and
 batch item, once the conveyor's window is full) value is the conveyor's, baseline the windows', ratio = baseline / value, to be
-at least `goal`. Where there is a checkpoint `echo` and the test split of datasets/simulated_objects, also MPJPE (mm),
+at least `goal`. Where there is the test split of datasets/simulated_objects, also MPJPE (mm),
 E_v2v (cm) and jitter (m/s³) over the beginnings of some of its recordings: value the conveyor's, baseline the
 windows', ratio = value / baseline, to be at most `goal`.
 """
 
 import statistics
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from benchmarks.speed.echo_runs import NAME, conditions_of, figure, pipeline_of
-from wearcap.models.checkpoint import shared_checkpoints
-from wearcap.recording import Recording, RecordingStore
+from benchmarks.speed.echo_runs import conditions_of, pipeline_of
+from benchmarks.speed.figures import figure, seconds
+from wearcap.recording import RecordingStore
+from wearcap.recording.timing import first_seconds
 from wearcap.runtime.system import CaptureInput
 from wearcap.systems.echo.pipeline import Echo
 from wearcap.systems.echo.queue import Conditioning, EchoQueue
@@ -31,16 +31,16 @@ DATASET = Path(__file__).resolve().parents[2] / "datasets" / "simulated_objects"
 SCORES = {"mpjpe_mm": "mm MPJPE", "v2v_cm": "cm E_v2v", "jitter_m_s3": "m/s³ of the joints"}
 
 
-def measure(items: int = 4, rounds: int = 6, recordings: int = 4, seconds: float = 20.0) -> list[dict]:
+def measure(items: int = 4, rounds: int = 6, recordings: int = 4, length_s: float = 20.0) -> list[dict]:
     conveyor = pipeline_of("ablation/echo_conveyor", guided=False)
     windows = replace(conveyor, sampling=replace(conveyor.sampling, rewindow=STRIDE, average=False))
     few = replace(windows.sampling, rewindow_steps=STRIDE * conveyor.sampling.per_frame)
     pipelines = {"conveyor": conveyor, "rewindow": windows, EQUAL: replace(windows, sampling=few)}
     rows = _time(pipelines, items, rounds)
-    if NAME in shared_checkpoints() and (DATASET / "manifest.json").is_file():
-        rows += _errors(pipelines, recordings, seconds)
+    if recordings and (DATASET / "manifest.json").is_file():
+        rows += _errors(pipelines, recordings, length_s)
     else:
-        print(f"no checkpoint {NAME!r} or no {DATASET}: time alone", file=sys.stderr)
+        print(f"no {DATASET}: time alone", file=sys.stderr)
     return rows
 
 
@@ -65,7 +65,7 @@ def _time(pipelines: dict[str, Echo], items: int, rounds: int) -> list[dict]:
             for again, before in zip(windows, befores)
         ]
         for taken, run in zip(times, runs):
-            taken.append(_seconds(run))
+            taken.append(seconds(run))
     value, full, equal = (1000 * statistics.median(taken) / STRIDE / items for taken in times)
     unit = "ms per frame and batch item, no guidance"
     return [
@@ -89,16 +89,10 @@ def _pushed(queue: EchoQueue, conditioning: Conditioning, start: int) -> None:
         queue.push(conditioning.frames(slice(number, number + 1)))
 
 
-def _seconds(run) -> float:
-    begin = time.perf_counter()
-    run()
-    return time.perf_counter() - begin
-
-
-def _errors(pipelines: dict[str, Echo], recordings: int, seconds: float) -> list[dict]:
+def _errors(pipelines: dict[str, Echo], recordings: int, length_s: float) -> list[dict]:
     """Means over recordings; of the object over those in which one is active."""
     store = RecordingStore.open(DATASET)
-    shown = [_beginning(store.load(name), seconds) for name in store.names("test")[:recordings]]
+    shown = [first_seconds(store.load(name), length_s) for name in store.names("test")[:recordings]]
     means = {}
     for pipeline_name, pipeline in pipelines.items():
         sources = [CaptureInput(recording, store.root) for recording in shown]
@@ -107,7 +101,7 @@ def _errors(pipelines: dict[str, Echo], recordings: int, seconds: float) -> list
         means[pipeline_name] = {
             name: statistics.mean(score[name] for score in scores if name in score) for name in SCORES
         }
-    of = f", {seconds:g} s of {len(shown)} recordings, one seed"
+    of = f", {length_s:g} s of {len(shown)} recordings, one seed"
     figures = []
     for windows in ("rewindow", EQUAL):
         what = of if windows != EQUAL else f"{of}; as many evaluations"
@@ -116,19 +110,3 @@ def _errors(pipelines: dict[str, Echo], recordings: int, seconds: float) -> list
             ours, theirs = means["conveyor"][name], means[windows][name]
             figures.append(figure(f"echo_conveyor{mark}_{name}", ours, unit + what, theirs, ours / theirs, 1.0))
     return figures
-
-
-def _beginning(recording: Recording, seconds: float) -> Recording:
-    """Its first seconds: the head's path determines how long the capture is."""
-    head = recording.head
-    assert head is not None
-    count = int(torch.searchsorted(head.timestamps, head.timestamps[0] + seconds))
-    return replace(
-        recording,
-        head=replace(
-            head,
-            timestamps=head.timestamps[:count],
-            R_world_device=head.R_world_device[:count],
-            t_world_device=head.t_world_device[:count],
-        ),
-    )

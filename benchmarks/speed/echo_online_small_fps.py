@@ -9,7 +9,8 @@ be at least `goal`.
 
 from dataclasses import replace
 
-from benchmarks.speed.echo_runs import figure, frames_per_second, pipeline_of
+from benchmarks.speed.echo_runs import frames_per_second, pipeline_of
+from benchmarks.speed.figures import per_second
 
 REAL_TIME = 30.0
 
@@ -23,7 +24,6 @@ def measure(frames: int = 150, repeats: int = 5) -> list[dict]:
         "echo_conveyor_small_fps": conveyor,
     }
     return [
-        figure(name, value, "frames/s", REAL_TIME, value / REAL_TIME, 1.0)
+        per_second(name, frames_per_second(pipeline, frames, repeats), REAL_TIME, 1.0)
         for name, pipeline in rows.items()
-        for value in [frames_per_second(pipeline, frames, repeats)]
     ]

@@ -11,6 +11,11 @@ def figure(name: str, value: float, unit: str, baseline: float, ratio: float, go
     return {"name": name, "value": value, "unit": unit, "baseline": baseline, "ratio": ratio, "goal": goal}
 
 
+def per_second(name: str, value: float, baseline: float, goal: float | None) -> dict[str, Any]:
+    """A figure of frames per second; its ratio is ours over the baseline."""
+    return figure(name, value, "frames/s", baseline, value / baseline, goal)
+
+
 def seconds(run: Callable[[], object]) -> float:
     """Time (s) of one call."""
     begin = time.perf_counter()

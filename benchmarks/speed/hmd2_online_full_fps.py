@@ -4,9 +4,10 @@ The steps, runtime and precision of `pipeline=hmd2_online`; median push of a wal
 baseline: real time, 60; ratio = value / baseline, to be at least `goal` (60 frames/s on two cores).
 """
 
-from benchmarks.speed.online import figure, frames_per_second, pipeline_of
+from benchmarks.speed.figures import per_second
+from benchmarks.speed.online import frames_per_second, pipeline_of
 
 
 def measure(pushes: int = 30) -> list[dict]:
     value = frames_per_second(pipeline_of("full"), pushes)
-    return [figure("hmd2_online_full_fps", value, 60.0, 1.0)]
+    return [per_second("hmd2_online_full_fps", value, 60.0, 1.0)]

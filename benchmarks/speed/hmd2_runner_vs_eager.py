@@ -16,7 +16,8 @@ in the table of steps (`python benchmarks/tables.py hmd2`, Table 6.7).
 from dataclasses import fields, replace
 from typing import Any
 
-from benchmarks.speed.online import Streamed, figure, pipeline_of
+from benchmarks.speed.figures import per_second
+from benchmarks.speed.online import Streamed, pipeline_of
 from wearcap.diffusion.process import step_levels
 from wearcap.systems.hmd2.model import StepRunner
 from wearcap.systems.hmd2.pipeline import HMD2
@@ -65,7 +66,7 @@ def measure(pushes: int = 15, sizes: tuple[str, ...] = ("full", "small")) -> lis
             ("hmd2_precision_in_runner", narrow, runner, None),
             ("hmd2_steps_in_runner", ours, long, None),
         ):
-            figures.append(figure(name + ending, value.frames_per_second, baseline.frames_per_second, goal))
+            figures.append(per_second(name + ending, value.frames_per_second, baseline.frames_per_second, goal))
     return figures
 
 

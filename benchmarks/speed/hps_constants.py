@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from hydra.utils import instantiate
 
+from benchmarks.speed.figures import figure
 from benchmarks.tables.hps_sessions import TrueClock
 from wearcap.cli.conf import compose
 from wearcap.metrics.table import evaluate_motion
@@ -56,13 +57,6 @@ def errors_cm(split: str, seed: int) -> list[float]:
 def measure(split: str = "val", seeds: int = 3) -> list[dict]:
     baseline, *values = torch.tensor([errors_cm(split, seed) for seed in range(seeds)]).mean(0).tolist()
     return [
-        {
-            "name": f"hps_constants_{name}",
-            "value": value,
-            "unit": "cm",
-            "baseline": baseline,
-            "ratio": value / baseline,
-            "goal": 0.98,
-        }
+        figure(f"hps_constants_{name}", value, "cm", baseline, value / baseline, 0.98)
         for name, value in zip(list(PRIORS)[1:], values)
     ]

@@ -22,6 +22,7 @@ from pathlib import Path
 
 from hydra.utils import instantiate
 
+from benchmarks.speed.figures import figure
 from wearcap.cli.conf import compose, splits_dir
 from wearcap.cli.scene import run as build_scene_map
 from wearcap.geometry import rotation
@@ -116,14 +117,14 @@ def measure(split: str = "test", end_m: float = 30.0) -> list[dict]:
     ours, anew = rows.values()
     value, baseline = (row["times_real_time"] for row in (ours, anew))
     return [
-        {
-            "name": "hps_end_to_end_realtime",
-            "value": value,
-            "unit": f"s of recording per s (camera {ours['camera_cm']:.2f} cm off, each frame anew {anew['camera_cm']:.2f}; "
+        figure(
+            "hps_end_to_end_realtime",
+            value,
+            f"s of recording per s (camera {ours['camera_cm']:.2f} cm off, each frame anew {anew['camera_cm']:.2f}; "
             f"joints {ours['joints_cm']:.2f} cm, {anew['joints_cm']:.2f}; {ours['core_s_per_s']:.2f} s of a core per s, "
             f"{anew['core_s_per_s']:.2f})",
-            "baseline": baseline,
-            "ratio": value / baseline,
-            "goal": 5.0,
-        }
+            baseline,
+            value / baseline,
+            5.0,
+        )
     ]

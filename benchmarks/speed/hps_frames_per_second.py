@@ -9,6 +9,7 @@ import time
 
 from hydra.utils import instantiate
 
+from benchmarks.speed.figures import figure
 from benchmarks.speed.hps_solver_vs_best_adam import walk
 from wearcap.cli.conf import compose
 
@@ -21,13 +22,4 @@ def measure(duration_s: float = 600.0) -> list[dict]:
     begin = time.perf_counter()
     solver(energy, data)
     value = len(data) / (time.perf_counter() - begin)
-    return [
-        {
-            "name": "hps_frames_per_second",
-            "value": value,
-            "unit": "frames/s",
-            "baseline": 30.0,
-            "ratio": value / 30.0,
-            "goal": 100.0 / 30.0,
-        }
-    ]
+    return [figure("hps_frames_per_second", value, "frames/s", 30.0, value / 30.0, 100.0 / 30.0)]

@@ -13,6 +13,7 @@ from hydra.utils import instantiate
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from benchmarks.speed.figures import figure
 from benchmarks.tables.hps_outages import with_outage
 from benchmarks.tables.hps_sessions import TrueClock
 from wearcap.cli.conf import compose
@@ -66,5 +67,4 @@ def measure(split: str = "test", seeds: int = 3) -> list[dict]:
         for column, (start, stop) in enumerate((AFTER_S, BEFORE_S)):
             means[seed, column] = error[(times >= start) & (times < stop)].mean()
     value, baseline = means.mean(0).tolist()
-    figure = {"name": "hps_online_recovery", "value": value, "unit": "cm", "baseline": baseline}
-    return [{**figure, "ratio": value / baseline, "goal": 2.0}]
+    return [figure("hps_online_recovery", value, "cm", baseline, value / baseline, 2.0)]

@@ -18,14 +18,13 @@ On one core, in processor seconds for 30 s of recording (the least of four runs 
 
 import math
 import os
-import statistics
 import time
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from hydra.utils import instantiate
 
+from benchmarks.speed.adam import WITHIN, Run, Schedule, compared, least, reach
 from wearcap.body.anny_body import anny_body
 from wearcap.cli.conf import compose
 from wearcap.geometry import rotation
@@ -52,27 +51,7 @@ RATES, DECAYS = (1e-3, 3e-3, 1e-2, 3e-2, 1e-1), (None, 150, 300, 500)
 """Learning rates, and steps over which they decay; None: a constant rate."""
 BUDGET, LOOK_UP = 500, 10
 """Most steps of a run of Adam, and steps between two look-ups of scene points."""
-WITHIN, FPS, SWEPT_S = 1.001, 30.0, 15.0
-
-
-class Run(NamedTuple):
-    """A run of one side until a target."""
-
-    seconds: float
-    energy: float
-    steps: int
-
-
-class Schedule(NamedTuple):
-    """How Adam runs."""
-
-    rate: float
-    decay: int | None
-    dtype: torch.dtype = torch.float32
-
-    def __str__(self) -> str:
-        decay = "constant" if self.decay is None else f"to zero over {self.decay} steps"
-        return f"{self.rate:g} {decay}, {str(self.dtype).removeprefix('torch.')}"
+FPS, SWEPT_S = 30.0, 15.0
 
 
 def measure(duration_s: float = 60.0, rates=RATES, decays=DECAYS, budget: int = BUDGET, repeats: int = 3) -> list[dict]:
@@ -86,41 +65,17 @@ def measure(duration_s: float = 60.0, rates=RATES, decays=DECAYS, budget: int = 
     doubled = best._replace(dtype=torch.float64)
     runs[doubled] = adam(energy, short, doubled, budget)
     best = min(best, doubled, key=lambda schedule: reach(runs[schedule], swept))
-    lowest = min(runs, key=lambda schedule: runs[schedule][-1].energy)
-    target, depth = ours(energy, data, ITERATIONS[0]).energy, adam(energy, data, lowest, budget)[-1].energy
-    return [
-        figure("hps_solver_vs_best_adam", energy, data, target, best, budget, repeats, 10.0),
-        figure("hps_solver_vs_best_adam_lowest", energy, data, depth, lowest, budget, repeats, None),
-    ]
-
-
-def figure(
-    name: str,
-    energy: HpsEnergy,
-    data: HpsData,
-    target: float,
-    schedule: Schedule,
-    budget: int,
-    repeats: int,
-    goal: float | None,
-) -> dict:
-    """Both sides until a target, in turns."""
-    iterations = next((n for n in ITERATIONS if ours(energy, data, n).energy <= target * WITHIN), ITERATIONS[-1])
-    pairs = []
-    for _ in range(repeats):
-        pairs.append((ours(energy, data, iterations), adam(energy, data, schedule, budget, target * WITHIN)[-1]))
-    mine, theirs = zip(*pairs)
-    value, baseline = (statistics.median(run.seconds for run in runs) for runs in (mine, theirs))
-    unit = f"s (energy {mine[0].energy:.3f} after {iterations} iterations against {theirs[0].energy:.3f} after "
-    unit += f"{theirs[0].steps} steps at {schedule}"
-    for who, run in (("Adam", theirs[0]), ("ours", mine[0])):
-        if run.energy > target * WITHIN:
-            unit += f"; {who} does not reach {target:.3f}: its time is a lower bound"
-    return dict(zip(("name", "value", "unit"), (name, value, unit + ")"))) | {
-        "baseline": baseline,
-        "ratio": baseline / value,
-        "goal": goal,
-    }
+    lowest = min(runs, key=lambda schedule: least(runs[schedule]))
+    target, depth = ours(energy, data, ITERATIONS[0]).energy, least(adam(energy, data, lowest, budget))
+    figures = []
+    for name, goal_energy, schedule, goal in (("", target, best, 10.0), ("_lowest", depth, lowest, None)):
+        enough = goal_energy * WITHIN
+        iterations = next((n for n in ITERATIONS if ours(energy, data, n).energy <= enough), ITERATIONS[-1])
+        pairs = [
+            (ours(energy, data, iterations), adam(energy, data, schedule, budget, enough)[-1]) for _ in range(repeats)
+        ]
+        figures.append(compared(f"hps_solver_vs_best_adam{name}", pairs, goal_energy, schedule, goal))
+    return figures
 
 
 def ours(energy: HpsEnergy, data: HpsData, iterations: int) -> Run:
@@ -155,17 +110,11 @@ def adam(energy: HpsEnergy, data: HpsData, schedule: Schedule, budget: int, targ
             found.append(Run(time.perf_counter() - begin, total.item(), step))
             if found[-1].energy <= target:
                 break
-        if schedule.decay is not None:
-            optimizer.param_groups[0]["lr"] = schedule.rate * 0.5 * (1 + math.cos(math.pi * step / schedule.decay))
+        optimizer.param_groups[0]["lr"] = schedule.at(step)
         optimizer.zero_grad()
         total.backward()
         optimizer.step()
     return found
-
-
-def reach(runs: list[Run], target: float) -> tuple[float, float]:
-    """Order of Adam's schedules: the energy where the target is not reached, then the seconds until it is."""
-    return next(((0.0, run.seconds) for run in runs if run.energy <= target * WITHIN), (runs[-1].energy, 0.0))
 
 
 def paper_energy() -> HpsEnergy:

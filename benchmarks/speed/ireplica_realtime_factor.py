@@ -10,6 +10,7 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.speed.figures import figure
 from benchmarks.tables.ireplica_runs import Case, pipeline_of
 from wearcap.errors import WearcapError
 from wearcap.recording import RecordingStore
@@ -35,14 +36,7 @@ def measure() -> list[dict]:
         registered, tracked = middle - begin, time.perf_counter() - middle
     length = case.recording.duration_s
     return [
-        {
-            "name": name,
-            "value": length / seconds,
-            "unit": "s/s",
-            "baseline": 1.0,
-            "ratio": length / seconds,
-            "goal": GOAL,
-        }
+        figure(name, length / seconds, "s/s", 1.0, length / seconds, GOAL)
         for name, seconds in (
             ("ireplica_realtime_factor", registered + tracked),
             ("ireplica_realtime_factor_without_hps", tracked),

@@ -13,8 +13,6 @@ unit says so, and its time is that of its whole budget: a lower bound of the tim
 """
 
 import math
-import statistics
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,15 +24,14 @@ import torch
 from hydra.utils import instantiate
 from torch import Tensor
 
+from benchmarks.speed.adam import WITHIN, Run, Schedule, compared, least, reach
 from benchmarks.speed.planted import swinging
-from wearcap.body.skeleton import xsens23
 from wearcap.cli.conf import compose
 from wearcap.geometry import rotation
-from wearcap.models.checkpoint import load_trained, shared_checkpoints
+from wearcap.models.checkpoint import load_trained
 from wearcap.recording import Motion, Recording
 from wearcap.systems.mocap_every import energy
 from wearcap.systems.mocap_every.energy import LatentSolver
-from wearcap.systems.mocap_every.manifold import MotionManifold
 from wearcap.systems.mocap_every.visual_cues import VisualCues
 from wearsim.sensors.keypoints import action_camera, camera_path, seen_joints
 
@@ -42,25 +39,7 @@ NAME = "motion_manifold"
 OFF_DEG = 15.0
 RATES, DECAYS = (1e-3, 1e-2, 3e-2, 5e-2, 1e-1), (None, 60, 150)
 """Learning rates, and steps over which they decay; None: a constant rate."""
-BUDGET, WITHIN, SWEPT_S = 300, 1.001, 6.0
-
-
-class Schedule(NamedTuple):
-    """How Adam runs."""
-
-    rate: float
-    decay: int | None
-
-    def __str__(self) -> str:
-        return f"{self.rate:g} " + ("constant" if self.decay is None else f"to zero over {self.decay} steps")
-
-
-class Run(NamedTuple):
-    """A run of one side until a target."""
-
-    seconds: float
-    energy: float
-    steps: int
+BUDGET, SWEPT_S = 300, 6.0
 
 
 class Problem(NamedTuple):
@@ -75,37 +54,20 @@ def measure(duration_s: float = 60.0, rates=RATES, decays=DECAYS, budget: int = 
     problem, short = posed(duration_s), posed(SWEPT_S)
     swept = ours(short, solver).energy
     runs = {s: adam(short, s, budget) for s in (Schedule(rate, decay) for rate in rates for decay in decays)}
-    best = min(runs, key=lambda schedule: _reach(runs[schedule], swept))
-    lowest = min(runs, key=lambda schedule: _least(runs[schedule]))
-    target, depth = ours(problem, solver).energy, _least(adam(problem, lowest, budget))
-    name = "latent_optimisation_vs_best_adam"
-    return [
-        figure(name, problem, target, solver, best, budget, repeats, 3.0),
-        figure(f"{name}_lowest", problem, depth, replace(solver, steps=budget), lowest, budget, repeats, None),
-    ]
-
-
-def figure(
-    name: str,
-    problem: Problem,
-    target: float,
-    solver: LatentSolver,
-    schedule: Schedule,
-    budget: int,
-    repeats: int,
-    goal: float | None,
-) -> dict:
-    """Both sides until a target, in turns."""
-    runs = [(ours(problem, solver, target), adam(problem, schedule, budget, target)[-1]) for _ in range(repeats)]
-    (mine, theirs), *_ = runs
-    value, baseline = (statistics.median(run.seconds for run in side) for side in zip(*runs))
-    unit = f"s (energy {mine.energy:.4f} after {mine.steps} evaluations against {theirs.energy:.4f} after "
-    unit += f"{theirs.steps} of Adam at {schedule}"
-    for who, run in (("Adam", theirs), ("ours", mine)):
-        if run.energy > target * WITHIN:
-            unit += f"; {who} does not reach {target:.4f}: its time is a lower bound"
-    speeds = {"value": value, "unit": unit + ")", "baseline": baseline, "ratio": baseline / value, "goal": goal}
-    return {"name": name} | speeds
+    best = min(runs, key=lambda schedule: reach(runs[schedule], swept))
+    lowest = min(runs, key=lambda schedule: least(runs[schedule]))
+    target, depth = ours(problem, solver).energy, least(adam(problem, lowest, budget))
+    figures = []
+    for name, goal_energy, our_solver, schedule, goal in (
+        ("", target, solver, best, 3.0),
+        ("_lowest", depth, replace(solver, steps=budget), lowest, None),
+    ):
+        pairs = [
+            (ours(problem, our_solver, goal_energy), adam(problem, schedule, budget, goal_energy)[-1])
+            for _ in range(repeats)
+        ]
+        figures.append(compared(f"latent_optimisation_vs_best_adam{name}", pairs, goal_energy, schedule, goal))
+    return figures
 
 
 def posed(duration_s: float) -> Problem:
@@ -118,7 +80,7 @@ def posed(duration_s: float) -> Problem:
         return energy.LatentSolution(start)
 
     with patch.object(energy, "solve_latent", keep):
-        VisualCues(_manifold(), batch=10**6).edit(motion, recording, motion.joint("head"))
+        VisualCues(load_trained(NAME)[0].net, batch=10**6).edit(motion, recording, motion.joint("head"))
     (problem,) = problems
     return problem
 
@@ -144,20 +106,10 @@ def adam(problem: Problem, schedule: Schedule, budget: int, target: float = 0.0)
         found.append(Run(time.perf_counter() - begin, total.item(), step + 1))
         if found[-1].energy <= target * WITHIN:
             break
-        if schedule.decay is not None:
-            optimizer.param_groups[0]["lr"] = schedule.rate * 0.5 * (1 + math.cos(math.pi * step / schedule.decay))
+        optimizer.param_groups[0]["lr"] = schedule.at(step)
         (latent.grad,) = torch.autograd.grad(total, latent)
         optimizer.step()
     return found
-
-
-def _least(runs: list[Run]) -> float:
-    return min(run.energy for run in runs)
-
-
-def _reach(runs: list[Run], target: float) -> tuple[float, float]:
-    """Order of Adam's schedules: the energy where the target is not reached, then the seconds until it is."""
-    return next(((0.0, run.seconds) for run in runs if run.energy <= target * WITHIN), (_least(runs), 0.0))
 
 
 def _seen(duration_s: float) -> tuple[Motion, Recording]:
@@ -176,12 +128,3 @@ def _seen(duration_s: float) -> tuple[Motion, Recording]:
         R[:, joint] = R[:, joint] @ rotation.about_axis("z", torch.tensor(math.radians(OFF_DEG)))
     wrong = replace(truth, R_parent_joint=R, contact_prob=torch.zeros(len(truth), 4))
     return wrong, replace(recording, camera=camera, cues=cues)
-
-
-def _manifold() -> MotionManifold:
-    if NAME in shared_checkpoints():
-        return load_trained(NAME)[0].net
-    torch.manual_seed(0)
-    print(f"no checkpoint {NAME!r}: drawn weights", file=sys.stderr)
-    config = compose("train", [f"experiment={NAME}"]).model.net
-    return instantiate(config)(size=5 + 6 * len(xsens23())).eval()

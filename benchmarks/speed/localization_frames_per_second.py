@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from benchmarks.speed.figures import figure
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
@@ -149,13 +150,6 @@ def measure(frames: int = 24, baseline_frames: int = 4) -> list[dict]:
         pairwise(image, QUERY)
     baseline = baseline_frames / (time.perf_counter() - begin)
     return [
-        {
-            "name": "localization_frames_per_second",
-            "value": value,
-            "unit": f"frames/s, {unit}",
-            "baseline": baseline,
-            "ratio": value / baseline,
-            "goal": 5.0,
-        }
+        figure("localization_frames_per_second", value, f"frames/s, {unit}", baseline, value / baseline, 5.0)
         for value, unit in zip(rates, ("video", "single pictures"))
     ]

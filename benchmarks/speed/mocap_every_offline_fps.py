@@ -4,10 +4,10 @@ Ten minutes at 30 Hz; windows of 40 frames advance by 20, one after the other, a
 window to window; PyTorch, then ONNX Runtime. baseline: real time, 30; ratio = value / baseline, to be at least `goal` (3000 frames/s).
 """
 
-import time
 from dataclasses import replace
 
-from benchmarks.speed.mocap_every_runs import figure, pipeline_of, watched
+from benchmarks.speed.figures import per_second, rate
+from benchmarks.speed.mocap_every_runs import pipeline_of, watched
 
 
 def measure(duration_s: float = 600.0, repeats: int = 3) -> list[dict]:
@@ -17,11 +17,6 @@ def measure(duration_s: float = 600.0, repeats: int = 3) -> list[dict]:
         ("mocap_every_offline_fps", eager),
         ("mocap_every_offline_onnx_fps", replace(eager, runtime="onnx")),
     ):
-        pipeline(recording)
-        rates = []
-        for _ in range(repeats):
-            begin = time.perf_counter()
-            frames = len(pipeline(recording))
-            rates.append(frames / (time.perf_counter() - begin))
-        rows.append(figure(name, sorted(rates)[repeats // 2], 30.0, 100.0))
+        frames = len(pipeline(recording))
+        rows.append(per_second(name, rate(lambda run=pipeline: run(recording), frames, repeats), 30.0, 100.0))
     return rows

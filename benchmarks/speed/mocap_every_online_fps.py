@@ -12,7 +12,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from benchmarks.speed.mocap_every_runs import figure, pipeline_of, watched
+from benchmarks.speed.figures import per_second
+from benchmarks.speed.mocap_every_runs import pipeline_of, watched
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Recording
 from wearcap.runtime.graphs import undisturbed
@@ -34,7 +35,7 @@ def measure(duration_s: float = 30.0, repeats: int = 3) -> list[dict]:
         stepping = replace(pipeline, stride=stride)
         with undisturbed(pipeline.runtime == "onnx"):
             rates = sorted(_rate(stepping, recording, points) for _ in range(repeats))
-        rows.append(figure(f"mocap_every_online{name}_fps", rates[repeats // 2], 30.0, 10.0))
+        rows.append(per_second(f"mocap_every_online{name}_fps", rates[repeats // 2], 30.0, 10.0))
     return rows
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from benchmarks.speed.figures import figure
 from wearcap.metrics.detection import average_precision
 from wearcap.scene.objects import CONTACT_CLASSES
 from wearcap.systems.ireplica.features import HandViews
@@ -78,7 +79,6 @@ def measure(train: int = 36, test: int = 16, seeds: int = 3) -> list[dict]:
     scores = torch.tensor([one_frame(seen, unseen, seed) for seed in range(seeds)]).mean(0).tolist()
     shares = torch.cat([y.flatten(0, 1) for _, y in unseen]).float().mean(0).tolist()
     return [
-        {"name": f"one_frame_contact {kind}", "value": score, "unit": "AP", "baseline": share}
-        | {"ratio": score / share, "goal": GOAL}
+        figure(f"one_frame_contact {kind}", score, "AP", share, score / share, GOAL)
         for kind, score, share in zip((ANY, *CONTACT_CLASSES), scores, shares)
     ]

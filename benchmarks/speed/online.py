@@ -25,18 +25,20 @@ EXPERIMENTS = {"small": "hmd2", "full": "full/hmd2"}
 IMAGE = 64
 LAP_S = 20.0
 """The walk leads there and back, over and over."""
+NEW_POINTS = 40
+"""Points that come with each pose."""
 
 
-def pipeline_of(size: str, device: str = "cpu", *overrides: str) -> HMD2:
+def pipeline_of(size: str) -> HMD2:
     """The online pipeline around a checkpoint of the project, or around random weights of that size, which is printed."""
-    config = compose("capture", ["pipeline=hmd2_online", *overrides, "recording=none"]).pipeline
+    config = compose("capture", ["pipeline=hmd2_online", "recording=none"]).pipeline
     if EXPERIMENTS[size] in shared_checkpoints():
-        pipeline = load_pipeline(EXPERIMENTS[size], config, device)
+        pipeline = load_pipeline(EXPERIMENTS[size], config, "cpu")
         assert isinstance(pipeline, HMD2)
     else:
         net = random_net(size)
         model = DiffusionModel(net, _FEATURES, CosineSchedule(), xsens23(), 60.0, VoxelAutoencoder(), "any")
-        pipeline = instantiate(config, _convert_="all")(model=model, device=device)
+        pipeline = instantiate(config, _convert_="all")(model=model, device="cpu")
         count = sum(parameter.numel() for parameter in net.parameters()) / 1e6
         print(f"no checkpoint {EXPERIMENTS[size]!r}: random weights, {count:.1f} M parameters", file=sys.stderr)
     return pipeline
@@ -61,10 +63,10 @@ def random_net(size: str) -> MotionDenoiser:
 
 
 class Walk:
-    """A head's path there and back at 60 Hz, with an embedding every other frame, and points on the first lap or forever."""
+    """A head's path there and back at 60 Hz, with an embedding every other frame, and points on the first lap."""
 
-    def __init__(self, pipeline: HMD2, new_points: int = 40, forever: bool = False):
-        self.pipeline, self.new_points, self.forever = pipeline, new_points, forever
+    def __init__(self, pipeline: HMD2):
+        self.pipeline = pipeline
         head = swinging("walk", LAP_S / 2, 0).head
         assert head is not None
         there = head.T_world_device
@@ -74,7 +76,7 @@ class Walk:
     def moment(self, number: int) -> HeadSample:
         place = number % len(self.lap.t)
         pose = self.lap[place]
-        count = self.new_points if self.forever or number < len(self.lap.t) else 0
+        count = NEW_POINTS if number < len(self.lap.t) else 0
         points = pose.t + 4 * torch.rand(count, 3, generator=self._random) - torch.tensor([2.0, 2.0, 3.0])
         shown = torch.randn(self.pipeline.model.net.image_size, generator=self._random) if number % 2 == 0 else None
         return HeadSample(number / 60, pose, points, shown)
@@ -115,30 +117,3 @@ def frames_per_second(pipeline: HMD2, pushes: int = 40) -> float:
     for _ in range(pushes):
         stream.step()
     return stream.frames_per_second
-
-
-def figure(name: str, value: float, baseline: float, goal: float | None) -> dict:
-    return {
-        "name": name,
-        "value": value,
-        "unit": "frames/s",
-        "baseline": baseline,
-        "ratio": value / baseline,
-        "goal": goal,
-    }
-
-
-def beside_paper(name: str, stride: int, paper: float, pushes: int) -> list[dict]:
-    """Full model on a GPU at one stride in 20 steps, beside the paper's frames per second; nothing without a GPU."""
-    if without_cuda(name):
-        return []
-    sampling = "pipeline.sampling.steps=20", "pipeline.sampling.spacing=1.0", "pipeline.precision=auto"
-    pipeline = pipeline_of("full", "cuda", f"pipeline.overlap.stride={stride}", *sampling)
-    return [figure(name, frames_per_second(pipeline, pushes), paper, 10.0)]
-
-
-def without_cuda(name: str) -> bool:
-    """Whether a benchmark for a GPU has none, which is printed."""
-    if not torch.cuda.is_available():
-        print(f"{name}: left out, no CUDA device", file=sys.stderr)
-    return not torch.cuda.is_available()

@@ -1,13 +1,12 @@
 """Data for benchmarks that ask how fast and not how well: bodies that swing their joints."""
 
 import math
-from pathlib import Path
 
 import torch
 
 from wearcap.body.skeleton import xsens23
 from wearcap.geometry import rotation
-from wearcap.recording import FloorTrack, HeadStream, Motion, Recording, RecordingStore
+from wearcap.recording import FloorTrack, HeadStream, Motion, Recording
 
 
 def swinging(name: str, seconds: float, seed: int, fps: float = 60.0) -> Recording:
@@ -24,12 +23,3 @@ def swinging(name: str, seconds: float, seed: int, fps: float = 60.0) -> Recordi
     return Recording(
         name, head=head, motion=motion, floor=FloorTrack(t, torch.zeros(len(t))), skeleton=skeleton, subject=name
     )
-
-
-def write_store(root: str | Path, seconds: tuple[float, ...]) -> RecordingStore:
-    """A data set with one training recording per length, the first one for validation too."""
-    store = RecordingStore(root)
-    for seed, length in enumerate(seconds):
-        store.add(swinging(f"swing_{seed}", length, seed), split="train", config_hash="planted")
-    store.add(swinging("swing_val", seconds[0], len(seconds)), split="val", config_hash="planted")
-    return store

@@ -13,6 +13,7 @@ import time
 import numpy as np
 import torch
 
+from benchmarks.speed.figures import figure
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.render import SplatCloud
 from wearcap.geometry.rigid import Rigid
@@ -78,14 +79,5 @@ def measure(view: int = 2_000_000, whole: int = 10_000_000, turns: int = 5) -> l
             ours.append(middle - begin)
             theirs.append(time.thread_time() - middle)
         value, baseline = (len(points) / 1e6 / statistics.median(side) for side in (ours, theirs))
-        figures.append(
-            {
-                "name": "splat_mpoints_per_second",
-                "value": value,
-                "unit": unit,
-                "baseline": baseline,
-                "ratio": value / baseline,
-                "goal": 5.0,
-            }
-        )
+        figures.append(figure("splat_mpoints_per_second", value, unit, baseline, value / baseline, 5.0))
     return figures

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from hydra.utils import instantiate
 
+from benchmarks.speed.figures import figure
 from wearcap.cli.conf import compose
 from wearcap.systems.ireplica.trajectory import BendingProblem, BentPath, bend_adam, bending_problem
 from wearcap.systems.ireplica.trajectory_banded import bend_banded
@@ -37,14 +38,14 @@ def measure(duration_s: float = 600.0, longest: int = LONGEST, repeats: int = 5)
     if reached < ours:
         raise SystemExit(f"error: Adam's energy {reached:.4f} is below ours {ours:.4f}")
     return [
-        {
-            "name": "trajectory_bending_vs_adam",
-            "value": value,
-            "unit": f"ms (energy {ours:.2f} against {reached:.2f} after {after} iterations)",
-            "baseline": baseline,
-            "ratio": baseline / value,
-            "goal": 20.0,
-        }
+        figure(
+            "trajectory_bending_vs_adam",
+            value,
+            f"ms (energy {ours:.2f} against {reached:.2f} after {after} iterations)",
+            baseline,
+            baseline / value,
+            20.0,
+        )
     ]
 
 

@@ -12,6 +12,7 @@ import time
 import torch
 
 from benchmarks.speed import planted_flat
+from benchmarks.speed.figures import figure
 from wearcap.scene.voxels import VoxelMap, voxelize
 
 FPS = 60.0
@@ -35,13 +36,6 @@ def measure(points: int = 1_000_000, frames: int = 54_000) -> list[dict]:
         growing.voxelize(pose[frame : frame + 1])
     streamed = (last - 1) / (time.thread_time() - begin)
     return [
-        {
-            "name": "voxelize_frames_per_second",
-            "value": value,
-            "unit": unit,
-            "baseline": FPS,
-            "ratio": value / FPS,
-            "goal": 1000.0,
-        }
+        figure("voxelize_frames_per_second", value, unit, FPS, value / FPS, 1000.0)
         for value, unit in ((whole, "frames/s, whole recording"), (streamed, "frames/s, growing map"))
     ]

@@ -15,6 +15,7 @@ import torch
 from scipy.spatial import KDTree
 
 from benchmarks.speed import planted_flat
+from benchmarks.speed.figures import figure
 from wearcap.geometry import rotation
 from wearcap.scene.voxels import VoxelGrid, voxelize
 
@@ -63,14 +64,5 @@ def measure(points: int = 1_000_000, frames: int = 18_000, compared: int = 40) -
         error = float(np.abs(grids[chosen].numpy() - np.stack(theirs)).max())
         if error > 1e-3:
             raise SystemExit(f"error: the grids differ by {error} m ({unit})")
-        figures.append(
-            {
-                "name": "voxelize_vs_brute_force",
-                "value": value,
-                "unit": unit,
-                "baseline": baseline,
-                "ratio": value / baseline,
-                "goal": goal,
-            }
-        )
+        figures.append(figure("voxelize_vs_brute_force", value, unit, baseline, value / baseline, goal))
     return figures

@@ -46,10 +46,15 @@ def test_adams_clock_stops_at_equal_energy_and_says_where_it_never_gets_there():
     stopped = clocks.adam(problem, schedule, 300, target=1.0)
     assert stopped[-1].energy <= 1.001 < stopped[-2].energy
     assert clocks.ours(problem, solver, 1.0).energy <= 1.001
-    reached = clocks.figure("bowl", problem, 1.0, solver, schedule, 300, 1, None)
+
+    def figure(schedule: clocks.Schedule, budget: int) -> dict:
+        pair = clocks.ours(problem, solver, 1.0), clocks.adam(problem, schedule, budget, 1.0)[-1]
+        return clocks.compared("bowl", [pair], 1.0, schedule, None)
+
+    reached = figure(schedule, 300)
     assert "lower bound" not in reached["unit"]
     assert reached["ratio"] == pytest.approx(reached["baseline"] / reached["value"])
-    slow = clocks.figure("bowl", problem, 1.0, solver, clocks.Schedule(1e-5, None), 10, 1, None)
+    slow = figure(clocks.Schedule(1e-5, None), 10)
     assert "Adam does not reach 1.0000: its time is a lower bound" in slow["unit"]
 
 
