@@ -242,22 +242,16 @@ def person_cloud(
 
     `depth_mm`: one image per view. Empty where nobody is in sight. Raises WearcapError when the numbers differ.
     """
-    merged = _merged(depth_mm, views, [view.background.foreground(image) for image, view in zip(depth_mm, views)])
-    return merged[largest_cluster(merged)]
-
-
-def _merged(
-    depth_mm: Sequence[np.ndarray], views: Sequence[DepthView], masks: Sequence[np.ndarray]
-) -> Float[np.ndarray, "point 3"]:
-    """Points in the scene (m) of the masked pixels of all cameras."""
     if len(depth_mm) != len(views):
         raise WearcapError(f"{len(depth_mm)} depth images for {len(views)} cameras", expected="one for each")
     parts = []
-    for image, view, mask in zip(depth_mm, views, masks):
+    for image, view in zip(depth_mm, views):
+        mask = view.background.foreground(image)
         points = torch.from_numpy(_unproject_depth(image / np.float32(1000), mask, view.camera))
         pose = view.T_world_cam.to(torch.float64)
         parts.append((points @ pose.R.T + pose.t).numpy())
-    return np.concatenate(parts)
+    merged = np.concatenate(parts)
+    return merged[largest_cluster(merged)]
 
 
 def _flying(depth_m: np.ndarray) -> np.ndarray:

@@ -7,7 +7,6 @@ diffusion, as in the paper; where there are trainings with other seeds (RUNS/NAM
 """
 
 import argparse
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
@@ -44,17 +43,17 @@ from benchmarks.tables.tabling import (
     UPSIDE_DOWN,
     add_people,
     budget,
-    finite,
     left_out,
+    plain,
     recordings_of,
     split_of,
     titled,
     training_of,
     trainings_of,
     upright,
+    write_tree,
 )
 from wearcap.cli.conf import compose
-from wearcap.files import write_text
 from wearcap.metrics.table import TRUTH, Scores, Summary, aggregate, markdown_table, truth_row
 from wearcap.recording import RecordingStore
 from wearcap.runtime.system import CaptureInput
@@ -236,9 +235,9 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
             title, columns, scores = make(options, progress)
             ours = next((row for row in scores.values() if f"{TRUTH}physicality" in row), {})
             scores = scores | {"truth": truth_row(ours)}
-            found[title] = {method: {k: vars(v) for k, v in row.items()} for method, row in scores.items()}
+            found[title] = plain(scores)
             console.print(f"\n{title}\n\n{markdown_table(scores, columns)}", markup=False, soft_wrap=True)
-            write_text(path, json.dumps(finite({"about": about, "tables": found}), indent=1) + "\n")
+            write_tree(path, {"about": about, "tables": found})
     return path
 
 

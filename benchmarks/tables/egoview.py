@@ -1,7 +1,6 @@
 """Our image encoder on held-out people and places: whether hands are in the picture, and where."""
 
 import argparse
-import json
 from pathlib import Path
 
 import torch
@@ -9,9 +8,8 @@ from rich.console import Console
 from rich.progress import track
 from torch.utils.data import DataLoader
 
-from benchmarks.tables.tabling import finite, new_table
+from benchmarks.tables.tabling import new_table, write_tree
 from wearcap.data.windows import Source
-from wearcap.files import write_text
 from wearcap.models.checkpoint import load_trained
 from wearcap.systems.hmd2.egoview_frames import POINTS, EgoFrame, EgoFrames
 from wearcap.systems.hmd2.egoview_training import EgoView, view_scores
@@ -54,8 +52,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
         table.add_row(Path(root).name, *(f"{rows[root][key]:.{1 if 'cm' in key else 3}f}" for key in COLUMNS))
     Console(width=120).print(table)
     path = options.output / "egoview.json"
-    write_text(path, json.dumps(finite({"about": about, "datasets": rows}), indent=1) + "\n")
-    return path
+    return write_tree(path, {"about": about, "datasets": rows})
 
 
 def _scores(system: EgoView, frames: EgoFrames) -> dict[str, float]:

@@ -6,10 +6,8 @@ out, which is printed. Checkpoints come by name (checkpoints/) or path.
 """
 
 import argparse
-import json
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
 
 from joblib import Parallel, delayed
 from rich.console import Console
@@ -38,17 +36,17 @@ from benchmarks.tables.tabling import (
     TRAINING,
     add_people,
     budget,
-    finite,
     is_trained,
     left_out,
+    plain,
     split_of,
     titled,
     trainings_of,
+    write_tree,
 )
 from benchmarks.tables.wearables import WEARABLES
 from wearcap.errors import WearcapError
 from wearcap.evaluation.breakdown import extremes
-from wearcap.files import write_text
 from wearcap.metrics.table import P95, Scores, Summary, rich_lines, truth_row
 from wearcap.models.checkpoint import checkpoint_file
 from wearcap.recording import RecordingStore
@@ -216,11 +214,10 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     tree = {
         "about": facts,
         "tables": {title: [_short(asdict(result)) for result in rows] for title, rows in found.items()},
-        "percentiles": _plain(tail),
-        "scenarios": {title: _plain(rows) for title, rows in scenarios.items()},
+        "percentiles": plain(tail),
+        "scenarios": {title: plain(rows) for title, rows in scenarios.items()},
     }
-    write_text(path, json.dumps(finite(tree), indent=1) + "\n")
-    return path
+    return write_tree(path, tree)
 
 
 def _strangers(options: argparse.Namespace, about: dict[str, str]) -> Path:
@@ -247,9 +244,9 @@ def _strangers(options: argparse.Namespace, about: dict[str, str]) -> Path:
         found = [result for result in results if result is not None]
         console.print(_table(title, found))
         scores = {result.method: result.scores for result in found}
-        tables[title] = _plain(scores | {"truth": truth_row(scores[ours[0].name])})
+        tables[title] = plain(scores | {"truth": truth_row(scores[ours[0].name])})
         facts = {**about, "split": options.split, "sensors": options.sensors, "seeds": len(seeds)}
-        write_text(path, json.dumps(finite({"about": facts, "tables": tables}), indent=1) + "\n")
+        write_tree(path, {"about": facts, "tables": tables})
     return path
 
 
@@ -260,11 +257,6 @@ def _short(result: Tree) -> Tree:
         for name, scores in result["activities"].items()
     }
     return result | {"activities": activities}
-
-
-def _plain(scores: Scores) -> dict[str, dict[str, Any]]:
-    """Summaries as JSON."""
-    return {method: {name: asdict(value) for name, value in row.items()} for method, row in scores.items()}
 
 
 def _sweeps(options: argparse.Namespace, case: Case) -> list[tuple[str, Case, list[Method]]]:

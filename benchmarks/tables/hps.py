@@ -4,7 +4,6 @@ Sessions, scans and the rig's clouds are kept in OUTPUT/hps/cache.
 """
 
 import argparse
-import json
 import math
 from dataclasses import replace
 from itertools import pairwise
@@ -31,8 +30,7 @@ from benchmarks.tables.result_pages import (
     ranged,
     text,
 )
-from benchmarks.tables.tabling import cell, finite, new_table, summarize
-from wearcap.files import write_text
+from benchmarks.tables.tabling import cell, new_table, summarize, write_tree
 from wearsim.recordings.hps import HpsConfig, Protocol
 from wearsim.recordings.localization_noise import LocalizationNoise
 from wearsim.sensors.suit import SUITS, SuitNoise
@@ -102,8 +100,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     show(_order_line(tree["order_beyond_start"]))
     tree["seeds"] = runs
     path = options.output / f"{name}.json"
-    write_text(path, json.dumps(finite(tree), indent=1, allow_nan=False) + "\n")
-    return path
+    return write_tree(path, tree)
 
 
 def _all_tables(tree: dict[str, Any]) -> list[Table]:

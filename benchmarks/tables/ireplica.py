@@ -7,7 +7,6 @@ the page takes ideal, typical and poor.
 """
 
 import argparse
-import json
 import math
 import sys
 from pathlib import Path
@@ -33,9 +32,8 @@ from benchmarks.tables.result_pages import (
     text,
     times,
 )
-from benchmarks.tables.tabling import cell, finite, new_table, summarize
+from benchmarks.tables.tabling import cell, new_table, summarize, write_tree
 from wearcap.errors import WearcapError
-from wearcap.files import write_text
 from wearcap.metrics.detection import mean_detection_scores
 from wearcap.recording import RecordingStore
 from wearcap.scene.objects import CONTACT_CLASSES
@@ -134,8 +132,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     )
     _show(tree)
     path = options.output / (f"ireplica_{preset}.json" if sensors else "ireplica.json")
-    write_text(path, json.dumps(finite(tree), indent=1, allow_nan=False) + "\n")
-    return path
+    return write_tree(path, tree)
 
 
 HEADLINE = {

@@ -8,7 +8,6 @@ table gives their mean and spread. A row without its checkpoint is left out, and
 """
 
 import argparse
-import json
 from collections import defaultdict
 from functools import partial
 from itertools import product
@@ -42,17 +41,17 @@ from benchmarks.tables.tabling import (
     TRAINING,
     add_people,
     budget,
-    finite,
     left_out,
+    plain,
     recordings_of,
     split_of,
     titled,
     training_of,
     trainings_of,
     upright,
+    write_tree,
 )
 from benchmarks.tables.wearables import WEARABLES
-from wearcap.files import write_text
 from wearcap.metrics.table import Row, Scores, Summary, aggregate, markdown_table, truth_row
 from wearcap.models.checkpoint import checkpoint_file
 from wearcap.recording import RecordingStore
@@ -186,12 +185,11 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
         makers = [PARTS[part] for part in options.parts] + [partial(_strangers, root) for root in strangers]
         for make in makers:
             title, columns, scores = make(options, progress)
-            found[title] = {method: {k: vars(v) for k, v in row.items()} for method, row in scores.items()}
+            found[title] = plain(scores)
             console.print(f"\n{title}\n\n{markdown_table(scores, columns)}", markup=False, soft_wrap=True)
     path = options.output / f"mocap_every{'' if options.sensors == 'typical' else f'_{options.sensors}'}.json"
     facts = {**about, "sensors": options.sensors}
-    write_text(path, json.dumps(finite({"about": facts, "tables": found}), indent=1) + "\n")
-    return path
+    return write_tree(path, {"about": facts, "tables": found})
 
 
 LABELS = {

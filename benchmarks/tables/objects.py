@@ -7,7 +7,6 @@ its half extents in metres, which knows the size, whereas the encoder does not. 
 """
 
 import argparse
-import json
 import time
 from pathlib import Path
 
@@ -17,8 +16,7 @@ from rich.console import Console
 from torch import Tensor
 from torch.nn import functional as F
 
-from benchmarks.tables.tabling import finite, new_table
-from wearcap.files import write_text
+from benchmarks.tables.tabling import new_table, write_tree
 from wearcap.models.checkpoint import load_trained
 from wearcap.models.point_encoder import bounds, to_unit_sphere
 from wearcap.systems.echo.object_training import CloudAugmentation, ObjectEncoding
@@ -107,5 +105,4 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
         "confused": confused,
         "ms_per_cloud": speed,
     }
-    write_text(path, json.dumps(finite(content), indent=1) + "\n")
-    return path
+    return write_tree(path, content)

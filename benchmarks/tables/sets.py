@@ -6,9 +6,8 @@ only captured. Trainings that are finished are taken from OUTPUT/runs.
 """
 
 import argparse
-import json
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,12 +15,11 @@ import torch
 from joblib import Parallel, cpu_count, delayed
 from rich.console import Console
 
-from benchmarks.tables.tabling import finite, new_table, split_of
+from benchmarks.tables.tabling import new_table, plain, split_of, write_tree
 from wearcap.cli import train
 from wearcap.cli.conf import compose, load_pipeline
 from wearcap.errors import WearcapError
 from wearcap.evaluation.evaluate import evaluate
-from wearcap.files import write_text
 from wearcap.metrics.table import TRUTH, Row, Summary, aggregate
 from wearcap.recording import RecordingStore
 
@@ -112,16 +110,9 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
         name: {split: _minutes(store, split) for split in ("train", "val")} for name, (store, _) in people.items()
     }
     content = {"steps": trainings[0].steps, "weights": dict(_pairs(options.weights)), "minutes": minutes}
-    plain = {
-        row: {name: {metric: asdict(value) for metric, value in each.items()} for name, each in by_set.items()}
-        for row, by_set in scores.items()
-    }
+    found = {row: plain(by_set) for row, by_set in scores.items()}
     path = options.output / "sets.json"
-    write_text(
-        path,
-        json.dumps(finite({"about": about | {"quick": str(options.quick)}, **content, "rows": plain}), indent=1) + "\n",
-    )
-    return path
+    return write_tree(path, {"about": about | {"quick": str(options.quick)}, **content, "rows": found})
 
 
 def _pairs(given: list[str]) -> list[tuple[str, str]]:

@@ -1,7 +1,6 @@
 """Errors of simulated sensors, measured against the truth that they were drawn from, beside what papers and vendors say."""
 
 import argparse
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,8 +9,7 @@ from rich.table import Table
 
 from benchmarks.tables.result_pages import Grid, Page, Tree, Trees, commands, grid_of, text
 from benchmarks.tables.simulated_sensors import Sensing, sensors
-from benchmarks.tables.tabling import finite
-from wearcap.files import write_text
+from benchmarks.tables.tabling import write_tree
 from wearsim.recordings.hps import HpsConfig, Protocol
 
 WIDTH = 220
@@ -35,8 +33,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     found = sensors(Sensing(HpsConfig(protocol=protocol), sessions, draws, options.interactions))
     Console(width=WIDTH).print(_table(found))
     path = options.output / "simulation.json"
-    write_text(path, json.dumps(finite({"about": about, "tables": {"sensors": found}}), indent=1) + "\n")
-    return path
+    return write_tree(path, {"about": about, "tables": {"sensors": found}})
 
 
 LITERATURE = Path(__file__).with_name("sensor_literature.tsv")

@@ -4,12 +4,14 @@ import argparse
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from rich.table import Table
 
 from wearcap.errors import WearcapError
+from wearcap.files import write_text
 from wearcap.metrics.table import Row, Scores, Summary, aggregate
 from wearcap.models.checkpoint import read_checkpoint
 from wearcap.recording import RecordingStore
@@ -175,10 +177,21 @@ def upright(name: str, scored: Sequence[Row]) -> Scores:
     return {f"{name}, without {', '.join(UPSIDE_DOWN)}": aggregate(others)} if len(others) < len(scored) else {}
 
 
-def finite(tree: Any) -> Any:
+def plain(scores: Scores) -> dict[str, dict[str, Any]]:
+    """Summaries as JSON."""
+    return {row: {metric: asdict(value) for metric, value in found.items()} for row, found in scores.items()}
+
+
+def write_tree(path: Path, tree: dict[str, Any]) -> Path:
+    """Write a table's figures as JSON; returns the file."""
+    write_text(path, json.dumps(_finite(tree), indent=1, allow_nan=False) + "\n")
+    return path
+
+
+def _finite(tree: Any) -> Any:
     """What is not finite becomes null."""
     if isinstance(tree, dict):
-        return {key: finite(value) for key, value in tree.items()}
+        return {key: _finite(value) for key, value in tree.items()}
     if isinstance(tree, list | tuple):
-        return [finite(value) for value in tree]
+        return [_finite(value) for value in tree]
     return None if isinstance(tree, float) and not math.isfinite(tree) else tree

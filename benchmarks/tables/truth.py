@@ -6,13 +6,12 @@ Of each set (number of people) the median over persons, and in brackets the wors
 """
 
 import argparse
-import json
 from math import isfinite
 from pathlib import Path
 from statistics import median
 
+from benchmarks.tables.tabling import write_tree
 from wearcap.doctor.truth import FIGURES, Figure, people
-from wearcap.files import write_text
 from wearcap.recording import RecordingStore
 
 People = dict[str, dict[str, float]]
@@ -39,8 +38,7 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
         rows = {f"{name} ({len(persons)})": _of_set(persons) for name, persons in sets.items() if persons}
     print(markdown(rows))
     path = options.output / "truth.json"
-    write_text(path, json.dumps({"about": about, "table": rows, "people": sets}, indent=1) + "\n")
-    return path
+    return write_tree(path, {"about": about, "table": rows, "people": sets})
 
 
 def markdown(rows: dict[str, list[str]]) -> str:

@@ -8,7 +8,6 @@ Speed: grids per second of one core. Writes a picture of slices, too.
 """
 
 import argparse
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,10 +17,9 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from benchmarks.tables.tabling import finite, new_table
+from benchmarks.tables.tabling import new_table, write_tree
 from wearcap.data.surroundings import PlaceCodes
 from wearcap.data.windows import Source, Windows
-from wearcap.files import write_text
 from wearcap.metrics.detection import distance_mae_cm, occupancy_iou, occupied_distance_mae_cm
 from wearcap.scene.voxels import VoxelGrid
 from wearcap.systems.hmd2.voxel_autoencoder_training import PlaceContent
@@ -151,5 +149,4 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
     save_png(options.output / "voxels_slices.png", picture.numpy())
     path = options.output / "voxels.json"
     content = about | {"test_grids": len(test), "picture_rows": list(pictured), "rows": rows}
-    write_text(path, json.dumps(finite(content), indent=1) + "\n")
-    return path
+    return write_tree(path, content)
