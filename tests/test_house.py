@@ -182,8 +182,10 @@ def test_a_lightning_module_stays_small():
 
 
 @pytest.mark.parametrize("name", ["train.py", "evaluate.py", "capture.py", "export.py"])
-def test_entry_scripts_are_short(name):
-    assert len((ROOT / name).read_text(encoding="utf-8").splitlines()) <= MAX_ENTRY
+def test_entry_scripts_are_short_and_show_their_application(name):
+    text = (ROOT / name).read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= MAX_ENTRY
+    assert f'@hydra.main(version_base="1.3", config_path="conf", config_name="{name[:-3]}")' in text
 
 
 def test_nothing_unsafe_is_read():

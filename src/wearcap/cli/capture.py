@@ -3,6 +3,7 @@
 import json
 import math
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from wearcap.body.model import BodyModel
 from wearcap.body.skeleton import xsens23
 from wearcap.body.smpl_body import betas_of, smpl_body, template_pelvis
 from wearcap.cli.capture_all import capture_all, is_dataset
-from wearcap.cli.conf import hydra_main, load_pipeline, with_pipeline, with_pipeline_of_content
+from wearcap.cli.conf import hydra_application, load_pipeline, run_application, with_pipeline, with_pipeline_of_content
 from wearcap.cli.stated import stated
 from wearcap.doctor import require_sound
 from wearcap.doctor.consistency import SCAN_FILE
@@ -160,6 +161,8 @@ def _live(system: System, config: DictConfig, folder: Path) -> None:
     show(f"motion: {folder}")
 
 
-def main(arguments: list[str]) -> None:
+def main(arguments: list[str], application: Callable[[], Any] | None = None) -> None:
     arguments = ["live=true" if argument == "--live" else argument for argument in arguments]
-    hydra_main("capture", run, with_pipeline_of_content(with_pipeline(arguments)))
+    run_application(
+        "capture", application or hydra_application("capture", run), with_pipeline_of_content(with_pipeline(arguments))
+    )

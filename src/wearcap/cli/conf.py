@@ -132,30 +132,38 @@ def readable(argument: str) -> str:
 
 
 def hydra_main(config_name: str, task: Callable[[DictConfig], Any], arguments: list[str]) -> None:
-    """Run `task(config)` as a Hydra application with its command line: overrides, `-m`, `--cfg job`, `--help` …
+    """Run `task(config)` as a Hydra application of `conf/` (see `run_application`)."""
+    run_application(config_name, hydra_application(config_name, task), arguments)
+
+
+def hydra_application(config_name: str, task: Callable[[DictConfig], Any]) -> Callable[[], Any]:
+    """What `@hydra.main` with `@guarded` makes of a task, with a config of `conf/`."""
+    return hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)(guarded(task))
+
+
+def run_application(config_name: str, application: Callable[[], Any], arguments: list[str]) -> None:
+    """Run what `hydra.main` made of a `guarded` task with its command line: overrides, `-m`, `--cfg job`, `--help` …
 
     A WearcapError of the task is raised unchanged; a config error is raised as a WearcapError.
     """
-    guarded = _Guarded(task)
-    application = hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)
     with explained(config_name, arguments):
         # Hydra reads sys.argv, and with HYDRA_FULL_ERROR it raises errors instead of exiting.
         before, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
         sys.argv = [sys.argv[0], *map(readable, arguments)]
         os.environ["HYDRA_FULL_ERROR"] = "1"
         try:
-            application(guarded)()
+            application()
         finally:
             sys.argv = before
             if full_error is None:
                 os.environ.pop("HYDRA_FULL_ERROR", None)
             else:
                 os.environ["HYDRA_FULL_ERROR"] = full_error
-        if guarded.refused is not None:
-            raise guarded.refused
+        if (refused := application.__wrapped__.refused) is not None:  # pyright: ignore[reportFunctionMemberAccess]
+            raise refused
 
 
-class _Guarded:
+class guarded:
     """A task that stores its WearcapError for later, so that Hydra does not print its own message.
 
     It is a class because the joblib launcher has to pickle it. In a multirun the error passes through Hydra, which

@@ -10,7 +10,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from rich import get_console
 from rich import print as show
 
-from wearcap.cli.conf import hydra_main, load_systems, parallel_of, trained_on, with_pipeline
+from wearcap.cli.conf import hydra_application, load_systems, parallel_of, run_application, trained_on, with_pipeline
 from wearcap.cli.stated import stated
 from wearcap.errors import WearcapError
 from wearcap.evaluation.baselines import BASELINES
@@ -269,5 +269,5 @@ def _summaries(rows: list[Row], realism: Realism | None, method: str) -> dict[st
     return aggregate(rows) | realism.scores(method)
 
 
-def main(arguments: list[str]) -> None:
-    hydra_main("evaluate", run, with_pipeline(arguments))
+def main(arguments: list[str], application: Callable[[], Any] | None = None) -> None:
+    run_application("evaluate", application or hydra_application("evaluate", run), with_pipeline(arguments))

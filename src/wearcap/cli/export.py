@@ -1,9 +1,12 @@
 """`wearcap export`: a checkpoint's network as ONNX or torch.export, checked against eager, or the checkpoint for sharing."""
 
+from collections.abc import Callable
+from typing import Any
+
 from omegaconf import DictConfig
 from rich import print as show
 
-from wearcap.cli.conf import hydra_main, load_pipeline, with_pipeline
+from wearcap.cli.conf import hydra_application, load_pipeline, run_application, with_pipeline
 from wearcap.export.files import ExportReport, write_exports
 from wearcap.models.checkpoint import load_trained, share_checkpoint
 
@@ -31,5 +34,5 @@ def run(config: DictConfig) -> dict[str, ExportReport]:
     return reports
 
 
-def main(arguments: list[str]) -> None:
-    hydra_main("export", run, with_pipeline(arguments))
+def main(arguments: list[str], application: Callable[[], Any] | None = None) -> None:
+    run_application("export", application or hydra_application("export", run), with_pipeline(arguments))

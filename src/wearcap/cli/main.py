@@ -7,6 +7,8 @@ import re
 import sys
 import traceback
 from argparse import ArgumentParser
+from collections.abc import Callable
+from typing import Any
 
 from wearcap import __version__
 from wearcap.boundary.limits import VARIABLE, gib_bytes
@@ -35,8 +37,11 @@ def usage() -> str:
     return "\n".join(lines)
 
 
-def run_verb(verb: str, arguments: list[str]) -> int:
-    """Run one verb and return the exit code; errors that a user can fix become one message on stderr."""
+def run_verb(verb: str, arguments: list[str], application: Callable[[], Any] | None = None) -> int:
+    """Run one verb and return the exit code; errors that a user can fix become one message on stderr.
+
+    `application` is a script's own of `hydra.main`, with which its verb runs.
+    """
     debug, trust = (bool({f"{key}=true", f"--{key}"} & set(arguments)) for key in ("debug", "trust"))
     own = re.compile(r"(--)?(debug|trust)=(true|false)|--(debug|trust)")  # of every verb
     arguments = [word for word in arguments if not own.fullmatch(word)]
@@ -50,7 +55,7 @@ def run_verb(verb: str, arguments: list[str]) -> int:
         elif (conf_dir() / f"{verb}.yaml").is_file():
             arguments = overrides(verb, arguments)
         with trusting(trust):
-            importlib.import_module(f"wearcap.cli.{module}").main(arguments)
+            importlib.import_module(f"wearcap.cli.{module}").main(arguments, *([application] if application else []))
         return 0
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)

@@ -2,8 +2,10 @@
 
 import logging
 import warnings
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import lightning
 from hydra.utils import instantiate
@@ -14,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich import print as show
 
 from wearcap.cli import evaluate
-from wearcap.cli.conf import compose, explained, hydra_main, trained_on, with_pipeline
+from wearcap.cli.conf import compose, explained, hydra_application, run_application, trained_on, with_pipeline
 from wearcap.data.surroundings import embeddings_of
 from wearcap.errors import WearcapError
 from wearcap.locks import folder_lock
@@ -127,7 +129,7 @@ def _in_own_folder(arguments: list[str]) -> list[str]:
     return arguments if run is None else [*arguments, f"hydra.run.dir='{run}'"]
 
 
-def main(arguments: list[str]) -> None:
+def main(arguments: list[str], application: Callable[[], Any] | None = None) -> None:
     with explained("train", arguments):
         arguments = _in_own_folder(arguments)
-    hydra_main("train", train, arguments)
+    run_application("train", application or hydra_application("train", train), arguments)
