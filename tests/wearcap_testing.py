@@ -1,9 +1,7 @@
 """Small recordings for tests, made in milliseconds: a body that sways while it wanders in a circle."""
 
-import importlib
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import torch
 
@@ -30,11 +28,6 @@ def experiments(*kinds: str) -> list[str]:
     root = PROJECT / "conf" / "experiment"
     names = (path.relative_to(root).with_suffix("") for path in root.rglob("*.yaml"))
     return sorted(name.as_posix() for name in names if name.name.startswith(kinds))
-
-
-def benchmark(name: str) -> ModuleType:
-    """A module of `benchmarks/`, by its room and name."""
-    return importlib.import_module(f"benchmarks.{name}")
 
 
 def swaying_motion(frames: int, seed: int = 0, fps: float = 60.0, skeleton: Skeleton | None = None) -> Motion:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.tables import seen_flat
+from benchmarks.tables import simulated_detections as detecting
 from wearcap.geometry.rotation import about_axis
 from wearcap.recording import Recording
-from wearcap_testing import benchmark
 from wearsim.recordings.interaction_session import InteractionConfig, simulate_interactions
 
-seen_flat, detecting = map(benchmark, ("tables.seen_flat", "tables.simulated_detections"))
 PERFECT = detecting.Detector(found=1.0, side=1.0, state=1.0, apart=1.0, false_hands=0.0, whole=0.01)
 EVERY = 15
 

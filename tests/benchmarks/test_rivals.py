@@ -1,19 +1,23 @@
 """Rivals are trained at the best of a few rates, go on after a kill, and their tables say so."""
 
 import argparse
+import importlib
 import json
 from pathlib import Path
 
 import pytest
 from rich.progress import Progress
 
+from benchmarks.rivals import trainings as rivals
+from benchmarks.tables import echo as tables
+from benchmarks.tables import hmd2_runs as runs
+from benchmarks.tables import tabling
 from wearcap.cli.conf import compose
 from wearcap.errors import WearcapError
 from wearcap.metrics.table import Row, Summary
 from wearcap.models.checkpoint import read_checkpoint
-from wearcap_testing import benchmark, small_dataset
+from wearcap_testing import small_dataset
 
-rivals, tabling = map(benchmark, ("rivals.trainings", "tables.tabling"))
 NAME, STEP = "motion_diffusion_head", 8 * 240
 SMALL = [f"model.net.{name}" for name in ("width=32", "layers=1", "heads=4", "feedforward=32")]
 QUIET = [
@@ -120,7 +124,7 @@ def test_another_budget_and_no_finite_loss_are_refused(datasets, tmp_path, monke
 
 @pytest.mark.parametrize("system", rivals.SYSTEMS)
 def test_budgets_scale_with_what_is_asked_for(system):
-    table = benchmark(f"tables.{system}")
+    table = importlib.import_module(f"benchmarks.tables.{system}")
     ours = compose("train", table.training(table.RUNS[0])).data.loading.batch_size
     for run in table.RUNS:
         small, large = (compose("train", table.training(run, frames)) for frames in (table.BUDGET, 10 * table.BUDGET))
@@ -159,7 +163,6 @@ def two_trainings(tmp_path) -> tuple[str, str]:
 
 
 def test_a_row_of_hmd2_is_the_mean_of_trainings_that_differ_in_the_seed(two_trainings, tmp_path, monkeypatch):
-    runs = benchmark("tables.hmd2_runs")
     errors = dict(zip(two_trainings, (3.0, 5.0)))
 
     def evaluate(path, store, names, seeds, **_):
@@ -176,7 +179,6 @@ def test_a_row_of_hmd2_is_the_mean_of_trainings_that_differ_in_the_seed(two_trai
 
 
 def test_a_row_of_echo_captures_each_training_with_a_seed_of_its_own(two_trainings, tmp_path, monkeypatch):
-    tables = benchmark("tables.echo")
     options = argparse.Namespace(runs=tmp_path, leave=(), quick=False, seeds=4, items=2, pipeline=[])
     made = tables._trained({"ours": (NAME, "pipeline=echo")}, options, Progress())
     monkeypatch.setattr(

@@ -1,6 +1,7 @@
 """The table of what each set of motion brings: who learns from what, and what is reported of whom."""
 
 import argparse
+import importlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from normal_walk import walk
 from wearcap.errors import WearcapError
 from wearcap.models.checkpoint import read_checkpoint
 from wearcap.recording import RecordingStore
-from wearcap_testing import benchmark, recording_of, small_dataset
+from wearcap_testing import recording_of, small_dataset
 
 SMALL = [
     *(f"model.net.{name}" for name in ("width=32", "layers=1", "heads=4", "feedforward=32")),
@@ -22,7 +23,7 @@ SMALL = [
 
 @pytest.fixture
 def table():
-    return benchmark("tables.sets")
+    return importlib.import_module("benchmarks.tables.sets")
 
 
 def given(table, tmp_path: Path, *more: str) -> argparse.Namespace:

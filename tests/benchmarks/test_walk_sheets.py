@@ -1,5 +1,6 @@
 """A recorded walk as a sheet: cycles seen from the side, and figures that are those of the body and the floor."""
 
+import importlib
 import json
 import sys
 from dataclasses import replace
@@ -17,14 +18,14 @@ from wearcap.geometry.rotation import about_axis
 from wearcap.metrics.gait import STANCE, normal_knee_deg
 from wearcap.recording import PointCloud, RecordingStore
 from wearcap.recording.motion import Motion
-from wearcap_testing import benchmark, recording_of
+from wearcap_testing import recording_of
 
 FLOOR_M = 0.4
 
 
 @pytest.fixture
 def sheets():
-    return benchmark("pictures.contact_sheets")
+    return importlib.import_module("benchmarks.pictures.contact_sheets")
 
 
 @pytest.fixture

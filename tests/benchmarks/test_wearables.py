@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.tables import wearables
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording import Recording
 from wearcap.recording.recording import FloorTrack, PointCloud
 from wearcap.sensors.simulated import SlamNoise, head_stream, slam_poses
-from wearcap_testing import benchmark, swaying_motion
+from wearcap_testing import swaying_motion
 
-wearables = benchmark("tables.wearables")
 WEARABLES, WearableNoise = wearables.WEARABLES, wearables.WearableNoise
 
 SEAT = torch.tensor([0.09, 0.0, 0.08])

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
+from benchmarks.rivals import hps_scores
 from wearcap.errors import WearcapError
 from wearcap.metrics.surface import Chamfer, chamfer
-from wearcap_testing import benchmark
 
-mean_chamfer = benchmark("rivals.hps_scores").mean_chamfer
+mean_chamfer = hps_scores.mean_chamfer
 
 
 def square(side: float, cells: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.rivals import echo_baselines as baselines
+from benchmarks.tables import echo_rows as rows
 from carried_box import GRIP, WINDOW, boxes, carried_dataset, carrying, drawn_echo, scenario_of, small_features
 from wearcap.data.windows import Source, Windows
 from wearcap.errors import WearcapError
@@ -23,9 +25,7 @@ from wearcap.systems.echo.observations import batch_item_of
 from wearcap.systems.echo.scores import score_echo, truth_of
 from wearcap.systems.echo.training_windows import EchoContent
 from wearcap.tracking.head_path import head_path
-from wearcap_testing import benchmark
 
-baselines, rows = map(benchmark, ("echo_baselines", "echo_rows"))
 RECORDING = carrying(1.5)
 TIMES = RECORDING.motion.timestamps
 

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.rivals import hps_scores as hps
+from benchmarks.tables import hps_outages as outages
 from wearcap.body.anny_body import anny_body
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
 from wearcap.errors import WearcapError
@@ -14,10 +16,8 @@ from wearcap.metrics.position import joint_error_cm
 from wearcap.recording import Motion, Recording
 from wearcap.recording.recording import ContactTrack, Intervals
 from wearcap.scene.scan import Scan
-from wearcap_testing import benchmark
 
 SECONDS, FPS, SPEED = 2.0, 60.0, 0.5
-outages, hps = map(benchmark, ("hps_outages", "hps_scores"))
 
 
 def gliding(speed: float = SPEED) -> Motion:

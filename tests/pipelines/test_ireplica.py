@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.rivals import ireplica_baselines as baselines
 from wearcap.body.kinematics import site_positions
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
@@ -29,9 +30,7 @@ from wearcap.systems.ireplica.scores import score_interactions
 from wearcap.systems.ireplica.snapping import BendCorrection, HandSnapping, HingeFit, SnapCorrection, fit_about_hinge
 from wearcap.systems.ireplica.trajectory import Bending, bend
 from wearcap.systems.ireplica.trajectory_banded import bend_banded
-from wearcap_testing import benchmark
 
-baselines = benchmark("rivals.ireplica_baselines")
 FPS, FRAMES = 60.0, 360
 TAKE, LEAVE = 60, 240
 CUBE = np.array([[x, y, z] for x in (-0.2, 0.2) for y in (-0.2, 0.2) for z in (-0.2, 0.2)], np.float32)

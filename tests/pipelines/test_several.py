@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.tables import two_wearers
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.recording import Motion, Recording, RecordingStore
@@ -13,14 +14,13 @@ from wearcap.systems.mocap_every.energy import LatentSolver, LatentWeights
 from wearcap.systems.mocap_every.manifold import MotionManifold
 from wearcap.systems.mocap_every.visual_cues import View, VisualCues, capture_session
 from wearcap.tracking.anchor import anchored_to_head
-from wearcap_testing import benchmark
 from wearsim.recordings.simulate import SimulationConfig
 
 
 @pytest.fixture(scope="module")
 def pair() -> tuple[Recording, Recording]:
     config = SimulationConfig(duration_s=3.0, fps=30.0, points=False, suit=None, world="flat")
-    return benchmark("tables.two_wearers").simulate_two_wearers(config, "talk", "val", 3, distance_m=2.5)
+    return two_wearers.simulate_two_wearers(config, "talk", "val", 3, distance_m=2.5)
 
 
 class AnyMotion(MotionManifold):

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.tables import depth_rig as rig
+from benchmarks.tables import simulated_depth_rig as simulated
 from wearcap.body.anny_body import anny_body
 from wearcap.body.kinematics import forward_kinematics
 from wearcap.body.skeleton import xsens23
@@ -15,10 +17,8 @@ from wearcap.geometry.camera import Camera
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.rigid import Rigid
 from wearcap.metrics.surface import chamfer
-from wearcap_testing import benchmark
 from wearsim.places.builder import WorldBuilder
 
-rig = benchmark("tables.depth_rig")
 Background = rig.Background
 DepthView = rig.DepthView
 _unproject_depth = rig._unproject_depth
@@ -26,7 +26,6 @@ _visible_points = rig._visible_points
 largest_cluster = rig.largest_cluster
 person_cloud = rig.person_cloud
 
-simulated = benchmark("tables.simulated_depth_rig")
 KINECT = simulated.KINECT
 SimulatedRig = simulated.SimulatedRig
 approximate = simulated.approximate

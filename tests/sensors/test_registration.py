@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.tables import depth_rig as rig
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.io.formats.pcd import read_pcd
-from wearcap_testing import benchmark
 
-rig = benchmark("tables.depth_rig")
 _register = rig._register
 
 

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.tables import mocap_every_several
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.recording import Motion
-from wearcap_testing import benchmark, swaying_motion
+from wearcap_testing import swaying_motion
 from wearsim.sensors.keypoints import ACTION_CAMERA, action_camera, camera_path, seen_joints
 from wearsim.sensors.slam import R_DEVICE_CAM
 
@@ -99,7 +100,7 @@ def test_a_clock_of_its_own_is_refused(motion):
 
 def test_an_estimated_pose_is_as_wrong_as_asked_and_of_what_is_in_the_picture(motion):
     path = watching(motion, 1.2)
-    seen_pose = benchmark("tables.mocap_every_several").seen_pose
+    seen_pose = mocap_every_several.seen_pose
     exact, seen = seen_pose(motion, path, ACTION_CAMERA, 0.0, 0.0, np.random.default_rng(0))
     off, confidence = seen_pose(motion, path, ACTION_CAMERA, 12.0, 0.2, np.random.default_rng(0))
     assert torch.allclose(exact.R_parent_joint, motion.R_parent_joint[::2][: len(path)], atol=1e-5)

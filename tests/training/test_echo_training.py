@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from benchmarks.tables import echo
+from benchmarks.tables import echo_rows as rows
 from carried_box import WINDOW, carried_dataset, carrying, small_features, small_net
 from wearcap.body.skeleton import xsens23
 from wearcap.cli import capture, evaluate, train
@@ -26,11 +28,11 @@ from wearcap.systems.echo.scores import score_echo
 from wearcap.systems.echo.training import SLOPE, STANDING, EchoDiffusion
 from wearcap.systems.echo.training_windows import EchoContent, EchoWindow
 from wearcap.training import losses
-from wearcap_testing import benchmark, experiments, small_dataset
+from wearcap_testing import experiments, small_dataset
 
 pytestmark = pytest.mark.usefixtures("few_statistics")
 
-RUNS = {name: (f"experiment={name}",) for name in experiments("echo")} | benchmark("tables.echo").TRAININGS
+RUNS = {name: (f"experiment={name}",) for name in experiments("echo")} | echo.TRAININGS
 WEIGHTS = {
     "human": 1.0,
     "object": 1.0,
@@ -338,7 +340,6 @@ def test_a_baseline_learns_in_a_few_steps_and_captures(name, data, people, tmp_p
     train.main(arguments(f"baseline/{name}", data, people, run, *small))
     losses = [float(loss) for loss in losses_of(run).values()]
     assert sum(losses[-5:]) < 0.9 * sum(losses[:5])
-    rows = benchmark("tables.echo_rows")
     method = rows.Method(
         name,
         f"{run}/checkpoints/last.ckpt",

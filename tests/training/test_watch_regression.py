@@ -8,6 +8,7 @@ import torch
 from hydra.utils import instantiate
 from torch import nn
 
+from benchmarks.tables import mocap_every
 from wearcap.body.skeleton import xsens23
 from wearcap.cli import capture, evaluate, train
 from wearcap.cli.conf import compose
@@ -23,11 +24,11 @@ from wearcap.systems.mocap_every.model import Estimate, LastPoseEstimator, MLPEs
 from wearcap.systems.mocap_every.training import WatchRegression
 from wearcap.systems.mocap_every.training_windows import WatchContent
 from wearcap.systems.mocap_every.visual_cues import load_visual_cues
-from wearcap_testing import benchmark, small_dataset
+from wearcap_testing import small_dataset
 
 pytestmark = pytest.mark.usefixtures("few_statistics")
 
-TRAININGS = benchmark("tables.mocap_every").TRAININGS
+TRAININGS = mocap_every.TRAININGS
 SMALL = ["model.net.width=32", "model.net.layers=1", "model.net.heads=4", "model.net.feedforward=32"]
 WEIGHTS = {
     "skate": 0.5,

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.tables import hps_outages
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
@@ -13,7 +14,6 @@ from wearcap.geometry.trajectory import Trajectory, resample
 from wearcap.prepare.engine import check_recording
 from wearcap.recording.serialize import flatten, unflatten
 from wearcap.sensors.claps import detect_claps, detect_claps_audio
-from wearcap_testing import benchmark
 from wearsim.places.site import build_site
 from wearsim.recordings.hps import HpsConfig, Protocol, simulate_hps
 from wearsim.recordings.localization_noise import LocalizationNoise, MapErrors, by_gravity, localize_statistically
@@ -172,7 +172,7 @@ def test_outages_come_where_there_is_little_to_see(long_path):
 
 def test_an_outage_can_be_planted(long_path):
     found = localize_statistically(long_path, LocalizationNoise(lost=(0.0, 0.0)), np.random.default_rng(0))
-    with_outage = benchmark("tables.hps_outages").with_outage
+    with_outage = hps_outages.with_outage
     gone = with_outage(found, 100.0, 30.0)
     inside = (found.timestamps >= 100) & (found.timestamps < 130)
     assert (gone.confidence[inside] == 0).all()

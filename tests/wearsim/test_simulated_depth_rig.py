@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.tables import simulated_depth_rig as simulated
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import capsules, checker_floor
 from wearcap.geometry.rigid import Rigid
-from wearcap_testing import benchmark
 from wearsim.places.world import World
 
-simulated = benchmark("tables.simulated_depth_rig")
 KINECT = simulated.KINECT
 DepthNoise = simulated.DepthNoise
 approximate = simulated.approximate

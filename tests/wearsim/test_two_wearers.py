@@ -3,12 +3,12 @@
 import pytest
 import torch
 
+from benchmarks.tables import two_wearers
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
-from wearcap_testing import benchmark
 from wearsim.recordings.simulate import SimulationConfig
 
-simulate_two_wearers = benchmark("tables.two_wearers").simulate_two_wearers
+simulate_two_wearers = two_wearers.simulate_two_wearers
 CONFIG = SimulationConfig(duration_s=3.0, points=False, suit=None, world="flat")
 
 
