@@ -21,7 +21,6 @@ MODULES = [
     if path.stem != "__init__"
 ]
 KEYS = list(figure("", 0.0, "", 0.0, 0.0, None))
-ONE = {"rates": (1e-2,), "decays": (None,), "repeats": 1}
 SMALLEST: dict[str, dict] = {
     "carried_heads": {"folders": ()},
     "contact_seconds_per_minute": {"seconds": 2.0, "rounds": 1},
@@ -32,11 +31,15 @@ SMALLEST: dict[str, dict] = {
     "hmd2_online_full_fps": {"pushes": 1},
     "hmd2_online_small_fps": {"pushes": 1},
     "hmd2_runner_vs_eager": {"pushes": 1, "sizes": ("small",)},
-    "hps_frames_per_second": {"duration_s": 3.0},
-    "hps_solver_vs_best_adam": {"duration_s": 2.0, "budget": 10, **ONE},
-    "latent_optimisation_vs_best_adam": {"duration_s": 2.0, "budget": 3, **ONE},
+    "latent_optimisation_vs_best_adam": {
+        "duration_s": 2.0,
+        "budget": 3,
+        "rates": (1e-2,),
+        "decays": (None,),
+        "repeats": 1,
+    },
     "mocap_every_offline_fps": {"duration_s": 4.0, "repeats": 1},
-    "mocap_every_online_fps": {"duration_s": 3.0, "repeats": 1},
+    "mocap_every_online_fps": {"duration_s": 2.8, "repeats": 1},
     "splat_mpoints_per_second": {"view": 2000, "whole": 4000, "turns": 1},
     "trajectory_bending_vs_adam": {"duration_s": 10.0, "longest": 10, "repeats": 1},
     "voxelize_frames_per_second": {"points": 2000, "frames": 100},
@@ -46,7 +49,9 @@ SMALLEST: dict[str, dict] = {
 LARGE = {
     "hps_constants": "simulated sessions of 110 m",
     "hps_end_to_end_realtime": "a filmed session and its map",
+    "hps_frames_per_second": "a simulated walk on a scanned floor",
     "hps_online_recovery": "simulated sessions of 130 m",
+    "hps_solver_vs_best_adam": "a simulated walk on a scanned floor",
     "ireplica_realtime_factor": "a prepared data set",
     "localization_frames_per_second": "a map of 504 pictures",
     "one_frame_contact": "simulated households, two minutes each",
