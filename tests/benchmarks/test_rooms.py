@@ -30,7 +30,6 @@ SMALLEST: dict[str, dict] = {
     "faults": {"kills": 0},
     "hmd2_online_full_fps": {"pushes": 1},
     "hmd2_online_small_fps": {"pushes": 1},
-    "hmd2_runner_vs_eager": {"pushes": 1, "sizes": ("small",)},
     "latent_optimisation_vs_best_adam": {
         "duration_s": 2.0,
         "budget": 3,
@@ -47,6 +46,7 @@ SMALLEST: dict[str, dict] = {
 }
 """Arguments of each benchmark that is small in seconds."""
 LARGE = {
+    "hmd2_runner_vs_eager": "five streams side by side, of up to twenty steps",
     "hps_constants": "simulated sessions of 110 m",
     "hps_end_to_end_realtime": "a filmed session and its map",
     "hps_frames_per_second": "a simulated walk on a scanned floor",
