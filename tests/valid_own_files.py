@@ -42,7 +42,7 @@ from wearcap.reading import examine  # noqa: E402
 from wearcap.reading.any_file import read  # noqa: E402
 from wearcap.recording import PointCloud, Recording, RecordingStore  # noqa: E402
 from wearcap.recording.store import RecordingFile, save_recording  # noqa: E402
-from wearcap.runtime.stages import StageCache  # noqa: E402
+from wearcap.runtime.stages import Stage, StageCache  # noqa: E402
 from wearcap.systems.ireplica.contact_prediction import ContactDetector  # noqa: E402
 from wearcap.systems.ireplica.contact_sequence import ContactSequence  # noqa: E402
 from wearcap.systems.ireplica.export import exports  # noqa: E402
@@ -215,7 +215,7 @@ OWN: dict[str, Reader] = {
     "visual_map": made("map.safetensors", lambda path: test_doctor_scene.small_map(3, 5).save(path), VisualMap.load),
     "exported_onnx": Reader(_exported, _read_exported),
     "training_run": Reader(_run, _read_run),
-    "stage_cache": Reader(_stage, lambda folder: StageCache(folder).read("poses", "ab")),
+    "stage_cache": Reader(_stage, lambda folder: StageCache(folder).read(Stage("poses", dict, list), "ab")),
     "live_setup": made(
         "s.json", lambda path: write_setup(Setup(xsens23(), {"head": head_seat()}, 0.1), path), read_setup
     ),

@@ -46,6 +46,7 @@ SMALLEST: dict[str, dict] = {
 }
 """Arguments of each benchmark that is small in seconds."""
 LARGE = {
+    "hmd2_train_mfu": "a CUDA device",
     "hmd2_runner_vs_eager": "five streams side by side, of up to twenty steps",
     "hps_constants": "simulated sessions of 110 m",
     "hps_end_to_end_realtime": "a filmed session and its map",

@@ -2,7 +2,6 @@
 
 import importlib
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -52,8 +51,7 @@ def recorded(walker, tmp_path) -> Path:
 def test_a_walk_is_drawn_and_measured(sheets, walker, recorded, tmp_path, monkeypatch, capsys):
     seen = []
     monkeypatch.setattr(sheets, "load_pipeline", lambda *_: lambda source: seen.append(source.recording) or walker)
-    monkeypatch.setattr(sys, "argv", ["contact_sheets.py", "hmd2", "--walk", str(recorded), "--output", str(tmp_path)])
-    sheets.main()
+    sheets.main(["hmd2", "--walk", str(recorded), "--output", str(tmp_path)])
     figures = json.loads((tmp_path / "hmd2_somebody.json").read_text())
     assert json.loads(capsys.readouterr().out) == figures
     assert seen[0].motion is None
