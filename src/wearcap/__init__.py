@@ -1,6 +1,6 @@
 """Motion capture from what a person wears."""
 
-__version__ = "0.1.0"
+from wearcap.version import __version__ as __version__
 
 
 def load(pipeline: str, *overrides: str, checkpoint=None, device: str = "cpu", trust: bool = False):

@@ -10,11 +10,11 @@ from argparse import ArgumentParser
 from collections.abc import Callable
 from typing import Any
 
-from wearcap import __version__
 from wearcap.boundary.limits import VARIABLE, gib_bytes
 from wearcap.boundary.own import trusting
 from wearcap.cli.verbs import VERBS, conf_dir, help_of, overrides
 from wearcap.errors import WearcapError, nearest
+from wearcap.version import __version__
 
 USER_ERROR, INTERRUPTED = 2, 130
 

@@ -21,7 +21,6 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-import wearcap
 from wearcap.boundary.texts import read_json
 from wearcap.doctor import require_sound
 from wearcap.errors import WearcapError
@@ -35,6 +34,7 @@ from wearcap.parallel import Parallel, divided, progress_bar, reason_of
 from wearcap.recording import RecordingStore
 from wearcap.runtime.stages import code_digest, digest
 from wearcap.runtime.system import StageOptions, System
+from wearcap.version import __version__
 
 SHOWN = 3
 """Metrics of a table of recordings; its file has them all."""
@@ -182,7 +182,7 @@ def settings_key(config: dict[str, Any], checkpoints: Sequence[str | Path], *mod
     files += [shared_checkpoints()[value] for value in named if value in shared_checkpoints()]
     used = [checkpoint_file(checkpoint) for checkpoint in checkpoints] + files
     sums = [remembered_sha256(path) for path in used]
-    return digest(wearcap.__version__, json.dumps(config, sort_keys=True), sums, code_digest(*targets))
+    return digest(__version__, json.dumps(config, sort_keys=True), sums, code_digest(*targets))
 
 
 def _values(config: Any, key: str = "") -> Iterator[tuple[str, Any]]:

@@ -20,7 +20,6 @@ from lightning.fabric.plugins.io.checkpoint_io import CheckpointIO
 from lightning.pytorch import Callback
 from torch import Tensor
 
-import wearcap
 from wearcap.boundary.opening import understood
 from wearcap.boundary.own import remember_own, require_own
 from wearcap.boundary.tensors import plain_tensors
@@ -32,6 +31,7 @@ from wearcap.models.build import check_weights
 from wearcap.models.checkpoint import Training as Taken
 from wearcap.models.checkpoint import read_checkpoint, read_run_file
 from wearcap.training.base import Training
+from wearcap.version import __version__
 
 FREE_TO_CHANGE = (
     *("paths.", "resume.", "init.", "test.", "logger.", "early_stop.", "callbacks.progress.", "data.loading.workers."),
@@ -96,7 +96,7 @@ class RunRecord(Callback):
             "machine": machine(),
         }
         config = json.dumps(self.config | {"training": training})
-        checkpoint["wearcap"] = {"version": wearcap.__version__, "config": config}
+        checkpoint["wearcap"] = {"version": __version__, "config": config}
 
 
 def trained_parameters(module: torch.nn.Module) -> int:

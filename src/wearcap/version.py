@@ -1,0 +1,3 @@
+"""The package's version, for whoever stands below its face."""
+
+__version__ = "0.1.0"
