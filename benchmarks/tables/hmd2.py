@@ -503,7 +503,7 @@ def _limits(simulated: dict[str, Tree], real: dict[str, Tree], strangers: dict[s
         f"from last, {_frames(real)} million frames each, at the best of three learning rates; our checkpoint {OURS_SAW} in three "
         "trainings. They are compared on real motion alone. Captured as their papers sample them, most are worse: `--all`.",
         f"The paper reports {paper[0]:.2f} cm and an FID of {paper[fid]:.2f} on its own real recordings (Nymeria): no comparison. FID needs more windows than "
-        "CMU's held-out subjects have.",
+        "CMU's held-out subjects have. FIDs here are in the space of the motion autoencoder before 2026-11-28.",
         "No recording of a real head-mounted device has been scored.",
     )
 
