@@ -7,10 +7,10 @@ from dataclasses import replace
 import torch
 
 from walking_person import SEAT, room, walk
+from wearcap.apps.live.sink import Sink
+from wearcap.apps.live.status import DeviceStatus, Latency, LiveStatus, SinkStatus, WearerStatus
 from wearcap.body.skeleton import Skeleton
 from wearcap.geometry.rigid import Rigid
-from wearcap.live.sink import Sink
-from wearcap.live.status import DeviceStatus, Latency, LiveStatus, SinkStatus, WearerStatus
 from wearcap.recording import Motion
 
 FPS, PIECE = 60.0, 10

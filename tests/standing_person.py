@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 
 import torch
 
+from wearcap.apps.live.clock_offset import Aligned
+from wearcap.apps.live.setup_estimation import SetupEstimation
 from wearcap.body.skeleton import skeleton_of_height
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import about_axis, exp
-from wearcap.live.clock_offset import Aligned
-from wearcap.live.setup_estimation import SetupEstimation
 from wearcap.recording import Motion
 from wearcap.sensors.imu import synthesize_imu
 from wearcap.sensors.samples import HeadSample, WatchSample, WristSample

@@ -16,9 +16,8 @@ FLOORS = (
     ("models", "diffusion", "sensors", "localization", "io"),
     ("optimize", "tracking", "data", "training", "metrics", "runtime"),
     ("systems", "wearsim"),
-    ("evaluation", "export", "viewer", "doctor", "prepare"),
-    ("reading",),
-    ("live",),
+    ("evaluation", "export", "checks", "prepare", "reading"),
+    ("apps",),
     ("cli", "data_prep"),
 )
 MAY_SIMULATE = ("wearsim", "data_prep", "cli")

@@ -25,6 +25,11 @@ import test_store  # noqa: E402
 
 from sound_packets import SOUND  # noqa: E402
 from valid_files import Reader, made, one  # noqa: E402
+from wearcap.apps.annotate.takes import starting_labels  # noqa: E402
+from wearcap.apps.doctor import examine  # noqa: E402
+from wearcap.apps.live.setup import Setup, head_seat, read_setup, write_setup  # noqa: E402
+from wearcap.apps.live.sources import source_of  # noqa: E402
+from wearcap.apps.viewer.page_layers import read_scene  # noqa: E402
 from wearcap.body.skeleton import xsens23  # noqa: E402
 from wearcap.boundary import arrays, tensors, texts  # noqa: E402
 from wearcap.boundary.own import trusting  # noqa: E402
@@ -33,12 +38,9 @@ from wearcap.export.files import load_exported, sidecar_path, write_exports  # n
 from wearcap.files import sha256_of  # noqa: E402
 from wearcap.io.conventions import Conventions  # noqa: E402
 from wearcap.io.formats import video  # noqa: E402
-from wearcap.live.setup import Setup, head_seat, read_setup, write_setup  # noqa: E402
-from wearcap.live.sources import source_of  # noqa: E402
 from wearcap.localization.visual_map import VisualMap  # noqa: E402
 from wearcap.models import checkpoint, weights  # noqa: E402
 from wearcap.prepare.foreign_conventions import read_mapping  # noqa: E402
-from wearcap.reading import examine  # noqa: E402
 from wearcap.reading.any_file import read  # noqa: E402
 from wearcap.recording import PointCloud, Recording, RecordingStore  # noqa: E402
 from wearcap.recording.store import RecordingFile, save_recording  # noqa: E402
@@ -49,8 +51,6 @@ from wearcap.systems.ireplica.export import exports  # noqa: E402
 from wearcap.systems.ireplica.features import HandViews  # noqa: E402
 from wearcap.training import run  # noqa: E402
 from wearcap.training.loggers import read_metrics  # noqa: E402
-from wearcap.viewer.annotate import starting_labels  # noqa: E402
-from wearcap.viewer.page_layers import read_scene  # noqa: E402
 from wearcap_testing import recording_of, swaying_motion  # noqa: E402
 
 NAMED = {"net.weight": torch.ones(4, 3), "net.bias": torch.zeros(4, dtype=torch.bfloat16), "count": torch.tensor([7])}

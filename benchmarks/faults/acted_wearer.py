@@ -19,11 +19,11 @@ from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
 from torch import Tensor
 
+from wearcap.apps.live.setup import hand_seat
 from wearcap.body.skeleton import WRISTS
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import about_axis, quat_wxyz_from_matrix
-from wearcap.live.setup import hand_seat
 from wearcap.recording import Motion
 from wearcap.recording.timing import joined
 from wearcap.sensors.imu import acceleration

@@ -27,6 +27,7 @@ sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
 
 from benchmarks.speed.figures import figure
 from own_bvh import read_bvh
+from wearcap.apps.annotate.takes import AnnotationFile
 from wearcap.cli import capture, export, train
 from wearcap.export.files import open_exported
 from wearcap.io.formats.contact_labels import LabelClock
@@ -36,7 +37,6 @@ from wearcap.prepare.engine import Task, prepare
 from wearcap.recording import RecordingStore
 from wearcap.training.loggers import read_metrics
 from wearcap.training.run import RunCheckpointIO
-from wearcap.viewer.annotate import AnnotationFile
 from wearcap_testing import recording_of, small_dataset, swaying_motion
 
 FORK = multiprocessing.get_context("fork")

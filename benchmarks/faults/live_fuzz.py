@@ -36,11 +36,11 @@ from benchmarks.faults.fuzz_mutate import FLOATS, NUMBER, VALUES, WHOLE, mutated
 sys.path[:0] = [str(Path(__file__).resolve().parents[2] / "tests")]
 
 from sound_packets import SOUND  # noqa: E402
-from wearcap.live.packets import Inbox, Packet  # noqa: E402
-from wearcap.live.source import Budget, DatagramSource  # noqa: E402
-from wearcap.live.sources import SOURCES, source_of  # noqa: E402
-from wearcap.live.sources.parts import MAX_NAME  # noqa: E402
-from wearcap.live.sources.posts import MAX_HEADER, _Connections  # noqa: E402
+from wearcap.apps.live.packets import Inbox, Packet  # noqa: E402
+from wearcap.apps.live.source import Budget, DatagramSource  # noqa: E402
+from wearcap.apps.live.sources import SOURCES, source_of  # noqa: E402
+from wearcap.apps.live.sources.parts import MAX_NAME  # noqa: E402
+from wearcap.apps.live.sources.posts import MAX_HEADER, _Connections  # noqa: E402
 from wearcap.sensors.packets import MAX_ACC_M_S2, MAX_POSITION_M, pose_fault, time_fault, values_fault  # noqa: E402
 from wearcap.sensors.samples import (  # noqa: E402
     ActiveObject,

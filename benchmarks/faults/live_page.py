@@ -35,9 +35,9 @@ from benchmarks.faults.acted_wearer import ACTS, STAND, Actor, Sender, act_of
 sys.path[:0] = [str(Path(__file__).resolve().parents[2] / "tests")]
 
 from ports import free_port  # noqa: E402
+from wearcap.apps.live.setup import Setup, read_setup  # noqa: E402
 from wearcap.body.skeleton import WRISTS  # noqa: E402
 from wearcap.geometry import rotation  # noqa: E402
-from wearcap.live.setup import Setup, read_setup  # noqa: E402
 from wearcap.metrics.position import mpjpe_cm, root_error_cm  # noqa: E402
 from wearcap.reading import read  # noqa: E402
 from wearcap.recording import Motion  # noqa: E402

@@ -34,9 +34,9 @@ from websockets.sync.client import connect
 sys.path[:0] = [str(Path(__file__).resolve().parents[2] / "tests")]
 
 from ports import free_port, listens  # noqa: E402
+from wearcap.apps.live.sources.replay import ReplaySource  # noqa: E402
 from wearcap.cli.conf import compose, load_pipeline  # noqa: E402
 from wearcap.geometry.rotation import quat_wxyz_from_matrix  # noqa: E402
-from wearcap.live.sources.replay import ReplaySource  # noqa: E402
 from wearcap.reading import read  # noqa: E402
 from wearcap.sensors.samples import HeadSample, WatchSample, WristSample  # noqa: E402
 

@@ -5,7 +5,7 @@
     python -m benchmarks.faults.live_turns --palms [DATASET ...]
 
 People turn their head before the body, so that turns show an offset of clocks although there is none. Head and wrists of recorded motion, on one clock, are compared as the guided first minute of a live capture does
-(`wearcap.live.clock_offset`), in windows a second apart in which both have turned to both sides. Prints one JSON line for
+(`wearcap.apps.live.clock_offset`), in windows a second apart in which both have turned to both sides. Prints one JSON line for
 windows of people at one place with hanging arms, and one for all others: numbers of windows and recordings, the share that
 is compared at all, quantiles (0, 5, 50, 95, 100 %) of the offset (s) found, and the share that is not left alone.
 
@@ -33,15 +33,15 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from wearcap.apps.live.clock_offset import LEAST_OFFSET_S, offset_by_turning, turned
+from wearcap.apps.live.placement import PRONATED_DEG, hanging
+from wearcap.apps.live.setup import Setup
+from wearcap.apps.live.setup_estimation import HOLD_S, SetupEstimation
+from wearcap.apps.live.sources.replay import ReplaySource
 from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.live.clock_offset import LEAST_OFFSET_S, offset_by_turning, turned
-from wearcap.live.placement import PRONATED_DEG, hanging
-from wearcap.live.setup import Setup
-from wearcap.live.setup_estimation import HOLD_S, SetupEstimation
-from wearcap.live.sources.replay import ReplaySource
 from wearcap.recording import Motion, Recording
 from wearcap.recording.store import RecordingStore
 from wearcap.sensors.imu import ImuNoise, synthesize_imu

@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
 
+from wearcap.apps.viewer.picture import save_png
 from wearcap.systems.ireplica.trajectory import Bending, BentPath, bend
 from wearcap.systems.ireplica.trajectory_banded import bend_banded
-from wearcap.viewer.picture import save_png
 
 RIGIDITIES = (1000.0, 30.0, 3.0, 0.1)
 PANEL = (760, 560)

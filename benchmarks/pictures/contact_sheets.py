@@ -25,6 +25,7 @@ from torch import Tensor
 
 from benchmarks.tables.sensed import GIVEN, SensedStore
 from benchmarks.tables.tabling import UPSIDE_DOWN
+from wearcap.apps.viewer.picture import VIEW_RAD, captioned, contact_sheet, save_png
 from wearcap.body.skeleton import xsens23
 from wearcap.cli.conf import compose, load_pipeline
 from wearcap.errors import WearcapError
@@ -42,7 +43,6 @@ from wearcap.recording.store import dataset_folder
 from wearcap.runtime.system import CaptureInput, System
 from wearcap.scene.floor import estimate_floor
 from wearcap.tracking.stature import with_stature
-from wearcap.viewer.picture import VIEW_RAD, captioned, contact_sheet, save_png
 
 SENSORS = {"hmd2": "typical", "mocap_every": "typical", "echo": GIVEN}
 """Errors of heads and watches, as in the systems' tables."""

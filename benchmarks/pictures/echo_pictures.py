@@ -8,6 +8,8 @@ from pathlib import Path
 
 import torch
 
+from wearcap.apps.viewer.page_layers import with_objects
+from wearcap.apps.viewer.picture import contact_sheet, save_png
 from wearcap.body.anny_body import anny_body
 from wearcap.cli.conf import compose, load_pipeline
 from wearcap.geometry.trajectory import resample
@@ -17,8 +19,6 @@ from wearcap.runtime.system import CaptureInput
 from wearcap.scene.objects import Environment, SceneObject
 from wearcap.systems.echo.observations import ObjectShape
 from wearcap.systems.echo.pipeline import Echo
-from wearcap.viewer.page_layers import with_objects
-from wearcap.viewer.picture import contact_sheet, save_png
 
 FRAMES, LONGEST_S = 6, 14.0
 KINDS = ("box", "table", "suitcase")

@@ -11,13 +11,13 @@ import numpy as np
 import torch
 
 from benchmarks.tables.ireplica_runs import Case, pipeline_of
+from wearcap.apps.viewer.page_layers import with_objects
+from wearcap.apps.viewer.picture import contact_sheet, save_png
 from wearcap.body.anny_body import anny_body
 from wearcap.metrics.objects import handlings
 from wearcap.recording import Motion, RecordingStore
 from wearcap.recording.timing import at_times
 from wearcap.scene.objects import Environment
-from wearcap.viewer.page_layers import with_objects
-from wearcap.viewer.picture import contact_sheet, save_png
 
 FRAMES, AROUND_S = 5, 0.5
 NEAR_M = 2.2

@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 
+from wearcap.apps.viewer.picture import save_png
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory, find_gaps, resample
 from wearcap.io.devices.watch_log import read_watch_log
 from wearcap.sensors.watches import MAX_GAP_S
-from wearcap.viewer.picture import save_png
 
 WIDTH, BAND, MARGIN = 1300, 250, 56
 AXES = {"x": (200, 60, 50), "y": (40, 140, 60), "z": (50, 90, 200)}

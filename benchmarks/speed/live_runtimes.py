@@ -14,8 +14,8 @@ import time
 import numpy as np
 import torch
 
+from wearcap.apps.live.sources.replay import ReplaySource
 from wearcap.cli.conf import compose, load_pipeline
-from wearcap.live.sources.replay import ReplaySource
 from wearcap.reading import read
 from wearcap.recording.timing import first_seconds, joined
 from wearcap.runtime.wearer import Wearer

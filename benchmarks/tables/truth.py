@@ -11,7 +11,7 @@ from pathlib import Path
 from statistics import median
 
 from benchmarks.tables.tabling import write_tree
-from wearcap.doctor.truth import FIGURES, Figure, people
+from wearcap.checks.truth import FIGURES, Figure, people
 from wearcap.recording import RecordingStore
 
 People = dict[str, dict[str, float]]

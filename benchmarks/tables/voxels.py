@@ -18,12 +18,12 @@ from rich.console import Console
 from torch import Tensor
 
 from benchmarks.tables.tabling import new_table, write_tree
+from wearcap.apps.viewer.picture import save_png
 from wearcap.data.surroundings import PlaceCodes
 from wearcap.data.windows import Source, Windows
 from wearcap.metrics.detection import distance_mae_cm, occupancy_iou, occupied_distance_mae_cm
 from wearcap.scene.voxels import VoxelGrid
 from wearcap.systems.hmd2.voxel_autoencoder_training import PlaceContent
-from wearcap.viewer.picture import save_png
 
 Rebuild = Callable[[Tensor], Tensor]
 

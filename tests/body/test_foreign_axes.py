@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from foreign_bvh import CONVENTIONS, NAMES, OFFSETS, PARENTS, Convention, turn, write
-from wearcap.doctor.body import check_motion
+from wearcap.checks.body import check_motion
 from wearcap.io.conventions import Conventions
 from wearcap.prepare.foreign import ForeignMotion, read_foreign_motion, straightest
 from wearcap.prepare.foreign_conventions import Mapping

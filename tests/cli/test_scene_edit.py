@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
+from wearcap.apps.scene_editor.editor import ObjectEditor
 from wearcap.cli import scene_edit
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.io.formats.environment import write_environment
 from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.scene.objects import Environment, Freedom, SceneObject
-from wearcap.viewer.object_editor import ObjectEditor
 
 
 def a_floor(folder, scale: float = 1.0):

@@ -11,11 +11,11 @@ import pytest
 import trimesh
 
 from hostile import in_time
+from wearcap.apps.viewer.page_layers import read_scene
 from wearcap.errors import WearcapError
 from wearcap.io.formats.environment import read_environment
 from wearcap.io.formats.glb import read_glb
 from wearcap.io.formats.ply import Ply, write_ply
-from wearcap.viewer.page_layers import read_scene
 
 VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
 FACES = np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3]], np.uint16)

@@ -8,6 +8,7 @@ from hypothesis import given
 from totalcapture_files import vicon, write_totalcapture
 
 from hostile import fuzz, mutated
+from wearcap.apps.doctor import examine
 from wearcap.cli.main import run_verb
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
@@ -21,7 +22,6 @@ from wearcap.io.datasets.totalcapture import (
     read_vicon,
     totalcapture_files,
 )
-from wearcap.reading import examine
 from wearcap.recording.store import RecordingStore
 from wearcap.sensors.watches import watches_at
 

@@ -4,8 +4,8 @@ import asyncio
 import threading
 import time
 
-from wearcap.live.packets import Inbox
-from wearcap.live.sources import source_of
+from wearcap.apps.live.packets import Inbox
+from wearcap.apps.live.sources import source_of
 
 
 class Served:

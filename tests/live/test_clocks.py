@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from wearcap.live.clocks import AGREEING, Clocks, DeviceClock
+from wearcap.apps.live.clocks import AGREEING, Clocks, DeviceClock
 
 
 def packets(seconds: float, hz: float, offset_s: float, drift: float, jitter_s: float, seed: int = 0):

@@ -17,20 +17,20 @@ from websockets.exceptions import ConnectionClosed, InvalidMessage
 
 from ports import free_port
 from silent_sockets import silent
+from wearcap.apps.live import capture
+from wearcap.apps.live.packets import Packet
+from wearcap.apps.live.sink import SinkThread
+from wearcap.apps.live.sinks import files, sink_of
+from wearcap.apps.live.sinks.files import FilesSink
+from wearcap.apps.live.source import Budget
+from wearcap.apps.live.sources import source_of
+from wearcap.apps.web import connections
+from wearcap.apps.web.connections import CONNECTIONS, DELIVERING, SPOKEN, Connections
 from wearcap.cli import live
 from wearcap.errors import WearcapError
 from wearcap.io.formats.motion_npz import read_motion
-from wearcap.live import capture
-from wearcap.live.packets import Packet
-from wearcap.live.sink import SinkThread
-from wearcap.live.sinks import files, sink_of
-from wearcap.live.sinks.files import FilesSink
-from wearcap.live.source import Budget
-from wearcap.live.sources import source_of
 from wearcap.recording.store import save_recording
 from wearcap.sensors.samples import HeadSample
-from wearcap.viewer import connections
-from wearcap.viewer.connections import CONNECTIONS, DELIVERING, SPOKEN, Connections
 from wearcap_testing import recording_of, swaying_motion
 
 POSE = {"position": [0.1, 0.2, 1.6], "rotation_wxyz": [1, 0, 0, 0]}

@@ -27,23 +27,23 @@ from own_bvh import read_bvh
 from ports import free_port
 from small_hmd2 import hmd2_of
 from watched_walk import drawn_pipeline, watched_walk
+from wearcap.apps.live import wearer as wearer_module
+from wearcap.apps.live.capture import LiveCapture, report_text
+from wearcap.apps.live.packets import HEAD, Inbox, Packet
+from wearcap.apps.live.setup import Seat, Setup, plain_name
+from wearcap.apps.live.sink import Sink, SinkThread
+from wearcap.apps.live.sinks import sink_of
+from wearcap.apps.live.sinks.files import FilesSink, join_sections
+from wearcap.apps.live.sinks.vmc import BONES, VmcSink
+from wearcap.apps.live.sinks.websocket import WebSocketSink
+from wearcap.apps.live.source import Address, Source
+from wearcap.apps.live.sources import source_of
+from wearcap.apps.live.sources.replay import ReplaySource
+from wearcap.apps.live.wearer import LiveWearer
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.rotation import about_axis, matrix_from_quat_wxyz
 from wearcap.io.formats.motion_npz import read_motion
-from wearcap.live import wearer as wearer_module
-from wearcap.live.capture import LiveCapture, report_text
-from wearcap.live.packets import HEAD, Inbox, Packet
-from wearcap.live.setup import Seat, Setup, plain_name
-from wearcap.live.sink import Sink, SinkThread
-from wearcap.live.sinks import sink_of
-from wearcap.live.sinks.files import FilesSink, join_sections
-from wearcap.live.sinks.vmc import BONES, VmcSink
-from wearcap.live.sinks.websocket import WebSocketSink
-from wearcap.live.source import Address, Source
-from wearcap.live.sources import source_of
-from wearcap.live.sources.replay import ReplaySource
-from wearcap.live.wearer import LiveWearer
 from wearcap.recording import Motion, Recording
 from wearcap.recording.timing import joined
 from wearcap.sensors.samples import HeadSample, WatchSample
@@ -301,7 +301,7 @@ def test_an_independent_receiver_of_vmc_rebuilds_the_body():
         torch.testing.assert_close(rebuilt(frames[k]).float(), motion.T_world_joint.t[k, joints], atol=1e-4, rtol=0)
     # The rest pose has no rotations: where all our joints have none, all bones have none.
     still = replace(motion, R_parent_joint=torch.eye(3).expand(len(motion), 23, 3, 3).contiguous())
-    from wearcap.live.sinks.vmc import bones_of
+    from wearcap.apps.live.sinks.vmc import bones_of
 
     torch.testing.assert_close(bones_of(still)[1].abs(), torch.tensor([0.0, 0.0, 0.0, 1.0]).expand(len(motion), 22, 4))
 
@@ -347,7 +347,7 @@ def test_the_files_of_a_killed_capture_open_and_lack_at_most_a_second(tmp_path: 
     script = f"""
 import sys, time
 sys.path[:0] = {[str(Path(__file__).parents[1])]!r}
-from wearcap.live.sinks.files import FilesSink
+from wearcap.apps.live.sinks.files import FilesSink
 from pathlib import Path
 from dataclasses import replace
 from wearcap_testing import swaying_motion
@@ -508,7 +508,7 @@ def test_a_port_that_is_taken_ends_the_capture_with_its_reason():
 
 
 def test_a_replay_of_an_export_has_wrists_and_no_controllers_also_with_a_height(tmp_path: Path, monkeypatch):
-    from wearcap.live import __main__ as command
+    from wearcap.apps.live import __main__ as command
     from wearcap.recording.store import save_recording
 
     given: dict = {}
@@ -532,7 +532,7 @@ def test_an_exported_model_captures_live_without_lightning_and_hydra(tmp_path: P
     files.write_exports(small_hmd2().exports(), tmp_path / "model.onnx", "onnx")
     save_recording(sensed, tmp_path / "in.safetensors")
     program = (
-        "import sys; from wearcap.live.__main__ import main; main(sys.argv[1:]); "
+        "import sys; from wearcap.apps.live.__main__ import main; main(sys.argv[1:]); "
         "assert not {'lightning', 'hydra', 'omegaconf'} & set(sys.modules)"
     )
     arguments = [tmp_path / "model.onnx", "--recording", tmp_path / "in.safetensors", "--speed", "inf"]

@@ -7,13 +7,13 @@ import torch
 
 from standing_person import FPS, acting
 from watched_walk import drawn_pipeline
+from wearcap.apps.live.clocks import AGREEING
+from wearcap.apps.live.guided import TURN
+from wearcap.apps.live.packets import Packet
+from wearcap.apps.live.setup_estimation import SetupEstimation
+from wearcap.apps.live.wearer import LiveWearer, Opener
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import about_axis, exp
-from wearcap.live.clocks import AGREEING
-from wearcap.live.guided import TURN
-from wearcap.live.packets import Packet
-from wearcap.live.setup_estimation import SetupEstimation
-from wearcap.live.wearer import LiveWearer, Opener
 from wearcap.sensors.imu import synthesize_imu
 from wearcap.sensors.samples import HeadSample, WatchSample
 from wearcap.systems.mocap_every.stream import MocapEverySession

@@ -15,18 +15,18 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from ports import free_port
+from wearcap.apps.live.capture import LiveCapture
+from wearcap.apps.live.devices import Devices
+from wearcap.apps.live.packets import MAX_POINTS_WAITING, Inbox, Packet
+from wearcap.apps.live.setup import plain_name, read_setup, write_setup
+from wearcap.apps.live.sink import SinkThread
+from wearcap.apps.live.sinks import sink_of
+from wearcap.apps.live.sinks.files import FilesSink, join_sections
+from wearcap.apps.live.sinks.websocket import WebSocketSink
+from wearcap.apps.live.source import Address, Budget, Source
+from wearcap.apps.live.sources.replay import ReplaySource
 from wearcap.errors import WearcapError
 from wearcap.io.formats.motion_npz import read_motion
-from wearcap.live.capture import LiveCapture
-from wearcap.live.devices import Devices
-from wearcap.live.packets import MAX_POINTS_WAITING, Inbox, Packet
-from wearcap.live.setup import plain_name, read_setup, write_setup
-from wearcap.live.sink import SinkThread
-from wearcap.live.sinks import sink_of
-from wearcap.live.sinks.files import FilesSink, join_sections
-from wearcap.live.sinks.websocket import WebSocketSink
-from wearcap.live.source import Address, Budget, Source
-from wearcap.live.sources.replay import ReplaySource
 from wearcap.recording import Motion
 from wearcap.sensors.samples import HeadSample
 from wearcap.systems.hmd2.stream import HMD2Session
@@ -205,7 +205,7 @@ def test_a_host_without_a_possible_name_is_refused(scheme):
 
 def test_what_sessions_refused_and_dropped_is_in_the_report_at_the_end(monkeypatch):
     """Of a wearer who has left and come back, both sessions' counts."""
-    monkeypatch.setattr("wearcap.live.wearer.AWAY_S", 0.4)
+    monkeypatch.setattr("wearcap.apps.live.wearer.AWAY_S", 0.4)
     sensed = swaying(60)
     script = [(packet._replace(arrived_s=0.0), pause_s) for packet, pause_s in heads(sensed, "", 59, 2.0)]
     bad = script[30][0].sample.T_world_device
@@ -247,7 +247,7 @@ class Failing(Source):
 
 
 def test_a_source_that_fails_is_started_again_and_ends_no_other(monkeypatch):
-    monkeypatch.setattr("wearcap.live.capture.RESTART_S", 0.01)
+    monkeypatch.setattr("wearcap.apps.live.capture.RESTART_S", 0.01)
     sensed, kept, failing = swaying(60), Kept(), Failing(listens=True)
     setup = ReplaySource(sensed, HMD2Session).setup
     report = LiveCapture(small_hmd2(), [failing, Scripted(list(heads(sensed)))], [kept], setup=setup).run(30.0)
@@ -262,7 +262,7 @@ def test_a_source_that_never_runs_ends_the_capture_with_its_reason():
 
 
 def test_silent_strangers_make_room(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr("wearcap.live.capture.FORGOTTEN_S", 0.0)
+    monkeypatch.setattr("wearcap.apps.live.capture.FORGOTTEN_S", 0.0)
     sensed, kept = swaying(60), Kept()
     strangers = [next(heads(sensed, f"stranger {k}")) for k in range(20)]
     lone = [(packet._replace(device=f"tracker {k}", wearer="anna"), 0.0) for k, (packet, _) in enumerate(strangers * 3)]
@@ -286,8 +286,8 @@ def test_points_that_wait_are_bounded():
 
 def test_a_source_has_messages_bytes_and_time(monkeypatch):
     now, busy = [100.0], [0.0]
-    monkeypatch.setattr("wearcap.live.source.time.monotonic", lambda: now[0])
-    monkeypatch.setattr("wearcap.live.source.time.thread_time", lambda: busy[0])
+    monkeypatch.setattr("wearcap.apps.live.source.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("wearcap.apps.live.source.time.thread_time", lambda: busy[0])
     budget = Budget(messages=30, size=100, parse_s=0.2)
     assert [budget.allows(1) for _ in range(31)] == [True] * 30 + [False]
     now[0] = 101.0
@@ -305,8 +305,8 @@ def test_a_source_has_messages_bytes_and_time(monkeypatch):
 def test_a_pause_of_the_program_costs_a_sender_no_messages(monkeypatch):
     """A garbage collection, for example, falls into whichever message is being read."""
     busy = [0.0]
-    monkeypatch.setattr("wearcap.live.source.time.monotonic", lambda: 100.0)
-    monkeypatch.setattr("wearcap.live.source.time.thread_time", lambda: busy[0])
+    monkeypatch.setattr("wearcap.apps.live.source.time.monotonic", lambda: 100.0)
+    monkeypatch.setattr("wearcap.apps.live.source.time.thread_time", lambda: busy[0])
     budget = Budget()
     for _ in range(10):
         assert budget.allows(200)

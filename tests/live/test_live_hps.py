@@ -11,11 +11,11 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "pipelines"))
 from hps_walk import floor_points, hps_recording
 from hydra.utils import instantiate
 
+from wearcap.apps.live.capture import LiveCapture
+from wearcap.apps.live.sink import Sink
+from wearcap.apps.live.sources.replay import ReplaySource
 from wearcap.cli.conf import compose
 from wearcap.geometry.rigid import Rigid
-from wearcap.live.capture import LiveCapture
-from wearcap.live.sink import Sink
-from wearcap.live.sources.replay import ReplaySource
 from wearcap.recording import Motion
 from wearcap.recording.timing import joined
 from wearcap.runtime.system import CaptureInput

@@ -18,23 +18,23 @@ from websockets.sync.client import connect
 
 from carried_box import boxes, carrying, drawn_echo
 from ports import free_port, listens
+from wearcap.apps.live import wearer as wearer_module
+from wearcap.apps.live.capture import LiveCapture
+from wearcap.apps.live.packets import HEAD, OBJECT, Packet
+from wearcap.apps.live.setup import Setup
+from wearcap.apps.live.sink import Sink
+from wearcap.apps.live.sinks.objects import objects_of
+from wearcap.apps.live.sinks.vmc import VmcSink
+from wearcap.apps.live.sinks.websocket import WebSocketSink
+from wearcap.apps.live.source import Address
+from wearcap.apps.live.sources import source_of
+from wearcap.apps.live.sources.replay import ReplaySource
+from wearcap.apps.live.wearer import LiveWearer, Opener
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import matrix_from_quat_wxyz, quat_wxyz_from_matrix
 from wearcap.io.formats.environment import write_environment
-from wearcap.live import wearer as wearer_module
-from wearcap.live.capture import LiveCapture
-from wearcap.live.packets import HEAD, OBJECT, Packet
-from wearcap.live.setup import Setup
-from wearcap.live.sink import Sink
-from wearcap.live.sinks.objects import objects_of
-from wearcap.live.sinks.vmc import VmcSink
-from wearcap.live.sinks.websocket import WebSocketSink
-from wearcap.live.source import Address
-from wearcap.live.sources import source_of
-from wearcap.live.sources.replay import ReplaySource
-from wearcap.live.wearer import LiveWearer, Opener
 from wearcap.recording import Motion, Recording
 from wearcap.recording.active_objects import active_at
 from wearcap.runtime.system import CaptureInput

@@ -11,16 +11,16 @@ import torch
 
 from carried_box import boxes
 from live_show import FPS, PIECE, Show, walking
+from wearcap.apps.live.page import MAX_WEARERS, LivePage
+from wearcap.apps.live.page_devices import Devices
+from wearcap.apps.live.page_panel import sinks_html, wearer_html
+from wearcap.apps.live.playout import BEHIND_S, Playout
+from wearcap.apps.live.status import DeviceStatus, Latency, LiveStatus, SinkStatus, WearerStatus
+from wearcap.apps.viewer.page import COLORS
 from wearcap.body.skeleton import skeleton_of_height
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.live.page import MAX_WEARERS, LivePage
-from wearcap.live.page_devices import Devices
-from wearcap.live.page_panel import sinks_html, wearer_html
-from wearcap.live.playout import BEHIND_S, Playout
-from wearcap.live.status import DeviceStatus, Latency, LiveStatus, SinkStatus, WearerStatus
-from wearcap.viewer.page import COLORS
 from wearcap_browser import chromium
 
 NASTY = "<img src=x onerror=\"document.title='broken'\">"

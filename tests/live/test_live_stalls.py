@@ -10,10 +10,10 @@ import pytest
 import torch
 from test_live_capture import Kept, small_hmd2, swaying
 
-from wearcap.live.capture import CATCH_UP_S, LiveCapture
-from wearcap.live.packets import HEAD, Packet
-from wearcap.live.sources.replay import ReplaySource
-from wearcap.live.wearer import LEFT_OUT_S
+from wearcap.apps.live.capture import CATCH_UP_S, LiveCapture
+from wearcap.apps.live.packets import HEAD, Packet
+from wearcap.apps.live.sources.replay import ReplaySource
+from wearcap.apps.live.wearer import LEFT_OUT_S
 from wearcap.sensors.samples import HeadSample
 from wearcap.systems.hmd2.stream import HMD2Session
 

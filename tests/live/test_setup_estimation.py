@@ -8,16 +8,16 @@ import pytest
 import torch
 
 from standing_person import Devices, acting
+from wearcap.apps.live.clock_offset import LEAST_OFFSET_S, offset_by_turning
+from wearcap.apps.live.guided import ARMS, RAISE, STAND, TURN, WALK
+from wearcap.apps.live.setup import Seat, Setup, hand_seat, read_setup, write_setup
+from wearcap.apps.live.setup_estimation import SetupEstimation
 from wearcap.body.skeleton import skeleton_of_height, xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import about_axis, exp
 from wearcap.geometry.trajectory import Trajectory
-from wearcap.live.clock_offset import LEAST_OFFSET_S, offset_by_turning
-from wearcap.live.guided import ARMS, RAISE, STAND, TURN, WALK
-from wearcap.live.setup import Seat, Setup, hand_seat, read_setup, write_setup
-from wearcap.live.setup_estimation import SetupEstimation
 from wearcap.sensors.samples import HeadSample, SuitPiece, WatchSample, WristSample
 
 HEAD, HANDS = ("head",), ("head", "left_wrist", "right_wrist")

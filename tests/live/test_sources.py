@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 from serving import Served
 
 from ports import free_port
-from wearcap.live.packets import Packet
-from wearcap.live.source import DatagramSource
-from wearcap.live.sources import SOURCES, source_of
+from wearcap.apps.live.packets import Packet
+from wearcap.apps.live.source import DatagramSource
+from wearcap.apps.live.sources import SOURCES, source_of
 from wearcap.sensors.packets import MAX_ACC_M_S2, MAX_POSITION_M
 
 PAGE = (Path(__file__).parents[2] / "docs" / "live_adapters.md").read_text(encoding="utf-8")

@@ -14,9 +14,9 @@ from serving import Served
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from ports import free_port
+from wearcap.apps.live.packets import Packet
+from wearcap.apps.live.sources import SOURCES, source_of
 from wearcap.errors import WearcapError
-from wearcap.live.packets import Packet
-from wearcap.live.sources import SOURCES, source_of
 from wearcap.sensors.samples import ActiveObject, HeadSample, LocalizationSample, ObjectSample, WatchSample, WristSample
 
 TURN = Rotation.from_rotvec([0.4, -0.7, 1.1])

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from wearcap.apps.live.packets import Packet
+from wearcap.apps.live.sources import source_of
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
-from wearcap.live.packets import Packet
-from wearcap.live.sources import source_of
 
 ORDER = [
     *("pelvis", "l5", "l3", "t12", "t8", "neck", "head"),

@@ -10,8 +10,8 @@ from pythonosc.osc_bundle_builder import IMMEDIATELY, OscBundleBuilder
 from pythonosc.osc_message_builder import OscMessageBuilder
 from scipy.spatial.transform import Rotation
 
-from wearcap.live.packets import Packet
-from wearcap.live.sources import source_of
+from wearcap.apps.live.packets import Packet
+from wearcap.apps.live.sources import source_of
 
 TURN = Rotation.from_rotvec([0.4, -0.7, 1.1])
 PLACE = np.array([0.3, -1.2, 1.65])

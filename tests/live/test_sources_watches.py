@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 from serving import Served
 
 from ports import free_port
+from wearcap.apps.live.packets import Packet
+from wearcap.apps.live.sources import source_of
 from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.io.devices.watch_log import read_watch_log
-from wearcap.live.packets import Packet
-from wearcap.live.sources import source_of
 
 G = 9.80665
 EPOCH = 1.7e9

@@ -10,15 +10,15 @@ import pytest
 import torch
 
 from walking_person import MOUNT, sound_recording
+from wearcap.apps.doctor import examine
 from wearcap.body.skeleton import xsens23
+from wearcap.checks import Finding, Report
 from wearcap.cli.doctor import main
-from wearcap.doctor import Finding, Report
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.formats.poses import write_tum
-from wearcap.reading import examine
 from wearcap.recording import CameraStream, PointCloud, Recording, RecordingStore
 from wearcap.recording.store import save_recording
 from wearcap.sensors.imu import ImuNoise, synthesize_imu

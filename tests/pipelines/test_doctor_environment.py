@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from boxes import box_mesh
+from wearcap.apps.doctor import examine
+from wearcap.checks import Finding
+from wearcap.checks.places import _check_environment
 from wearcap.cli.main import run_verb
-from wearcap.doctor import Finding
-from wearcap.doctor.places import _check_environment
 from wearcap.io.formats.environment import write_environment
-from wearcap.reading import examine
 from wearcap.scene.objects import Environment, Freedom, SceneObject
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import short_walk
+from wearcap.apps.doctor import examine
 from wearcap.io.conventions import Conventions
-from wearcap.reading import examine
 
 NAMES = {
     "time": "time",

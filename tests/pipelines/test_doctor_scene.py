@@ -11,9 +11,10 @@ from PIL import Image
 from small_scene import LEVEL, inverted, room_cloud, write_room
 
 from walking_person import sound_recording
-from wearcap.doctor import Finding, examine_recording, require_sound
-from wearcap.doctor.body import check_contact_prob
-from wearcap.doctor.consistency import check_localization, check_offset
+from wearcap.apps.doctor import examine
+from wearcap.checks import Finding, examine_recording, require_sound
+from wearcap.checks.body import check_contact_prob
+from wearcap.checks.consistency import check_localization, check_offset
 from wearcap.errors import WearcapError
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
@@ -21,7 +22,6 @@ from wearcap.geometry.rotation import about_axis
 from wearcap.io.formats.camera_json import write_photos
 from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.localization.visual_map import Observations, VisualMap, _Landmarks
-from wearcap.reading import examine
 from wearcap.recording import CameraStream, Localization, Recording, RecordingStore
 
 CAMERA = Camera("opencv", 64, 48, 40.0, 40.0, 31.5, 23.5, (0.0, 0.0, 0.0, 0.0))

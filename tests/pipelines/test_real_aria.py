@@ -10,6 +10,8 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from small_hmd2 import hmd2_of
+from wearcap.apps.doctor import examine
+from wearcap.apps.viewer.picture import contact_sheet, draw_head_path
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
@@ -20,7 +22,6 @@ from wearcap.io.datasets.adt import read_adt
 from wearcap.io.devices.aria_mps import read_closed_loop, read_mps
 from wearcap.metrics.scores import cue_errors_cm
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
-from wearcap.reading import examine
 from wearcap.recording import HeadStream, Motion, PointCloud, Recording
 from wearcap.scene.floor import estimate_floor
 from wearcap.scene.voxels import VoxelGrid, VoxelMap, voxelize
@@ -28,7 +29,6 @@ from wearcap.systems.hmd2.features import HeadFeatures
 from wearcap.systems.hmd2.model import MotionDenoiser
 from wearcap.systems.hmd2.pipeline import HMD2
 from wearcap.tracking.anchor import anchor
-from wearcap.viewer.picture import contact_sheet, draw_head_path
 
 
 @pytest.fixture(scope="module")

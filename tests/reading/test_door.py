@@ -8,10 +8,11 @@ import pytest
 import short_walk
 import wearcap
 from command_line import exit_code, files_in
+from wearcap.apps.doctor import examine
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import Conventions
 from wearcap.io.formats.motion_npz import read_motion
-from wearcap.reading import examine, read
+from wearcap.reading import read
 from wearcap.recording import RecordingStore
 from wearcap_testing import recording_of, swaying_motion
 

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from walking_person import sound_recording
+from wearcap.apps.doctor import examine
+from wearcap.checks import truth as doctor_truth
+from wearcap.checks.truth import FIGURES, of_person, people
 from wearcap.cli import prepare
 from wearcap.cli.doctor import main
-from wearcap.doctor import truth as doctor_truth
-from wearcap.doctor.truth import FIGURES, of_person, people
 from wearcap.prepare.engine import Report
-from wearcap.reading import examine
 from wearcap.recording import Recording, RecordingStore
 
 

@@ -8,11 +8,12 @@ import pytest
 import torch
 
 import wearcap
+from wearcap.apps.doctor import examine
 from wearcap.body.skeleton import skeleton_of_height, xsens23
+from wearcap.checks.examine import examine_recording
 from wearcap.cli.conf import compose
-from wearcap.doctor.examine import examine_recording
 from wearcap.errors import WearcapError
-from wearcap.reading import examine, load
+from wearcap.reading import load
 from wearcap.recording import Recording
 from wearcap.recording.recording import FloorTrack, HeadStream, PointCloud
 from wearcap.systems.mocap_every.pipeline import MocapEvery

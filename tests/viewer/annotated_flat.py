@@ -11,12 +11,12 @@ import av
 import numpy as np
 import torch
 
+from wearcap.apps.annotate.server import AnnotationServer
+from wearcap.apps.annotate.takes import Desk
 from wearcap.geometry.camera import Camera
 from wearcap.io.formats.contact_labels import Label, LabelClock, annotation_of
 from wearcap.recording import CameraStream, RecordingStore
 from wearcap.recording.motion import Interactions
-from wearcap.viewer.annotate import Desk
-from wearcap.viewer.annotate_server import AnnotationServer
 from wearcap_testing import recording_of, swaying_motion
 
 FRAMES, FPS = 600, 60.0

@@ -9,6 +9,8 @@ import pytest
 import torch
 from annotated_flat import CLOCK, FPS, FRAMES, TIMES, ask, held, labels, served, write_flat
 
+from wearcap.apps.annotate.server import AnnotationServer, _byte_range
+from wearcap.apps.annotate.takes import AnnotationFile, Conflict, Take, starting_labels
 from wearcap.body.skeleton import Skeleton, xsens23
 from wearcap.cli.annotate import main as annotate
 from wearcap.errors import WearcapError
@@ -18,8 +20,6 @@ from wearcap.io.formats.environment import write_environment
 from wearcap.io.formats.motion_npz import write_motion
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.scene.objects import Environment, Freedom, SceneObject
-from wearcap.viewer.annotate import AnnotationFile, Conflict, Take, starting_labels
-from wearcap.viewer.annotate_server import AnnotationServer, _byte_range
 from wearcap_testing import recording_of, swaying_motion
 
 

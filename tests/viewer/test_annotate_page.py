@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from annotated_flat import CLOCK, FPS, TIMES, labels, served, write_flat
 
+from wearcap.apps.annotate.server import AnnotationServer
+from wearcap.apps.annotate.takes import AnnotationFile, Desk
 from wearcap.io.formats.contact_labels import LabelClock, read_contact_labels
-from wearcap.viewer.annotate import AnnotationFile, Desk
-from wearcap.viewer.annotate_server import AnnotationServer
 from wearcap_browser import SHIFT, Chromium, chromium
 
 

@@ -8,6 +8,20 @@ import torch
 from PIL import Image
 
 from boxes import box_mesh
+from wearcap.apps.viewer.page import FLESH_M, Page, _spacing_m
+from wearcap.apps.viewer.page_layers import (
+    BALL_M,
+    BRIGHT,
+    DIM,
+    TOUCH_M,
+    _lit_color,
+    _true_body_contact,
+    lit_points,
+    poses_at,
+    stick_body,
+    with_objects,
+)
+from wearcap.apps.viewer.picture import _actors, contact_sheet
 from wearcap.body.anny_body import anny_body
 from wearcap.body.contact_points import BODY_POINTS, HAND_POINTS, contact_points
 from wearcap.cli import render as render_verb
@@ -20,20 +34,6 @@ from wearcap.io.formats.motion_npz import write_motion
 from wearcap.recording import Motion, Recording, RecordingStore
 from wearcap.recording.motion import Interactions
 from wearcap.scene.objects import Environment, Freedom, SceneObject
-from wearcap.viewer.page import FLESH_M, Page, _spacing_m
-from wearcap.viewer.page_layers import (
-    BALL_M,
-    BRIGHT,
-    DIM,
-    TOUCH_M,
-    _lit_color,
-    _true_body_contact,
-    lit_points,
-    poses_at,
-    stick_body,
-    with_objects,
-)
-from wearcap.viewer.picture import _actors, contact_sheet
 from wearcap_testing import swaying_motion
 
 FRAMES = 30

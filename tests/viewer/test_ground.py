@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from wearcap.apps.viewer.ground import Ground
 from wearcap.body.kinematics import site_positions
 from wearcap.body.skeleton import FOOT_PATCHES
-from wearcap.viewer.ground import Ground
 from wearcap_testing import swaying_motion
 
 COLORS, RIM = np.ones((2, 3)), np.ones(3)

@@ -24,18 +24,18 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from silent_sockets import silent
+from wearcap.apps.annotate import server as annotate_server
+from wearcap.apps.annotate.server import MAX_CONNECTIONS, AnnotationServer
+from wearcap.apps.annotate.takes import Desk, Video
+from wearcap.apps.scene_editor.editor import ObjectEditor
+from wearcap.apps.viewer.page import Page
+from wearcap.apps.web.connections import CONNECTIONS
+from wearcap.apps.web.guard import Guard, Refused
+from wearcap.apps.web.page_server import _start_server
 from wearcap.errors import WearcapError
 from wearcap.io.formats.environment import FILE_NAME
 from wearcap.recording import PointCloud, Recording, RecordingStore
 from wearcap.scene.scan import Box, Scan
-from wearcap.viewer import annotate_server
-from wearcap.viewer.annotate import Desk, Video
-from wearcap.viewer.annotate_server import MAX_CONNECTIONS, AnnotationServer
-from wearcap.viewer.connections import CONNECTIONS
-from wearcap.viewer.guard import Guard, Refused
-from wearcap.viewer.object_editor import ObjectEditor
-from wearcap.viewer.page import Page
-from wearcap.viewer.page_server import _start_server
 from wearcap_browser import chromium
 from wearcap_testing import recording_of, swaying_motion
 

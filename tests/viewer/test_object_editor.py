@@ -12,15 +12,15 @@ import pytest
 import torch
 from scanned_room import CHAIR, DOOR_X, DOOR_Y, SOFA, scanned_room
 
+from wearcap.apps.scene_editor.editor import ObjectEditor
+from wearcap.apps.scene_editor.view import HINTS, TOOLS, _typical_spacing
+from wearcap.apps.viewer.page_layers import by_height
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.formats.environment import read_environment, write_environment
 from wearcap.scene.editing import hinge_places
 from wearcap.scene.objects import Environment
 from wearcap.scene.scan import Box, Scan
-from wearcap.viewer.object_editor import ObjectEditor
-from wearcap.viewer.object_editor_view import HINTS, TOOLS, _typical_spacing
-from wearcap.viewer.page_layers import by_height
 from wearcap_browser import CONTROL, Chromium, chromium
 
 DOOR = Box((DOOR_X, DOOR_Y, 1.03), (0.94, 0.1, 2.0))

@@ -7,6 +7,8 @@ import pytest
 import torch
 import trimesh
 
+from wearcap.apps.viewer.page import CAPTURE_COLOR, Page, _Timeline
+from wearcap.apps.viewer.page_layers import AIR_COLOR, CONTACT_COLOR, nearest_frame, stick_body, surface_or_sticks
 from wearcap.body.skeleton import FOOT_PATCHES, Skeleton, xsens23
 from wearcap.cli.view import main as view
 from wearcap.errors import WearcapError
@@ -14,8 +16,6 @@ from wearcap.geometry import rotation
 from wearcap.io.formats.motion_npz import write_motion
 from wearcap.recording import ContactTrack, HeadStream, Motion, PointCloud, Recording, RecordingStore
 from wearcap.recording.store import dataset_folder
-from wearcap.viewer.page import CAPTURE_COLOR, Page, _Timeline
-from wearcap.viewer.page_layers import AIR_COLOR, CONTACT_COLOR, nearest_frame, stick_body, surface_or_sticks
 from wearcap_browser import chromium
 
 

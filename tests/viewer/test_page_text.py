@@ -19,19 +19,19 @@ from annotated_flat import ask, served, write_flat
 
 import wearcap
 from ports import free_port
+from wearcap.apps.live.page_devices import Device
+from wearcap.apps.live.page_panel import Panel
+from wearcap.apps.live.status import DeviceStatus, LiveControls, LiveStatus, SinkStatus, WearerStatus
+from wearcap.apps.scene_editor.editor import ObjectEditor
+from wearcap.apps.viewer.page import Page
+from wearcap.apps.web import page_server
+from wearcap.apps.web.page_text import MAX_NAME, MAX_TEXT
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.io.formats.environment import FILE_NAME, write_environment
-from wearcap.live.page_devices import Device
-from wearcap.live.page_panel import Panel
-from wearcap.live.status import DeviceStatus, LiveControls, LiveStatus, SinkStatus, WearerStatus
 from wearcap.recording import PointCloud, Recording
 from wearcap.scene.objects import Environment, Freedom, SceneObject
 from wearcap.scene.scan import Scan
-from wearcap.viewer import page_server
-from wearcap.viewer.object_editor import ObjectEditor
-from wearcap.viewer.page import Page
-from wearcap.viewer.page_text import MAX_NAME, MAX_TEXT
 from wearcap_browser import chromium
 
 HOSTILE = {

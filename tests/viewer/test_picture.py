@@ -8,12 +8,12 @@ import pytest
 import torch
 from PIL import Image
 
+from wearcap.apps.viewer.picture import SKY, contact_sheet, draw_head_path, save_png, shared_frames, write_video
 from wearcap.cli import render as render_verb
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.recording import Motion, PointCloud, Recording
 from wearcap.recording.timing import at_times
-from wearcap.viewer.picture import SKY, contact_sheet, draw_head_path, save_png, shared_frames, write_video
 from wearcap_testing import recording_of, small_dataset, swaying_motion
 
 SKY_8BIT = np.round(255 * np.array(SKY))
@@ -116,8 +116,8 @@ def test_png_is_written_whole(tmp_path):
 
 def test_the_camera_looks_past_what_would_hide_the_person():
     """A wall in the usual line of sight, farther from the person than what is cut away anyway: seen through nothing."""
-    from wearcap.viewer.camera_path import azimuths, smoothed
-    from wearcap.viewer.picture import DISTANCE_M, TILT, VIEW_RAD
+    from wearcap.apps.viewer.camera_path import azimuths, smoothed
+    from wearcap.apps.viewer.picture import DISTANCE_M, TILT, VIEW_RAD
 
     body = np.random.default_rng(0).uniform([-0.2, -0.2, 0.0], [0.2, 0.2, 1.7], (20, 3))
     toward = np.array([np.cos(VIEW_RAD), np.sin(VIEW_RAD), 0.0])
@@ -134,13 +134,13 @@ def test_the_camera_looks_past_what_would_hide_the_person():
 
 
 def test_videos_drawn_by_several_threads_have_their_frames_in_order():
-    from wearcap.viewer.picture import _in_parallel
+    from wearcap.apps.viewer.picture import _in_parallel
 
     assert [int(x[0]) for x in _in_parallel(lambda t: np.array([t]), [float(k) for k in range(50)])] == list(range(50))
 
 
 def test_an_interrupted_video_leaves_nothing_and_progress_is_printed_without_a_terminal(tmp_path, monkeypatch, capfd):
-    from wearcap.viewer import picture
+    from wearcap.apps.viewer import picture
 
     drawn = picture.captioned
 
@@ -157,9 +157,9 @@ def test_an_interrupted_video_leaves_nothing_and_progress_is_printed_without_a_t
 
 
 def test_a_body_is_only_shown_where_a_motion_has_its_joints():
+    from wearcap.apps.viewer.picture import _actors
     from wearcap.body.anny_body import anny_body
     from wearcap.body.skeletons import smpl24
-    from wearcap.viewer.picture import _actors
 
     motion = swaying_motion(10)
     other = replace(

@@ -41,9 +41,9 @@ def main(arguments: list[str]) -> None:
     if options.video_start is not None and options.video is None:
         raise WearcapError("--video-start without a video", expected="--video FILE with it")
 
+    from wearcap.apps.annotate.server import AnnotationServer
+    from wearcap.apps.annotate.takes import Desk
     from wearcap.io.formats.motion_npz import read_motion
-    from wearcap.viewer.annotate import Desk
-    from wearcap.viewer.annotate_server import AnnotationServer
 
     motion = read_motion(options.motion) if options.motion else None
     desk = Desk(options.recording, options.output, motion, options.video, options.video_start)
@@ -76,7 +76,7 @@ def _export(arguments: list[str]) -> None:
     parser.add_argument("--to", type=Path, help="file, or folder for several recordings (default: NAME.json here)")
     options = parser.parse_args(arguments)
 
-    from wearcap.viewer.annotate import Desk
+    from wearcap.apps.annotate.takes import Desk
 
     for target, left, right in Desk(options.recording, options.output).export(options.to):
         print(f"wrote {target}: {left} contacts of the left hand, {right} of the right")

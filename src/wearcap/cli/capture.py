@@ -15,15 +15,17 @@ from rich.console import Console
 from rich.markup import escape
 from torch import Tensor
 
+from wearcap.apps.viewer.page_layers import with_objects
+from wearcap.apps.viewer.picture import contact_sheet, save_png, write_video
 from wearcap.body.anny_body import anny_body
 from wearcap.body.model import BodyModel
 from wearcap.body.skeleton import xsens23
 from wearcap.body.smpl_body import betas_of, smpl_body, template_pelvis
+from wearcap.checks import require_sound
+from wearcap.checks.consistency import SCAN_FILE
 from wearcap.cli.capture_all import capture_all, is_dataset
 from wearcap.cli.conf import hydra_application, load_pipeline, run_application, with_pipeline, with_pipeline_of_content
 from wearcap.cli.stated import stated
-from wearcap.doctor import require_sound
-from wearcap.doctor.consistency import SCAN_FILE
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.io.datasets.amass import write_amass
@@ -38,8 +40,6 @@ from wearcap.recording import Motion, Recording
 from wearcap.recording.store import MANIFEST, dataset_folder
 from wearcap.runtime.system import CaptureInput, StageOptions, System
 from wearcap.tracking.stature import skeleton_of, with_stature
-from wearcap.viewer.page_layers import with_objects
-from wearcap.viewer.picture import contact_sheet, save_png, write_video
 
 
 def run(config: DictConfig) -> Motion | None:

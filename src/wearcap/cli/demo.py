@@ -18,11 +18,11 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--steps", type=int, default=400, help="training steps")
     options = parser.parse_args(arguments)
 
+    from wearcap.apps.viewer.picture import contact_sheet, save_png, shared_frames
     from wearcap.body.anny_body import anny_body
     from wearcap.cli import capture, evaluate, export, prepare, train
     from wearcap.io.formats.motion_npz import read_motion
     from wearcap.recording import RecordingStore
-    from wearcap.viewer.picture import contact_sheet, save_png, shared_frames
 
     out, data, trained = options.output, options.output / "data", options.output / "train/checkpoints/last.ckpt"
     started = time.monotonic()

@@ -13,12 +13,12 @@ from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
+from wearcap.apps.doctor import examine
+from wearcap.apps.doctor.preflight import preflight
+from wearcap.checks import Report
+from wearcap.checks.truth import FIGURES
 from wearcap.cli.conf import compose
 from wearcap.cli.stated import stated
-from wearcap.doctor import Report
-from wearcap.doctor.preflight import preflight
-from wearcap.doctor.truth import FIGURES
-from wearcap.reading import examine
 from wearcap.runtime.system import System
 
 _COLOR = {"ok": "green", "note": "cyan", "warning": "yellow", "error": "bold red"}

@@ -10,6 +10,8 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from rich import get_console
 from rich import print as show
 
+from wearcap.apps.viewer.page_layers import with_objects
+from wearcap.apps.viewer.picture import contact_sheet, save_png
 from wearcap.cli.conf import hydra_application, load_systems, parallel_of, run_application, trained_on, with_pipeline
 from wearcap.cli.stated import stated
 from wearcap.errors import WearcapError
@@ -44,8 +46,6 @@ from wearcap.reading import read
 from wearcap.recording import RecordingStore
 from wearcap.recording.store import MANIFEST, dataset_folder
 from wearcap.runtime.system import CaptureInput, System
-from wearcap.viewer.page_layers import with_objects
-from wearcap.viewer.picture import contact_sheet, save_png
 
 OURS = "wearcap"
 """Name of the evaluated checkpoint's method in the table."""

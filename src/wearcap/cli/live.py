@@ -18,25 +18,25 @@ from omegaconf import DictConfig, ListConfig
 from rich import print as show
 from rich.markup import escape
 
+from wearcap.apps.live.capture import LiveCapture, report_text
+from wearcap.apps.live.page import LivePage
+from wearcap.apps.live.setup import Setup, read_setup
+from wearcap.apps.live.sink import Sink
+from wearcap.apps.live.sinks import sink_of
+from wearcap.apps.live.sinks.files import FilesSink
+from wearcap.apps.live.source import Source
+from wearcap.apps.live.sources import source_of
+from wearcap.apps.live.sources.replay import ReplaySource
+from wearcap.apps.web.guard import LOOPBACK
 from wearcap.body.skeleton import xsens23
 from wearcap.cli.conf import compose, hydra_main, load_pipeline
 from wearcap.cli.stated import stated
 from wearcap.errors import WearcapError, nearest, require_choice
 from wearcap.files import write_text
-from wearcap.live.capture import LiveCapture, report_text
-from wearcap.live.page import LivePage
-from wearcap.live.setup import Setup, read_setup
-from wearcap.live.sink import Sink
-from wearcap.live.sinks import sink_of
-from wearcap.live.sinks.files import FilesSink
-from wearcap.live.source import Source
-from wearcap.live.sources import source_of
-from wearcap.live.sources.replay import ReplaySource
 from wearcap.reading import read
 from wearcap.recording.store import MANIFEST, dataset_folder
 from wearcap.runtime.system import CaptureInput, System
 from wearcap.tracking.stature import with_stature
-from wearcap.viewer.guard import LOOPBACK
 
 MAX_MESSAGES = 20
 """Different messages of libraries that are shown."""

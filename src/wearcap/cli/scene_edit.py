@@ -21,9 +21,9 @@ def main(arguments: list[str]) -> None:
     add_page(parser, 8080, host=True)
     options = parser.parse_args(arguments)
 
+    from wearcap.apps.scene_editor.editor import ObjectEditor
     from wearcap.io.formats.environment import FILE_NAME
     from wearcap.io.formats.scene_folder import cloud_file, read_scan
-    from wearcap.viewer.object_editor import ObjectEditor
 
     cloud = cloud_file(options.scene)
     file = Path(options.environment) if options.environment else cloud.parent / FILE_NAME

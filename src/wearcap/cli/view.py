@@ -51,10 +51,10 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--environment", help="objects to show (default: what the recording names)")
     options = parser.parse_args(arguments)
 
+    from wearcap.apps.viewer.page import Page
     from wearcap.reading import read
     from wearcap.recording.store import dataset_folder
     from wearcap.runtime.system import CaptureInput
-    from wearcap.viewer.page import Page
 
     recording, folder = read(options.recording, stated(vars(options))), dataset_folder(options.recording)
     captures = read_motions(options.motion)

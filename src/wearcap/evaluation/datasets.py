@@ -22,7 +22,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from wearcap.boundary.texts import read_json
-from wearcap.doctor import require_sound
+from wearcap.checks import require_sound
 from wearcap.errors import WearcapError
 from wearcap.evaluation.evaluate import Measure, evaluate
 from wearcap.files import remembered_sha256, write_text

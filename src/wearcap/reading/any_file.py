@@ -9,10 +9,10 @@ from pathlib import Path
 import torch
 
 from wearcap.boundary.arrays import read_npz
-from wearcap.doctor.consistency import check_files
-from wearcap.doctor.examine import require_sound
-from wearcap.doctor.places import is_map, is_place, read_environment_file, read_map, read_place
-from wearcap.doctor.report import Check, Finding
+from wearcap.checks.consistency import check_files
+from wearcap.checks.examine import require_sound
+from wearcap.checks.places import is_map, is_place, read_environment_file, read_map, read_place
+from wearcap.checks.report import Check, Finding
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import DETECTED, Conventions
 from wearcap.io.datasets.adt import is_adt, read_adt

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from wearcap.body.skeleton import WRISTS
 from wearcap.boundary.texts import read_json_object
-from wearcap.doctor.report import Check, Finding, refusal
-from wearcap.doctor.streams import check_clock
+from wearcap.checks.report import Check, Finding, refusal
+from wearcap.checks.streams import check_clock
 from wearcap.errors import WearcapError
 from wearcap.io.conventions import AUTO, Conventions
 from wearcap.io.devices.aria_mps import find_mps_file, head_stream, read_closed_loop, read_mps

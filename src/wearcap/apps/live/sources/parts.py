@@ -1,0 +1,107 @@
+"""What the sources share: checked poses in wearcap's axes, names of devices, options of addresses."""
+
+import math
+import re
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from wearcap.apps.live.packets import CAMERA, HEAD, SUIT
+from wearcap.body.skeleton import WRISTS
+from wearcap.geometry.rigid import Rigid
+from wearcap.io.devices.headset_axes import CONVENTIONS
+from wearcap.sensors.packets import MAX_POSITION_M, NOT_A_ROTATION, NOT_FINITE, rotation_fault, values_fault
+
+MAX_NAME = 64
+"""Characters of a device's or wearer's name."""
+MAX_NAMES = 64
+"""Names that a source knows at once."""
+FORGOTTEN_S = 60.0
+"""A name that was silent for so long makes room for another."""
+UNIT_TOLERANCE = 0.02
+"""Tolerance of a quaternion's length."""
+AXES = {"wearcap": torch.eye(3), **CONVENTIONS}
+"""Rotations or reflections into wearcap's axes (x forward, y left, z up), by name."""
+_OTHER_PARTS = re.compile("foot|feet|ankle|toe|knee|leg|thigh|hip|elbow|arm(?!and)|shoulder|chest|waist|eye|ear")
+
+UNTRACKED = "not tracked"
+TOO_MANY_NAMES = "too many devices"
+BAD_NAME = "no name"
+
+
+class Names:
+    """Names that come from the network, bounded in number and length; a name that has been silent is forgotten."""
+
+    def __init__(self, limit: int = MAX_NAMES):
+        self.limit = limit
+        self._last_s: dict[str, float] = {}
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._last_s
+
+    def fault(self, name: object, now_s: float) -> str | None:
+        """Why a name cannot be used, or None."""
+        if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME or not name.isprintable():
+            return BAD_NAME
+        if name not in self._last_s and len(self._last_s) >= self.limit:
+            oldest = min(self._last_s, key=self._last_s.__getitem__)
+            if now_s - self._last_s[oldest] < FORGOTTEN_S:
+                return TOO_MANY_NAMES
+            del self._last_s[oldest]
+        self._last_s[name] = now_s
+        return None
+
+
+def device_of(serial: str) -> str:
+    """The wrist that a serial plainly names ("LeftHand", "Controller (Right)"), else the serial itself.
+
+    A serial that is the name of another kind of device gets another name.
+    """
+    if serial in (HEAD, SUIT, CAMERA):
+        return f"tracker {serial}"
+    name = serial.lower()
+    left, right = "left" in name, "right" in name
+    if left == right or _OTHER_PARTS.search(name):
+        return serial
+    return WRISTS[0] if left else WRISTS[1]
+
+
+def pose_of(position: Sequence[float], quat_wxyz: Sequence[float], axes: str) -> Rigid | str:
+    """A pose of named axes, world and device alike, in wearcap's; or why there is none."""
+    R = matrix_of(quat_wxyz)
+    return R if isinstance(R, str) else checked_pose(position, R, axes)
+
+
+def matrix_of(quat_wxyz: Sequence[float]) -> Float[Tensor, "3 3"] | str:
+    """Rotation matrix of a quaternion of about unit length; or why there is none."""
+    w, x, y, z = quat_wxyz
+    square = w * w + x * x + y * y + z * z
+    if not math.isfinite(square):
+        return NOT_FINITE
+    if abs(square - 1) > 2 * UNIT_TOLERANCE:
+        return NOT_A_ROTATION
+    s = 2 / square
+    rows = [
+        [1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)],
+        [s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)],
+        [s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)],
+    ]
+    return torch.tensor(rows)
+
+
+def checked_pose(position: Sequence[float], R: Float[Tensor, "3 3"], axes: str) -> Rigid | str:
+    """As `pose_of`, of a matrix."""
+    t = torch.tensor(position, dtype=torch.float32)
+    if fault := rotation_fault(R) or values_fault(t, (3,), MAX_POSITION_M):
+        return fault
+    if axes == "wearcap":
+        return Rigid(R, t)
+    M = AXES[axes]
+    return Rigid(M @ R @ M.T, M @ t)
+
+
+def untracked(position: Sequence[float], quat_wxyz: Sequence[float]) -> bool:
+    """Whether a pose is what runtimes send for a device that they do not see: all zero, or zero and unturned."""
+    return not any(position) and not any(quat_wxyz[1:])
