@@ -331,7 +331,7 @@ def test_hps_page_shows_the_range_over_presets_of_sensors():
     one = tables_hps.page({"hps": tree("typical", 3.0, 4.0)}, {})
     assert (
         one.measured
-        == "joints 3.5 cm off over 380 m and more, with typical sensors (as published 50.0; suit alone: 50)"
+        == "joints 3.5 cm off over 380 m and more, with typical sensors (the authors' code 50.0; suit alone: 50)"
     )
     assert one.speed == "100 × real time, localised cameras given (a machine)"
     trees = {"hps": tree("typical", 3.0, 4.0), "hps_ideal": tree("ideal", 2.0), "hps_poor": tree("poor", 7.0)}
