@@ -11,7 +11,6 @@ import argparse
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import torch
 from rich.console import Console
@@ -22,6 +21,7 @@ from wearcap.apps.viewer.picture import save_png
 from wearcap.data.surroundings import PlaceCodes
 from wearcap.data.windows import Source, Windows
 from wearcap.metrics.detection import distance_mae_cm, occupancy_iou, occupied_distance_mae_cm
+from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.scene.voxels import VoxelGrid
 from wearcap.systems.hmd2.voxel_autoencoder_training import PlaceContent
 
@@ -103,22 +103,22 @@ def slices(grids: dict[str, Tensor], clip_m: float, level: int = 5, pixels: int 
     return torch.cat(rows).repeat_interleave(pixels, 0).repeat_interleave(pixels, 1)
 
 
-def methods(options: argparse.Namespace, train: Tensor) -> tuple[dict[str, Rebuild], dict[str, Any]]:
-    """Ways to rebuild grids by label, and the encoders among them."""
+def methods(options: argparse.Namespace, train: Tensor) -> tuple[dict[str, Rebuild], dict[str, VoxelAutoencoder]]:
+    """Ways to rebuild grids by label, and the networks among them."""
     rebuilds: dict[str, Rebuild] = {
         "no point anywhere": lambda grids: torch.full_like(grids, VoxelGrid().clip_m),
         "nearest of training": nearest(train),
         "128 principal components": principal(train),
     }
-    encoders = {}
+    networks = {}
     for given in options.checkpoints:
         label, _, path = given.rpartition("=")
         net = PlaceCodes(path).encoder
-        encoders[label or "ours"] = net.encode
+        networks[label or "ours"] = net
         rebuilds[label or "ours"] = lambda grids, net=net: torch.cat(
             [net.decode(net.encode(part)) for part in grids.split(500)]
         )
-    return rebuilds, encoders
+    return rebuilds, networks
 
 
 @torch.no_grad()
@@ -129,19 +129,19 @@ def tables(options: argparse.Namespace, about: dict[str, str]) -> Path:
         grids_of(options.data, split, count // share, grid)
         for split, count in (("train", 24_000), ("val", 1_000), ("test", 4_000))
     )
-    rebuilds, encoders = methods(options, train)
+    rebuilds, networks = methods(options, train)
     rows = {label: scored(rebuild, val, test, grid.clip_m) for label, rebuild in rebuilds.items()}
-    for label, encode in encoders.items():
-        rows[label]["encoded_per_s"] = encoded_per_second(encode, test)
+    for label, net in networks.items():
+        rows[label]["encoded_per_s"] = encoded_per_second(net.encode, test)
+        rows[label]["parameters"] = sum(weights.numel() for weights in net.parameters())
     table = new_table(
         f"Grids of {options.data.name} from their codes ({len(test)} of the test split)",
-        ["", "distance, cm", "of held cells, cm", "occupancy IoU", "encoded/s"],
+        ["", "distance, cm", "of held cells, cm", "occupancy IoU", "encoded/s", "parameters"],
     )
     for label, row in rows.items():
-        speed = f"{row['encoded_per_s']:.0f}" if "encoded_per_s" in row else ""
-        table.add_row(
-            label, f"{row['distance_cm']:.4f}", f"{row['held_distance_cm']:.2f}", f"{row['occupancy_iou']:.3f}", speed
-        )
+        figures = [f"{row['distance_cm']:.4f}", f"{row['held_distance_cm']:.2f}", f"{row['occupancy_iou']:.3f}"]
+        figures += [f"{row[name]:,.0f}" for name in ("encoded_per_s", "parameters") if name in row]
+        table.add_row(label, *figures)
     Console(width=120).print(table)
     shown = test[:: len(test) // 12][:12]
     pictured = {"true": shown} | {label: rebuild(shown) for label, rebuild in rebuilds.items()}
