@@ -19,12 +19,9 @@ from contextlib import contextmanager, suppress
 from functools import cache, lru_cache
 from pathlib import Path
 
-from wearcap.errors import WearcapError
+from filelock import lock_descriptor
 
-try:
-    import fcntl
-except ModuleNotFoundError:  # Windows
-    fcntl = None
+from wearcap.errors import WearcapError
 
 _TEMPORARY = re.compile(r"\..+\.tmp-[0-9a-f]{8}(\.[^.]+)?")
 _OF_WRITES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG)
@@ -100,12 +97,12 @@ def _sync_folder(folder: Path) -> None:
 
 def _claim(temporary: Path) -> int | None:
     """Create and lock the file; returns the descriptor, or None where files cannot be locked."""
-    if fcntl is None:
-        return None
+    if os.name != "posix":
+        return None  # Windows renames no open file
     while True:
         descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT, 0o666)
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            lock_descriptor(descriptor)
         except OSError:
             os.close(descriptor)
             return None
@@ -120,11 +117,19 @@ def open_own(path: Path, flags: int) -> int:
     Raises OSError for a link, whose target is not touched, for a pipe, and for a device.
     """
     descriptor = os.open(path, flags | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0), 0o666)
+    try:
+        require_own(descriptor, path)
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def require_own(descriptor: int, path: Path) -> None:
+    """Raise OSError for an open file that is a pipe or a device, or that has another name, too."""
     status = os.fstat(descriptor)
     if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
-        os.close(descriptor)
         raise OSError(errno.ELOOP, "no regular file of its own", str(path))
-    return descriptor
 
 
 def remove_leftovers(folder: str | Path, *, below: bool = False) -> None:
@@ -139,13 +144,13 @@ def remove_leftovers(folder: str | Path, *, below: bool = False) -> None:
                 continue
             path = Path(where, name)
             with suppress(OSError):  # locked, removed by another process, or without permission to remove
-                if fcntl is None:
+                if os.name != "posix":
                     path.unlink()  # Windows refuses this while a writer has it open
                     continue
                 descriptor = open_own(path, os.O_RDWR)
                 try:
-                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    path.unlink()
+                    if lock_descriptor(descriptor, blocking=False):
+                        path.unlink()
                 finally:
                     os.close(descriptor)
         if not below:
