@@ -30,7 +30,7 @@ KNOWN: dict[str, type] = _PARTS | {
 def flatten(value: Any, key: str = "") -> tuple[Any, dict[str, Tensor]]:
     """Return (JSON tree, tensors by dotted key). Parts that are None or empty are omitted."""
     if isinstance(value, Tensor):
-        return {"$tensor": key}, {key: value.detach().cpu().contiguous().clone()}
+        return {"$tensor": key}, {key: value.detach().cpu()}
     if dataclasses.is_dataclass(value):
         items = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
         tree: dict[str, Any] = {"$type": type(value).__name__}

@@ -11,14 +11,13 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 from safetensors import SafetensorError
-from safetensors.torch import save
 from torch import Tensor
 
 from wearcap.boundary.opening import explained, file_size, path_inside, read_bytes, understood
-from wearcap.boundary.tensors import open_tensors
-from wearcap.boundary.texts import parse_json
+from wearcap.boundary.tensors import open_described, write_tensors
+from wearcap.boundary.texts import parse_json, require_layout
 from wearcap.errors import WearcapError, require_choice
-from wearcap.files import atomic_path, remembered_sha256, sha256_of, write_text
+from wearcap.files import remembered_sha256, sha256_of, write_text
 from wearcap.recording.recording import Recording
 from wearcap.recording.serialize import dumps, flatten, require_part, unflatten
 
@@ -107,11 +106,9 @@ class RecordingFile:
                     raise WearcapError(f"{size} bytes long", self.path, expected, fix)
                 if entry is not None and remembered_sha256(self.path) != entry.sha256:
                     raise _differs(self.path)
-        self._file = open_tensors(path, "recording", "Prepare this recording again.")
-        metadata = self._file.metadata() or {}
-        if "wearcap" not in metadata:
-            raise WearcapError("a .safetensors file, but not a recording", path, "one that `wearcap prepare` wrote")
-        description = parse_json(metadata["wearcap"], path, schema=_Description)
+        fix = "Prepare this recording again."
+        self._file, content = open_described(path, "wearcap", "recording", "`wearcap prepare`", fix)
+        description = require_layout(content, _Description, path)
         if (version := description.schema_version) != SCHEMA_VERSION:
             raise WearcapError(f"schema version {version}", path, f"version {SCHEMA_VERSION}", "Prepare it again.")
         self._tree = description.recording
@@ -181,10 +178,7 @@ def _entries(manifest: Path, *stamp: int) -> Mapping[str, Entry]:
 def save_recording(recording: Recording, path: str | Path) -> None:
     """Write one recording atomically; equal recordings give equal bytes."""
     tree, tensors = flatten(recording)
-    # One entry only: safetensors writes several in an order that changes from process to process.
-    metadata = {"wearcap": dumps({"schema_version": SCHEMA_VERSION, "recording": tree})}
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(save(dict(sorted(tensors.items())), metadata))
+    write_tensors(path, tensors, {"wearcap": dumps({"schema_version": SCHEMA_VERSION, "recording": tree})})
 
 
 class RecordingStore:
