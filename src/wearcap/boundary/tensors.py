@@ -85,7 +85,7 @@ def write_tensors(
     One key only: safetensors writes several in an order that changes from process to process.
     """
     whole = {
-        name: torch.tensor(value) if isinstance(value, np.ndarray) else value.detach().cpu().contiguous().clone()
+        name: (torch.tensor(value) if isinstance(value, np.ndarray) else value.detach().cpu().clone()).contiguous()
         for name, value in sorted(tensors.items())
     }
     with atomic_path(path) as temporary:
