@@ -45,10 +45,10 @@ def _show_report(report: Report, store: RecordingStore) -> None:
     for split in SPLITS:
         entries = [store.entries[name] for name in store.names(split)]
         minutes = sum(entry.duration_s for entry in entries) / 60
-        subjects = len({entry.subject for entry in entries})
+        subjects = len({entry.context.subject for entry in entries})
         print(f"  {split:5} {len(entries):4} recordings, {subjects:3} subjects, {minutes:7.1f} min")
-    fresh = {store.entries[name].subject for name in report.written}
-    names = sorted(name for name in ours if store.entries[name].subject in fresh)
+    fresh = {store.entries[name].context.subject for name in report.written}
+    names = sorted(name for name in ours if store.entries[name].context.subject in fresh)
     for subject, person in people(store, names).items():
         if wrong := [f"{finding.what} ({finding.evidence})" for finding in of_person(person)]:
             print(f"warning: person {subject}: {'; '.join(wrong)}")

@@ -1,6 +1,5 @@
 """Data sets on disk: a `manifest.json`, and one memory-mapped `.safetensors` file per recording."""
 
-import dataclasses
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
@@ -38,8 +37,18 @@ _DAMAGE = (
 
 
 @dataclass(frozen=True)
+class Context:
+    """Who a recording is of, where, doing what, and under which licence."""
+
+    subject: str
+    location: str
+    activity: str
+    license: str
+
+
+@dataclass(frozen=True)
 class Entry:
-    """Manifest entry of one recording."""
+    """Manifest entry of one recording; in the file its context stands among the other keys."""
 
     file: str
     sha256: str
@@ -47,11 +56,8 @@ class Entry:
     frames: Annotated[int, msgspec.Meta(ge=0, le=10**9)]  # a week at 1.6 kHz
     fps: Annotated[float, msgspec.Meta(ge=0, le=1e5)]
     duration_s: Annotated[float, msgspec.Meta(ge=0, le=1e11)]
-    subject: str
-    location: str
-    activity: str
+    context: Context
     split: Literal["train", "val", "test"]
-    license: str
     config_hash: str
     """Hash of source bytes and preparation settings: prepare skips a recording whose hash is current."""
 
@@ -63,7 +69,6 @@ class Entry:
         stream = recording.motion or recording.suit or recording.head
         frames = len(stream.timestamps) if stream else 0
         fps = round(1 / stream.timestamps.diff().median().item(), 4) if stream and frames > 1 else 0.0
-        about = {name: getattr(recording, name) for name in ("subject", "location", "activity", "license")}
         return cls(
             file=path.relative_to(root).as_posix(),
             sha256=sha256_of(path),
@@ -71,9 +76,9 @@ class Entry:
             frames=frames,
             fps=fps,
             duration_s=round(recording.duration_s, 4),
+            context=Context(recording.subject, recording.location, recording.activity, recording.license),
             split=split,
             config_hash=config_hash,
-            **about,
         )
 
 
@@ -196,7 +201,8 @@ class RecordingStore:
             what = f"schema version {str(version)[:40]}"
             raise WearcapError(what, path, f"version {SCHEMA_VERSION}", "Prepare the data set again.")
         with understood("not a readable manifest", path, fix="Delete it and prepare the data set again."):
-            self.entries = msgspec.convert(manifest["recordings"], dict[str, Entry])
+            rows = {name: row | {"context": row} for name, row in manifest["recordings"].items()}
+            self.entries = msgspec.convert(rows, dict[str, Entry])
             for name, entry in self.entries.items():
                 if self.root / entry.file != recording_path(self.root, name):
                     raise ValueError(f"{name!r} is at {entry.file!r}, outside this data set")
@@ -229,7 +235,9 @@ class RecordingStore:
     def register(self, entries: dict[str, Entry]) -> None:
         """Add manifest entries of recordings whose files already exist (written by workers)."""
         self.entries |= entries
-        recordings = {key: dataclasses.asdict(value) for key, value in sorted(self.entries.items())}
+        recordings = {key: vars(value) | vars(value.context) for key, value in sorted(self.entries.items())}
+        for row in recordings.values():
+            del row["context"]
         text = json.dumps({"schema_version": SCHEMA_VERSION, "recordings": recordings}, indent=1)
         write_text(self.manifest_path, text + "\n")
 
