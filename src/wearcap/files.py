@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache, lru_cache
 from pathlib import Path
+from typing import Any
 
 from filelock import lock_descriptor
 
@@ -185,8 +186,8 @@ def resource(in_checkout: str, in_wheel: str) -> Path:
 
 SETTLED_S = 2.0
 """Age (s) below which files are hashed every time: a file system's clock may not separate two writes."""
-MAX_LEDGER_BYTES = 1 << 26
-"""Size (64 MiB, some 300,000 files) beyond which the cache is cleared."""
+_SUMS, MAX_LEDGER_BYTES = "sha256.jsonl", 1 << 26
+"""The cache of digests, and the size (64 MiB, some 300,000 files) beyond which it is cleared."""
 
 Key = tuple[str, int, int, int]
 
@@ -203,11 +204,7 @@ def remembered_sha256(path: str | Path) -> str:
     digest = sha256_of(path)
     if key == _key(Path(path)) and time.time() - key[2] / 1e9 > SETTLED_S:
         known[key] = digest
-        with suppress(OSError):  # without a cache folder, only in memory
-            ledger = _ledger_path()
-            ledger.parent.mkdir(parents=True, exist_ok=True)
-            with open(ledger, "ab") as file:  # one write, so that lines of other processes do not mix with it
-                file.write((json.dumps([*key, digest]) + "\n").encode())
+        remember(_SUMS, [*key, digest])
     return digest
 
 
@@ -223,24 +220,34 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "wearcap"
 
 
-def _ledger_path() -> Path:
-    return cache_folder() / "sha256.jsonl"
+def remember(ledger: str, value: Any) -> None:
+    """Add a line of JSON to a file in the cache folder. Without such a folder nothing is kept."""
+    path = cache_folder() / ledger
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(path, "ab") as file:  # one write, so that lines of other processes do not mix with it
+            file.write((json.dumps(value) + "\n").encode())
+
+
+def remembered(ledger: str) -> list[Any]:
+    """Values of a file's lines in the cache folder; truncated or foreign ones are ignored."""
+    values = []
+    with suppress(OSError, UnicodeDecodeError):
+        for line in (cache_folder() / ledger).read_text(encoding="utf-8").splitlines():
+            with suppress(ValueError):
+                values.append(json.loads(line))
+    return values
 
 
 @cache
 def _ledger() -> dict[Key, str]:
-    """Digests cached by earlier processes; truncated or foreign lines are ignored."""
+    """Digests cached by earlier processes."""
     known: dict[Key, str] = {}
-    path = _ledger_path()
-    try:
-        if path.stat().st_size > MAX_LEDGER_BYTES:
+    with suppress(OSError):
+        if (path := cache_folder() / _SUMS).stat().st_size > MAX_LEDGER_BYTES:
             path.unlink()
-        for line in path.read_text(encoding="utf-8").splitlines():
-            try:
-                name, size, mtime_ns, inode, digest = json.loads(line)
-                known[(name, size, mtime_ns, inode)] = digest
-            except (ValueError, TypeError):
-                continue
-    except (OSError, UnicodeDecodeError):
-        return known
+    for row in remembered(_SUMS):
+        with suppress(ValueError, TypeError):
+            name, size, mtime_ns, inode, digest = row
+            known[(name, size, mtime_ns, inode)] = digest
     return known
