@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from data_prep.shared.engine import Splits, Task
 from data_prep.simulated import source_files
 from wearcap.errors import WearcapError
+from wearcap.files import content_hash
 from wearcap.geometry import rotation
-from wearcap.prepare.engine import Splits, Task, content_hash
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
 from wearsim.places.surround import surround

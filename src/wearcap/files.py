@@ -175,6 +175,12 @@ def sha256_of(path: str | Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def content_hash(*parts: Any) -> str:
+    """Hex digest (16 digits) of settings (anything JSON can hold) and of the bytes of files given as Path."""
+    plain = [sha256_of(part) if isinstance(part, Path) else part for part in parts]
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
+
+
 def resource(in_checkout: str, in_wheel: str) -> Path:
     """A folder of the checkout when the package is imported from one, else the copy that the wheel carries."""
     package = Path(__file__).resolve().parent

@@ -14,6 +14,8 @@ import torch
 from data_prep.amass import amass_tasks
 from data_prep.bvh import Hips, bvh_tasks
 from data_prep.cmu import cmu_tasks
+from data_prep.shared.engine import Splits, check_recording
+from data_prep.shared.mocap import About, CleaningLimits, MocapSettings, foot_patches, mocap_recording, without_glitches
 from foreign_bvh import CONVENTIONS, walk, write
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
 from wearcap.boundary.texts import read_bytes
@@ -24,8 +26,6 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.datasets.amass import write_amass
 from wearcap.metrics.gait import knee_cycles, normal_knee_deg
-from wearcap.prepare import Splits, check_recording
-from wearcap.prepare.mocap import About, CleaningLimits, MocapSettings, foot_patches, mocap_recording, without_glitches
 from wearcap.recording import Motion, RecordingStore
 from wearcap.recording.timing import resampled
 

@@ -9,12 +9,12 @@ import torch
 
 from data_prep.behave import _ground_rotation
 from data_prep.omomo import _check_rate, read_omomo
+from data_prep.shared.engine import Splits, check_recording
 from wearcap.cli.conf import splits_dir
 from wearcap.cli.main import run_verb
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.formats.environment import read_environment
-from wearcap.prepare import Splits, check_recording
 from wearcap.recording.store import RecordingStore
 
 

@@ -6,12 +6,12 @@ from pathlib import Path
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from data_prep.shared.engine import Report, Splits, prepare
 from wearcap.checks import require_sound
 from wearcap.checks.truth import of_person, people
 from wearcap.cli.conf import compose, explained, require_writable, splits_dir
 from wearcap.cli.verbs import sources
 from wearcap.errors import WearcapError, nearest
-from wearcap.prepare.engine import Report, Splits, prepare
 from wearcap.recording.store import SPLITS, RecordingStore
 
 

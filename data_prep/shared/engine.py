@@ -6,7 +6,6 @@ moment, a data set is left with whole files and a whole manifest, and the next r
 
 import csv
 import hashlib
-import json
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -100,12 +99,6 @@ class Splits:
                 expected = f"one of {', '.join((*SPLITS, BY_HASH))}"
                 raise WearcapError(f"no split {row['split']!r}", where=path, expected=expected)
         return cls(path, tuple((row["subject"], row["split"]) for row in table))
-
-
-def content_hash(*parts: Any) -> str:
-    """Hex digest (16 digits) of settings (anything JSON can hold) and of the bytes of files given as Path."""
-    plain = [sha256_of(part) if isinstance(part, Path) else part for part in parts]
-    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def source_folder(source: str | Path) -> Path:
