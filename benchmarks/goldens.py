@@ -159,7 +159,7 @@ EVALUATIONS = {
         "seeds=[0]",
     ),
 }
-EXPORTS = {"hmd2": "hmd2", "mocap_every": "mocap_every", "echo": "echo", "contact_sequence": "hmd2"}
+EXPORTS = {"hmd2": "hmd2", "mocap_every": "mocap_every", "echo": "echo", "contact_sequence": "ireplica"}
 """Checkpoints with the pipeline that they are exported for."""
 
 

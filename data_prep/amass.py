@@ -5,11 +5,12 @@ from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
+from data_prep.shared.engine import Splits, Task, source_folder
+from data_prep.shared.mocap import About, MocapSettings, mocap_recording
 from wearcap.errors import WearcapError, nearest
+from wearcap.files import content_hash
 from wearcap.io.conventions import AUTO
 from wearcap.io.datasets.amass import read_amass
-from wearcap.prepare.engine import Splits, Task, content_hash, source_folder
-from wearcap.prepare.mocap import About, MocapSettings, mocap_recording
 from wearcap.recording.recording import Recording
 
 VERSION = 3

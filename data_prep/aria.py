@@ -3,9 +3,10 @@
 from functools import partial
 from pathlib import Path
 
+from data_prep.shared.engine import Splits, Task, changed, source_folder
 from wearcap.errors import WearcapError
+from wearcap.files import content_hash
 from wearcap.io.devices.aria_mps import is_mps_folder, mps_files, read_mps
-from wearcap.prepare.engine import Splits, Task, changed, content_hash, source_folder
 
 VERSION = 2
 """Version of the conversion, increased when the same source and settings yield another recording."""

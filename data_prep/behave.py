@@ -18,11 +18,14 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from data_prep.one_object import VERSION, OneObject, one_object_recording
+from data_prep.shared.engine import Splits, Task
+from data_prep.shared.mocap import MocapSettings, foot_patches, on_xsens23
 from wearcap.body.skeletons import smplh52
 from wearcap.boundary.arrays import read_npz, require
 from wearcap.boundary.opening import understood
 from wearcap.boundary.texts import read_json
 from wearcap.errors import WearcapError
+from wearcap.files import content_hash
 from wearcap.geometry import rotation
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
@@ -30,8 +33,6 @@ from wearcap.io.datasets.amass import PELVIS_SMPLH
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import check_rising
 from wearcap.io.formats.smpl import shape_from_betas, smpl_motion
-from wearcap.prepare.engine import Splits, Task, content_hash
-from wearcap.prepare.mocap import MocapSettings, foot_patches, on_xsens23
 from wearcap.scene.objects import centered, check_object_mesh
 
 FPS = 30

@@ -11,16 +11,17 @@ from pathlib import Path
 
 from torch import Tensor
 
+from data_prep.shared.engine import NOTE, Splits, Task, source_folder
+from data_prep.shared.hips import find_shift, with_shift
+from data_prep.shared.mocap import About, MocapSettings, mocap_recording
 from wearcap.boundary.texts import numbered_lines
 from wearcap.errors import WearcapError
+from wearcap.files import content_hash
 from wearcap.io.conventions import AUTO, Conventions
-from wearcap.prepare.engine import NOTE, Splits, Task, content_hash, source_folder
 from wearcap.prepare.foreign import read_foreign_motion, straightest
 from wearcap.prepare.foreign_conventions import Mapping, read_mapping
 from wearcap.prepare.foreign_files import Take, asf_beside
-from wearcap.prepare.hips import find_shift, with_shift
 from wearcap.prepare.levels import Levels, levels_in
-from wearcap.prepare.mocap import About, MocapSettings, mocap_recording
 from wearcap.recording.recording import Recording
 
 VERSION = 3
@@ -36,7 +37,7 @@ SUBJECT_TRIALS = 24
 
 @dataclass(frozen=True)
 class Hips:
-    """Whether and from where a person's hip joints are moved (`prepare.hips`)."""
+    """Whether and from where a person's hip joints are moved (`data_prep.shared.hips`)."""
 
     repair: bool
     usual_m: Sequence[float]

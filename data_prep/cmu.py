@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from data_prep.bvh import Hips, motion_files, motion_tasks, stem_of, subjects_of
+from data_prep.shared.engine import Splits, Task, source_folder
+from data_prep.shared.mocap import About, MocapSettings
 from wearcap.boundary.opening import understood
 from wearcap.boundary.texts import numbered_lines
 from wearcap.errors import WearcapError
-from wearcap.prepare.engine import Splits, Task, source_folder
 from wearcap.prepare.foreign_conventions import Mapping
-from wearcap.prepare.mocap import About, MocapSettings
 
 VERSION = 5
 """Version of the conversion, increased when the same source and settings yield another recording."""

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from data_prep.shared.engine import Splits, Task
 from data_prep.simulated import source_files
 from wearcap.errors import WearcapError
+from wearcap.files import content_hash
 from wearcap.geometry import rotation
-from wearcap.prepare.engine import Splits, Task, content_hash
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import RecordingFile, RecordingStore
 from wearsim.places.surround import surround
@@ -80,12 +81,14 @@ def cmu_surrounded_tasks(
     store, simulator = RecordingStore.open(source), source_files()
     names = store.names()
     if recordings is not None:
-        in_split = {split: [n for n in names if splits.of(store.entries[n].subject) == split] for split in recordings}
+        in_split = {
+            split: [n for n in names if splits.of(store.entries[n].context.subject) == split] for split in recordings
+        }
         names = [name for split, count in recordings.items() for name in _evenly(in_split[split], count)]
     tasks = []
     for name in names:
         entry = store.entries[name]
         make = partial(_surrounded, store.root / entry.file, name, Path(output), camera, look_round, seed)
         key = content_hash(entry.sha256, camera, look_round, seed, simulator)
-        tasks.append(Task(name, make, splits.of(entry.subject), key))
+        tasks.append(Task(name, make, splits.of(entry.context.subject), key))
     return tasks

@@ -16,9 +16,11 @@ import numpy as np
 import torch
 
 from data_prep.hcontact import about_sequence, read_smpl_json
+from data_prep.shared.engine import Splits, Task
 from wearcap.boundary.opening import understood
 from wearcap.boundary.texts import read_json
 from wearcap.errors import WearcapError
+from wearcap.files import content_hash
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.hps import read_hps_subject, subject_of
@@ -26,7 +28,6 @@ from wearcap.io.formats.contact_labels import LabelClock, interactions_of, label
 from wearcap.io.formats.environment import FILE_NAME, write_environment
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import checked_trajectory
-from wearcap.prepare.engine import Splits, Task, content_hash
 from wearcap.recording.motion import HANDS, Interactions
 from wearcap.recording.recording import Recording
 from wearcap.recording.timing import resampled

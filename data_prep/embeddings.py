@@ -6,12 +6,12 @@ This does not use the task engine: a failure must leave the recording in its dat
 from dataclasses import replace
 from pathlib import Path
 
+from data_prep.shared.engine import Report, check_recording, registering
 from wearcap.data.embeddings import embed_camera, embedding_name
 from wearcap.errors import WearcapError
 from wearcap.files import remove_leftovers
 from wearcap.locks import folder_lock
 from wearcap.models.image_encoder import ImageEncoder
-from wearcap.prepare.engine import Report, check_recording, registering
 from wearcap.recording.recording import CameraStream
 from wearcap.recording.store import Entry, RecordingFile, RecordingStore, save_recording
 

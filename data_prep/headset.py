@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
+from data_prep.shared.engine import Splits, Task
 from data_prep.trajectory import log_task
 from wearcap.errors import WearcapError
 from wearcap.io.devices.headset_log import is_headset_log, is_headset_session
-from wearcap.prepare.engine import Splits, Task
 from wearcap.prepare.logs import HeadsetSettings
 from wearcap.recording.recording import Recording
 

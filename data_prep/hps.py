@@ -4,9 +4,10 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from data_prep.shared.engine import Splits, Task, source_folder
 from wearcap.errors import WearcapError
+from wearcap.files import content_hash
 from wearcap.io.datasets.hps import hps_names, read_hps_sequence, resampled_localization, subject_of
-from wearcap.prepare.engine import Splits, Task, content_hash, source_folder
 from wearcap.recording.recording import Recording
 from wearcap.recording.timing import resampled
 

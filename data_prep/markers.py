@@ -6,14 +6,15 @@ from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
 
+from data_prep.shared.engine import NOTE, Splits, Task, source_folder
+from data_prep.shared.mocap import About, MocapSettings, mocap_recording
 from data_prep.ui_prmd import read_ui_prmd
 from wearcap.boundary.opening import placed, understood
 from wearcap.errors import WearcapError
+from wearcap.files import content_hash
 from wearcap.io.conventions import AUTO, Conventions
 from wearcap.io.formats.trc import Markers, read_trc
 from wearcap.optimize.markers import MARKERS, MarkerBody, fit_body, fit_motion, plug_in_gait
-from wearcap.prepare.engine import NOTE, Splits, Task, content_hash, source_folder
-from wearcap.prepare.mocap import About, MocapSettings, mocap_recording
 from wearcap.recording.recording import Recording
 
 VERSION = 1

@@ -14,12 +14,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from data_prep.shared.engine import Splits, Task, source_folder
 from wearcap.body.skeleton import WRISTS
 from wearcap.boundary.arrays import array_of, require
 from wearcap.boundary.opening import understood
 from wearcap.boundary.pickles import read_pickle, read_pickled_dict
 from wearcap.boundary.texts import finite_floats, read_text, read_yaml_object
 from wearcap.errors import WearcapError
+from wearcap.files import content_hash
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory
@@ -28,7 +30,6 @@ from wearcap.io.devices.watch_log import read_watch_log
 from wearcap.io.formats.ply import read_ply
 from wearcap.io.formats.poses import checked_trajectory
 from wearcap.io.formats.video import video_info
-from wearcap.prepare.engine import Splits, Task, content_hash, source_folder
 from wearcap.recording import CameraStream, HeadStream, ImuStream, PointCloud, Recording
 from wearcap.sensors.camera_alignment import align_by_walks
 from wearcap.sensors.monocular_slam import clean_track

@@ -7,13 +7,14 @@ from pathlib import Path
 
 import torch
 
+from data_prep.shared.engine import Splits, Task
 from wearcap.errors import WearcapError
+from wearcap.files import content_hash
 from wearcap.io.datasets.hps import nominal_mount
 from wearcap.io.formats.camera_json import read_camera
 from wearcap.io.formats.scene_folder import cloud_file, used_files
 from wearcap.io.formats.trajectory import read_trajectory
 from wearcap.io.formats.video import video_info
-from wearcap.prepare.engine import Splits, Task, content_hash
 from wearcap.prepare.suits import read_suit
 from wearcap.recording.recording import CameraStream, Localization, Recording
 from wearcap.sensors.slam_alignment import pose_of

@@ -3,10 +3,11 @@
 from functools import partial
 from pathlib import Path
 
+from data_prep.shared.engine import Splits, Task, changed, source_folder
 from wearcap.errors import WearcapError
+from wearcap.files import content_hash
 from wearcap.io.datasets.nymeria import head_vrs, is_nymeria, read_metadata, read_nymeria
 from wearcap.io.devices.aria_mps import mps_files
-from wearcap.prepare.engine import Splits, Task, changed, content_hash, source_folder
 
 VERSION = 2
 """Version of the conversion, increased when the same source and settings yield another recording."""

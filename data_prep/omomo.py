@@ -19,18 +19,19 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from data_prep.one_object import VERSION, OneObject, one_object_recording
+from data_prep.shared.engine import Splits, Task
+from data_prep.shared.mocap import MocapSettings, foot_patches, on_xsens23
 from wearcap.body.skeletons import smplx22
 from wearcap.boundary.arrays import require
 from wearcap.boundary.pickles import read_pickled_dict
 from wearcap.errors import WearcapError
+from wearcap.files import content_hash
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory
 from wearcap.io.datasets.amass import PELVIS_SMPLX
 from wearcap.io.formats.poses import are_rotations
 from wearcap.io.formats.smpl import shape_from_arrays, smpl_motion
 from wearcap.io.formats.wavefront import read_obj
-from wearcap.prepare.engine import Splits, Task, content_hash
-from wearcap.prepare.mocap import MocapSettings, foot_patches, on_xsens23
 from wearcap.scene.objects import centered, check_object_mesh
 
 FILES = ("train_diffusion_manip_seq_joints24.p", "test_diffusion_manip_seq_joints24.p")

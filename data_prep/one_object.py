@@ -9,13 +9,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from data_prep.shared.engine import NOTE
+from data_prep.shared.mocap import About, MocapSettings, mocap_recording, on_xsens23, without_glitches
 from wearcap.data.objects import object_class
 from wearcap.errors import WearcapError
 from wearcap.geometry.mesh import Mesh
 from wearcap.geometry.trajectory import Trajectory, resample
 from wearcap.io.formats.environment import FILE_NAME, write_environment
-from wearcap.prepare.engine import NOTE
-from wearcap.prepare.mocap import About, MocapSettings, mocap_recording, on_xsens23, without_glitches
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import Recording
 from wearcap.scene.objects import Environment, Freedom, SceneObject

@@ -8,8 +8,9 @@ from typing import Any
 
 import wearcap.sensors
 import wearsim
+from data_prep.shared.engine import Splits, Task
 from wearcap.errors import WearcapError
-from wearcap.prepare.engine import Splits, Task, content_hash
+from wearcap.files import content_hash
 from wearcap.recording.recording import Recording
 from wearcap.recording.store import SPLITS
 from wearsim.recordings.simulate import SimulationConfig, simulate_recording

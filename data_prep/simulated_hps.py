@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from data_prep.shared.engine import Splits, Task
 from data_prep.simulated import split_tasks
 from wearcap.errors import WearcapError
 from wearcap.io.formats.scene_folder import CLOUD
-from wearcap.prepare.engine import Splits, Task
 from wearcap.recording.recording import Recording
 from wearsim.places.site import changed_world
 from wearsim.recordings.hps import HpsConfig, Protocol, simulate_hps

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from data_prep.shared.engine import Splits, Task
 from data_prep.simulated import source_files, split_tasks
 from wearcap.errors import WearcapError
 from wearcap.files import write_text
 from wearcap.io.formats.environment import FILE_NAME, write_environment
 from wearcap.io.formats.ply import Ply, write_ply
 from wearcap.io.formats.scene_folder import CLOUD
-from wearcap.prepare.engine import Splits, Task
 from wearcap.recording.recording import Recording
 from wearsim.recordings.interaction_session import InteractionConfig, ObjectConfig, simulate_interactions
 from wearsim.recordings.localization_noise import LocalizationNoise

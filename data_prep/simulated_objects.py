@@ -3,9 +3,9 @@
 from dataclasses import asdict
 from functools import partial
 
+from data_prep.shared.engine import Splits, Task
 from data_prep.simulated import source_files, split_tasks
 from data_prep.simulated_interactions import in_flat
-from wearcap.prepare.engine import Splits, Task
 from wearsim.recordings.interaction_session import ObjectConfig, simulate_objects
 
 

@@ -7,11 +7,12 @@ from pathlib import Path
 import roma
 import torch
 
+from data_prep.shared.engine import NOTE, Splits, Task, source_folder
+from data_prep.shared.mocap import About, MocapSettings, mocap_recording, on_xsens23, without_glitches
 from wearcap.errors import WearcapError
+from wearcap.files import content_hash
 from wearcap.geometry import rotation
 from wearcap.io.datasets.totalcapture import TotalCaptureFiles, read_totalcapture, totalcapture_files
-from wearcap.prepare.engine import NOTE, Splits, Task, content_hash, source_folder
-from wearcap.prepare.mocap import About, MocapSettings, mocap_recording, on_xsens23, without_glitches
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import ImuStream, Recording
 

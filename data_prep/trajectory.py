@@ -6,10 +6,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from data_prep.shared.engine import Splits, Task
 from wearcap.errors import WearcapError
+from wearcap.files import content_hash
 from wearcap.io.devices.aria_mps import is_mps_folder
 from wearcap.io.formats.trajectory import trajectory_file, trajectory_format
-from wearcap.prepare.engine import Splits, Task, content_hash
 from wearcap.prepare.logs import TrajectorySettings, log_name, read_path
 from wearcap.recording.recording import Recording
 

@@ -3,12 +3,12 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from data_prep.shared.engine import Splits, Task
 from data_prep.trajectory import log_task
 from wearcap.body.skeleton import WRISTS
 from wearcap.errors import WearcapError
 from wearcap.io.devices.watch_log import read_watch_log
 from wearcap.io.formats.trajectory import read_trajectory_file
-from wearcap.prepare.engine import Splits, Task
 from wearcap.prepare.logs import TrajectorySettings, head_of, origin_of
 from wearcap.recording.recording import Recording
 from wearcap.sensors.clock import require_overlap

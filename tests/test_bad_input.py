@@ -176,17 +176,17 @@ ROWS = {
     ),
     "evaluate: other model": (
         lambda data, ckpt, tmp, out: with_checkpoint("evaluate", other_checkpoint(tmp / "o.ckpt", ckpt), out),
-        "do not fit this model",
+        "weights of this model",
     ),
     "export: other model": (
         lambda data, ckpt, tmp, out: with_checkpoint("export", other_checkpoint(tmp / "o.ckpt", ckpt), out),
-        "do not fit this model",
+        "weights of this model",
     ),
     "capture: other model": (
         lambda data, ckpt, tmp, out: with_checkpoint(
             "capture", other_checkpoint(tmp / "o.ckpt", ckpt), out, f"recording={data}/r4"
         ),
-        "do not fit this model",
+        "weights of this model",
     ),
     "evaluate: three frames": (
         lambda data, ckpt, tmp, out: with_checkpoint("evaluate", ckpt, out, f"dataset={brief_dataset(tmp / 'brief')}"),

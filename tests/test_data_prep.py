@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from data_prep.shared.engine import Splits
 from wearcap.cli.conf import compose, splits_dir
 from wearcap.cli.verbs import help_of, sources
-from wearcap.prepare import Splits
 
 DATA_PREP = Path(__file__).parents[1] / "data_prep"
 PAGE = (DATA_PREP / "README.md").read_text(encoding="utf-8")

@@ -172,7 +172,7 @@ def test_without_locks_the_run_goes_on_with_a_warning(tmp_path, monkeypatch):
     def refuse(descriptor, mode):
         raise OSError(errno.ENOLCK, "No locks available")
 
-    monkeypatch.setattr(files.fcntl, "flock", refuse)
+    monkeypatch.setattr("fcntl.flock", refuse)
     message = re.escape(f"{tmp_path}: this file system has no locks")
     with pytest.warns(UserWarning, match=message), folder_lock(tmp_path, "prepare") as descriptor:
         write_text(tmp_path / "a.txt", "a")

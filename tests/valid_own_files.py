@@ -44,11 +44,13 @@ from wearcap.prepare.foreign_conventions import read_mapping  # noqa: E402
 from wearcap.reading.any_file import read  # noqa: E402
 from wearcap.recording import PointCloud, Recording, RecordingStore  # noqa: E402
 from wearcap.recording.store import RecordingFile, save_recording  # noqa: E402
-from wearcap.runtime.stages import Stage, StageCache  # noqa: E402
-from wearcap.systems.ireplica.contact_prediction import ContactDetector  # noqa: E402
+from wearcap.runtime.stages import Stage, StageCache, StagedSystem  # noqa: E402
+from wearcap.systems.ireplica.contact_prediction import ContactDetector, ContactPredictor  # noqa: E402
 from wearcap.systems.ireplica.contact_sequence import ContactSequence  # noqa: E402
 from wearcap.systems.ireplica.export import exports  # noqa: E402
 from wearcap.systems.ireplica.features import HandViews  # noqa: E402
+from wearcap.systems.ireplica.object_tracker import ObjectTracker  # noqa: E402
+from wearcap.systems.ireplica.pipeline import IReplica  # noqa: E402
 from wearcap.training import run  # noqa: E402
 from wearcap.training.loggers import read_metrics  # noqa: E402
 from wearcap_testing import recording_of, swaying_motion  # noqa: E402
@@ -117,11 +119,16 @@ def _ckpt(path: Path) -> None:
     test_checkpoint_files.run_file(path, training={"frames": 2.0})
 
 
+class _Unregistered(StagedSystem):
+    stages = motion_of = None
+
+
 def _exported(folder: Path) -> None:
     """An exported contact network with drawn weights."""
     features = HandViews()
     net = ContactSequence(features.size, width=4, dilations=(1, 2, 4, 6)).eval()
-    write_exports(exports(ContactDetector(net, features, ("sliding", "hinged"))), folder / "net.onnx", "onnx")
+    predictor = ContactPredictor(ContactDetector(net, features, ("sliding", "hinged")))
+    write_exports(exports(IReplica(_Unregistered(), predictor, ObjectTracker(None))), folder / "net.onnx", "onnx")
 
 
 def _read_exported(folder: Path) -> None:

@@ -26,6 +26,7 @@ from rich.progress import track
 sys.path.append(str(Path(__file__).resolve().parents[2] / "tests"))
 
 from benchmarks.speed.figures import figure
+from data_prep.shared.engine import Task, prepare
 from own_bvh import read_bvh
 from wearcap.apps.annotate.takes import AnnotationFile
 from wearcap.cli import capture, export, train
@@ -33,7 +34,6 @@ from wearcap.export.files import open_exported
 from wearcap.io.formats.contact_labels import LabelClock
 from wearcap.io.formats.motion_npz import read_motion
 from wearcap.models.checkpoint import read_checkpoint, read_run_file
-from wearcap.prepare.engine import Task, prepare
 from wearcap.recording import RecordingStore
 from wearcap.training.loggers import read_metrics
 from wearcap.training.run import RunCheckpointIO

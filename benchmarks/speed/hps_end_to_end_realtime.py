@@ -23,11 +23,11 @@ from pathlib import Path
 from hydra.utils import instantiate
 
 from benchmarks.speed.figures import figure
+from data_prep.shared.engine import Splits, prepare
 from wearcap.cli.conf import compose, splits_dir
 from wearcap.cli.scene import run as build_scene_map
 from wearcap.geometry import rotation
 from wearcap.geometry.trajectory import nearest_frames
-from wearcap.prepare.engine import Splits, prepare
 from wearcap.recording import Motion, Recording
 from wearcap.recording.recording import Localization
 from wearcap.recording.store import RecordingStore

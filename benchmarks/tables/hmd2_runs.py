@@ -101,7 +101,9 @@ def run_method(method: Method, case: Case) -> Result:
         scores |= realism.scores(method.name)
     if method.checkpoint is not None:
         scores |= training_of(method.checkpoint, *method.others)
-    return Result(method.name, scores, by_activity(rows, {name: store.entries[name].activity for name in case.names}))
+    return Result(
+        method.name, scores, by_activity(rows, {name: store.entries[name].context.activity for name in case.names})
+    )
 
 
 def best_of(rows: list[Row]) -> list[Row]:

@@ -16,10 +16,9 @@ from benchmarks.tables.depth_rig import Background, DepthView, person_cloud, vox
 from benchmarks.tables.simulated_depth_rig import approximate, place_rig, simulate_rig
 from data_prep.simulated import source_files
 from wearcap.body.anny_body import anny_body
-from wearcap.files import write_text
+from wearcap.files import content_hash, write_text
 from wearcap.geometry.mesh import Mesh
 from wearcap.io.formats.ply import Ply, read_ply, write_ply
-from wearcap.prepare.engine import content_hash
 from wearcap.recording import Recording
 from wearcap.recording.store import RecordingFile, save_recording
 from wearcap.scene.scan import Scan

@@ -18,13 +18,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache, lru_cache
 from pathlib import Path
+from typing import Any
+
+from filelock import lock_descriptor
 
 from wearcap.errors import WearcapError
-
-try:
-    import fcntl
-except ModuleNotFoundError:  # Windows
-    fcntl = None
 
 _TEMPORARY = re.compile(r"\..+\.tmp-[0-9a-f]{8}(\.[^.]+)?")
 _OF_WRITES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG)
@@ -100,12 +98,12 @@ def _sync_folder(folder: Path) -> None:
 
 def _claim(temporary: Path) -> int | None:
     """Create and lock the file; returns the descriptor, or None where files cannot be locked."""
-    if fcntl is None:
-        return None
+    if os.name != "posix":
+        return None  # Windows renames no open file
     while True:
         descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT, 0o666)
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            lock_descriptor(descriptor)
         except OSError:
             os.close(descriptor)
             return None
@@ -120,11 +118,19 @@ def open_own(path: Path, flags: int) -> int:
     Raises OSError for a link, whose target is not touched, for a pipe, and for a device.
     """
     descriptor = os.open(path, flags | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0), 0o666)
+    try:
+        require_own(descriptor, path)
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def require_own(descriptor: int, path: Path) -> None:
+    """Raise OSError for an open file that is a pipe or a device, or that has another name, too."""
     status = os.fstat(descriptor)
     if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
-        os.close(descriptor)
         raise OSError(errno.ELOOP, "no regular file of its own", str(path))
-    return descriptor
 
 
 def remove_leftovers(folder: str | Path, *, below: bool = False) -> None:
@@ -139,13 +145,13 @@ def remove_leftovers(folder: str | Path, *, below: bool = False) -> None:
                 continue
             path = Path(where, name)
             with suppress(OSError):  # locked, removed by another process, or without permission to remove
-                if fcntl is None:
+                if os.name != "posix":
                     path.unlink()  # Windows refuses this while a writer has it open
                     continue
                 descriptor = open_own(path, os.O_RDWR)
                 try:
-                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    path.unlink()
+                    if lock_descriptor(descriptor, blocking=False):
+                        path.unlink()
                 finally:
                     os.close(descriptor)
         if not below:
@@ -169,6 +175,12 @@ def sha256_of(path: str | Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def content_hash(*parts: Any) -> str:
+    """Hex digest (16 digits) of settings (anything JSON can hold) and of the bytes of files given as Path."""
+    plain = [sha256_of(part) if isinstance(part, Path) else part for part in parts]
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
+
+
 def resource(in_checkout: str, in_wheel: str) -> Path:
     """A folder of the checkout when the package is imported from one, else the copy that the wheel carries."""
     package = Path(__file__).resolve().parent
@@ -180,8 +192,8 @@ def resource(in_checkout: str, in_wheel: str) -> Path:
 
 SETTLED_S = 2.0
 """Age (s) below which files are hashed every time: a file system's clock may not separate two writes."""
-MAX_LEDGER_BYTES = 1 << 26
-"""Size (64 MiB, some 300,000 files) beyond which the cache is cleared."""
+_SUMS, MAX_LEDGER_BYTES = "sha256.jsonl", 1 << 26
+"""The cache of digests, and the size (64 MiB, some 300,000 files) beyond which it is cleared."""
 
 Key = tuple[str, int, int, int]
 
@@ -198,11 +210,7 @@ def remembered_sha256(path: str | Path) -> str:
     digest = sha256_of(path)
     if key == _key(Path(path)) and time.time() - key[2] / 1e9 > SETTLED_S:
         known[key] = digest
-        with suppress(OSError):  # without a cache folder, only in memory
-            ledger = _ledger_path()
-            ledger.parent.mkdir(parents=True, exist_ok=True)
-            with open(ledger, "ab") as file:  # one write, so that lines of other processes do not mix with it
-                file.write((json.dumps([*key, digest]) + "\n").encode())
+        remember(_SUMS, [*key, digest])
     return digest
 
 
@@ -218,24 +226,34 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "wearcap"
 
 
-def _ledger_path() -> Path:
-    return cache_folder() / "sha256.jsonl"
+def remember(ledger: str, value: Any) -> None:
+    """Add a line of JSON to a file in the cache folder. Without such a folder nothing is kept."""
+    path = cache_folder() / ledger
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(path, "ab") as file:  # one write, so that lines of other processes do not mix with it
+            file.write((json.dumps(value) + "\n").encode())
+
+
+def remembered(ledger: str) -> list[Any]:
+    """Values of a file's lines in the cache folder; truncated or foreign ones are ignored."""
+    values = []
+    with suppress(OSError, UnicodeDecodeError):
+        for line in (cache_folder() / ledger).read_text(encoding="utf-8").splitlines():
+            with suppress(ValueError):
+                values.append(json.loads(line))
+    return values
 
 
 @cache
 def _ledger() -> dict[Key, str]:
-    """Digests cached by earlier processes; truncated or foreign lines are ignored."""
+    """Digests cached by earlier processes."""
     known: dict[Key, str] = {}
-    path = _ledger_path()
-    try:
-        if path.stat().st_size > MAX_LEDGER_BYTES:
+    with suppress(OSError):
+        if (path := cache_folder() / _SUMS).stat().st_size > MAX_LEDGER_BYTES:
             path.unlink()
-        for line in path.read_text(encoding="utf-8").splitlines():
-            try:
-                name, size, mtime_ns, inode, digest = json.loads(line)
-                known[(name, size, mtime_ns, inode)] = digest
-            except (ValueError, TypeError):
-                continue
-    except (OSError, UnicodeDecodeError):
-        return known
+    for row in remembered(_SUMS):
+        with suppress(ValueError, TypeError):
+            name, size, mtime_ns, inode, digest = row
+            known[(name, size, mtime_ns, inode)] = digest
     return known

@@ -1,4 +1,7 @@
-"""Locks of folders: one writer at a time, in all processes of this machine and its workers."""
+"""Locks of folders: one writer at a time, in all processes of this machine and its workers.
+
+The lock is filelock's; here is what it lacks: the holder by name, workers that hold the lock on, folders from anywhere.
+"""
 
 import errno
 import json
@@ -11,24 +14,21 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
+
 from wearcap.errors import WearcapError
-from wearcap.files import explaining_writes, open_own
-
-try:
-    import fcntl
-except ModuleNotFoundError:  # Windows
-    import msvcrt
-
-    fcntl = None
+from wearcap.files import explaining_writes, open_own, require_own
 
 LOCK = ".wearcap.lock"
 """Lock file in a folder that one process writes into; it names that process."""
 
 _MAX_HOLDER = 1 << 16
-"""Characters of a lock's file that are read."""
+"""Bytes of a lock's file that are read."""
 
 LOCK_PATIENCE_S, ORPHANS_PATIENCE_S = 2.0, 20.0
 """Time (s) to wait for a lock that is taken, and for one that only workers of an ended process still hold."""
+
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL)
 
 
 @contextmanager
@@ -43,11 +43,10 @@ def folder_lock(folder: str | Path, purpose: str) -> Iterator[int | None]:
     path = Path(folder) / LOCK
     with explaining_writes(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = _wait_for_lock(path)
-    if descriptor is None:
+        lock, descriptor = _taken(path)
+    if lock is None:
         yield None
         return
-    _HELD.add(descriptor)
     try:
         holder = {
             "pid": os.getpid(),
@@ -57,100 +56,63 @@ def folder_lock(folder: str | Path, purpose: str) -> Iterator[int | None]:
         }
         with explaining_writes(path.parent), open(descriptor, "w", encoding="utf-8", closefd=False) as file:
             file.truncate()
-            json.dump(holder, file)
+            file.write(" " + json.dumps(holder))  # Windows lets others read all but the first byte
         yield descriptor
     finally:
-        if descriptor in _HELD:  # a forked child does not hold it
-            _HELD.remove(descriptor)
-            _unlock(path, descriptor)
+        if lock.is_locked:  # a forked child does not hold it
+            with suppress(OSError):
+                if os.path.samestat(os.fstat(descriptor), path.stat()):
+                    path.unlink()  # Windows removes no open file; filelock does there, after its release
+            lock.release()
 
 
-_HELD: set[int] = set()
-"""Descriptors of the locks that this process has taken."""
+def _taken(path: Path) -> tuple[FileLock | None, int]:
+    """(the lock of a file and its descriptor), or None and -1 where files cannot be locked.
 
+    Raises WearcapError when it stays locked by another process, or is no file of its own.
+    """
+    found: list[int] = []
 
-def _let_go_after_fork() -> None:
-    while _HELD:
-        os.close(_HELD.pop())  # the parent's own descriptor keeps the lock
+    def admit(descriptor: int) -> None:
+        require_own(descriptor, path)
+        found.append(descriptor)
 
+    def given_up() -> bool:
+        return time.monotonic() - start > LOCK_PATIENCE_S and not _has_ended(_holder(path))
 
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_let_go_after_fork)
-
-
-def _wait_for_lock(path: Path) -> int | None:
-    """Open and lock a file; None where files cannot be locked. Raises WearcapError when it stays locked by another."""
-    start = time.monotonic()
-    while True:
-        try:
-            descriptor = open_own(path, os.O_RDWR | os.O_CREAT)
-        except OSError as error:
-            if error.errno not in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
-                raise
+    start, lock = time.monotonic(), FileLock(path, thread_local=False, fallback_to_soft=False, on_acquired=admit)
+    try:
+        lock.acquire(timeout=ORPHANS_PATIENCE_S, cancel_check=given_up)
+        return lock, found[0]
+    except Timeout as error:
+        raise _held_by(_holder(path), path.parent) from error
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
             fix = "Remove it: it is not wearcap's, and nothing was written through it."
             raise WearcapError("a link, or no regular file", path, "the lock of this folder", fix) from error
-        try:
-            _lock(descriptor)
-            if os.path.samestat(os.fstat(descriptor), path.stat()):
-                return descriptor
-        except (BlockingIOError, FileNotFoundError):  # locked, or removed by its holder, which has just ended
-            pass
-        except OSError as error:
-            os.close(descriptor)
-            path.unlink(missing_ok=True)
-            warnings.warn(
-                f"{path.parent}: this file system has no locks ({error.strerror}). "
-                "Let no other run write into this folder meanwhile.",
-                stacklevel=4,
-            )
-            return None
-        try:
-            with open(descriptor, encoding="utf-8") as file:
-                holder = json.loads(file.read(_MAX_HOLDER))
-        except (OSError, ValueError, RecursionError):
-            holder = {}
-        if not isinstance(holder, dict) or not isinstance(holder.get("pid"), int):
-            holder = {}  # the lock's file is being written
-        if time.monotonic() - start > (ORPHANS_PATIENCE_S if _has_ended(holder) else LOCK_PATIENCE_S):
-            raise _held_by(holder, path.parent)
-        time.sleep(0.05)
+        if error.errno not in _NO_LOCKS:
+            raise
+        path.unlink(missing_ok=True)
+        what = f"{path.parent}: this file system has no locks ({error.strerror})."
+        warnings.warn(f"{what} Let no other run write into this folder meanwhile.", stacklevel=4)
+        return None, -1
 
 
-def _lock(descriptor: int) -> None:
-    """Lock a file for this process. Raises BlockingIOError when another has it."""
-    if fcntl is not None:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    else:
-        try:
-            _lock_on_windows(descriptor, msvcrt.LK_NBLCK)
-        except PermissionError as error:
-            raise BlockingIOError(*error.args) from error
-
-
-def _unlock(path: Path, descriptor: int) -> None:
-    """Remove a lock's file, if it is still the one in the folder, and release the lock for all processes that share it."""
-    with suppress(OSError):
-        if fcntl is not None and os.path.samestat(os.fstat(descriptor), path.stat()):
-            path.unlink()
-    with suppress(OSError):
-        if fcntl is not None:
-            fcntl.flock(descriptor, fcntl.LOCK_UN)
-        else:
-            _lock_on_windows(descriptor, msvcrt.LK_UNLCK)
-    os.close(descriptor)
-    with suppress(OSError):
-        if fcntl is None:
-            path.unlink()  # Windows removes no open file
-
-
-def _lock_on_windows(descriptor: int, mode: int) -> None:
-    os.lseek(descriptor, 1 << 20, os.SEEK_SET)  # a byte beyond the text, which others must be able to read
-    msvcrt.locking(descriptor, mode, 1)
+def _holder(path: Path) -> dict[str, Any]:
+    """What a lock's file says of the process that took it; nothing while it is being written."""
+    try:
+        descriptor = open_own(path, os.O_RDONLY)
+        with open(descriptor, encoding="utf-8") as file:
+            file.seek(1)
+            holder = json.loads(file.read(_MAX_HOLDER))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return holder if isinstance(holder, dict) and isinstance(holder.get("pid"), int) else {}
 
 
 def _has_ended(holder: dict[str, Any]) -> bool:
     """Whether the process that took a lock has certainly ended, while its workers still hold the lock."""
-    if os.name != "posix" or holder.get("host") != platform.node() or holder["pid"] <= 0:
+    if os.name != "posix" or holder.get("host") != platform.node() or holder.get("pid", 0) <= 0:
         return False
     try:
         os.kill(holder["pid"], 0)

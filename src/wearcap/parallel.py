@@ -1,8 +1,10 @@
 """Items spread over processes by joblib: one machine or a cluster, results as they are finished, one reason per failure."""
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import joblib
@@ -42,12 +44,12 @@ class Parallel:
         require_choice(self.backend, BACKENDS, f"no backend {self.backend!r}")
 
     def run(
-        self, function: Callable[[Item], Result], items: Sequence[Item], lock: int | None = None
+        self, function: Callable[[Item], Result], items: Sequence[Item], root: Path, lock: int | None = None
     ) -> Generator[Result, None, None]:
         """`function` of each item, in the order in which they are finished.
 
-        Local workers end with this process and before the `lock` is released. Raises BrokenExecutor when one was
-        killed, and WearcapError for a backend that is not installed.
+        Local workers end with this process and before the `lock` is released. Raises WearcapError, naming the folder
+        `root` that they write into, when one was killed, and for a backend that is not installed.
         """
         if not items:
             return
@@ -56,8 +58,14 @@ class Parallel:
             results_as = "generator_unordered" if as_generator else "list"
             parallel = joblib.Parallel(n_jobs=self.jobs, batch_size=1, return_as=results_as)
             for start in range(0, len(items), chunk_size):
-                results: Any = parallel(joblib.delayed(function)(item) for item in items[start : start + chunk_size])
-                yield from results
+                try:
+                    results: Any = parallel(
+                        joblib.delayed(function)(item) for item in items[start : start + chunk_size]
+                    )
+                    yield from results
+                except BrokenExecutor as error:
+                    fix = "What is finished is kept: run again with fewer jobs."
+                    raise WearcapError("a worker process was killed (out of memory?)", root, fix=fix) from error
 
     @contextmanager
     def _backend(self, lock: int | None) -> Iterator[bool]:

@@ -10,10 +10,11 @@ from pathlib import Path
 
 import torch
 
+from data_prep.shared.engine import Task, prepare
 from wearcap.body.skeleton import xsens23
 from wearcap.errors import WearcapError
+from wearcap.files import content_hash
 from wearcap.geometry.rotation import exp
-from wearcap.prepare import Task, content_hash, prepare
 from wearcap.recording import Motion, Recording
 
 

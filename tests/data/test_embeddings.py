@@ -181,7 +181,7 @@ def test_a_second_run_does_nothing_and_a_killed_one_goes_on(filmed, monkeypatch)
         raise Killed
 
     # Files are written, the manifest never learns of them.
-    monkeypatch.setattr("wearcap.prepare.engine.REGISTER_EVERY_S", 1000)
+    monkeypatch.setattr("data_prep.shared.engine.REGISTER_EVERY_S", 1000)
     monkeypatch.setattr(RecordingStore, "register", dies)
     with pytest.raises(Killed):
         embed_dataset(filmed.root, Corners())

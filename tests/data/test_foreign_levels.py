@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from data_prep.shared.mocap import About, CleaningLimits, MocapSettings, foot_patches, mocap_recording
 from wearcap.body.kinematics import local_rotations, site_positions
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
 from wearcap.geometry import rotation
 from wearcap.prepare.levels import Levels, levels_in, with_levels
-from wearcap.prepare.mocap import About, CleaningLimits, MocapSettings, foot_patches, mocap_recording
 from wearcap.recording import Motion
 
 SETTINGS = MocapSettings(60.0, (0.09, 0.0, 0.09), CleaningLimits(8.0, 15.0, 0.5, 0.06, 0.12))

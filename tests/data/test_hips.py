@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
+from data_prep.shared.hips import STRAIGHTEST_DEG, find_shift, with_shift
 from wearcap.body.skeleton import xsens23
 from wearcap.geometry.rotation import about_axis
 from wearcap.metrics.gait import POINTS, knee_cycles, knee_deg, normal_knee_deg
-from wearcap.prepare.hips import STRAIGHTEST_DEG, find_shift, with_shift
 from wearcap.recording.motion import Motion
 
 FAULT = torch.tensor([0.012, -0.015], dtype=torch.float64)

@@ -8,9 +8,9 @@ from hydra.utils import instantiate
 
 import captured_motion as captured
 from data_prep import cmu_surrounded
+from data_prep.shared.engine import Splits
 from wearcap.cli.conf import compose, splits_dir
 from wearcap.cli.prepare import run
-from wearcap.prepare.engine import Splits
 from wearcap.recording import Recording, RecordingStore
 from wearcap.recording.recording import CameraStream, HeadStream
 from wearcap.recording.serialize import flatten

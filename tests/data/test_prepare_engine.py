@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 from prepare_tasks import tasks
 
+from data_prep.shared.engine import Splits, prepare
 from wearcap.errors import WearcapError
-from wearcap.files import sha256_of
-from wearcap.prepare import Splits, content_hash, prepare
+from wearcap.files import content_hash, sha256_of
 from wearcap.recording import RecordingStore
 
 

@@ -16,12 +16,13 @@ import prepare_tasks
 import pytest
 from prepare_tasks import tasks
 
+from data_prep.shared import engine
+from data_prep.shared.engine import prepare
 from wearcap import locks
 from wearcap.errors import WearcapError
 from wearcap.files import sha256_of, write_text
 from wearcap.locks import LOCK
 from wearcap.parallel import Parallel
-from wearcap.prepare import engine, prepare
 from wearcap.recording import RecordingStore
 
 posix = pytest.mark.skipif(os.name != "posix", reason="SIGKILL")
@@ -130,8 +131,8 @@ def test_workers_end_with_a_killed_run_and_the_next_one_has_the_folder_alone(alo
 STUCK = """
 import sys
 from prepare_tasks import tasks
-from wearcap.prepare import engine
-from wearcap.prepare import prepare
+from data_prep.shared import engine
+from data_prep.shared.engine import prepare
 prepare(tasks(2, r00="stuck", r01="stuck"), sys.argv[1], jobs=2)
 """
 

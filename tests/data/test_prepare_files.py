@@ -11,6 +11,8 @@ import torch
 
 from boxes import box_mesh
 from data_prep.keypoints import Simulated, keypoints_dataset
+from data_prep.shared.engine import Task
+from data_prep.shared.engine import prepare as prepare_tasks
 from hostile import in_time
 from mvnx_files import mvnx
 from wearcap.cli import prepare
@@ -19,8 +21,6 @@ from wearcap.geometry.camera import Camera
 from wearcap.io.formats.environment import read_environment, write_environment
 from wearcap.io.formats.scene_folder import used_files
 from wearcap.prepare import files
-from wearcap.prepare.engine import Task
-from wearcap.prepare.engine import prepare as prepare_tasks
 from wearcap.prepare.files import with_own_files
 from wearcap.recording import CameraStream, Recording, RecordingStore
 from wearcap.scene.objects import Environment, Freedom, SceneObject

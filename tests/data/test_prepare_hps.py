@@ -26,7 +26,7 @@ def test_sequences_become_recordings(tmp_path, files):
     verb.main(arguments)
     store = RecordingStore.open(tmp_path / "out")
     entry = store.entries[files.NAME]
-    assert (entry.subject, entry.location, entry.split, entry.fps) == ("SUB4", files.SCAN, "test", 30.0)
+    assert (entry.context.subject, entry.context.location, entry.split, entry.fps) == ("SUB4", files.SCAN, "test", 30.0)
     recording = store.load(files.NAME)
     assert recording.motion is not None
     assert recording.suit is not None

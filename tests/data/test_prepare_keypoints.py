@@ -101,7 +101,7 @@ def test_simulated_keypoints_come_with_a_camera(filmed, tmp_path):
             assert seen.all()
             assert (pixels - cue.points).abs().max() < 0.1
     entry, old = store.entries["r1"], filmed.entries["r1"]
-    assert (entry.split, entry.subject) == (old.split, old.subject)
+    assert (entry.split, entry.context.subject) == (old.split, old.context.subject)
     again = keypoints_dataset(
         filmed.root, store.root, Simulated(joints=("left_toe", "left_wrist", "left_hand"), noise_px=0, drop=0)
     )

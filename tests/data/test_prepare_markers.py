@@ -6,12 +6,11 @@ import pytest
 import torch
 from hydra.utils import instantiate
 
+from data_prep.shared.engine import NOTE, Splits, Task, check_recording, prepare
 from marker_person import markers_of, person, squats, write_trc
 from wearcap.cli.conf import compose, splits_dir
 from wearcap.errors import WearcapError
 from wearcap.metrics.gait import knee_deg, standing
-from wearcap.prepare import Splits, check_recording, prepare
-from wearcap.prepare.engine import NOTE, Task
 from wearcap.recording import RecordingStore
 
 

@@ -14,6 +14,8 @@ import torch
 from data_prep.amass import amass_tasks
 from data_prep.bvh import Hips, bvh_tasks
 from data_prep.cmu import cmu_tasks
+from data_prep.shared.engine import Splits, check_recording
+from data_prep.shared.mocap import About, CleaningLimits, MocapSettings, foot_patches, mocap_recording, without_glitches
 from foreign_bvh import CONVENTIONS, walk, write
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
 from wearcap.boundary.texts import read_bytes
@@ -24,8 +26,6 @@ from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.datasets.amass import write_amass
 from wearcap.metrics.gait import knee_cycles, normal_knee_deg
-from wearcap.prepare import Splits, check_recording
-from wearcap.prepare.mocap import About, CleaningLimits, MocapSettings, foot_patches, mocap_recording, without_glitches
 from wearcap.recording import Motion, RecordingStore
 from wearcap.recording.timing import resampled
 
@@ -189,7 +189,7 @@ def test_the_command_prepares_a_folder_and_names_what_it_cannot_read(bvh_folder,
     assert "2 written, 0 current, 2 failed" in printed.out
     store = RecordingStore.open(bvh_folder / "out")
     assert store.names() == ["07_01", "dance"]
-    assert store.entries["07_01"].subject == "7"
+    assert store.entries["07_01"].context.subject == "7"
     assert (store.entries["07_01"].split, store.entries["07_01"].fps) == ("train", 60.0)
     (bvh_folder / "in" / "broken.bvh").unlink()
     (bvh_folder / "in" / "33_01.amc").unlink()
@@ -389,7 +389,7 @@ def test_foreign_files_become_recordings_and_what_the_doctor_refuses_does_not(fo
     assert "The unit is centimetres (0.01 m)" in motion.provenance["conventions"]
     verb.main([*arguments, "check=false", r"subject=(anna|ben)/[\w-]+\.bvh"])
     store = RecordingStore.open(foreign_folder / "out")
-    assert {store.entries[n].subject for n in ("anna__anna-a", "ben__ben-b")} == {"anna", "ben"}
+    assert {store.entries[n].context.subject for n in ("anna__anna-a", "ben__ben-b")} == {"anna", "ben"}
     assert "1 written, 4 current, 0 failed" in capfd.readouterr().out
     one = foreign_folder / "in" / "ben" / "ben-a.bvh"
     verb.main(["bvh", f"source={one}", f"output={foreign_folder / 'single'}", "jobs=1", "subject=ben"])

@@ -24,7 +24,11 @@ def test_sequences_become_recordings(tmp_path, monkeypatch):
     verb.main(arguments)
     store = RecordingStore.open(tmp_path / "out")
     entry = store.entries[name]
-    assert (entry.subject, entry.location, entry.activity) == ("james_johnson", "house_3", "cooking")
+    assert (entry.context.subject, entry.context.location, entry.context.activity) == (
+        "james_johnson",
+        "house_3",
+        "cooking",
+    )
     assert entry.fps == 60.0
     recording = store.load(name)
     assert recording.head is not None

@@ -9,12 +9,12 @@ import torch
 
 from data_prep.behave import _ground_rotation
 from data_prep.omomo import _check_rate, read_omomo
+from data_prep.shared.engine import Splits, check_recording
 from wearcap.cli.conf import splits_dir
 from wearcap.cli.main import run_verb
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.io.formats.environment import read_environment
-from wearcap.prepare import Splits, check_recording
 from wearcap.recording.store import RecordingStore
 
 
@@ -68,8 +68,13 @@ def test_behave_becomes_a_data_set(tmp_path, files):
     assert store.names("test") == [files.BEHAVE_NAME]
     assert store.names("train") == ["Date01_Sub01_boxlarge_lift"]
     entry = store.entries[files.BEHAVE_NAME]
-    assert (entry.subject, entry.location, entry.activity, entry.fps) == ("Sub04", "Date03", "boxlarge_hand", 30.0)
-    assert "non-commercial" in entry.license
+    assert (entry.context.subject, entry.context.location, entry.context.activity, entry.fps) == (
+        "Sub04",
+        "Date03",
+        "boxlarge_hand",
+        30.0,
+    )
+    assert "non-commercial" in entry.context.license
     check_take(store, files.BEHAVE_NAME, "boxlarge", files)
     assert store.load(files.BEHAVE_NAME).source == "BEHAVE"
 
@@ -135,8 +140,8 @@ def test_omomo_becomes_a_data_set(tmp_path, files):
     assert store.names("test") == [files.OMOMO_NAME]
     assert store.names("train") == ["sub3_largebox_001"]
     entry = store.entries[files.OMOMO_NAME]
-    assert (entry.subject, entry.activity, entry.fps) == ("sub16", "largebox_007", 30.0)
-    assert "research" in entry.license
+    assert (entry.context.subject, entry.context.activity, entry.fps) == ("sub16", "largebox_007", 30.0)
+    assert "research" in entry.context.license
     check_take(store, files.OMOMO_NAME, "largebox", files)
     assert store.load(files.OMOMO_NAME).source == "OMOMO"
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from command_line import exit_code
+from data_prep.shared.engine import Splits
 from data_prep.simulated import simulated_tasks
 from wearcap.cli.conf import compose, splits_dir
 from wearcap.errors import WearcapError
 from wearcap.files import sha256_of
-from wearcap.prepare import Splits
 from wearcap.recording import RecordingStore
 
 

@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 from hydra.utils import instantiate
 
+from data_prep.shared.engine import Splits, prepare
 from data_prep.simulated_hps import simulated_hps_tasks
 from wearcap.cli.conf import compose, splits_dir
 from wearcap.errors import WearcapError
 from wearcap.io.formats.camera_json import read_photos
-from wearcap.prepare.engine import Splits, prepare
 from wearcap.recording.store import RecordingStore
 
 

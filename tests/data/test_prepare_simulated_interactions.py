@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
+from data_prep.shared.engine import Splits, prepare
 from data_prep.simulated_interactions import simulated_interactions_tasks
 from wearcap.errors import WearcapError
 from wearcap.io.formats.environment import read_environment
 from wearcap.io.formats.ply import read_ply
-from wearcap.prepare.engine import Splits, prepare
 from wearcap.recording.store import RecordingStore
 
 SPLITS = Splits.read(Path(__file__).parents[2] / "data_prep/splits/simulated.csv")

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from data_prep.shared.engine import Splits, prepare
 from data_prep.simulated_objects import simulated_objects_tasks
 from wearcap.errors import WearcapError
 from wearcap.io.formats.environment import read_environment
-from wearcap.prepare.engine import Splits, prepare
 from wearcap.recording.store import RecordingStore
 
 SPLITS = Splits.read(Path(__file__).parents[2] / "data_prep/splits/simulated.csv")

@@ -16,10 +16,10 @@ from data_prep.hcontact import (
     read_hcontact_split,
     read_smpl_json,
 )
+from data_prep.shared.engine import Splits
 from hostile import fuzz, mutated
 from wearcap.cli.main import run_verb
 from wearcap.errors import WearcapError
-from wearcap.prepare.engine import Splits
 from wearcap.recording.store import RecordingStore
 
 DOOR, SOFA = "SUB5_TUB_2OG_door.00", "SUB9_TUB_2OG_sofamove.00"

@@ -87,6 +87,13 @@ def test_a_bare_motion_comes_back_bare(tmp_path):
     assert torch.equal(back.R_parent_joint, motion.R_parent_joint)
 
 
+def test_no_interaction_is_read_as_none_of_any(tmp_path):
+    write_motion(dataclasses.replace(sample(), interactions=Interactions.of([])), tmp_path / "a.npz")
+    back = read_motion(tmp_path / "a.npz").interactions
+    assert back is not None
+    assert len(back) == 0
+
+
 def test_nan_is_not_written(tmp_path):
     motion = dataclasses.replace(sample(), t_world_root=torch.full((6, 3), float("nan")))
     with pytest.raises(WearcapError, match="t_world_root"):

@@ -268,7 +268,7 @@ def test_files_that_are_no_maps(room_map, tmp_path):
     from safetensors.numpy import save_file
 
     path = tmp_path / "map.safetensors"
-    with pytest.raises(WearcapError, match="no such map"):
+    with pytest.raises(WearcapError, match="no such visual map"):
         VisualMap.load(path)
     save_file({"a": np.zeros(3)}, path)
     with pytest.raises(WearcapError, match="not a visual map"):
@@ -276,7 +276,7 @@ def test_files_that_are_no_maps(room_map, tmp_path):
     room_map.save(path)
     content = path.read_bytes()
     path.write_bytes(content[:-100])
-    with pytest.raises(WearcapError, match="not a readable map"):
+    with pytest.raises(WearcapError, match="not a readable visual map"):
         VisualMap.load(path)
     shifted = replace(room_map.observations, first=room_map.observations.first + 1)
     replace(room_map, observations=shifted).save(path)

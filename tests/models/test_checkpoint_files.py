@@ -12,8 +12,9 @@ from torch import nn
 
 from wearcap.errors import WearcapError
 from wearcap.models import checkpoint as module
-from wearcap.models.build import build, check_weights
+from wearcap.models.build import build
 from wearcap.models.checkpoint import load_trained, read_checkpoint, share_checkpoint
+from wearcap.models.weights import check_weights
 
 pytestmark = pytest.mark.usefixtures("trusted")
 
@@ -64,7 +65,7 @@ def test_a_shared_checkpoint_is_the_weights_and_what_others_need_of_the_config(t
     assert state.keys() == original.keys()
     assert all(torch.equal(state[name], value) for name, value in original.items())
     assert b"/home" not in (tmp_path / "shared.safetensors").read_bytes()
-    check_weights(Net().state_dict(), state, "shared")
+    check_weights(Net().state_dict(), state, "it", "shared")
     share_checkpoint(tmp_path / "shared.safetensors", tmp_path / "again.safetensors")
     assert (tmp_path / "again.safetensors").read_bytes() == (tmp_path / "shared.safetensors").read_bytes()
 
@@ -235,12 +236,12 @@ def test_weights_that_do_not_fit_are_named(tmp_path):
     config = {"model": MODEL}
     state = {name: value.clone() for name, value in Net(5).state_dict().items()}
     _, read = read_checkpoint(shared_file(tmp_path / "x.safetensors", state, config))
-    with pytest.raises(WearcapError, match=r"3 weights do not fit this model, such as 'first.weight'"):
-        check_weights(Net().state_dict(), read, "x")
+    with pytest.raises(WearcapError, match=r"another size of it: first.weight is 5×4 and should be"):
+        check_weights(Net().state_dict(), read, "it", "x")
     del state["mean"]
     _, read = read_checkpoint(shared_file(tmp_path / "x.safetensors", state, config))
-    with pytest.raises(WearcapError, match=r"1 weights do not fit this model, such as 'mean'"):
-        check_weights(Net(5).state_dict(), read, "x")
+    with pytest.raises(WearcapError, match=r"not the weights of it: tensors 1 missing \(mean\)"):
+        check_weights(Net(5).state_dict(), read, "it", "x")
 
 
 @pytest.mark.parametrize("kind", ["ckpt", "safetensors"])

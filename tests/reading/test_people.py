@@ -7,13 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 
+from data_prep.shared.engine import Report
 from walking_person import sound_recording
 from wearcap.apps.doctor import examine
 from wearcap.checks import truth as doctor_truth
 from wearcap.checks.truth import FIGURES, of_person, people
 from wearcap.cli import prepare
 from wearcap.cli.doctor import main
-from wearcap.prepare.engine import Report
 from wearcap.recording import Recording, RecordingStore
 
 

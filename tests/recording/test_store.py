@@ -172,7 +172,7 @@ def test_equal_recordings_have_equal_bytes(tmp_path):
 
 def test_the_manifest_describes_the_file(store):
     entry = store.entries["all"]
-    assert (entry.frames, entry.fps, entry.subject, entry.split) == (FRAMES, 60.0, "s1", "train")
+    assert (entry.frames, entry.fps, entry.context.subject, entry.split) == (FRAMES, 60.0, "s1", "train")
     assert entry.duration_s == pytest.approx(FRAMES / 60, abs=0.02)
     assert dict(store.verify()) == {"all": None}
     assert store.names("val") == []

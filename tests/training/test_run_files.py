@@ -100,7 +100,7 @@ def test_what_cannot_be_resumed_from_is_named(tmp_path):
     torch.save(whole, path)
     require_resumable(path, weights)
     assert "without optimizer_states" in refusal({"state_dict": weights})
-    assert "do not fit this model" in refusal(whole | {"state_dict": {"net.weight": torch.zeros(3, 2)}})
+    assert "of this model" in refusal(whole | {"state_dict": {"net.weight": torch.zeros(3, 2)}})
     assert "more than tensors" in refusal(whole | {"callbacks": Runs(mark)})
     path.write_bytes(pickle.dumps(Runs(mark)))
     with pytest.raises(WearcapError, match="more than tensors|not a readable checkpoint"):

@@ -264,7 +264,7 @@ def test_a_checkpoint_of_another_model_is_named(checkpoint, tmp_path, trusted):
     saved = torch.load(checkpoint, weights_only=True)
     saved["state_dict"].pop("net.head.weight")
     torch.save(saved, tmp_path / "other.ckpt")
-    with pytest.raises(WearcapError, match="do not fit this model, such as 'net.head.weight'"):
+    with pytest.raises(WearcapError, match="not the weights of this model: tensors 1 missing .net.head.weight"):
         load_trained(tmp_path / "other.ckpt")
 
 

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from benchmarks.tables import hps_outages
+from data_prep.shared.engine import check_recording
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, resample
-from wearcap.prepare.engine import check_recording
 from wearcap.recording.serialize import flatten, unflatten
 from wearcap.sensors.claps import detect_claps, detect_claps_audio
 from wearsim.places.site import build_site

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import captured_motion as captured
+from data_prep.shared.mocap import About, CleaningLimits, MocapSettings, mocap_recording
 from wearcap.geometry.triangle_distance import TriangleIndex
 from wearcap.io.formats.asf_amc import read_amc, read_asf
-from wearcap.prepare.mocap import About, CleaningLimits, MocapSettings, mocap_recording
 from wearsim.people.body_space import LIMBS, BodySpace, limb_ends
 from wearsim.places.outline import points_in_convex
 from wearsim.places.surround import MARGIN_M, NEAR_M, PELVIS_OVER_SEAT_M, find_sits, find_treads, surround

@@ -18,11 +18,11 @@ from pathlib import Path
 import numpy as np
 import safetensors
 from jaxtyping import Float, Float32, Int, Int64
-from safetensors.numpy import load_file, save
+from safetensors.numpy import load_file
 from scipy import sparse
 
+from wearcap.boundary.tensors import write_tensors
 from wearcap.errors import WearcapError
-from wearcap.files import atomic_path
 from wearcap.geometry.mesh import face_normals
 
 LEVELS = {
@@ -115,11 +115,9 @@ def load_assets(keep: int | None) -> AnnyAssets:
         )
     except (OSError, safetensors.SafetensorError, KeyError, ValueError):  # absent or truncated: created again
         assets = _read_assets(keep)
-    # safetensors ignores strides, so arrays must be contiguous.
-    tensors = {name: np.ascontiguousarray(getattr(assets, name)) for name in _ARRAYS}
+    tensors = {name: getattr(assets, name) for name in _ARRAYS}
     tensors |= {f"joint.{name}": corners for name, corners in assets.joints.items()}
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(save(tensors, {"bones": json.dumps(assets.bones)}))
+    write_tensors(path, tensors, {"bones": json.dumps(assets.bones)})
     return assets
 
 

@@ -4,18 +4,18 @@ A run's `.ckpt` and an exported `.pt2` open where they lie in `outputs/`, in the
 that this user's commands wrote (kept in the user's cache folder), and elsewhere with `trust=true`.
 """
 
-import json
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from wearcap.errors import WearcapError
-from wearcap.files import cache_folder
+from wearcap.files import remember, remembered
 
 TRUST = "WEARCAP_TRUST"
 """Environment variable that `trust=true` sets to 1, for worker processes too."""
 OUTPUTS = Path("outputs")
+_OWN = "own.jsonl"
 
 
 @contextmanager
@@ -33,28 +33,10 @@ def trusting(trust: bool) -> Iterator[None]:
             os.environ[TRUST] = before
 
 
-def _ledger() -> Path:
-    return cache_folder() / "own.jsonl"
-
-
 def remember_own(path: str | Path) -> None:
     """Keep in mind that a file, or all in a run's folder, was written here. Without a cache folder nothing is kept."""
-    path = Path(path).resolve()
-    with suppress(OSError):
-        if str(path) in _known():
-            return
-        _ledger().parent.mkdir(parents=True, exist_ok=True)
-        with open(_ledger(), "a", encoding="utf-8") as file:  # one write, so that lines of other processes do not mix
-            file.write(json.dumps(str(path)) + "\n")
-
-
-def _known() -> set[str]:
-    known = set()
-    with suppress(OSError, UnicodeDecodeError):
-        for line in _ledger().read_text(encoding="utf-8").splitlines():
-            with suppress(ValueError):
-                known.add(json.loads(line))
-    return known
+    if (name := str(Path(path).resolve())) not in remembered(_OWN):
+        remember(_OWN, name)
 
 
 def require_own(path: str | Path) -> None:
@@ -62,7 +44,8 @@ def require_own(path: str | Path) -> None:
     real = Path(path).resolve()
     if os.environ.get(TRUST) == "1" or OUTPUTS.resolve() in real.parents:
         return
-    if {str(real), *map(str, real.parents)} & _known():
+    known = remembered(_OWN)
+    if any(str(place) in known for place in (real, *real.parents)):
         return
     what = f"a {real.suffix or 'PyTorch'} file from elsewhere, which can run code when it is opened"
     fix = "Ask for the .safetensors or .onnx export, or give trust=true if it is your own."

@@ -1,4 +1,6 @@
-"""Tensors of strangers' `.safetensors` files, and of PyTorch files without running their code."""
+"""Named tensors in `.safetensors` files, with a description in JSON among their metadata, and those of strangers' PyTorch
+files without running their code.
+"""
 
 import io
 import pickle
@@ -13,12 +15,14 @@ from typing import Any
 import numpy as np
 import safetensors
 import torch
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save
 
 from wearcap.boundary.arrays import open_archive
 from wearcap.boundary.limits import LIMITS, Budget
 from wearcap.boundary.opening import explained, file_size
+from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError
+from wearcap.files import atomic_path
 
 _DAMAGE = (safetensors.SafetensorError, OSError, RuntimeError, ValueError, LookupError, TypeError)
 # A score beside the weights, as training scripts save it, is a NumPy number: plain data, but unknown to torch.load.
@@ -36,7 +40,7 @@ _NUMBERS = [
 _CONVERT = "If you trust its origin, save its state_dict with safetensors.torch.save_file."
 
 
-def open_tensors(path: str | Path, kind: str, fix: str = "", framework: str = "pt") -> Any:
+def open_tensors(path: str | Path, kind: str, fix: str = "") -> Any:
     """An open `.safetensors` file, memory-mapped, as `safetensors.safe_open` gives it.
 
     `kind` names in messages what it should be ("recording"). Raises WearcapError when it is missing, no regular file,
@@ -51,7 +55,7 @@ def open_tensors(path: str | Path, kind: str, fix: str = "", framework: str = "p
             budget.spend(length)
             budget.count(file.read(length).count(b"{"), "tensors")
     try:
-        return safetensors.safe_open(str(path), framework=framework)
+        return safetensors.safe_open(str(path), framework="pt")
     except _DAMAGE as error:
         raise WearcapError(f"not a readable {kind}", path, "a complete .safetensors file", fix) from error
 
@@ -60,6 +64,32 @@ def read_tensors(path: str | Path, kind: str, fix: str = "") -> tuple[dict[str, 
     """(metadata, tensors) of a whole `.safetensors` file. Raises WearcapError as `open_tensors` does."""
     metadata = open_tensors(path, kind, fix).metadata() or {}
     return metadata, load_file(path)
+
+
+def open_described(path: str | Path, key: str, kind: str, writer: str, fix: str = "") -> tuple[Any, Any]:
+    """(the open file, its description: content of the JSON text under `key` of its metadata).
+
+    Raises WearcapError as `open_tensors` does, and for a file without it, which `writer` would have written.
+    """
+    file = open_tensors(path, kind, fix)
+    if key not in (metadata := file.metadata() or {}):
+        raise WearcapError(f"a .safetensors file, but not a {kind}", path, f"one that {writer} wrote")
+    return file, parse_json(metadata[key], path)
+
+
+def write_tensors(
+    path: str | Path, tensors: Mapping[str, torch.Tensor | np.ndarray], description: Mapping[str, str] | None = None
+) -> None:
+    """Write named tensors, and a description by its key, atomically; equal content gives equal bytes.
+
+    One key only: safetensors writes several in an order that changes from process to process.
+    """
+    whole = {
+        name: (torch.tensor(value) if isinstance(value, np.ndarray) else value.detach().cpu().clone()).contiguous()
+        for name, value in sorted(tensors.items())
+    }
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(save(whole, description and dict(description)))
 
 
 def read_torch(path: str | Path, kind: str, expected: str) -> Any:

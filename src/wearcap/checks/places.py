@@ -19,7 +19,7 @@ from wearcap.io.formats.environment import FILE_NAME as ENVIRONMENT
 from wearcap.io.formats.environment import read_environment
 from wearcap.io.formats.scene_folder import read_scan
 from wearcap.io.formats.video import open_image
-from wearcap.localization.visual_map import VisualMap
+from wearcap.localization.visual_map import MAP, VisualMap
 from wearcap.recording import PointCloud, Recording
 from wearcap.scene.objects import FREEDOMS, Environment, SceneObject
 from wearcap.scene.scan import Photo, Scan
@@ -91,7 +91,7 @@ def read_place(folder: Path) -> tuple[Recording, list[Finding]]:
 def is_map(path: Path) -> bool:
     """Whether a .safetensors file is marked as a visual map."""
     try:
-        return "wearcap_map" in (open_tensors(path, "map", framework="numpy").metadata() or {})
+        return MAP in (open_tensors(path, "map").metadata() or {})
     except WearcapError:
         return False
 

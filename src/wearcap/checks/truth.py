@@ -66,7 +66,7 @@ def people(store: RecordingStore, names: Iterable[str]) -> dict[str, dict[str, f
     """Figures of each person of these recordings of a data set from `SAMPLE_S` of motion; people without are left out."""
     own: dict[str, list[str]] = {}
     for name in names:
-        own.setdefault(store.entries[name].subject or "unnamed", []).append(name)
+        own.setdefault(store.entries[name].context.subject or "unnamed", []).append(name)
     sampled = {subject: _sample(store, own[subject]) for subject in sorted(own)}
     return {subject: truth(cuts) for subject, cuts in sampled.items() if cuts}
 

@@ -97,4 +97,4 @@ def _captured(names: Sequence[str], plain: dict[str, Any], key: str, capture: Ca
     files = [(str(path), path.stat().st_size) for path in sorted(folder.iterdir()) if path.is_file()]
     entry = store.entries[name]
     frames = entry.frames if motion is None else len(motion)
-    return [Outcome(name, seconds, frames, tuple(rows), tuple(files), error, entry.activity)]
+    return [Outcome(name, seconds, frames, tuple(rows), tuple(files), error, entry.context.activity)]

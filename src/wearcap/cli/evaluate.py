@@ -167,7 +167,7 @@ class _Scoring:
     def __init__(self, config: DictConfig, store: RecordingStore, names: Sequence[str], realism: Realism | None):
         self.config, self.store, self.realism = config, store, realism
         self.names = sorted(names, key=lambda name: store.entries[name].frames)
-        self.activity_of = {name: store.entries[name].activity for name in names}
+        self.activity_of = {name: store.entries[name].context.activity for name in names}
 
     def of(
         self, system: System, checkpoints: Sequence[str], seeds: Sequence[int], title: str, method: str

@@ -8,7 +8,7 @@ from rich import print as show
 
 from wearcap.cli.conf import hydra_application, load_pipeline, run_application, with_pipeline
 from wearcap.export.files import ExportReport, write_exports
-from wearcap.models.checkpoint import load_trained, share_checkpoint
+from wearcap.models.checkpoint import share_checkpoint
 
 
 def run(config: DictConfig) -> dict[str, ExportReport]:
@@ -20,11 +20,7 @@ def run(config: DictConfig) -> dict[str, ExportReport]:
         share_checkpoint(config.checkpoint, config.output, config.dtype)
         show(f"checkpoint: {config.output}")
         return {}
-    module = load_trained(config.checkpoint)[0]
-    if hasattr(module, "exports"):
-        exports = module.exports()
-    else:
-        exports = load_pipeline(config.checkpoint, config.pipeline, "cpu").exports()
+    exports = load_pipeline(config.checkpoint, config.pipeline, "cpu").exports()
     reports = write_exports(exports, config.output, config.format)
     for name, report in reports.items():
         show(

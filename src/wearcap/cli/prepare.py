@@ -6,12 +6,12 @@ from pathlib import Path
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from data_prep.shared.engine import Report, Splits, prepare
 from wearcap.checks import require_sound
 from wearcap.checks.truth import of_person, people
 from wearcap.cli.conf import compose, explained, require_writable, splits_dir
 from wearcap.cli.verbs import sources
 from wearcap.errors import WearcapError, nearest
-from wearcap.prepare.engine import Report, Splits, prepare
 from wearcap.recording.store import SPLITS, RecordingStore
 
 
@@ -45,10 +45,10 @@ def _show_report(report: Report, store: RecordingStore) -> None:
     for split in SPLITS:
         entries = [store.entries[name] for name in store.names(split)]
         minutes = sum(entry.duration_s for entry in entries) / 60
-        subjects = len({entry.subject for entry in entries})
+        subjects = len({entry.context.subject for entry in entries})
         print(f"  {split:5} {len(entries):4} recordings, {subjects:3} subjects, {minutes:7.1f} min")
-    fresh = {store.entries[name].subject for name in report.written}
-    names = sorted(name for name in ours if store.entries[name].subject in fresh)
+    fresh = {store.entries[name].context.subject for name in report.written}
+    names = sorted(name for name in ours if store.entries[name].context.subject in fresh)
     for subject, person in people(store, names).items():
         if wrong := [f"{finding.what} ({finding.evidence})" for finding in of_person(person)]:
             print(f"warning: person {subject}: {'; '.join(wrong)}")

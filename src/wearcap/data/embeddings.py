@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from safetensors.torch import save
 from torch import Tensor
 
-from wearcap.boundary.tensors import read_tensors
+from wearcap.boundary.tensors import read_tensors, write_tensors
 from wearcap.errors import WearcapError
-from wearcap.files import atomic_path, sha256_of
+from wearcap.files import sha256_of
 from wearcap.io.formats.video import read_frames, read_image
 from wearcap.models.image_encoder import ImageEncoder
 from wearcap.recording.recording import CameraStream
@@ -42,8 +41,7 @@ def embed_camera(camera: CameraStream, folder: Path, encoder: ImageEncoder, cach
     embeddings = _read(kept, encoder.size)
     if embeddings is None:
         embeddings = _embed(pictures(camera, folder), encoder)
-        with atomic_path(kept) as temporary:
-            temporary.write_bytes(save(embeddings))  # save_file would leave a file of its own when killed
+        write_tensors(kept, embeddings)
     count = len(embeddings["embedding"])
     if count != len(camera.timestamps):
         what = f"{count} pictures for {len(camera.timestamps)} timestamps"

@@ -28,7 +28,7 @@ def body_size(skeleton: Skeleton) -> Float[Tensor, "limb"]:
 
 def on_level_ground(file: RecordingFile) -> bool:
     """Whether a recording's floor may be taken to be where it says, or at z = 0; not where people climb on what was not
-    captured, so that their height over the floor says nothing (`prepare.mocap`)."""
+    captured, so that their height over the floor says nothing (`data_prep.shared.mocap`)."""
     motion = file.part("motion")
     return file.part("floor") is not None or motion is None or motion.provenance.get("floor") != "uneven"
 

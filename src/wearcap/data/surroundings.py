@@ -10,13 +10,11 @@ from pathlib import Path
 import torch
 from jaxtyping import Bool, Float64, Int64
 from rich.progress import track
-from safetensors.torch import save
 from torch import Tensor
 
-from wearcap.boundary.tensors import open_tensors
+from wearcap.boundary.tensors import open_tensors, write_tensors
 from wearcap.data.windows import open_recording
 from wearcap.errors import WearcapError
-from wearcap.files import atomic_path
 from wearcap.models.checkpoint import load_network
 from wearcap.models.voxel_autoencoder import VoxelAutoencoder
 from wearcap.recording.store import Entry, RecordingStore
@@ -73,8 +71,7 @@ class PlaceCodes:
                 grids = surroundings.voxelize(head.T_world_device[part], head.timestamps[part])
                 with torch.inference_mode():
                     code[part], code_mirrored[part] = self.encoder.encode(grids), self.encoder.encode(mirrored(grids))
-            with atomic_path(path) as temporary:
-                temporary.write_bytes(save({"code": code, "code_mirrored": code_mirrored}))
+            write_tensors(path, {"code": code, "code_mirrored": code_mirrored})
         return path
 
     def prepare(self, store: RecordingStore, names: Iterable[str]) -> None:

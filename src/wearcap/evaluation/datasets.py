@@ -11,13 +11,13 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor
-from contextlib import closing, nullcontext
+from contextlib import closing, nullcontext, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from rich.markup import escape
 from rich.table import Table
 
@@ -38,7 +38,6 @@ from wearcap.version import __version__
 
 SHOWN = 3
 """Metrics of a table of recordings; its file has them all."""
-_DAMAGE = (OSError, ValueError, LookupError, TypeError, AttributeError, WearcapError)
 
 
 @dataclass(frozen=True)
@@ -103,15 +102,11 @@ def over_recordings(
                 done()
         chunks = divided(todo, chunk)
         how = how if len(chunks) > 1 else Parallel(jobs=1)
-        try:
-            with closing(how.run(partial(_worked, work=work, notes=notes), chunks, lock)) as finished:
-                for outcomes in finished:
-                    for outcome in outcomes:
-                        yield outcome
-                        done()
-        except BrokenExecutor as error:
-            fix = "What is finished is kept: run again with fewer jobs."
-            raise WearcapError("a worker process was killed (out of memory?)", store.root, fix=fix) from error
+        with closing(how.run(partial(_worked, work=work, notes=notes), chunks, store.root, lock)) as finished:
+            for outcomes in finished:
+                for outcome in outcomes:
+                    yield outcome
+                    done()
 
 
 def _worked(part: Sequence[tuple[str, str]], work: Work, notes: Path | None) -> list[Outcome]:
@@ -138,19 +133,11 @@ def _note(outcome: Outcome, key: str) -> str:
 
 def _kept(notes: Path, name: str, key: str) -> Outcome | None:
     """The outcome of a recording's note, if it has the key and all files are there as they were written."""
-    try:
+    with suppress(OSError, LookupError, TypeError, ValueError, WearcapError):  # none, or a damaged one
         about = read_json(notes / f"{name}.json")
-        if about.pop("key") != key:
-            return None
-        rows = tuple(
-            Row(**row | {"scores": {metric: float(value) for metric, value in row["scores"].items()}})
-            for row in about.pop("rows")
-        )
-        files = tuple((str(path), int(size)) for path, size in about.pop("files"))
-        if all(Path(path).stat().st_size == size for path, size in files):
-            return Outcome(**about, rows=rows, files=files)
-    except _DAMAGE:
-        return None
+        outcome = msgspec.convert(about, Outcome, strict=False)  # texts are numbers, too: "nan"
+        if about["key"] == key and all(Path(path).stat().st_size == size for path, size in outcome.files):
+            return outcome
     return None
 
 
@@ -245,7 +232,7 @@ def scored(
             entry.frames,
             tuple(rows[name]),
             error="" if rows[name] else "no motion",
-            activity=entry.activity,
+            activity=entry.context.activity,
         )
         for name, entry in entries
     ]

@@ -14,12 +14,11 @@ from typing import Annotated, Any
 
 import msgspec
 import torch
-from safetensors.torch import save
 from torch import Tensor, nn
 
 from wearcap.boundary.opening import file_size, understood
 from wearcap.boundary.own import remember_own, require_own
-from wearcap.boundary.tensors import read_tensors
+from wearcap.boundary.tensors import read_tensors, write_tensors
 from wearcap.boundary.texts import read_json_object, require_layout
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, sha256_of, write_text
@@ -164,8 +163,7 @@ def write_exports(exports: Exports, path: str | Path, format: str) -> dict[str, 
     weights = {}
     for name, module in exports.weights.items():
         file = part_path(path, name).with_suffix(".safetensors")
-        with atomic_path(file) as temporary:
-            temporary.write_bytes(save({key: value.cpu() for key, value in module.state_dict().items()}))
+        write_tensors(file, module.state_dict())
         weights[name] = {"file": file.name, "sha256": sha256_of(file)}
     files = {
         name: {"file": Path(report.path).name, "sha256": sha256_of(report.path)} for name, report in reports.items()

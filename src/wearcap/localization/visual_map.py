@@ -10,13 +10,11 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float32, Int8, Int32, Int64
-from safetensors.numpy import save
 
 from wearcap.boundary.opening import understood
-from wearcap.boundary.tensors import open_tensors
-from wearcap.boundary.texts import parse_json
+from wearcap.boundary.tensors import open_described, write_tensors
+from wearcap.boundary.texts import require_layout
 from wearcap.errors import WearcapError
-from wearcap.files import atomic_path
 from wearcap.geometry.camera import Camera
 from wearcap.geometry.rigid import Rigid
 from wearcap.localization.features import Extractor, Vlad
@@ -27,7 +25,21 @@ STEPS = 254.0
 _CHUNK = 1 << 18
 _MIN_COSINE = 0.85
 """Smallest similarity of descriptors that are merged."""
+MAP = "wearcap_map"
+"""Key of a map's description in its file."""
 _AGAIN = "Build it again: wearcap scene."
+
+
+@dataclass(frozen=True)
+class _Header:
+    """A map's description in its file: its fields of that name."""
+
+    schema_version: int
+    extractor: str
+    descriptor: str
+    names: tuple[str, ...]
+    cameras: tuple[Camera, ...]
+    cell_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,52 +132,39 @@ class VisualMap:
 
     def save(self, path: str | Path) -> None:
         """Write one .safetensors file, atomically."""
-        header = {
-            "schema_version": SCHEMA_VERSION,
-            "extractor": self.extractor,
-            "descriptor": self.descriptor,
-            "names": self.names,
-            "cameras": [dataclasses.asdict(camera) for camera in self.cameras],
-            "cell_m": self.cell_m,
-        }
+        header = _Header(
+            SCHEMA_VERSION, self.extractor, self.descriptor, self.names, self.cameras, float(self.cell_m)
+        )
         arrays = {
-            "R_world_cam": self.T_world_cam.R.numpy(),
-            "t_world_cam": self.T_world_cam.t.numpy(),
+            "R_world_cam": self.T_world_cam.R,
+            "t_world_cam": self.T_world_cam.t,
             "global_descriptors": self.global_descriptors,
             "vocabulary": self.vocabulary,
             **vars(self.observations),
             **{f"landmarks.{name}": array for name, array in vars(self.landmarks).items()},
         }
-        tensors = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-        with atomic_path(path) as temporary:
-            temporary.write_bytes(save(tensors, {"wearcap_map": json.dumps(header, sort_keys=True)}))
+        write_tensors(path, arrays, {MAP: json.dumps(dataclasses.asdict(header), sort_keys=True)})
 
     @classmethod
     def load(cls, path: str | Path) -> "VisualMap":
         """Read a map. Raises WearcapError for a file that is missing, damaged, no map, or of another version."""
-        file = open_tensors(path, "map", _AGAIN, "numpy")
-        metadata = file.metadata() or {}
-        if "wearcap_map" not in metadata:
-            what = "a .safetensors file, but not a visual map"
-            raise WearcapError(what, where=path, expected="one that `wearcap scene` wrote")
+        file, content = open_described(path, MAP, "visual map", "`wearcap scene`", _AGAIN)
         with understood("a damaged map", path, fix=_AGAIN):
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            header = parse_json(metadata["wearcap_map"], path)
-            if header["schema_version"] != SCHEMA_VERSION:
-                what = f"a map of version {header['schema_version']}"
-                raise WearcapError(what, where=path, expected=f"version {SCHEMA_VERSION}", fix=_AGAIN)
-            cameras = [camera | {"distortion": tuple(camera["distortion"])} for camera in header["cameras"]]
+            if (version := content["schema_version"]) != SCHEMA_VERSION:
+                raise WearcapError(f"a map of version {version}", path, f"version {SCHEMA_VERSION}", _AGAIN)
+            header = require_layout(content, _Header, path)
+            arrays = {name: file.get_tensor(name).numpy() for name in file.keys()}  # noqa: SIM118
             loaded = cls(
-                header["extractor"],
-                header["descriptor"],
-                tuple(header["names"]),
-                tuple(Camera(**camera) for camera in cameras),
-                Rigid(*(torch.from_numpy(tensors[name]) for name in ("R_world_cam", "t_world_cam"))),
-                tensors["global_descriptors"],
-                Observations(**{field.name: tensors[field.name] for field in dataclasses.fields(Observations)}),
-                _Landmarks(tensors["landmarks.points_world"], tensors["landmarks.descriptors"]),
-                tensors["vocabulary"],
-                float(header["cell_m"]),
+                header.extractor,
+                header.descriptor,
+                header.names,
+                header.cameras,
+                Rigid(*(torch.from_numpy(arrays[name]) for name in ("R_world_cam", "t_world_cam"))),
+                arrays["global_descriptors"],
+                Observations(**{field.name: arrays[field.name] for field in dataclasses.fields(Observations)}),
+                _Landmarks(arrays["landmarks.points_world"], arrays["landmarks.descriptors"]),
+                arrays["vocabulary"],
+                header.cell_m,
             )
             loaded.check()
         return loaded

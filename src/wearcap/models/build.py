@@ -7,7 +7,7 @@ have the names and shapes of the file's tensors is then built.
 
 import importlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from wearcap.errors import WearcapError
+from wearcap.models.weights import check_weights
 
 _OPTIMIZERS = "ASGD Adadelta Adagrad Adam AdamW Adamax LBFGS NAdam RAdam RMSprop SGD"
 _SCHEDULERS = (
@@ -86,18 +87,24 @@ TIMES_WEIGHTS = 8
 
 def brought_up_to_date(config: Any) -> None:
     """Give, in place, a model's config today's names of targets and settings, and leave out settings that went and were off."""
+    for part in _parts(config):
+        if isinstance(target := part.get(_TARGET), str):
+            module, dot, name = target.rpartition(".")
+            target = part[_TARGET] = MOVED.get(module, module) + dot + name
+            for old, new in RENAMED.get(target, {}).items():
+                if old in part:
+                    part[new] = part.pop(old)
+        for name in [name for name, off in STRUCK.items() if name in part and part[name] is off]:
+            del part[name]
+
+
+def _parts(config: Any) -> Iterator[dict[str, Any]]:
+    """All dictionaries in a config."""
     rest = [config]
     while rest:
         value = rest.pop()
         if isinstance(value, dict):
-            if isinstance(target := value.get(_TARGET), str):
-                module, dot, name = target.rpartition(".")
-                target = value[_TARGET] = MOVED.get(module, module) + dot + name
-                for old, new in RENAMED.get(target, {}).items():
-                    if old in value:
-                        value[new] = value.pop(old)
-            for name in [name for name, off in STRUCK.items() if name in value and value[name] is off]:
-                del value[name]
+            yield value
         rest += value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
 
 
@@ -149,12 +156,15 @@ def build(config: dict[str, Any], state: Mapping[str, Tensor], where: str | Path
     check_config(config, where)
     own = {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
     needed = sum(value.numel() * value.element_size() for value in own.values())
+    for part in _parts(config):  # a module that makes tensors when it is imported must not make them without memory
+        if _TARGET in part:
+            target_of(part[_TARGET])
     try:
         with torch.device("meta"), _Rehearsal(ALLOWANCE + TIMES_WEIGHTS * needed):
             rehearsed = _made(config)
         if not isinstance(rehearsed, nn.Module):
             raise TypeError(f"a {type(rehearsed).__name__}, no network")
-        check_weights(rehearsed.state_dict(), own, where)
+        check_weights(rehearsed.state_dict(), own, "this model", where)
         module: nn.Module = _made(config)
     except Exception as error:  # constructors may raise anything for arguments that no release of ours wrote
         if isinstance(error, WearcapError) and error.where:
@@ -163,15 +173,6 @@ def build(config: dict[str, Any], state: Mapping[str, Tensor], where: str | Path
         raise WearcapError(what, where=where, expected="a checkpoint of this version of wearcap") from error
     module.load_state_dict(own)
     return module.eval()
-
-
-def check_weights(own: Mapping[str, Tensor], state: Mapping[str, Tensor], where: str | Path) -> None:
-    """Raise WearcapError unless the weights of a file have the names and shapes of a model's own."""
-    wrong = sorted(set(own) ^ set(state)) or [name for name in own if own[name].shape != state[name].shape]
-    if wrong:
-        what = f"{len(wrong)} weights do not fit this model, such as {wrong[0][:80]!r}"
-        fix = "Check which model it was trained for."
-        raise WearcapError(what, where=where, expected="a checkpoint of the same model", fix=fix)
 
 
 def target_of(name: str) -> Callable[..., Any]:

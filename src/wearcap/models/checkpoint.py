@@ -14,15 +14,14 @@ from pathlib import Path
 from typing import Any, NotRequired, TypedDict, TypeVar
 
 import torch
-from safetensors.torch import save
 from torch import Tensor, nn
 
 from wearcap.boundary.opening import file_size
 from wearcap.boundary.own import require_own
-from wearcap.boundary.tensors import plain_tensors, read_tensors, read_torch
+from wearcap.boundary.tensors import plain_tensors, read_tensors, read_torch, write_tensors
 from wearcap.boundary.texts import parse_json, require_layout
 from wearcap.errors import WearcapError, nearest
-from wearcap.files import atomic_path, resource
+from wearcap.files import resource
 from wearcap.models.build import brought_up_to_date, build, check_config
 
 Network = TypeVar("Network", bound=nn.Module)
@@ -180,9 +179,7 @@ def share_checkpoint(source: str | Path, target: str | Path, dtype: str = "float
         if roots and not any(Path(source["root"]).is_absolute() for source in roots.values()):
             shared.setdefault("data", {})[key] = roots
     about = json.dumps(shared | {_DIGEST: _digest(shared, narrow)}, sort_keys=True)
-    with atomic_path(target) as temporary:
-        tensors = {name: value.contiguous().clone() for name, value in narrow.items()}
-        temporary.write_bytes(save(tensors, {_KEY: about}))
+    write_tensors(target, narrow, {_KEY: about})
 
 
 def load_trained(checkpoint: str | Path) -> tuple[nn.Module, dict[str, Any]]:

@@ -35,20 +35,23 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
 
 
 def load_weights(network: nn.Module, tensors: Mapping[str, Tensor], *, name: str, where: str | Path) -> None:
-    """Fill `network` with `tensors`; all of its names, no others, in its shapes.
+    """Fill `network` with `tensors`. Raises WearcapError as `check_weights` does."""
+    check_weights(network.state_dict(), tensors, name, where)
+    network.load_state_dict(dict(tensors))
 
-    Raises WearcapError that shows a few of the names or shapes that do not fit.
-    """
-    own = network.state_dict()
+
+def check_weights(own: Mapping[str, Tensor], tensors: Mapping[str, Tensor], name: str, where: str | Path) -> None:
+    """Raise WearcapError unless the tensors of a file have the names and shapes of a model's own; it shows a few of those
+    that do not fit."""
     missing, unexpected = sorted(own.keys() - tensors.keys()), sorted(tensors.keys() - own.keys())
-    if missing or unexpected:
-        wrong = [
-            f"{len(names)} {what} ({', '.join(names[:_SHOWN])}{', …' if len(names) > _SHOWN else ''})"
-            for names, what in ((missing, "missing"), (unexpected, "unexpected"))
-            if names
-        ]
+    wrong = [
+        f"{len(names)} {what} ({', '.join(each[:80] for each in names[:_SHOWN])}{', …' if len(names) > _SHOWN else ''})"
+        for names, what in ((missing, "missing"), (unexpected, "unexpected"))
+        if names
+    ]
+    if wrong:
         what = f"these are not the weights of {name}: tensors {' and '.join(wrong)}"
-        raise WearcapError(what, where=where, expected=f"{len(own)} tensors such as {next(iter(own))}")
+        raise WearcapError(what, where=where, expected=f"{len(own)} tensors such as {next(iter(own), '')}")
     shapes = [
         f"{key} is {_shape(tensors[key])} and should be {_shape(value)}"
         for key, value in own.items()
@@ -58,7 +61,6 @@ def load_weights(network: nn.Module, tensors: Mapping[str, Tensor], *, name: str
         more = f"; and {len(shapes) - _SHOWN} more" if len(shapes) > _SHOWN else ""
         what = f"the weights are those of another size of {name}: {'; '.join(shapes[:_SHOWN])}{more}"
         raise WearcapError(what, where=where)
-    network.load_state_dict(dict(tensors))
 
 
 def _shape(tensor: Tensor) -> str:

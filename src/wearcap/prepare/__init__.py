@@ -1,9 +1,4 @@
-"""Preparation: sources in, a data set of recordings out.
+"""Files of any origin as recordings, for preparation and for reading: foreign motion files, suits, a wearer's own logs.
 
-Open `engine.py` first. `data_prep/` has a file per data set; here is what they share: motion capture on training skeletons
-(`mocap.py`; files of any origin, `foreign.py`), suits, and a wearer's own logs. `conf/prepare/` names what `wearcap prepare` runs.
+`data_prep/` has a file per data set; `data_prep/shared/engine.py` makes their recordings.
 """
-
-from wearcap.prepare.engine import Report, Splits, Task, check_recording, content_hash, prepare
-
-__all__ = ["Report", "Splits", "Task", "check_recording", "content_hash", "prepare"]

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from wearcap.body.skeleton import WRISTS, Skeleton, skeleton_of_height
 from wearcap.errors import WearcapError, require_choice
+from wearcap.files import content_hash
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.rotation import swing_between
 from wearcap.geometry.trajectory import Trajectory
@@ -30,7 +31,6 @@ from wearcap.io.formats.pose_columns import FIRST_CAMERA
 from wearcap.io.formats.poses import check_finite
 from wearcap.io.formats.trajectory import TrajectoryFile, read_trajectory_file
 from wearcap.io.formats.video import video_info
-from wearcap.prepare.engine import content_hash
 from wearcap.recording.recording import CameraStream, FloorTrack, HeadStream, ImuStream, PointCloud, Recording
 from wearcap.sensors.camera_alignment import SlamAlignment
 from wearcap.sensors.slam_alignment import SceneEvidence, align_cleaned, pose_of

@@ -30,7 +30,7 @@ KNOWN: dict[str, type] = _PARTS | {
 def flatten(value: Any, key: str = "") -> tuple[Any, dict[str, Tensor]]:
     """Return (JSON tree, tensors by dotted key). Parts that are None or empty are omitted."""
     if isinstance(value, Tensor):
-        return {"$tensor": key}, {key: value.detach().cpu().contiguous().clone()}
+        return {"$tensor": key}, {key: value.detach().cpu()}
     if dataclasses.is_dataclass(value):
         items = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
         tree: dict[str, Any] = {"$type": type(value).__name__}
@@ -63,13 +63,17 @@ def unflatten(tree: Any, fetch, known: dict[str, type] = KNOWN) -> Any:
     if tree["$type"] not in known:
         raise WearcapError(f"unknown part {tree['$type']!r}", expected=f"one of {', '.join(sorted(known))}")
     kind = known[tree["$type"]]
+    first: dict[str, tuple[int, str]] = {}
+    """Size of each axis by its name, and the field that it was found in."""
     for name, item in items.items():
         require_part(kind, name, item)
-    times = items.get("timestamps")
-    for name in _over_time(kind) if isinstance(times, Tensor) else ():
-        if isinstance(items.get(name), Tensor) and len(items[name]) != len(times):
-            what = f"{kind.__name__}.{name} has {len(items[name])} rows for {len(times)} timestamps"
-            raise WearcapError(what, expected="a row for each timestamp")
+    for name, axes in _axes(kind).items():
+        item = items.get(name)
+        for axis, size in zip(axes, item.shape) if isinstance(item, Tensor) else ():
+            expected, other = first.setdefault(axis, (size, name))
+            if size != expected:
+                what = f"{kind.__name__}.{name} has {size} rows for {expected} {other}"
+                raise WearcapError(what, expected=f"one size of the axis {axis!r}")
     return kind(**items)
 
 
@@ -107,13 +111,13 @@ def _fits(value: Any, hint: Any) -> bool:
 
 
 @functools.cache
-def _over_time(kind: type) -> tuple[str, ...]:
-    """Names of the fields whose first annotated axis is "time"."""
-    hints = _hints(kind)
+def _axes(kind: type) -> dict[str, list[str]]:
+    """Names of the annotated axes of the fields that are tensors."""
     shapes = {
-        name: [getattr(part, "dim_str", "") for part in (get_args(hint) or (hint,))] for name, hint in hints.items()
+        name: [getattr(part, "dim_str", "") for part in (get_args(hint) or (hint,))]
+        for name, hint in _hints(kind).items()
     }
-    return tuple(name for name, found in shapes.items() if any(dims.split()[:1] == ["time"] for dims in found))
+    return {name: dims.split() for name, found in shapes.items() for dims in found if dims}
 
 
 def dumps(tree: Any) -> str:

@@ -1,6 +1,5 @@
 """Data sets on disk: a `manifest.json`, and one memory-mapped `.safetensors` file per recording."""
 
-import dataclasses
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
@@ -11,14 +10,13 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 from safetensors import SafetensorError
-from safetensors.torch import save
 from torch import Tensor
 
 from wearcap.boundary.opening import explained, file_size, path_inside, read_bytes, understood
-from wearcap.boundary.tensors import open_tensors
-from wearcap.boundary.texts import parse_json
+from wearcap.boundary.tensors import open_described, write_tensors
+from wearcap.boundary.texts import parse_json, require_layout
 from wearcap.errors import WearcapError, require_choice
-from wearcap.files import atomic_path, remembered_sha256, sha256_of, write_text
+from wearcap.files import remembered_sha256, sha256_of, write_text
 from wearcap.recording.recording import Recording
 from wearcap.recording.serialize import dumps, flatten, require_part, unflatten
 
@@ -39,8 +37,18 @@ _DAMAGE = (
 
 
 @dataclass(frozen=True)
+class Context:
+    """Who a recording is of, where, doing what, and under which licence."""
+
+    subject: str
+    location: str
+    activity: str
+    license: str
+
+
+@dataclass(frozen=True)
 class Entry:
-    """Manifest entry of one recording."""
+    """Manifest entry of one recording; in the file its context stands among the other keys."""
 
     file: str
     sha256: str
@@ -48,11 +56,8 @@ class Entry:
     frames: Annotated[int, msgspec.Meta(ge=0, le=10**9)]  # a week at 1.6 kHz
     fps: Annotated[float, msgspec.Meta(ge=0, le=1e5)]
     duration_s: Annotated[float, msgspec.Meta(ge=0, le=1e11)]
-    subject: str
-    location: str
-    activity: str
+    context: Context
     split: Literal["train", "val", "test"]
-    license: str
     config_hash: str
     """Hash of source bytes and preparation settings: prepare skips a recording whose hash is current."""
 
@@ -64,7 +69,6 @@ class Entry:
         stream = recording.motion or recording.suit or recording.head
         frames = len(stream.timestamps) if stream else 0
         fps = round(1 / stream.timestamps.diff().median().item(), 4) if stream and frames > 1 else 0.0
-        about = {name: getattr(recording, name) for name in ("subject", "location", "activity", "license")}
         return cls(
             file=path.relative_to(root).as_posix(),
             sha256=sha256_of(path),
@@ -72,9 +76,9 @@ class Entry:
             frames=frames,
             fps=fps,
             duration_s=round(recording.duration_s, 4),
+            context=Context(recording.subject, recording.location, recording.activity, recording.license),
             split=split,
             config_hash=config_hash,
-            **about,
         )
 
 
@@ -107,11 +111,9 @@ class RecordingFile:
                     raise WearcapError(f"{size} bytes long", self.path, expected, fix)
                 if entry is not None and remembered_sha256(self.path) != entry.sha256:
                     raise _differs(self.path)
-        self._file = open_tensors(path, "recording", "Prepare this recording again.")
-        metadata = self._file.metadata() or {}
-        if "wearcap" not in metadata:
-            raise WearcapError("a .safetensors file, but not a recording", path, "one that `wearcap prepare` wrote")
-        description = parse_json(metadata["wearcap"], path, schema=_Description)
+        fix = "Prepare this recording again."
+        self._file, content = open_described(path, "wearcap", "recording", "`wearcap prepare`", fix)
+        description = require_layout(content, _Description, path)
         if (version := description.schema_version) != SCHEMA_VERSION:
             raise WearcapError(f"schema version {version}", path, f"version {SCHEMA_VERSION}", "Prepare it again.")
         self._tree = description.recording
@@ -181,10 +183,7 @@ def _entries(manifest: Path, *stamp: int) -> Mapping[str, Entry]:
 def save_recording(recording: Recording, path: str | Path) -> None:
     """Write one recording atomically; equal recordings give equal bytes."""
     tree, tensors = flatten(recording)
-    # One entry only: safetensors writes several in an order that changes from process to process.
-    metadata = {"wearcap": dumps({"schema_version": SCHEMA_VERSION, "recording": tree})}
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(save(dict(sorted(tensors.items())), metadata))
+    write_tensors(path, tensors, {"wearcap": dumps({"schema_version": SCHEMA_VERSION, "recording": tree})})
 
 
 class RecordingStore:
@@ -202,7 +201,8 @@ class RecordingStore:
             what = f"schema version {str(version)[:40]}"
             raise WearcapError(what, path, f"version {SCHEMA_VERSION}", "Prepare the data set again.")
         with understood("not a readable manifest", path, fix="Delete it and prepare the data set again."):
-            self.entries = msgspec.convert(manifest["recordings"], dict[str, Entry])
+            rows = {name: row | {"context": row} for name, row in manifest["recordings"].items()}
+            self.entries = msgspec.convert(rows, dict[str, Entry])
             for name, entry in self.entries.items():
                 if self.root / entry.file != recording_path(self.root, name):
                     raise ValueError(f"{name!r} is at {entry.file!r}, outside this data set")
@@ -235,7 +235,9 @@ class RecordingStore:
     def register(self, entries: dict[str, Entry]) -> None:
         """Add manifest entries of recordings whose files already exist (written by workers)."""
         self.entries |= entries
-        recordings = {key: dataclasses.asdict(value) for key, value in sorted(self.entries.items())}
+        recordings = {key: vars(value) | vars(value.context) for key, value in sorted(self.entries.items())}
+        for row in recordings.values():
+            del row["context"]
         text = json.dumps({"schema_version": SCHEMA_VERSION, "recordings": recordings}, indent=1)
         write_text(self.manifest_path, text + "\n")
 

@@ -20,14 +20,12 @@ from typing import Any
 import numpy as np
 import torch
 from rich.console import Console
-from safetensors.torch import save
 from torch import Tensor, nn
 
-from wearcap.boundary.opening import file_size, path_inside
-from wearcap.boundary.tensors import read_tensors
-from wearcap.boundary.texts import read_json
+from wearcap.boundary.opening import file_size, path_inside, understood
+from wearcap.boundary.tensors import open_described, write_tensors
 from wearcap.errors import WearcapError
-from wearcap.files import atomic_path, sha256_of, write_text
+from wearcap.files import sha256_of
 from wearcap.recording import Motion, Recording
 from wearcap.recording.serialize import KNOWN, dumps, flatten, unflatten
 from wearcap.runtime.system import Captured, CaptureInput, StageOptions, System
@@ -160,43 +158,34 @@ class Stage:
 
 @dataclass(frozen=True)
 class StageCache:
-    """Cached results in a folder: a .safetensors file per stage and key, and a .json file that is written last."""
+    """Cached results in a folder: a .safetensors file per stage and key, laid out as a recording's."""
 
     folder: Path
 
     def read(self, stage: Stage, key: str) -> tuple[Any, str, float] | None:
         """(result, its digest, seconds), or None if it is not cached. Raises WearcapError when it is damaged."""
-        note, tensors = self._files(stage.name, key)
-        if not note.exists():
+        if not (path := self._file(stage.name, key)).exists():
             return None
-        try:
-            kept = read_json(note)
-            _, content = read_tensors(tensors, "result")
-            value = unflatten(
-                kept["result"], content.__getitem__, KNOWN | {kind.__name__: kind for kind in stage.kinds}
-            ).get("value")
-            found, seconds = digest(kept["result"], content), float(kept["seconds"])
-            expected = kept["digest"]
-        except _DAMAGE as error:
-            raise WearcapError(f"damaged ({error})", where=note) from error
-        if found != expected:
-            raise WearcapError("damaged (its content is not what was written)", where=tensors)
-        return value, found, seconds
+        with understood("damaged", path, errors=_DAMAGE):
+            file, kept = open_described(path, "wearcap_stage", "result", "a stage")
+            content = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            known = KNOWN | {kind.__name__: kind for kind in stage.kinds}
+            value = unflatten(kept["result"], content.__getitem__, known).get("value")
+            if digest(kept["result"], content) != kept["digest"]:
+                raise ValueError("its content is not what was written")
+            return value, kept["digest"], float(kept["seconds"])
 
     def write(self, stage: str, key: str, value: Any, seconds: float) -> str:
         """Store a result; returns its digest."""
-        note, tensors = self._files(stage, key)
         tree, content = flatten({"value": value})
         tree = json.loads(dumps(tree))
         found = digest(tree, content)
         kept = {"stage": stage, "key": key, "digest": found, "seconds": round(seconds, 3), "result": tree}
-        with atomic_path(tensors) as temporary:
-            temporary.write_bytes(save(content))
-        write_text(note, json.dumps(kept, indent=1) + "\n")
+        write_tensors(self._file(stage, key), content, {"wearcap_stage": dumps(kept)})
         return found
 
-    def _files(self, stage: str, key: str) -> tuple[Path, Path]:
-        return tuple(self.folder / f"{stage}-{key[:16]}{ending}" for ending in (".json", ".safetensors"))  # pyright: ignore[reportReturnType]
+    def _file(self, stage: str, key: str) -> Path:
+        return self.folder / f"{stage}-{key[:16]}.safetensors"
 
 
 def run_stages(

@@ -27,9 +27,9 @@ from wearcap.boundary.texts import parse_json, read_yaml_object
 from wearcap.data.datamodule import WindowsModule
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path, write_text
-from wearcap.models.build import check_weights
 from wearcap.models.checkpoint import Training as Taken
 from wearcap.models.checkpoint import read_checkpoint, read_run_file
+from wearcap.models.weights import check_weights
 from wearcap.training.base import Training
 from wearcap.version import __version__
 
@@ -178,7 +178,7 @@ def require_resumable(path: str | Path, own: Mapping[str, Tensor]) -> _Resumed:
     if missing:
         what = f"a checkpoint without {missing[0]}"
         raise WearcapError(what, where=path, expected="a run's .ckpt file, as `wearcap train` writes it")
-    check_weights(own, plain_tensors(saved["state_dict"], path), path)
+    check_weights(own, plain_tensors(saved["state_dict"], path), "this model", path)
     about = saved.get("wearcap")
     text = about.get("config") if isinstance(about, dict) else None
     return parse_json(text if isinstance(text, str) else "{}", path, "config", schema=_Resumed)

@@ -1,7 +1,7 @@
 """Surroundings for a motion that was captured in an empty hall: a room or a street that fits the activity.
 
 Walls and furniture stand beside the path, some within arm's reach, and nothing ever meets the body; below sitters
-stands a seat, below climbers a step. The floor is at z = 0, where `prepare.mocap` puts it.
+stands a seat, below climbers a step. The floor is at z = 0, where `data_prep.shared.mocap` puts it.
 
 Supports are found by balance: a body that is still with bent hips while its centre of mass is not over the feet, or
 both feet are off the floor, sits; a lower foot at rest above the floor while the body does not fly stands on a step.

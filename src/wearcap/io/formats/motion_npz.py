@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Int64
 from torch import Tensor
 
-from wearcap.boundary.arrays import read_npz, require
+from wearcap.boundary.arrays import read_npz
 from wearcap.boundary.texts import parse_json
 from wearcap.errors import WearcapError
 from wearcap.files import atomic_path
@@ -35,8 +35,7 @@ def write_motion(motion: Motion, path: str | Path) -> None:
     Raises WearcapError when it cannot be written, or holds NaN or infinite values.
     """
     tree, tensors = flatten(motion)
-    if bad := [key for key, tensor in tensors.items() if not tensor.isfinite().all()]:
-        raise WearcapError(f"{bad[0]!r} holds NaN or infinite values", path, "a finite motion")
+    _require_finite(tensors, path)
     arrays = {key: tensor.numpy() for key, tensor in sorted(tensors.items())}
     arrays["wearcap"] = np.array(dumps({"schema": SCHEMA, "motion": tree}))
     arrays["trans"] = arrays["t_world_root"]
@@ -96,40 +95,30 @@ def _damaged(error: Exception, path: str | Path) -> WearcapError:
 
 
 def _check(motion: Motion, path: str | Path) -> None:
-    """Check that sizes agree and numbers are finite, for a file with arbitrary content; `unflatten` has checked the types."""
+    """Raise WearcapError or ValueError for a motion with arbitrary content; `unflatten` has checked types and axes."""
     if not isinstance(motion, Motion):
         raise WearcapError("holds no motion", path)
-    skeleton = motion.skeleton
-    parts: dict[str, tuple[Tensor | None, tuple[int | str, ...]]] = {
-        "timestamps": (motion.timestamps, ("time",)),
-        "R_parent_joint": (motion.R_parent_joint, ("time", len(skeleton), 3, 3)),
-        "t_world_root": (motion.t_world_root, ("time", 3)),
-        "t_parent_joint": (skeleton.t_parent_joint, (len(skeleton), 3)),
-        "contact_prob": (motion.contact_prob, ("time", "patch")),
-        "hand_contact_prob": (motion.hand_contact_prob, ("time", len(HANDS))),
-        "body_contact_prob": (motion.body_contact_prob, ("time", "point")),
+    _require_finite(flatten(motion)[1], path)
+    skeleton, interactions = motion.skeleton, motion.interactions
+    sizes = {
+        "R_parent_joint": (motion.R_parent_joint, len(skeleton)),
+        "hand_contact_prob": (motion.hand_contact_prob, len(HANDS)),
+        "interactions.hands": (None if interactions is None else interactions.hands, len(HANDS)),
     }
-    if (interactions := motion.interactions) is not None:
-        stored = {
-            "start_s": interactions.start_s.numpy(),
-            "stop_s": interactions.stop_s.numpy(),
-            "hands": interactions.hands.numpy().astype(np.uint8),
-        }
-        sizes = require(stored, path, start_s=("interval",), stop_s=("interval",), hands=("interval", len(HANDS)))
-        if {len(interactions.objects), len(interactions.classes)} != {sizes["interval"]}:
-            raise ValueError(f"names that do not match {sizes['interval']} interactions")
-    for name, track in (motion.object_motion or {}).items():
-        clock = f"time of {name}"
-        parts[f"{name} timestamps"] = (track.timestamps, (clock,))
-        parts[f"{name} R"] = (track.R_world_body, (clock, 3, 3))
-        parts[f"{name} t"] = (track.t_world_body, (clock, 3))
-    arrays = {key: tensor for key, (tensor, _) in parts.items() if tensor is not None}
-    shapes = {key: parts[key][1] for key in arrays}
-    require({key: tensor.numpy() for key, tensor in arrays.items()}, path, **shapes)
+    for name, (value, size) in sizes.items():
+        if value is not None and value.shape[1] != size:
+            raise WearcapError(f"array {name!r} has shape {tuple(value.shape)}", path, f"{size} in the second place")
+    if interactions is not None and {len(interactions.objects), len(interactions.classes)} != {len(interactions)}:
+        raise ValueError(f"names that do not match {len(interactions)} interactions")
     for site in skeleton.sites.values():
         skeleton.index(site.joint)
         if not np.isfinite(site.t_joint_site).all():
             raise ValueError("a site without a finite position")
+
+
+def _require_finite(tensors: dict[str, Tensor], path: str | Path) -> None:
+    if bad := [key for key, tensor in tensors.items() if not tensor.isfinite().all()]:
+        raise WearcapError(f"{bad[0]!r} holds NaN or infinite values", path, "a finite motion")
 
 
 STILL_FPS = 30.0

@@ -2,22 +2,22 @@
 
 import json
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import safetensors
 import torch
 from einops import rearrange, reduce, repeat
 from jaxtyping import Float, Int64
-from safetensors.torch import load_file, save
 from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import Dataset
 
+from wearcap.boundary.tensors import read_tensors, write_tensors
 from wearcap.data.objects import POINTS
 from wearcap.data.windows import Source
-from wearcap.files import atomic_path
+from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.models.point_encoder import ObjectNetwork, bounds, to_unit_sphere
 from wearcap.training.base import OptimizerOf, SchedulerOf, Training
@@ -92,16 +92,12 @@ class ObjectClouds(Dataset):
         """
         count, path = per_class[split], Path(root) / f"{split}.safetensors"
         made_of = json.dumps([list(classes), count, points])
-        try:
-            with safetensors.safe_open(str(path), framework="pt") as file:
-                cached = (file.metadata() or {}).get(_KEY)
-        except (safetensors.SafetensorError, OSError):
-            cached = None
-        if cached != made_of:
-            clouds, labels = generate(split, tuple(classes), count, points)
-            with atomic_path(path) as temporary:
-                temporary.write_bytes(save({"clouds": clouds, "labels": labels}, {_KEY: made_of}))
-        tensors = load_file(path)
+        metadata, tensors = dict[str, str](), dict[str, Tensor]()
+        with suppress(WearcapError):  # none yet, or damaged
+            metadata, tensors = read_tensors(path, "file of clouds")
+        if metadata.get(_KEY) != made_of:
+            tensors = dict(zip(("clouds", "labels"), generate(split, tuple(classes), count, points)))
+            write_tensors(path, tensors, {_KEY: made_of})
         self.clouds: Float[Tensor, "object point 3"] = tensors["clouds"]
         self.labels: Int64[Tensor, "object"] = tensors["labels"]
         self.augmentation, self.augmented = augmentation or CloudAugmentation(), augmented

@@ -14,12 +14,27 @@ from wearcap.geometry import rotation
 from wearcap.recording import Recording
 from wearcap.recording.motion import HANDS
 from wearcap.runtime.graphs import Call, Exports, Graph, Rate, Run
-from wearcap.systems.ireplica.contact_prediction import FRAMES, ContactDetector, ContactNetwork, ContactStream
+from wearcap.systems.ireplica.contact_prediction import (
+    FRAMES,
+    ContactDetector,
+    ContactNetwork,
+    ContactPredictor,
+    ContactStream,
+)
 from wearcap.systems.ireplica.features import FEATURES, pose_frames
+from wearcap.systems.ireplica.pipeline import IReplica
 
 
-def exports(detector: ContactDetector) -> Exports:
-    """A detector's network, from `pose` "batch 61 feature" to the middle frame's probabilities "batch hand class"."""
+def exports(pipeline: IReplica) -> Exports:
+    """The contact network, from `pose` "batch 61 feature" to the middle frame's probabilities "batch hand class".
+
+    Raises WearcapError for a pipeline with several of them, or with none.
+    """
+    predictor = pipeline.predictor
+    detectors = predictor.detectors if isinstance(predictor, ContactPredictor) else ()
+    if len(detectors) != 1:
+        raise WearcapError(f"{len(detectors)} contact networks", expected="one, of one checkpoint")
+    detector = detectors[0]
     skeleton, random = detector.features.skeleton, torch.Generator().manual_seed(0)
     turns = 0.3 * torch.randn(3, FRAMES, len(skeleton), 3, generator=random)
     graph = Graph(Call(detector.net, "middle_probability"), {"pose": detector.features.encode(rotation.exp(turns))})

@@ -17,10 +17,8 @@ from wearcap.io.formats.environment import read_environment
 from wearcap.metrics.detection import mean_detection_scores
 from wearcap.metrics.objects import summary
 from wearcap.recording import Motion, Recording, RecordingStore
-from wearcap.runtime.graphs import Exports
 from wearcap.runtime.system import CaptureInput
 from wearcap.systems.ireplica.contact_prediction import REACH, ContactDetector, ContactNetwork, ContactPredictor
-from wearcap.systems.ireplica.export import exports
 from wearcap.systems.ireplica.features import PoseFeatures
 from wearcap.systems.ireplica.pipeline import IReplica
 from wearcap.systems.ireplica.scores import score_interactions
@@ -48,10 +46,6 @@ class ContactDetection(Training):
         self.net = net(inputs=features.size, classes=len(classes))
         self.features, self.classes, self.fps = features, tuple(classes), fps
         self._validated: list[tuple[Tensor, Tensor]] = []
-
-    def exports(self) -> Exports:
-        """The contact network as a graph."""
-        return exports(ContactDetector(self.net.eval(), self.features, self.classes, self.fps))
 
     def set_statistics(self, dataset: Windows, limit: int = 400) -> None:
         (batch,) = drawn_batches(dataset, limit)

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from data_prep.shared.engine import NOTE
 from wearcap.body.kinematics import site_positions
 from wearcap.body.retarget import fit_offsets, retarget
 from wearcap.body.skeleton import FOOT_PATCHES, xsens23
-from wearcap.prepare.engine import NOTE
 from wearcap.recording.motion import Motion
 from wearcap.recording.recording import ContactTrack, FloorTrack, HeadStream, Recording
 from wearcap.recording.timing import resampled

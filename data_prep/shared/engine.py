@@ -6,11 +6,9 @@ moment, a data set is left with whole files and a whole manifest, and the next r
 
 import csv
 import hashlib
-import json
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from concurrent.futures import BrokenExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
@@ -103,12 +101,6 @@ class Splits:
         return cls(path, tuple((row["subject"], row["split"]) for row in table))
 
 
-def content_hash(*parts: Any) -> str:
-    """Hex digest (16 digits) of settings (anything JSON can hold) and of the bytes of files given as Path."""
-    plain = [sha256_of(part) if isinstance(part, Path) else part for part in parts]
-    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
-
-
 def source_folder(source: str | Path) -> Path:
     """The folder of a source's files. Raises WearcapError if it does not exist."""
     if not Path(source).is_dir():
@@ -150,22 +142,18 @@ def prepare(
         remove_leftovers(store.root, below=True)
         todo = tasks if overwrite else [task for task in tasks if not _is_current(store, task)]
         report = Report(current=sorted(names - {task.name for task in todo}))
-        outcomes = parallel.run(partial(_run, root=store.root, inspect=inspect), todo, lock)
-        try:
-            with closing(outcomes), registering(store, len(tasks), len(report.current)) as finish:
-                for name, outcome, note in outcomes:
-                    made = {name: outcome} if isinstance(outcome, Entry) else {}
-                    if isinstance(outcome, Entry):
-                        report.written.append(name)
-                    else:
-                        report.failed[name] = outcome
-                        store.entries.pop(name, None)  # made with other settings
-                    if note:
-                        report.notes[name] = note
-                    finish(made)
-        except BrokenExecutor as error:
-            fix = "What is finished is kept: run again with fewer jobs."
-            raise WearcapError("a worker process was killed (out of memory?)", where=store.root, fix=fix) from error
+        outcomes = parallel.run(partial(_run, root=store.root, inspect=inspect), todo, store.root, lock)
+        with closing(outcomes), registering(store, len(tasks), len(report.current)) as finish:
+            for name, outcome, note in outcomes:
+                made = {name: outcome} if isinstance(outcome, Entry) else {}
+                if isinstance(outcome, Entry):
+                    report.written.append(name)
+                else:
+                    report.failed[name] = outcome
+                    store.entries.pop(name, None)  # made with other settings
+                if note:
+                    report.notes[name] = note
+                finish(made)
     report.written.sort()
     return report
 
