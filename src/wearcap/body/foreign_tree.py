@@ -12,12 +12,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from wearcap.body.joint_matching import BodyJoints, ancestors, common_ancestor
+from wearcap.body.joint_matching import BodyJoints, common_ancestor
 from wearcap.body.kinematics import forward_kinematics
-from wearcap.body.skeleton import Skeleton
-from wearcap.geometry.rotation import geodesic, nearest_rotation, swing_between
+from wearcap.body.skeleton import SIDES, Skeleton, ancestors
+from wearcap.geometry.rotation import geodesic, matrix_from_rot6d, nearest_rotation, swing_between
 
-SIDES = ("left", "right")
 LIMBS = {"leg": ("hip", "knee", "ankle"), "arm": ("shoulder", "elbow", "wrist")}
 _BENT = 0.26
 """Sine of the bend (15°) from which a knee or an elbow shows its axis."""
@@ -122,11 +121,9 @@ def standing_rotation(
 
 def _frame(first: int, a: Float[Tensor, "*t 3"], second: int, b: Float[Tensor, "*t 3"]) -> Float[Tensor, "*t 3 3"]:
     """Rotation whose column `first` points along a, and whose column `second` lies towards b."""
-    a = torch.nn.functional.normalize(a, dim=-1)
-    b = torch.nn.functional.normalize(b - (a * b).sum(-1, keepdim=True) * a, dim=-1)
-    third = 3 - first - second
+    along, across, normal = matrix_from_rot6d(torch.cat([a, b], -1)).unbind(-1)
     sign = 1.0 if (second - first) % 3 == 1 else -1.0
-    columns = {first: a, second: b, third: sign * torch.linalg.cross(a, b)}
+    columns = {first: along, second: across, 3 - first - second: sign * normal}
     return torch.stack([columns[k] for k in range(3)], -1)
 
 

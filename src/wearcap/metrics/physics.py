@@ -9,10 +9,9 @@ from torch import Tensor
 from torch.nn.functional import max_pool1d
 
 from wearcap.body.kinematics import site_positions
-from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
+from wearcap.body.skeleton import FOOT_PATCHES, SIDES, Skeleton
 from wearcap.geometry.rigid import Rigid
 
-SIDES = ("left", "right")
 FLOOR_WINDOW_S = 10.0
 """Time to either side of a frame in which the lowest true joint is the local floor (thesis §6.4: 20 s in total)."""
 CONTACT_HEIGHT_M = 0.05

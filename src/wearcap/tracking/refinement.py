@@ -15,7 +15,7 @@ from torch import Tensor
 
 from wearcap.body.kinematics import local_rotations, site_positions
 from wearcap.body.retarget import reach
-from wearcap.body.skeleton import FEET, FOOT_PATCHES, WRISTS, Skeleton
+from wearcap.body.skeleton import FEET, FOOT_PATCHES, SIDES, WRISTS, Skeleton
 from wearcap.errors import WearcapError
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
@@ -25,7 +25,6 @@ from wearcap.tracking.anchor import anchored_to_head
 from wearcap.tracking.foot_lock import FootLock, FootState, displacements
 from wearcap.tracking.head_path import HeadPath
 
-SIDES = ("left", "right")
 _REACH = 2.5
 """Half width of the filter in standard deviations."""
 _STRAIGHT, _SOFT = 0.97, 0.025
