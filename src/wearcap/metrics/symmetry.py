@@ -5,7 +5,6 @@ degrees and centimetres.
 """
 
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 import torch
@@ -57,7 +56,9 @@ class Symmetry:
                     return False
             return True
 
-        turns = [frame.T @ R @ frame for frame in (np.eye(3), principal) for R in _cube_group()]
+        turns = [
+            frame.T @ R @ frame for frame in (np.eye(3), principal) for R in Rotation.create_group("O").as_matrix()
+        ]
         turns = [R for R in turns if kept(R)]
         steps = 2 * np.pi / STEPS * np.arange(1, STEPS)
         axes: list[Float64[np.ndarray, "3"]] = []
@@ -135,12 +136,6 @@ def _center_and_axes(mesh: Mesh) -> tuple[Float64[np.ndarray, "3"], Float64[np.n
     spread += 9 * np.einsum("f,fi,fj->ij", weight, inside.mean(1), inside.mean(1))
     axes = np.linalg.eigh(spread)[1].T
     return center, axes * np.linalg.det(axes)
-
-
-@cache
-def _cube_group() -> Float64[np.ndarray, "24 3 3"]:
-    """The rotations that bring a cube back to itself."""
-    return Rotation.create_group("O").as_matrix()
 
 
 def closest_surface_error_cm(

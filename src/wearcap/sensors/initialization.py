@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from wearcap.errors import WearcapError
+from wearcap.errors import WearcapError, require_choice
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.geometry.trajectory import Trajectory, nearest_frames, outlier_mask, resample
@@ -189,8 +189,7 @@ class InitializationSettings:
     """Whether the suit's motion is tilted to gravity's direction in the map (ours)."""
 
     def __post_init__(self):
-        if self.path not in PATHS:
-            raise WearcapError(f"path={self.path!r}", expected=f"one of {', '.join(PATHS)}")
+        require_choice(self.path, PATHS, f"path={self.path!r}")
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from wearcap.body.kinematics import forward_kinematics, local_rotations, site_positions
 from wearcap.body.skeleton import FOOT_PATCHES, Skeleton
-from wearcap.errors import WearcapError
+from wearcap.errors import require_choice
 from wearcap.geometry import rotation
 from wearcap.geometry.rigid import Rigid
 from wearcap.recording.motion import Motion
@@ -96,8 +96,7 @@ class SuitNoise:
     @classmethod
     def preset(cls, name: str) -> "SuitNoise":
         """Errors of a suit "ideal", "typical" or "poor". Raises WearcapError for another name."""
-        if name not in SUITS:
-            raise WearcapError(f"suit={name!r}", expected=f"one of {', '.join(SUITS)}")
+        require_choice(name, SUITS, f"suit={name!r}")
         return SUITS[name]
 
 
