@@ -15,6 +15,7 @@ from scipy.special import ndtr
 from torch import Tensor
 
 from wearcap.errors import WearcapError
+from wearcap.geometry.trajectory import interpolate_clamped
 from wearcap.recording.recording import ImuStream, Recording
 from wearcap.sensors.stillness import StepCheck, Stretch
 
@@ -80,12 +81,7 @@ class Clock:
 
 def _through(time: Tensor, knots: Tensor, values: Tensor, rate: float) -> Tensor:
     """Linear between knots, beyond them with `rate`."""
-    inside = time.clamp(knots[0], knots[-1])
-    if len(knots) == 1:
-        return values[0] + (time - inside) * rate
-    after = torch.searchsorted(knots, inside.contiguous(), right=True).clamp(1, len(knots) - 1)
-    slope = (values[after] - values[after - 1]) / (knots[after] - knots[after - 1])
-    return values[after - 1] + (inside - knots[after - 1]) * slope + (time - inside) * rate
+    return interpolate_clamped(knots, values, time) + (time - time.clamp(knots[0], knots[-1])) * rate
 
 
 def fit_clock(

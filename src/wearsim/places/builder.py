@@ -247,7 +247,7 @@ class WorldBuilder:
         """All triangles so far, in the world."""
         return merged(
             [
-                Mesh(vertices.astype(np.float32), faces, np.array(color, np.float32))
+                Mesh(vertices.astype(np.float32), faces.astype(np.int32), np.array(color, np.float32))
                 for vertices, faces, color, *_ in self._triangles
             ]
         )
