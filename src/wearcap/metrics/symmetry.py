@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from einops import rearrange, reduce
 from jaxtyping import Float, Float64
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -148,5 +149,7 @@ def closest_surface_error_cm(
     """
     T_true_found = T_true.to(torch.float64).inverse() @ T_found.to(torch.float64)
     points: Tensor = T_true_found[:, None] @ cloud[::EVERY].double()  # pyright: ignore[reportAssignmentType]
-    distance, _ = surface.nearest(np.ascontiguousarray((points + middle.double()).flatten(0, 1).numpy()))
-    return 100 * torch.from_numpy(distance).unflatten(0, points.shape[:2]).mean(-1)
+    distance, _ = surface.nearest(
+        np.ascontiguousarray(rearrange((points + middle.double()).numpy(), "time point axis -> (time point) axis"))
+    )
+    return 100 * reduce(torch.from_numpy(distance), "(time point) -> time", "mean", time=len(points))

@@ -12,6 +12,7 @@ import scipy.ndimage
 import scipy.signal
 import scipy.stats
 import torch
+from einops import rearrange
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -182,7 +183,8 @@ def _orientations(motion: Motion, errors: SegmentErrors, rng: np.random.Generato
     """World orientations of the segments with errors of calibration, fusion and soft tissue, before the heading's."""
     length, joints, fps = len(motion), len(motion.skeleton), motion.fps
     fixed = torch.from_numpy(rng.standard_normal((1, joints, 3))).float()
-    slow = smooth_noise(rng, length, joints * 3, errors.slow_period_s, fps).unflatten(-1, (joints, 3))
+    slow = smooth_noise(rng, length, joints * 3, errors.slow_period_s, fps)
+    slow = rearrange(slow, "time (joint axis) -> time joint axis", axis=3)
     T_world_joint = motion.T_world_joint
     sideways, axis = torch.nn.functional.normalize(
         torch.from_numpy(rng.standard_normal((2, joints, 3))).float(), dim=-1
