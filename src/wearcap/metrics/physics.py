@@ -30,14 +30,14 @@ def foot_points(skeleton: Skeleton, T_world_joint: Rigid) -> Float[Tensor, "time
     """Two points (m) per foot, left foot first: heel and toe tip, or ankle and toe of a skeleton without such sites."""
     if all(patch in skeleton.sites for patch in FOOT_PATCHES):
         points = site_positions(skeleton, T_world_joint, FOOT_PATCHES)
-        return rearrange(points, "time (foot point) axis -> time foot point axis", foot=FEET)
+        return rearrange(points, "time (foot point) xyz -> time foot point xyz", foot=FEET)
     return foot_joints(skeleton, T_world_joint)
 
 
 def foot_joints(skeleton: Skeleton, T_world_joint: Rigid) -> Float[Tensor, "time foot point 3"]:
     """Ankle and toe joint (m) of both feet, left foot first."""
     joints = [skeleton.index(f"{side}_{name}") for side in SIDES for name in ("ankle", "toe")]
-    return rearrange(T_world_joint.t[:, joints], "time (foot point) axis -> time foot point axis", foot=FEET)
+    return rearrange(T_world_joint.t[:, joints], "time (foot point) xyz -> time foot point xyz", foot=FEET)
 
 
 def foot_contact(contact: Bool[Tensor, "time patch"]) -> Bool[Tensor, "time foot"]:

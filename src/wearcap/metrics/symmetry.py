@@ -150,6 +150,6 @@ def closest_surface_error_cm(
     T_true_found = T_true.to(torch.float64).inverse() @ T_found.to(torch.float64)
     points: Tensor = T_true_found[:, None] @ cloud[::EVERY].double()  # pyright: ignore[reportAssignmentType]
     distance, _ = surface.nearest(
-        np.ascontiguousarray(rearrange((points + middle.double()).numpy(), "time point axis -> (time point) axis"))
+        np.ascontiguousarray(rearrange((points + middle.double()).numpy(), "time point xyz -> (time point) xyz"))
     )
     return 100 * reduce(torch.from_numpy(distance), "(time point) -> time", "mean", time=len(points))

@@ -185,7 +185,7 @@ class Refiner:
         if self._feet is None or motion.contact_prob is None:
             return None
         points = site_positions(motion.skeleton, motion.T_world_joint, FOOT_PATCHES)
-        points = rearrange(points, "time (foot patch) axis -> time foot patch axis", foot=FEET)
+        points = rearrange(points, "time (foot patch) xyz -> time foot patch xyz", foot=FEET)
         prob = reduce(motion.contact_prob, "time (foot patch) -> time foot", "max", foot=FEET)
         offsets, self._states = displacements(
             self._feet, points, prob, measured.floor_height, self.fps, self._states, count

@@ -184,7 +184,7 @@ def _orientations(motion: Motion, errors: SegmentErrors, rng: np.random.Generato
     length, joints, fps = len(motion), len(motion.skeleton), motion.fps
     fixed = torch.from_numpy(rng.standard_normal((1, joints, 3))).float()
     slow = smooth_noise(rng, length, joints * 3, errors.slow_period_s, fps)
-    slow = rearrange(slow, "time (joint axis) -> time joint axis", axis=3)
+    slow = rearrange(slow, "time (joint xyz) -> time joint xyz", xyz=3)
     T_world_joint = motion.T_world_joint
     sideways, axis = torch.nn.functional.normalize(
         torch.from_numpy(rng.standard_normal((2, joints, 3))).float(), dim=-1
