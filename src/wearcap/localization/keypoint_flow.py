@@ -7,7 +7,6 @@ weighted towards the nearer detection. Video frames pass through a buffer as lon
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -197,13 +196,11 @@ def flow_there_and_back(
 ) -> tuple[Float32[np.ndarray, "point 2"], Float32[np.ndarray, "point"], Bool[np.ndarray, "point"]]:
     """Points' places in the next picture by optical flow (from a guess of them, if any), how far (px) from their start the
     flow back takes them, and which are found both ways, within the picture."""
-    guesses, flags = (None, None), 0
-    if guess is not None:
-        guesses, flags = (guess[:, None], start[:, None].copy()), cv2.OPTFLOW_USE_INITIAL_FLOW
-    flow = partial(cv2.calcOpticalFlowPyrLK, winSize=(window_px, window_px), maxLevel=levels, flags=flags)
-    end, there, _ = flow(before, after, start[:, None], guesses[0])  # type: ignore[call-overload]
-    back, again, _ = flow(after, before, end, guesses[1])  # type: ignore[call-overload]
-    end, back = end[:, 0], back[:, 0]
+    options = {"winSize": (window_px, window_px), "maxLevel": levels, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
+    first = np.array(start if guess is None else guess)
+    end, there, _ = cv2.calcOpticalFlowPyrLK(before, after, start, first, **options)  # type: ignore[call-overload]
+    first = np.array(end if guess is None else start)
+    back, again, _ = cv2.calcOpticalFlowPyrLK(after, before, end, first, **options)  # type: ignore[call-overload]
     inside = ((end >= -0.5) & (end < np.array(after.shape[::-1]) - 0.5)).all(-1)
     return end, np.linalg.norm(back - start, axis=-1), (there[:, 0] == 1) & (again[:, 0] == 1) & inside
 
